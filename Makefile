@@ -1,0 +1,60 @@
+# Every target sets up what it needs in .venv; nothing has to be done before.
+#   make demo       grow, hurt and heal the shipped rule, train a small one (CPU); writes demo/
+#   make test       the test suite without the slow tests
+#   make test-all   all tests
+#   make check      ruff, formatting, types, spelling
+# PIP_ARGS goes to pip: PIP_ARGS='--extra-index-url https://download.pytorch.org/whl/cpu' takes
+# torch's smaller CPU build.
+
+PYTHON ?= python3
+PIP_ARGS ?=
+VENV := .venv
+BIN := $(VENV)/bin
+CHECK := build/check
+
+# A stamp a set of extras, older than these files: pip runs again only when they change.
+CORE := $(VENV)/installed-core
+DEV := $(VENV)/installed-dev
+INPUTS := pyproject.toml constraints.txt
+
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
+
+.PHONY: demo test test-all check clean
+.DELETE_ON_ERROR:
+
+$(BIN)/python:
+	$(PYTHON) -c 'import sys; v = sys.version_info; v >= (3, 11) or sys.exit("npa-envs needs Python 3.11 or newer, got %d.%d: make PYTHON=python3.12" % v[:2])'
+	$(PYTHON) -m venv $(VENV)
+
+$(CORE): $(INPUTS) | $(BIN)/python
+	$(BIN)/python -m pip install --quiet $(PIP_ARGS) -e . -c constraints.txt
+	touch $@
+
+$(DEV): $(INPUTS) | $(BIN)/python
+	$(BIN)/python -m pip install --quiet $(PIP_ARGS) -e '.[dev]' -c constraints.txt
+	touch $@ $(CORE)
+
+demo: $(CORE)
+	$(BIN)/npa-envs warmup --device cpu
+	$(BIN)/npa-envs demo --device cpu --out demo
+
+test: $(DEV)
+	$(PYTEST) -m 'not slow'
+
+test-all: $(DEV)
+	$(PYTEST)
+
+# Static checkers do not follow the editable finder for envs/, wrappers/ and agents/, so the types
+# are checked in a regular install, made from a copy: setuptools would leave stale files in build/.
+check: $(DEV)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/typos
+	rm -rf $(CHECK)
+	mkdir -p $(CHECK)/source
+	cp -R pyproject.toml README.md LICENSE npa_envs envs wrappers agents $(CHECK)/source
+	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --target $(CHECK)/site $(CHECK)/source
+	cd $(CHECK)/site && ../../../$(BIN)/mypy --config-file ../../../pyproject.toml --cache-dir ../cache -p npa_envs
+
+clean:
+	rm -rf build dist demo *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -1,0 +1,107 @@
+"""The command `npa-envs`: one module a sub-command, imported only when it is asked for."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+
+from npa_envs.errors import NPAError, suggest
+
+COMMANDS = {
+    "demo": "grow, hurt and heal the shipped rule, and train a small one; about a minute on a CPU",
+    "train": "train a rule on a task",
+    "rollout": "grow a rule from its seed, with damage on the way; writes GIF, MP4 and a filmstrip",
+    "evaluate": "measure a rule: loss, PSNR, overflow and extent over thousands of steps",
+    "list": "tasks, presets, built-in targets, shipped rules",
+    "warmup": "compile the kernels ahead of time",
+    "doctor": "versions, devices, kernel cache, fonts",
+}
+"""Every sub-command with its summary."""
+
+USAGE_ERROR = 2
+INTERRUPTED = 130
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        arguments: The words after `npa-envs`; None takes them from the process.
+
+    Returns:
+        The exit code: 0, 2 for a mistake in what was asked for, 130 after Ctrl-C.
+    """
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        return _dispatch(words)
+    except NPAError as error:
+        print(f"npa-envs: error: {' '.join(str(error).split())}", file=sys.stderr)
+        return USAGE_ERROR
+    except KeyboardInterrupt:
+        print("npa-envs: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:
+        # The reader of a pipe (head, less) has seen enough; the interpreter's own flush at its
+        # end must not complain about that either.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+def _dispatch(words: list[str]) -> int:
+    if not words or words[0] in {"-h", "--help", "help"}:
+        print(_help())
+        return 0 if words else USAGE_ERROR
+    if words[0] in {"-V", "--version"}:
+        from npa_envs import __version__
+
+        print(f"npa-envs {__version__}")
+        return 0
+    name, rest = words[0], words[1:]
+    # Spelled out, so that the import ladder's test and type checkers see every import.
+    match name:
+        case "demo":
+            from npa_envs.cli import demo
+
+            return demo.main(rest)
+        case "train":
+            from npa_envs.cli import train
+
+            return train.main(rest)
+        case "rollout":
+            from npa_envs.cli import rollout
+
+            return rollout.main(rest)
+        case "evaluate":
+            from npa_envs.cli import evaluate
+
+            return evaluate.main(rest)
+        case "list":
+            from npa_envs.cli import listing
+
+            return listing.main(rest)
+        case "warmup":
+            from npa_envs.cli import warmup
+
+            return warmup.main(rest)
+        case "doctor":
+            from npa_envs.cli import doctor
+
+            return doctor.main(rest)
+    raise NPAError(f"unknown command {name!r}: {suggest(name, COMMANDS)}")
+
+
+def _help() -> str:
+    width = max(map(len, COMMANDS))
+    lines = [f"  {name:<{width}}  {summary}" for name, summary in COMMANDS.items()]
+    return "\n".join(
+        [
+            "usage: npa-envs COMMAND [options]",
+            "",
+            "Neural Particle Automata: differentiable particle worlds.",
+            "",
+            *lines,
+            "",
+            "Options of a command: npa-envs COMMAND --help",
+        ]
+    )

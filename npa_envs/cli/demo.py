@@ -1,0 +1,270 @@
+"""`npa-envs demo`: the main job at a glance, on a CPU in about a minute."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from npa_envs.errors import NPAError
+
+GROW_STEPS = 512
+HEAL_STEPS = 384
+FRAME_STEPS = 8
+
+SMALL_RUN: dict[str, Any] = {
+    "particle_count": 256,
+    "target_point_count": 256,
+    "eps": 0.28,
+    "hidden_dim": 64,
+    "resolution": 48,
+    "steps": (12, 24),
+    "iterations": 400,
+    "milestones": (240, 340),
+    "learning_rate": 5e-3,
+    "pool_size": 8,
+    "seed_interval": 1,
+}
+"""Fields over the preset `fast`: the target is learned in half a minute on one core."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoOptions:
+    """Grow a shipped rule from its seed, cut it, erase a part and let it heal each time; then train
+    a small rule from a picture."""
+
+    out: Path = Path("demo")
+    """Folder to write to; created where missing."""
+
+    rule: str = "gecko"
+    """The rule to grow: a shipped one or a file."""
+
+    target: str = "heart"
+    """The picture to train on: a built-in name, an emoji or a path."""
+
+    train_seconds: float = 30.0
+    """Time for the training [s]."""
+
+    seed: int = 0
+    """Randomness."""
+
+    device: str = "cpu"
+    """Where to run: cpu, cuda, cuda:1."""
+
+    progress: bool = True
+    """Show progress bars."""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run the command.
+
+    Args:
+        arguments: The words after `npa-envs demo`.
+
+    Returns:
+        0.
+
+    Raises:
+        NPAError: A value is wrong, or a file cannot be written.
+    """
+    options = tyro.cli(DemoOptions, prog="npa-envs demo", args=arguments)
+    from npa_envs.cli.worlds import make_folder
+
+    if not 1.0 <= options.train_seconds <= 3600.0:
+        raise NPAError(f"train_seconds must lie in [1, 3600], got {options.train_seconds}")
+    start = time.perf_counter()
+    make_folder(options.out)
+    report = Report()
+    grow_and_heal(options, report)
+    train_small(options, report)
+    report.line(f"all of it took {time.perf_counter() - start:.0f} s")
+    report.write(options.out / "report.txt")
+    return 0
+
+
+class Report:
+    """What the demo says, on the screen and in a file."""
+
+    def __init__(self) -> None:
+        self._lines: list[str] = []
+
+    def line(self, text: str) -> None:
+        """Print a line and keep it.
+
+        Args:
+            text: The line.
+        """
+        print(text, flush=True)
+        self._lines.append(text)
+
+    def wrote(self, *paths: Path) -> None:
+        """Say which files were written.
+
+        Args:
+            paths: The files.
+        """
+        for path in paths:
+            self.line(f"  wrote {path}")
+
+    def write(self, path: Path) -> None:
+        """Write everything said so far.
+
+        Args:
+            path: The text file.
+
+        Raises:
+            NPAError: It cannot be written.
+        """
+        from npa_envs.files import write_text
+
+        write_text(path, "\n".join(self._lines) + "\n")
+        print(f"  wrote {path}")
+
+    @contextmanager
+    def timed(self) -> Iterator[Stopwatch]:
+        """Measure the time [s] until the block ends."""
+        watch = Stopwatch()
+        start = time.perf_counter()
+        yield watch
+        watch.seconds = time.perf_counter() - start
+
+
+@dataclass
+class Stopwatch:
+    """A time measured by `Report.timed`."""
+
+    seconds: float = 0.0
+    """How long the block took [s]."""
+
+
+def grow_and_heal(options: DemoOptions, report: Report) -> None:
+    """Grow the shipped rule, damage it twice, and film how it heals.
+
+    Args:
+        options: What the command line said.
+        report: Where the figures go.
+
+    Raises:
+        NPAError: The rule cannot be loaded, or a file cannot be written.
+    """
+    import torch
+
+    from npa_envs.cli.film import DAMAGE_SIZES, Damage, apply_damage, film_world, write_film
+    from npa_envs.cli.progress import StepBar
+    from npa_envs.cli.worlds import task_of_rule
+    from npa_envs.evaluation import measure
+    from npa_envs.rule_io import load_rule
+    from npa_envs.training import check_device
+
+    device = check_device(options.device)
+    rule = load_rule(options.rule, device=device).float()
+    trained = task_of_rule(options.rule, rule, device)
+    task = trained.task
+    generator = torch.Generator(device).manual_seed(options.seed)
+    x, s = task.seed(1, generator=generator, device=device)
+    report.line(f"{options.rule}: {x.shape[1]} particles, {weight_count(rule)} weights")
+
+    def figures(step: int) -> str:
+        if trained.doubt is not None:
+            return f"no figures ({trained.doubt})"
+        row = measure(task, x, s, step)
+        return f"PSNR {row.psnr:5.2f} dB, loss {row.loss:.3f}"
+
+    with StepBar(GROW_STEPS + 2 * HEAL_STEPS, show=options.progress) as bar:
+        common: dict[str, Any] = {
+            "generator": generator,
+            "every": FRAME_STEPS,
+            "progress": bar.advance,
+        }
+        with report.timed() as watch:
+            x, s, film = film_world(rule, task, x, s, GROW_STEPS, **common)
+        lines = [f"  grown for {GROW_STEPS} steps in {watch.seconds:4.1f} s: {figures(GROW_STEPS)}"]
+        step = GROW_STEPS
+        for kind in ("cut", "erase"):
+            damage = Damage(step, kind, DAMAGE_SIZES[kind])
+            x, s = apply_damage(damage, x, s, generator)
+            film.shoot(task, x, s, f"step {step}: {damage.text}", mark=True)
+            lines.append(f"  {damage.text}: {figures(step)}")
+            with report.timed() as watch:
+                x, s, film = film_world(
+                    rule, task, x, s, HEAL_STEPS, first_step=step, film=film, **common
+                )
+            step += HEAL_STEPS
+            lines.append(
+                f"  healed for {HEAL_STEPS} steps in {watch.seconds:4.1f} s: {figures(step)}"
+            )
+    for line in lines:
+        report.line(line)
+    name = Path(options.rule.rpartition("#")[2]).stem
+    report.wrote(*write_film(film, options.out, name))
+
+
+def train_small(options: DemoOptions, report: Report) -> None:
+    """Train a small rule from a picture, and film what it learned.
+
+    Args:
+        options: What the command line said.
+        report: Where the figures go.
+
+    Raises:
+        NPAError: The target cannot be loaded, or a file cannot be written.
+    """
+    import torch
+
+    from npa_envs.cli.film import film_world, write_film
+    from npa_envs.cli.progress import StepBar
+    from npa_envs.evaluation import measure
+    from npa_envs.render import to_uint8, write_filmstrip
+    from npa_envs.training import RunFolder, check_device, preset, task_entry, train
+
+    task_name = "morphogenesis2d"
+    config = preset(
+        "fast",
+        task_name,
+        target=options.target,
+        seed=options.seed,
+        device=options.device,
+        out=options.out / "training",
+        **SMALL_RUN,
+    )
+    report.line(f"training on {options.target}: {config.task.particle_count} particles")
+    with report.timed() as watch:
+        result = train(
+            config,
+            task_name,
+            overwrite=True,
+            progress=options.progress,
+            max_seconds=options.train_seconds,
+        )
+    report.line(f"  {result.iteration} iterations in {watch.seconds:.1f} s")
+    device = check_device(options.device)
+    task = task_entry(task_name).make(config.task, device)
+    generator = torch.Generator(device).manual_seed(options.seed + 1)
+    x, s = task.seed(1, generator=generator, device=device)
+    steps = 4 * config.steps[1]
+    with StepBar(steps, show=options.progress) as bar:
+        x, s, film = film_world(
+            result.rule, task, x, s, steps, generator=generator, every=1, progress=bar.advance
+        )
+    row = measure(task, x, s, steps)
+    report.line(f"  grown for {steps} steps: PSNR {row.psnr:5.2f} dB, loss {row.loss:.3f}")
+    name = f"trained-{Path(options.target).stem}"
+    report.wrote(*write_film(film, options.out, name))
+    comparison = options.out / f"{name}-comparison.png"
+    frames = [to_uint8(task.target_picture), film.frames[-1]]
+    write_filmstrip(comparison, frames, ["target", f"step {steps}"])
+    report.wrote(comparison, RunFolder(result.folder).rule)
+
+
+def weight_count(rule: Any) -> int:
+    """Return how many numbers a rule is made of.
+
+    Args:
+        rule: Any torch module.
+    """
+    return sum(parameter.numel() for parameter in rule.parameters())

@@ -1,0 +1,223 @@
+"""Films of a world, with damage on the way."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from npa_envs.dynamics import rollout
+from npa_envs.errors import NPAError, suggest
+from npa_envs.render import to_uint8, write_filmstrip, write_gif, write_mp4
+from npa_envs.rule import NPARule
+from npa_envs.tasks.damage import clump, cut, erase_state, random_particle
+
+if TYPE_CHECKING:
+    from npa_envs.tasks.task import PictureTask
+
+DAMAGE_SIZES = {"erase": 0.2, "cut": 0.1, "clump": 0.2}
+"""Kinds of damage with their usual size: radius, gap, radius [length units]."""
+
+CLUMP_FACTOR = 0.9
+"""Share of its distance from the centre that a particle loses when it is clumped."""
+
+
+@dataclass(frozen=True)
+class Damage:
+    """Something done to the worlds after a number of steps."""
+
+    step: int
+    """Steps from the seed."""
+
+    kind: str
+    """One of `DAMAGE_SIZES`."""
+
+    size: float
+    """Radius or gap [length units]."""
+
+    @property
+    def text(self) -> str:
+        """The damage in a few words, for captions."""
+        return f"{self.kind} {self.size:g}"
+
+
+def parse_damage(text: str) -> Damage:
+    """Read "STEP:KIND" or "STEP:KIND:SIZE".
+
+    Args:
+        text: For example "300:cut" or "500:erase:0.3".
+
+    Raises:
+        NPAError: It is written in another way, or the kind is unknown.
+    """
+    parts = text.split(":")
+    kind = parts[1] if len(parts) > 1 else ""
+    if kind and kind not in DAMAGE_SIZES:
+        raise NPAError(f"unknown damage {kind!r} in {text!r}: {suggest(kind, DAMAGE_SIZES)}")
+    try:
+        step = int(parts[0])
+        size = float(parts[2]) if len(parts) == 3 else DAMAGE_SIZES[kind]
+        valid = len(parts) in (2, 3) and step >= 0 and 0 < size < math.inf
+    except (ValueError, KeyError):
+        valid = False
+    if not valid:
+        raise NPAError(
+            f"damage must be STEP:KIND or STEP:KIND:SIZE with a positive size, got {text!r}: "
+            "for example 300:cut or 500:erase:0.3"
+        )
+    return Damage(step, kind, size)
+
+
+def apply_damage(
+    damage: Damage, x: Tensor, s: Tensor, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Damage worlds at a random place, or cut them through the middle at a random angle.
+
+    Args:
+        damage: What to do.
+        x: Positions [length units], shape [B, N, D].
+        s: States, shape [B, N, C].
+        generator: Where the place comes from.
+    """
+    if damage.kind == "cut":
+        normal = torch.randn(
+            (len(x), x.shape[2]), generator=generator, device=x.device, dtype=x.dtype
+        )
+        return cut(x, s, centre=x.mean(1), normal=normal, gap=damage.size)
+    centre = random_particle(x, generator)
+    if damage.kind == "clump":
+        return clump(x, s, centre=centre, radius=damage.size, factor=CLUMP_FACTOR)
+    return x, erase_state(x, s, centre=centre, radius=damage.size)
+
+
+@dataclass
+class Film:
+    """Frames of one world."""
+
+    frames: list[NDArray[np.uint8]] = field(default_factory=list)
+    """Pictures, uint8, shape [R, R, 3] each."""
+
+    captions: list[str] = field(default_factory=list)
+    """One for each frame."""
+
+    marked: list[int] = field(default_factory=list)
+    """Frames that show fresh damage."""
+
+    def shoot(
+        self, task: PictureTask, x: Tensor, s: Tensor, caption: str, *, mark: bool = False
+    ) -> None:
+        """Add a frame.
+
+        Args:
+            task: Draws the picture.
+            x: Positions [length units], shape [1, N, D].
+            s: States, shape [1, N, C].
+            caption: What it shows.
+            mark: Whether it must be in the filmstrip.
+        """
+        if mark:
+            self.marked.append(len(self.frames))
+        self.frames.append(to_uint8(task.picture(x, s)[0]))
+        self.captions.append(caption)
+
+    def strip(self, count: int = 8) -> tuple[list[NDArray[np.uint8]], list[str]]:
+        """Return frames for a filmstrip: those with damage, and others evenly spread.
+
+        Args:
+            count: Frames to take in all, if there are as many.
+        """
+        others = max(count - len(self.marked), 2)
+        even = np.linspace(0, len(self.frames) - 1, min(others, len(self.frames)))
+        chosen = sorted({*self.marked, *(round(float(k)) for k in even)})
+        return [self.frames[k] for k in chosen], [self.captions[k] for k in chosen]
+
+
+def film_world(
+    rule: NPARule,
+    task: PictureTask,
+    x: Tensor,
+    s: Tensor,
+    steps: int,
+    *,
+    generator: torch.Generator,
+    damages: Sequence[Damage] = (),
+    every: int = 8,
+    first_step: int = 0,
+    film: Film | None = None,
+    progress: Callable[[int], None] = lambda _: None,
+    stop: Callable[[], bool] = lambda: False,
+) -> tuple[Tensor, Tensor, Film]:
+    """Run one world and take pictures of it.
+
+    Args:
+        rule: The rule, on the device of `x`.
+        task: Gives the world's constants and the picture.
+        x: Positions [length units], shape [1, N, D].
+        s: States, shape [1, N, C].
+        steps: Steps to run.
+        generator: Randomness of updates and damage.
+        damages: What to do to the world on the way, by its `step`.
+        every: Steps between two frames.
+        first_step: Steps that the world has behind it.
+        film: A film to go on with.
+        progress: Called with the number of steps done since its last call.
+        stop: Asked after each frame whether to end here.
+
+    Returns:
+        Positions and states at the end, and the film.
+    """
+    film = Film() if film is None else film
+    last = first_step + steps
+    hurts = {damage.step: [d for d in damages if d.step == damage.step] for damage in damages}
+    stops = {step for step in hurts if first_step <= step < last}
+    stops |= {*range(first_step, last, every), last}
+    now = first_step
+    with torch.no_grad():
+        for step in sorted(stops):
+            x, s = rollout(
+                rule,
+                x,
+                s,
+                step - now,
+                eps=task.eps,
+                box=task.box,
+                update_prob=task.update_prob,
+                generator=generator,
+            )
+            progress(step - now)
+            now = step
+            if not film.frames or step > first_step:
+                film.shoot(task, x, s, f"step {step}")
+            for damage in hurts.get(step, ()) if step < last else ():
+                x, s = apply_damage(damage, x, s, generator)
+                film.shoot(task, x, s, f"step {step}: {damage.text}", mark=True)
+            if stop():
+                break
+    return x, s, film
+
+
+def write_film(film: Film, folder: Path, name: str, *, fps: float = 25.0) -> list[Path]:
+    """Write a film as GIF, MP4 and filmstrip, and return the files.
+
+    Args:
+        film: The film.
+        folder: An existing folder.
+        name: The files' name without suffix.
+        fps: Frames a second.
+
+    Raises:
+        NPAError: A file cannot be written.
+    """
+    strip, captions = film.strip()
+    paths = [folder / f"{name}.gif", folder / f"{name}.mp4", folder / f"{name}-filmstrip.png"]
+    write_gif(paths[0], film.frames, fps)
+    write_mp4(paths[1], film.frames, fps)
+    write_filmstrip(paths[2], strip, captions)
+    return paths

@@ -1,0 +1,47 @@
+"""`npa-envs list`: everything that has a name."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import tyro
+
+
+@dataclass(frozen=True)
+class ListOptions:
+    """Tasks and their presets, built-in targets, shipped rules."""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run the command.
+
+    Args:
+        arguments: The words after `npa-envs list`.
+
+    Returns:
+        0.
+    """
+    tyro.cli(ListOptions, prog="npa-envs list", args=arguments)
+    from npa_envs.rule_io import load_rule, shipped_rules
+    from npa_envs.tasks.targets import builtin_targets
+    from npa_envs.training import TASKS
+
+    print("tasks (npa-envs train TASK --preset PRESET)")
+    for name, entry in TASKS.items():
+        print(f"  {name}: {entry.summary}")
+        for preset, config in entry.presets.items():
+            print(
+                f"    {preset}: {config.total_iterations} iterations of {config.world_count} worlds"
+            )
+    print("targets (--target NAME, the path of a picture, or one emoji)")
+    print(f"  {', '.join(builtin_targets())}")
+    print("rules (npa-envs rollout NAME)")
+    for name in shipped_rules():
+        rule = load_rule(name)
+        weights = sum(parameter.numel() for parameter in rule.parameters())
+        shape = f"{rule.space_dim}D, {rule.state_dim} channels, {rule.hidden_dim} hidden units"
+        print(f"  {name}: {shape}, {weights} weights, eps0 {rule.eps0:g}")
+    if not shipped_rules():
+        print("  none")
+    return 0

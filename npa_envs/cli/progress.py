@@ -1,0 +1,41 @@
+"""The progress bar of the commands."""
+
+from __future__ import annotations
+
+from types import TracebackType
+
+from tqdm import tqdm
+
+
+class StepBar:
+    """A progress bar that counts steps; a context manager.
+
+    Args:
+        total: Steps to come; None where that is not known.
+        show: Whether to show it at all.
+    """
+
+    def __init__(self, total: int | None, *, show: bool) -> None:
+        self.done = 0
+        """Steps done so far."""
+        self._bar = tqdm(total=total, disable=not show, unit="step")
+
+    def advance(self, steps: int) -> None:
+        """Count steps that are done.
+
+        Args:
+            steps: How many since the last call.
+        """
+        self.done += steps
+        self._bar.update(steps)
+
+    def __enter__(self) -> StepBar:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._bar.close()

@@ -1,0 +1,160 @@
+"""`npa-envs rollout RULE`: grow a rule from its seed and film it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from npa_envs.errors import NPAError
+
+
+@dataclass(frozen=True, kw_only=True)
+class RolloutOptions:
+    """Grow a rule from its seed, damage it on the way, and write a GIF, an MP4 and a filmstrip."""
+
+    rule: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RULE")]
+    """A shipped rule (`npa-envs list`), a file of ours or the authors' (.safetensors, .pth), or a
+    rule of their web demo (models.json#name)."""
+
+    steps: int = 512
+    """Steps to run."""
+
+    damage: tuple[str, ...] = ()
+    """Damage on the way, STEP:KIND or STEP:KIND:SIZE: 200:cut (gap 0.1), 300:erase (radius 0.2),
+    400:clump (radius 0.2); sizes in length units."""
+
+    out: Path = Path("runs/rollout")
+    """Folder to write to; created where missing."""
+
+    target: str | None = None
+    """The target to measure against; default: the one that the rule was trained on."""
+
+    particle_count: int | None = None
+    """Particles N; default: as trained."""
+
+    eps: float | None = None
+    """Perception radius [length units]; default: as trained."""
+
+    update_prob: float | None = None
+    """Probability of each particle's update in a step; default: as trained."""
+
+    resolution: int | None = None
+    """Pixels on each side of the film; default: as trained."""
+
+    every: int | None = None
+    """Steps between two frames; default: as many as make about 150 frames."""
+
+    fps: float = 25.0
+    """Frames a second."""
+
+    seed: int = 0
+    """Randomness; the same seed gives the same film."""
+
+    device: str = "cpu"
+    """Where to run: cpu, cuda, cuda:1."""
+
+    progress: bool = True
+    """Show a progress bar."""
+
+    def __post_init__(self) -> None:
+        """Check the numbers that nothing else checks.
+
+        Raises:
+            NPAError: One is out of range.
+        """
+        for name in ("steps", "every"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise NPAError(f"{name} must be at least 1, got {value}")
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run the command.
+
+    Args:
+        arguments: The words after `npa-envs rollout`.
+
+    Returns:
+        0.
+
+    Raises:
+        NPAError: The rule, the damage or another value is wrong, or a file cannot be written.
+    """
+    options = tyro.cli(RolloutOptions, prog="npa-envs rollout", args=arguments)
+    return run(options)
+
+
+def run(options: RolloutOptions) -> int:
+    """Grow, film, write.
+
+    Args:
+        options: What the command line said.
+
+    Raises:
+        NPAError: As for `main`.
+    """
+    import torch
+
+    from npa_envs.cli.film import film_world, parse_damage, write_film
+    from npa_envs.cli.progress import StepBar
+    from npa_envs.cli.worlds import make_folder, task_of_rule
+    from npa_envs.evaluation import measure
+    from npa_envs.rule_io import load_rule
+    from npa_envs.training import check_device
+    from npa_envs.training.interrupt import stop_flag
+
+    device = check_device(options.device)
+    damages = [parse_damage(text) for text in options.damage]
+    late = [damage for damage in damages if damage.step >= options.steps]
+    if late:
+        raise NPAError(
+            f"damage must come before the last of {options.steps} steps, got step {late[0].step}: "
+            f"raise --steps above {late[0].step}"
+        )
+    rule = load_rule(options.rule, device=device).float()
+    trained = task_of_rule(
+        options.rule,
+        rule,
+        device,
+        target=options.target,
+        particle_count=options.particle_count,
+        target_point_count=options.particle_count,
+        eps=options.eps,
+        update_prob=options.update_prob,
+        resolution=options.resolution,
+    )
+    task = trained.task
+    folder = make_folder(options.out)
+    generator = torch.Generator(device).manual_seed(options.seed)
+    x, s = task.seed(1, generator=generator, device=device)
+    with (
+        stop_flag() as flag,
+        StepBar(options.steps, show=options.progress) as bar,
+    ):
+        x, s, film = film_world(
+            rule,
+            task,
+            x,
+            s,
+            options.steps,
+            generator=generator,
+            damages=damages,
+            every=options.every or max(options.steps // 150, 1),
+            progress=bar.advance,
+            stop=lambda: flag.requested,
+        )
+    done = bar.done
+    if done < options.steps:
+        print(f"stopped at step {done} of {options.steps}; the film goes that far")
+    if trained.doubt is not None:
+        print(f"no figures for {options.rule}: {trained.doubt}; give --target")
+    else:
+        row = measure(task, x, s, done)
+        print(f"step {done}: loss {row.loss:.4f}, PSNR {row.psnr:.2f} dB, extent {row.extent:.3f}")
+    for path in write_film(film, folder, "growth", fps=options.fps):
+        print(f"wrote {path}")
+    return 0

@@ -1,0 +1,62 @@
+"""`npa-envs warmup`: compile the kernels before they are needed."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import tyro
+
+from npa_envs.errors import NPAError
+
+
+@dataclass(frozen=True, kw_only=True)
+class WarmupOptions:
+    """Compile the kernels ahead of time, into Warp's cache (`npa-envs doctor` says where)."""
+
+    device: str = "cpu"
+    """For which device: cpu, cuda, cuda:1."""
+
+    space_dims: tuple[int, ...] = (2,)
+    """Space dimensions: 2, 3 or both."""
+
+    dtypes: tuple[Literal["float32", "float64"], ...] = ("float32",)
+    """Precisions."""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run the command.
+
+    Args:
+        arguments: The words after `npa-envs warmup`.
+
+    Returns:
+        0.
+
+    Raises:
+        NPAError: There is no such device, or a dimension is not 2 or 3.
+    """
+    options = tyro.cli(WarmupOptions, prog="npa-envs warmup", args=arguments)
+    import torch
+
+    from npa_envs.sph import warmup
+    from npa_envs.training import check_device
+    from npa_envs.warp_report import kernel_cache_folder
+
+    if not options.space_dims or not options.dtypes or not set(options.space_dims) <= {2, 3}:
+        raise NPAError(
+            f"space_dims must be 2, 3 or both and dtypes not empty, got {options.space_dims} and "
+            f"{options.dtypes}: for example --space-dims 2 3 --dtypes float32"
+        )
+    known = {"float32": torch.float32, "float64": torch.float64}
+    start = time.perf_counter()
+    warmup(
+        check_device(options.device),
+        space_dims=options.space_dims,
+        dtypes=[known[name] for name in options.dtypes],
+    )
+    seconds = time.perf_counter() - start
+    print(f"kernels for {options.device} are ready ({seconds:.1f} s), in {kernel_cache_folder()}")
+    return 0

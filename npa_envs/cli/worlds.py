@@ -1,0 +1,91 @@
+"""The task that a rule was trained on, as its file tells."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from npa_envs.errors import NPAError
+from npa_envs.rule import NPARule
+from npa_envs.rule_io import rule_metadata, shipped_rules
+from npa_envs.tasks.targets import builtin_targets
+
+if TYPE_CHECKING:
+    from npa_envs.tasks.task import PictureTask
+
+
+@dataclass(frozen=True)
+class TrainedTask:
+    """The task of a rule, and whether its target is the one that the rule was trained on."""
+
+    task: PictureTask
+    """The task."""
+
+    doubt: str | None
+    """Why figures against the target would mean nothing; None where they do mean something."""
+
+
+def task_of_rule(source: str, rule: NPARule, device: torch.device, **fields: Any) -> TrainedTask:
+    """Return the task that a rule was trained on, as its file tells.
+
+    A rule whose file says nothing of a task, as the authors' do, is run in the paper's world of
+    2D morphogenesis with the rule's own sizes. Where the target is not known, or is a picture that
+    is not there any more, a built-in one stands in for it: worlds can still be run and drawn.
+
+    Args:
+        source: What the rule was loaded from.
+        rule: The rule.
+        device: Where the task keeps its target.
+        fields: Fields of the task's configuration to change; None leaves one as it is.
+
+    Raises:
+        NPAError: The rule does not fit the task, or a field is wrong.
+    """
+    from npa_envs.training import override, preset, task_entry
+
+    if rule.space_dim != 2 or rule.static:
+        raise NPAError(
+            f"the command line shows moving rules in 2D, got space_dim={rule.space_dim}, "
+            f"static={rule.static}: run this one in Python with npa_envs.rollout"
+        )
+    path = shipped_rules().get(source, Path(source))
+    metadata = rule_metadata(path) if path.suffix == ".safetensors" else {}
+    task_name = metadata.get("task", "morphogenesis2d")
+    own: dict[str, Any] = {"state_dim": rule.state_dim, "hidden_dim": rule.hidden_dim}
+    own |= {"eps": rule.eps0, "alpha": rule.alpha}
+    told = "config" in metadata
+    config = preset("paper", task_name, **(json.loads(metadata["config"]) if told else own))
+    config = override(config, **{k: v for k, v in fields.items() if v is not None})
+    make = task_entry(task_name).make
+    chosen = fields.get("target") is not None
+    doubt = None if told or chosen else "its file does not say what it grows"
+    try:
+        return TrainedTask(make(config.task, device), doubt)
+    except NPAError as error:
+        if chosen:
+            raise
+        stand_in = override(config, target=builtin_targets()[0])
+        return TrainedTask(make(stand_in.task, device), f"its target cannot be loaded: {error}")
+
+
+def make_folder(path: Path) -> Path:
+    """Create a folder, and those above it, where missing.
+
+    Args:
+        path: The folder.
+
+    Raises:
+        NPAError: It cannot be created.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise NPAError(
+            f"out must be a folder that can be created, got {str(path)!r} "
+            f"({error.strerror or error}): choose another one"
+        ) from error
+    return path

@@ -1,0 +1,291 @@
+"""Worlds in time: one step of a rule, and rollouts that can be differentiated."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, NamedTuple, overload
+
+import torch
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from npa_envs.errors import NPAError
+from npa_envs.rule import FoldedRule, NPARule
+from npa_envs.sph.checks import Box, check_finite_positions, check_world, checked_box, checked_eps
+from npa_envs.sph.operators import Terms, perceive_rows, update_particles
+
+Memory = Literal["store", "recompute"]
+
+OVERFLOW_LOG_PROBABILITY = 34.5
+"""Row capacities hold with probability 1 - exp(-34.5), about 1 - 1e-15, for each step."""
+
+
+class StepOptions(NamedTuple):
+    """Everything about a step that stays the same over a rollout, checked."""
+
+    eps: float
+    box: tuple[float, ...] | None
+    update_prob: float
+    dt: float
+    position_noise: float
+    detach_positions: bool
+
+
+def row_capacity(particle_total: int, update_prob: float) -> int:
+    """Return how many rows hold the active particles of a step, without reading their number.
+
+    Bernstein's inequality bounds the number of active particles; a graph of kernels needs a shape
+    that does not depend on the draw. On the CPU the exact number is used instead.
+
+    Args:
+        particle_total: Particles of all worlds, B N.
+        update_prob: Probability p with which each is active.
+    """
+    mean = particle_total * update_prob
+    variance = mean * (1.0 - update_prob)
+    slack = OVERFLOW_LOG_PROBABILITY / 3.0
+    margin = slack + math.sqrt(slack * slack + 2.0 * OVERFLOW_LOG_PROBABILITY * variance)
+    return min(particle_total, math.ceil(mean + margin))
+
+
+def _checked_options(
+    rule: NPARule,
+    x: Tensor,
+    s: Tensor,
+    eps: float | None,
+    box: Box,
+    update_prob: float,
+    dt: float,
+    position_noise: float,
+    detach_positions: bool,
+) -> StepOptions:
+    check_world(x, s)
+    if (x.shape[2], s.shape[2]) != (rule.space_dim, rule.state_dim):
+        raise NPAError(
+            f"x and s must have the rule's {rule.space_dim} coordinates and {rule.state_dim} "
+            f"channels, got {tuple(x.shape)} and {tuple(s.shape)}"
+        )
+    weight = rule.hidden.weight
+    if weight.dtype != x.dtype or weight.device != x.device:
+        raise NPAError(
+            f"the rule must share dtype and device with x, got {weight.dtype} on {weight.device} "
+            f"and {x.dtype} on {x.device}: move it with rule.to(x)"
+        )
+    radius = checked_eps("eps", rule.eps0 if eps is None else eps)
+    if not 0.0 < update_prob <= 1.0:
+        raise NPAError(f"update_prob must lie in (0, 1], got {update_prob}")
+    if not (math.isfinite(dt) and dt > 0.0):
+        raise NPAError(f"dt must be positive and finite, got {dt}")
+    if not (math.isfinite(position_noise) and position_noise >= 0.0):
+        raise NPAError(f"position_noise must be finite and not negative, got {position_noise}")
+    sides = checked_box(box, rule.space_dim, radius)
+    check_finite_positions(x)
+    return StepOptions(
+        radius, sides, float(update_prob), float(dt), float(position_noise), detach_positions
+    )
+
+
+def _draw(
+    x: Tensor, options: StepOptions, generator: torch.Generator | None
+) -> tuple[Tensor | None, Tensor | None]:
+    """Draw a step's update mask (uint8, [B, N], None for all) and position noise, in this order."""
+    mask = noise = None
+    if options.update_prob < 1.0:
+        mask = torch.empty(x.shape[:2], dtype=torch.uint8, device=x.device)
+        mask.bernoulli_(options.update_prob, generator=generator)
+    if options.position_noise > 0.0:
+        noise = torch.randn(x.shape, dtype=x.dtype, device=x.device, generator=generator)
+        noise *= options.position_noise
+    return mask, noise
+
+
+def _advance(
+    rule: NPARule,
+    folded: FoldedRule | None,
+    options: StepOptions,
+    x: Tensor,
+    s: Tensor,
+    path_length: Tensor,
+    mask: Tensor | None,
+    noise: Tensor | None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Advance checked worlds by one step whose random draws are given."""
+    total = x.shape[0] * x.shape[1]
+    capacity = total
+    if mask is not None:
+        # Counting is free on the CPU; on CUDA it would stall the stream.
+        capacity = (
+            row_capacity(total, options.update_prob) if x.is_cuda else max(int(mask.sum()), 1)
+        )
+    perception, rows = perceive_rows(
+        x.detach() if options.detach_positions else x,
+        s,
+        mask=mask,
+        row_capacity=capacity,
+        row_width=rule.perception_dim if folded is None else folded.row_width,
+        eps=options.eps,
+        eps0=rule.eps0,
+        box=options.box,
+        terms=Terms(rule.state_gradient, rule.moment_correction, rule.density_gradient),
+    )
+    return update_particles(
+        rule(perception) if folded is None else folded(perception),
+        x if noise is None else x + noise,
+        s,
+        path_length,
+        rows=rows,
+        reach=rule.alpha * options.eps,
+        dt=options.dt,
+        box=options.box,
+    )
+
+
+def step(
+    rule: NPARule,
+    x: Tensor,
+    s: Tensor,
+    *,
+    eps: float | None = None,
+    box: Box = None,
+    update_prob: float = 0.5,
+    dt: float = 1.0,
+    position_noise: float = 0.0,
+    detach_positions: bool = True,
+    generator: torch.Generator | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Advance worlds by one step: `rollout` with steps=1, same arguments and errors.
+
+    Returns:
+        Positions [length units], shape [B, N, D], and states, dimensionless, shape [B, N, C].
+    """
+    return rollout(
+        rule,
+        x,
+        s,
+        1,
+        eps=eps,
+        box=box,
+        update_prob=update_prob,
+        dt=dt,
+        position_noise=position_noise,
+        detach_positions=detach_positions,
+        generator=generator,
+    )
+
+
+@overload
+def rollout(
+    rule: NPARule,
+    x: Tensor,
+    s: Tensor,
+    steps: int,
+    *,
+    eps: float | None = ...,
+    box: Box = ...,
+    update_prob: float = ...,
+    dt: float = ...,
+    position_noise: float = ...,
+    detach_positions: bool = ...,
+    memory: Memory = ...,
+    generator: torch.Generator | None = ...,
+    return_path_length: Literal[False] = ...,
+) -> tuple[Tensor, Tensor]: ...
+
+
+@overload
+def rollout(
+    rule: NPARule,
+    x: Tensor,
+    s: Tensor,
+    steps: int,
+    *,
+    eps: float | None = ...,
+    box: Box = ...,
+    update_prob: float = ...,
+    dt: float = ...,
+    position_noise: float = ...,
+    detach_positions: bool = ...,
+    memory: Memory = ...,
+    generator: torch.Generator | None = ...,
+    return_path_length: Literal[True],
+) -> tuple[Tensor, Tensor, Tensor]: ...
+
+
+def rollout(
+    rule: NPARule,
+    x: Tensor,
+    s: Tensor,
+    steps: int,
+    *,
+    eps: float | None = None,
+    box: Box = None,
+    update_prob: float = 0.5,
+    dt: float = 1.0,
+    position_noise: float = 0.0,
+    detach_positions: bool = True,
+    memory: Memory = "store",
+    generator: torch.Generator | None = None,
+    return_path_length: bool = False,
+) -> tuple[Tensor, Tensor] | tuple[Tensor, Tensor, Tensor]:
+    """Run a rule for a number of steps; differentiable, and particle i stays particle i.
+
+    Each step draws m ~ Bernoulli(update_prob) for every particle, perceives the particles with
+    m = 1 and updates them: x ← x + m dt Δx (+ noise), s ← s + m dt Δs, with
+    Δx = alpha eps δ / (1 + |δ|) and [δ ; Δs] = rule(z) (arXiv 2601.16096, section 3).
+
+    Args:
+        rule: The rule; dtype and device of x.
+        x: Particle positions [length units], shape [B, N, D].
+        s: Particle states, dimensionless, shape [B, N, C].
+        steps: Number of steps T, 0 or more.
+        eps: Perception radius [length units]; default: the rule's eps0.
+        box: Sides of a periodic box centred on the origin [length units], into which positions are
+            wrapped, or None for open space.
+        update_prob: Probability p of each particle's update in a step, in (0, 1].
+        dt: Time step, dimensionless.
+        position_noise: Standard deviation of the noise added to every position in each step
+            [length units].
+        detach_positions: Perception does not back-propagate into positions (the paper's choice).
+        memory: "store" what the backward pass reads, or "recompute" it from each step's worlds:
+            several times less memory, about one more forward pass of time. Same gradients.
+        generator: Source of the masks and the noise, on x's device; default: torch's global one.
+        return_path_length: Also return how far each particle travelled.
+
+    Returns:
+        Positions [length units], shape [B, N, D]; states, dimensionless, shape [B, N, C]; and where
+        asked the length of each particle's path [length units], shape [B, N].
+
+    Raises:
+        NPAError: Shapes, dtypes or devices do not fit each other or the rule, a position is not
+            finite, or a number is out of its range.
+    """
+    if isinstance(steps, bool) or not isinstance(steps, int) or steps < 0:
+        raise NPAError(f"steps must be an integer of at least 0, got {steps!r}")
+    if memory not in ("store", "recompute"):
+        raise NPAError(f"memory must be 'store' or 'recompute', got {memory!r}")
+    options = _checked_options(
+        rule, x, s, eps, box, update_prob, dt, position_noise, detach_positions
+    )
+    path_length = x.new_zeros(x.shape[:2])
+    # A rule that overrides the network runs as it is.
+    folded = rule.folded() if type(rule).forward is NPARule.forward else None
+    recompute = memory == "recompute" and torch.is_grad_enabled()
+    for _ in range(steps):
+        mask, noise = _draw(x, options, generator)
+        if recompute:
+            x, s, path_length = checkpoint(
+                _advance,
+                rule,
+                folded,
+                options,
+                x,
+                s,
+                path_length,
+                mask,
+                noise,
+                use_reentrant=False,
+                preserve_rng_state=False,
+            )
+        else:
+            x, s, path_length = _advance(rule, folded, options, x, s, path_length, mask, noise)
+    return (x, s, path_length) if return_path_length else (x, s)

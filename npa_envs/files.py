@@ -1,0 +1,145 @@
+"""Files that are written whole or not at all.
+
+Whatever is written goes to a temporary file in the same folder first and is renamed over its
+destination once it is complete and on the disk: a killed program, a full disk, or an error
+half-way leaves the file that was there before.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import secrets
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+from npa_envs.errors import NPAError
+
+_DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+_NO_PERMISSION = {errno.EACCES, errno.EPERM, errno.EROFS}
+_NEARLY_FULL_BYTES = 64 * 1024
+
+
+@contextlib.contextmanager
+def atomic_path(path: str | Path) -> Iterator[Path]:
+    """Yield a temporary path to write to, and rename it over `path` when the block succeeds.
+
+    The temporary file lies in the folder of `path` and has the same suffix, so that writers that
+    look at the suffix work. It exists (empty) from the start, so that a folder that cannot be
+    written to is noticed before any work is done. If the block raises, it is removed and `path`
+    stays as it was. A symbolic link is followed: the file that it points to is replaced.
+
+    Args:
+        path: The file to write; an existing one is replaced, and its mode is kept.
+
+    Raises:
+        NPAError: The folder is missing or cannot be written to, `path` is a folder, the disk is
+            full, or the system refuses the file for another reason.
+    """
+    given = Path(path)
+    target = Path(os.path.realpath(given))
+    _check_target(given, target)
+    temporary = target.with_name(f".{target.stem[:100]}.{secrets.token_hex(6)}.tmp{target.suffix}")
+    try:
+        # os.open keeps to the umask; the tempfile module would leave files only their owner reads.
+        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+        yield temporary
+        _sync(temporary)
+        if target.exists():
+            shutil.copymode(target, temporary)
+        os.replace(temporary, target)
+        if os.name == "posix":
+            _sync(target.parent)
+    except OSError as error:
+        if _concerns_another_file(error, temporary, target):
+            raise
+        raise NPAError(_explain(given, error)) from error
+    except Exception as error:
+        # Writers in C report a full disk as RuntimeError or an exception of their own.
+        if not isinstance(error, NPAError) and _disk_is_full(target.parent):
+            raise NPAError(_explain(given, OSError(errno.ENOSPC, str(error)))) from error
+        raise
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+def write_bytes(path: str | Path, data: bytes) -> None:
+    """Write `data` to `path`, whole or not at all.
+
+    Args:
+        path: The file to write; an existing one is replaced.
+        data: Its new content.
+
+    Raises:
+        NPAError: As for `atomic_path`.
+    """
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write `text` as UTF-8 with plain newlines to `path`, whole or not at all.
+
+    Args:
+        path: The file to write; an existing one is replaced.
+        text: Its new content.
+
+    Raises:
+        NPAError: As for `atomic_path`.
+    """
+    write_bytes(path, text.encode("utf-8"))
+
+
+def _check_target(given: Path, target: Path) -> None:
+    try:
+        if target.is_dir():
+            raise NPAError(
+                f"cannot write {str(given)!r}: that is a folder: give the path of a file inside it"
+            )
+        if not target.parent.exists():
+            raise NPAError(
+                f"cannot write {str(given)!r}: the folder {str(target.parent)!r} does not exist: "
+                f"create it first (mkdir -p {str(target.parent)!r})"
+            )
+        if not target.parent.is_dir():
+            raise NPAError(
+                f"cannot write {str(given)!r}: {str(target.parent)!r} is a file, not a folder: "
+                "give a path in a folder"
+            )
+    except OSError as error:
+        raise NPAError(_explain(given, error)) from error
+
+
+def _sync(path: Path) -> None:
+    """Wait until the file or folder is on the disk; a late write error is raised here."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _concerns_another_file(error: OSError, temporary: Path, target: Path) -> bool:
+    ours = {str(temporary), str(target), str(target.parent)}
+    return error.filename is not None and os.fsdecode(error.filename) not in ours
+
+
+def _disk_is_full(folder: Path) -> bool:
+    try:
+        return shutil.disk_usage(folder).free < _NEARLY_FULL_BYTES
+    except OSError:
+        return False
+
+
+def _explain(given: Path, error: OSError) -> str:
+    folder = str(given.parent)
+    if error.errno in _DISK_FULL:
+        rule, cure = "the disk is full", "free some space or choose another disk"
+    elif error.errno in _NO_PERMISSION:
+        rule, cure = "no write permission", f"choose another path, or check: ls -ld {folder!r}"
+    else:
+        rule, cure = (error.strerror or type(error).__name__), "choose another path"
+    return f"cannot write {str(given)!r}: {rule} ({error}): {cure}; nothing was changed"

@@ -1,0 +1,288 @@
+"""Hand-written adjoints of the perception pass, gathered: no float atomics, a fixed order of sums.
+
+Notation: centre i sees neighbour j at r = x_j - x_i with smoothing W, spiky gradient K = f r and
+volume v_j. A bar marks a cotangent. b_i and G_i are the smoothed state and the (uncorrected) state
+gradient of centre i; the moment correction is a stopped gradient, so it has no adjoint.
+
+State:     s_k += v_k (sum_i W b_i + G_i K_ik) - G_k sum_j v_j K_kj
+Volume:    v_k += sum_i W s_k b_i + (s_k - s_i) G_i K_ik,     rho_k = -v_k^2 v_k
+Positions: pair (i, j) pulls r by (rho_i + v_j s_j b_i) dW/dr + (dK/dr)^T (v_j (s_j - s_i) G_i + q_i)
+           with q the cotangent of the density gradient.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from npa_envs.kernels.domain import (
+    domain_types,
+    kernel_module,
+    log_scale_adjoint,
+    smoothing,
+    smoothing_slope,
+    spiky_factor,
+    spiky_factor_slope,
+)
+from npa_envs.kernels.lanes import make_lane_sum, make_wide_load
+
+
+@functools.cache
+def adjoint_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
+    """Return the kernels of one variant; `width` channels form a group."""
+    types = domain_types(space_dim, scalar)
+    vector, particle, Domain = types.vector, types.particle, types.Domain
+    cell_of, segment_count, segment_cells = (
+        types.cell_of,
+        types.segment_count,
+        types.segment_cells,
+    )
+    minimum_image, position_of = types.minimum_image, types.position_of
+    group = wp.types.vector(width, scalar)
+    group_gradient = wp.types.matrix((space_dim, width), scalar)
+    module = kernel_module("adjoint", space_dim, scalar, width)
+    load_group = make_wide_load(group, scalar)
+    load_gradient = make_wide_load(group_gradient, scalar)
+    add_group = make_lane_sum("adjoint", group, scalar)
+
+    @wp.kernel(enable_backward=False, module=module)
+    def unscale_cotangents(
+        state_dim: wp.int32,
+        state_gradient: wp.int32,
+        density_gradient: wp.int32,
+        gradient_scale: scalar,
+        density_scale: scalar,
+        row_base: wp.int32,
+        group_count: wp.int32,
+        starts: wp.array(dtype=wp.int32),
+        perception: wp.array(dtype=scalar, ndim=2),
+        perception_bar: wp.array(dtype=scalar, ndim=2),
+        # outputs
+        blur_bar: wp.array(dtype=group),
+        gradient_bar: wp.array(dtype=group_gradient),
+        density_gradient_bar: wp.array(dtype=vector),
+    ):
+        """Pull the cotangent of z back through its scaling, into cotangents of the raw sums."""
+        row, g = wp.tid()
+        if row >= starts[starts.shape[0] - 1] - row_base:
+            return
+        first = g * wp.static(width)
+        gradient_start = 2 * state_dim
+        density_start = gradient_start
+        if state_gradient != 0:
+            density_start += state_dim * wp.static(space_dim)
+        blur = group()
+        gradient = group_gradient()
+        for c in range(wp.static(width)):
+            channel = first + c
+            if channel < state_dim:
+                blur[c] = perception_bar[row, state_dim + channel]
+                if state_gradient != 0:
+                    place = gradient_start + channel * wp.static(space_dim)
+                    scaled = vector()
+                    bar = vector()
+                    for d in range(wp.static(space_dim)):
+                        scaled[d] = perception[row, place + d]
+                        bar[d] = perception_bar[row, place + d]
+                    raw = gradient_scale * log_scale_adjoint(scaled, bar)
+                    for d in range(wp.static(space_dim)):
+                        gradient[d, c] = raw[d]
+        blur_bar[row * group_count + g] = blur
+        gradient_bar[row * group_count + g] = gradient
+        if g == 0 and density_gradient_bar.shape[0] > 0:
+            scaled = vector()
+            bar = vector()
+            if density_gradient != 0:
+                for d in range(wp.static(space_dim)):
+                    scaled[d] = perception[row, density_start + d]
+                    bar[d] = perception_bar[row, density_start + d]
+                bar = density_scale * log_scale_adjoint(scaled, bar)
+            density_gradient_bar[row] = bar
+
+    @wp.kernel(enable_backward=False, module=module)
+    def gather_state_cotangents(
+        domain: Domain,
+        particle_count: wp.int32,
+        state_dim: wp.int32,
+        state_gradient: wp.int32,
+        active_offset: wp.int32,
+        row_base: wp.int32,
+        row_capacity: wp.int32,
+        group_count: wp.int32,
+        lane_count: wp.int32,
+        starts: wp.array(dtype=wp.int32),
+        particles: wp.array(dtype=particle),
+        source: wp.array(dtype=wp.int32),
+        row_of: wp.array(dtype=wp.int32),
+        row_positions: wp.array(dtype=vector),
+        row_kernel_sum: wp.array(dtype=vector),
+        perception_bar: wp.array(dtype=scalar, ndim=2),
+        blur_bar: wp.array(dtype=group),
+        gradient_bar: wp.array(dtype=group_gradient),
+        # outputs
+        states_bar: wp.array(dtype=scalar, ndim=2),
+    ):
+        """Write the cotangent of every particle's state, from the active rows around it."""
+        k, g, lane = wp.tid()
+        entry = particles[k]
+        position = position_of(entry)
+        total = group()
+        base = active_offset + (k / particle_count) * domain.cell_count
+        cell = cell_of(domain, position)
+        for segment in range(segment_count(domain, cell)):
+            first_cell, last_cell = segment_cells(domain, cell, segment)
+            begin = starts[base + first_cell] - row_base
+            end = wp.min(starts[base + last_cell] - row_base, row_capacity)
+            for row in range(begin + lane, end, lane_count):
+                offset = minimum_image(domain, position - row_positions[row])
+                squared = wp.dot(offset, offset)
+                if squared < domain.squared_eps:
+                    total += (
+                        smoothing(squared, domain.inverse_squared_eps, domain.smoothing_norm)
+                        * load_group(blur_bar, row * group_count + g)
+                    )
+                    if state_gradient != 0:
+                        kernel = offset * spiky_factor(
+                            wp.sqrt(squared), domain.inverse_eps, domain.spiky_norm
+                        )
+                        total += kernel * load_gradient(gradient_bar, row * group_count + g)
+        total = entry[wp.static(space_dim)] * add_group(total)
+        i = source[k]
+        row = row_of[i]
+        first = g * wp.static(width)
+        own = group()
+        if row >= 0 and state_gradient != 0:
+            own = row_kernel_sum[row] * gradient_bar[row * group_count + g]
+        for c in range(wp.static(width)):
+            if first + c < state_dim and c % lane_count == lane:
+                bar = total[c]
+                if row >= 0:
+                    bar += perception_bar[row, first + c] - own[c]
+                states_bar[i, first + c] = bar
+
+    @wp.kernel(enable_backward=False, module=module)
+    def gather_density_cotangents(
+        domain: Domain,
+        particle_count: wp.int32,
+        group_count: wp.int32,
+        state_gradient: wp.int32,
+        starts: wp.array(dtype=wp.int32),
+        particles: wp.array(dtype=particle),
+        states: wp.array(dtype=group),
+        source: wp.array(dtype=wp.int32),
+        row_of: wp.array(dtype=wp.int32),
+        blur_bar: wp.array(dtype=group),
+        gradient_bar: wp.array(dtype=group_gradient),
+        # outputs
+        density_bar: wp.array(dtype=scalar),
+    ):
+        """Write the cotangent of every particle's density, through its volume."""
+        k = wp.tid()
+        entry = particles[k]
+        position = position_of(entry)
+        volume = entry[wp.static(space_dim)]
+        volume_bar = scalar(0.0)
+        base = (k / particle_count) * domain.cell_count
+        cell = cell_of(domain, position)
+        for segment in range(segment_count(domain, cell)):
+            first, last = segment_cells(domain, cell, segment)
+            for j in range(starts[base + first], starts[base + last]):
+                offset = minimum_image(domain, position - position_of(particles[j]))
+                squared = wp.dot(offset, offset)
+                row = row_of[source[j]]
+                if squared < domain.squared_eps and row >= 0:
+                    weight = smoothing(
+                        squared, domain.inverse_squared_eps, domain.smoothing_norm
+                    )
+                    kernel = offset * spiky_factor(
+                        wp.sqrt(squared), domain.inverse_eps, domain.spiky_norm
+                    )
+                    for g in range(group_count):
+                        own = states[k * group_count + g]
+                        volume_bar += weight * wp.dot(own, blur_bar[row * group_count + g])
+                        if state_gradient != 0:
+                            volume_bar += wp.dot(
+                                own - states[j * group_count + g], kernel * gradient_bar[row * group_count + g]
+                            )
+        density_bar[k] = -volume * volume * volume_bar
+
+    @wp.func
+    def pair_pull(
+        domain: Domain,
+        offset: vector,
+        squared: scalar,
+        smoothing_bar: scalar,
+        kernel_bar: vector,
+    ):
+        """Cotangent of r = neighbour - centre, from the cotangents of W(r) and K(r)."""
+        distance = wp.sqrt(squared)
+        slope = smoothing_slope(squared, domain.inverse_squared_eps, domain.smoothing_norm)
+        factor = spiky_factor(distance, domain.inverse_eps, domain.spiky_norm)
+        factor_slope = spiky_factor_slope(distance, domain.inverse_eps, domain.spiky_norm)
+        along = smoothing_bar * slope + factor_slope * wp.dot(offset, kernel_bar)
+        return along * offset + factor * kernel_bar
+
+    @wp.kernel(enable_backward=False, module=module)
+    def gather_position_cotangents(
+        domain: Domain,
+        particle_count: wp.int32,
+        group_count: wp.int32,
+        starts: wp.array(dtype=wp.int32),
+        particles: wp.array(dtype=particle),
+        states: wp.array(dtype=group),
+        source: wp.array(dtype=wp.int32),
+        row_of: wp.array(dtype=wp.int32),
+        density_bar: wp.array(dtype=scalar),
+        blur_bar: wp.array(dtype=group),
+        gradient_bar: wp.array(dtype=group_gradient),
+        density_gradient_bar: wp.array(dtype=vector),
+        # outputs
+        positions_bar: wp.array(dtype=vector),
+    ):
+        """Write the cotangent of every position: as a neighbour of others, and as a centre."""
+        k = wp.tid()
+        entry = particles[k]
+        position = position_of(entry)
+        volume = entry[wp.static(space_dim)]
+        own_row = row_of[source[k]]
+        pull = vector()
+        base = (k / particle_count) * domain.cell_count
+        cell = cell_of(domain, position)
+        for segment in range(segment_count(domain, cell)):
+            first, last = segment_cells(domain, cell, segment)
+            for j in range(starts[base + first], starts[base + last]):
+                other = particles[j]
+                offset = minimum_image(domain, position - position_of(other))
+                squared = wp.dot(offset, offset)
+                if squared < domain.squared_eps and j != k:
+                    other_volume = other[wp.static(space_dim)]
+                    row = row_of[source[j]]
+                    as_neighbour = density_bar[j]
+                    as_centre = density_bar[k]
+                    neighbour_kernel = vector()
+                    centre_kernel = vector()
+                    if row >= 0:
+                        neighbour_kernel = density_gradient_bar[row]
+                    if own_row >= 0:
+                        centre_kernel = density_gradient_bar[own_row]
+                    for g in range(group_count):
+                        own = states[k * group_count + g]
+                        seen = states[j * group_count + g]
+                        if row >= 0:
+                            as_neighbour += volume * wp.dot(own, blur_bar[row * group_count + g])
+                            neighbour_kernel += volume * (gradient_bar[row * group_count + g] * (own - seen))
+                        if own_row >= 0:
+                            as_centre += other_volume * wp.dot(seen, blur_bar[own_row * group_count + g])
+                            centre_kernel += other_volume * (
+                                gradient_bar[own_row * group_count + g] * (seen - own)
+                            )
+                    pull += pair_pull(domain, offset, squared, as_neighbour, neighbour_kernel)
+                    pull -= pair_pull(domain, -offset, squared, as_centre, centre_kernel)
+        positions_bar[source[k]] = pull
+
+    return SimpleNamespace(
+        unscale_cotangents=unscale_cotangents,
+        gather_state_cotangents=gather_state_cotangents,
+        gather_density_cotangents=gather_density_cotangents,
+        gather_position_cotangents=gather_position_cotangents,
+    )

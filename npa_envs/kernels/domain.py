@@ -1,0 +1,307 @@
+"""Types, the `Domain` struct and the mathematics that every kernel shares.
+
+Kernels are made by cached factories for one space dimension and one scalar type, so that the same
+source serves 2D and 3D, float32 and float64, CPU and CUDA. Each (dimension, scalar, channel width)
+is one Warp module: a scene compiles one or two small modules, never all of them.
+
+Sources: design formulas of arXiv 2601.16096, section 3 and appendix.
+"""
+
+import functools
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+CELL_SLACK = 1.0 + 2.0**-20
+"""Cells are this much larger than eps / reach: rounding a cell index cannot lose a neighbour."""
+
+MOMENT_THRESHOLD = 1e-3
+"""Smallest |det M| that is inverted, dimensionless; below it the gradient stays uncorrected."""
+
+SMALL_LOG = 5e-2
+"""Below this |z| the ratio |z| / (exp|z| - 1) is evaluated by its series: the quotient cancels."""
+
+
+def scalar_name(scalar: type) -> str:
+    """Return "f32" or "f64"."""
+    return {wp.float32: "f32", wp.float64: "f64"}[scalar]
+
+
+@functools.cache
+def kernel_module(topic: str, space_dim: int, scalar: type, width: int | None = None) -> wp.Module:
+    """Return the Warp module that holds one variant of a topic's kernels."""
+    suffix = "" if width is None else f"_w{width}"
+    return wp.get_module(f"npa_envs.kernels.{topic}_{space_dim}d_{scalar_name(scalar)}{suffix}")
+
+
+@wp.func
+def smoothing(squared_distance: Any, inverse_squared_eps: Any, norm: Any):
+    """Poly6 smoothing kernel W, inside its support [1 / length^D]."""
+    falloff = type(norm)(1.0) - squared_distance * inverse_squared_eps
+    return norm * falloff * falloff * falloff
+
+
+@wp.func
+def smoothing_slope(squared_distance: Any, inverse_squared_eps: Any, norm: Any):
+    """Factor g of the gradient dW/dr = g r of the smoothing kernel [1 / length^(D+2)]."""
+    falloff = type(norm)(1.0) - squared_distance * inverse_squared_eps
+    return type(norm)(-6.0) * norm * inverse_squared_eps * falloff * falloff
+
+
+@wp.func
+def spiky_factor(distance: Any, inverse_eps: Any, norm: Any):
+    """Factor f of the spiky gradient kernel K(r) = f r; zero at r = 0 [1 / length^(D+2)]."""
+    factor = type(norm)(0.0)
+    if distance > type(norm)(0.0):
+        falloff = type(norm)(1.0) - distance * inverse_eps
+        factor = norm * falloff * falloff / distance
+    return factor
+
+
+@wp.func
+def spiky_factor_slope(distance: Any, inverse_eps: Any, norm: Any):
+    """f'(r) / r of the spiky factor, for its adjoint; zero at r = 0 [1 / length^(D+4)]."""
+    slope = type(norm)(0.0)
+    if distance > type(norm)(0.0):
+        falloff = type(norm)(1.0) - distance * inverse_eps
+        inverse = type(norm)(1.0) / distance
+        slope = -norm * falloff * inverse * inverse
+        slope *= type(norm)(2.0) * inverse_eps + falloff * inverse
+    return slope
+
+
+@wp.func
+def log1p(value: Any):
+    """log(1 + value), accurate also where value is far below one."""
+    one_plus = type(value)(1.0) + value
+    result = value
+    if one_plus > type(value)(1.0):
+        result = wp.log(one_plus) * (value / (one_plus - type(value)(1.0)))
+    return result
+
+
+@wp.func
+def log_scale_factor(length: Any):
+    """L(v) / v of the logarithmic scaling: log(1 + |v|) / |v|, and 1 at 0."""
+    factor = type(length)(1.0)
+    if length > type(length)(0.0):
+        factor = log1p(length) / length
+    return factor
+
+
+@wp.func
+def log_scale_tangential(length: Any):
+    """Derivative of L across its direction as a function of |L|: |L| / (exp|L| - 1)."""
+    ratio = type(length)(1.0)
+    if length < type(length)(SMALL_LOG):
+        series = type(length)(1.0)
+        for k in range(6):
+            series = type(length)(1.0) + series * length / type(length)(7 - k)
+        ratio = type(length)(1.0) / series
+    else:
+        ratio = length / (wp.exp(length) - type(length)(1.0))
+    return ratio
+
+
+@wp.func
+def log_scale_adjoint(scaled: Any, cotangent: Any):
+    """Pull a cotangent of L(v) back to v, given L(v): L is radial, so its value suffices."""
+    length = wp.length(scaled)
+    tangential = log_scale_tangential(length)
+    result = tangential * cotangent
+    if length > type(length)(0.0):
+        radial = wp.exp(-length)
+        direction = scaled / length
+        result += (radial - tangential) * wp.dot(direction, cotangent) * direction
+    return result
+
+
+@functools.cache
+def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
+    """Return the vector types, the `Domain` struct and the functions on it of one variant.
+
+    The struct holds what all worlds share: radius, kernel constants, box and cell grid.
+    """
+    vector = wp.types.vector(space_dim, scalar)
+    cell_vector = wp.types.vector(space_dim, wp.int32)
+    double_vector = wp.types.vector(space_dim, wp.float64)
+    particle = wp.types.vector(space_dim + 1, scalar)
+
+    @wp.struct
+    class Domain:
+        eps: scalar
+        inverse_eps: scalar
+        squared_eps: scalar
+        inverse_squared_eps: scalar
+        smoothing_norm: scalar
+        spiky_norm: scalar
+        periodic: wp.int32
+        box: vector
+        inverse_box: vector
+        cell_scale: double_vector
+        cell_shape: cell_vector
+        cell_count: wp.int32
+        reach: wp.int32
+
+    @wp.func
+    def cell_of(domain: Domain, position: vector):
+        """Cell of a position; open space wraps around the grid, so that any position has one."""
+        cell = cell_vector()
+        for d in range(wp.static(space_dim)):
+            count = wp.float64(domain.cell_shape[d])
+            place = wp.float64(position[d]) * domain.cell_scale[d]
+            if domain.periodic != 0:
+                place = (place - wp.floor(place)) * count
+            place = wp.floor(place)
+            place -= count * wp.floor(place / count)
+            # False for NaN too: a world that blew up must still index inside its grid.
+            if place >= wp.float64(0.0) and place < count:
+                cell[d] = wp.int32(place)
+        return cell
+
+    @wp.func
+    def cell_index(domain: Domain, cell: cell_vector):
+        index = cell[wp.static(space_dim - 1)]
+        for d in range(wp.static(space_dim - 1)):
+            index = index * domain.cell_shape[wp.static(space_dim - 2) - d]
+            index += cell[wp.static(space_dim - 2) - d]
+        return index
+
+    @wp.func
+    def row_width(domain: Domain, d: wp.int32):
+        return wp.min(wp.int32(2) * domain.reach + 1, domain.cell_shape[d])
+
+    @wp.func
+    def wrapped(coordinate: wp.int32, count: wp.int32):
+        result = coordinate
+        if coordinate < 0:
+            result = coordinate + count
+        if coordinate >= count:
+            result = coordinate - count
+        return result
+
+    @wp.func
+    def segment_count(domain: Domain, cell: cell_vector):
+        """Contiguous runs of cells around a cell: one for each row, two where rows wrap around."""
+        rows = wp.int32(1)
+        for d in range(1, wp.static(space_dim)):
+            rows *= row_width(domain, d)
+        first = wrapped(cell[0] - domain.reach, domain.cell_shape[0])
+        if first + row_width(domain, 0) > domain.cell_shape[0]:
+            rows *= 2
+        return rows
+
+    @wp.func
+    def segment_cells(domain: Domain, cell: cell_vector, segment: wp.int32):
+        """First cell and one past the last cell of a run, in row-major order within the world."""
+        width = row_width(domain, 0)
+        nx = domain.cell_shape[0]
+        first = wrapped(cell[0] - domain.reach, nx)
+        row = segment
+        begin = first
+        end = first + width
+        if end > nx:
+            row = segment / 2
+            if segment % 2 == 0:
+                end = nx
+            else:
+                begin = 0
+                end = first + width - nx
+        y_width = row_width(domain, 1)
+        y = wrapped(cell[1] - domain.reach + row % y_width, domain.cell_shape[1])
+        base = y * nx
+        if wp.static(space_dim == 3):
+            last = wp.static(space_dim - 1)
+            z = wrapped(cell[last] - domain.reach + row / y_width, domain.cell_shape[last])
+            base += z * domain.cell_shape[1] * nx
+        return base + begin, base + end
+
+    @wp.func
+    def minimum_image(domain: Domain, difference: vector):
+        """Shortest periodic image of a difference of positions [length units]."""
+        result = difference
+        if domain.periodic != 0:
+            for d in range(wp.static(space_dim)):
+                result[d] -= domain.box[d] * wp.round(difference[d] * domain.inverse_box[d])
+        return result
+
+    @wp.func
+    def position_of(entry: particle):
+        result = vector()
+        for d in range(wp.static(space_dim)):
+            result[d] = entry[d]
+        return result
+
+    return SimpleNamespace(
+        vector=vector,
+        particle=particle,
+        Domain=Domain,
+        cell_of=cell_of,
+        cell_index=cell_index,
+        segment_count=segment_count,
+        segment_cells=segment_cells,
+        minimum_image=minimum_image,
+        position_of=position_of,
+    )
+
+
+def cell_grid(
+    space_dim: int, particle_count: int, eps: float, box: tuple[float, ...] | None, reach: int
+) -> tuple[int, ...]:
+    """Return the number of cells along each dimension.
+
+    Open space gets about one cell for each particle (a power of two along each dimension: the grid
+    wraps around); a periodic box is divided into cells no smaller than eps / reach, and into no
+    more than about that many.
+    """
+    open_side = 8
+    while open_side**space_dim < particle_count:
+        open_side *= 2
+    if box is None:
+        return (open_side,) * space_dim
+    size = eps / reach * CELL_SLACK
+    limit = 4 * open_side
+    return tuple(min(max(int(side / size), 1), limit) for side in box)
+
+
+@functools.lru_cache(maxsize=256)
+def make_domain(
+    space_dim: int,
+    scalar: type,
+    eps: float,
+    box: tuple[float, ...] | None,
+    particle_count: int,
+    reach: int = 2,
+) -> Any:
+    """Return the `Domain` of worlds of `particle_count` particles.
+
+    Args:
+        space_dim: Space dimension D, 2 or 3.
+        scalar: `wp.float32` or `wp.float64`.
+        eps: Perception radius [length units].
+        box: Sides of the periodic box [length units], or None in open space.
+        particle_count: Particles in each world N.
+        reach: Cells on each side of a cell in which its neighbours lie; a cell is eps / reach wide.
+    """
+    types = domain_types(space_dim, scalar)
+    domain = types.Domain()
+    domain.eps = eps
+    domain.inverse_eps = 1.0 / eps
+    domain.squared_eps = eps * eps
+    domain.inverse_squared_eps = 1.0 / (eps * eps)
+    smoothing_norm, spiky_norm = (4.0, 30.0) if space_dim == 2 else (315.0 / 64.0, 45.0)
+    domain.smoothing_norm = smoothing_norm / (math.pi * eps**space_dim)
+    domain.spiky_norm = spiky_norm / (math.pi * eps ** (space_dim + 1))
+    shape = cell_grid(space_dim, particle_count, eps, box, reach)
+    domain.periodic = 0 if box is None else 1
+    domain.box = types.vector(*(box or (1.0,) * space_dim))
+    domain.inverse_box = types.vector(*(1.0 / side for side in (box or (1.0,) * space_dim)))
+    scale = 1.0 / (eps / reach * CELL_SLACK)
+    scales = (scale,) * space_dim if box is None else tuple(1.0 / side for side in box)
+    domain.cell_scale = wp.types.vector(space_dim, wp.float64)(*scales)
+    domain.cell_shape = wp.types.vector(space_dim, wp.int32)(*shape)
+    domain.cell_count = math.prod(shape)
+    domain.reach = reach
+    return domain

@@ -1,0 +1,318 @@
+"""Density and the fused perception pass: what a particle sees of its neighbourhood.
+
+One particle is served by a few lanes (one on the CPU), which split the candidates between them, for
+each group of state channels. Sums run over sorted particles, run by run of cells, and lanes are
+added in a fixed order.
+
+Sources: arXiv 2601.16096, section 3 (density, smoothing, gradients, moment matrix, scaling).
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from npa_envs.kernels.domain import (
+    MOMENT_THRESHOLD,
+    domain_types,
+    kernel_module,
+    log_scale_factor,
+    smoothing,
+    spiky_factor,
+)
+from npa_envs.kernels.lanes import make_lane_sum, make_wide_load
+
+
+@functools.cache
+def perception_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
+    """Return the kernels of one variant; `width` channels form a group."""
+    types = domain_types(space_dim, scalar)
+    vector, particle, Domain = types.vector, types.particle, types.Domain
+    cell_of, segment_count, segment_cells = (
+        types.cell_of,
+        types.segment_count,
+        types.segment_cells,
+    )
+    minimum_image, position_of = types.minimum_image, types.position_of
+    wide = wp.types.vector(space_dim, wp.float64)
+    group = wp.types.vector(width, scalar)
+    group_gradient = wp.types.matrix((space_dim, width), scalar)
+    square = wp.types.matrix((space_dim, space_dim), scalar)
+    module = kernel_module("perception", space_dim, scalar, width)
+    load_group = make_wide_load(group, scalar)
+    add_density = make_lane_sum("density", scalar, scalar)
+    add_wide = make_lane_sum("density", wide, wp.float64)
+    add_group = make_lane_sum("perception", group, scalar)
+    add_gradient = make_lane_sum("perception", group_gradient, scalar)
+    add_vector = make_lane_sum("perception", vector, scalar)
+    add_square = make_lane_sum("perception", square, scalar)
+
+    @wp.func
+    def spiky_wide(domain: Domain, centre: vector, neighbour: vector, squared: scalar):
+        """Spiky gradient kernel of a pair in float64: a Newton step refines 1 / distance."""
+        kernel = wide()
+        if squared > scalar(0.0):
+            r = wide()
+            for d in range(wp.static(space_dim)):
+                r[d] = wp.float64(neighbour[d]) - wp.float64(centre[d])
+                if domain.periodic != 0:
+                    images = wp.round((neighbour[d] - centre[d]) * domain.inverse_box[d])
+                    r[d] -= wp.float64(images) * wp.float64(domain.box[d])
+            exact = wp.dot(r, r)
+            inverse = wp.float64(scalar(1.0) / wp.sqrt(squared))
+            inverse *= wp.float64(1.5) - wp.float64(0.5) * exact * inverse * inverse
+            falloff = wp.float64(1.0) - exact * inverse * wp.float64(domain.inverse_eps)
+            kernel = (wp.float64(domain.spiky_norm) * falloff * falloff * inverse) * r
+        return kernel
+
+    @wp.kernel(enable_backward=False, module=module)
+    def compute_density(
+        domain: Domain,
+        particle_count: wp.int32,
+        density_gradient: wp.int32,
+        lane_count: wp.int32,
+        starts: wp.array(dtype=wp.int32),
+        source: wp.array(dtype=wp.int32),
+        row_of: wp.array(dtype=wp.int32),
+        sorted_positions: wp.array(dtype=vector),
+        # outputs
+        particles: wp.array(dtype=particle),
+        row_density_gradient: wp.array(dtype=wide),
+    ):
+        """Write each sorted particle's position and volume 1 / rho, and each row's density gradient.
+
+        The density gradient cancels almost fully where particles are dense, and rules amplify its
+        rounding error: it stays in float64 up to its scaling, which costs little.
+        """
+        k, lane = wp.tid()
+        position = sorted_positions[k]
+        row = wp.int32(-1)
+        if density_gradient != 0:
+            row = row_of[source[k]]
+        base = (k / particle_count) * domain.cell_count
+        cell = cell_of(domain, position)
+        density = scalar(0.0)
+        gradient = wide()
+        for segment in range(segment_count(domain, cell)):
+            first, last = segment_cells(domain, cell, segment)
+            for j in range(starts[base + first] + lane, starts[base + last], lane_count):
+                neighbour = sorted_positions[j]
+                offset = minimum_image(domain, neighbour - position)
+                squared = wp.dot(offset, offset)
+                if squared < domain.squared_eps and j != k:
+                    density += smoothing(
+                        squared, domain.inverse_squared_eps, domain.smoothing_norm
+                    )
+                    if row >= 0:
+                        gradient += spiky_wide(domain, position, neighbour, squared)
+        # A particle always sees itself: a position that is not finite would otherwise have rho 0.
+        density = domain.smoothing_norm + add_density(density)
+        gradient = add_wide(gradient)
+        if lane == 0:
+            entry = particle()
+            for d in range(wp.static(space_dim)):
+                entry[d] = position[d]
+            entry[wp.static(space_dim)] = scalar(1.0) / density
+            particles[k] = entry
+            if row >= 0:
+                row_density_gradient[row] = gradient
+
+    @wp.func
+    def sum_neighbours(
+        domain: Domain,
+        starts: wp.array(dtype=wp.int32),
+        particles: wp.array(dtype=particle),
+        states: wp.array(dtype=group),
+        world: wp.int32,
+        g: wp.int32,
+        group_count: wp.int32,
+        lane: wp.int32,
+        lane_count: wp.int32,
+        position: vector,
+        own: group,
+        state_gradient: wp.int32,
+    ):
+        """Return the smoothed state, the state gradient, the sum of v K and the moment matrix."""
+        blur = group()
+        gradient = group_gradient()
+        kernel_sum = vector()
+        moment = square()
+        base = world * domain.cell_count
+        cell = cell_of(domain, position)
+        for segment in range(segment_count(domain, cell)):
+            first, last = segment_cells(domain, cell, segment)
+            for j in range(starts[base + first] + lane, starts[base + last], lane_count):
+                entry = particles[j]
+                offset = minimum_image(domain, position_of(entry) - position)
+                squared = wp.dot(offset, offset)
+                if squared < domain.squared_eps:
+                    volume = entry[wp.static(space_dim)]
+                    state = load_group(states, j * group_count + g)
+                    weight = smoothing(
+                        squared, domain.inverse_squared_eps, domain.smoothing_norm
+                    )
+                    blur += (volume * weight) * state
+                    if state_gradient != 0:
+                        kernel = offset * spiky_factor(
+                            wp.sqrt(squared), domain.inverse_eps, domain.spiky_norm
+                        )
+                        weighted = volume * kernel
+                        kernel_sum += weighted
+                        gradient += wp.outer(weighted, state - own)
+                        moment += wp.outer(offset, weighted)
+        blur = add_group(blur)
+        if state_gradient != 0:
+            gradient = add_gradient(gradient)
+            kernel_sum = add_vector(kernel_sum)
+            moment = add_square(moment)
+        return blur, gradient, kernel_sum, moment
+
+    @wp.func
+    def corrected(gradient: group_gradient, moment: square):
+        """Apply the inverse moment matrix where it is safely invertible."""
+        result = gradient
+        if wp.abs(wp.determinant(moment)) >= scalar(wp.static(MOMENT_THRESHOLD)):
+            result = wp.inverse(moment) * gradient
+        return result
+
+    @wp.kernel(enable_backward=False, module=module)
+    def perceive(
+        domain: Domain,
+        particle_count: wp.int32,
+        state_dim: wp.int32,
+        state_gradient: wp.int32,
+        moment_correction: wp.int32,
+        density_gradient: wp.int32,
+        gradient_scale: scalar,
+        density_scale: wp.float64,
+        row_base: wp.int32,
+        group_count: wp.int32,
+        lane_count: wp.int32,
+        starts: wp.array(dtype=wp.int32),
+        particles: wp.array(dtype=particle),
+        states: wp.array(dtype=group),
+        unsorted_states: wp.array(dtype=scalar, ndim=2),
+        row_source: wp.array(dtype=wp.int32),
+        row_positions: wp.array(dtype=vector),
+        row_density_gradient: wp.array(dtype=wide),
+        # outputs
+        perception: wp.array(dtype=scalar, ndim=2),
+        row_kernel_sum: wp.array(dtype=vector),
+    ):
+        """Write the perception vector of each row, a one and zeros up to the row's width.
+
+        Rows beyond the last active one are zero.
+        """
+        row, g, lane = wp.tid()
+        first = g * wp.static(width)
+        channels = wp.min(state_dim - first, wp.static(width))
+        gradient_start = 2 * state_dim
+        density_start = gradient_start
+        if state_gradient != 0:
+            density_start += state_dim * wp.static(space_dim)
+        row_end = density_start
+        if density_gradient != 0:
+            row_end += wp.static(space_dim)
+        bias = scalar(0.0)
+        own = group()
+        blur = group()
+        gradient = group_gradient()
+        kernel_sum = vector()
+        rho_gradient = wide()
+        if row < starts[starts.shape[0] - 1] - row_base:
+            bias = scalar(1.0)
+            i = row_source[row]
+            if density_gradient != 0:
+                rho_gradient = row_density_gradient[row]
+            for c in range(wp.static(width)):
+                if c < channels:
+                    own[c] = unsorted_states[i, first + c]
+            blur, gradient, kernel_sum, moment = sum_neighbours(
+                domain,
+                starts,
+                particles,
+                states,
+                i / particle_count,
+                g,
+                group_count,
+                lane,
+                lane_count,
+                row_positions[row],
+                own,
+                state_gradient,
+            )
+            if moment_correction != 0:
+                gradient = corrected(gradient, moment)
+        for c in range(wp.static(width)):
+            if c < channels and c % lane_count == lane:
+                perception[row, first + c] = own[c]
+                perception[row, state_dim + first + c] = blur[c]
+                if state_gradient != 0:
+                    along = vector()
+                    for d in range(wp.static(space_dim)):
+                        along[d] = gradient_scale * gradient[d, c]
+                    along *= log_scale_factor(wp.length(along))
+                    place = gradient_start + (first + c) * wp.static(space_dim)
+                    for d in range(wp.static(space_dim)):
+                        perception[row, place + d] = along[d]
+        if g == 0 and lane == 0:
+            row_kernel_sum[row] = kernel_sum
+            if density_gradient != 0:
+                scaled = density_scale * rho_gradient
+                scaled *= log_scale_factor(wp.length(scaled))
+                for d in range(wp.static(space_dim)):
+                    perception[row, density_start + d] = scalar(scaled[d])
+            for column in range(row_end, perception.shape[1]):
+                perception[row, column] = wp.where(column == row_end, bias, scalar(0.0))
+
+    @wp.kernel(enable_backward=False, module=module)
+    def gather_fields(
+        domain: Domain,
+        particle_count: wp.int32,
+        state_dim: wp.int32,
+        group_count: wp.int32,
+        lane_count: wp.int32,
+        starts: wp.array(dtype=wp.int32),
+        particles: wp.array(dtype=particle),
+        states: wp.array(dtype=group),
+        source: wp.array(dtype=wp.int32),
+        # outputs
+        density: wp.array(dtype=scalar),
+        blur_field: wp.array(dtype=scalar, ndim=2),
+        gradient_field: wp.array(dtype=scalar, ndim=3),
+        moment_field: wp.array(dtype=square),
+        corrected_field: wp.array(dtype=scalar, ndim=3),
+    ):
+        """Write the unscaled fields of every particle, in the caller's order."""
+        k, g, lane = wp.tid()
+        i = source[k]
+        entry = particles[k]
+        blur, gradient, kernel_sum, moment = sum_neighbours(
+            domain,
+            starts,
+            particles,
+            states,
+            k / particle_count,
+            g,
+            group_count,
+            lane,
+            lane_count,
+            position_of(entry),
+            states[k * group_count + g],
+            1,
+        )
+        straight = corrected(gradient, moment)
+        first = g * wp.static(width)
+        for c in range(wp.static(width)):
+            if first + c < state_dim and c % lane_count == lane:
+                blur_field[i, first + c] = blur[c]
+                for d in range(wp.static(space_dim)):
+                    gradient_field[i, first + c, d] = gradient[d, c]
+                    corrected_field[i, first + c, d] = straight[d, c]
+        if g == 0 and lane == 0:
+            density[i] = scalar(1.0) / entry[wp.static(space_dim)]
+            moment_field[i] = moment
+
+    return SimpleNamespace(
+        compute_density=compute_density, perceive=perceive, gather_fields=gather_fields
+    )

@@ -1,0 +1,225 @@
+"""Picture and film files; each appears whole or not at all."""
+
+from __future__ import annotations
+
+import importlib
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from npa_envs.errors import MissingDependencyError, NPAError
+from npa_envs.files import atomic_path
+
+Frame = NDArray[np.uint8]
+
+_GIF_LONGEST_RATE = 50
+_PALETTE_SAMPLE = 2**20
+_MARGIN = 8
+
+
+def write_png(path: str | Path, frame: Frame) -> None:
+    """Write one picture.
+
+    Args:
+        path: The PNG file.
+        frame: Pixels, uint8, shape [H, W, 3].
+
+    Raises:
+        NPAError: A wrong shape or dtype, or the file cannot be written.
+    """
+    (checked,) = _check_frames([frame])
+    with atomic_path(path) as temporary:
+        Image.fromarray(checked).save(temporary, format="PNG", optimize=True)
+
+
+def write_gif(path: str | Path, frames: Iterable[Frame], fps: float = 25) -> None:
+    """Write a GIF that repeats for ever, with one palette for all frames and no dithering.
+
+    Args:
+        path: The GIF file.
+        frames: Pictures of one size, uint8, shape [H, W, 3] each.
+        fps: Frames a second, at most 50; what players show. A GIF counts in hundredths of a second:
+            single frames are rounded to them, the length of the film is not.
+
+    Raises:
+        NPAError: No frames, a wrong shape, dtype or rate, or the file cannot be written.
+    """
+    pictures = _check_frames(frames)
+    _check_rate(fps, highest=_GIF_LONGEST_RATE)
+    palette, background, entry = _shared_palette(pictures)
+    indexed = []
+    for picture in pictures:
+        quantised = Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE)
+        # Pillow finds palette entries only roughly; a background off by one level would flicker.
+        index = np.array(quantised)
+        index[(picture == background).all(axis=-1)] = entry
+        exact = Image.fromarray(index, "P")
+        exact.putpalette(palette.getpalette() or [])
+        indexed.append(exact)
+    ends = [round(100 * (k + 1) / fps) for k in range(len(pictures))]
+    durations = [10 * (end - start) for start, end in zip([0, *ends], ends, strict=False)]
+    with atomic_path(path) as temporary:
+        indexed[0].save(
+            temporary, format="GIF", save_all=True, append_images=indexed[1:],
+            duration=durations, loop=0, optimize=False, disposal=1,
+        )  # fmt: skip
+
+
+def write_mp4(path: str | Path, frames: Iterable[Frame], fps: float = 25) -> None:
+    """Write an H.264 film that browsers play.
+
+    Args:
+        path: The MP4 file.
+        frames: Pictures of one size, uint8, shape [H, W, 3] each. An odd width or height is made
+            even by repeating the last column or row, as the format demands.
+        fps: Frames a second.
+
+    Raises:
+        NPAError: No frames, a wrong shape, dtype or rate, or the file cannot be written.
+        MissingDependencyError: imageio or its ffmpeg is not installed.
+    """
+    pictures = _check_frames(frames)
+    _check_rate(fps)
+    imageio, ffmpeg = _import_imageio()
+    height, width, _ = pictures[0].shape
+    padding = ((0, height % 2), (0, width % 2), (0, 0))
+    with atomic_path(path) as temporary:
+        with imageio.get_writer(
+            temporary, format="FFMPEG", mode="I", fps=fps, codec="libx264", quality=8,
+            pixelformat="yuv420p", macro_block_size=2, output_params=["-movflags", "+faststart"],
+            ffmpeg_log_level="error",
+        ) as writer:  # fmt: skip
+            for picture in pictures:
+                writer.append_data(np.pad(picture, padding, mode="edge"))
+        _check_film(temporary, len(pictures), ffmpeg)
+
+
+def write_filmstrip(
+    path: str | Path,
+    frames: Iterable[Frame],
+    captions: Sequence[str] | None = None,
+    columns: int | None = None,
+) -> None:
+    """Write frames side by side into one PNG, each with a caption below.
+
+    Args:
+        path: The PNG file.
+        frames: Pictures of one size, uint8, shape [H, W, 3] each.
+        captions: One text for each frame, or None for none.
+        columns: Frames in a row; None is all of them, at most 8.
+
+    Raises:
+        NPAError: No frames, a wrong shape or dtype, another number of captions than of frames,
+            fewer than one column, or the file cannot be written.
+    """
+    pictures = _check_frames(frames)
+    count = len(pictures)
+    if captions is not None and len(captions) != count:
+        raise NPAError(
+            f"captions must be as many as the frames, {count}, got {len(captions)}: "
+            "give one for each frame, or None"
+        )
+    across = min(count, 8) if columns is None else columns
+    if isinstance(across, bool) or not isinstance(across, int) or across < 1:
+        raise NPAError(f"columns must be an integer of at least 1, got {columns!r}: try 4")
+    across = min(across, count)
+    height, width, _ = pictures[0].shape
+    font = _caption_font(captions or [], width)
+    _, top, _, bottom = font.getbbox("Ågjy")
+    text_height = math.ceil(bottom - top) + _MARGIN if captions else 0
+    pitch_x, pitch_y = width + _MARGIN, height + text_height + _MARGIN
+    down = -(-count // across)
+    strip = Image.new("RGB", (across * pitch_x + _MARGIN, down * pitch_y + _MARGIN), "white")
+    draw = ImageDraw.Draw(strip)
+    for k, picture in enumerate(pictures):
+        left, upper = _MARGIN + (k % across) * pitch_x, _MARGIN + (k // across) * pitch_y
+        strip.paste(Image.fromarray(picture), (left, upper))
+        if captions:
+            middle = (left + width / 2, upper + height + _MARGIN / 2)
+            draw.text(middle, captions[k], fill="#333333", font=font, anchor="ma")
+    with atomic_path(path) as temporary:
+        strip.save(temporary, format="PNG", optimize=True)
+
+
+def _check_frames(frames: Iterable[Frame]) -> list[Frame]:
+    pictures = [np.ascontiguousarray(frame) for frame in frames]
+    if not pictures:
+        raise NPAError(
+            "frames must hold at least one picture, got none: give uint8 [H, W, 3] arrays"
+        )
+    first = pictures[0].shape
+    for k, picture in enumerate(pictures):
+        if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[-1] != 3:
+            raise NPAError(
+                f"frame {k} must be uint8 of shape [H, W, 3], got {picture.dtype} "
+                f"{picture.shape}: make frames with npa_envs.render.to_uint8"
+            )
+        if picture.shape != first or 0 in first:
+            raise NPAError(
+                f"frames must all have one size that is not zero, got {first} and frame {k} of "
+                f"{picture.shape}: render them at one resolution"
+            )
+    return pictures
+
+
+def _check_rate(fps: float, *, highest: float = 1000) -> None:
+    if not (math.isfinite(fps) and 0.1 <= fps <= highest):
+        raise NPAError(f"fps must be in [0.1, {highest}], got {fps}: try 25")
+
+
+def _shared_palette(pictures: list[Frame]) -> tuple[Image.Image, Frame, int]:
+    """Return a palette for all frames, the commonest colour, and the entry that holds it."""
+    step = max(1, math.ceil(sum(p.size // 3 for p in pictures) / _PALETTE_SAMPLE))
+    sample = np.concatenate([p.reshape(-1, 3)[k % step :: step] for k, p in enumerate(pictures)])
+    _, which, counts = np.unique(
+        (sample >> 3) @ np.array([1024, 32, 1]), return_inverse=True, return_counts=True
+    )
+    means = [np.bincount(which, weights=sample[:, k]) / counts for k in range(3)]
+    shades, shade_counts = np.unique(sample[which == counts.argmax()], axis=0, return_counts=True)
+    background = shades[shade_counts.argmax()]
+    # Each colour by the root of its count: else a wide background would drown small spots.
+    repeats = np.ceil(np.sqrt(counts)).astype(np.int64)
+    swatch = np.repeat(np.stack(means, axis=1).round().astype(np.uint8), repeats, axis=0)[None]
+    palette = Image.fromarray(swatch).quantize(
+        colors=255, method=Image.Quantize.MEDIANCUT, kmeans=2, dither=Image.Dither.NONE
+    )
+    entries = (palette.getpalette() or [])[: 255 * 3]
+    entry = len(entries) // 3
+    palette.putpalette([*entries, *(int(v) for v in background)])
+    return palette, background, entry
+
+
+def _import_imageio() -> tuple[Any, Any]:
+    try:
+        return importlib.import_module("imageio.v2"), importlib.import_module("imageio_ffmpeg")
+    except ImportError as error:
+        raise MissingDependencyError(
+            f"an MP4 file needs imageio with ffmpeg, which is not installed ({error}): "
+            "pip install 'imageio[ffmpeg]', or write a GIF"
+        ) from error
+
+
+def _check_film(path: Path, frame_count: int, ffmpeg: Any) -> None:
+    # The writer does not report an encoder that died, for example on a full disk.
+    try:
+        found, _ = ffmpeg.count_frames_and_secs(str(path))
+    except RuntimeError as error:
+        raise OSError(f"the encoder left a broken film: {error}") from error
+    if found != frame_count:
+        raise OSError(f"the encoder wrote {found} of {frame_count} frames")
+
+
+def _caption_font(
+    captions: Sequence[str], width: int
+) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    largest = max(12, min(28, width // 12))
+    for size in range(largest, 9, -1):
+        font = ImageFont.load_default(size)
+        if all(font.getlength(caption) <= width for caption in captions):
+            return font
+    return ImageFont.load_default(10)

@@ -1,0 +1,226 @@
+"""The rule: one small network that every particle runs on its own perception vector."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, TypedDict
+
+import torch
+from torch import Tensor, nn
+
+from npa_envs.errors import NPAError
+
+COLOUR_OFFSET = 0.5
+"""A particle's colour is its last three outputs plus this, dimensionless."""
+
+INIT_GAIN = 0.1
+"""Gain of the Xavier-uniform initialisation: a fresh rule hardly moves its particles."""
+
+
+FOLD = 4
+"""Rows of perception are padded to a multiple of this many columns: 16 bytes of float32."""
+
+
+OUTPUT_BLOCKS = 4
+"""The sum over hidden units is taken in this many blocks."""
+
+
+class RuleHyperParameters(TypedDict):
+    """Everything besides its weights that makes an `NPARule`."""
+
+    space_dim: int
+    state_dim: int
+    hidden_dim: int
+    eps0: float
+    alpha: float
+    static: bool
+    readout_dim: int
+    readout_hidden_dim: int
+    moment_correction: bool
+    state_gradient: bool
+    density_gradient: bool
+
+
+class _BlockedProduct(torch.autograd.Function):
+    """hidden @ weight.T, summed in blocks: less rounding, which rules amplify step by step."""
+
+    @staticmethod
+    def forward(ctx: Any, hidden: Tensor, weight: Tensor) -> Tensor:  # type: ignore[override]
+        ctx.save_for_backward(hidden, weight)
+        blocks = OUTPUT_BLOCKS if hidden.shape[1] % OUTPUT_BLOCKS == 0 else 1
+        left = hidden.unflatten(1, (blocks, -1)).transpose(0, 1)
+        right = weight.unflatten(1, (blocks, -1)).permute(1, 2, 0)
+        return torch.bmm(left, right).sum(dim=0)
+
+    @staticmethod
+    def backward(ctx: Any, update_bar: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
+        hidden, weight = ctx.saved_tensors
+        return update_bar @ weight, update_bar.T @ hidden
+
+
+class FoldedRule(NamedTuple):
+    """A rule's weights as two plain products: the bias is one more column of the first.
+
+    A row of perception is followed by a one and by zeros up to a multiple of `FOLD` columns, which
+    saves the passes over all rows that a bias and its gradient cost, and aligns the products.
+    """
+
+    hidden_weight: Tensor
+    """[W1 | b1 | 0], shape [H, row_width]."""
+    output_weight: Tensor
+    """W2, shape [A, H]."""
+
+    @property
+    def row_width(self) -> int:
+        """Columns of a row of perception: P + 1, rounded up to a multiple of `FOLD`."""
+        return self.hidden_weight.shape[1]
+
+    def __call__(self, rows: Tensor) -> Tensor:
+        """Map rows [z | 1 | 0], shape [K, row_width], to raw updates, shape [K, A]."""
+        hidden = torch.relu(rows @ self.hidden_weight.T)
+        update: Tensor = _BlockedProduct.apply(hidden, self.output_weight)  # type: ignore[no-untyped-call]
+        return update
+
+
+class NPARule(nn.Module):
+    """The update rule of Neural Particle Automata: y = W2 relu(W1 z + b1).
+
+    z is a particle's perception vector and y = [δ (D) ; Δs (C)] its update (no δ where `static`).
+    Source: arXiv 2601.16096, section 3; the same network for every particle and every step.
+
+    Args:
+        space_dim: Space dimension D, 2 or 3.
+        state_dim: State channels C.
+        hidden_dim: Width of the hidden layer.
+        eps0: Perception radius at which the rule is trained [length units]: it scales what is
+            perceived at another radius.
+        alpha: Largest displacement in one step as a fraction of the perception radius.
+        static: Particles never move, so the rule has no displacement outputs.
+        readout_dim: Outputs of the read-out network s -> outputs; 0 for none.
+        readout_hidden_dim: Width of the read-out's hidden layer; needed where `readout_dim` > 0.
+        moment_correction: The perceived state gradient is corrected by the moment matrix.
+        state_gradient: The rule perceives the state gradient.
+        density_gradient: The rule perceives the density gradient.
+
+    Raises:
+        NPAError: A dimension or a length is out of range.
+    """
+
+    def __init__(
+        self,
+        space_dim: int = 2,
+        state_dim: int = 16,
+        hidden_dim: int = 128,
+        *,
+        eps0: float = 0.1,
+        alpha: float = 0.5,
+        static: bool = False,
+        readout_dim: int = 0,
+        readout_hidden_dim: int = 0,
+        moment_correction: bool = True,
+        state_gradient: bool = True,
+        density_gradient: bool = True,
+    ) -> None:
+        super().__init__()
+        if space_dim not in (2, 3):
+            raise NPAError(f"space_dim must be 2 or 3, got {space_dim}")
+        for name, value in (("state_dim", state_dim), ("hidden_dim", hidden_dim)):
+            if value < 1:
+                raise NPAError(f"{name} must be at least 1, got {value}")
+        for name, number in (("eps0", eps0), ("alpha", alpha)):
+            if not 0.0 < number < float("inf"):
+                raise NPAError(f"{name} must be positive and finite, got {number}")
+        if readout_dim < 0 or (readout_dim > 0 and readout_hidden_dim < 1):
+            raise NPAError(
+                f"readout_dim must be 0, or positive with readout_hidden_dim at least 1, "
+                f"got {readout_dim} and {readout_hidden_dim}"
+            )
+        self.space_dim = space_dim
+        self.state_dim = state_dim
+        self.hidden_dim = hidden_dim
+        self.eps0 = eps0
+        self.alpha = alpha
+        self.static = static
+        self.readout_dim = readout_dim
+        self.readout_hidden_dim = readout_hidden_dim
+        self.moment_correction = moment_correction
+        self.state_gradient = state_gradient
+        self.density_gradient = density_gradient
+
+        self.hidden = nn.Linear(self.perception_dim, hidden_dim)
+        self.output = nn.Linear(hidden_dim, self.update_dim, bias=False)
+        self.readout = (
+            nn.Sequential(
+                nn.Linear(state_dim, readout_hidden_dim),
+                nn.ReLU(),
+                nn.Linear(readout_hidden_dim, readout_dim),
+            )
+            if readout_dim
+            else None
+        )
+        for module in self.modules():
+            if isinstance(module, nn.Linear):
+                nn.init.xavier_uniform_(module.weight, gain=INIT_GAIN)
+
+    @property
+    def perception_dim(self) -> int:
+        """Length P of the perception vector: C(2+D)+D with every group perceived."""
+        gradients = self.state_dim * self.space_dim * self.state_gradient
+        return 2 * self.state_dim + gradients + self.space_dim * self.density_gradient
+
+    @property
+    def update_dim(self) -> int:
+        """Length A of the update: D+C, or C where particles are static."""
+        return self.state_dim + (0 if self.static else self.space_dim)
+
+    def forward(self, perception: Tensor) -> Tensor:
+        """Map perception vectors to raw updates, row by row.
+
+        Args:
+            perception: Perception vectors z, dimensionless, shape [..., P].
+
+        Returns:
+            Updates [δ (D) ; Δs (C)], dimensionless, shape [..., A]; δ is not yet bounded.
+        """
+        update: Tensor = self.output(torch.relu(self.hidden(perception)))
+        return update
+
+    def folded(self) -> FoldedRule:
+        """Return the weights as two plain products, differentiable in the parameters."""
+        padding = -(self.perception_dim + 1) % FOLD
+        weight = torch.cat((self.hidden.weight, self.hidden.bias[:, None]), dim=1)
+        return FoldedRule(nn.functional.pad(weight, (0, padding)), self.output.weight)
+
+    def read_out(self, states: Tensor) -> Tensor:
+        """Return the rule's outputs: the read-out network's, or the states where it has none.
+
+        Args:
+            states: Particle states, dimensionless, shape [..., C].
+        """
+        if self.readout is None:
+            return states
+        outputs: Tensor = self.readout(states)
+        return outputs
+
+    def colour(self, states: Tensor) -> Tensor:
+        """Return RGB colours, dimensionless and not clipped, shape [..., 3]: the last three outputs.
+
+        Args:
+            states: Particle states, dimensionless, shape [..., C], C at least 3 without read-out.
+        """
+        return self.read_out(states)[..., -3:] + COLOUR_OFFSET
+
+    def hyper_parameters(self) -> RuleHyperParameters:
+        """Return everything besides the weights: `NPARule(**rule.hyper_parameters())` has its shape."""
+        return RuleHyperParameters(
+            space_dim=self.space_dim,
+            state_dim=self.state_dim,
+            hidden_dim=self.hidden_dim,
+            eps0=self.eps0,
+            alpha=self.alpha,
+            static=self.static,
+            readout_dim=self.readout_dim,
+            readout_hidden_dim=self.readout_hidden_dim,
+            moment_correction=self.moment_correction,
+            state_gradient=self.state_gradient,
+            density_gradient=self.density_gradient,
+        )

@@ -1,0 +1,87 @@
+"""Where PyTorch meets Warp: tensors become kernel arguments, launches join torch's stream."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from npa_envs.kernels.lanes import CUDA_LANES
+
+SCALARS: dict[torch.dtype, Any] = {torch.float32: wp.float32, torch.float64: wp.float64}
+"""Warp's scalar type for each floating dtype that the operators take."""
+
+GROUP_WIDTHS = (4, 8, 16)
+"""Channels of a group: one thread serves a group, with more groups beyond the largest width."""
+
+
+def scalar_type(dtype: torch.dtype) -> Any:
+    """Return Warp's scalar type for a checked floating dtype."""
+    return SCALARS[dtype]
+
+
+def channel_width(state_dim: int) -> int:
+    """Return how many channels form a group."""
+    return next((width for width in GROUP_WIDTHS if width >= state_dim), GROUP_WIDTHS[-1])
+
+
+def lane_count(device: torch.device, topic: str) -> int:
+    """Return how many lanes of a device share a particle in a pass."""
+    return CUDA_LANES[topic] if device.type == "cuda" else 1
+
+
+@functools.cache
+def _quiet_init() -> None:
+    wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)  # no banner in pipelines
+    wp.init()
+
+
+def warp_device(device: torch.device) -> Any:
+    """Return Warp's device for a torch device, starting Warp (silently) where needed."""
+    _quiet_init()
+    return wp.device_from_torch(device)
+
+
+@functools.lru_cache(maxsize=1024)
+def _array_types(kernel: Any) -> tuple[Any, ...]:
+    return tuple(
+        argument.type if isinstance(argument.type, wp.array) else None
+        for argument in kernel.adj.args
+    )
+
+
+def _as_array(tensor: Tensor | None, array_type: Any) -> Any:
+    if tensor is None:
+        return None
+    return wp.from_torch(
+        tensor.detach(), dtype=array_type.dtype, requires_grad=False, return_ctype=True
+    )
+
+
+@functools.lru_cache(maxsize=64)
+def _warp_stream(device: torch.device, handle: int) -> Any:
+    return wp.Stream(wp.device_from_torch(device), cuda_stream=handle)
+
+
+def launch(kernel: Any, size: int | tuple[int, ...], device: torch.device, *arguments: Any) -> None:
+    """Launch a kernel on torch's current stream of a device.
+
+    Args:
+        kernel: A Warp kernel; its own signature says how each tensor is read.
+        size: Number of threads along each dimension.
+        device: Device of every tensor among the arguments.
+        arguments: Kernel arguments in order: tensors (None for an absent one), structs and numbers.
+    """
+    types = _array_types(kernel)
+    converted = [
+        value if array_type is None else _as_array(value, array_type)
+        for value, array_type in zip(arguments, types, strict=True)
+    ]
+    where = warp_device(device)
+    stream = None
+    if where.is_cuda:
+        stream = _warp_stream(device, torch.cuda.current_stream(device).cuda_stream)
+    wp.launch(kernel, size, inputs=converted, device=where, stream=stream, record_tape=False)

@@ -1,0 +1,184 @@
+"""Sorting worlds into cells: the first half of every SPH operator."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from npa_envs.kernels.cells import cell_kernels
+from npa_envs.kernels.domain import make_domain
+from npa_envs.kernels.perception import perception_kernels
+from npa_envs.sph.bridge import channel_width, lane_count, launch, scalar_type
+
+
+class Plan(NamedTuple):
+    """What is known of an operator call before any of its data: variant, sizes, domain."""
+
+    scalar: Any
+    width: int
+    world_count: int
+    particle_count: int
+    space_dim: int
+    state_dim: int
+    row_capacity: int
+    masked: bool
+    domain: Any
+
+    @property
+    def total(self) -> int:
+        """Particles of all worlds, B N."""
+        return self.world_count * self.particle_count
+
+    @property
+    def group_count(self) -> int:
+        """Channel groups of a particle."""
+        return -(-self.state_dim // self.width)
+
+    @property
+    def active_offset(self) -> int:
+        """Where the starts of the active rows begin within `starts`."""
+        return self.world_count * int(self.domain.cell_count) if self.masked else 0
+
+    @property
+    def row_base(self) -> int:
+        """What is subtracted from a start of active rows to give a row."""
+        return self.total if self.masked else 0
+
+
+class SortedWorlds(NamedTuple):
+    """Particles in the order world, cell, index; the active ones have rows in the same order."""
+
+    starts: Tensor
+    """First sorted place of every cell, then first row of every cell (shifted), int32."""
+    source: Tensor
+    """Caller's index of each sorted particle, int32, shape [B N]."""
+    row_of: Tensor
+    """Row of each particle, -1 where it is not active, int32, shape [B N]."""
+    row_source: Tensor
+    """Caller's index of each row, int32, shape [K]; undefined beyond the last active row."""
+    positions: Tensor
+    """Sorted positions [length units], shape [B N, D]."""
+    row_positions: Tensor
+    """Positions of the rows [length units], shape [K, D]; undefined beyond the last active row."""
+    states: Tensor
+    """Sorted states, dimensionless, shape [B N G, W]: channels padded with zeros to G groups."""
+
+
+def make_plan(
+    x: Tensor,
+    s: Tensor,
+    row_capacity: int,
+    masked: bool,
+    eps: float,
+    box: tuple[float, ...] | None,
+    width: int | None = None,
+) -> Plan:
+    """Return the plan of a call on positions [B, N, D] and states [B, N, C].
+
+    Channels are grouped by `width`, by default as suits the device.
+    """
+    world_count, particle_count, space_dim = x.shape
+    scalar = scalar_type(x.dtype)
+    return Plan(
+        scalar=scalar,
+        width=width or channel_width(s.shape[2]),
+        world_count=world_count,
+        particle_count=particle_count,
+        space_dim=space_dim,
+        state_dim=s.shape[2],
+        row_capacity=row_capacity,
+        masked=masked,
+        domain=make_domain(space_dim, scalar, eps, box, particle_count),
+    )
+
+
+def sort_worlds(plan: Plan, x: Tensor, s: Tensor, mask: Tensor | None) -> SortedWorlds:
+    """Sort contiguous worlds into cells; `mask` (uint8, [B, N]) says which particles get rows."""
+    kernels = cell_kernels(plan.space_dim, plan.scalar, plan.width)
+    device, total = x.device, plan.total
+    cell, arrival, arrived = torch.empty(3, total, dtype=torch.int32, device=device).unbind()
+    cell_total = plan.world_count * int(plan.domain.cell_count)
+    counts = torch.zeros(cell_total * (2 if plan.masked else 1) + 1, dtype=torch.int32, device=device)
+    positions = x.view(total, plan.space_dim)
+    states = s.view(total, plan.state_dim)
+    flat_mask = None if mask is None else mask.view(total)
+    launch(
+        kernels.count_cells,
+        total,
+        device,
+        plan.domain,
+        positions,
+        flat_mask,
+        int(plan.masked),
+        plan.particle_count,
+        plan.active_offset,
+        cell,
+        arrival,
+        counts,
+    )
+    starts = torch.cumsum(counts, 0, dtype=torch.int32)
+    launch(kernels.place_by_arrival, total, device, cell, arrival, starts, arrived)
+
+    source = torch.empty(total, dtype=torch.int32, device=device)
+    row_of = torch.empty_like(source)
+    row_source = torch.empty(plan.row_capacity, dtype=torch.int32, device=device)
+    sorted_positions = torch.empty_like(positions)
+    row_positions = torch.empty(plan.row_capacity, plan.space_dim, dtype=x.dtype, device=device)
+    sorted_states = torch.empty(total * plan.group_count, plan.width, dtype=s.dtype, device=device)
+    launch(
+        kernels.order_particles,
+        (total, plan.group_count),
+        device,
+        positions,
+        states,
+        flat_mask,
+        int(plan.masked),
+        plan.active_offset,
+        plan.row_base,
+        plan.row_capacity,
+        plan.group_count,
+        cell,
+        arrived,
+        starts,
+        source,
+        row_of,
+        row_source,
+        sorted_positions,
+        row_positions,
+        sorted_states,
+    )
+    return SortedWorlds(
+        starts, source, row_of, row_source, sorted_positions, row_positions, sorted_states
+    )
+
+
+def compute_density(
+    plan: Plan, ordered: SortedWorlds, density_gradient: bool
+) -> tuple[Tensor, Tensor]:
+    """Return sorted positions with volumes 1 / rho, [B N, D + 1], and the rows' density gradients.
+
+    The latter, float64, [K, D], are undefined beyond the last active row and where not asked for.
+    """
+    kernels = perception_kernels(plan.space_dim, plan.scalar, plan.width)
+    positions = ordered.positions
+    particles = positions.new_empty(plan.total, plan.space_dim + 1)
+    row_density_gradient = torch.empty_like(ordered.row_positions, dtype=torch.float64)
+    lanes = lane_count(positions.device, "density")
+    launch(
+        kernels.compute_density,
+        (plan.total, lanes),
+        positions.device,
+        plan.domain,
+        plan.particle_count,
+        int(density_gradient),
+        lanes,
+        ordered.starts,
+        ordered.source,
+        ordered.row_of,
+        positions,
+        particles,
+        row_density_gradient,
+    )
+    return particles, row_density_gradient

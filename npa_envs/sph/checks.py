@@ -1,0 +1,110 @@
+"""Checks at the door of the operators: everything behind it may trust its arguments."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from npa_envs.errors import NPAError
+
+DTYPES = (torch.float32, torch.float64)
+
+Box = float | Sequence[float] | None
+"""Sides of a periodic box centred on the origin [length units]; one number for a cube; None: open."""
+
+
+def check_world(x: Tensor, s: Tensor) -> None:
+    """Check shapes, dtypes and devices of positions and states.
+
+    Raises:
+        NPAError: They are not [B, N, D] and [B, N, C] of one floating dtype on one device.
+    """
+    for name, tensor, last in (("x", x, "D"), ("s", s, "C")):
+        if not isinstance(tensor, Tensor):
+            raise NPAError(
+                f"{name} must be a torch tensor, got {type(tensor).__name__}: "
+                f"convert it with torch.as_tensor"
+            )
+        if tensor.ndim != 3:
+            cure = f"add a world dimension with {name}[None]" if tensor.ndim == 2 else "reshape it"
+            raise NPAError(
+                f"{name} must have shape [B, N, {last}], got {tuple(tensor.shape)}: {cure}"
+            )
+        if tensor.dtype not in DTYPES:
+            raise NPAError(
+                f"{name} must be float32 or float64, got {tensor.dtype}: convert it with .float()"
+            )
+    if x.shape[2] not in (2, 3):
+        raise NPAError(f"x must have 2 or 3 coordinates, got shape {tuple(x.shape)}")
+    if x.shape[:2] != s.shape[:2]:
+        raise NPAError(
+            f"x and s must agree in worlds and particles, got {tuple(x.shape)} and {tuple(s.shape)}"
+        )
+    if 0 in x.shape or 0 in s.shape:
+        raise NPAError(
+            f"a world needs at least one particle and one state channel, "
+            f"got {tuple(x.shape)} and {tuple(s.shape)}"
+        )
+    if x.dtype != s.dtype or x.device != s.device:
+        raise NPAError(
+            f"x and s must share dtype and device, got {x.dtype} on {x.device} and "
+            f"{s.dtype} on {s.device}: convert one with .to(other)"
+        )
+
+
+def check_finite_positions(x: Tensor) -> None:
+    """Check that every position is finite; skipped while a CUDA graph is captured.
+
+    Raises:
+        NPAError: A coordinate is NaN or infinite; the message names the first such particle.
+    """
+    if x.is_cuda and torch.cuda.is_current_stream_capturing():
+        return
+    if torch.compiler.is_compiling():
+        return
+    finite = torch.isfinite(x.detach()).all(dim=-1)
+    if not bool(finite.all()):
+        world, particle = (int(k) for k in (~finite).nonzero()[0])
+        raise NPAError(
+            f"x must be finite, got {x[world, particle].tolist()} at world {world}, particle "
+            f"{particle} ({int((~finite).sum())} such particles): reset those worlds"
+        )
+
+
+def checked_eps(name: str, eps: float) -> float:
+    """Return a perception radius as a float [length units].
+
+    Raises:
+        NPAError: It is not positive and finite.
+    """
+    value = float(eps)
+    if not (math.isfinite(value) and value > 0.0):
+        raise NPAError(f"{name} must be positive and finite [length units], got {eps}")
+    return value
+
+
+def checked_box(box: Box, space_dim: int, eps: float) -> tuple[float, ...] | None:
+    """Return the sides of a periodic box as a tuple of D floats, or None in open space.
+
+    Raises:
+        NPAError: Wrong number of sides, or a side below 2 eps, where a particle would see another
+            one twice.
+    """
+    if box is None:
+        return None
+    if isinstance(box, int | float):
+        sides: tuple[float, ...] = (float(box),) * space_dim
+    else:
+        sides = tuple(float(side) for side in box)
+    if len(sides) != space_dim:
+        raise NPAError(f"box must have {space_dim} sides, got {len(sides)}: {sides}")
+    # Ten digits of grace: a box of exactly 2 eps must pass however both were rounded.
+    if not all(math.isfinite(side) and side >= 2.0 * eps * (1.0 - 1e-10) for side in sides):
+        raise NPAError(
+            f"box sides must be finite and at least 2 eps = {2.0 * eps:g}, got {sides}: "
+            f"enlarge the box or perceive at a smaller eps"
+        )
+    return sides

@@ -1,0 +1,148 @@
+"""The public SPH operators over whole worlds: perception vectors and the fields behind them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from npa_envs.kernels.perception import perception_kernels
+from npa_envs.sph.bridge import lane_count, launch
+from npa_envs.sph.cells import compute_density, make_plan, sort_worlds
+from npa_envs.sph.checks import (
+    Box,
+    check_finite_positions,
+    check_world,
+    checked_box,
+    checked_eps,
+)
+from npa_envs.sph.operators import Terms, perceive_rows
+
+
+class PerceptionFields(NamedTuple):
+    """The unscaled SPH fields at every particle (arXiv 2601.16096, section 3)."""
+
+    rho: Tensor
+    """Density [1 / length^D], shape [B, N]."""
+    blur: Tensor
+    """Smoothed states, dimensionless, shape [B, N, C]."""
+    grad0: Tensor
+    """State gradients without correction [1 / length], shape [B, N, C, D]."""
+    moment: Tensor
+    """Moment matrices M, dimensionless, shape [B, N, D, D]."""
+    grad1: Tensor
+    """State gradients times the inverse of M where |det M| >= 1e-3 [1 / length], [B, N, C, D]."""
+    drho: Tensor
+    """Density gradients [1 / length^(D+1)], shape [B, N, D]."""
+
+
+def perceive(
+    x: Tensor,
+    s: Tensor,
+    eps: float,
+    eps0: float | None = None,
+    box: Box = None,
+    detach_positions: bool = True,
+    *,
+    state_gradient: bool = True,
+    moment_correction: bool = True,
+    density_gradient: bool = True,
+) -> Tensor:
+    """Perceive every particle's neighbourhood: z = [s ; smoothed s ; L(c ∇s) ; L(c^(1+D) ∇ρ / N)].
+
+    c = eps / eps0, L(v) = log(1 + |v|) v / |v|. Differentiable in s, and in x where
+    `detach_positions` is False; the moment correction of ∇s is a stopped gradient, as in the paper
+    (arXiv 2601.16096, section 3). Bit-identical from run to run; world k of B equals that world
+    alone.
+
+    Args:
+        x: Particle positions [length units], shape [B, N, D], D = 2 or 3, anywhere in open space.
+        s: Particle states, dimensionless, shape [B, N, C], any C; dtype and device of x.
+        eps: Perception radius [length units].
+        eps0: Radius at which the rule was trained [length units]; default: eps.
+        box: Sides of a periodic box centred on the origin [length units], a number for equal
+            sides, or None for open space.
+        detach_positions: Do not back-propagate into x.
+        state_gradient: Include the state gradient in z.
+        moment_correction: Correct the state gradient by the inverse moment matrix.
+        density_gradient: Include the density gradient in z.
+
+    Returns:
+        Perception vectors z, dimensionless, shape [B, N, P], P = C(2+D)+D with every group.
+
+    Raises:
+        NPAError: Shapes, dtypes or devices do not fit, a position is not finite, eps or eps0 is
+            not positive and finite, or a box side is below 2 eps.
+    """
+    check_world(x, s)
+    radius = checked_eps("eps", eps)
+    radius0 = radius if eps0 is None else checked_eps("eps0", eps0)
+    sides = checked_box(box, x.shape[2], radius)
+    check_finite_positions(x)
+    terms = Terms(state_gradient, moment_correction, density_gradient)
+    perception, rows = perceive_rows(
+        x.detach() if detach_positions else x,
+        s,
+        mask=None,
+        row_capacity=x.shape[0] * x.shape[1],
+        row_width=terms.perception_dim(x.shape[2], s.shape[2]),
+        eps=radius,
+        eps0=radius0,
+        box=sides,
+        terms=terms,
+    )
+    return perception.index_select(0, rows.row_of).view(*x.shape[:2], -1)
+
+
+@torch.no_grad()
+def perception_fields(x: Tensor, s: Tensor, eps: float, box: Box = None) -> PerceptionFields:
+    """Return the unscaled SPH fields of every particle; not differentiable (`perceive` is).
+
+    Args:
+        x: Particle positions [length units], shape [B, N, D].
+        s: Particle states, dimensionless, shape [B, N, C].
+        eps: Perception radius [length units].
+        box: Sides of a periodic box centred on the origin [length units], or None for open space.
+
+    Raises:
+        NPAError: As `perceive`.
+    """
+    check_world(x, s)
+    radius = checked_eps("eps", eps)
+    sides = checked_box(box, x.shape[2], radius)
+    check_finite_positions(x)
+    x, s = x.contiguous(), s.contiguous()
+    world_count, particle_count, space_dim = x.shape
+    state_dim = s.shape[2]
+    plan = make_plan(x, s, x.shape[0] * x.shape[1], False, radius, sides)
+    kernels = perception_kernels(space_dim, plan.scalar, plan.width)
+    ordered = sort_worlds(plan, x, s, None)
+    particles, row_density_gradient = compute_density(plan, ordered, density_gradient=True)
+    fields = PerceptionFields(
+        rho=x.new_empty(plan.total),
+        blur=x.new_empty(plan.total, state_dim),
+        grad0=x.new_empty(plan.total, state_dim, space_dim),
+        moment=x.new_empty(plan.total, space_dim, space_dim),
+        grad1=x.new_empty(plan.total, state_dim, space_dim),
+        drho=row_density_gradient[ordered.row_of].to(x.dtype),
+    )
+    lanes = lane_count(x.device, "perception")
+    launch(
+        kernels.gather_fields,
+        (plan.total, plan.group_count, lanes),
+        x.device,
+        plan.domain,
+        particle_count,
+        state_dim,
+        plan.group_count,
+        lanes,
+        ordered.starts,
+        particles,
+        ordered.states,
+        ordered.source,
+        *fields[:-1],
+    )
+    return PerceptionFields(
+        *(field.view(world_count, particle_count, *field.shape[1:]) for field in fields)
+    )

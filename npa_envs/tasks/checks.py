@@ -1,0 +1,87 @@
+"""Checks that the configuration dataclasses share: each error names field, rule, value, cure."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from npa_envs.errors import NPAError
+
+
+def check_positive(config: object, kind: type, *names: str, at_least: int = 1) -> None:
+    """Check that fields are whole numbers >= `at_least` (`kind` int) or finite and > 0 (float).
+
+    Args:
+        config: The dataclass that holds the fields.
+        kind: `int` or `float`.
+        names: The fields to check.
+        at_least: Smallest whole number allowed; ignored for floats.
+
+    Raises:
+        NPAError: A field breaks the rule.
+    """
+    for name in names:
+        value = getattr(config, name)
+        if kind is int:
+            if not is_whole(value) or value < at_least:
+                raise NPAError(
+                    f"{name} must be a whole number of at least {at_least}, got {value!r}: "
+                    f"for example {name}={_example(config, name, at_least)}"
+                )
+        elif not is_real(value) or value <= 0:
+            raise NPAError(
+                f"{name} must be a finite number greater than 0, got {value!r}: "
+                f"for example {name}={_example(config, name, 1.0)}"
+            )
+
+
+def check_non_negative(config: object, *names: str) -> None:
+    """Check that fields are finite numbers of at least 0.
+
+    Args:
+        config: The dataclass that holds the fields.
+        names: The fields to check.
+
+    Raises:
+        NPAError: A field breaks the rule.
+    """
+    for name in names:
+        value = getattr(config, name)
+        if not is_real(value) or value < 0:
+            raise NPAError(
+                f"{name} must be a finite number of at least 0, got {value!r}: "
+                f"for example {name}={_example(config, name, 0.0)}"
+            )
+
+
+def check_fraction(config: object, *names: str) -> None:
+    """Check that fields are numbers in (0, 1].
+
+    Args:
+        config: The dataclass that holds the fields.
+        names: The fields to check.
+
+    Raises:
+        NPAError: A field breaks the rule.
+    """
+    for name in names:
+        value = getattr(config, name)
+        if not is_real(value) or not 0 < value <= 1:
+            raise NPAError(
+                f"{name} must lie in (0, 1], got {value!r}: "
+                f"for example {name}={_example(config, name, 0.5)}"
+            )
+
+
+def is_whole(value: Any) -> bool:
+    """Return whether `value` is an int (a bool is not)."""
+    return isinstance(value, int) and not isinstance(value, bool)
+
+
+def is_real(value: Any) -> bool:
+    """Return whether `value` is a finite int or float (a bool is not)."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _example(config: object, name: str, otherwise: float) -> object:
+    return getattr(type(config), name, otherwise)

@@ -1,0 +1,171 @@
+"""Damage that a rule should heal: erased states, cuts and clumps; batched, on the world's device.
+
+Nothing here reads a value back from the device, so all of it may be captured in a CUDA graph.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from npa_envs.errors import NPAError
+
+
+def random_particle(x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+    """Return the position of one particle of each world, each as likely as the others.
+
+    Args:
+        x: Particle positions [length units], shape [B, N, D].
+        generator: Where the choice comes from, on the device of `x`; None is torch's own.
+
+    Returns:
+        The chosen positions [length units], shape [B, D].
+
+    Raises:
+        NPAError: A wrong shape or dtype, no particles, or a generator on another device.
+    """
+    _check_positions(x)
+    if generator is not None and generator.device.type != x.device.type:
+        raise NPAError(
+            f"generator must be on the device of x, {x.device}, got {generator.device}: "
+            f"make it with torch.Generator({x.device.type!r})"
+        )
+    world_count, particle_count, _ = x.shape
+    if particle_count == 0:
+        raise NPAError("x must hold at least one particle, got N = 0: give a world with particles")
+    chosen = torch.randint(
+        particle_count, (world_count, 1, 1), generator=generator, device=x.device
+    )
+    return x.take_along_dim(chosen, dim=1).squeeze(1)
+
+
+def erase_state(x: Tensor, s: Tensor, *, centre: Tensor, radius: float | Tensor) -> Tensor:
+    """Return the states with those of the particles inside a ball set to zero.
+
+    Args:
+        x: Particle positions [length units], shape [B, N, D].
+        s: Particle states (dimensionless), shape [B, N, C].
+        centre: Centre of the ball in each world [length units], shape [B, D].
+        radius: Radius of the ball [length units], a number or a tensor of shape [B].
+
+    Returns:
+        The new states, shape [B, N, C]; `s` itself is left as it is.
+
+    Raises:
+        NPAError: A wrong shape or dtype, or a radius that is negative or not finite.
+    """
+    _check_world(x, s)
+    inside = _inside_ball(x, centre, radius)
+    return s.masked_fill(inside[..., None], 0.0)
+
+
+def cut(
+    x: Tensor, s: Tensor, *, centre: Tensor, normal: Tensor, gap: float | Tensor
+) -> tuple[Tensor, Tensor]:
+    """Open a slit: push what lies on either side of a line (a plane in 3D) apart by half the gap.
+
+    Args:
+        x: Particle positions [length units], shape [B, N, D].
+        s: Particle states (dimensionless), shape [B, N, C].
+        centre: A point on the line in each world [length units], shape [B, D].
+        normal: Direction across the line, of any length, shape [B, D]; a zero vector cuts nothing.
+        gap: Width of the slit [length units], a number or a tensor of shape [B].
+
+    Returns:
+        The new positions, shape [B, N, D], and the states as they came.
+
+    Raises:
+        NPAError: A wrong shape or dtype, or a gap that is negative or not finite.
+    """
+    _check_world(x, s)
+    _check_vector("centre", centre, x)
+    _check_vector("normal", normal, x)
+    width = _per_world("gap", gap, x)
+    length = torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
+    # Masked before the division: a zero normal must give a shift of zero, not NaN.
+    direction = normal / torch.where(length > 0, length, torch.ones_like(length))
+    height = ((x - centre[:, None]) * direction[:, None]).sum(dim=-1, keepdim=True)
+    side = (height >= 0).to(x.dtype) - 0.5
+    return x + side * width * direction[:, None], s
+
+
+def clump(
+    x: Tensor, s: Tensor, *, centre: Tensor, radius: float | Tensor, factor: float | Tensor
+) -> tuple[Tensor, Tensor]:
+    """Draw the particles inside a ball together.
+
+    Args:
+        x: Particle positions [length units], shape [B, N, D].
+        s: Particle states (dimensionless), shape [B, N, C].
+        centre: Centre of the ball in each world [length units], shape [B, D].
+        radius: Radius of the ball [length units], a number or a tensor of shape [B].
+        factor: The share of its distance from the centre that a particle loses (dimensionless),
+            from 0, nothing moves, to 1, all meet in the centre; a number or a tensor of shape [B].
+
+    Returns:
+        The new positions, shape [B, N, D], and the states as they came.
+
+    Raises:
+        NPAError: A wrong shape or dtype, a radius that is negative or not finite, or a factor
+            outside [0, 1].
+    """
+    _check_world(x, s)
+    inside = _inside_ball(x, centre, radius)
+    share = _per_world("factor", factor, x, highest=1.0)
+    pulled = x + share * (centre[:, None] - x)
+    return torch.where(inside[..., None], pulled, x), s
+
+
+def _inside_ball(x: Tensor, centre: Tensor, radius: float | Tensor) -> Tensor:
+    _check_vector("centre", centre, x)
+    distance = torch.linalg.vector_norm(x - centre[:, None], dim=-1)
+    return torch.le(distance, _per_world("radius", radius, x).squeeze(-1))
+
+
+def _per_world(name: str, value: float | Tensor, x: Tensor, *, highest: float = math.inf) -> Tensor:
+    """Return the number of each world in a shape [B, 1, 1] or [1, 1, 1]."""
+    if isinstance(value, Tensor):
+        if value.shape not in ((), (x.shape[0],)):
+            raise NPAError(
+                f"{name} must be a number or a tensor of shape [B] = [{x.shape[0]}], "
+                f"got {list(value.shape)}: give one number for each world"
+            )
+        # The values stay unread: looking at them would wait for the device.
+        return value.to(x).reshape(-1, 1, 1)
+    if not (math.isfinite(value) and 0 <= value <= highest):
+        rule = "finite and at least 0" if highest == math.inf else f"in [0, {highest:g}]"
+        raise NPAError(f"{name} must be {rule}, got {value}: try 0.1")
+    return x.new_full((1, 1, 1), value)
+
+
+def _check_positions(x: Tensor) -> None:
+    if x.ndim != 3:
+        cure = ": add a world dimension with x[None]" if x.ndim == 2 else ""
+        raise NPAError(f"x must have shape [B, N, D], got {tuple(x.shape)}{cure}")
+    if not x.is_floating_point():
+        raise NPAError(f"x must be float32 or float64, got {x.dtype}: convert it with x.float()")
+
+
+def _check_world(x: Tensor, s: Tensor) -> None:
+    _check_positions(x)
+    if s.ndim != 3 or s.shape[:2] != x.shape[:2]:
+        raise NPAError(
+            f"s must have shape [B, N, C] with the B and N of x, {tuple(x.shape[:2])}, "
+            f"got {tuple(s.shape)}: give one state for each particle"
+        )
+
+
+def _check_vector(name: str, vector: Tensor, x: Tensor) -> None:
+    wanted = (x.shape[0], x.shape[2])
+    if vector.shape != wanted:
+        raise NPAError(
+            f"{name} must have shape [B, D] = {wanted}, got {tuple(vector.shape)}: "
+            f"give one vector for each world, for example {name}.expand{wanted}"
+        )
+    if vector.device != x.device or vector.dtype != x.dtype:
+        raise NPAError(
+            f"{name} must be {x.dtype} on {x.device} like x, got {vector.dtype} on "
+            f"{vector.device}: convert it with {name}.to(x)"
+        )

@@ -1,0 +1,277 @@
+"""The built-in targets, drawn by the project itself: RGBA pictures, transparent around."""
+
+from __future__ import annotations
+
+import colorsys
+import math
+from collections.abc import Callable
+
+import numpy as np
+from PIL import Image, ImageChops
+
+from npa_envs.tasks.canvas import (
+    Canvas,
+    ellipse,
+    gradient,
+    grid,
+    mirror,
+    place,
+    polygon,
+    smooth_curve,
+    stroke,
+    union,
+)
+
+
+def draw_gecko() -> Image.Image:
+    """A gecko from above: spots, four legs with splayed toes, a tail that curls."""
+    canvas, line = Canvas(), 0.024
+    spine = [(0.06, 0.52), (-0.05, 0.28), (-0.12, 0.0), (-0.04, -0.26), (0.1, -0.44)]
+    tail = [
+        (0.1, -0.44), (0.18, -0.64), (0.1, -0.82), (-0.12, -0.87), (-0.36, -0.78),
+        (-0.56, -0.84), (-0.7, -0.76),
+    ]  # fmt: skip
+    head = [
+        (0.04, 0.42), (-0.1, 0.58), (-0.06, 0.8), (0.13, 0.94), (0.3, 0.85), (0.34, 0.66),
+        (0.22, 0.46),
+    ]  # fmt: skip
+    legs = [
+        ([(0.0, 0.3), (0.26, 0.24), (0.48, 0.4)], 40),
+        ([(-0.06, 0.3), (-0.32, 0.34), (-0.5, 0.56)], 130),
+        ([(0.02, -0.3), (0.3, -0.26), (0.5, -0.46)], -40),
+        ([(-0.02, -0.26), (-0.32, -0.16), (-0.55, -0.32)], -135),
+    ]
+
+    def silhouette(grow: float) -> Image.Image:
+        parts = [
+            stroke(spine, [0.2, 0.28, 0.38, 0.34, 0.2], grow=grow),
+            stroke(tail, [0.2, 0.19, 0.17, 0.14, 0.11, 0.08, 0.06], grow=grow),
+            polygon(smooth_curve(head, closed=True), grow=grow),
+        ]
+        for path, facing in legs:
+            parts.append(stroke(path, [0.17, 0.14, 0.11], grow=grow))
+            foot = path[-1]
+            for spread in (-84, -42, 0, 42, 84):
+                tip = place([(0.18, 0.0)], centre=foot, angle=facing + spread)[0]
+                parts.append(stroke([foot, tip], [0.06, 0.055], grow=grow))
+                parts.append(ellipse(tip, (0.042, 0.042), grow=grow))
+        return union(*parts)
+
+    canvas.paint(silhouette(line), "#14532d")
+    body = silhouette(0)
+    _, y = grid()
+    canvas.paint(body, gradient((0.95 - y) / 1.9, "#a3e635", "#4ade80", "#22c55e", "#0d9488"))
+    canvas.paint(stroke(spine, [0.05, 0.1, 0.14, 0.1, 0.05]), "#bef264", within=body)
+    spots = (
+        (-0.03, 0.36, 0.05), (0.1, 0.26, 0.038), (-0.17, 0.2, 0.042), (-0.07, 0.12, 0.052),
+        (-0.2, -0.03, 0.045), (0.03, 0.0, 0.042), (-0.11, -0.14, 0.054), (0.06, -0.2, 0.04),
+        (-0.03, -0.3, 0.045), (0.08, -0.4, 0.042), (0.06, 0.58, 0.036), (0.19, 0.55, 0.036),
+    )  # fmt: skip
+    canvas.paint_dots("#f97316", spots, within=body)
+    bands = (
+        (0.17, -0.58, 15), (0.14, -0.76, -35), (-0.01, -0.86, -85), (-0.21, -0.85, -110),
+        (-0.38, -0.785, -95), (-0.55, -0.835, -80),
+    )  # fmt: skip
+    for bx, by, angle in bands:
+        canvas.paint(ellipse((bx, by), (0.14, 0.028), angle=angle), "#fde047", within=body)
+    for centre in ((0.0, 0.74), (0.29, 0.77)):
+        canvas.paint(ellipse(centre, (0.085, 0.085)), "#14532d")
+        canvas.paint(ellipse(centre, (0.062, 0.062)), "#fde047")
+        canvas.paint(ellipse(centre, (0.03, 0.05), angle=-15), "#111827")
+    return canvas.finish()
+
+
+def draw_heart() -> Image.Image:
+    """A red heart with a dark outline and a highlight."""
+    canvas = Canvas()
+    turns = np.linspace(0, 2 * math.pi, 240, endpoint=False)
+    outline = [
+        (
+            16 * math.sin(t) ** 3 / 18.5,
+            (13 * math.cos(t) - 5 * math.cos(2 * t) - 2 * math.cos(3 * t) - math.cos(4 * t) + 2.5)
+            / 18.5,
+        )
+        for t in turns
+    ]
+    body = polygon(outline)
+    canvas.paint(polygon(outline, grow=0.055), "#7f1d1d")
+    x, y = grid()
+    amount = np.hypot(x + 0.35, y - 0.4) / 1.5
+    canvas.paint(body, gradient(amount, "#ff6b81", "#f43f5e", "#e11d48", "#9f1239"))
+    shine = [(-0.64, 0.2), (-0.62, 0.44), (-0.46, 0.58), (-0.27, 0.57)]
+    canvas.paint(stroke(shine, [0.06, 0.13, 0.13, 0.06]), "#ffe4e6", within=body)
+    canvas.paint(ellipse((-0.58, 0.03), (0.055, 0.055)), "#ffe4e6", within=body)
+    return canvas.finish()
+
+
+def draw_letter_a() -> Image.Image:
+    """A capital A with serifs, an outline and a seam of light."""
+    canvas, line = Canvas(), 0.035
+    left = [(-0.7, -0.8), (-0.52, -0.8), (0.06, 0.86), (-0.12, 0.86)]
+    right = [(0.3, -0.8), (0.7, -0.8), (0.14, 0.86), (-0.2, 0.86)]
+    bar = [(-0.45, -0.34), (-0.4, -0.16), (0.4, -0.16), (0.44, -0.34)]
+    feet = [
+        [(-0.9, -0.94), (-0.9, -0.84), (-0.7, -0.76), (-0.5, -0.76), (-0.3, -0.84), (-0.3, -0.94)],
+        [(0.07, -0.94), (0.07, -0.84), (0.28, -0.76), (0.69, -0.76), (0.95, -0.84), (0.95, -0.94)],
+        [(-0.36, 0.94), (-0.34, 0.84), (-0.1, 0.78), (0.14, 0.78), (0.28, 0.84), (0.3, 0.94)],
+    ]  # fmt: skip
+    parts = [left, right, bar, *feet]
+    canvas.paint(union(*(polygon(p, grow=line) for p in parts)), "#1e1b4b")
+    body = union(*(polygon(p) for p in parts))
+    x, y = grid()
+    amount = (0.95 - y + 0.3 * x) / 2
+    canvas.paint(body, gradient(amount, "#fb923c", "#ec4899", "#8b5cf6", "#2563eb"))
+    canvas.paint(stroke([(0.0, 0.66), (0.46, -0.7)], [0.05, 0.07]), "#fde68a", within=body)
+    return canvas.finish()
+
+
+def draw_ring() -> Image.Image:
+    """A ring around the colour wheel, with a thin inner ring on eight spokes."""
+    canvas = Canvas()
+    x, y = grid()
+    hue = ((np.arctan2(y, x) / (2 * math.pi)) % 1.0).astype(np.float32)
+    stops = [colorsys.hsv_to_rgb(k / 12, 0.9, 1.0) for k in range(13)]
+    wheel = ["#" + "".join(f"{round(255 * v):02x}" for v in rgb) for rgb in stops]
+
+    def band(inner: float, outer: float) -> Image.Image:
+        return ImageChops.subtract(ellipse((0, 0), (outer, outer)), ellipse((0, 0), (inner, inner)))
+
+    for k in range(8):
+        spoke = [(0.36, 0.0), (0.7, 0.0)]
+        canvas.paint(stroke(place(spoke, angle=45 * k + 22.5), [0.07, 0.07]), "#475569")
+    canvas.paint(band(0.66, 0.96), "#1e293b")
+    canvas.paint(band(0.7, 0.92), gradient(hue, *wheel))
+    canvas.paint(band(0.3, 0.4), gradient(1 - hue, *wheel))
+    return canvas.finish()
+
+
+def draw_butterfly() -> Image.Image:
+    """A butterfly with rimmed, spotted wings, a striped body and clubbed antennae."""
+    canvas, line = Canvas(), 0.055
+    upper = [
+        (0.04, 0.12), (0.2, 0.5), (0.56, 0.84), (0.88, 0.82), (0.9, 0.5), (0.7, 0.14),
+        (0.36, -0.02),
+    ]  # fmt: skip
+    lower = [
+        (0.04, 0.02), (0.4, 0.0), (0.68, -0.18), (0.72, -0.46), (0.54, -0.62), (0.5, -0.84),
+        (0.38, -0.66), (0.14, -0.36),
+    ]  # fmt: skip
+    x, y = grid()
+    distance = np.hypot(x, y - 0.05)
+    warm = gradient(distance / 1.05, "#fef08a", "#fbbf24", "#f97316", "#dc2626")
+    cool = gradient(distance / 0.9, "#a5f3fc", "#38bdf8", "#2563eb", "#6d28d9")
+    wings = (
+        (smooth_curve(upper, closed=True), warm),
+        (smooth_curve(lower, closed=True), cool),
+    )
+    for side in (list, mirror):
+        for outline, _ in wings:
+            canvas.paint(polygon(side(outline), grow=line), "#1c1917")
+        for outline, colours in reversed(wings):
+            canvas.paint(polygon(side(outline)), colours)
+        for vein in (
+            [(0.08, 0.14), (0.34, 0.42), (0.72, 0.8)],
+            [(0.08, 0.1), (0.42, 0.26), (0.86, 0.46)],
+        ):
+            canvas.paint(stroke(side(vein), [0.03, 0.03]), "#1c1917")
+        (px, py), (qx, qy), (rx, ry), (ex, ey) = side(
+            [(0.76, 0.66), (0.6, 0.58), (0.66, 0.28), (0.48, -0.32)]
+        )
+        canvas.paint_dots("#fef9c3", ((px, py, 0.075), (qx, qy, 0.05), (rx, ry, 0.06)))
+        for colour, size in (("#1e1b4b", 0.14), ("#f472b6", 0.095), ("#fef9c3", 0.045)):
+            canvas.paint_dots(colour, ((ex, ey, size),))
+        feeler = side([(0.02, 0.36), (0.1, 0.62), (0.26, 0.85)])
+        canvas.paint(stroke(feeler, [0.06, 0.055]), "#1c1917")
+        canvas.paint(ellipse(feeler[-1], (0.07, 0.055)), "#1c1917")
+    canvas.paint(stroke([(0, 0.26), (0, 0.0), (0, -0.5)], [0.16, 0.19, 0.17, 0.08]), "#1c1917")
+    canvas.paint(ellipse((0, 0.35), (0.1, 0.1)), "#1c1917")
+    for y0 in (0.12, -0.02, -0.16, -0.3):
+        canvas.paint(ellipse((0, y0), (0.06, 0.025)), "#f59e0b")
+    return canvas.finish()
+
+
+def draw_octopus() -> Image.Image:
+    """An octopus with eight curling arms."""
+    canvas, line = Canvas(), 0.03
+    right = [
+        [(0.22, -0.02), (0.5, 0.1), (0.76, 0.02), (0.9, 0.2), (0.76, 0.34)],
+        [(0.24, -0.12), (0.56, -0.16), (0.74, -0.34), (0.92, -0.26)],
+        [(0.18, -0.2), (0.42, -0.44), (0.52, -0.72), (0.74, -0.76), (0.78, -0.6)],
+        [(0.08, -0.2), (0.16, -0.54), (0.1, -0.82), (0.26, -0.92)],
+    ]
+    arms = [*right, *(mirror(a) for a in right)]
+    head = [
+        (0, 0.94), (0.32, 0.82), (0.43, 0.5), (0.32, 0.16), (0.28, -0.14), (0, -0.26),
+        (-0.28, -0.14), (-0.32, 0.16), (-0.43, 0.5), (-0.32, 0.82),
+    ]  # fmt: skip
+
+    def silhouette(grow: float) -> Image.Image:
+        return union(
+            polygon(smooth_curve(head, closed=True), grow=grow),
+            *(stroke(a, [0.2, 0.16, 0.12, 0.08], grow=grow) for a in arms),
+        )
+
+    canvas.paint(silhouette(line), "#4c1d95")
+    body = silhouette(0)
+    x, y = grid()
+    amount = np.hypot(x, y - 0.5) / 1.5
+    canvas.paint(body, gradient(amount, "#f0abfc", "#d946ef", "#a855f7", "#fb7185", "#fdba74"))
+    for arm in arms:
+        suckers = [(px, py, 0.03) for px, py in smooth_curve(arm, steps=3)[3:]]
+        canvas.paint_dots("#fff1f2", suckers, within=body)
+    canvas.paint_dots("#fae8ff", ((-0.2, 0.66, 0.06), (0.04, 0.78, 0.05), (0.22, 0.62, 0.045)))
+    for side in (-1, 1):
+        canvas.paint(ellipse((0.16 * side, 0.3), (0.12, 0.14)), "#ffffff")
+        canvas.paint(ellipse((0.14 * side, 0.28), (0.065, 0.085)), "#111827")
+        canvas.paint(ellipse((0.14 * side + 0.025, 0.32), (0.025, 0.025)), "#ffffff")
+    canvas.paint(stroke([(-0.1, 0.06), (0, 0.02), (0.1, 0.06)], [0.04, 0.05, 0.04]), "#4c1d95")
+    return canvas.finish()
+
+
+def draw_flower() -> Image.Image:
+    """A sunflower with a stem and two leaves."""
+    canvas, line, middle = Canvas(), 0.026, (0.0, 0.32)
+    stem = [(0.0, 0.1), (0.05, -0.3), (-0.03, -0.62), (0.02, -0.9)]
+    leaf = smooth_curve(
+        [(0.0, -0.74), (0.16, -0.44), (0.44, -0.32), (0.7, -0.36), (0.56, -0.62), (0.3, -0.78)],
+        closed=True,
+    )
+    for outline in (leaf, [(0.9 * x, y - 0.06) for x, y in mirror(leaf)]):
+        canvas.paint(polygon(outline, grow=line), "#14532d")
+        canvas.paint(polygon(outline), "#4ade80")
+        (ax, ay), (bx, by) = outline[16], outline[80]
+        rib = [outline[0], ((ax + bx) / 2, (ay + by) / 2), outline[40]]
+        canvas.paint(stroke(rib, [0.05, 0.035]), "#15803d")
+    canvas.paint(stroke(stem, [0.11, 0.11], grow=line), "#14532d")
+    canvas.paint(stroke(stem, [0.11, 0.11]), "#22c55e")
+    x, y = grid()
+    amount = np.hypot(x - middle[0], y - middle[1]) / 0.66
+    petals = gradient(amount, "#ea580c", "#f97316", "#facc15", "#fef08a")
+    petal = smooth_curve(
+        [(0.2, 0.07), (0.42, 0.1), (0.62, 0.0), (0.42, -0.1), (0.2, -0.07)], closed=True
+    )
+    for ring in (15, 0):
+        for k in range(12):
+            shape = place(petal, centre=middle, angle=30 * k + ring)
+            canvas.paint(polygon(shape, grow=line), "#9a3412")
+            canvas.paint(polygon(shape), petals)
+    canvas.paint(ellipse(middle, (0.28, 0.28)), "#431407")
+    canvas.paint(ellipse(middle, (0.24, 0.24)), "#7c2d12")
+    seeds = []
+    for k in range(40):
+        reach, turn = 0.215 * math.sqrt((k + 0.5) / 40), k * math.pi * (3 - math.sqrt(5))
+        seeds.append((reach * math.cos(turn), middle[1] + reach * math.sin(turn), 0.018))
+    canvas.paint_dots("#fbbf24", seeds)
+    return canvas.finish()
+
+
+DRAWINGS: dict[str, Callable[[], Image.Image]] = {
+    "butterfly": draw_butterfly,
+    "flower": draw_flower,
+    "gecko": draw_gecko,
+    "heart": draw_heart,
+    "letter-a": draw_letter_a,
+    "octopus": draw_octopus,
+    "ring": draw_ring,
+}
+"""Every built-in target by name; each draws an RGBA picture."""

@@ -1,0 +1,64 @@
+"""What the trainer asks of a task: a seed, a loss, a picture. Any object with these will do."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from npa_envs.rule import NPARule
+
+
+class Task(Protocol):
+    """A thing to learn. Shapes: B worlds, N particles, D space, C channels, R pixels.
+
+    No method may wait for the device (no `.item()`, no branch on a tensor's value): the trainer
+    captures the loss in a CUDA graph and never reads a number back between two log lines.
+    """
+
+    @property
+    def eps(self) -> float:
+        """Perception radius ε [length units]."""
+
+    @property
+    def box(self) -> tuple[float, ...] | None:
+        """Sides of the periodic box [length units], or None where the domain is open."""
+
+    @property
+    def update_prob(self) -> float:
+        """Probability p that a particle is updated in a step (dimensionless)."""
+
+    def make_rule(self, generator: torch.Generator) -> NPARule:
+        """Return an untrained rule on the CPU; its weights are drawn from `generator`."""
+
+    def seed(
+        self, world_count: int, *, generator: torch.Generator, device: torch.device
+    ) -> tuple[Tensor, Tensor]:
+        """Return fresh worlds: positions x [B, N, D] [length units] and states s [B, N, C]."""
+
+    def damage(self, x: Tensor, s: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Return the worlds damaged, as the pool's are before a rollout, so that they heal."""
+
+    def loss(self, x: Tensor, s: Tensor, path_length: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the scalar to minimise and its named parts, scalars too.
+
+        Args:
+            x: Positions [length units], shape [B, N, D].
+            s: States, shape [B, N, C].
+            path_length: Σ|Δx| of every particle over the rollout [length units], shape [B, N].
+        """
+
+    def picture(self, x: Tensor, s: Tensor) -> Tensor:
+        """Return the picture of each world: rgb sums and density, shape [B, R, R, 4]."""
+
+    def metric(self, x: Tensor, s: Tensor) -> Tensor:
+        """Return how far each world is from the goal, shape [B]; lower is better."""
+
+
+class PictureTask(Task, Protocol):
+    """A task that is learned from a picture: what the evaluation needs for its PSNR."""
+
+    @property
+    def target_picture(self) -> Tensor:
+        """The picture to match: rgb sums and density, shape [R, R, 4]."""

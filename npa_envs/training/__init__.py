@@ -1,0 +1,63 @@
+"""Training: configurations and presets, the pool, the trainer, checkpoints and logs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from npa_envs.tasks.task import PictureTask, Task
+from npa_envs.training.config import Morphogenesis2DTrainConfig, TrainConfig
+from npa_envs.training.device import check_device
+from npa_envs.training.divergence import DivergedError
+from npa_envs.training.folder import JsonlLog, RunFolder
+from npa_envs.training.overrides import config_to_dict, load_config, override
+from npa_envs.training.presets import TASKS, TaskEntry, preset, task_entry
+from npa_envs.training.trainer import Trainer, TrainResult
+
+__all__ = [
+    "TASKS",
+    "DivergedError",
+    "JsonlLog",
+    "Morphogenesis2DTrainConfig",
+    "PictureTask",
+    "RunFolder",
+    "Task",
+    "TaskEntry",
+    "TrainConfig",
+    "TrainResult",
+    "Trainer",
+    "check_device",
+    "config_to_dict",
+    "load_config",
+    "override",
+    "preset",
+    "task_entry",
+    "train",
+]
+
+
+def train(
+    config: TrainConfig[Any],
+    task_name: str = "morphogenesis2d",
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+    progress: bool = True,
+    max_seconds: float | None = None,
+) -> TrainResult:
+    """Train a rule on a task of the table `TASKS`.
+
+    Args:
+        config: The run's configuration, for example `preset("fast", target="heart")`.
+        task_name: The task.
+        resume: Go on from the checkpoint in `config.out`.
+        overwrite: Start anew although `config.out` holds a run; its files are removed.
+        progress: Show a progress bar.
+        max_seconds: Stop after this time [s]; the run can be resumed.
+
+    Raises:
+        NPAError: The task is unknown, its target cannot be loaded, or as for `Trainer`.
+        DivergedError: The loss is not finite.
+    """
+    task = task_entry(task_name).make(config.task, check_device(config.device))
+    trainer = Trainer(task, config, task_name=task_name, resume=resume, overwrite=overwrite)
+    return trainer.run(progress=progress, max_seconds=max_seconds)

@@ -1,0 +1,134 @@
+"""Checkpoints: everything a killed run needs to go on as if it had never stopped."""
+
+from __future__ import annotations
+
+import io
+import pickle
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from npa_envs.errors import NPAError
+from npa_envs.files import write_bytes
+from npa_envs.training.config import TrainConfig
+from npa_envs.training.overrides import config_to_dict
+
+FORMAT = "npa-envs checkpoint"
+"""Marks a file as ours."""
+
+FORMAT_VERSION = 1
+"""Raised whenever what a checkpoint holds changes."""
+
+MAY_DIFFER = frozenset(
+    {
+        "out",
+        "repeats",
+        "log_interval",
+        "picture_interval",
+        "checkpoint_interval",
+        "tensorboard",
+        "cuda_graph",
+    }
+)
+"""Fields that a resumed run may set anew: they do not change what is learned, only how long."""
+
+
+def save_checkpoint(path: Path, content: dict[str, Any]) -> None:
+    """Write a checkpoint, whole or not at all.
+
+    Args:
+        path: The file; an existing one stays as it is until the new one is complete.
+        content: Tensors, numbers, strings, and lists and dicts of them.
+
+    Raises:
+        NPAError: The file cannot be written.
+    """
+    # torch.save straight to the file would hide the system's reason (disk full) from the caller.
+    buffer = io.BytesIO()
+    torch.save({"format": FORMAT, "format_version": FORMAT_VERSION, **content}, buffer)
+    write_bytes(path, buffer.getvalue())
+
+
+def load_checkpoint(path: Path) -> dict[str, Any]:
+    """Read a checkpoint on to the CPU; nothing in it is executed.
+
+    Args:
+        path: A file that `save_checkpoint` wrote.
+
+    Raises:
+        NPAError: There is no such file, it cannot be read, or it is no checkpoint of this version.
+    """
+    if not path.is_file():
+        raise NPAError(
+            f"there is no checkpoint to resume from at {str(path)!r}: give the folder of an "
+            "earlier run as `out`, or start a new run"
+        )
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except OSError as error:
+        raise NPAError(f"cannot read the checkpoint {str(path)!r}: {error}") from error
+    except (
+        RuntimeError,
+        EOFError,
+        ValueError,
+        KeyError,
+        pickle.UnpicklingError,
+        zipfile.BadZipFile,
+    ) as error:
+        raise NPAError(
+            f"{str(path)!r} is not a checkpoint or is damaged ({type(error).__name__}): "
+            "start a new run with overwrite, or put a copy of it in its place"
+        ) from error
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise NPAError(f"{str(path)!r} is not a checkpoint of npa-envs: choose another folder")
+    if content["format_version"] != FORMAT_VERSION:
+        raise NPAError(
+            f"{str(path)!r} has checkpoint format {content['format_version']}, this version reads "
+            f"{FORMAT_VERSION}: resume it with the version of npa-envs that wrote it"
+        )
+    return content
+
+
+def check_same_run(
+    content: dict[str, Any], task_name: str, config: TrainConfig[Any], path: Path
+) -> None:
+    """Check that a checkpoint belongs to the run that is to be resumed.
+
+    Args:
+        content: What `load_checkpoint` returned.
+        task_name: Name of the task of the run.
+        config: Configuration of the run.
+        path: Where the checkpoint lies, for the error.
+
+    Raises:
+        NPAError: It is of another task, of another configuration, or further than the run goes.
+    """
+    if content["task_name"] != task_name:
+        raise NPAError(
+            f"the checkpoint {str(path)!r} is of task {content['task_name']!r}, "
+            f"not of {task_name!r}: resume it with that task, or choose another folder"
+        )
+    theirs, ours = _flat(content["config"]), _flat(config_to_dict(config))
+    differences = [
+        f"{name}: {theirs.get(name, 'absent')!r} there, {ours.get(name, 'absent')!r} here"
+        for name in sorted(theirs.keys() | ours.keys())
+        if name not in MAY_DIFFER and theirs.get(name) != ours.get(name)
+    ]
+    if differences:
+        raise NPAError(
+            f"the checkpoint {str(path)!r} is of another configuration ({'; '.join(differences)}): "
+            f"resume with the configuration in {str(path.with_name('config.json'))!r}, or start a "
+            "new run in another folder"
+        )
+    if content["iteration"] > config.total_iterations:
+        raise NPAError(
+            f"the checkpoint {str(path)!r} is at iteration {content['iteration']}, beyond the "
+            f"{config.total_iterations} of this run: raise repeats"
+        )
+
+
+def _flat(config: dict[str, Any]) -> dict[str, Any]:
+    own = {name: value for name, value in config.items() if name != "task"}
+    return own | {f"task.{name}": value for name, value in config["task"].items()}

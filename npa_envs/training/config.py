@@ -1,0 +1,185 @@
+"""What a training run can be told."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Generic, Literal, TypeVar
+
+import torch
+
+from npa_envs.errors import NPAError
+from npa_envs.tasks.checks import check_fraction, check_non_negative, check_positive, is_whole
+from npa_envs.tasks.morphogenesis2d_config import Morphogenesis2DConfig
+
+TaskConfigT = TypeVar("TaskConfigT")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainConfig(Generic[TaskConfigT]):
+    """A training run: the schedule, the pool, the optimiser, the machine, what is written.
+
+    The defaults are the paper's for 2D morphogenesis (design section 4). Fields of the task lie
+    in `task`; `npa_envs.training.override` and configuration files take both kinds by plain name.
+    """
+
+    task: TaskConfigT
+    """The task's own configuration."""
+
+    iterations: int = 10_000
+    """Optimiser steps in one repeat."""
+
+    repeats: int = 3
+    """How often the schedule runs; rule and pool go on, the optimiser starts afresh."""
+
+    world_count: int = 8
+    """Worlds in a batch, B."""
+
+    pool_size: int = 512
+    """Worlds that live on between batches."""
+
+    steps: tuple[int, int] = (32, 96)
+    """Range [lo, hi) that the number of steps of a rollout is drawn from, uniformly."""
+
+    learning_rate: float = 5e-4
+    """AdamW's learning rate at the start of each repeat."""
+
+    milestones: tuple[int, ...] = (2_000, 4_000, 6_000, 8_000)
+    """Iterations of a repeat after which the learning rate is multiplied by `decay`."""
+
+    decay: float = 0.3
+    """Factor on the learning rate at each milestone, in (0, 1]."""
+
+    weight_decay: float = 0.0
+    """AdamW's weight decay."""
+
+    normalise_gradients: bool = True
+    """Every parameter's gradient is divided by its own norm before the optimiser's step."""
+
+    seed_interval: int = 16
+    """The first world of every this-many-th batch is a fresh seed; 1: of every batch."""
+
+    damage: bool = True
+    """Worlds from the pool are damaged before the rollout, so that the rule learns to heal."""
+
+    runaway_limit: float = 10.0
+    """A world with |x| or |s| above this, or not finite, is replaced by a seed in the pool."""
+
+    seed: int = 0
+    """Seed of every random number of the run."""
+
+    device: str = "cpu"
+    """Where to train: "cpu", "cuda", "cuda:1", ..."""
+
+    dtype: Literal["float32", "float64"] = "float32"
+    """Precision of the worlds and of the rule."""
+
+    memory: Literal["store", "recompute"] = "store"
+    """Keep the perception of every step for the backward pass, or compute it again there."""
+
+    cuda_graph: bool = True
+    """On CUDA, capture rollout, loss and backward pass as one graph per number of steps."""
+
+    out: Path = Path("runs/morphogenesis2d")
+    """Folder that log, pictures, checkpoint and rule are written to; created where missing."""
+
+    log_interval: int = 10
+    """Iterations between two lines of the log."""
+
+    picture_interval: int = 250
+    """Iterations between two pictures of the batch; 0: none."""
+
+    checkpoint_interval: int = 500
+    """Iterations between two checkpoints."""
+
+    tensorboard: bool = True
+    """Write TensorBoard events as well as the JSONL log."""
+
+    def __post_init__(self) -> None:
+        """Check every field.
+
+        Raises:
+            NPAError: A field has the wrong type or lies outside its range.
+        """
+        check_positive(self, int, "iterations", "repeats", "world_count", "pool_size")
+        check_positive(self, int, "seed_interval", "log_interval", "checkpoint_interval")
+        check_positive(self, float, "learning_rate", "runaway_limit")
+        check_fraction(self, "decay")
+        check_non_negative(self, "weight_decay")
+        for name in ("seed", "picture_interval"):
+            value = getattr(self, name)
+            if not is_whole(value) or value < 0:
+                raise NPAError(f"{name} must be a whole number of at least 0, got {value!r}")
+        self._check_schedule()
+        if self.world_count > self.pool_size:
+            raise NPAError(
+                f"world_count must be at most pool_size (batches are drawn without replacement), "
+                f"got world_count={self.world_count} and pool_size={self.pool_size}: "
+                f"set pool_size={self.world_count} or more"
+            )
+        self._check_choice("dtype", ("float32", "float64"))
+        self._check_choice("memory", ("store", "recompute"))
+        try:
+            kind = torch.device(self.device).type
+        except (RuntimeError, TypeError) as error:
+            raise NPAError(
+                f"device must name a device, got {self.device!r}: 'cpu' or 'cuda' ({error})"
+            ) from error
+        if kind not in ("cpu", "cuda"):
+            raise NPAError(f"device must be 'cpu' or 'cuda', got {self.device!r}")
+        if not isinstance(self.out, Path):
+            raise NPAError(f"out must be a pathlib.Path, got {self.out!r}: Path({self.out!r})")
+
+    def _check_schedule(self) -> None:
+        steps = self.steps
+        if (
+            not isinstance(steps, tuple)
+            or len(steps) != 2
+            or not all(is_whole(bound) for bound in steps)
+            or not 1 <= steps[0] < steps[1]
+        ):
+            raise NPAError(
+                f"steps must be two whole numbers (lo, hi) with 1 <= lo < hi, got {steps!r}: "
+                "hi is exclusive, so exactly 32 steps are steps=(32, 33)"
+            )
+        milestones = self.milestones
+        if not isinstance(milestones, tuple) or not all(is_whole(m) for m in milestones):
+            raise NPAError(f"milestones must be a tuple of whole numbers, got {milestones!r}")
+        if any(m < 1 for m in milestones) or list(milestones) != sorted(set(milestones)):
+            raise NPAError(
+                f"milestones must be positive and increasing, got {milestones!r}: "
+                "for example milestones=(2000, 4000)"
+            )
+
+    def _check_choice(self, name: str, choices: tuple[str, ...]) -> None:
+        if getattr(self, name) not in choices:
+            raise NPAError(
+                f"{name} must be one of {', '.join(choices)}, got {getattr(self, name)!r}"
+            )
+
+    @property
+    def total_iterations(self) -> int:
+        """Optimiser steps of the whole run: iterations times repeats."""
+        return self.iterations * self.repeats
+
+    @property
+    def torch_dtype(self) -> torch.dtype:
+        """`dtype` as torch's own."""
+        return torch.float64 if self.dtype == "float64" else torch.float32
+
+    def learning_rate_at(self, iteration: int) -> float:
+        """Return the learning rate of an iteration, counted from 0 over all repeats.
+
+        It is a function of the iteration alone (MultiStepLR, restarted with each repeat), so
+        that a resumed run needs no scheduler state.
+
+        Args:
+            iteration: Iterations done so far in the run.
+        """
+        within = iteration % self.iterations
+        passed = sum(milestone <= within for milestone in self.milestones)
+        return float(self.learning_rate * self.decay**passed)
+
+
+Morphogenesis2DTrainConfig = TrainConfig[Morphogenesis2DConfig]
+"""A training run of 2D morphogenesis."""

@@ -1,0 +1,57 @@
+"""The report of a loss that is not finite."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from npa_envs.errors import NPAError
+from npa_envs.tasks.task import Task
+
+
+class DivergedError(NPAError):
+    """The loss became infinite or NaN; the message says when, which term, and in which worlds."""
+
+
+def divergence_error(task: Task, snapshot: dict[str, Any], diagnosis: Path) -> DivergedError:
+    """Return the error that ends a run whose loss is not finite.
+
+    Args:
+        task: The run's task, to find the worlds at fault.
+        snapshot: `LossMeter.snapshot()`.
+        diagnosis: Where the snapshot was written.
+    """
+    terms = [name for name, value in snapshot["terms"].items() if not math.isfinite(value)]
+    shown = [name for name in terms if name != "loss"] or terms
+    worlds = bad_worlds(task, snapshot)
+    where = f"world{'s' * (len(worlds) > 1)} {', '.join(map(str, worlds))}" if worlds else "no one"
+    return DivergedError(
+        f"the loss must stay finite, but {' and '.join(shown)} was not in iteration "
+        f"{snapshot['iteration']} ({snapshot['steps']} steps, {where} of the batch): lower "
+        f"learning_rate, or use fewer steps; the worlds and the rule are in {str(diagnosis)!r}, "
+        "the last good checkpoint is untouched"
+    )
+
+
+def bad_worlds(task: Task, snapshot: dict[str, Any]) -> list[int]:
+    """Return which worlds of the batch alone give a loss that is not finite.
+
+    Args:
+        task: The run's task.
+        snapshot: `LossMeter.snapshot()`, with `x` [B, N, D] and `s` [B, N, C] after the rollout.
+    """
+    x, s = snapshot["x"], snapshot["s"]
+    found = []
+    for world in range(len(x)):
+        one = slice(world, world + 1)
+        finite = bool(torch.isfinite(x[one]).all() and torch.isfinite(s[one]).all())
+        if finite:
+            with torch.no_grad():
+                total, parts = task.loss(x[one], s[one], torch.zeros_like(x[one][..., 0]))
+            finite = all(bool(torch.isfinite(v).all()) for v in (total, *parts.values()))
+        if not finite:
+            found.append(world)
+    return found

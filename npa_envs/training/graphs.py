@@ -1,0 +1,173 @@
+"""Rollout, loss and backward pass of one iteration: run eagerly, or replayed as CUDA graphs."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, Protocol
+
+import torch
+from torch import Tensor
+
+import npa_envs.dynamics
+from npa_envs.dynamics import Memory
+from npa_envs.rule import NPARule
+from npa_envs.tasks.task import Task
+from npa_envs.training.config import TrainConfig
+
+WARM_UP_STEPS = 2
+"""Steps of the eager rollout that loads every kernel before the first capture."""
+
+
+class Rollout(Protocol):
+    """`npa_envs.rollout` as the trainer calls it."""
+
+    def __call__(
+        self,
+        rule: NPARule,
+        x: Tensor,
+        s: Tensor,
+        steps: int,
+        /,
+        *,
+        eps: float,
+        box: tuple[float, ...] | None,
+        update_prob: float,
+        memory: Memory,
+        generator: torch.Generator,
+        return_path_length: Literal[True],
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return positions, states and path lengths after `steps` steps."""
+
+
+class EagerIteration:
+    """One iteration up to the gradients, launched kernel by kernel.
+
+    Reads `x0`, `s0`; writes `x`, `s`, `terms` and the `.grad` of every parameter. All of these
+    are the same tensors in every iteration: fill them with `copy_`.
+
+    Args:
+        task: Gives the loss and the world's constants.
+        rule: The rule to differentiate.
+        config: Gives the batch size and the rollout's memory mode.
+        x: Positions of any batch [length units], shape [B, N, D]: shape, dtype and device count.
+        s: States of any batch, shape [B, N, C], likewise.
+        generator: Randomness of the update masks, on the worlds' device.
+        rollout: The rollout to run; another one only in tests.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        rule: NPARule,
+        config: TrainConfig[Any],
+        x: Tensor,
+        s: Tensor,
+        generator: torch.Generator,
+        rollout: Rollout | None = None,
+    ) -> None:
+        self.x0, self.s0 = x.clone(), s.clone()
+        """Worlds before the rollout."""
+        self.x, self.s = torch.empty_like(x), torch.empty_like(s)
+        """Worlds after the rollout."""
+        with torch.no_grad():
+            total, parts = task.loss(x, s, torch.zeros_like(x[..., 0]))
+        self.term_names: tuple[str, ...] = ("loss", *parts)
+        """Names of `terms`."""
+        self.terms = total.new_zeros(len(self.term_names))
+        """The loss and then its named parts, shape [K]."""
+        self.parameters = [p for p in rule.parameters() if p.requires_grad]
+        """What the gradients are for."""
+        self._gradients = [torch.zeros_like(p) for p in self.parameters]
+        for parameter, buffer in zip(self.parameters, self._gradients, strict=True):
+            parameter.grad = buffer
+        self._task = task
+        self._rule = rule
+        self._memory = config.memory
+        self._generator = generator
+        self._rollout: Rollout = npa_envs.dynamics.rollout if rollout is None else rollout
+
+    def run(self, steps: int) -> None:
+        """Run the rollout, the loss and the backward pass.
+
+        Args:
+            steps: Steps of the rollout, T.
+        """
+        self._forward_backward(steps)
+
+    def _forward_backward(self, steps: int) -> None:
+        x, s, path_length = self._rollout(
+            self._rule,
+            self.x0,
+            self.s0,
+            steps,
+            eps=self._task.eps,
+            box=self._task.box,
+            update_prob=self._task.update_prob,
+            memory=self._memory,
+            generator=self._generator,
+            return_path_length=True,
+        )
+        total, parts = self._task.loss(x, s, path_length)
+        # Not backward(): its accumulation nodes remember the stream they were first used on,
+        # which a capture on another stream must not touch.
+        gradients = torch.autograd.grad(
+            total, self.parameters, allow_unused=True, materialize_grads=True
+        )
+        for buffer, gradient in zip(self._gradients, gradients, strict=True):
+            buffer.copy_(gradient)
+        self.terms.copy_(torch.stack([total, *parts.values()]).detach())
+        self.x.copy_(x.detach())
+        self.s.copy_(s.detach())
+
+
+class GraphedIteration(EagerIteration):
+    """The same on CUDA, captured once for every number of steps and replayed from then on.
+
+    Launches of thousands of short kernels would otherwise take longer than the kernels do. All
+    graphs share one memory pool: they never run at the same time, and everything that outlives a
+    replay lies in buffers outside that pool.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._graphs: dict[int, torch.cuda.CUDAGraph] = {}
+        self._stream = torch.cuda.Stream(self.x0.device)  # type: ignore[no-untyped-call]
+        self._memory_pool = torch.cuda.graph_pool_handle()
+
+    def run(self, steps: int) -> None:
+        """Replay the graph for this number of steps, capturing it when it is first asked for.
+
+        Args:
+            steps: Steps of the rollout, T.
+        """
+        with torch.cuda.device(self.x0.device):
+            if steps not in self._graphs:
+                self._graphs[steps] = self._capture(steps)
+            self._graphs[steps].replay()
+
+    def _capture(self, steps: int) -> torch.cuda.CUDAGraph:
+        if not self._graphs:
+            self._warm_up()
+        graph = torch.cuda.CUDAGraph()
+        # Without this every replay would draw the masks of the capture again.
+        graph.register_generator_state(self._generator)
+        # The backward pass runs on a thread of its own, whose calls the strict mode would refuse.
+        with torch.cuda.graph(
+            graph,
+            pool=self._memory_pool,
+            stream=self._stream,
+            capture_error_mode="thread_local",
+        ):
+            self._forward_backward(steps)
+        return graph
+
+    def _warm_up(self) -> None:
+        """Run eagerly once: load kernels and allocate workspaces, which no capture may do."""
+        # A resumed run warms up again: the masks that follow must not depend on that.
+        state = self._generator.get_state()
+        current = torch.cuda.current_stream()
+        self._stream.wait_stream(current)
+        with torch.cuda.stream(self._stream):
+            self._forward_backward(WARM_UP_STEPS)
+        current.wait_stream(self._stream)
+        torch.cuda.synchronize()
+        self._generator.set_state(state)

@@ -1,0 +1,166 @@
+"""Change a configuration by plain field names or by a file: `override`, `load_config`."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import tomllib
+import types
+import typing
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+from npa_envs.errors import MissingDependencyError, NPAError, suggest
+from npa_envs.training.config import TrainConfig
+
+TaskConfigT = TypeVar("TaskConfigT")
+
+
+def override(config: TrainConfig[TaskConfigT], /, **fields: Any) -> TrainConfig[TaskConfigT]:
+    """Return `config` with fields changed, the run's and the task's alike, by plain name.
+
+    Values may be as plain as a file's: a list for a tuple, a string for a path, "5e-4" for a
+    number (YAML reads that as a string). `task` may be a mapping of task fields.
+
+    Args:
+        config: The configuration to start from; it stays as it is.
+        fields: New values by field name, for example `iterations=500, target="heart"`.
+
+    Raises:
+        NPAError: A name is unknown, or a value has the wrong type or lies outside its range.
+    """
+    own = _field_types(config)
+    task = config.task
+    task_types = _field_types(task)
+    own_changes: dict[str, Any] = {}
+    task_changes: dict[str, Any] = {}
+    for name, value in fields.items():
+        if name == "task" and isinstance(value, Mapping):
+            for inner, inner_value in value.items():
+                if inner not in task_types:
+                    raise NPAError(f"unknown field 'task.{inner}': {suggest(inner, task_types)}")
+                task_changes[inner] = _convert(inner, inner_value, task_types[inner])
+        elif name == "task":
+            if type(value) is not type(config.task):
+                raise NPAError(
+                    f"task must be a {type(config.task).__name__} or a mapping of its fields, "
+                    f"got {value!r}"
+                )
+            task = value
+        elif name in own:
+            own_changes[name] = _convert(name, value, own[name])
+        elif name in task_types:
+            task_changes[name] = _convert(name, value, task_types[name])
+        else:
+            known = [*own, *task_types]
+            raise NPAError(f"unknown field {name!r}: {suggest(name, known)}")
+    changed = dataclasses.replace(typing.cast(Any, task), **task_changes)
+    return dataclasses.replace(config, task=changed, **own_changes)
+
+
+def load_config(path: str | Path, base: TrainConfig[TaskConfigT]) -> TrainConfig[TaskConfigT]:
+    """Return `base` with the fields that a YAML, TOML or JSON file sets.
+
+    The file holds field names and values at its top level; fields of the task may also lie in a
+    section `task`. The `config.json` that a run leaves in its folder is such a file.
+
+    Args:
+        path: A file that ends in .yaml, .yml, .toml or .json.
+        base: The configuration that gives every field the file does not, for example a preset.
+
+    Raises:
+        NPAError: The file cannot be read, is no such file, names an unknown field, or gives a
+            value of the wrong type or outside its range.
+        MissingDependencyError: The file is YAML and PyYAML is not installed.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise NPAError(f"cannot read the configuration file {str(path)!r}: {error}") from error
+    fields = _parse(path, text)
+    if not isinstance(fields, Mapping) or not all(isinstance(key, str) for key in fields):
+        raise NPAError(
+            f"the configuration file {str(path)!r} must hold field names and values at its top "
+            f"level, got {type(fields).__name__}: for example 'iterations: 500'"
+        )
+    try:
+        return override(base, **fields)
+    except NPAError as error:
+        raise NPAError(f"in the configuration file {str(path)!r}: {error}") from error
+
+
+def config_to_dict(config: TrainConfig[Any]) -> dict[str, Any]:
+    """Return a configuration as plain numbers, strings, lists and one inner dict `task`.
+
+    Args:
+        config: The configuration; `override(base, **config_to_dict(config))` gives it back.
+    """
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, tuple):
+            return [plain(item) for item in value]
+        if isinstance(value, dict):
+            return {key: plain(item) for key, item in value.items()}
+        return str(value) if isinstance(value, Path) else value
+
+    result = plain(dataclasses.asdict(config))
+    assert isinstance(result, dict)
+    return result
+
+
+def _parse(path: Path, text: str) -> Any:
+    suffix = path.suffix.lower()
+    try:
+        if suffix == ".toml":
+            return tomllib.loads(text)
+        if suffix == ".json":
+            return json.loads(text)
+        if suffix in (".yaml", ".yml"):
+            try:
+                import yaml
+            except ImportError as error:
+                raise MissingDependencyError(
+                    "reading YAML needs PyYAML: pip install pyyaml, or write the file as TOML"
+                ) from error
+            try:
+                # An empty file sets nothing.
+                return yaml.safe_load(text) or {}
+            except yaml.YAMLError as error:
+                raise NPAError(f"{str(path)!r} is not valid YAML: {error}") from error
+    except (tomllib.TOMLDecodeError, json.JSONDecodeError) as error:
+        raise NPAError(f"{str(path)!r} is not valid {suffix[1:].upper()}: {error}") from error
+    raise NPAError(
+        f"a configuration file must end in .yaml, .yml, .toml or .json, got {str(path)!r}"
+    )
+
+
+def _field_types(config: Any) -> dict[str, Any]:
+    hints = typing.get_type_hints(type(config))
+    return {field.name: hints[field.name] for field in dataclasses.fields(config)}
+
+
+def _convert(name: str, value: Any, kind: Any) -> Any:
+    """Return a plain value as the field's type; ranges are the dataclass's own business."""
+    origin = typing.get_origin(kind)
+    if origin is typing.Literal:
+        return value
+    if origin in (typing.Union, types.UnionType):
+        inner = [option for option in typing.get_args(kind) if option is not type(None)]
+        return None if value is None else _convert(name, value, inner[0])
+    if origin is tuple:
+        if not isinstance(value, list | tuple):
+            raise NPAError(f"{name} must be a list, got {value!r}: for example {name}: [1, 2]")
+        item = typing.get_args(kind)[0]
+        return tuple(_convert(name, entry, item) for entry in value)
+    if kind is Path and isinstance(value, str | Path):
+        return Path(value)
+    if kind is float and not isinstance(value, bool):
+        try:
+            return float(value)
+        except (TypeError, ValueError):
+            pass
+    elif isinstance(value, kind) and (kind is bool or not isinstance(value, bool)):
+        return value
+    raise NPAError(f"{name} must be of type {kind.__name__}, got {value!r}")

@@ -1,0 +1,127 @@
+"""The tasks that can be trained, by name, and their presets."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from npa_envs.errors import NPAError, suggest
+from npa_envs.tasks.morphogenesis2d_config import Morphogenesis2DConfig
+from npa_envs.tasks.task import PictureTask
+from npa_envs.training.config import Morphogenesis2DTrainConfig, TrainConfig
+from npa_envs.training.overrides import override
+
+
+@dataclass(frozen=True)
+class TaskEntry:
+    """A task that can be trained."""
+
+    summary: str
+    """One line for lists."""
+
+    presets: Mapping[str, TrainConfig[Any]]
+    """Configurations by name: `paper`, `fast`, `tiny`."""
+
+    make: Callable[[Any, torch.device], PictureTask]
+    """Builds the task from its own configuration, on a device."""
+
+
+def _make_morphogenesis2d(config: Morphogenesis2DConfig, device: torch.device) -> PictureTask:
+    # Imported late: a task brings the kernels along, which a list of presets does not need.
+    from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
+
+    return Morphogenesis2D(config, device=device)
+
+
+_OUT = Path("runs/morphogenesis2d")
+
+MORPHOGENESIS2D_PRESETS: Mapping[str, Morphogenesis2DTrainConfig] = {
+    "paper": TrainConfig(task=Morphogenesis2DConfig(), out=_OUT),
+    "fast": TrainConfig(
+        task=Morphogenesis2DConfig(
+            target_point_count=512,
+            particle_count=512,
+            hidden_dim=96,
+            eps=0.2,
+            resolution=64,
+        ),
+        iterations=600,
+        repeats=1,
+        world_count=4,
+        pool_size=32,
+        steps=(16, 40),
+        learning_rate=2e-3,
+        milestones=(300, 450, 550),
+        out=_OUT,
+        picture_interval=50,
+        checkpoint_interval=50,
+        tensorboard=False,
+    ),
+    "tiny": TrainConfig(
+        task=Morphogenesis2DConfig(
+            target="ring",
+            target_point_count=128,
+            particle_count=128,
+            hidden_dim=32,
+            eps=0.3,
+            resolution=32,
+        ),
+        iterations=40,
+        repeats=1,
+        world_count=2,
+        pool_size=8,
+        steps=(8, 16),
+        learning_rate=5e-3,
+        milestones=(30,),
+        out=_OUT,
+        log_interval=1,
+        picture_interval=20,
+        checkpoint_interval=20,
+        tensorboard=False,
+    ),
+}
+"""2D morphogenesis: `paper` (design section 4), `fast` (minutes on one core), `tiny` (tests)."""
+
+TASKS: Mapping[str, TaskEntry] = {
+    "morphogenesis2d": TaskEntry(
+        summary="grow a picture from a disk of blank particles",
+        presets=MORPHOGENESIS2D_PRESETS,
+        make=_make_morphogenesis2d,
+    ),
+}
+"""Every task that can be trained, by its name on the command line and in checkpoints."""
+
+
+def task_entry(task_name: str) -> TaskEntry:
+    """Return the entry of a task.
+
+    Args:
+        task_name: For example `morphogenesis2d`.
+
+    Raises:
+        NPAError: There is no such task.
+    """
+    if task_name not in TASKS:
+        raise NPAError(f"unknown task {task_name!r}: {suggest(task_name, TASKS)}")
+    return TASKS[task_name]
+
+
+def preset(name: str, task_name: str = "morphogenesis2d", /, **fields: Any) -> TrainConfig[Any]:
+    """Return a preset with fields changed by plain name.
+
+    Args:
+        name: `paper`, `fast` or `tiny`.
+        task_name: The task it is for.
+        fields: New values by field name, the run's and the task's alike.
+
+    Raises:
+        NPAError: The task, the preset or a field is unknown, or a value is not allowed.
+    """
+    presets = task_entry(task_name).presets
+    if name not in presets:
+        raise NPAError(f"unknown preset {name!r} of {task_name}: {suggest(name, presets)}")
+    return override(presets[name], **fields)

@@ -1,0 +1,396 @@
+"""The command line does what it says, says what it did, and refuses mistakes in one line."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from npa_envs.cli import COMMANDS, main
+from npa_envs.errors import NPAError
+from npa_envs.rule import NPARule
+from npa_envs.rule_io import load_rule, save_rule
+
+TINY = ["morphogenesis2d", "--preset", "tiny", "--iterations", "6", "--no-progress"]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run of six iterations."""
+    folder = tmp_path_factory.mktemp("runs") / "ring"
+    assert main(["train", *TINY, "--milestones", "--out", str(folder)]) == 0
+    return folder
+
+
+def error_of(capsys: pytest.CaptureFixture[str], words: list[str]) -> str:
+    """Run a command that must be refused, and return its message."""
+    assert main(words) == 2
+    captured = capsys.readouterr()
+    assert captured.err.count("\n") == 1
+    assert captured.err.startswith("npa-envs: error: ")
+    return captured.err
+
+
+def test_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--help"]) == 0
+    text = capsys.readouterr().out
+    assert [name for name in COMMANDS if f"\n  {name} " not in text] == []
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_explains_itself(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    try:
+        code: object = main([name, "--help"])
+    except SystemExit as end:
+        code = end.code
+    assert code == 0
+    assert f"usage: npa-envs {name}" in capsys.readouterr().out
+
+
+def test_no_command_is_a_usage_error_and_a_misspelt_one_is_suggested(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main([]) == 2
+    capsys.readouterr()
+    assert "unknown command 'trian': did you mean 'train'?" in error_of(capsys, ["trian"])
+
+
+def test_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:
+    import npa_envs
+
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"npa-envs {npa_envs.__version__}\n"
+
+
+def test_help_starts_without_torch() -> None:
+    program = (
+        "import sys\nfrom npa_envs.cli import main\nmain(['--help'])\n"
+        "print([m for m in ('torch', 'warp', 'tyro') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.stdout.endswith("\n[]\n"), done.stdout + done.stderr
+
+
+def test_list_names_tasks_presets_and_targets(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["list"]) == 0
+    text = capsys.readouterr().out
+    for word in ("morphogenesis2d", "paper", "fast", "tiny", "gecko", "butterfly"):
+        assert word in text
+
+
+def test_doctor_reports_versions_and_the_kernel_cache(capsys: pytest.CaptureFixture[str]) -> None:
+    code = main(["doctor"])
+    text = capsys.readouterr().out
+    assert code == (1 if re.search("^!", text, re.MULTILINE) else 0)
+    assert re.search(rf"^  torch +{re.escape(torch.__version__)}$", text, re.MULTILINE)
+    for subject in ("kernel cache", "ffmpeg", "warp devices"):
+        assert re.search(rf"^  {subject} +\S", text, re.MULTILINE)
+
+
+def test_doctor_goes_on_where_a_check_breaks(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken() -> list[str]:
+        raise OSError("no driver")
+
+    monkeypatch.setattr("npa_envs.warp_report.warp_devices", broken)
+    assert main(["doctor"]) == 1
+    text = capsys.readouterr().out
+    assert "! warp devices" in text
+    assert "OSError: no driver" in text
+    assert "ffmpeg" in text
+
+
+def test_warmup_refuses_what_it_cannot_compile(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "2, 3 or both" in error_of(capsys, ["warmup", "--space-dims", "4"])
+    assert "device must" in error_of(capsys, ["warmup", "--device", "cuda:99"])
+
+
+def test_train_writes_a_rule_that_loads_and_says_where(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "run"
+    words = ["train", *TINY, "--milestones", "3", "5", "--target", "heart", "--out", str(folder)]
+    assert main(words) == 0
+    text = capsys.readouterr().out
+    assert "finished: 6 iterations" in text
+    for name in ("rule.safetensors", "log.jsonl", "pictures"):
+        assert str(folder / name) in text
+        assert (folder / name).exists()
+    config = json.loads((folder / "config.json").read_text())
+    assert (config["iterations"], config["milestones"]) == (6, [3, 5])
+    assert config["task"]["target"] == "heart"
+    assert load_rule(folder / "rule.safetensors").hidden_dim == config["task"]["hidden_dim"]
+
+
+def test_a_configuration_file_goes_over_the_preset_and_options_over_the_file(
+    tmp_path: Path,
+) -> None:
+    from npa_envs.cli.train import parse, starting_configuration
+
+    path = tmp_path / "run.yaml"
+    path.write_text("learning_rate: 0.125\nparticle_count: 77\nseed: 5\n")
+    words = ["--config", str(path), "--preset", "tiny", "--seed", "6", "--eps", "0.25"]
+    base = starting_configuration("morphogenesis2d", words)
+    _, config = parse("morphogenesis2d", base, words)
+    assert (config.learning_rate, config.seed) == (0.125, 6)
+    assert (config.task.particle_count, config.task.eps) == (77, 0.25)
+    assert config.iterations == 40
+
+
+def test_a_run_stopped_by_time_resumes_to_the_same_rule(
+    tmp_path: Path, trained: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "run"
+    words = ["train", *TINY, "--milestones", "--out", str(folder)]
+    assert main([*words, "--max-seconds", "1e-9"]) == 0
+    text = capsys.readouterr().out
+    assert "stopped at iteration 0" in text
+    (command,) = re.findall(r"go on +npa-envs (train .*--resume)", text)
+    assert main([*command.split(), "--no-progress"]) == 0
+    assert "finished: 6 iterations" in capsys.readouterr().out
+    expected = load_rule(trained / "rule.safetensors").state_dict()
+    got = load_rule(folder / "rule.safetensors").state_dict()
+    assert all(torch.equal(got[name], expected[name]) for name in expected)
+
+
+def test_a_folder_with_a_run_is_not_overwritten_unasked(
+    trained: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = (trained / "rule.safetensors").read_bytes()
+    message = error_of(capsys, ["train", *TINY, "--milestones", "--out", str(trained)])
+    assert "holds one" in message
+    assert (trained / "rule.safetensors").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([], "needs a task first"),
+        (["--preset", "tiny"], "needs a task first"),
+        (["morphogenesis"], "unknown task 'morphogenesis': did you mean 'morphogenesis2d'"),
+        (["morphogenesis2d", "--preset", "papr"], "unknown preset 'papr'"),
+        (["morphogenesis2d", "--preset"], "expected one argument"),
+        (["morphogenesis2d", "--resume", "--out", "/nowhere"], "no checkpoint to resume from"),
+        (["morphogenesis2d", "--config", "/nowhere.yaml"], "cannot read the configuration file"),
+        ([*TINY, "--max-seconds", "-1"], "max_seconds must be positive"),
+        ([*TINY, "--milestones", "--target", "/nowhere.png"], "nowhere.png"),
+    ],
+)
+def test_train_refuses_a_mistake_in_one_line(
+    words: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = [] if "--out" in words or len(words) < 3 else ["--out", str(tmp_path / "run")]
+    assert message in error_of(capsys, ["train", *words, *out])
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [(["--iterations", "0"], "iterations must be a whole number"), (["--iters", "3"], "--iters")],
+)
+def test_train_refuses_a_wrong_field(
+    words: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(["train", "morphogenesis2d", "--preset", "tiny", *words])
+    assert end.value.code == 2
+    assert message in capsys.readouterr().err
+
+
+def test_ctrl_c_leaves_a_checkpoint_and_says_how_to_go_on(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    words = ["train", *TINY[:3], "--iterations", "100000", "--milestones", "--out", str(folder)]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "npa_envs.cli", *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+    )
+    log = folder / "log.jsonl"
+    deadline = time.monotonic() + 120
+    while not log.exists() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    text, _ = process.communicate(timeout=60)
+    assert process.returncode == 0
+    assert re.search(r"stopped at iteration [1-9]", text)
+    assert f"--out {folder} --resume" in text
+    assert (folder / "checkpoint.pt").is_file()
+
+
+def test_rollout_writes_films_that_open(
+    tmp_path: Path, trained: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "a" / "film"
+    words = ["rollout", str(trained / "rule.safetensors"), "--steps", "20", "--every", "5"]
+    words += [
+        "--damage",
+        "0:cut",
+        "8:cut",
+        "10:erase:0.3",
+        "10:clump",
+        "--out",
+        str(out),
+        "--no-progress",
+    ]
+    assert main(words) == 0
+    text = capsys.readouterr().out
+    assert re.search(r"step 20: loss \d+\.\d+, PSNR +\d+\.\d+ dB", text)
+    with Image.open(out / "growth.gif") as film:
+        assert film.size == (32, 32)
+        # 0, cut, 5, 8, cut, 10, erase, clump, 15, 20
+        assert getattr(film, "n_frames", 1) == 10
+    assert (out / "growth.mp4").stat().st_size > 500
+    with Image.open(out / "growth-filmstrip.png") as strip:
+        assert strip.width > 8 * 32
+    for name in ("growth.gif", "growth.mp4", "growth-filmstrip.png"):
+        assert f"wrote {out / name}" in text
+
+
+def test_rollout_repeats_itself(tmp_path: Path, trained: Path) -> None:
+    words = ["rollout", str(trained / "rule.safetensors"), "--steps", "12", "--no-progress"]
+    for name in ("a", "b"):
+        assert main([*words, "--damage", "6:erase", "--out", str(tmp_path / name)]) == 0
+    assert main([*words, "--seed", "1", "--out", str(tmp_path / "c")]) == 0
+    films = [(tmp_path / name / "growth.gif").read_bytes() for name in "abc"]
+    assert films[0] == films[1]
+    assert films[0] != films[2]
+
+
+def test_rollout_runs_a_rule_whose_file_names_no_task(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_rule(NPARule(2, 8, 16, eps0=0.2), tmp_path / "rule.safetensors")
+    words = ["rollout", str(tmp_path / "rule.safetensors"), "--steps", "2", "--no-progress"]
+    words += ["--particle-count", "100", "--resolution", "24", "--out", str(tmp_path)]
+    assert main(words) == 0
+    text = capsys.readouterr().out
+    assert "PSNR" not in text
+    assert "its file does not say what it grows" in text
+    with Image.open(tmp_path / "growth.gif") as film:
+        assert np.asarray(film.convert("RGB")).min() < 250
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["nosuchrule"], "unknown rule 'nosuchrule'"),
+        (["RULE", "--damage", "5:burn"], "unknown damage 'burn'"),
+        (["RULE", "--damage", "5"], "STEP:KIND"),
+        (["RULE", "--damage", "5:cut:-1"], "positive size"),
+        (["RULE", "--damage", "20:cut"], "damage must come before the last of 20 steps"),
+        (["RULE", "--target", "nosuchtarget"], "nosuchtarget"),
+        (["RULE", "--eps", "-1"], "eps must be"),
+        (["RULE", "--device", "cuda:99"], "device must be"),
+        (["RULE", "--out", "FILE/inside"], "out must be a folder"),
+    ],
+)
+def test_rollout_refuses_a_mistake_in_one_line(
+    words: list[str],
+    message: str,
+    trained: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (tmp_path / "file").touch()
+    names = {"RULE": str(trained / "rule.safetensors"), "FILE/inside": str(tmp_path / "file/a")}
+    words = [names.get(word, word) for word in words]
+    out = [] if "--out" in words else ["--out", str(tmp_path / "film")]
+    command = ["rollout", *words, "--steps", "20", "--no-progress", *out]
+    assert message in error_of(capsys, command)
+    assert not (tmp_path / "film" / "growth.gif").exists()
+
+
+def test_evaluate_prints_a_row_for_each_checkpoint(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["evaluate", str(trained / "rule.safetensors"), "--checkpoints", "2", "5", "--json"]
+    words += [str(tmp_path / "table.json"), "--seed-count", "3", "--no-progress"]
+    assert main(words) == 0
+    text = capsys.readouterr().out
+    rows = json.loads((tmp_path / "table.json").read_text())
+    assert [row["step"] for row in rows] == [2, 5]
+    for row in rows:
+        assert row["loss_worst"] >= row["loss"] > 0
+        assert re.search(rf"^ *{row['step']} ", text, re.MULTILINE)
+
+
+def test_evaluate_wants_to_know_the_target(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_rule(NPARule(2, 8, 16, eps0=0.2), tmp_path / "rule.safetensors")
+    words = ["evaluate", str(tmp_path / "rule.safetensors"), "--no-progress"]
+    assert "give --target" in error_of(capsys, words)
+
+
+def test_a_rule_outlives_the_picture_that_it_was_trained_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    picture = tmp_path / "square.png"
+    pixels = np.zeros((16, 16, 4), dtype=np.uint8)
+    pixels[4:12, 4:12] = (200, 30, 30, 255)
+    Image.fromarray(pixels).save(picture)
+    words = ["train", *TINY, "--milestones", "--target", str(picture), "--out"]
+    assert main([*words, str(tmp_path / "run")]) == 0
+    picture.unlink()
+    rule = str(tmp_path / "run" / "rule.safetensors")
+    words = ["rollout", rule, "--steps", "2", "--no-progress", "--out", str(tmp_path)]
+    assert main(words) == 0
+    assert "its target cannot be loaded" in capsys.readouterr().out
+    assert "square.png" in error_of(capsys, ["evaluate", rule, "--no-progress"])
+    assert main([*words, "--target", "ring"]) == 0
+    assert "PSNR" in capsys.readouterr().out
+
+
+def test_only_moving_rules_in_2d_are_shown(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_rule(NPARule(3, 8, 16), tmp_path / "rule.safetensors")
+    words = ["rollout", str(tmp_path / "rule.safetensors"), "--out", str(tmp_path)]
+    assert "got space_dim=3" in error_of(capsys, words)
+
+
+def test_an_interrupted_command_ends_without_a_traceback(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupt(_: object) -> int:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("npa_envs.cli.listing.main", interrupt)
+    assert main(["list"]) == 130
+    assert capsys.readouterr().err == "npa-envs: interrupted\n"
+
+
+def test_a_message_of_several_lines_becomes_one(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(_: object) -> int:
+        raise NPAError("x must be\n  positive")
+
+    monkeypatch.setattr("npa_envs.cli.listing.main", fail)
+    assert error_of(capsys, ["list"]) == "npa-envs: error: x must be positive\n"
+
+
+def test_demo_shows_growth_healing_and_training(
+    tmp_path: Path, trained: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "demo"
+    words = ["demo", "--rule", str(trained / "rule.safetensors"), "--out", str(out)]
+    assert main([*words, "--train-seconds", "1", "--no-progress"]) == 0
+    text = capsys.readouterr().out
+    assert len(re.findall(r"PSNR +\d+\.\d+ dB", text)) == 6
+    assert (out / "report.txt").read_text() in text
+    written = {Path(name) for name in re.findall(r"wrote (\S+)", text)}
+    assert {path.suffix for path in written} == {".gif", ".mp4", ".png", ".txt", ".safetensors"}
+    assert all(path.is_file() for path in written)

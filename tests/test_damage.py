@@ -1,0 +1,208 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from npa_envs.errors import NPAError
+from npa_envs.tasks.damage import clump, cut, erase_state, random_particle
+
+DEVICES = [
+    "cpu",
+    pytest.param(
+        "cuda",
+        marks=[
+            pytest.mark.gpu,
+            pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
+        ],
+    ),
+]
+B, N, C = 3, 257, 5
+
+
+@pytest.fixture(params=[2, 3], ids=["2d", "3d"])
+def space_dim(request) -> int:
+    return request.param
+
+
+@pytest.fixture(params=[torch.float32, torch.float64], ids=["float32", "float64"])
+def dtype(request) -> torch.dtype:
+    return request.param
+
+
+@pytest.fixture(params=DEVICES)
+def world(request, space_dim, dtype) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    g = torch.Generator().manual_seed(3)
+    x = 2 * torch.rand(B, N, space_dim, generator=g, dtype=dtype) - 1
+    s = torch.randn(B, N, C, generator=g, dtype=dtype)
+    centre = 0.6 * torch.rand(B, space_dim, generator=g, dtype=dtype) - 0.3
+    return x.to(request.param), s.to(request.param), centre.to(request.param)
+
+
+def test_states_inside_the_ball_are_zero_and_the_others_untouched(world):
+    x, s, centre = world
+    before = s.clone()
+    erased = erase_state(x, s, centre=centre, radius=0.4)
+    counted = 0
+    for b in range(B):
+        for i in range(N):
+            if math.dist(x[b, i].tolist(), centre[b].tolist()) <= 0.4:
+                assert (erased[b, i] == 0).all()
+                counted += 1
+            else:
+                assert torch.equal(erased[b, i], s[b, i])
+    assert counted > 10
+    assert torch.equal(s, before)
+
+
+def test_each_world_may_have_its_own_radius(world):
+    x, s, centre = world
+    radius = torch.tensor([0.0, 0.3, 9.0], dtype=x.dtype, device=x.device)
+    erased = erase_state(x, s, centre=centre, radius=radius)
+    assert torch.equal(erased[0], s[0])
+    assert torch.equal(erased[1:2], erase_state(x, s, centre=centre, radius=0.3)[1:2])
+    assert (erased[2] == 0).all()
+
+
+def test_cut_leaves_a_slit_of_the_gap_and_only_shifts_each_half(world):
+    x, s, centre = world
+    normal = torch.randn(B, x.shape[-1], generator=torch.Generator().manual_seed(1)).to(x)
+    moved, states = cut(x, s, centre=centre, normal=normal, gap=0.2)
+    unit = normal / normal.norm(dim=-1, keepdim=True)
+    before = ((x - centre[:, None]) * unit[:, None]).sum(dim=-1)
+    after = ((moved - centre[:, None]) * unit[:, None]).sum(dim=-1)
+    assert after.abs().min() >= 0.1 - 1e-6
+    torch.testing.assert_close(after, before + 0.1 * torch.where(before < 0, -1.0, 1.0).to(x))
+    along = (moved - x) - 0.1 * torch.where(before < 0, -1.0, 1.0).to(x)[..., None] * unit[:, None]
+    assert along.abs().max() < 1e-6
+    assert states is s
+
+
+def test_cut_with_a_zero_normal_moves_nothing(world):
+    x, s, centre = world
+    moved, _ = cut(x, s, centre=centre, normal=torch.zeros_like(centre), gap=0.2)
+    assert torch.equal(moved, x)
+
+
+def test_clump_shortens_the_distance_inside_and_moves_nothing_outside(world):
+    x, s, centre = world
+    moved, states = clump(x, s, centre=centre, radius=0.5, factor=0.75)
+    distance = (x - centre[:, None]).norm(dim=-1)
+    inside = distance <= 0.5
+    assert 10 < inside.sum() < B * N
+    shortened = (moved - centre[:, None]).norm(dim=-1)
+    torch.testing.assert_close(shortened[inside], 0.25 * distance[inside])
+    assert torch.equal(moved[~inside], x[~inside])
+    assert states is s
+
+
+def test_clump_by_one_collects_all_in_the_centre_and_by_zero_does_nothing(world):
+    x, s, centre = world
+    collected, _ = clump(x, s, centre=centre, radius=9.0, factor=1.0)
+    torch.testing.assert_close(collected, centre[:, None].expand_as(x))
+    same, _ = clump(x, s, centre=centre, radius=9.0, factor=0.0)
+    assert torch.equal(same, x)
+
+
+def test_worlds_are_damaged_independently(world):
+    x, s, centre = world
+    normal = torch.ones_like(centre)
+    together = (
+        erase_state(x, s, centre=centre, radius=0.3),
+        cut(x, s, centre=centre, normal=normal, gap=0.1)[0],
+        clump(x, s, centre=centre, radius=0.3, factor=0.5)[0],
+    )
+    for b in range(B):
+        one = slice(b, b + 1)
+        alone = (
+            erase_state(x[one], s[one], centre=centre[one], radius=0.3),
+            cut(x[one], s[one], centre=centre[one], normal=normal[one], gap=0.1)[0],
+            clump(x[one], s[one], centre=centre[one], radius=0.3, factor=0.5)[0],
+        )
+        for whole, single in zip(together, alone, strict=True):
+            assert torch.equal(whole[one], single)
+
+
+def test_random_particle_is_one_of_its_own_world(world):
+    x, _, _ = world
+    chosen = random_particle(x, torch.Generator(x.device).manual_seed(0))
+    for b in range(B):
+        assert (x[b] == chosen[b]).all(dim=-1).any()
+
+
+def test_random_particle_repeats_with_its_seed_and_reaches_every_particle():
+    x = torch.arange(8.0).reshape(1, 8, 1).expand(500, 8, 2)
+    first = random_particle(x, torch.Generator().manual_seed(5))
+    assert torch.equal(first, random_particle(x, torch.Generator().manual_seed(5)))
+    counts = first[:, 0].long().bincount(minlength=8)
+    assert counts.min() > 30
+
+
+def test_damage_is_differentiable():
+    x = torch.randn(2, 9, 2, dtype=torch.float64, requires_grad=True)
+    s = torch.randn(2, 9, 3, dtype=torch.float64, requires_grad=True)
+    centre = torch.zeros(2, 2, dtype=torch.float64)
+    cleared = erase_state(x, s, centre=centre, radius=1.0)
+    (grad,) = torch.autograd.grad(cleared.sum(), s)
+    outside = (x.norm(dim=-1) > 1.0).double()
+    torch.testing.assert_close(grad, outside[..., None].expand_as(grad))
+    moved, _ = clump(x, s, centre=centre, radius=1.0, factor=0.75)
+    (grad,) = torch.autograd.grad(moved.sum(), x)
+    torch.testing.assert_close(grad, (0.25 + 0.75 * outside)[..., None].expand_as(grad))
+
+
+def test_wrong_arguments_are_clear_errors():
+    x, s, centre = torch.zeros(2, 4, 2), torch.zeros(2, 4, 3), torch.zeros(2, 2)
+    with pytest.raises(NPAError, match=r"add a world dimension with x\[None\]"):
+        random_particle(x[0])
+    with pytest.raises(NPAError, match="at least one particle"):
+        random_particle(x[:, :0])
+    with pytest.raises(NPAError, match=r"x must be float32 or float64, got torch\.int64"):
+        random_particle(x.long())
+    with pytest.raises(NPAError, match=r"s must have shape \[B, N, C\]"):
+        erase_state(x, s[:, :3], centre=centre, radius=0.1)
+    with pytest.raises(NPAError, match=r"centre must have shape \[B, D\] = \(2, 2\), got \(2,\)"):
+        erase_state(x, s, centre=centre[0], radius=0.1)
+    with pytest.raises(NPAError, match=r"centre must be torch\.float32"):
+        erase_state(x, s, centre=centre.double(), radius=0.1)
+    with pytest.raises(NPAError, match=r"normal must have shape"):
+        cut(x, s, centre=centre, normal=torch.zeros(2, 3), gap=0.1)
+    with pytest.raises(NPAError, match=r"radius must be a number or a tensor of shape \[B\]"):
+        erase_state(x, s, centre=centre, radius=torch.zeros(3))
+    for radius in (-0.1, math.nan, math.inf):
+        with pytest.raises(NPAError, match="radius must be finite and at least 0"):
+            clump(x, s, centre=centre, radius=radius, factor=0.5)
+    with pytest.raises(NPAError, match=r"factor must be in \[0, 1\], got 1\.5"):
+        clump(x, s, centre=centre, radius=0.1, factor=1.5)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_damage_can_be_captured_in_a_cuda_graph():
+    x, s = torch.randn(2, 64, 2, device="cuda"), torch.randn(2, 64, 3, device="cuda")
+    generator = torch.Generator("cuda").manual_seed(0)
+
+    def damage() -> tuple[torch.Tensor, torch.Tensor]:
+        centre = random_particle(x, generator)
+        moved, _ = cut(x, s, centre=centre, normal=torch.ones_like(centre), gap=0.1)
+        moved, _ = clump(moved, s, centre=centre, radius=0.3, factor=0.5)
+        return moved, erase_state(moved, s, centre=centre, radius=0.5)
+
+    for _ in range(2):
+        damage()
+    graph = torch.cuda.CUDAGraph()
+    graph.register_generator_state(generator)
+    with torch.cuda.graph(graph):
+        moved, erased = damage()
+    graph.replay()
+    torch.cuda.synchronize()
+    assert (erased == 0).all(dim=-1).any()
+    assert moved.isfinite().all()
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_generator_of_another_device_is_a_clear_error():
+    with pytest.raises(NPAError, match=r"generator must be on the device of x"):
+        random_particle(torch.zeros(1, 4, 2, device="cuda"), torch.Generator())

@@ -1,0 +1,186 @@
+"""The numbers by which a rule is judged."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+import torch
+from circle_task import PARTICLE_COUNT, STATE_DIM, CircleTask
+
+import npa_envs.evaluation
+from npa_envs.errors import NPAError
+from npa_envs.evaluation import (
+    EvaluationRow,
+    HealingRow,
+    evaluate,
+    healing,
+    psnr,
+    table_json,
+    table_text,
+)
+from npa_envs.rule import NPARule
+
+
+def make_rule(scale):
+    rule = NPARule(2, STATE_DIM, 16, eps0=CircleTask.eps)
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for parameter in rule.parameters():
+            parameter.uniform_(-scale, scale, generator=generator)
+    return rule
+
+
+def test_psnr_of_known_errors():
+    pictures = torch.stack([torch.full((2, 2, 4), v) for v in (0.5, 0.9, 7.0)])
+    values = psnr(pictures, torch.ones(2, 2, 4)).tolist()
+    assert values == [pytest.approx(6.0206, abs=1e-4), pytest.approx(20.0, abs=1e-4), math.inf]
+
+
+def test_rule_that_does_nothing_leaves_the_seed_at_every_checkpoint():
+    task = CircleTask()
+    rows = evaluate(make_rule(0.0), task, checkpoints=[1, 3], seeds=[5, 6, 7])
+    worlds = [
+        task.seed(1, generator=torch.Generator().manual_seed(k), device=torch.device("cpu"))
+        for k in (5, 6, 7)
+    ]
+    x, s = (torch.cat(parts) for parts in zip(*worlds, strict=True))
+    losses = task.metric(x, s)
+    ratios = psnr(task.picture(x, s), task.target_picture)
+    sides = (x.amax(1) - x.amin(1)).amax(1)
+    for row, step in zip(rows, (1, 3), strict=True):
+        assert row.step == step
+        assert row.loss == pytest.approx(losses.mean().item(), rel=1e-6)
+        assert row.loss_worst == pytest.approx(losses.max().item(), rel=1e-6)
+        assert row.psnr == pytest.approx(ratios.mean().item(), rel=1e-6)
+        assert row.psnr_worst == pytest.approx(ratios.min().item(), rel=1e-6)
+        assert row.overflow == 0.0
+        assert row.extent == pytest.approx(sides.mean().item(), rel=1e-6)
+
+
+def test_rule_is_run_for_as_many_steps_as_the_table_says(monkeypatch):
+    def count(rule, x, s, steps, **options):
+        return x, s + steps
+
+    monkeypatch.setattr(npa_envs.evaluation, "rollout", count)
+    done = []
+    rows = evaluate(
+        make_rule(0.0), CircleTask(), checkpoints=[2, 5, 30], seeds=[0], progress=done.append
+    )
+    # States count the steps, and all above 1 is overflow.
+    assert [(row.step, row.overflow) for row in rows] == [(2, 1.0), (5, 4.0), (30, 29.0)]
+    assert done == [2, 3, 25]
+
+
+def test_the_same_seeds_give_the_same_table_and_others_another():
+    rule = make_rule(1.0)
+    before = [p.clone() for p in rule.parameters()]
+    tables = [evaluate(rule, CircleTask(), checkpoints=[4], seeds=k) for k in ([1, 2], [1, 2], [3])]
+    assert tables[0] == tables[1]
+    assert tables[0] != tables[2]
+    assert all(torch.equal(a, b) for a, b in zip(before, rule.parameters(), strict=True))
+
+
+def shrink(rate):
+    """A rollout that brings every particle to the circle, its distance times `rate` a step."""
+
+    def rollout(rule, x, s, steps, **options):
+        radius = x.norm(dim=-1, keepdim=True)
+        goal = x / radius * 0.5
+        return goal + (x - goal) * rate**steps, s
+
+    return rollout
+
+
+def test_healing_counts_the_steps_until_the_loss_is_back(monkeypatch):
+    monkeypatch.setattr(npa_envs.evaluation, "rollout", shrink(0.98))
+    rows = healing(
+        make_rule(0.0),
+        CircleTask(),
+        grow_steps=100,
+        heal_steps=205,
+        every=25,
+        seeds=[0, 1, 2],
+        cut_gap=0.4,
+    )
+    cut, erased = rows
+    assert (cut.damage, erased.damage) == ("cut, gap 0.4", "erased disk, radius 0.2")
+    # The loss is the mean square of the distances, so 25 steps multiply it by 0.98**50.
+    needed = math.log(1.2 * cut.before / cut.after) / math.log(0.98) / 2
+    assert cut.after > 3 * cut.before
+    assert cut.steps_to_heal == 25 * math.ceil(needed / 25)
+    assert (cut.worlds_healed, cut.world_count) == (3, 3)
+    assert cut.end == pytest.approx(cut.after * 0.98**410, rel=1e-3)
+    # Only states were erased, which this task's loss does not see.
+    assert erased.after == erased.before == cut.before
+    assert erased.steps_to_heal == 0
+
+
+def test_rule_that_does_nothing_never_heals_a_cut():
+    cut, erased = healing(
+        make_rule(0.0), CircleTask(), grow_steps=1, heal_steps=4, every=2, seeds=[0, 1], cut_gap=3.0
+    )
+    assert cut.after > 1.2 * cut.before
+    assert cut.end == pytest.approx(cut.after)
+    assert (cut.steps_to_heal, cut.worlds_healed) == (None, 0)
+    assert erased.steps_to_heal == 0
+
+
+def test_erased_disk_blanks_states_of_the_grown_world(monkeypatch):
+    seen = []
+
+    def fill(rule, x, s, steps, **options):
+        seen.append((s == 0).all(-1).float().mean(1).tolist())
+        return x, torch.ones_like(s)
+
+    monkeypatch.setattr(npa_envs.evaluation, "rollout", fill)
+    healing(
+        make_rule(0.0),
+        CircleTask(),
+        grow_steps=1,
+        heal_steps=1,
+        every=1,
+        seeds=[0],
+        erase_radius=0.1,
+    )
+    blank_after_cut, blank_after_erasure = seen[1][0], seen[2][0]
+    assert blank_after_cut == 0
+    assert 1 / PARTICLE_COUNT <= blank_after_erasure < 1
+
+
+@pytest.mark.parametrize(
+    ("options", "rule"),
+    [
+        ({"checkpoints": []}, "checkpoints must be whole numbers of at least 1, increasing"),
+        ({"checkpoints": [5, 5]}, "checkpoints must be whole numbers of at least 1, increasing"),
+        ({"checkpoints": [0, 5]}, "checkpoints must be whole numbers of at least 1, increasing"),
+        ({"seeds": []}, "seeds must hold at least one number"),
+    ],
+)
+def test_wrong_arguments_are_named(options, rule):
+    with pytest.raises(NPAError, match=rule):
+        evaluate(make_rule(0.0), CircleTask(), **options)
+
+
+@pytest.mark.parametrize("name", ["grow_steps", "heal_steps", "every"])
+def test_wrong_numbers_of_steps_are_named(name):
+    with pytest.raises(NPAError, match=name):
+        healing(make_rule(0.0), CircleTask(), **{name: 0})
+
+
+ROW = EvaluationRow(
+    step=64, loss=0.125, loss_worst=0.25, psnr=math.inf, psnr_worst=31.4159, overflow=0, extent=1.5
+)
+
+
+def test_tables_as_text_line_up_and_as_json_can_be_read_back():
+    hurt = HealingRow("cut", 0.1, 0.2, None, 1, 2, 0.3)
+    lines = table_text([ROW, ROW]).splitlines()
+    assert lines[0].split("  ")[0].strip() == "step"
+    assert lines[1].split() == ["64", "0.125", "0.25", "inf", "31.42", "0", "1.5"]
+    assert len({len(line) for line in lines}) == 1
+    assert "never" in table_text([hurt])
+    (back,) = json.loads(table_json([ROW]))
+    assert (back["step"], back["psnr"], back["psnr_worst"]) == (64, None, 31.4159)
+    assert json.loads(table_json([hurt]))[0]["steps_to_heal"] is None

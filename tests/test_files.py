@@ -1,0 +1,183 @@
+"""Files are written whole or not at all, whatever goes wrong in the middle."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from npa_envs.errors import NPAError
+from npa_envs.files import atomic_path, write_bytes, write_text
+
+
+def write_half_and_raise(target: Path, error: BaseException) -> None:
+    with atomic_path(target) as temporary:
+        temporary.write_bytes(b"half")
+        raise error
+
+
+def fill_the_disk_and_raise_another_error(target: Path) -> None:
+    with atomic_path(target) as temporary:
+        with pytest.raises(OSError, match="No space"):
+            temporary.write_bytes(b"x" * 1_000_000)
+        raise RuntimeError("a writer in C that does not tell why")
+
+
+def test_writes_what_was_given_and_leaves_nothing_else(tmp_path: Path) -> None:
+    write_text(tmp_path / "a.txt", "ε = 0.1\n")
+    write_bytes(tmp_path / "b.bin", b"\x00\x01")
+    write_bytes(tmp_path / "b.bin", b"\x02")
+    assert (tmp_path / "a.txt").read_bytes() == "ε = 0.1\n".encode()
+    assert (tmp_path / "b.bin").read_bytes() == b"\x02"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.txt", "b.bin"]
+
+
+def test_temporary_lies_beside_the_target_and_keeps_its_suffix(tmp_path: Path) -> None:
+    with atomic_path(tmp_path / "film.mp4") as temporary:
+        assert temporary.parent == tmp_path
+        assert temporary.suffix == ".mp4"
+        assert temporary.name != "film.mp4"
+        temporary.write_bytes(b"new")
+        assert not (tmp_path / "film.mp4").exists()
+    assert (tmp_path / "film.mp4").read_bytes() == b"new"
+
+
+@pytest.mark.parametrize("error", [ValueError("bug"), KeyboardInterrupt(), SystemExit(3)])
+def test_an_exception_in_the_block_keeps_the_old_file(tmp_path: Path, error: BaseException) -> None:
+    target = tmp_path / "rule.safetensors"
+    target.write_bytes(b"old")
+    with pytest.raises(type(error)):
+        write_half_and_raise(target, error)
+    assert target.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [target]
+
+
+def test_a_killed_process_keeps_the_old_file(tmp_path: Path) -> None:
+    target = tmp_path / "checkpoint.pt"
+    target.write_bytes(b"old")
+    program = (
+        "import os, signal, sys\n"
+        "from npa_envs.files import atomic_path\n"
+        "with atomic_path(sys.argv[1]) as temporary:\n"
+        "    temporary.write_bytes(b'half')\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program, str(target)], check=False)
+    assert done.returncode == -signal.SIGKILL
+    assert target.read_bytes() == b"old"
+    write_bytes(target, b"new")
+    assert target.read_bytes() == b"new"
+
+
+def test_missing_folder_is_named(tmp_path: Path) -> None:
+    with pytest.raises(NPAError, match=r"folder '.*nowhere' does not exist: create it first"):
+        write_bytes(tmp_path / "nowhere" / "a.bin", b"1")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_is_no_target_and_a_file_is_no_folder(tmp_path: Path) -> None:
+    with pytest.raises(NPAError, match="that is a folder"):
+        write_bytes(tmp_path, b"1")
+    (tmp_path / "plain").write_bytes(b"")
+    with pytest.raises(NPAError, match="is a file, not a folder"):
+        write_bytes(tmp_path / "plain" / "a.bin", b"1")
+
+
+def _fail_with(number: int) -> Any:
+    def refuse(path: Any, *_: Any) -> int:
+        name = None if isinstance(path, int) else os.fspath(path)
+        raise OSError(number, os.strerror(number), name)
+
+    return refuse
+
+
+@pytest.mark.parametrize("number", [errno.EACCES, errno.EROFS])
+def test_no_permission_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    monkeypatch.setattr(os, "open", _fail_with(number))
+    with pytest.raises(NPAError, match=r"cannot write .*a\.bin.*no write permission.*ls -ld"):
+        write_bytes(tmp_path / "a.bin", b"1")
+
+
+@pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="root may write anywhere")
+def test_a_read_only_folder_is_refused_before_any_work(tmp_path: Path) -> None:
+    tmp_path.chmod(0o500)
+    try:
+        with pytest.raises(NPAError, match="no write permission"), atomic_path(tmp_path / "a.bin"):
+            pytest.fail("the block must not run")
+    finally:
+        tmp_path.chmod(0o700)
+
+
+def test_disk_full_while_writing_keeps_the_old_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target = tmp_path / "a.bin"
+    target.write_bytes(b"old")
+
+    def full(self: Path, data: bytes) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(NPAError, match=r"cannot write .*a\.bin.*disk is full.*nothing was changed"):
+        write_bytes(target, b"new")
+    assert target.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [target]
+
+
+def test_disk_full_on_the_last_flush_keeps_the_old_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target = tmp_path / "a.bin"
+    target.write_bytes(b"old")
+    monkeypatch.setattr(os, "fsync", _fail_with(errno.ENOSPC))
+    with pytest.raises(NPAError, match="disk is full"):
+        write_bytes(target, b"new")
+    assert target.read_bytes() == b"old"
+
+
+def test_a_real_full_disk_is_recognised_whatever_the_writer_raises(tmp_path: Path) -> None:
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=256k", "tmpfs", str(disk)]
+    if shutil.which("mount") is None or subprocess.run(mount, capture_output=True).returncode:
+        pytest.skip("no permission to mount a small tmpfs")
+    try:
+        target = disk / "a.bin"
+        target.write_bytes(b"old")
+        with pytest.raises(NPAError, match="disk is full"):
+            write_bytes(target, b"x" * 1_000_000)
+        with pytest.raises(NPAError, match="disk is full"):
+            fill_the_disk_and_raise_another_error(target)
+        assert target.read_bytes() == b"old"
+        assert list(disk.iterdir()) == [target]
+    finally:
+        subprocess.run(["umount", str(disk)], check=True)
+
+
+def test_an_error_about_another_file_is_not_blamed_on_this_one(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"other\.txt"), atomic_path(tmp_path / "a.bin"):
+        (tmp_path / "other.txt").read_bytes()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_mode_and_symbolic_links_are_kept(tmp_path: Path) -> None:
+    target, link = tmp_path / "a.bin", tmp_path / "link.bin"
+    write_bytes(target, b"1")
+    umask = os.umask(0)
+    os.umask(umask)
+    assert target.stat().st_mode & 0o777 == 0o666 & ~umask
+    target.chmod(0o640)
+    link.symlink_to(target)
+    write_bytes(link, b"2")
+    assert link.is_symlink()
+    assert target.read_bytes() == b"2"
+    assert target.stat().st_mode & 0o777 == 0o640

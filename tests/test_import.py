@@ -1,0 +1,45 @@
+"""Importing the package is cheap: it starts no device and pulls in no heavy extra."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+UNWANTED = ("stable_baselines3", "matplotlib", "imageio", "tensorboard", "tyro", "yaml")
+
+
+def run(program: str) -> str:
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    return done.stdout
+
+
+def test_import_prints_nothing_and_leaves_heavy_libraries_alone() -> None:
+    program = f"import sys, npa_envs\nprint([m for m in {UNWANTED!r} if m in sys.modules])"
+    assert run(program) == "[]\n"
+
+
+def test_import_starts_neither_cuda_nor_warp() -> None:
+    program = (
+        "import sys, npa_envs, torch\n"
+        "warp = sys.modules.get('warp')\n"
+        "runtime = None if warp is None else sys.modules['warp._src.context'].runtime\n"
+        "print(torch.cuda.is_initialized(), runtime)"
+    )
+    assert run(program) == "False None\n"
+
+
+def test_import_leaves_the_global_settings_of_torch_alone() -> None:
+    program = (
+        "import torch\n"
+        "def settings():\n"
+        "    b = torch.backends\n"
+        "    return (torch.get_default_dtype(), torch.get_num_threads(), torch.initial_seed(),\n"
+        "            torch.is_grad_enabled(), b.cuda.matmul.allow_tf32, b.cudnn.benchmark)\n"
+        "torch.manual_seed(5)\n"
+        "before, state = settings(), torch.get_rng_state()\n"
+        "import npa_envs\n"
+        "print(settings() == before, torch.equal(state, torch.get_rng_state()))"
+    )
+    assert run(program) == "True True\n"

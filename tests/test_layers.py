@@ -1,0 +1,185 @@
+"""The import ladder: each module imports only what stands on a lower rung, and few libraries.
+
+The table below is the whole rule. A new module needs a row (or lies in a folder that has one); the
+libraries named are the only ones outside Python's own that its files may import, at any depth.
+"""
+
+from __future__ import annotations
+
+import ast
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+MAPPED = ("envs", "wrappers", "agents")
+
+
+@dataclass(frozen=True)
+class Rung:
+    """Where a module stands and which libraries it may use."""
+
+    level: int
+    libraries: frozenset[str]
+    never: tuple[str, ...] = ()
+    """Modules of ours that it must not import although they stand lower."""
+
+
+def rung(level: int, libraries: str = "", never: tuple[str, ...] = ()) -> Rung:
+    return Rung(level, frozenset(libraries.split()), never)
+
+
+INSIDES = ("npa_envs.kernels", "npa_envs.sph", "npa_envs.reference")
+LADDER = {
+    "npa_envs._checkout": rung(0),
+    "npa_envs.errors": rung(0),
+    "npa_envs.files": rung(1),
+    "npa_envs.kernels": rung(1, "warp"),
+    "npa_envs.reference": rung(1, "torch"),
+    "npa_envs.warp_report": rung(1, "warp"),
+    "npa_envs.sph": rung(2, "warp torch", never=("npa_envs.reference",)),
+    "npa_envs.rule": rung(3, "torch"),
+    "npa_envs.rule_formats": rung(3, "torch", never=INSIDES),
+    "npa_envs.rule_io": rung(4, "torch safetensors", never=INSIDES),
+    "npa_envs.dynamics": rung(4, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
+    "npa_envs.tasks": rung(5, "torch numpy PIL", never=("npa_envs.kernels", "npa_envs.reference")),
+    "npa_envs.render": rung(6, "torch numpy PIL imageio imageio_ffmpeg", never=INSIDES),
+    "npa_envs.evaluation": rung(7, "torch numpy tqdm", never=INSIDES),
+    "npa_envs.training": rung(
+        8, "torch numpy tqdm yaml", never=("npa_envs.kernels", "npa_envs.reference")
+    ),
+    "npa_envs.diagnostics": rung(8, "torch PIL imageio_ffmpeg", never=INSIDES),
+    "npa_envs": rung(9, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
+    "npa_envs.cli": rung(
+        10, "torch numpy tqdm tyro", never=("npa_envs.kernels", "npa_envs.reference")
+    ),
+    "npa_envs.envs": rung(11, "torch numpy gymnasium pettingzoo", never=INSIDES),
+    "npa_envs.wrappers": rung(
+        12, "torch numpy gymnasium pettingzoo stable_baselines3", never=INSIDES
+    ),
+    "npa_envs.agents": rung(
+        13, "torch numpy tqdm gymnasium pettingzoo stable_baselines3", never=INSIDES
+    ),
+}
+WARP_AND_TORCH = {"npa_envs.sph"}
+
+
+def source_files() -> list[Path]:
+    folders = [ROOT / "npa_envs", *(ROOT / name for name in MAPPED)]
+    return sorted(p for folder in folders for p in folder.rglob("*.py"))
+
+
+def module_name(path: Path) -> str:
+    parts = list(path.relative_to(ROOT).with_suffix("").parts)
+    parts = parts[:-1] if parts[-1] == "__init__" else parts
+    return ".".join(parts if parts[0] == "npa_envs" else ["npa_envs", *parts])
+
+
+MODULES = {module_name(path) for path in source_files()}
+
+
+def row_of(module: str) -> str | None:
+    """The longest row of the ladder that holds `module`; a submodule needs a row of its own."""
+    name = module
+    while name not in LADDER and "." in name:
+        name = name.rpartition(".")[0]
+    if name not in LADDER or (name == "npa_envs" and module != "npa_envs"):
+        return None
+    return name
+
+
+def imported_modules(module: str, source: str, *, is_package: bool) -> set[str]:
+    """Every module that `source` imports, also inside functions, with relative names resolved."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                parts = module.split(".")
+                kept = parts[: len(parts) - node.level + (1 if is_package else 0)]
+                base = ".".join([*kept, *([node.module] if node.module else [])])
+            for alias in node.names:
+                inner = f"{base}.{alias.name}"
+                found.add(inner if inner in MODULES or inner in LADDER else base)
+        elif isinstance(node, ast.Call):
+            called = ast.unparse(node.func)
+            if called in {"__import__", "import_module", "importlib.import_module"}:
+                argument = node.args[0] if node.args else None
+                is_text = isinstance(argument, ast.Constant) and isinstance(argument.value, str)
+                found.add(str(argument.value) if is_text else "<imported by a computed name>")  # type: ignore[union-attr]
+    return found
+
+
+def violations(module: str, source: str, *, is_package: bool = False) -> list[str]:
+    """What `source`, standing in `module`, imports against the ladder."""
+    row = row_of(module)
+    if row is None:
+        return [f"{module} has no row in the ladder"]
+    here = LADDER[row]
+    wrong = []
+    for name in sorted(imported_modules(module, source, is_package=is_package)):
+        top = name.split(".")[0]
+        if top != "npa_envs":
+            if top not in sys.stdlib_module_names and top not in here.libraries:
+                wrong.append(f"{module} imports the library {name}")
+            continue
+        other = row_of(name)
+        if other is None:
+            wrong.append(f"{module} imports {name}, which has no row in the ladder")
+        elif other != row and LADDER[other].level >= here.level:
+            wrong.append(f"{module} imports {name}, which stands no lower")
+        elif other in here.never:
+            wrong.append(f"{module} imports {name}, which it must not know")
+    return wrong
+
+
+@pytest.mark.parametrize("path", source_files(), ids=lambda p: p.relative_to(ROOT).as_posix())
+def test_every_source_file_keeps_to_the_ladder(path: Path) -> None:
+    is_package = path.name == "__init__.py"
+    assert violations(module_name(path), path.read_text(), is_package=is_package) == []
+
+
+def test_only_sph_knows_both_warp_and_torch() -> None:
+    both = {name for name, here in LADDER.items() if {"warp", "torch"} <= here.libraries}
+    assert both == WARP_AND_TORCH
+
+
+@pytest.mark.parametrize(
+    ("module", "source"),
+    [
+        ("npa_envs.kernels.cells", "import torch"),
+        ("npa_envs.kernels.cells", "from npa_envs.sph import perceive"),
+        ("npa_envs.reference", "import warp as wp"),
+        ("npa_envs.rule", "import warp"),
+        ("npa_envs.dynamics", "def f():\n    import warp"),
+        ("npa_envs.dynamics", "from npa_envs.kernels import cells"),
+        ("npa_envs.dynamics", "from .tasks import targets"),
+        ("npa_envs.tasks.new", "from npa_envs.training import trainer"),
+        ("npa_envs.tasks.new", "import matplotlib.pyplot"),
+        ("npa_envs.training.new", "import importlib\nimportlib.import_module('warp')"),
+        ("npa_envs.training.new", "import npa_envs"),
+        ("npa_envs.envs.new", "from npa_envs.sph.splat import splat"),
+        ("npa_envs.envs.new", "from ..kernels import cells"),
+        ("npa_envs.envs.new", "import stable_baselines3"),
+        ("npa_envs.unheard_of", ""),
+    ],
+)
+def test_the_checker_refuses_a_wrong_import(module: str, source: str) -> None:
+    assert len(violations(module, source)) == 1
+
+
+@pytest.mark.parametrize(
+    ("module", "source"),
+    [
+        ("npa_envs.kernels.cells", "import math\nimport warp as wp\nfrom . import domain"),
+        ("npa_envs.sph.bridge", "import torch\nimport warp\nfrom npa_envs.kernels import cells"),
+        ("npa_envs.envs.new", "import gymnasium\nfrom npa_envs import dynamics, tasks"),
+        ("npa_envs.agents.new", "import npa_envs\nfrom npa_envs.envs import new"),
+    ],
+)
+def test_the_checker_accepts_a_right_import(module: str, source: str) -> None:
+    assert violations(module, source) == []

@@ -1,0 +1,145 @@
+"""The layout of the repository and the layout of the installed package agree."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+
+import npa_envs
+from npa_envs._checkout import MAPPED_PACKAGES, extend_path
+
+ROOT = Path(__file__).resolve().parent.parent
+SHIPPED = ("pyproject.toml", "README.md", "LICENSE", "npa_envs", *MAPPED_PACKAGES)
+IGNORE = shutil.ignore_patterns("__pycache__", "*.egg-info")
+PRINT_FILES = (
+    "import npa_envs, npa_envs.envs, npa_envs.wrappers, npa_envs.agents\n"
+    "for m in (npa_envs, npa_envs.envs, npa_envs.wrappers, npa_envs.agents): print(m.__file__)\n"
+)
+
+
+def copy_sources(destination: Path) -> Path:
+    destination.mkdir()
+    for name in SHIPPED:
+        if (ROOT / name).is_dir():
+            shutil.copytree(ROOT / name, destination / name, ignore=IGNORE)
+        else:
+            shutil.copy(ROOT / name, destination)
+    return destination
+
+
+def run_python(cwd: Path, program: str, *, search: Path | None = None) -> list[str]:
+    """Run a program in a Python that finds its folder first, then `search`, then what is installed.
+
+    -I would hide the working folder and -S the installed torch, so the path is set by hand.
+    """
+    prelude = (
+        "import sys\nsys.meta_path = [f for f in sys.meta_path if 'editable' not in repr(f)]\n"
+    )
+    prelude += f"sys.path.insert(1, {str(search)!r})\n" if search else ""
+    done = subprocess.run(
+        [sys.executable, "-c", prelude + program], cwd=cwd, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.split("\n")[:-1]
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the unpacked wheel, as pip would lay it down in site-packages."""
+    work = tmp_path_factory.mktemp("wheel")
+    source = copy_sources(work / "source")
+    options = ["--no-deps", "--no-build-isolation", "--quiet", "--no-index"]
+    subprocess.run(
+        [sys.executable, "-m", "pip", "wheel", *options, "-w", str(work), str(source)], check=True
+    )
+    (wheel,) = work.glob("npa_envs-*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(work / "site")
+    return work / "site"
+
+
+def test_wheel_puts_one_name_into_site_packages(site: Path) -> None:
+    names = {p.name for p in site.iterdir() if not p.name.endswith(".dist-info")}
+    assert names == {"npa_envs"}
+
+
+def test_wheel_holds_every_source_file_and_the_rules(site: Path) -> None:
+    expected = {p.relative_to(ROOT).as_posix() for p in (ROOT / "npa_envs").rglob("*.py")}
+    for name in MAPPED_PACKAGES:
+        expected |= {
+            f"npa_envs/{p.relative_to(ROOT).as_posix()}" for p in (ROOT / name).rglob("*.py")
+        }
+    expected |= {f"npa_envs/rules/{p.name}" for p in (ROOT / "npa_envs/rules").glob("*.*")}
+    expected.add("npa_envs/py.typed")
+    built = {p.relative_to(site).as_posix() for p in (site / "npa_envs").rglob("*") if p.is_file()}
+    assert built == expected
+
+
+def test_license_travels_with_the_wheel(site: Path) -> None:
+    (license_file,) = site.glob("npa_envs-*.dist-info/licenses/LICENSE")
+    assert license_file.read_bytes() == (ROOT / "LICENSE").read_bytes()
+
+
+def test_installed_package_imports_from_outside_the_checkout(site: Path, tmp_path: Path) -> None:
+    files = run_python(tmp_path, PRINT_FILES, search=site)
+    names = ["npa_envs", "npa_envs/envs", "npa_envs/wrappers", "npa_envs/agents"]
+    assert files == [str(site / name / "__init__.py") for name in names]
+
+
+def test_checkout_imports_from_its_root_after_a_plain_install(site: Path, tmp_path: Path) -> None:
+    checkout = copy_sources(tmp_path / "checkout")
+    files = run_python(checkout, PRINT_FILES, search=site)
+    names = ["npa_envs", "envs", "wrappers", "agents"]
+    assert files == [str(checkout / name / "__init__.py") for name in names]
+
+
+def test_folders_called_envs_in_site_packages_are_not_taken_for_ours(tmp_path: Path) -> None:
+    package = tmp_path / "npa_envs"
+    package.mkdir()
+    for name in MAPPED_PACKAGES:
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "__init__.py").touch()
+    path = [str(package)]
+    extend_path(path, str(package / "__init__.py"))
+    assert path == [str(package)]
+    (tmp_path / "pyproject.toml").touch()
+    extend_path(path, str(package / "__init__.py"))
+    extend_path(path, str(package / "__init__.py"))
+    assert path == [str(package), str(tmp_path)]
+
+
+def test_every_package_is_listed_in_pyproject() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    found = {
+        ".".join(p.parent.relative_to(ROOT).parts) for p in (ROOT / "npa_envs").rglob("__init__.py")
+    }
+    for name in MAPPED_PACKAGES:
+        found |= {
+            ".".join(("npa_envs", *p.parent.relative_to(ROOT).parts))
+            for p in (ROOT / name).rglob("__init__.py")
+        }
+    assert sorted(project["tool"]["setuptools"]["packages"]) == sorted(found)
+
+
+def test_constraints_pin_every_direct_dependency() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    requirements = [*project["dependencies"]]
+    for extra in project["optional-dependencies"].values():
+        requirements += extra
+    wanted = {r.split(">=")[0].split("[")[0].lower() for r in requirements} - {"npa-envs"}
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    pinned = {line.split("==")[0].lower() for line in lines if "==" in line}
+    assert wanted <= pinned
+    assert not [line for line in lines if "+" in line]
+
+
+def test_the_version_is_the_same_everywhere() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert npa_envs.__version__ == project["version"]
+    assert f"\nversion: {project['version']}\n" in (ROOT / "CITATION.cff").read_text()

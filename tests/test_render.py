@@ -1,0 +1,285 @@
+from __future__ import annotations
+
+import errno
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from npa_envs.errors import MissingDependencyError, NPAError
+from npa_envs.render import to_uint8, write_filmstrip, write_gif, write_mp4, write_png
+
+WRITERS = [write_gif, write_mp4, write_filmstrip]
+
+
+def film(count: int = 6, height: int = 48, width: int = 64) -> list[np.ndarray]:
+    """A coloured square that moves over white."""
+    frames = []
+    for k in range(count):
+        frame = np.full((height, width, 3), 255, np.uint8)
+        frame[10:30, 4 * k : 4 * k + 20] = (200, 30 + 10 * k, 60)
+        frames.append(frame)
+    return frames
+
+
+def read_film(path: Path) -> list[np.ndarray]:
+    with Image.open(path) as opened:
+        frames = []
+        for k in range(opened.n_frames):
+            opened.seek(k)
+            frames.append(np.asarray(opened.convert("RGB")))
+    return frames
+
+
+def test_empty_picture_is_all_background():
+    empty = torch.zeros(5, 5, 4)
+    assert (to_uint8(empty) == 255).all()
+    assert (to_uint8(empty, background="black") == 0).all()
+    assert (to_uint8(empty, background="#102030") == (16, 32, 48)).all()
+    assert (to_uint8(empty, background=(0.0, 0.5, 1.0)) == (0, 128, 255)).all()
+
+
+def test_overlapping_particles_average_and_thin_ones_let_the_background_through():
+    picture = torch.zeros(1, 3, 4)
+    picture[0, 0] = torch.tensor([0.5, 0.0, 1.0, 1.0])
+    picture[0, 1] = torch.tensor([2.0, 0.0, 1.0, 4.0])
+    picture[0, 2] = torch.tensor([0.0, 0.25, 0.0, 0.25])
+    over_white = [[128, 0, 255], [128, 0, 64], [191, 255, 191]]
+    over_black = [[128, 0, 255], [128, 0, 64], [0, 64, 0]]
+    np.testing.assert_array_equal(to_uint8(picture)[0], over_white)
+    np.testing.assert_array_equal(to_uint8(picture, "black")[0], over_black)
+
+
+def test_first_row_of_the_shown_picture_is_the_highest_y():
+    picture = torch.zeros(2, 4, 4, 4)
+    picture[1, 0, 2] = torch.tensor([1.0, 0.0, 0.0, 1.0])
+    shown = to_uint8(picture)
+    assert shown.shape == (2, 4, 4, 3)
+    assert (shown[1, 3, 2] == (255, 0, 0)).all()
+    assert (shown[0] == 255).all()
+    assert (np.delete(shown[1].reshape(16, 3), 14, axis=0) == 255).all()
+
+
+def test_colours_outside_their_range_are_clipped_and_nonfinite_ones_shown_as_background():
+    picture = torch.zeros(1, 3, 4)
+    picture[0, 0] = torch.tensor([9.0, -9.0, 0.5, 1.0])
+    picture[0, 1] = torch.tensor([float("nan"), 0.0, 0.0, 1.0])
+    picture[0, 2] = torch.tensor([0.0, 0.0, 0.0, float("inf")])
+    shown = to_uint8(picture, "black")
+    np.testing.assert_array_equal(shown[0], [[255, 0, 128], [0, 0, 0], [0, 0, 0]])
+
+
+def test_picture_that_requires_grad_is_shown():
+    picture = torch.ones(2, 2, 4, dtype=torch.float64, requires_grad=True)
+    assert (to_uint8(picture) == 255).all()
+
+
+def test_wrong_picture_or_background_is_a_clear_error():
+    with pytest.raises(NPAError, match=r"\[\.\.\., R, R, 4\].*\(8, 8, 3\)"):
+        to_uint8(torch.zeros(8, 8, 3))
+    with pytest.raises(NPAError, match=r"torch\.uint8"):
+        to_uint8(torch.zeros(8, 8, 4, dtype=torch.uint8))
+    with pytest.raises(NPAError, match="background must be a colour, got 'blurple'"):
+        to_uint8(torch.zeros(8, 8, 4), "blurple")
+    with pytest.raises(NPAError, match=r"red, green and blue in \[0, 1\]"):
+        to_uint8(torch.zeros(8, 8, 4), (255, 255, 255))
+
+
+def test_png_is_read_back_exactly(tmp_path):
+    frame = np.random.default_rng(0).integers(0, 256, (7, 9, 3), dtype=np.uint8)
+    write_png(tmp_path / "picture.png", frame)
+    np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "picture.png")), frame)
+
+
+def test_gif_holds_every_frame_with_nearly_exact_colours(tmp_path):
+    frames = film()
+    write_gif(tmp_path / "film.gif", frames, fps=20)
+    found = read_film(tmp_path / "film.gif")
+    assert len(found) == len(frames)
+    for shown, frame in zip(found, frames, strict=True):
+        assert np.abs(shown.astype(int) - frame).max() <= 6
+
+
+def test_gif_background_is_exact_in_every_frame_however_many_colours_there_are(tmp_path):
+    rng = np.random.default_rng(0)
+    frames = []
+    for _ in range(4):
+        frame = np.full((80, 80, 3), 255, np.uint8)
+        frame[20:60, 20:60] = rng.integers(0, 250, (40, 40, 3), dtype=np.uint8)
+        frame[62:, 20:60] = rng.integers(248, 256, (18, 40, 3), dtype=np.uint8)
+        frames.append(frame)
+    write_gif(tmp_path / "noise.gif", frames)
+    for shown, frame in zip(read_film(tmp_path / "noise.gif"), frames, strict=True):
+        background = (frame == 255).all(axis=-1)
+        assert (shown[background] == 255).all()
+        assert np.abs(shown.astype(int) - frame)[~background].mean() < 25
+
+
+def test_gif_shows_what_stands_still_the_same_in_every_frame(tmp_path):
+    ramp = np.linspace(0, 255, 64).astype(np.uint8)
+    still = np.stack(
+        [ramp[:, None] + 0 * ramp, ramp + 0 * ramp[:, None], 0 * ramp + 0 * ramp[:, None]], -1
+    )
+    frames = []
+    for k in range(5):
+        frame = np.full((64, 96, 3), 255, np.uint8)
+        frame[:, :64] = still
+        frame[5 * k : 5 * k + 9, 70:90] = (30 * k, 10, 250 - 30 * k)
+        frames.append(frame)
+    write_gif(tmp_path / "still.gif", frames)
+    found = read_film(tmp_path / "still.gif")
+    for shown in found[1:]:
+        np.testing.assert_array_equal(shown[:, :64], found[0][:, :64])
+
+
+@pytest.mark.parametrize("fps", [7, 25, 30, 50])
+def test_gif_lasts_as_long_as_its_frames(tmp_path, fps):
+    frames = film(21, width=128)
+    write_gif(tmp_path / "film.gif", frames, fps=fps)
+    with Image.open(tmp_path / "film.gif") as opened:
+        assert opened.info["loop"] == 0
+        length = 0
+        for k in range(opened.n_frames):
+            opened.seek(k)
+            length += opened.info["duration"]
+    assert length == pytest.approx(1000 * len(frames) / fps, abs=10)
+
+
+@pytest.mark.parametrize(("height", "width"), [(48, 64), (47, 65)])
+def test_mp4_holds_every_frame_at_an_even_size(tmp_path, height, width):
+    imageio = pytest.importorskip("imageio.v2")
+    frames = film(9, height, width)
+    write_mp4(tmp_path / "film.mp4", frames, fps=10)
+    with imageio.get_reader(tmp_path / "film.mp4") as reader:
+        found = list(reader.iter_data())
+        assert reader.get_meta_data()["fps"] == pytest.approx(10)
+    assert len(found) == 9
+    assert found[0].shape == (height + height % 2, width + width % 2, 3)
+    for shown, frame in zip(found, frames, strict=True):
+        assert np.abs(shown[:height, :width].astype(int) - frame).mean() < 4
+
+
+def test_filmstrip_holds_the_frames_exactly_in_rows(tmp_path):
+    frames = film(5)
+    write_filmstrip(tmp_path / "strip.png", frames, columns=3)
+    strip = np.asarray(Image.open(tmp_path / "strip.png"))
+    assert strip.shape == (2 * 56 + 8, 3 * 72 + 8, 3)
+    for k, frame in enumerate(frames):
+        top, left = 8 + (k // 3) * 56, 8 + (k % 3) * 72
+        np.testing.assert_array_equal(strip[top : top + 48, left : left + 64], frame)
+
+
+def test_filmstrip_writes_a_caption_below_each_frame_and_none_beside_it(tmp_path):
+    frames = [np.full((64, 96, 3), 255, np.uint8)] * 3
+    write_filmstrip(tmp_path / "strip.png", frames, ["step 0", "", "a caption far too long"])
+    strip = np.asarray(Image.open(tmp_path / "strip.png")).min(axis=-1)
+    below = strip[8 + 64 :]
+    assert (strip[: 8 + 64] == 255).all()
+    ink = [(below[:, 8 + 104 * k : 8 + 104 * k + 96] < 128).sum() for k in range(3)]
+    assert ink[0] > 30
+    assert ink[1] == 0
+    assert ink[2] > ink[0]
+    assert (below[-2:] == 255).all()
+
+
+def test_filmstrip_of_one_frame_needs_no_further_arguments(tmp_path):
+    write_filmstrip(tmp_path / "strip.png", film(1))
+    assert Image.open(tmp_path / "strip.png").size == (64 + 16, 48 + 16)
+
+
+@pytest.mark.parametrize("writer", WRITERS)
+def test_wrong_frames_are_clear_errors_and_leave_nothing(tmp_path, writer):
+    path = tmp_path / (
+        "film" + {"write_gif": ".gif", "write_mp4": ".mp4"}.get(writer.__name__, ".png")
+    )
+    for frames, message in (
+        ([], "at least one picture"),
+        ([np.zeros((4, 4, 3))], "must be uint8"),
+        ([np.zeros((4, 4, 4), np.uint8)], r"shape \[H, W, 3\]"),
+        ([np.zeros((4, 4, 3), np.uint8), np.zeros((5, 4, 3), np.uint8)], "all have one size"),
+        ([np.zeros((0, 4, 3), np.uint8)], "not zero"),
+    ):
+        with pytest.raises(NPAError, match=message):
+            writer(path, frames)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_wrong_rates_captions_and_columns_are_clear_errors(tmp_path):
+    for fps in (0, -1, 51, float("nan")):
+        with pytest.raises(NPAError, match=r"fps must be in \[0\.1, 50\]"):
+            write_gif(tmp_path / "film.gif", film(), fps=fps)
+    with pytest.raises(NPAError, match="fps must be in"):
+        write_mp4(tmp_path / "film.mp4", film(), fps=0)
+    with pytest.raises(NPAError, match="as many as the frames, 6, got 2"):
+        write_filmstrip(tmp_path / "strip.png", film(), ["a", "b"])
+    with pytest.raises(NPAError, match="columns must be an integer of at least 1"):
+        write_filmstrip(tmp_path / "strip.png", film(), columns=0)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("writer", WRITERS)
+def test_missing_folder_is_a_clear_error(tmp_path, writer):
+    suffix = {"write_gif": ".gif", "write_mp4": ".mp4"}.get(writer.__name__, ".png")
+    with pytest.raises(NPAError, match="nowhere"):
+        writer(tmp_path / "nowhere" / f"film{suffix}", film())
+
+
+FILE_SIZE_LIMIT = """
+import resource, sys
+import numpy as np
+from npa_envs.errors import NPAError
+from npa_envs.render import film
+noise = np.random.default_rng(0).integers(0, 256, (6, 128, 128, 3), dtype=np.uint8)
+resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+try:
+    getattr(film, sys.argv[1])(sys.argv[2], noise)
+except NPAError as error:
+    print("refused:", error)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a limit on the size of files")
+@pytest.mark.parametrize("writer", WRITERS)
+def test_disk_that_fills_up_is_a_clear_error_and_keeps_the_old_file(tmp_path, writer):
+    suffix = {"write_gif": ".gif", "write_mp4": ".mp4"}.get(writer.__name__, ".png")
+    path = tmp_path / f"film{suffix}"
+    path.write_bytes(b"old")
+    program = [sys.executable, "-c", FILE_SIZE_LIMIT, writer.__name__, str(path)]
+    done = subprocess.run(program, capture_output=True, text=True, timeout=120, check=False)
+    assert "refused: cannot write" in done.stdout, done.stderr
+    assert str(path) in done.stdout
+    assert path.read_bytes() == b"old"
+    assert os.listdir(tmp_path) == [path.name]
+
+
+def test_write_error_of_the_system_names_the_path(tmp_path, monkeypatch):
+    def refuse(*_args: object, **_options: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Image.Image, "save", refuse)
+    with pytest.raises(NPAError, match=r"picture\.png.*disk is full"):
+        write_png(tmp_path / "picture.png", film(1)[0])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_mp4_without_ffmpeg_names_the_pip_command(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(MissingDependencyError, match=r"pip install 'imageio\[ffmpeg\]'"):
+        write_mp4(tmp_path / "film.mp4", film())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_importing_render_loads_neither_matplotlib_nor_imageio():
+    program = (
+        "import sys, npa_envs.render\n"
+        "print([m for m in ('matplotlib', 'imageio', 'imageio_ffmpeg') if m in sys.modules])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == "[]"

@@ -1,0 +1,375 @@
+"""Rules survive their files, the authors' formats mean what ours do, and bad files are refused."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save_file
+from torch import Tensor
+
+from npa_envs.errors import NPAError
+from npa_envs.rule import NPARule
+from npa_envs.rule_io import load_rule, rule_metadata, save_rule, shipped_rules
+
+REFERENCE = Path(__file__).resolve().parent.parent.parent / "shared" / "reference"
+AUBERGINE = REFERENCE / "authors_demo_aubergine.json"
+needs_reference = pytest.mark.skipif(
+    not AUBERGINE.is_file(), reason="the reference numbers are not beside the checkout"
+)
+
+RULES: dict[str, Callable[[], NPARule]] = {
+    "plain 2D": lambda: NPARule(),
+    "3D with read-out": lambda: NPARule(
+        3, 5, 7, eps0=0.12, alpha=1.0, readout_dim=4, readout_hidden_dim=6
+    ),
+    "static": lambda: NPARule(2, 4, 8, static=True, readout_dim=10, readout_hidden_dim=3),
+    "ablated": lambda: NPARule(
+        2, 6, 5, moment_correction=False, state_gradient=False, density_gradient=False
+    ),
+}
+
+
+def assert_same_rule(got: NPARule, expected: NPARule) -> None:
+    assert got.hyper_parameters() == expected.hyper_parameters()
+    state = expected.state_dict()
+    assert got.state_dict().keys() == state.keys()
+    for name, tensor in got.state_dict().items():
+        assert tensor.dtype == state[name].dtype
+        assert torch.equal(tensor, state[name]), name
+
+
+@pytest.mark.parametrize("kind", RULES)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_saved_rule_comes_back_bit_by_bit(tmp_path: Path, kind: str, dtype: torch.dtype) -> None:
+    rule = RULES[kind]().to(dtype)
+    save_rule(rule, tmp_path / "rule.safetensors")
+    loaded = load_rule(tmp_path / "rule.safetensors")
+    assert_same_rule(loaded, rule)
+    assert all(p.requires_grad for p in loaded.parameters())
+    z = torch.randn(3, rule.perception_dim, dtype=dtype)
+    assert torch.equal(loaded(z), rule(z))
+
+
+def test_loading_draws_no_random_numbers(tmp_path: Path) -> None:
+    save_rule(NPARule(), tmp_path / "rule.safetensors")
+    torch.manual_seed(3)
+    before = torch.get_rng_state()
+    load_rule(tmp_path / "rule.safetensors")
+    assert torch.equal(before, torch.get_rng_state())
+
+
+def test_a_loaded_rule_does_not_hang_on_its_file(tmp_path: Path) -> None:
+    path = tmp_path / "rule.safetensors"
+    rule = NPARule()
+    save_rule(rule, path)
+    loaded = load_rule(path)
+    save_rule(NPARule(), path)
+    assert_same_rule(loaded, rule)
+    save_rule(loaded, path)
+    assert_same_rule(load_rule(path), rule)
+
+
+def test_metadata_is_kept_and_holds_every_hyper_parameter(tmp_path: Path) -> None:
+    path = tmp_path / "rule.safetensors"
+    save_rule(NPARule(eps0=0.125), path, metadata={"trained": "10 000 iterations, ε = 0.125"})
+    metadata = rule_metadata(path)
+    assert metadata["trained"] == "10 000 iterations, ε = 0.125"
+    assert (metadata["format"], metadata["version"]) == ("npa-envs rule", "1")
+    assert metadata["eps0"] == "0.125"
+    assert metadata["static"] == "false"
+    assert set(NPARule().hyper_parameters()) <= set(metadata)
+
+
+@pytest.mark.parametrize(
+    ("metadata", "message"),
+    [({"eps0": "1"}, "must not use the name 'eps0'"), ({"steps": 3}, "must map text to text")],
+)
+def test_bad_metadata_is_refused(tmp_path: Path, metadata: dict[str, Any], message: str) -> None:
+    with pytest.raises(NPAError, match=message):
+        save_rule(NPARule(), tmp_path / "rule.safetensors", metadata=metadata)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_saving_refuses_another_suffix_and_weights_that_are_not_finite(tmp_path: Path) -> None:
+    with pytest.raises(NPAError, match=r"must end in \.safetensors"):
+        save_rule(NPARule(), tmp_path / "rule.pth")
+    rule = NPARule()
+    with torch.no_grad():
+        rule.output.weight[0, :2] = math.nan
+    with pytest.raises(NPAError, match=r"2 of 2304 numbers in 'output.weight'"):
+        save_rule(rule, tmp_path / "rule.safetensors")
+    assert list(tmp_path.iterdir()) == []
+
+
+def write_raw(path: Path, rule: NPARule, change: Callable[[dict, dict], None]) -> None:
+    """Write a file as `save_rule` does, with the header and the weights changed."""
+    save_rule(rule, path)
+    header = rule_metadata(path)
+    weights = {name: tensor.clone() for name, tensor in rule.state_dict().items()}
+    change(header, weights)
+    save_file(weights, path, metadata=header)
+
+
+BAD_HEADERS: dict[str, tuple[Callable[[dict, dict], Any], str]] = {
+    "unknown version": (lambda h, w: h.update(version="2"), "version must be 1, got '2'.*upgrade"),
+    "another format": (lambda h, w: h.update(format="llama"), "format must be 'npa-envs rule'"),
+    "no format": (lambda h, w: h.pop("format"), "format must be 'npa-envs rule', got None"),
+    "a missing key": (lambda h, w: h.pop("alpha"), "lacks 'alpha'"),
+    "a wrong type": (lambda h, w: h.update(static="0"), "'static' must be a JSON bool, got '0'"),
+    "no JSON": (lambda h, w: h.update(eps0="0,1"), "'eps0' must be a JSON float"),
+    "a wrong value": (lambda h, w: h.update(space_dim="4"), "space_dim must be 2 or 3"),
+    "NaN radius": (lambda h, w: h.update(eps0="NaN"), "eps0 must be positive and finite"),
+    "a huge size": (lambda h, w: h.update(hidden_dim="9" * 30), "no rule has|shapes"),
+    "another shape": (lambda h, w: h.update(hidden_dim="64"), r"\(128, 66\) instead of \(64, 66\)"),
+    "a missing weight": (lambda h, w: w.pop("hidden.bias"), "hidden.bias: missing"),
+    "a weight too many": (lambda h, w: w.update(extra=torch.ones(1)), "extra: .* instead of"),
+    "whole numbers": (
+        lambda h, w: w.update({k: v.to(torch.int32) for k, v in w.items()}),
+        "float32 or all float64, got .'torch.int32'",
+    ),
+    "mixed precision": (lambda h, w: w.update({"hidden.bias": w["hidden.bias"].double()}), "all"),
+    "infinite weights": (lambda h, w: w["hidden.bias"].fill_(math.inf), "128 of 128 numbers"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_HEADERS)
+def test_a_wrong_file_of_ours_is_refused(tmp_path: Path, case: str) -> None:
+    change, message = BAD_HEADERS[case]
+    path = tmp_path / "rule.safetensors"
+    write_raw(path, NPARule(), change)
+    with pytest.raises(
+        NPAError, match=f"cannot load a rule from .*: .*{message}"
+    ):
+        load_rule(path)
+
+
+def test_an_unchanged_raw_file_is_accepted(tmp_path: Path) -> None:
+    rule = NPARule()
+    write_raw(tmp_path / "rule.safetensors", rule, lambda h, w: None)
+    assert_same_rule(load_rule(tmp_path / "rule.safetensors"), rule)
+
+
+def authors_state(rule: NPARule) -> dict[str, Any]:
+    state: dict[str, Any] = {
+        "model.0.weight": rule.hidden.weight.detach(),
+        "model.0.bias": rule.hidden.bias.detach(),
+        "model.2.weight": rule.output.weight.detach(),
+        "eps0": torch.tensor(rule.eps0),
+        "N0": torch.tensor(4096),
+        "alpha": torch.tensor(rule.alpha),
+    }
+    if rule.readout is not None:
+        for name, tensor in rule.readout.state_dict().items():
+            state[f"decoder.{name}"] = tensor
+    return state
+
+
+@pytest.mark.parametrize("kind", ["plain 2D", "3D with read-out", "static"])
+def test_the_authors_state_dict_is_the_same_rule(tmp_path: Path, kind: str) -> None:
+    rule = RULES[kind]()
+    torch.save(authors_state(rule), tmp_path / "npa.pth")
+    loaded = load_rule(tmp_path / "npa.pth")
+    if rule.static:
+        loaded.alpha = rule.alpha
+    assert_same_rule(loaded, rule)
+
+
+def test_the_authors_convolutions_and_plain_numbers_are_read(tmp_path: Path) -> None:
+    rule = NPARule(eps0=0.2)
+    state = authors_state(rule) | {"eps0": 0.2, "alpha": 0.5}
+    for name in ("model.0.weight", "model.2.weight"):
+        state[name] = state[name][:, :, None, None]
+    torch.save(state, tmp_path / "npa.pth")
+    assert_same_rule(load_rule(tmp_path / "npa.pth"), rule)
+
+
+class Trap:
+    """Unpickling it would leave a file behind."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Path.touch, (self.path,)
+
+
+def test_code_in_a_state_dict_is_not_run(tmp_path: Path) -> None:
+    torch.save({"model.0.weight": Trap(tmp_path / "ran")}, tmp_path / "npa.pth")
+    with pytest.raises(NPAError, match="without running code"):
+        load_rule(tmp_path / "npa.pth")
+    assert not (tmp_path / "ran").exists()
+
+
+BAD_STATES: dict[str, tuple[Callable[[dict], Any], str]] = {
+    "a missing key": (lambda s: s.pop("alpha"), r"missing: \['alpha'\]"),
+    "an unknown key": (lambda s: s.update({"model.2.bias": torch.ones(18)}), "model.2.bias"),
+    "half a decoder": (lambda s: s.update({"decoder.0.bias": torch.ones(3)}), "decoder.2.weight"),
+    "no tensor": (lambda s: s.update({"model.0.bias": [1.0]}), "must be a tensor, got a list"),
+    "a wrong rank": (lambda s: s.update({"model.0.bias": torch.ones(128, 1)}), "1 dimension"),
+    "a wrong size": (lambda s: s.update({"model.0.bias": torch.ones(64)}), "shapes"),
+    "odd inputs": (lambda s: s.update({"model.0.weight": torch.ones(128, 65)}), "65 inputs"),
+    "odd outputs": (lambda s: s.update({"model.2.weight": torch.ones(17, 128)}), "17 outputs"),
+    "no radius": (lambda s: s.update(eps0=torch.tensor(math.nan)), "eps0 must be a finite number"),
+    "NaN weights": (lambda s: s["model.0.bias"].fill_(math.nan), "must be finite"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_STATES)
+def test_a_wrong_state_dict_is_refused(tmp_path: Path, case: str) -> None:
+    change, message = BAD_STATES[case]
+    state = authors_state(NPARule())
+    change(state)
+    torch.save(state, tmp_path / "npa.pth")
+    with pytest.raises(NPAError, match=message):
+        load_rule(tmp_path / "npa.pth")
+
+
+def pack(array: Any) -> dict[str, Any]:
+    array = np.ascontiguousarray(array, dtype="<f4")
+    text = base64.b64encode(array.tobytes()).decode()
+    return {"shape": list(array.shape), "dtype": "float32", "data64": text}
+
+
+def demo_entry(rule: NPARule) -> dict[str, Any]:
+    """A rule as the web demo has it: displacement last, rows padded to whole texels."""
+
+    def padded(tensor: Tensor) -> Tensor:
+        return torch.nn.functional.pad(tensor.detach(), (0, -tensor.shape[-1] % 4))
+
+    output = rule.output.weight
+    return {
+        "eps0": float(np.float32(rule.eps0)),
+        "N0": 4096,
+        "alpha": rule.alpha,
+        "w1.weight": pack(padded(rule.hidden.weight)),
+        "w1.bias": pack(rule.hidden.bias.detach()),
+        "w2.weight.T": pack(padded(torch.cat([output[2:], output[:2]]).T)),
+    }
+
+
+@pytest.mark.parametrize("state_dim", [16, 5])
+def test_a_rule_of_the_web_demo_is_the_same_rule(tmp_path: Path, state_dim: int) -> None:
+    rule = NPARule(state_dim=state_dim)
+    path = tmp_path / "models.json"
+    path.write_text(json.dumps({"other": demo_entry(NPARule()), "mine": demo_entry(rule)}))
+    assert_same_rule(load_rule(f"{path}#mine"), rule)
+
+
+def test_a_collection_of_one_needs_no_name(tmp_path: Path) -> None:
+    rule = NPARule()
+    path = tmp_path / "models.json"
+    path.write_text(json.dumps({"mine": demo_entry(rule)}))
+    assert_same_rule(load_rule(path), rule)
+    path.write_text(json.dumps({"mine": demo_entry(rule), "other": demo_entry(rule)}))
+    with pytest.raises(NPAError, match="several rules: add #name; names: mine, other"):
+        load_rule(path)
+    with pytest.raises(NPAError, match="no rule 'mina': did you mean 'mine'"):
+        load_rule(f"{path}#mina")
+
+
+BAD_ENTRIES: dict[str, tuple[Callable[[dict], Any], str]] = {
+    "a missing array": (lambda e: e.pop("w1.bias"), "lacks 'w1.bias'"),
+    "no base64": (lambda e: e["w1.bias"].update(data64="!!"), "no base64"),
+    "cut data": (lambda e: e["w1.bias"].update(data64="AAAA"), "512 bytes for shape .*, got 3"),
+    "another dtype": (lambda e: e["w1.bias"].update(dtype="float16"), "must be float32"),
+    "a bad shape": (lambda e: e["w1.bias"].update(shape=[-1]), "must be float32 with 1 dim"),
+    "shapes at odds": (lambda e: e.update({"w2.weight.T": pack(np.ones((128, 16)))}), "must agree"),
+    "no radius": (lambda e: e.pop("eps0"), "eps0 must be a finite number, got None"),
+    "NaN weights": (lambda e: e.update({"w1.bias": pack(np.full(128, np.nan))}), "must be finite"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_ENTRIES)
+def test_a_wrong_entry_of_the_web_demo_is_refused(tmp_path: Path, case: str) -> None:
+    change, message = BAD_ENTRIES[case]
+    entry = demo_entry(NPARule())
+    change(entry)
+    path = tmp_path / "models.json"
+    path.write_text(json.dumps({"mine": entry}))
+    with pytest.raises(NPAError, match=message):
+        load_rule(path)
+
+
+def write_good_files(folder: Path) -> list[Path]:
+    rule = NPARule()
+    save_rule(rule, folder / "rule.safetensors")
+    torch.save(authors_state(rule), folder / "npa.pth")
+    (folder / "models.json").write_text(json.dumps({"mine": demo_entry(rule)}))
+    return sorted(folder.iterdir())
+
+
+@pytest.mark.parametrize("suffix", ["safetensors", "pth", "pt", "json"])
+@pytest.mark.parametrize(
+    "data", [b"", b"\x00" * 64, b"garbage " * 100, b"[1, 2]", b"{}", b'{"a": 1}', b"PK\x03\x04"]
+)
+def test_garbage_is_refused(tmp_path: Path, suffix: str, data: bytes) -> None:
+    path = tmp_path / f"rule.{suffix}"
+    path.write_bytes(data)
+    with pytest.raises(NPAError, match="cannot load a rule from"):
+        load_rule(path)
+
+
+def test_truncated_files_are_refused(tmp_path: Path) -> None:
+    for path in write_good_files(tmp_path):
+        data = path.read_bytes()
+        load_rule(path)
+        for part in (0.01, 0.3, 0.9, 0.999):
+            path.write_bytes(data[: int(part * len(data))])
+            with pytest.raises(NPAError, match="cannot load a rule from"):
+                load_rule(path)
+
+
+def test_missing_files_and_folders_are_named(tmp_path: Path) -> None:
+    for suffix in ("safetensors", "pth", "json"):
+        with pytest.raises(NPAError, match=f"nowhere.{suffix}.*(cannot be read|no safetensors)"):
+            load_rule(tmp_path / f"nowhere.{suffix}")
+        (tmp_path / f"folder.{suffix}").mkdir()
+        with pytest.raises(NPAError, match=f"folder.{suffix}"):
+            load_rule(tmp_path / f"folder.{suffix}")
+    (tmp_path / "rule.bin").touch()
+    with pytest.raises(NPAError, match=r"must end in \.safetensors, \.pth, \.pt, \.json"):
+        load_rule(tmp_path / "rule.bin")
+
+
+def test_an_unknown_name_suggests_a_shipped_rule(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save_rule(NPARule(), tmp_path / "gecko.safetensors")
+    monkeypatch.setattr(
+        "npa_envs.rule_io.shipped_rules", lambda: {"gecko": tmp_path / "gecko.safetensors"}
+    )
+    with pytest.raises(NPAError, match="unknown rule 'geko': did you mean 'gecko'"):
+        load_rule("geko")
+    assert load_rule("gecko").hyper_parameters() == NPARule().hyper_parameters()
+
+
+@pytest.mark.parametrize("name", shipped_rules())
+def test_every_shipped_rule_loads_and_has_a_model_card(name: str) -> None:
+    rule = load_rule(name)
+    assert sum(p.numel() for p in rule.parameters()) > 0
+    card = shipped_rules()[name].with_suffix(".md").read_text(encoding="utf-8")
+    assert name in card
+
+
+@needs_reference
+def test_the_authors_aubergine_has_the_layout_that_its_rollout_shows() -> None:
+    """A wrong order of rows or columns moves particles by 0.3 and more in these eight steps."""
+    from npa_envs.dynamics import rollout
+
+    rule = load_rule(f"{AUBERGINE}#aubergine").double()
+    assert (rule.eps0, rule.alpha, rule.state_dim, rule.hidden_dim) == (0.1, 0.5, 16, 128)
+    numbers = np.load(REFERENCE / "rollout_aubergine_8_steps.npz")
+    x = torch.from_numpy(numbers["x0"])[None]
+    s = torch.zeros(1, x.shape[1], 16, dtype=torch.float64)
+    with torch.no_grad():
+        x, s = rollout(rule, x, s, int(numbers["steps"]), update_prob=1.0)
+    assert float((x[0] - torch.from_numpy(numbers["x"])).abs().max()) < 1e-11
+    assert float((s[0] - torch.from_numpy(numbers["s"])).abs().max()) < 1e-11

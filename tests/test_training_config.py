@@ -1,0 +1,153 @@
+"""Configurations: checks, overrides, files, presets."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+
+from npa_envs.errors import NPAError
+from npa_envs.tasks.morphogenesis2d_config import Morphogenesis2DConfig
+from npa_envs.training import (
+    TASKS,
+    TrainConfig,
+    config_to_dict,
+    load_config,
+    override,
+    preset,
+    task_entry,
+)
+
+PAPER = preset("paper")
+
+
+def test_paper_preset_is_the_designs_table():
+    task = PAPER.task
+    assert (task.particle_count, task.state_dim, task.hidden_dim) == (4096, 16, 128)
+    assert (task.eps, task.alpha, task.update_prob, task.seed_radius) == (0.1, 0.5, 0.5, 0.2)
+    assert (task.resolution, task.sigma, task.damage_radius) == (256, 1.0, 0.1)
+    assert (task.splat_weight, task.colour_weight) == (2.0, 5.0)
+    assert (task.motion_weight, task.overflow_weight, task.bound_weight) == (0.01, 100.0, 100.0)
+    assert (PAPER.pool_size, PAPER.world_count, PAPER.steps) == (512, 8, (32, 96))
+    assert (PAPER.iterations, PAPER.repeats, PAPER.seed_interval) == (10_000, 3, 16)
+    assert (PAPER.learning_rate, PAPER.weight_decay, PAPER.decay) == (5e-4, 0.0, 0.3)
+    assert PAPER.milestones == (2_000, 4_000, 6_000, 8_000)
+    assert PAPER.damage
+    assert PAPER.normalise_gradients
+
+
+def test_learning_rate_falls_at_milestones_and_starts_afresh_with_each_repeat():
+    config = override(PAPER, iterations=10, milestones=[2, 5], learning_rate=1.0, decay=0.5)
+    rates = [config.learning_rate_at(k) for k in range(12)]
+    assert rates == [1, 1, 0.5, 0.5, 0.5, 0.25, 0.25, 0.25, 0.25, 0.25, 1, 1]
+
+
+def test_override_reaches_fields_of_the_run_and_of_the_task():
+    config = override(PAPER, iterations=7, target="heart", eps=1, out="elsewhere")
+    assert (config.iterations, config.task.target, config.out) == (7, "heart", Path("elsewhere"))
+    assert config.task.eps == 1.0
+    assert isinstance(config.task.eps, float)
+    assert (PAPER.iterations, PAPER.task.target) == (10_000, "gecko")
+
+
+@pytest.mark.parametrize("name", [f.name for f in dataclasses.fields(TrainConfig)])
+def test_no_field_of_the_run_hides_one_of_the_task(name):
+    assert name not in {f.name for f in dataclasses.fields(Morphogenesis2DConfig)}
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "rule"),
+    [
+        ("iterations", 0, "iterations must be a whole number of at least 1, got 0"),
+        ("iterations", True, "iterations must be of type int, got True"),
+        ("iterations", 2.5, "iterations must be of type int, got 2.5"),
+        ("learning_rate", float("nan"), "learning_rate must be a finite number greater than 0"),
+        ("learning_rate", "fast", "learning_rate must be of type float, got 'fast'"),
+        ("decay", 1.5, r"decay must lie in \(0, 1\], got 1.5"),
+        ("weight_decay", -1, "weight_decay must be a finite number of at least 0, got -1.0"),
+        ("steps", [5, 5], "steps must be two whole numbers"),
+        ("steps", 5, "steps must be a list, got 5"),
+        ("milestones", [5, 2], "milestones must be positive and increasing"),
+        ("world_count", 1000, "world_count must be at most pool_size"),
+        ("seed", -1, "seed must be a whole number of at least 0, got -1"),
+        ("dtype", "float16", "dtype must be one of float32, float64, got 'float16'"),
+        ("memory", "disk", "memory must be one of store, recompute, got 'disk'"),
+        ("device", "gpu", "device must name a device, got 'gpu'"),
+        ("device", "meta", "device must be 'cpu' or 'cuda', got 'meta'"),
+        ("target", "", "target must be a built-in name, an emoji or a path, got ''"),
+        ("eps", -0.1, "eps must be a finite number greater than 0, got -0.1"),
+        ("update_prob", 0.0, r"update_prob must lie in \(0, 1\], got 0.0"),
+        ("state_dim", 2, "state_dim must be a whole number of at least 3, got 2"),
+        ("resolution", 4, "resolution must be a whole number of at least 8, got 4"),
+        ("splat_weight", float("inf"), "splat_weight must be a finite number of at least 0"),
+    ],
+)
+def test_each_wrong_value_is_named(field, value, rule):
+    with pytest.raises(NPAError, match=rule):
+        override(PAPER, **{field: value})
+
+
+def test_unknown_field_gets_a_suggestion():
+    with pytest.raises(NPAError, match=r"unknown field 'itertions': did you mean 'iterations'\?"):
+        override(PAPER, itertions=5)
+
+
+def test_unknown_preset_and_task_get_a_suggestion():
+    with pytest.raises(NPAError, match="unknown preset 'papr' of morphogenesis2d: did you mean"):
+        preset("papr")
+    with pytest.raises(NPAError, match="did you mean 'morphogenesis2d'"):
+        task_entry("morphogenesis")
+
+
+FILES = {
+    "run.yaml": "iterations: 5\nlearning_rate: 5e-4\nsteps: [2, 4]\ntarget: heart\n",
+    "run.toml": 'iterations = 5\nlearning_rate = 5e-4\nsteps = [2, 4]\n[task]\ntarget = "heart"\n',
+    "run.json": '{"iterations": 5, "learning_rate": 5e-4, "steps": [2, 4], "target": "heart"}',
+}
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_files_of_every_kind_set_the_same_fields(tmp_path, name):
+    (tmp_path / name).write_text(FILES[name])
+    expected = override(preset("tiny"), iterations=5, steps=(2, 4), target="heart")
+    expected = override(expected, learning_rate=5e-4)
+    assert load_config(tmp_path / name, preset("tiny")) == expected
+
+
+def test_an_empty_file_sets_nothing(tmp_path):
+    (tmp_path / "empty.yml").write_text("")
+    assert load_config(tmp_path / "empty.yml", PAPER) == PAPER
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "rule"),
+    [
+        ("a.yaml", "itertions: 5", "unknown field 'itertions': did you mean 'iterations'"),
+        ("a.toml", "[task]\ntarge = 'x'", "unknown field 'task.targe': did you mean 'target'"),
+        ("a.yaml", "- 5", "must hold field names and values at its top level, got list"),
+        ("a.yaml", "a: [", "is not valid YAML"),
+        ("a.toml", "a = ", "is not valid TOML"),
+        ("a.json", "{", "is not valid JSON"),
+        ("a.ini", "", "must end in .yaml, .yml, .toml or .json"),
+        ("a.yaml", "iterations: none", "iterations must be of type int, got 'none'"),
+    ],
+)
+def test_wrong_files_are_refused_with_their_name(tmp_path, name, text, rule):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(NPAError, match=rule) as caught:
+        load_config(tmp_path / name, PAPER)
+    assert name in str(caught.value)
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(NPAError, match=r"cannot read the configuration file .*none.yaml"):
+        load_config(tmp_path / "none.yaml", PAPER)
+
+
+@pytest.mark.parametrize("name", TASKS["morphogenesis2d"].presets)
+def test_a_configuration_survives_being_written_as_json(name):
+    config = preset(name, seed=3, target="heart")
+    plain = json.loads(json.dumps(config_to_dict(config)))
+    assert override(PAPER, **plain) == config

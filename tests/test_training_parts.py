@@ -1,0 +1,214 @@
+"""Pool, optimiser, iteration and meter, each by itself."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from circle_task import CircleTask, circle_config, plain_rollout
+from torch import nn
+
+from npa_envs.training.graphs import EagerIteration, GraphedIteration
+from npa_envs.training.meter import LossMeter
+from npa_envs.training.optimiser import RuleOptimiser, normalise_gradients
+from npa_envs.training.pool import WorldPool
+
+
+def make_pool(pool_size=6, particle_count=4, limit=10.0):
+    x = torch.arange(pool_size, dtype=torch.float32)[:, None, None].repeat(1, particle_count, 2)
+    return WorldPool(x, x[..., :1].repeat(1, 1, 3), runaway_limit=limit)
+
+
+def test_pool_draws_different_worlds_and_all_of_them_in_the_long_run():
+    pool = make_pool()
+    generator = torch.Generator().manual_seed(0)
+    counts = torch.zeros(6)
+    for _ in range(300):
+        index = pool.sample(4, generator)
+        assert len(set(index.tolist())) == 4
+        counts[index] += 1
+    # Each count is hypergeometric with mean 200 and standard deviation 8.2.
+    assert (counts - 200).abs().max() < 41
+
+
+def test_pool_reads_copies():
+    pool = make_pool()
+    x, s = pool.read(torch.tensor([4, 2]))
+    assert x[:, 0, 0].tolist() == [4, 2]
+    x.zero_()
+    s.zero_()
+    assert pool.x[4, 0, 0] == 4
+    assert pool.s[2, 0, 0] == 2
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 11.0, -11.0])
+@pytest.mark.parametrize("where", ["x", "s"])
+def test_pool_replaces_worlds_that_run_away_and_only_those(bad, where):
+    pool = make_pool()
+    x, s = torch.full((3, 4, 2), 7.0), torch.full((3, 4, 3), 8.0)
+    (x if where == "x" else s)[1, 2, 1] = bad
+    fresh_x, fresh_s = torch.full_like(x, 0.5), torch.full_like(s, 0.25)
+    replaced = pool.write(torch.tensor([5, 0, 3]), x, s, fresh_x, fresh_s)
+    assert replaced.tolist() == [False, True, False]
+    assert pool.x[:, 0, 0].tolist() == [0.5, 1, 2, 7, 4, 7]
+    assert pool.s[:, 0, 0].tolist() == [0.25, 1, 2, 8, 4, 8]
+
+
+def test_each_gradient_is_divided_by_its_own_norm():
+    gradients = [torch.tensor([[3.0, 4.0]]), torch.tensor([-1e-3]), torch.zeros(2)]
+    normalise_gradients(gradients)
+    torch.testing.assert_close(gradients[0], torch.tensor([[0.6, 0.8]]))
+    torch.testing.assert_close(gradients[1], torch.tensor([-1.0]), atol=2e-5, rtol=0)
+    assert gradients[2].tolist() == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_gradient_that_is_not_finite_becomes_zero_and_its_neighbour_stays(bad):
+    gradients = [torch.tensor([1.0, bad]), torch.tensor([2.0])]
+    normalise_gradients(gradients)
+    assert gradients[0].tolist() == [0.0, 0.0]
+    assert gradients[1].tolist() == [1.0]
+
+
+def step_with(config, gradient_values):
+    parameter = nn.Parameter(torch.zeros(1))
+    optimiser = RuleOptimiser([parameter], config)
+    path = []
+    for iteration, value in enumerate(gradient_values):
+        parameter.grad = torch.tensor([value])
+        optimiser.step(iteration)
+        path.append(parameter.item())
+    return path
+
+
+def test_first_step_of_each_repeat_has_the_full_learning_rate_and_fresh_moments(tmp_path):
+    config = circle_config(tmp_path, iterations=3, repeats=2, milestones=[1], decay=0.1)
+    path = step_with(config, [1.0, 1.0, 1.0, -1.0])
+    # With fresh moments AdamW's first step is the learning rate, against the gradient's sign.
+    assert path[0] == pytest.approx(-0.01, rel=1e-3)
+    assert path[1] - path[0] == pytest.approx(-0.001, rel=1e-3)
+    assert path[3] - path[2] == pytest.approx(0.01, rel=1e-3)
+
+
+def test_weight_decay_shrinks_weights_without_gradient(tmp_path):
+    parameter = nn.Parameter(torch.ones(1))
+    optimiser = RuleOptimiser([parameter], circle_config(tmp_path, weight_decay=0.5))
+    parameter.grad = torch.zeros(1)
+    optimiser.step(0)
+    assert parameter.item() == pytest.approx(1 - 0.01 * 0.5)
+
+
+def make_iteration(config, kind=EagerIteration, device="cpu"):
+    task = CircleTask()
+    rule = task.make_rule(torch.Generator().manual_seed(1)).to(device, config.torch_dtype)
+    x, s = task.seed(
+        config.world_count,
+        generator=torch.Generator(device).manual_seed(2),
+        device=torch.device(device),
+    )
+    generator = torch.Generator(device).manual_seed(3)
+    x, s = x.to(config.torch_dtype), s.to(config.torch_dtype)
+    return task, rule, kind(task, rule, config, x, s, generator, plain_rollout)
+
+
+def test_iteration_leaves_the_worlds_the_terms_and_the_gradients(tmp_path):
+    config = circle_config(tmp_path, dtype="float64")
+    task, rule, iteration = make_iteration(config)
+    iteration.run(5)
+    gradients = [p.grad.clone() for p in iteration.parameters]
+
+    generator = torch.Generator().manual_seed(3)
+    x, s, path_length = plain_rollout(
+        rule,
+        iteration.x0,
+        iteration.s0,
+        5,
+        eps=task.eps,
+        box=None,
+        update_prob=0.5,
+        memory="store",
+        generator=generator,
+        return_path_length=True,
+    )
+    total, parts = task.loss(x, s, path_length)
+    rule.zero_grad()
+    total.backward()
+    assert torch.equal(iteration.x, x.detach())
+    assert torch.equal(iteration.s, s.detach())
+    assert iteration.term_names == ("loss", "distance", "state", "motion")
+    assert iteration.terms.tolist() == [total.item(), *(v.item() for v in parts.values())]
+    for ours, parameter in zip(gradients, rule.parameters(), strict=True):
+        assert ours.abs().max() > 0
+        torch.testing.assert_close(ours, parameter.grad, rtol=1e-12, atol=0)
+
+
+def test_masks_differ_from_run_to_run(tmp_path):
+    _, _, iteration = make_iteration(circle_config(tmp_path))
+    iteration.run(5)
+    first = iteration.x.clone()
+    iteration.run(5)
+    assert not torch.equal(first, iteration.x)
+
+
+def test_a_parameter_outside_the_loss_gets_a_zero_gradient(tmp_path):
+    task = CircleTask()
+    rule = task.make_rule(torch.Generator().manual_seed(1))
+    rule.unused = nn.Parameter(torch.ones(2))
+    x, s = task.seed(2, generator=torch.Generator(), device=torch.device("cpu"))
+    config = circle_config(tmp_path)
+    iteration = EagerIteration(task, rule, config, x, s, torch.Generator(), plain_rollout)
+    rule.unused.grad.fill_(5.0)
+    iteration.run(2)
+    assert rule.unused.grad.tolist() == [0.0, 0.0]
+
+
+def test_meter_gives_the_means_of_the_interval(tmp_path):
+    _, _, iteration = make_iteration(circle_config(tmp_path))
+    meter = LossMeter(iteration)
+    for number, value in enumerate([1.0, 2.0, 6.0], start=1):
+        iteration.terms.fill_(value)
+        meter.observe(number, 4 * number, torch.tensor([number == 2, False]))
+    expected = dict.fromkeys(iteration.term_names, 3.0) | {"steps": 8.0, "replaced_worlds": 1}
+    assert meter.read() == expected
+    meter.clear()
+    iteration.terms.fill_(5.0)
+    meter.observe(4, 7, torch.tensor([False]))
+    assert meter.read() == dict.fromkeys(iteration.term_names, 5.0) | {
+        "steps": 7.0,
+        "replaced_worlds": 0,
+    }
+
+
+def test_meter_keeps_the_first_bad_iteration_and_not_a_later_one(tmp_path):
+    _, _, iteration = make_iteration(circle_config(tmp_path))
+    meter = LossMeter(iteration)
+    for number, (term, mark) in enumerate([(1.0, 10.0), (math.nan, 20.0), (math.inf, 30.0)], 1):
+        iteration.terms.fill_(1.0)
+        iteration.terms[2] = term
+        iteration.x0.fill_(mark)
+        meter.observe(number, 100 + number, torch.tensor([False]))
+    assert meter.bad_iteration() == 2
+    snapshot = meter.snapshot()
+    assert (snapshot["iteration"], snapshot["steps"]) == (2, 102)
+    assert math.isnan(snapshot["terms"]["state"])
+    assert snapshot["terms"]["distance"] == 1.0
+    assert snapshot["x0"].unique().tolist() == [20.0]
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_replayed_graphs_give_what_eager_launches_give(tmp_path):
+    config = circle_config(tmp_path, dtype="float64")
+    _, _, eager = make_iteration(config, EagerIteration, "cuda")
+    _, _, graphed = make_iteration(config, GraphedIteration, "cuda")
+    seen = []
+    for steps in (4, 7, 4, 7, 4):
+        for iteration in (eager, graphed):
+            iteration.run(steps)
+        torch.testing.assert_close(graphed.x, eager.x, rtol=1e-10, atol=1e-12)
+        torch.testing.assert_close(graphed.terms, eager.terms, rtol=1e-10, atol=1e-12)
+        for ours, theirs in zip(graphed.parameters, eager.parameters, strict=True):
+            torch.testing.assert_close(ours.grad, theirs.grad, rtol=1e-9, atol=1e-12)
+        seen.append(graphed.x.clone())
+    assert not torch.equal(seen[0], seen[2])

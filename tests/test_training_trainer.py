@@ -1,0 +1,469 @@
+"""The trainer as a whole: it learns, it leaves files behind, it can be killed and resumed."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from circle_task import CircleTask, circle_config, plain_rollout
+from PIL import Image
+
+from npa_envs.errors import NPAError
+from npa_envs.rule_io import load_rule, rule_metadata
+from npa_envs.training import (
+    DivergedError,
+    JsonlLog,
+    Trainer,
+    check_device,
+    load_config,
+    override,
+)
+from npa_envs.training.checkpoint import load_checkpoint, save_checkpoint
+
+TESTS = Path(__file__).parent
+
+
+def trainer_of(config, task=None, **options):
+    options = {"task_name": "circle", "rollout": plain_rollout} | options
+    return Trainer(task or CircleTask(), config, **options)
+
+
+def train(config, task=None, **options):
+    return trainer_of(config, task, **options).run(progress=False)
+
+
+def log_of(folder):
+    """The log without its times, which differ from run to run."""
+    records = JsonlLog(folder / "log.jsonl").records()
+    return [{k: v for k, v in record.items() if k != "seconds"} for record in records]
+
+
+class Killed(BaseException):
+    pass
+
+
+class KilledTask(CircleTask):
+    """Ends the program, as a kill would, in the loss of an iteration."""
+
+    def __init__(self, iteration, end):
+        super().__init__()
+        self.calls_before = iteration  # One of them is the trainer's look at the terms.
+        self.end = end
+
+    def loss(self, x, s, path_length):
+        if self.loss_calls == self.calls_before:
+            self.end()
+        return super().loss(x, s, path_length)
+
+
+def kill():
+    raise Killed
+
+
+def test_training_learns_the_circle(tmp_path):
+    config = circle_config(tmp_path, iterations=150, milestones=[100], log_interval=5)
+    config = override(config, learning_rate=3e-2, steps=(6, 12))
+    result = train(config)
+    log = log_of(tmp_path)
+    assert result.finished
+    assert result.iteration == 150
+    assert log[0]["distance"] > 0.1
+    # Seen over ten seeds: 0.0024 to 0.0047.
+    assert log[-1]["distance"] < 0.01
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {},
+        {"repeats": 2, "iterations": 3, "milestones": [1]},
+        {"log_interval": 2, "checkpoint_interval": 3},
+        {"dtype": "float64", "damage": False, "normalise_gradients": False},
+    ],
+)
+def test_killed_and_resumed_run_has_the_same_log_bit_for_bit(tmp_path, fields):
+    whole = circle_config(tmp_path / "whole", **fields)
+    whole_rule = train(whole).rule
+    broken = circle_config(tmp_path / "broken", **fields)
+    with pytest.raises(Killed):
+        train(broken, KilledTask(iteration=5, end=kill))
+    assert load_checkpoint(tmp_path / "broken" / "checkpoint.pt")["iteration"] == 3
+    resumed = train(broken, resume=True)
+    assert resumed.finished
+    assert log_of(tmp_path / "broken") == log_of(tmp_path / "whole")
+    for ours, theirs in zip(resumed.rule.parameters(), whole_rule.parameters(), strict=True):
+        assert torch.equal(ours, theirs)
+
+
+def test_run_killed_before_its_first_checkpoint_can_be_resumed(tmp_path):
+    whole = circle_config(tmp_path / "whole")
+    train(whole)
+    broken = circle_config(tmp_path / "broken")
+    with pytest.raises(Killed):
+        train(broken, KilledTask(iteration=1, end=kill))
+    train(broken, resume=True)
+    assert log_of(tmp_path / "broken") == log_of(tmp_path / "whole")
+
+
+SCRIPT = """
+import os, signal, sys
+from circle_task import circle_config
+from test_training_trainer import KilledTask, train
+out, iteration, resume = sys.argv[1], int(sys.argv[2]), sys.argv[3] == "resume"
+end = lambda: os.kill(os.getpid(), signal.SIGKILL)
+train(circle_config(out), KilledTask(iteration, end), resume=resume)
+"""
+
+
+def run_script(*arguments):
+    environment = os.environ | {"PYTHONPATH": f"{TESTS.parent}{os.pathsep}{TESTS}"}
+    command = [sys.executable, "-c", SCRIPT, *map(str, arguments)]
+    return subprocess.run(command, env=environment, capture_output=True, timeout=120, check=False)
+
+
+def test_run_killed_by_the_system_is_resumed_by_another_process(tmp_path):
+    killed = run_script(tmp_path / "broken", 5, "start")
+    assert killed.returncode == -signal.SIGKILL, killed.stderr
+    # What the kill cut short must not be read back.
+    with (tmp_path / "broken" / "log.jsonl").open("a") as file:
+        file.write('{"iteration": 5, "lo')
+    train(circle_config(tmp_path / "broken"), resume=True)
+    train(circle_config(tmp_path / "whole"))
+    assert log_of(tmp_path / "broken") == log_of(tmp_path / "whole")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signal_stops_after_the_iteration_saves_and_can_be_resumed(tmp_path, number):
+    handler = signal.getsignal(number)
+    broken = circle_config(tmp_path / "broken", checkpoint_interval=100)
+    task = KilledTask(iteration=2, end=lambda: os.kill(os.getpid(), number))
+    result = train(broken, task)
+    assert (result.iteration, result.finished) == (2, False)
+    assert signal.getsignal(number) == handler
+    assert train(broken, resume=True).finished
+    train(circle_config(tmp_path / "whole", checkpoint_interval=100))
+    assert log_of(tmp_path / "broken") == log_of(tmp_path / "whole")
+
+
+def test_training_works_in_a_thread_where_signals_cannot_be_caught(tmp_path):
+    results = []
+    thread = threading.Thread(target=lambda: results.append(train(circle_config(tmp_path))))
+    thread.start()
+    thread.join()
+    assert results[0].finished
+
+
+def test_run_stops_when_its_time_is_over(tmp_path):
+    result = trainer_of(circle_config(tmp_path)).run(progress=False, max_seconds=0.0)
+    assert (result.iteration, result.finished) == (0, False)
+
+
+def test_finished_run_resumed_does_nothing_and_more_repeats_go_on(tmp_path):
+    config = circle_config(tmp_path)
+    train(config)
+    before = log_of(tmp_path)
+    assert train(config, resume=True).iteration == 6
+    assert log_of(tmp_path) == before
+    assert train(override(config, repeats=2), resume=True).iteration == 12
+    assert [record["iteration"] for record in log_of(tmp_path)] == list(range(1, 13))
+
+
+def test_two_runs_with_one_seed_are_equal_and_with_two_seeds_differ(tmp_path):
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+        train(circle_config(tmp_path / name, seed=seed))
+    assert log_of(tmp_path / "a") == log_of(tmp_path / "b")
+    assert log_of(tmp_path / "a") != log_of(tmp_path / "c")
+
+
+def test_log_has_terms_rate_steps_and_time(tmp_path):
+    train(circle_config(tmp_path, iterations=5, log_interval=2, milestones=[3], decay=0.5))
+    records = JsonlLog(tmp_path / "log.jsonl").records()
+    # The last line closes an interval that the run's end cut short.
+    assert [record["iteration"] for record in records] == [2, 4, 5]
+    assert [record["learning_rate"] for record in records] == [0.01, 0.005, 0.005]
+    assert all(4 <= record["steps"] < 9 for record in records)
+    assert records[0]["seconds"] <= records[1]["seconds"] <= records[2]["seconds"]
+    terms = ["loss", "distance", "state", "motion"]
+    assert list(records[0]) == [
+        "iteration",
+        *terms,
+        "steps",
+        "replaced_worlds",
+        *list(records[0])[-2:],
+    ]
+    for record in records:
+        whole = record["distance"] + 0.01 * record["state"] + 0.001 * record["motion"]
+        assert record["loss"] == pytest.approx(whole, rel=1e-5)
+
+
+def test_rollout_steps_cover_the_whole_range_and_no_more(tmp_path):
+    train(circle_config(tmp_path, iterations=80, steps=[2, 5], milestones=[]))
+    assert {record["steps"] for record in log_of(tmp_path)} == {2, 3, 4}
+
+
+class WatchedTask(CircleTask):
+    """Counts the batches whose first world is a seed: only a seed's states are all 0."""
+
+    def __init__(self):
+        super().__init__()
+        self.fresh = []
+
+    def seed(self, world_count, *, generator, device):
+        x, s = super().seed(world_count, generator=generator, device=device)
+        return x, s + 0.125
+
+    def make_rollout(self):
+        def rollout(rule, x, s, steps, **options):
+            self.fresh.append((s == 0.125).flatten(1).all(1).tolist())
+            return plain_rollout(rule, x, s, steps, **options)
+
+        return rollout
+
+
+def test_every_fourth_batch_starts_with_a_fresh_seed(tmp_path):
+    task = WatchedTask()
+    # Once every world of the pool has been trained on, a seed can only be a fresh one.
+    config = circle_config(tmp_path, iterations=40, world_count=2, pool_size=2, milestones=[])
+    trainer_of(config, task, rollout=task.make_rollout()).run(progress=False)
+    assert [first for first, _ in task.fresh[4:]] == [k % 4 == 0 for k in range(4, 40)]
+    assert not any(second for _, second in task.fresh[4:])
+
+
+@pytest.mark.parametrize("damage", [True, False])
+def test_worlds_from_the_pool_are_damaged_where_asked_and_fresh_seeds_are_not(tmp_path, damage):
+    blank = []
+
+    def rollout(rule, x, s, steps, **options):
+        blank.append((s == 0).all(-1).sum(1).tolist())
+        return plain_rollout(rule, x, s, steps, **options)
+
+    config = circle_config(tmp_path, iterations=12, damage=damage, milestones=[])
+    trainer_of(config, WatchedTask(), rollout=rollout).run(progress=False)
+    # Each particle is blanked with probability 0.2; only damage makes states exactly 0.
+    total = sum(sum(counts) for counts in blank)
+    assert (50 < total < 130) if damage else total == 0
+    assert [counts[0] for counts in blank[::4]] == [0, 0, 0]
+
+
+def test_run_leaves_rule_configuration_and_pictures(tmp_path):
+    config = circle_config(tmp_path, picture_interval=3)
+    result = train(config)
+    rule = load_rule(tmp_path / "rule.safetensors")
+    for ours, theirs in zip(rule.parameters(), result.rule.parameters(), strict=True):
+        assert torch.equal(ours, theirs)
+    assert rule_metadata(tmp_path / "rule.safetensors")["iteration"] == "6"
+    assert load_config(tmp_path / "config.json", circle_config("x")) == config
+    assert sorted(p.name for p in tmp_path.glob("pictures/*")) == ["000003.png", "000006.png"]
+    pixels = np.asarray(Image.open(tmp_path / "pictures" / "000006.png"))
+    assert pixels.shape == (8, 3 * 8, 3)
+    assert pixels.min() < pixels.max()
+
+
+def test_tensorboard_gets_the_same_numbers_as_the_log(tmp_path):
+    train(circle_config(tmp_path, tensorboard=True, picture_interval=6))
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(tmp_path / "tensorboard"))
+    events.Reload()
+    losses = [(event.step, event.value) for event in events.Scalars("loss")]
+    expected = [(record["iteration"], record["loss"]) for record in log_of(tmp_path)]
+    assert losses == [(k, pytest.approx(loss, rel=1e-6)) for k, loss in expected]
+    assert [event.step for event in events.Images("batch")] == [6]
+
+
+class BrokenTask(CircleTask):
+    """Its loss becomes NaN in one iteration, through one world."""
+
+    def __init__(self, iteration):
+        super().__init__()
+        self.bad_call = iteration
+
+    def loss(self, x, s, path_length):
+        if self.loss_calls == self.bad_call:
+            s = s.clone()
+            s[1] = math.nan
+        return super().loss(x, s, path_length)
+
+
+def explode_after(iterations):
+    """A rollout that spoils the last world of the batch in one iteration."""
+    calls = []
+
+    def rollout(rule, x, s, steps, **options):
+        calls.append(steps)
+        x, s, path_length = plain_rollout(rule, x, s, steps, **options)
+        if len(calls) == iterations:
+            x = torch.cat([x[:2], x[2:] * math.inf])
+        return x, s, path_length
+
+    return rollout
+
+
+def test_loss_that_is_not_finite_stops_the_run_with_a_report(tmp_path):
+    config = circle_config(tmp_path, iterations=20, log_interval=2, checkpoint_interval=1)
+    trainer = trainer_of(config, rollout=explode_after(5))
+    with pytest.raises(DivergedError) as caught:
+        trainer.run(progress=False)
+    message = str(caught.value)
+    assert "distance was not in iteration 5 (" in message
+    assert "steps, world 2 of the batch)" in message
+    assert "diverged.pt" in message
+    assert [record["iteration"] for record in log_of(tmp_path)] == [2, 4]
+    assert load_checkpoint(tmp_path / "checkpoint.pt")["iteration"] == 4
+    diagnosis = load_checkpoint(tmp_path / "diverged.pt")
+    assert diagnosis["iteration"] == 5
+    assert torch.isfinite(diagnosis["x0"]).all()
+    assert torch.isfinite(diagnosis["x"]).flatten(1).all(1).tolist() == [True, True, False]
+
+
+def test_bad_term_is_named_when_the_worlds_are_sound(tmp_path):
+    with pytest.raises(DivergedError, match="state was not in iteration 3"):
+        train(circle_config(tmp_path), BrokenTask(iteration=3))
+
+
+def test_diverged_run_can_be_resumed_from_its_last_good_checkpoint(tmp_path):
+    config = circle_config(tmp_path / "broken", checkpoint_interval=2)
+    with pytest.raises(DivergedError):
+        train(config, BrokenTask(iteration=4))
+    assert train(config, resume=True).finished
+    train(circle_config(tmp_path / "whole", checkpoint_interval=2))
+    assert log_of(tmp_path / "broken") == log_of(tmp_path / "whole")
+
+
+def test_world_that_runs_away_does_not_stay_in_the_pool(tmp_path):
+    def rollout(rule, x, s, steps, **options):
+        x, s, path_length = plain_rollout(rule, x, s, steps, **options)
+        return x + torch.tensor([0.0, 100.0, 0.0])[:, None, None], s, path_length
+
+    trainer = trainer_of(circle_config(tmp_path), rollout=rollout)
+    trainer.run(progress=False)
+    assert trainer.pool.x.abs().max() < 10
+    assert [record["replaced_worlds"] for record in log_of(tmp_path)] == [1] * 6
+
+
+def test_second_run_in_a_folder_is_refused_unless_it_overwrites(tmp_path):
+    config = circle_config(tmp_path, picture_interval=1)
+    train(config)
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(NPAError, match="holds one: resume it, choose another folder, or overwrite"):
+        trainer_of(config)
+    result = train(override(config, iterations=2), overwrite=True)
+    assert result.iteration == 2
+    assert [record["iteration"] for record in log_of(tmp_path)] == [1, 2]
+    assert sorted(p.name for p in tmp_path.glob("pictures/*")) == ["000001.png", "000002.png"]
+    assert (tmp_path / "notes.txt").read_text() == "mine"
+
+
+def test_resume_needs_a_checkpoint(tmp_path):
+    with pytest.raises(NPAError, match="there is no checkpoint to resume from"):
+        trainer_of(circle_config(tmp_path / "none"), resume=True)
+    assert not (tmp_path / "none").exists()
+
+
+def test_checkpoint_of_another_task_or_configuration_is_refused(tmp_path):
+    config = circle_config(tmp_path)
+    train(config)
+    before = (tmp_path / "checkpoint.pt").read_bytes()
+    with pytest.raises(NPAError, match="is of task 'circle', not of 'square'"):
+        trainer_of(config, task_name="square", resume=True)
+    with pytest.raises(NPAError, match=r"learning_rate: 0.01 there, 0.5 here"):
+        trainer_of(override(config, learning_rate=0.5), resume=True)
+    with pytest.raises(NPAError, match=r"task.target: 'gecko' there, 'heart' here"):
+        trainer_of(override(config, target="heart"), resume=True)
+    train(override(config, repeats=2), resume=True)
+    with pytest.raises(NPAError, match="at iteration 12, beyond the 6 of this run: raise repeats"):
+        trainer_of(config, resume=True)
+    assert (tmp_path / "checkpoint.pt").read_bytes() != before
+
+
+@pytest.mark.parametrize("damage", ["garbage", "truncated", "empty", "other", "version"])
+def test_damaged_checkpoint_is_refused(tmp_path, damage):
+    config = circle_config(tmp_path)
+    train(config)
+    path = tmp_path / "checkpoint.pt"
+    data = path.read_bytes()
+    if damage == "other":
+        torch.save({"weights": torch.zeros(2)}, path)
+    elif damage == "version":
+        content = torch.load(path, weights_only=True)
+        torch.save(content | {"format_version": 99}, path)
+    else:
+        path.write_bytes({"garbage": b"x" * 100, "truncated": data[:-500], "empty": b""}[damage])
+    spoiled = path.read_bytes()
+    with pytest.raises(NPAError, match="checkpoint"):
+        trainer_of(config, resume=True)
+    assert path.read_bytes() == spoiled
+
+
+def test_checkpoint_that_would_run_code_is_refused(tmp_path):
+    class Trap:
+        def __reduce__(self):
+            return (Path(tmp_path / "ran").touch, ())
+
+    torch.save({"format": "npa-envs checkpoint", "trap": Trap()}, tmp_path / "checkpoint.pt")
+    with pytest.raises(NPAError, match="is not a checkpoint or is damaged"):
+        load_checkpoint(tmp_path / "checkpoint.pt")
+    assert not (tmp_path / "ran").exists()
+
+
+def test_folder_that_cannot_be_made_is_named_before_training(tmp_path):
+    (tmp_path / "file").write_text("")
+    task = CircleTask()
+    with pytest.raises(NPAError, match=r"out must be a folder that can be created .*file/run"):
+        trainer_of(circle_config(tmp_path / "file" / "run"), task)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_folder_without_write_permission_is_named_before_training(tmp_path):
+    folder = tmp_path / "locked"
+    folder.mkdir()
+    folder.chmod(0o555)
+    with pytest.raises(NPAError, match="permission"):
+        trainer_of(circle_config(folder))
+
+
+def test_disk_without_room_is_noticed_before_training(tmp_path, monkeypatch):
+    usage = type("Usage", (), {"free": 100})
+    monkeypatch.setattr("npa_envs.training.folder.shutil.disk_usage", lambda path: usage)
+    with pytest.raises(NPAError, match="must have room for two checkpoints"):
+        trainer_of(circle_config(tmp_path))
+    assert not (tmp_path / "checkpoint.pt").exists()
+
+
+def test_disk_that_fills_up_leaves_the_last_checkpoint(tmp_path):
+    resource = pytest.importorskip("resource")
+    config = circle_config(tmp_path)
+    trainer = trainer_of(config)
+    before = (tmp_path / "checkpoint.pt").read_bytes()
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    # The system refuses to write further than this, as it does on a full disk.
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) // 2, limits[1]))
+    try:
+        with pytest.raises(NPAError, match=r"cannot write .*checkpoint.pt"):
+            trainer.run(progress=False)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert (tmp_path / "checkpoint.pt").read_bytes() == before
+    assert not list(tmp_path.glob(".*tmp*"))
+    assert train(config, resume=True).finished
+
+
+def test_a_device_that_is_not_there_is_named():
+    with pytest.raises(NPAError, match="device must be one that torch sees, got 'cuda:99'"):
+        check_device("cuda:99")
+
+
+def test_checkpoint_round_trip_keeps_every_bit(tmp_path):
+    content = {"a": torch.tensor([1.0, math.nan]), "b": [1, "two", {"c": None}]}
+    save_checkpoint(tmp_path / "c.pt", content)
+    back = load_checkpoint(tmp_path / "c.pt")
+    assert back["b"] == content["b"]
+    assert back["a"].view(torch.int32).equal(content["a"].view(torch.int32))
