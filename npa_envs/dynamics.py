@@ -136,6 +136,7 @@ def _advance(
         rows=rows,
         reach=rule.alpha * options.eps,
         dt=options.dt,
+        moving=not rule.static,
         box=options.box,
     )
 

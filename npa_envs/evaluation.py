@@ -3,30 +3,38 @@
 from __future__ import annotations
 
 import copy
-import dataclasses
 import itertools
-import json
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from npa_envs.dynamics import rollout
 from npa_envs.errors import NPAError
+from npa_envs.render.tables import table_json, table_text
 from npa_envs.rule import NPARule
 from npa_envs.tasks.damage import cut, erase_state, random_particle
 from npa_envs.tasks.task import PictureTask
+
+__all__ = [
+    "CHECKPOINTS",
+    "EvaluationRow",
+    "HealingRow",
+    "check_steps",
+    "evaluate",
+    "healing",
+    "measure",
+    "psnr",
+    "table_json",
+    "table_text",
+]
 
 CHECKPOINTS = (64, 128, 256, 512, 1024, 2048, 4096)
 """Steps at which a rule is measured, unless others are asked for."""
 
 HEALED = 1.2
 """A world is healed once its loss is at most this many times the undamaged one."""
-
-Damage = Callable[[Tensor, Tensor, torch.Generator], tuple[Tensor, Tensor]]
 
 
 @dataclass(frozen=True)
@@ -108,15 +116,11 @@ def evaluate(
         NPAError: `checkpoints` or `seeds` are empty or out of order.
     """
     check_steps("checkpoints", checkpoints)
-    x, s, generator = _seed_worlds(rule, task, seeds, torch.device(device))
-    rule = copy.deepcopy(rule).to(device)
+    worlds = _Worlds(rule, task, seeds, torch.device(device), progress)
+    x, s = worlds.x, worlds.s
     rows = []
-    done = 0
-    for step in checkpoints:
-        x, s = _grow(rule, task, x, s, step - done, generator)
-        if progress is not None:
-            progress(step - done)
-        done = step
+    for step, before in zip(checkpoints, (0, *checkpoints), strict=False):
+        x, s = worlds.grow(x, s, step - before)
         rows.append(measure(task, x, s, step))
     return rows
 
@@ -193,40 +197,29 @@ def healing(
     check_steps("grow_steps", [grow_steps])
     check_steps("heal_steps", [heal_steps])
     check_steps("every", [every])
-    x, s, generator = _seed_worlds(rule, task, seeds, torch.device(device))
-    rule = copy.deepcopy(rule).to(device)
-    x, s = _grow(rule, task, x, s, grow_steps, generator)
-    if progress is not None:
-        progress(grow_steps)
+    worlds = _Worlds(rule, task, seeds, torch.device(device), progress)
+    x, s = worlds.grow(worlds.x, worlds.s, grow_steps)
     before = task.metric(x, s)
-
-    def erased(x: Tensor, s: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        centre = random_particle(x, generator=generator)
-        return x, erase_state(x, s, centre=centre, radius=erase_radius)
-
-    def halved(x: Tensor, s: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        normal = torch.randn(
-            len(x), x.shape[2], generator=generator, device=x.device, dtype=x.dtype
-        )
-        normal = normal / normal.norm(dim=1, keepdim=True)
-        return cut(x, s, centre=x.mean(1), normal=normal, gap=cut_gap)
-
-    damages: dict[str, Damage] = {
-        f"cut, gap {cut_gap:g}": halved,
-        f"erased disk, radius {erase_radius:g}": erased,
+    normal = torch.randn(
+        len(x), x.shape[2], generator=worlds.generator, dtype=x.dtype, device=x.device
+    )
+    centre = random_particle(x, generator=worlds.generator)
+    damaged = {
+        f"cut, gap {cut_gap:g}": cut(x, s, centre=x.mean(1), normal=normal, gap=cut_gap),
+        f"erased disk, radius {erase_radius:g}": (
+            x,
+            erase_state(x, s, centre=centre, radius=erase_radius),
+        ),
     }
     rows = []
-    for name, damage in damages.items():
-        hurt_x, hurt_s = damage(x, s, generator)
+    for name, (hurt_x, hurt_s) in damaged.items():
         losses = [task.metric(hurt_x, hurt_s)]
         steps = [0]
         while steps[-1] < heal_steps:
             more = min(every, heal_steps - steps[-1])
-            hurt_x, hurt_s = _grow(rule, task, hurt_x, hurt_s, more, generator)
+            hurt_x, hurt_s = worlds.grow(hurt_x, hurt_s, more)
             losses.append(task.metric(hurt_x, hurt_s))
             steps.append(steps[-1] + more)
-            if progress is not None:
-                progress(more)
         rows.append(_healing_row(name, before, torch.stack(losses), steps))
     return rows
 
@@ -243,44 +236,6 @@ def _healing_row(name: str, before: Tensor, losses: Tensor, steps: list[int]) ->
         world_count=len(before),
         end=losses[-1].mean().item(),
     )
-
-
-def table_text(rows: Sequence[EvaluationRow] | Sequence[HealingRow]) -> str:
-    """Return rows as a plain text table, one line each under a line of headings.
-
-    Args:
-        rows: What `evaluate` or `healing` returned.
-    """
-    if not rows:
-        return ""
-    names = [field.name for field in dataclasses.fields(rows[0])]
-    cells = [[name.replace("_", " ") for name in names]]
-    cells += [[_cell(getattr(row, name)) for name in names] for row in rows]
-    widths = [max(len(line[column]) for line in cells) for column in range(len(names))]
-    return "\n".join(
-        "  ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True))
-        for line in cells
-    )
-
-
-def table_json(rows: Sequence[EvaluationRow] | Sequence[HealingRow]) -> str:
-    """Return rows as a JSON list of objects; a number that is not finite becomes null.
-
-    Args:
-        rows: What `evaluate` or `healing` returned.
-    """
-
-    def plain(value: Any) -> Any:
-        return None if isinstance(value, float) and not math.isfinite(value) else value
-
-    objects = [{k: plain(v) for k, v in dataclasses.asdict(row).items()} for row in rows]
-    return json.dumps(objects, indent=2, allow_nan=False) + "\n"
-
-
-def _cell(value: str | int | float | None) -> str:
-    if value is None:
-        return "never"
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def check_steps(name: str, steps: Sequence[int]) -> None:
@@ -301,32 +256,45 @@ def check_steps(name: str, steps: Sequence[int]) -> None:
         )
 
 
-def _seed_worlds(
-    rule: NPARule, task: PictureTask, seeds: Sequence[int], device: torch.device
-) -> tuple[Tensor, Tensor, torch.Generator]:
-    """Return one world per seed [B, N, D] and [B, N, C], and a generator for the rest."""
-    if not seeds:
-        raise NPAError("seeds must hold at least one number, got none: for example seeds=(0, 1)")
-    dtype = next(rule.parameters()).dtype
-    worlds = [
-        task.seed(1, generator=torch.Generator(device).manual_seed(seed), device=device)
-        for seed in seeds
-    ]
-    x = torch.cat([world[0] for world in worlds]).to(dtype)
-    s = torch.cat([world[1] for world in worlds]).to(dtype)
-    return x, s, torch.Generator(device).manual_seed(seeds[0] + len(seeds))
+class _Worlds:
+    """One seed world for each of `seeds` (x [B, N, D], s [B, N, C]), and what lets them grow."""
 
+    def __init__(
+        self,
+        rule: NPARule,
+        task: PictureTask,
+        seeds: Sequence[int],
+        device: torch.device,
+        progress: Callable[[int], None] | None,
+    ) -> None:
+        if not seeds:
+            raise NPAError(
+                "seeds must hold at least one number, got none: for example seeds=(0, 1)"
+            )
+        worlds = [
+            task.seed(1, generator=torch.Generator(device).manual_seed(seed), device=device)
+            for seed in seeds
+        ]
+        # The caller's own rule stays on its device.
+        self._rule = copy.deepcopy(rule).to(device)
+        dtype = next(rule.parameters()).dtype
+        self.x = torch.cat([x for x, _ in worlds]).to(dtype)
+        self.s = torch.cat([s for _, s in worlds]).to(dtype)
+        self.generator = torch.Generator(device).manual_seed(seeds[0] + len(seeds))
+        self._task = task
+        self._progress = progress
 
-def _grow(
-    rule: NPARule, task: PictureTask, x: Tensor, s: Tensor, steps: int, generator: torch.Generator
-) -> tuple[Tensor, Tensor]:
-    return rollout(
-        rule,
-        x,
-        s,
-        steps,
-        eps=task.eps,
-        box=task.box,
-        update_prob=task.update_prob,
-        generator=generator,
-    )
+    def grow(self, x: Tensor, s: Tensor, steps: int) -> tuple[Tensor, Tensor]:
+        x, s = rollout(
+            self._rule,
+            x,
+            s,
+            steps,
+            eps=self._task.eps,
+            box=self._task.box,
+            update_prob=self._task.update_prob,
+            generator=self.generator,
+        )
+        if self._progress is not None:
+            self._progress(steps)
+        return x, s

@@ -17,7 +17,7 @@ INIT_GAIN = 0.1
 
 
 FOLD = 4
-"""Rows of perception are padded to a multiple of this many columns: 16 bytes of float32."""
+"""Rows of products are padded to a multiple of this many columns: 16 bytes of float32."""
 
 
 OUTPUT_BLOCKS = 4
@@ -67,7 +67,7 @@ class FoldedRule(NamedTuple):
     hidden_weight: Tensor
     """[W1 | b1 | 0], shape [H, row_width]."""
     output_weight: Tensor
-    """W2, shape [A, H]."""
+    """W2 and rows of zeros up to a multiple of `FOLD`, shape [A', H]."""
 
     @property
     def row_width(self) -> int:
@@ -75,7 +75,7 @@ class FoldedRule(NamedTuple):
         return self.hidden_weight.shape[1]
 
     def __call__(self, rows: Tensor) -> Tensor:
-        """Map rows [z | 1 | 0], shape [K, row_width], to raw updates, shape [K, A]."""
+        """Map rows [z | 1 | 0], shape [K, row_width], to raw updates [y | 0], shape [K, A']."""
         hidden = torch.relu(rows @ self.hidden_weight.T)
         update: Tensor = _BlockedProduct.apply(hidden, self.output_weight)  # type: ignore[no-untyped-call]
         return update
@@ -188,7 +188,8 @@ class NPARule(nn.Module):
         """Return the weights as two plain products, differentiable in the parameters."""
         padding = -(self.perception_dim + 1) % FOLD
         weight = torch.cat((self.hidden.weight, self.hidden.bias[:, None]), dim=1)
-        return FoldedRule(nn.functional.pad(weight, (0, padding)), self.output.weight)
+        output_weight = nn.functional.pad(self.output.weight, (0, 0, 0, -self.update_dim % FOLD))
+        return FoldedRule(nn.functional.pad(weight, (0, padding)), output_weight)
 
     def read_out(self, states: Tensor) -> Tensor:
         """Return the rule's outputs: the read-out network's, or the states where it has none.

@@ -80,8 +80,9 @@ def main(arguments: Sequence[str]) -> int:
     start = time.perf_counter()
     make_folder(options.out)
     report = Report()
-    grow_and_heal(options, report)
-    train_small(options, report)
+    with one_thread():
+        grow_and_heal(options, report)
+        train_small(options, report)
     report.line(f"all of it took {time.perf_counter() - start:.0f} s")
     report.write(options.out / "report.txt")
     return 0
@@ -132,6 +133,23 @@ class Report:
         start = time.perf_counter()
         yield watch
         watch.seconds = time.perf_counter() - start
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Keep torch to one CPU thread within the block.
+
+    On worlds as small as these several threads gain little, and on a busy machine they wait for
+    each other at every operation: a step then takes several times as long.
+    """
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 @dataclass

@@ -24,12 +24,17 @@ from npa_envs.kernels.domain import (
     spiky_factor,
     spiky_factor_slope,
 )
-from npa_envs.kernels.lanes import make_lane_sum, make_wide_load
+from npa_envs.kernels.lanes import make_lane_scatter, make_wide_load
+
+CUDA_REGISTERS = 64
+"""Registers of a thread that gathers state cotangents: it waits for memory more than it computes."""
 
 
 @functools.cache
-def adjoint_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
-    """Return the kernels of one variant; `width` channels form a group."""
+def adjoint_kernels(
+    space_dim: int, scalar: type, width: int, lanes: int, state_gradient: bool
+) -> SimpleNamespace:
+    """Return the kernels of one variant, as `perception_kernels` does."""
     types = domain_types(space_dim, scalar)
     vector, particle, Domain = types.vector, types.particle, types.Domain
     cell_of, segment_count, segment_cells = (
@@ -40,15 +45,16 @@ def adjoint_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace
     minimum_image, position_of = types.minimum_image, types.position_of
     group = wp.types.vector(width, scalar)
     group_gradient = wp.types.matrix((space_dim, width), scalar)
-    module = kernel_module("adjoint", space_dim, scalar, width)
+    share = width // lanes
+    topic = "adjoint" if state_gradient else "smoothing_adjoint"
+    module = kernel_module(topic, space_dim, scalar, width, lanes)
     load_group = make_wide_load(group, scalar)
     load_gradient = make_wide_load(group_gradient, scalar)
-    add_group = make_lane_sum("adjoint", group, scalar)
+    scatter_group = make_lane_scatter(group, scalar, lanes)
 
     @wp.kernel(enable_backward=False, module=module)
     def unscale_cotangents(
         state_dim: wp.int32,
-        state_gradient: wp.int32,
         density_gradient: wp.int32,
         gradient_scale: scalar,
         density_scale: scalar,
@@ -58,58 +64,55 @@ def adjoint_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace
         perception: wp.array(dtype=scalar, ndim=2),
         perception_bar: wp.array(dtype=scalar, ndim=2),
         # outputs
-        blur_bar: wp.array(dtype=group),
-        gradient_bar: wp.array(dtype=group_gradient),
+        blur_bar: wp.array(dtype=scalar),
+        gradient_bar: wp.array(dtype=scalar),
         density_gradient_bar: wp.array(dtype=vector),
     ):
         """Pull the cotangent of z back through its scaling, into cotangents of the raw sums."""
-        row, g = wp.tid()
+        row, channel = wp.tid()
         if row >= starts[starts.shape[0] - 1] - row_base:
             return
-        first = g * wp.static(width)
         gradient_start = 2 * state_dim
-        density_start = gradient_start
-        if state_gradient != 0:
-            density_start += state_dim * wp.static(space_dim)
-        blur = group()
-        gradient = group_gradient()
-        for c in range(wp.static(width)):
-            channel = first + c
-            if channel < state_dim:
-                blur[c] = perception_bar[row, state_dim + channel]
-                if state_gradient != 0:
-                    place = gradient_start + channel * wp.static(space_dim)
-                    scaled = vector()
-                    bar = vector()
-                    for d in range(wp.static(space_dim)):
-                        scaled[d] = perception[row, place + d]
-                        bar[d] = perception_bar[row, place + d]
-                    raw = gradient_scale * log_scale_adjoint(scaled, bar)
-                    for d in range(wp.static(space_dim)):
-                        gradient[d, c] = raw[d]
-        blur_bar[row * group_count + g] = blur
-        gradient_bar[row * group_count + g] = gradient
-        if g == 0 and density_gradient_bar.shape[0] > 0:
-            scaled = vector()
-            bar = vector()
+        blur = scalar(0.0)
+        gradient = vector()
+        if channel < state_dim:
+            blur = perception_bar[row, state_dim + channel]
+            if wp.static(state_gradient):
+                place = gradient_start + channel * wp.static(space_dim)
+                scaled = vector()
+                bar = vector()
+                for d in range(wp.static(space_dim)):
+                    scaled[d] = perception[row, place + d]
+                    bar[d] = perception_bar[row, place + d]
+                gradient = gradient_scale * log_scale_adjoint(scaled, bar)
+        entry = row * group_count + channel / wp.static(width)
+        c = channel % wp.static(width)
+        blur_bar[entry * wp.static(width) + c] = blur
+        for d in range(wp.static(space_dim)):
+            gradient_bar[(entry * wp.static(space_dim) + d) * wp.static(width) + c] = gradient[d]
+        if channel == 0 and density_gradient_bar.shape[0] > 0:
+            pull = vector()
             if density_gradient != 0:
+                density_start = gradient_start
+                if wp.static(state_gradient):
+                    density_start += state_dim * wp.static(space_dim)
+                scaled = vector()
+                bar = vector()
                 for d in range(wp.static(space_dim)):
                     scaled[d] = perception[row, density_start + d]
                     bar[d] = perception_bar[row, density_start + d]
-                bar = density_scale * log_scale_adjoint(scaled, bar)
-            density_gradient_bar[row] = bar
+                pull = density_scale * log_scale_adjoint(scaled, bar)
+            density_gradient_bar[row] = pull
 
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(enable_backward=False, module=module, cuda_max_registers=CUDA_REGISTERS)
     def gather_state_cotangents(
         domain: Domain,
         particle_count: wp.int32,
         state_dim: wp.int32,
-        state_gradient: wp.int32,
         active_offset: wp.int32,
         row_base: wp.int32,
         row_capacity: wp.int32,
         group_count: wp.int32,
-        lane_count: wp.int32,
         starts: wp.array(dtype=wp.int32),
         particles: wp.array(dtype=particle),
         source: wp.array(dtype=wp.int32),
@@ -119,6 +122,7 @@ def adjoint_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace
         perception_bar: wp.array(dtype=scalar, ndim=2),
         blur_bar: wp.array(dtype=group),
         gradient_bar: wp.array(dtype=group_gradient),
+        flat_gradient_bar: wp.array(dtype=scalar),
         # outputs
         states_bar: wp.array(dtype=scalar, ndim=2),
     ):
@@ -133,7 +137,7 @@ def adjoint_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace
             first_cell, last_cell = segment_cells(domain, cell, segment)
             begin = starts[base + first_cell] - row_base
             end = wp.min(starts[base + last_cell] - row_base, row_capacity)
-            for row in range(begin + lane, end, lane_count):
+            for row in range(begin + lane, end, wp.static(lanes)):
                 offset = minimum_image(domain, position - row_positions[row])
                 squared = wp.dot(offset, offset)
                 if squared < domain.squared_eps:
@@ -141,31 +145,35 @@ def adjoint_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace
                         smoothing(squared, domain.inverse_squared_eps, domain.smoothing_norm)
                         * load_group(blur_bar, row * group_count + g)
                     )
-                    if state_gradient != 0:
+                    if wp.static(state_gradient):
                         kernel = offset * spiky_factor(
                             wp.sqrt(squared), domain.inverse_eps, domain.spiky_norm
                         )
                         total += kernel * load_gradient(gradient_bar, row * group_count + g)
-        total = entry[wp.static(space_dim)] * add_group(total)
+        mine = entry[wp.static(space_dim)] * scatter_group(total)
         i = source[k]
         row = row_of[i]
-        first = g * wp.static(width)
-        own = group()
-        if row >= 0 and state_gradient != 0:
-            own = row_kernel_sum[row] * gradient_bar[row * group_count + g]
-        for c in range(wp.static(width)):
-            if first + c < state_dim and c % lane_count == lane:
-                bar = total[c]
+        for c in range(wp.static(share)):
+            local = lane * wp.static(share) + c
+            channel = g * wp.static(width) + local
+            if channel < state_dim:
+                bar = mine[c]
                 if row >= 0:
-                    bar += perception_bar[row, first + c] - own[c]
-                states_bar[i, first + c] = bar
+                    bar += perception_bar[row, channel]
+                    if wp.static(state_gradient):
+                        place = (row * group_count + g) * wp.static(space_dim)
+                        for d in range(wp.static(space_dim)):
+                            bar -= (
+                                row_kernel_sum[row][d]
+                                * flat_gradient_bar[(place + d) * wp.static(width) + local]
+                            )
+                states_bar[i, channel] = bar
 
     @wp.kernel(enable_backward=False, module=module)
     def gather_density_cotangents(
         domain: Domain,
         particle_count: wp.int32,
         group_count: wp.int32,
-        state_gradient: wp.int32,
         starts: wp.array(dtype=wp.int32),
         particles: wp.array(dtype=particle),
         states: wp.array(dtype=group),
@@ -200,7 +208,7 @@ def adjoint_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace
                     for g in range(group_count):
                         own = states[k * group_count + g]
                         volume_bar += weight * wp.dot(own, blur_bar[row * group_count + g])
-                        if state_gradient != 0:
+                        if wp.static(state_gradient):
                             volume_bar += wp.dot(
                                 own - states[j * group_count + g], kernel * gradient_bar[row * group_count + g]
                             )

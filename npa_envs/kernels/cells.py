@@ -16,13 +16,12 @@ from npa_envs.kernels.domain import domain_types, kernel_module
 
 
 @functools.cache
-def cell_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
-    """Return the kernels of one variant; states are sorted in groups of `width` channels."""
+def cell_kernels(space_dim: int, scalar: type, share: int) -> SimpleNamespace:
+    """Return the kernels of one variant; a thread moves `share` channels of a particle."""
     types = domain_types(space_dim, scalar)
     vector, Domain = types.vector, types.Domain
     cell_of, cell_index = types.cell_of, types.cell_index
-    group = wp.types.vector(width, scalar)
-    module = kernel_module("cells", space_dim, scalar, width)
+    module = kernel_module("cells", space_dim, scalar, share)
 
     @wp.kernel(enable_backward=False, module=module)
     def count_cells(
@@ -68,7 +67,6 @@ def cell_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
         active_offset: wp.int32,
         row_base: wp.int32,
         row_capacity: wp.int32,
-        group_count: wp.int32,
         cell: wp.array(dtype=wp.int32),
         arrived: wp.array(dtype=wp.int32),
         starts: wp.array(dtype=wp.int32),
@@ -76,12 +74,13 @@ def cell_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
         source: wp.array(dtype=wp.int32),
         row_of: wp.array(dtype=wp.int32),
         row_source: wp.array(dtype=wp.int32),
+        row_place: wp.array(dtype=wp.int32),
         sorted_positions: wp.array(dtype=vector),
         row_positions: wp.array(dtype=vector),
-        sorted_states: wp.array(dtype=group),
+        sorted_states: wp.array(dtype=scalar, ndim=2),
     ):
         """Move every particle to its rank by index within its cell; make the rows of active ones."""
-        k, g = wp.tid()
+        k, part = wp.tid()
         i = arrived[k]
         c = cell[i]
         begin = starts[c]
@@ -100,13 +99,13 @@ def cell_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
                     active_rank += 1
         place = begin + rank
 
-        padded = group()
-        first = g * wp.static(width)
-        for c_local in range(wp.static(width)):
-            if first + c_local < states.shape[1]:
-                padded[c_local] = states[i, first + c_local]
-        sorted_states[place * group_count + g] = padded
-        if g == 0:
+        for c_local in range(wp.static(share)):
+            channel = part * wp.static(share) + c_local
+            state = scalar(0.0)
+            if channel < states.shape[1]:
+                state = states[i, channel]
+            sorted_states[place, channel] = state
+        if part == 0:
             source[place] = i
             sorted_positions[place] = positions[i]
             row = wp.int32(-1)
@@ -116,6 +115,7 @@ def cell_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
                     row = wp.int32(-1)
             if row >= 0:
                 row_source[row] = i
+                row_place[row] = place
                 row_positions[row] = positions[i]
             row_of[i] = row
 

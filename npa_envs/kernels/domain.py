@@ -30,10 +30,16 @@ def scalar_name(scalar: type) -> str:
 
 
 @functools.cache
-def kernel_module(topic: str, space_dim: int, scalar: type, width: int | None = None) -> wp.Module:
+def kernel_module(
+    topic: str, space_dim: int, scalar: type, width: int = 0, lanes: int = 0
+) -> wp.Module:
     """Return the Warp module that holds one variant of a topic's kernels."""
-    suffix = "" if width is None else f"_w{width}"
-    return wp.get_module(f"npa_envs.kernels.{topic}_{space_dim}d_{scalar_name(scalar)}{suffix}")
+    variant = f"{space_dim}d_{scalar_name(scalar)}"
+    if width:
+        variant += f"_w{width}"
+    if lanes:
+        variant += f"_l{lanes}"
+    return wp.get_module(f"npa_envs.kernels.{topic}_{variant}")
 
 
 @wp.func

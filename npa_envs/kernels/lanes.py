@@ -1,9 +1,10 @@
 """Lanes: on CUDA a few neighbouring threads share one particle and split its candidates.
 
-Each lane sums every so-many-th candidate; a butterfly of warp shuffles adds the lanes in a fixed
-order. On the CPU a particle has one lane, and the same kernels run unchanged. The two native
-snippets here are what plain Warp cannot say: a shuffle among some threads of a warp, and a load
-of 16 bytes at a time.
+Each lane sums every so-many-th candidate; warp shuffles then add the lanes in a fixed order. Short
+sums go to every lane; the sums over channels are scattered, so that each lane finishes its own
+share of the channels. On the CPU a particle has one lane and the same source runs without either.
+The native snippets here are what plain Warp cannot say: a shuffle among some threads of a warp,
+and a load of 16 bytes at a time.
 """
 
 import functools
@@ -13,60 +14,148 @@ import warp as wp
 
 from npa_envs.kernels.domain import scalar_name
 
-CUDA_LANES = {"density": 8, "perception": 4, "adjoint": 8}
-"""Lanes of a particle in each pass on CUDA: powers of two, at most 32."""
+CUDA_LANES = 4
+"""Lanes of a particle on CUDA, a power of two; also the smallest channel group."""
 
-_SUM = """
-    auto total = value;
-#if defined(__CUDA_ARCH__)
-    {part}* parts = reinterpret_cast<{part}*>(&total);
+_SHUFFLES = """
     const unsigned first = threadIdx.x & 31u & ~({lanes}u - 1u);
-    const unsigned lanes = (unsigned)((1ull << {lanes}) - 1ull) << first;
+    const unsigned mask = ((1u << {lanes}) - 1u) << first;
+    auto parts = value;
+    {part}* sums = reinterpret_cast<{part}*>(&parts);
+"""
+
+_ADD = """
+#if defined(__CUDA_ARCH__)
+    {shuffles}
     #pragma unroll
-    for (unsigned i = 0; i < sizeof(total) / sizeof({part}); ++i) {{
+    for (unsigned i = 0; i < sizeof(parts) / sizeof({part}); ++i) {{
         #pragma unroll
-        for (int offset = {lanes} / 2; offset > 0; offset >>= 1) {{
-            parts[i] += __shfl_xor_sync(lanes, parts[i], offset);
+        for (unsigned offset = {lanes} / 2; offset > 0; offset >>= 1) {{
+            sums[i] += __shfl_xor_sync(mask, sums[i], offset);
         }}
     }}
+    return parts;
+#else
+    return value;
 #endif
-    return total;
+"""
+
+# At each step a lane keeps the half of the channels on its side and gives the other half away.
+_SCATTER = """
+    {share} result;
+    {part}* own = reinterpret_cast<{part}*>(&result);
+#if defined(__CUDA_ARCH__)
+    {shuffles}
+    #pragma unroll
+    for (unsigned row = 0; row < {rows}; ++row) {{
+        unsigned count = {width};
+        #pragma unroll
+        for (unsigned offset = {lanes} / 2; offset > 0; offset >>= 1) {{
+            const bool upper = threadIdx.x & offset;
+            count /= 2;
+            #pragma unroll
+            for (unsigned c = 0; c < {width} / 2; ++c) {{
+                if (c < count) {{
+                    const {part} low = sums[row * {width} + c];
+                    const {part} high = sums[row * {width} + count + c];
+                    const {part} given = __shfl_xor_sync(mask, upper ? low : high, offset);
+                    sums[row * {width} + c] = (upper ? high : low) + given;
+                }}
+            }}
+        }}
+        #pragma unroll
+        for (unsigned c = 0; c < {width} / {lanes}; ++c) {{
+            own[row * ({width} / {lanes}) + c] = sums[row * {width} + c];
+        }}
+    }}
+#else
+    const {part}* sums = reinterpret_cast<const {part}*>(&value);
+    for (unsigned i = 0; i < sizeof(result) / sizeof({part}); ++i) own[i] = sums[i];
+#endif
+    return result;
 """
 
 _LOAD = """
 #if defined(__CUDA_ARCH__)
     struct alignas(16) Chunk {{ unsigned part[4]; }};
-    auto entry = {entry}();
+    {entry} result;
     const Chunk* from = reinterpret_cast<const Chunk*>(entries.data + index);
-    unsigned* to = reinterpret_cast<unsigned*>(&entry);
+    unsigned* to = reinterpret_cast<unsigned*>(&result);
     #pragma unroll
-    for (unsigned i = 0; i < sizeof(entry) / 16; ++i) {{
+    for (unsigned i = 0; i < sizeof(result) / 16; ++i) {{
         const Chunk chunk = from[i];
         #pragma unroll
         for (unsigned k = 0; k < 4; ++k) to[4 * i + k] = chunk.part[k];
     }}
-    return entry;
+    return result;
 #else
     return entries.data[index];
 #endif
 """
 
 
+def _c_scalar(scalar: type) -> str:
+    return {"f32": "float", "f64": "double"}[scalar_name(scalar)]
+
+
+def _c_type(value_type: type, scalar: type) -> str:
+    shape = value_type._shape_
+    kind = "vec_t" if len(shape) == 1 else "mat_t"
+    return f"wp::{kind}<{', '.join(str(size) for size in shape)}, {_c_scalar(scalar)}>"
+
+
+def share_type(value_type: type, scalar: type, lanes: int) -> type:
+    """Return the type of one lane's share of a vector [W] or matrix [D, W] of channels."""
+    *rows, width = value_type._shape_
+    share = width // lanes
+    if rows:
+        return wp.types.matrix((rows[0], share), scalar)
+    return wp.types.vector(share, scalar)
+
+
 @functools.cache
-def make_lane_sum(topic: str, value_type: type, scalar: type) -> Any:
-    """Return a Warp function that adds a value over the lanes of a particle; all lanes get the sum.
+def make_lane_sum(value_type: type, scalar: type, lanes: int) -> Any:
+    """Return a Warp function that adds a value over the lanes of a particle; each gets the sum.
 
     Args:
-        topic: The pass, a key of `CUDA_LANES`.
         value_type: A scalar, vector or matrix type.
         scalar: The scalar type that it is made of.
+        lanes: Lanes of a particle, 1 on the CPU.
     """
-    part = {"f32": "float", "f64": "double"}[scalar_name(scalar)]
+    part = _c_scalar(scalar)
+    shuffles = _SHUFFLES.format(part=part, lanes=lanes)
 
-    @wp.func_native(_SUM.format(part=part, lanes=CUDA_LANES[topic]))
+    @wp.func_native(_ADD.format(part=part, lanes=lanes, shuffles=shuffles))
     def lane_sum(value: value_type) -> value_type: ...
 
     return lane_sum
+
+
+@functools.cache
+def make_lane_scatter(value_type: type, scalar: type, lanes: int) -> Any:
+    """Return a Warp function that adds a value over the lanes; each gets its share of channels.
+
+    Args:
+        value_type: A vector [W] or matrix [D, W] type; W is a multiple of `lanes`.
+        scalar: The scalar type that it is made of.
+        lanes: Lanes of a particle, 1 on the CPU.
+    """
+    part = _c_scalar(scalar)
+    shape = value_type._shape_
+    result_type = share_type(value_type, scalar, lanes)
+    snippet = _SCATTER.format(
+        part=part,
+        lanes=lanes,
+        shuffles=_SHUFFLES.format(part=part, lanes=lanes),
+        share=_c_type(result_type, scalar),
+        rows=shape[0] if len(shape) == 2 else 1,
+        width=shape[-1],
+    )
+
+    @wp.func_native(snippet)
+    def lane_scatter(value: value_type) -> result_type: ...
+
+    return lane_scatter
 
 
 @functools.cache
@@ -77,12 +166,8 @@ def make_wide_load(value_type: type, scalar: type) -> Any:
         value_type: A vector or matrix type of a multiple of 16 bytes.
         scalar: The scalar type that it is made of.
     """
-    part = {"f32": "float", "f64": "double"}[scalar_name(scalar)]
-    shape = value_type._shape_
-    kind = "vec_t" if len(shape) == 1 else "mat_t"
-    entry = f"wp::{kind}<{', '.join(str(size) for size in shape)}, {part}>"
 
-    @wp.func_native(_LOAD.format(entry=entry))
+    @wp.func_native(_LOAD.format(entry=_c_type(value_type, scalar)))
     def wide_load(entries: wp.array(dtype=value_type), index: wp.int32) -> value_type: ...
 
     return wide_load

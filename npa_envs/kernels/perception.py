@@ -20,12 +20,20 @@ from npa_envs.kernels.domain import (
     smoothing,
     spiky_factor,
 )
-from npa_envs.kernels.lanes import make_lane_sum, make_wide_load
+from npa_envs.kernels.lanes import make_lane_scatter, make_lane_sum, make_wide_load, share_type
+
+CUDA_REGISTERS = 128
+"""Registers of a thread of the perception pass: more threads in flight are worth a few spills."""
 
 
 @functools.cache
-def perception_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
-    """Return the kernels of one variant; `width` channels form a group."""
+def perception_kernels(
+    space_dim: int, scalar: type, width: int, lanes: int, state_gradient: bool
+) -> SimpleNamespace:
+    """Return the kernels of one variant: groups of `width` channels, `lanes` to a particle.
+
+    A variant without `state_gradient` neither sums nor holds what only that needs.
+    """
     types = domain_types(space_dim, scalar)
     vector, particle, Domain = types.vector, types.particle, types.Domain
     cell_of, segment_count, segment_cells = (
@@ -38,14 +46,18 @@ def perception_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamesp
     group = wp.types.vector(width, scalar)
     group_gradient = wp.types.matrix((space_dim, width), scalar)
     square = wp.types.matrix((space_dim, space_dim), scalar)
-    module = kernel_module("perception", space_dim, scalar, width)
+    share = width // lanes
+    topic = "perception" if state_gradient else "smoothing"
+    module = kernel_module(topic, space_dim, scalar, width, lanes)
     load_group = make_wide_load(group, scalar)
-    add_density = make_lane_sum("density", scalar, scalar)
-    add_wide = make_lane_sum("density", wide, wp.float64)
-    add_group = make_lane_sum("perception", group, scalar)
-    add_gradient = make_lane_sum("perception", group_gradient, scalar)
-    add_vector = make_lane_sum("perception", vector, scalar)
-    add_square = make_lane_sum("perception", square, scalar)
+    add_scalar = make_lane_sum(scalar, scalar, lanes)
+    add_wide = make_lane_sum(wide, wp.float64, lanes)
+    add_vector = make_lane_sum(vector, scalar, lanes)
+    add_square = make_lane_sum(square, scalar, lanes)
+    scatter_group = make_lane_scatter(group, scalar, lanes)
+    scatter_gradient = make_lane_scatter(group_gradient, scalar, lanes)
+    group_share = share_type(group, scalar, lanes)
+    gradient_share = share_type(group_gradient, scalar, lanes)
 
     @wp.func
     def spiky_wide(domain: Domain, centre: vector, neighbour: vector, squared: scalar):
@@ -70,7 +82,6 @@ def perception_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamesp
         domain: Domain,
         particle_count: wp.int32,
         density_gradient: wp.int32,
-        lane_count: wp.int32,
         starts: wp.array(dtype=wp.int32),
         source: wp.array(dtype=wp.int32),
         row_of: wp.array(dtype=wp.int32),
@@ -95,7 +106,7 @@ def perception_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamesp
         gradient = wide()
         for segment in range(segment_count(domain, cell)):
             first, last = segment_cells(domain, cell, segment)
-            for j in range(starts[base + first] + lane, starts[base + last], lane_count):
+            for j in range(starts[base + first] + lane, starts[base + last], wp.static(lanes)):
                 neighbour = sorted_positions[j]
                 offset = minimum_image(domain, neighbour - position)
                 squared = wp.dot(offset, offset)
@@ -106,7 +117,7 @@ def perception_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamesp
                     if row >= 0:
                         gradient += spiky_wide(domain, position, neighbour, squared)
         # A particle always sees itself: a position that is not finite would otherwise have rho 0.
-        density = domain.smoothing_norm + add_density(density)
+        density = domain.smoothing_norm + add_scalar(density)
         gradient = add_wide(gradient)
         if lane == 0:
             entry = particle()
@@ -127,12 +138,11 @@ def perception_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamesp
         g: wp.int32,
         group_count: wp.int32,
         lane: wp.int32,
-        lane_count: wp.int32,
         position: vector,
         own: group,
-        state_gradient: wp.int32,
     ):
-        """Return the smoothed state, the state gradient, the sum of v K and the moment matrix."""
+        """Return this lane's share of the smoothed state and of the state gradient, and the sums
+        of v K and of the moment matrix."""
         blur = group()
         gradient = group_gradient()
         kernel_sum = vector()
@@ -141,7 +151,7 @@ def perception_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamesp
         cell = cell_of(domain, position)
         for segment in range(segment_count(domain, cell)):
             first, last = segment_cells(domain, cell, segment)
-            for j in range(starts[base + first] + lane, starts[base + last], lane_count):
+            for j in range(starts[base + first] + lane, starts[base + last], wp.static(lanes)):
                 entry = particles[j]
                 offset = minimum_image(domain, position_of(entry) - position)
                 squared = wp.dot(offset, offset)
@@ -152,7 +162,7 @@ def perception_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamesp
                         squared, domain.inverse_squared_eps, domain.smoothing_norm
                     )
                     blur += (volume * weight) * state
-                    if state_gradient != 0:
+                    if wp.static(state_gradient):
                         kernel = offset * spiky_factor(
                             wp.sqrt(squared), domain.inverse_eps, domain.spiky_norm
                         )
@@ -160,40 +170,37 @@ def perception_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamesp
                         kernel_sum += weighted
                         gradient += wp.outer(weighted, state - own)
                         moment += wp.outer(offset, weighted)
-        blur = add_group(blur)
-        if state_gradient != 0:
-            gradient = add_gradient(gradient)
+        gradients = gradient_share()
+        if wp.static(state_gradient):
+            gradients = scatter_gradient(gradient)
             kernel_sum = add_vector(kernel_sum)
             moment = add_square(moment)
-        return blur, gradient, kernel_sum, moment
+        return scatter_group(blur), gradients, kernel_sum, moment
 
     @wp.func
-    def corrected(gradient: group_gradient, moment: square):
+    def corrected(gradient: gradient_share, moment: square):
         """Apply the inverse moment matrix where it is safely invertible."""
         result = gradient
         if wp.abs(wp.determinant(moment)) >= scalar(wp.static(MOMENT_THRESHOLD)):
             result = wp.inverse(moment) * gradient
         return result
 
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(enable_backward=False, module=module, cuda_max_registers=CUDA_REGISTERS)
     def perceive(
         domain: Domain,
         particle_count: wp.int32,
         state_dim: wp.int32,
-        state_gradient: wp.int32,
         moment_correction: wp.int32,
         density_gradient: wp.int32,
         gradient_scale: scalar,
         density_scale: wp.float64,
         row_base: wp.int32,
         group_count: wp.int32,
-        lane_count: wp.int32,
         starts: wp.array(dtype=wp.int32),
         particles: wp.array(dtype=particle),
         states: wp.array(dtype=group),
-        unsorted_states: wp.array(dtype=scalar, ndim=2),
-        row_source: wp.array(dtype=wp.int32),
-        row_positions: wp.array(dtype=vector),
+        flat_states: wp.array(dtype=scalar, ndim=2),
+        row_place: wp.array(dtype=wp.int32),
         row_density_gradient: wp.array(dtype=wide),
         # outputs
         perception: wp.array(dtype=scalar, ndim=2),
@@ -204,66 +211,52 @@ def perception_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamesp
         Rows beyond the last active one are zero.
         """
         row, g, lane = wp.tid()
-        first = g * wp.static(width)
-        channels = wp.min(state_dim - first, wp.static(width))
-        gradient_start = 2 * state_dim
-        density_start = gradient_start
-        if state_gradient != 0:
-            density_start += state_dim * wp.static(space_dim)
-        row_end = density_start
-        if density_gradient != 0:
-            row_end += wp.static(space_dim)
-        bias = scalar(0.0)
-        own = group()
-        blur = group()
-        gradient = group_gradient()
-        kernel_sum = vector()
-        rho_gradient = wide()
-        if row < starts[starts.shape[0] - 1] - row_base:
-            bias = scalar(1.0)
-            i = row_source[row]
-            if density_gradient != 0:
-                rho_gradient = row_density_gradient[row]
-            for c in range(wp.static(width)):
-                if c < channels:
-                    own[c] = unsorted_states[i, first + c]
-            blur, gradient, kernel_sum, moment = sum_neighbours(
-                domain,
-                starts,
-                particles,
-                states,
-                i / particle_count,
-                g,
-                group_count,
-                lane,
-                lane_count,
-                row_positions[row],
-                own,
-                state_gradient,
-            )
-            if moment_correction != 0:
-                gradient = corrected(gradient, moment)
-        for c in range(wp.static(width)):
-            if c < channels and c % lane_count == lane:
-                perception[row, first + c] = own[c]
-                perception[row, state_dim + first + c] = blur[c]
-                if state_gradient != 0:
+        if row >= starts[starts.shape[0] - 1] - row_base:
+            for column in range(g * wp.static(lanes) + lane, perception.shape[1], group_count * wp.static(lanes)):
+                perception[row, column] = scalar(0.0)
+            return
+        k = row_place[row]
+        blur, gradient, kernel_sum, moment = sum_neighbours(
+            domain,
+            starts,
+            particles,
+            states,
+            k / particle_count,
+            g,
+            group_count,
+            lane,
+            position_of(particles[k]),
+            load_group(states, k * group_count + g),
+        )
+        if moment_correction != 0:
+            gradient = corrected(gradient, moment)
+        mine = g * wp.static(width) + lane * wp.static(share)
+        for c in range(wp.static(share)):
+            channel = mine + c
+            if channel < state_dim:
+                perception[row, channel] = flat_states[k, channel]
+                perception[row, state_dim + channel] = blur[c]
+                if wp.static(state_gradient):
                     along = vector()
                     for d in range(wp.static(space_dim)):
                         along[d] = gradient_scale * gradient[d, c]
                     along *= log_scale_factor(wp.length(along))
-                    place = gradient_start + (first + c) * wp.static(space_dim)
+                    place = 2 * state_dim + channel * wp.static(space_dim)
                     for d in range(wp.static(space_dim)):
                         perception[row, place + d] = along[d]
         if g == 0 and lane == 0:
             row_kernel_sum[row] = kernel_sum
+            column = 2 * state_dim
+            if wp.static(state_gradient):
+                column += state_dim * wp.static(space_dim)
             if density_gradient != 0:
-                scaled = density_scale * rho_gradient
+                scaled = density_scale * row_density_gradient[row]
                 scaled *= log_scale_factor(wp.length(scaled))
                 for d in range(wp.static(space_dim)):
-                    perception[row, density_start + d] = scalar(scaled[d])
-            for column in range(row_end, perception.shape[1]):
-                perception[row, column] = wp.where(column == row_end, bias, scalar(0.0))
+                    perception[row, column + d] = scalar(scaled[d])
+                column += wp.static(space_dim)
+            for padding in range(column, perception.shape[1]):
+                perception[row, padding] = wp.where(padding == column, scalar(1.0), scalar(0.0))
 
     @wp.kernel(enable_backward=False, module=module)
     def gather_fields(
@@ -271,7 +264,6 @@ def perception_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamesp
         particle_count: wp.int32,
         state_dim: wp.int32,
         group_count: wp.int32,
-        lane_count: wp.int32,
         starts: wp.array(dtype=wp.int32),
         particles: wp.array(dtype=particle),
         states: wp.array(dtype=group),
@@ -296,19 +288,17 @@ def perception_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamesp
             g,
             group_count,
             lane,
-            lane_count,
             position_of(entry),
-            states[k * group_count + g],
-            1,
+            load_group(states, k * group_count + g),
         )
         straight = corrected(gradient, moment)
-        first = g * wp.static(width)
-        for c in range(wp.static(width)):
-            if first + c < state_dim and c % lane_count == lane:
-                blur_field[i, first + c] = blur[c]
+        mine = g * wp.static(width) + lane * wp.static(share)
+        for c in range(wp.static(share)):
+            if mine + c < state_dim:
+                blur_field[i, mine + c] = blur[c]
                 for d in range(wp.static(space_dim)):
-                    gradient_field[i, first + c, d] = gradient[d, c]
-                    corrected_field[i, first + c, d] = straight[d, c]
+                    gradient_field[i, mine + c, d] = gradient[d, c]
+                    corrected_field[i, mine + c, d] = straight[d, c]
         if g == 0 and lane == 0:
             density[i] = scalar(1.0) / entry[wp.static(space_dim)]
             moment_field[i] = moment

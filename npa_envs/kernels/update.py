@@ -38,18 +38,24 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         new_path_length: wp.array(dtype=scalar),
     ):
         """Move and change the particles that have a row; copy the others."""
-        i, c = wp.tid()
-        row = row_of[i]
-        offset = wp.int32(0)
-        if moving != 0:
-            offset = wp.int32(wp.static(space_dim))
-        state = states[i, c]
-        if row >= 0:
-            state += dt * update[row, offset + c]
-        new_states[i, c] = state
-        if c == 0:
-            position = positions[i]
-            path = path_length[i]
+        t = wp.tid()
+        total = positions.shape[0]
+        if t >= total:
+            # The threads after the first B N: one for each state channel.
+            i = (t - total) / states.shape[1]
+            c = (t - total) % states.shape[1]
+            row = row_of[i]
+            state = states[i, c]
+            if row >= 0:
+                offset = wp.int32(0)
+                if moving != 0:
+                    offset = wp.int32(wp.static(space_dim))
+                state += dt * update[row, offset + c]
+            new_states[i, c] = state
+        else:
+            row = row_of[t]
+            position = positions[t]
+            path = path_length[t]
             if row >= 0 and moving != 0:
                 # In float64: the position is then rounded once, and rules amplify its rounding.
                 delta = wide()
@@ -63,8 +69,8 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
             if periodic != 0:
                 for d in range(wp.static(space_dim)):
                     position[d] -= box[d] * wp.floor(position[d] / box[d] + scalar(0.5))
-            new_positions[i] = position
-            new_path_length[i] = path
+            new_positions[t] = position
+            new_path_length[t] = path
 
     @wp.kernel(enable_backward=False, module=module)
     def pull_back_update(
@@ -90,7 +96,9 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
             if moving != 0:
                 offset = wp.int32(wp.static(space_dim))
             if a >= offset:
-                bar = dt * new_states_bar[i, a - offset]
+                # Updates may be padded with columns that nothing reads.
+                if a - offset < new_states_bar.shape[1]:
+                    bar = dt * new_states_bar[i, a - offset]
             else:
                 delta = vector()
                 for d in range(wp.static(space_dim)):

@@ -15,7 +15,11 @@ SCALARS: dict[torch.dtype, Any] = {torch.float32: wp.float32, torch.float64: wp.
 """Warp's scalar type for each floating dtype that the operators take."""
 
 GROUP_WIDTHS = (4, 8, 16)
-"""Channels of a group: one thread serves a group, with more groups beyond the largest width."""
+"""Channels of a group: its lanes serve it together; there are several beyond the largest width."""
+
+
+CUDA_BLOCK = 128
+"""Threads of a CUDA block."""
 
 
 def scalar_type(dtype: torch.dtype) -> Any:
@@ -28,9 +32,9 @@ def channel_width(state_dim: int) -> int:
     return next((width for width in GROUP_WIDTHS if width >= state_dim), GROUP_WIDTHS[-1])
 
 
-def lane_count(device: torch.device, topic: str) -> int:
-    """Return how many lanes of a device share a particle in a pass."""
-    return CUDA_LANES[topic] if device.type == "cuda" else 1
+def lane_count(device: torch.device) -> int:
+    """Return how many lanes of a device share a particle."""
+    return CUDA_LANES if device.type == "cuda" else 1
 
 
 @functools.cache
@@ -84,4 +88,12 @@ def launch(kernel: Any, size: int | tuple[int, ...], device: torch.device, *argu
     stream = None
     if where.is_cuda:
         stream = _warp_stream(device, torch.cuda.current_stream(device).cuda_stream)
-    wp.launch(kernel, size, inputs=converted, device=where, stream=stream, record_tape=False)
+    wp.launch(
+        kernel,
+        size,
+        inputs=converted,
+        device=where,
+        stream=stream,
+        record_tape=False,
+        block_dim=CUDA_BLOCK if where.is_cuda else None,
+    )

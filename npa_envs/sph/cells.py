@@ -9,7 +9,6 @@ from torch import Tensor
 
 from npa_envs.kernels.cells import cell_kernels
 from npa_envs.kernels.domain import make_domain
-from npa_envs.kernels.perception import perception_kernels
 from npa_envs.sph.bridge import channel_width, lane_count, launch, scalar_type
 
 
@@ -18,6 +17,7 @@ class Plan(NamedTuple):
 
     scalar: Any
     width: int
+    lanes: int
     world_count: int
     particle_count: int
     space_dim: int
@@ -58,6 +58,8 @@ class SortedWorlds(NamedTuple):
     """Row of each particle, -1 where it is not active, int32, shape [B N]."""
     row_source: Tensor
     """Caller's index of each row, int32, shape [K]; undefined beyond the last active row."""
+    row_place: Tensor
+    """Sorted place of each row, int32, shape [K]; undefined beyond the last active row."""
     positions: Tensor
     """Sorted positions [length units], shape [B N, D]."""
     row_positions: Tensor
@@ -84,6 +86,7 @@ def make_plan(
     return Plan(
         scalar=scalar,
         width=width or channel_width(s.shape[2]),
+        lanes=lane_count(x.device),
         world_count=world_count,
         particle_count=particle_count,
         space_dim=space_dim,
@@ -96,7 +99,8 @@ def make_plan(
 
 def sort_worlds(plan: Plan, x: Tensor, s: Tensor, mask: Tensor | None) -> SortedWorlds:
     """Sort contiguous worlds into cells; `mask` (uint8, [B, N]) says which particles get rows."""
-    kernels = cell_kernels(plan.space_dim, plan.scalar, plan.width)
+    share = plan.width // plan.lanes
+    kernels = cell_kernels(plan.space_dim, plan.scalar, share)
     device, total = x.device, plan.total
     cell, arrival, arrived = torch.empty(3, total, dtype=torch.int32, device=device).unbind()
     cell_total = plan.world_count * int(plan.domain.cell_count)
@@ -124,12 +128,15 @@ def sort_worlds(plan: Plan, x: Tensor, s: Tensor, mask: Tensor | None) -> Sorted
     source = torch.empty(total, dtype=torch.int32, device=device)
     row_of = torch.empty_like(source)
     row_source = torch.empty(plan.row_capacity, dtype=torch.int32, device=device)
+    row_place = torch.empty_like(row_source)
     sorted_positions = torch.empty_like(positions)
     row_positions = torch.empty(plan.row_capacity, plan.space_dim, dtype=x.dtype, device=device)
-    sorted_states = torch.empty(total * plan.group_count, plan.width, dtype=s.dtype, device=device)
+    sorted_states = torch.empty(
+        total, plan.group_count * plan.width, dtype=s.dtype, device=device
+    )
     launch(
         kernels.order_particles,
-        (total, plan.group_count),
+        (total, plan.group_count * plan.lanes),
         device,
         positions,
         states,
@@ -138,42 +145,46 @@ def sort_worlds(plan: Plan, x: Tensor, s: Tensor, mask: Tensor | None) -> Sorted
         plan.active_offset,
         plan.row_base,
         plan.row_capacity,
-        plan.group_count,
         cell,
         arrived,
         starts,
         source,
         row_of,
         row_source,
+        row_place,
         sorted_positions,
         row_positions,
         sorted_states,
     )
     return SortedWorlds(
-        starts, source, row_of, row_source, sorted_positions, row_positions, sorted_states
+        starts,
+        source,
+        row_of,
+        row_source,
+        row_place,
+        sorted_positions,
+        row_positions,
+        sorted_states.view(-1, plan.width),
     )
 
 
 def compute_density(
-    plan: Plan, ordered: SortedWorlds, density_gradient: bool
+    plan: Plan, ordered: SortedWorlds, kernels: Any, density_gradient: bool
 ) -> tuple[Tensor, Tensor]:
     """Return sorted positions with volumes 1 / rho, [B N, D + 1], and the rows' density gradients.
 
-    The latter, float64, [K, D], are undefined beyond the last active row and where not asked for.
+    `kernels` are those of the perception that follows. The latter, float64, [K, D], are undefined beyond the last active row and where not asked for.
     """
-    kernels = perception_kernels(plan.space_dim, plan.scalar, plan.width)
     positions = ordered.positions
     particles = positions.new_empty(plan.total, plan.space_dim + 1)
     row_density_gradient = torch.empty_like(ordered.row_positions, dtype=torch.float64)
-    lanes = lane_count(positions.device, "density")
     launch(
         kernels.compute_density,
-        (plan.total, lanes),
+        (plan.total, plan.lanes),
         positions.device,
         plan.domain,
         plan.particle_count,
         int(density_gradient),
-        lanes,
         ordered.starts,
         ordered.source,
         ordered.row_of,

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.kernels.perception import perception_kernels
-from npa_envs.sph.bridge import lane_count, launch
+from npa_envs.sph.bridge import launch
 from npa_envs.sph.cells import compute_density, make_plan, sort_worlds
 from npa_envs.sph.checks import (
     Box,
@@ -116,9 +116,9 @@ def perception_fields(x: Tensor, s: Tensor, eps: float, box: Box = None) -> Perc
     world_count, particle_count, space_dim = x.shape
     state_dim = s.shape[2]
     plan = make_plan(x, s, x.shape[0] * x.shape[1], False, radius, sides)
-    kernels = perception_kernels(space_dim, plan.scalar, plan.width)
+    kernels = perception_kernels(space_dim, plan.scalar, plan.width, plan.lanes, True)
     ordered = sort_worlds(plan, x, s, None)
-    particles, row_density_gradient = compute_density(plan, ordered, density_gradient=True)
+    particles, row_density_gradient = compute_density(plan, ordered, kernels, density_gradient=True)
     fields = PerceptionFields(
         rho=x.new_empty(plan.total),
         blur=x.new_empty(plan.total, state_dim),
@@ -127,16 +127,14 @@ def perception_fields(x: Tensor, s: Tensor, eps: float, box: Box = None) -> Perc
         grad1=x.new_empty(plan.total, state_dim, space_dim),
         drho=row_density_gradient[ordered.row_of].to(x.dtype),
     )
-    lanes = lane_count(x.device, "perception")
     launch(
         kernels.gather_fields,
-        (plan.total, plan.group_count, lanes),
+        (plan.total, plan.group_count, plan.lanes),
         x.device,
         plan.domain,
         particle_count,
         state_dim,
         plan.group_count,
-        lanes,
         ordered.starts,
         particles,
         ordered.states,

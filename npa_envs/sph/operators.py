@@ -65,33 +65,31 @@ def _perceive_rows(
     plan = make_plan(
         x, s, row_capacity, mask is not None, eps, None if box is None else tuple(box)
     )
-    kernels = perception_kernels(plan.space_dim, plan.scalar, plan.width)
+    kernels = perception_kernels(
+        plan.space_dim, plan.scalar, plan.width, plan.lanes, state_gradient
+    )
     ordered = sort_worlds(plan, x, s, mask)
-    particles, row_density_gradient = compute_density(plan, ordered, density_gradient)
+    particles, row_density_gradient = compute_density(plan, ordered, kernels, density_gradient)
     perception = x.new_empty(row_capacity, row_width)
     row_kernel_sum = x.new_empty(row_capacity, plan.space_dim)
-    lanes = lane_count(x.device, "perception")
     launch(
         kernels.perceive,
-        (row_capacity, plan.group_count, lanes),
+        (row_capacity, plan.group_count, plan.lanes),
         x.device,
         plan.domain,
         plan.particle_count,
         plan.state_dim,
-        int(state_gradient),
         int(moment_correction and state_gradient),
         int(density_gradient),
         scale,
         _density_scale(scale, plan.space_dim, plan.particle_count),
         plan.row_base,
         plan.group_count,
-        lanes,
         ordered.starts,
         particles,
         ordered.states,
-        s.view(plan.total, plan.state_dim),
-        ordered.row_source,
-        ordered.row_positions,
+        ordered.states.view(plan.total, -1),
+        ordered.row_place,
         row_density_gradient,
         perception,
         row_kernel_sum,
@@ -169,6 +167,7 @@ def _perceive_rows_backward(
     plan = Plan(
         scalar=scalar,
         width=width,
+        lanes=lane_count(particles.device),
         world_count=total // particle_count,
         particle_count=particle_count,
         space_dim=space_dim,
@@ -177,7 +176,7 @@ def _perceive_rows_backward(
         masked=masked,
         domain=make_domain(space_dim, scalar, eps, sides, particle_count),
     )
-    kernels = adjoint_kernels(space_dim, scalar, width)
+    kernels = adjoint_kernels(space_dim, scalar, width, plan.lanes, state_gradient)
     device = particles.device
     bar = perception_bar.contiguous()
     blur_bar = bar.new_empty(row_capacity * plan.group_count, width)
@@ -185,10 +184,9 @@ def _perceive_rows_backward(
     density_gradient_bar = bar.new_empty(0 if states is None else row_capacity, space_dim)
     launch(
         kernels.unscale_cotangents,
-        (row_capacity, plan.group_count),
+        (row_capacity, plan.group_count * width),
         device,
         state_dim,
-        int(state_gradient),
         int(density_gradient),
         scale,
         _density_scale(scale, space_dim, particle_count),
@@ -197,25 +195,22 @@ def _perceive_rows_backward(
         starts,
         perception,
         bar,
-        blur_bar,
-        gradient_bar,
+        blur_bar.view(-1),
+        gradient_bar.view(-1),
         density_gradient_bar,
     )
     states_bar = bar.new_empty(total, state_dim)
-    lanes = lane_count(device, "adjoint")
     launch(
         kernels.gather_state_cotangents,
-        (total, plan.group_count, lanes),
+        (total, plan.group_count, plan.lanes),
         device,
         plan.domain,
         particle_count,
         state_dim,
-        int(state_gradient),
         plan.active_offset,
         plan.row_base,
         row_capacity,
         plan.group_count,
-        lanes,
         starts,
         particles,
         source,
@@ -225,6 +220,7 @@ def _perceive_rows_backward(
         bar,
         blur_bar,
         gradient_bar,
+        gradient_bar.view(-1),
         states_bar,
     )
     if states is None:
@@ -237,7 +233,6 @@ def _perceive_rows_backward(
         plan.domain,
         particle_count,
         plan.group_count,
-        int(state_gradient),
         starts,
         particles,
         states,
@@ -415,6 +410,7 @@ def _update_particles(
     row_of: Tensor,
     reach: float,
     dt: float,
+    moving: bool,
     box: list[float] | None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     space_dim, state_dim = x.shape[2], s.shape[2]
@@ -423,13 +419,13 @@ def _update_particles(
     outputs = torch.empty_like(x), torch.empty_like(s), torch.empty_like(path_length)
     launch(
         kernels.apply_update,
-        (total, state_dim),
+        total * (1 + state_dim),
         x.device,
         reach * dt,
         dt,
         int(box is not None),
         tuple(box) if box is not None else (1.0,) * space_dim,
-        int(update.shape[1] > state_dim),
+        int(moving),
         row_of,
         update.contiguous(),
         x.view(total, space_dim),
@@ -451,6 +447,7 @@ def _(
     row_of: Tensor,
     reach: float,
     dt: float,
+    moving: bool,
     box: list[float] | None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     return torch.empty_like(x), torch.empty_like(s), torch.empty_like(path_length)
@@ -467,6 +464,7 @@ def _update_particles_backward(
     row_base: int,
     reach: float,
     dt: float,
+    moving: bool,
 ) -> Tensor:
     space_dim, state_dim = new_x_bar.shape[2], new_s_bar.shape[2]
     kernels = update_kernels(space_dim, scalar_type(update.dtype))
@@ -477,7 +475,7 @@ def _update_particles_backward(
         update.device,
         reach * dt,
         dt,
-        int(update.shape[1] > state_dim),
+        int(moving),
         row_base,
         starts,
         row_source,
@@ -501,6 +499,7 @@ def _(
     row_base: int,
     reach: float,
     dt: float,
+    moving: bool,
 ) -> Tensor:
     return torch.empty_like(update, memory_format=torch.contiguous_format)
 
@@ -518,12 +517,13 @@ class UpdateParticles(torch.autograd.Function):
         rows: Rows,
         reach: float,
         dt: float,
+        moving: bool,
         box: list[float] | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        ctx.options = (rows.row_base, reach, dt)
+        ctx.options = (rows.row_base, reach, dt, moving)
         ctx.save_for_backward(update, rows.row_source, rows.starts)
         outputs: tuple[Tensor, Tensor, Tensor] = _update_particles(
-            update, x, s, path_length, rows.row_of, reach, dt, box
+            update, x, s, path_length, rows.row_of, reach, dt, moving, box
         )
         return outputs
 
@@ -532,7 +532,7 @@ class UpdateParticles(torch.autograd.Function):
     def backward(ctx: Any, *bars: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         update, row_source, starts = ctx.saved_tensors
         update_bar = _update_particles_backward(update, *bars, row_source, starts, *ctx.options)
-        return (update_bar, *bars, None, None, None, None)
+        return (update_bar, *bars, None, None, None, None, None)
 
 
 def update_particles(
@@ -544,18 +544,21 @@ def update_particles(
     rows: Rows,
     reach: float,
     dt: float,
+    moving: bool,
     box: tuple[float, ...] | None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Apply a rule's outputs to the particles that have rows.
 
     Args:
-        update: Raw updates [δ (D) ; Δs (C)], dimensionless, shape [K, A]; no δ where A equals C.
+        update: Raw updates [δ (D) ; Δs (C)], dimensionless, shape [K, A] or wider; the columns
+            beyond A are not read.
         x: Positions [length units], shape [B, N, D].
         s: States, dimensionless, shape [B, N, C].
         path_length: Length of each particle's path so far [length units], shape [B, N].
         rows: Which particles the rows stand for.
         reach: Largest displacement alpha eps of a unit step [length units].
         dt: Time step, dimensionless.
+        moving: Updates begin with δ; otherwise there is none and positions stay.
         box: Sides of the periodic box, into which positions are wrapped, or None.
     """
     outputs: tuple[Tensor, Tensor, Tensor] = UpdateParticles.apply(  # type: ignore[no-untyped-call]
@@ -566,6 +569,7 @@ def update_particles(
         rows,
         reach,
         dt,
+        moving,
         None if box is None else list(box),
     )
     return outputs

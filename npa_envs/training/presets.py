@@ -41,24 +41,28 @@ _OUT = Path("runs/morphogenesis2d")
 
 MORPHOGENESIS2D_PRESETS: Mapping[str, Morphogenesis2DTrainConfig] = {
     "paper": TrainConfig(task=Morphogenesis2DConfig(), out=_OUT),
+    # A few particles that see far, in worlds that start from seeds often: a recognisable gecko
+    # after about 190 s on one core (splat loss 0.20, PSNR 23 dB at step 64).
     "fast": TrainConfig(
         task=Morphogenesis2DConfig(
             target_point_count=512,
             particle_count=512,
-            hidden_dim=96,
+            hidden_dim=64,
             eps=0.2,
+            seed_radius=0.4,
             resolution=64,
         ),
-        iterations=600,
+        iterations=2400,
         repeats=1,
-        world_count=4,
+        world_count=2,
         pool_size=32,
-        steps=(16, 40),
+        steps=(16, 32),
         learning_rate=2e-3,
-        milestones=(300, 450, 550),
+        milestones=(1500, 2100),
+        seed_interval=6,
         out=_OUT,
-        picture_interval=50,
-        checkpoint_interval=50,
+        picture_interval=200,
+        checkpoint_interval=200,
         tensorboard=False,
     ),
     "tiny": TrainConfig(

@@ -1,0 +1,48 @@
+"""Results as tables: rows of one dataclass as plain text or as JSON."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Sequence
+from typing import Any
+
+
+def table_text(rows: Sequence[Any]) -> str:
+    """Return rows as a plain text table, one line each under a line of headings.
+
+    Args:
+        rows: Instances of one dataclass, for example what `npa_envs.evaluation.evaluate` returned.
+            A None is shown as "never".
+    """
+    if not rows:
+        return ""
+    names = [field.name for field in dataclasses.fields(rows[0])]
+    cells = [[name.replace("_", " ") for name in names]]
+    cells += [[_cell(getattr(row, name)) for name in names] for row in rows]
+    widths = [max(len(line[column]) for line in cells) for column in range(len(names))]
+    return "\n".join(
+        "  ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True))
+        for line in cells
+    )
+
+
+def table_json(rows: Sequence[Any]) -> str:
+    """Return rows as a JSON list of objects; a number that is not finite becomes null.
+
+    Args:
+        rows: Instances of dataclasses.
+    """
+
+    def plain(value: Any) -> Any:
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    objects = [{k: plain(v) for k, v in dataclasses.asdict(row).items()} for row in rows]
+    return json.dumps(objects, indent=2, allow_nan=False) + "\n"
+
+
+def _cell(value: str | int | float | None) -> str:
+    if value is None:
+        return "never"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

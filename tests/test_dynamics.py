@@ -1,0 +1,324 @@
+"""Steps and rollouts: reference trajectories, gradients, randomness, memory modes."""
+
+import numpy as np
+import pytest
+import torch
+from worlds import random_world, relative_error
+
+import npa_envs
+from npa_envs import reference as oracle
+from npa_envs.dynamics import row_capacity
+from npa_envs.sph import splat
+from npa_envs.tasks.seeds import uniform_ball
+
+
+def small_rule(device, dtype=torch.float64, seed=0, gain=8.0, **options):
+    """A rule whose updates are large enough to matter."""
+    torch.manual_seed(seed)
+    rule = npa_envs.NPARule(2, 5, 12, eps0=0.2, **options).to(device, dtype)
+    with torch.no_grad():
+        rule.output.weight *= gain
+    return rule
+
+
+def plain_rollout(rule, x, s, steps, *, eps, box=None, dt=1.0, masks=None, detach_positions=True):
+    """The dynamics in plain torch over the oracle, with given update masks."""
+    path = torch.zeros(x.shape[:2], dtype=x.dtype)
+    for t in range(steps):
+        z = oracle.perceive(x, s, eps, rule.eps0, box, detach_positions)
+        y = rule(z)
+        mask = 1.0 if masks is None else masks[t][..., None]
+        if rule.static:
+            s = s + mask * dt * y
+            continue
+        delta = y[..., :2]
+        length = delta.norm(dim=-1, keepdim=True)
+        step = mask * dt * rule.alpha * eps * delta / (1.0 + length)
+        x, s = x + step, s + mask * dt * y[..., 2:]
+        path = path + step.norm(dim=-1)
+        if box is not None:
+            sides = torch.tensor(box, dtype=x.dtype)
+            x = x - sides * torch.floor(x.detach() / sides + 0.5)
+    return x, s, path
+
+
+@pytest.fixture
+def aubergine(reference):
+    return npa_envs.load_rule(f"{reference / 'authors_demo_aubergine.json'}#aubergine")
+
+
+@pytest.mark.parametrize(
+    ("dtype", "x_bound", "s_bound"),
+    [(torch.float64, 1e-11, 1e-11), (torch.float32, 3e-5, 1.5e-4)],
+    ids=("float64", "float32"),
+)
+def test_a_rule_of_the_authors_follows_its_trajectory(
+    dtype, x_bound, s_bound, device, aubergine, reference
+):
+    data = np.load(reference / "rollout_aubergine_8_steps.npz")
+    x = torch.from_numpy(data["x0"])[None].to(device, dtype)
+    s = x.new_zeros(1, 1024, 16)
+    rule = aubergine.to(device, dtype)
+    with torch.no_grad():
+        x, s = npa_envs.rollout(rule, x, s, int(data["steps"]), eps=0.1, update_prob=1.0)
+    assert (x[0].cpu().double() - torch.from_numpy(data["x"])).abs().max() < x_bound
+    assert (s[0].cpu().double() - torch.from_numpy(data["s"])).abs().max() < s_bound
+
+
+@pytest.mark.slow
+def test_a_rule_of_the_authors_grows_its_picture(device, aubergine, reference):
+    data = np.load(reference / "aubergine_512_steps_picture.npz")
+    expected = torch.from_numpy(data["picture"].astype(np.float32)).flip(0)  # y points up here
+    rule = aubergine.to(device)
+    for seed in range(4):
+        generator = torch.Generator(device).manual_seed(seed)
+        x = uniform_ball(1, int(data["particle_count"]), 2, 0.2, generator=generator, device=device)
+        s = x.new_zeros(1, x.shape[1], 16)
+        with torch.no_grad():
+            x, s = npa_envs.rollout(rule, x, s, int(data["steps"]), generator=generator)
+            picture = splat(
+                x - x.mean(dim=1, keepdim=True),
+                rule.colour(s),
+                resolution=int(data["resolution"]),
+                pixel_size=float(data["pixel_size"]),
+            )[0].cpu()
+        psnr = -10.0 * torch.log10((picture - expected).square().mean())
+        assert psnr >= 24.0, f"seed {seed}: {psnr:.1f} dB"
+
+
+@pytest.mark.parametrize("static", [False, True])
+@pytest.mark.parametrize("box", [None, (1.4, 1.8)])
+@pytest.mark.parametrize("detach_positions", [True, False])
+def test_rollout_and_its_gradients_equal_plain_torch(box, detach_positions, static, device):
+    rule = small_rule("cpu", static=static, moment_correction=False)
+    x, s = random_world(2, 40, 2, 5, dtype=torch.float64, device="cpu")
+    x0, s0 = x.clone().requires_grad_(), s.clone().requires_grad_()
+    expected = plain_rollout_without_moment(
+        rule, x0, s0, 4, eps=0.3, box=box, dt=0.7, detach_positions=detach_positions
+    )
+    weights = [torch.randn(value.shape, dtype=torch.float64) for value in expected]
+    loss = sum((w * v).sum() for w, v in zip(weights, expected, strict=True))
+    inputs = [s0, *rule.parameters()] + ([] if static and detach_positions else [x0])
+    gradients = torch.autograd.grad(loss, inputs, allow_unused=True)
+
+    twin = small_rule(device, static=static, moment_correction=False)
+    x1 = x.to(device).requires_grad_()
+    s1 = s.to(device).requires_grad_()
+    values = npa_envs.rollout(
+        twin,
+        x1,
+        s1,
+        4,
+        eps=0.3,
+        box=box,
+        update_prob=1.0,
+        dt=0.7,
+        detach_positions=detach_positions,
+        return_path_length=True,
+    )
+    loss = sum((w.to(device) * v).sum() for w, v in zip(weights, values, strict=True))
+    inputs = [s1, *twin.parameters()] + ([] if static and detach_positions else [x1])
+    for value, answer in zip(values, expected, strict=True):
+        assert (value.cpu() - answer).abs().max() < 1e-12
+    for value, answer in zip(
+        torch.autograd.grad(loss, inputs, allow_unused=True), gradients, strict=True
+    ):
+        assert relative_error(value, answer) < 1e-11
+
+
+def plain_rollout_without_moment(rule, *args, **options):
+    """`plain_rollout` with the uncorrected state gradient."""
+    original = oracle.MOMENT_THRESHOLD
+    oracle.MOMENT_THRESHOLD = float("inf")
+    try:
+        return plain_rollout(rule, *args, **options)
+    finally:
+        oracle.MOMENT_THRESHOLD = original
+
+
+def test_update_masks_select_the_particles_that_change(device):
+    rule = small_rule(device)
+    x, s = random_world(2, 500, 2, 5, dtype=torch.float64, device=device)
+    generator = torch.Generator(device).manual_seed(4)
+    after_x, after_s = npa_envs.step(rule, x, s, update_prob=0.3, generator=generator)
+    twin = torch.Generator(device).manual_seed(4)
+    mask = torch.empty(2, 500, dtype=torch.uint8, device=device).bernoulli_(0.3, generator=twin)
+    all_x, all_s = npa_envs.step(rule, x, s, update_prob=1.0)
+    changed = mask.bool()[..., None]
+    assert 0.2 < mask.double().mean() < 0.4
+    torch.testing.assert_close(after_x, torch.where(changed, all_x, x), rtol=1e-13, atol=1e-13)
+    torch.testing.assert_close(after_s, torch.where(changed, all_s, s), rtol=1e-13, atol=1e-13)
+
+
+def test_masked_gradients_equal_plain_torch(device):
+    rule = small_rule(device, moment_correction=False)
+    x, s = random_world(2, 60, 2, 5, dtype=torch.float64, device=device)
+    generator = torch.Generator(device).manual_seed(9)
+    s1 = s.clone().requires_grad_()
+    values = npa_envs.rollout(
+        rule, x, s1, 3, eps=0.3, update_prob=0.4, generator=generator, return_path_length=True
+    )
+    twin_generator = torch.Generator(device).manual_seed(9)
+    masks = [
+        torch.empty(2, 60, dtype=torch.uint8, device=device)
+        .bernoulli_(0.4, generator=twin_generator)
+        .cpu()
+        .double()
+        for _ in range(3)
+    ]
+    twin = small_rule("cpu", moment_correction=False)
+    s0 = s.cpu().clone().requires_grad_()
+    expected = plain_rollout_without_moment(twin, x.cpu(), s0, 3, eps=0.3, masks=masks)
+    got = torch.autograd.grad(
+        sum(v.square().sum() for v in values), [s1, *rule.parameters()]
+    )
+    want = torch.autograd.grad(
+        sum(v.square().sum() for v in expected), [s0, *twin.parameters()]
+    )
+    for value, answer in zip(got, want, strict=True):
+        assert relative_error(value, answer) < 1e-11
+
+
+def test_recomputing_gives_the_gradients_of_storing(device):
+    rule = small_rule(device, dtype=torch.float32)
+    x, s = random_world(2, 200, 2, 5, dtype=torch.float32, device=device)
+    results = []
+    for memory in ("store", "recompute"):
+        s_ = s.clone().requires_grad_()
+        generator = torch.Generator(device).manual_seed(1)
+        out = npa_envs.rollout(
+            rule, x, s_, 5, position_noise=0.01, memory=memory, generator=generator
+        )
+        gradients = torch.autograd.grad(
+            out[0].square().sum() + out[1].square().sum(), [s_, *rule.parameters()]
+        )
+        results.append((*out, *gradients))
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+
+
+def test_seeded_rollouts_are_bit_identical(device):
+    rule = small_rule(device, dtype=torch.float32)
+    x, s = random_world(3, 300, 2, 5, dtype=torch.float32, device=device)
+    runs = []
+    for _ in range(2):
+        generator = torch.Generator(device).manual_seed(5)
+        runs.append(npa_envs.rollout(rule, x, s, 6, position_noise=0.01, generator=generator))
+    assert torch.equal(runs[0][0], runs[1][0])
+    assert torch.equal(runs[0][1], runs[1][1])
+    other = npa_envs.rollout(
+        rule, x, s, 6, position_noise=0.01, generator=torch.Generator(device).manual_seed(6)
+    )
+    assert not torch.equal(runs[0][0], other[0])
+
+
+def test_steps_one_by_one_equal_a_rollout(device):
+    rule = small_rule(device)
+    x, s = random_world(1, 100, 2, 5, dtype=torch.float64, device=device)
+    generator = torch.Generator(device).manual_seed(2)
+    expected = npa_envs.rollout(rule, x, s, 4, generator=generator)
+    generator = torch.Generator(device).manual_seed(2)
+    for _ in range(4):
+        x, s = npa_envs.step(rule, x, s, generator=generator)
+    assert torch.equal(x, expected[0])
+    assert torch.equal(s, expected[1])
+
+
+def test_particles_keep_their_identity(device):
+    """An untrained rule hardly moves anything, so particle i must stay where particle i was."""
+    rule = npa_envs.NPARule(2, 4, 8, eps0=0.2).to(device)
+    x, s = random_world(2, 400, 2, 4, dtype=torch.float32, device=device)
+    after_x, after_s = npa_envs.rollout(rule, x, 1e-3 * s, 3)
+    assert (after_x - x).abs().max() < 0.1
+    assert relative_error(after_x, x) < 0.1
+    assert (after_s - 1e-3 * s).abs().max() < 1.0
+
+
+def test_position_noise_has_its_standard_deviation(device):
+    rule = npa_envs.NPARule(2, 4, 8, eps0=0.2, static=True).to(device)
+    x = torch.zeros(4, 5000, 2, device=device)
+    x += torch.linspace(0, 100, 5000, device=device)[:, None]
+    s = torch.zeros(4, 5000, 4, device=device)
+    moved, _ = npa_envs.step(rule, x, s, position_noise=0.05)
+    noise = moved - x
+    assert float(noise.std()) == pytest.approx(0.05, rel=0.02)
+    assert abs(float(noise.mean())) < 0.002
+
+
+def test_periodic_positions_stay_in_the_box(device):
+    rule = small_rule(device, gain=200.0)
+    x, s = random_world(2, 150, 2, 5, dtype=torch.float64, device=device)
+    x, s, path = npa_envs.rollout(rule, x, s, 12, box=(1.4, 1.6), return_path_length=True)
+    assert (x[..., 0].abs() <= 0.7).all()
+    assert (x[..., 1].abs() <= 0.8).all()
+    assert path.max() > 0.3  # far enough that some crossed the seam
+
+
+def test_displacement_never_exceeds_alpha_eps(device):
+    rule = small_rule(device, gain=1e4)
+    x, s = random_world(1, 100, 2, 5, dtype=torch.float64, device=device)
+    moved, _ = npa_envs.step(rule, x, s, eps=0.2, update_prob=1.0)
+    length = (moved - x).norm(dim=-1)
+    assert length.max() <= rule.alpha * 0.2 * (1 + 1e-12)
+    assert length.max() > 0.9 * rule.alpha * 0.2
+
+
+def test_a_rule_that_overrides_its_network_is_used_as_it_is(device):
+    class Doubled(npa_envs.NPARule):
+        def forward(self, perception):
+            return 2.0 * super().forward(perception)
+
+    plain = small_rule(device)
+    doubled = Doubled(2, 5, 12, eps0=0.2).to(device, torch.float64)
+    doubled.load_state_dict(plain.state_dict())
+    x, s = random_world(1, 50, 2, 5, dtype=torch.float64, device=device)
+    _, once = npa_envs.step(plain, x, s, update_prob=1.0)
+    _, twice = npa_envs.step(doubled, x, s, update_prob=1.0)
+    torch.testing.assert_close(twice - s, 2.0 * (once - s), rtol=1e-12, atol=1e-13)
+
+
+@pytest.mark.parametrize("update_prob", [0.01, 0.05, 0.5, 0.95])
+@pytest.mark.parametrize("particle_total", [16, 512, 32768])
+def test_row_capacity_holds_far_more_than_ever_drawn(particle_total, update_prob):
+    generator = torch.Generator().manual_seed(0)
+    draws = torch.empty(200, particle_total).bernoulli_(update_prob, generator=generator).sum(1)
+    capacity = row_capacity(particle_total, update_prob)
+    assert draws.max() <= capacity <= particle_total
+    if particle_total == 32768:
+        assert capacity <= particle_total * update_prob + 12.0 * 181.0 * 0.5 + 24.0
+
+
+def test_folded_rule_equals_the_network(device):
+    rule = small_rule(device)
+    z = torch.randn(33, rule.perception_dim, dtype=torch.float64, device=device)
+    folded = rule.folded()
+    rows = torch.zeros(33, folded.row_width, dtype=torch.float64, device=device)
+    rows[:, : rule.perception_dim] = z
+    rows[:, rule.perception_dim] = 1.0
+    update = folded(rows)
+    torch.testing.assert_close(update[:, : rule.update_dim], rule(z), rtol=1e-13, atol=1e-14)
+    cotangent = torch.randn(33, rule.update_dim, dtype=torch.float64, device=device)
+    got = torch.autograd.grad(
+        (update[:, : rule.update_dim] * cotangent).sum(), list(rule.parameters())
+    )
+    want = torch.autograd.grad((rule(z) * cotangent).sum(), list(rule.parameters()))
+    for value, answer in zip(got, want, strict=True):
+        torch.testing.assert_close(value, answer, rtol=1e-12, atol=1e-13)
+
+
+def test_a_captured_rollout_equals_the_eager_one(device):
+    if device.type != "cuda":
+        pytest.skip("graphs are CUDA's")
+    rule = small_rule(device, dtype=torch.float32)
+    x, s = random_world(2, 3000, 2, 5, dtype=torch.float32, device=device)
+    generator = torch.Generator(device).manual_seed(3)
+    expected = npa_envs.rollout(rule, x, s, 5, generator=generator)
+    graph = torch.cuda.CUDAGraph()
+    generator.manual_seed(3)
+    graph.register_generator_state(generator)
+    with torch.no_grad(), torch.cuda.graph(graph, capture_error_mode="thread_local"):
+        captured = npa_envs.rollout(rule, x, s, 5, generator=generator)
+    generator.manual_seed(3)
+    graph.replay()
+    torch.cuda.synchronize()
+    assert torch.equal(captured[0], expected[0])
+    assert torch.equal(captured[1], expected[1])

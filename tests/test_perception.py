@@ -1,0 +1,354 @@
+"""The Warp operators against the plain torch oracle, the reference answers and their invariants."""
+
+import numpy as np
+import pytest
+import torch
+from worlds import degenerate_world, random_world, relative_error
+
+import npa_envs
+from npa_envs import reference as oracle
+
+# Worst error measured on CPU and CUDA, then the bound of the test: a few times larger.
+FORWARD = {torch.float32: 2e-6, torch.float64: 5e-15}  # 3.1e-7, 5e-16
+GRADIENT = {torch.float32: 5e-6, torch.float64: 1e-14}  # 5e-7, 1e-15
+POSITION_GRADIENT = {torch.float32: 2e-5, torch.float64: 2e-14}  # 7e-7, 2e-15
+
+DTYPES = (torch.float32, torch.float64)
+BOXES = (None, "square", "oblong")
+REFERENCE_FILES = (
+    "perception_2d_open",
+    "perception_2d_open_degenerate",
+    "perception_2d_periodic",
+    "perception_3d_open",
+    "perception_3d_periodic",
+)
+
+
+def sides(box, space_dim):
+    if box is None:
+        return None
+    return (1.4,) * space_dim if box == "square" else (1.4, 1.9, 1.5)[:space_dim]
+
+
+@pytest.mark.parametrize("dtype", DTYPES, ids=("float32", "float64"))
+@pytest.mark.parametrize("name", REFERENCE_FILES)
+def test_reference_answers_are_met(name, dtype, device, reference):
+    """The bounds are the project's promise: 1e-5 and 1e-11, positions 1e-4 and 1e-10."""
+    data = np.load(reference / f"{name}.npz")
+
+    def tensor(key):
+        return torch.from_numpy(data[key])[None].to(device, dtype)
+
+    eps, eps0, box = (float(data[key]) for key in ("eps", "eps0", "box"))
+    box = box or None
+    bound = 1e-5 if dtype == torch.float32 else 1e-11
+    position_bound = 1e-4 if dtype == torch.float32 else 1e-10
+    x, s = tensor("x"), tensor("s")
+    fields = npa_envs.perception_fields(x, s, eps, box)
+    for key, value in fields._asdict().items():
+        assert relative_error(value, torch.from_numpy(data[key])[None]) < bound, key
+
+    s.requires_grad_()
+    z = npa_envs.perceive(x, s, eps, eps0, box)
+    z.backward(tensor("cotangent_z"))
+    assert relative_error(z, torch.from_numpy(data["z"])[None]) < bound
+    assert relative_error(s.grad, torch.from_numpy(data["grad_s"])[None]) < bound
+
+    s.grad = None
+    x.requires_grad_()
+    npa_envs.perceive(x, s, eps, eps0, box, detach_positions=False).backward(tensor("cotangent_z"))
+    assert relative_error(s.grad, torch.from_numpy(data["grad_s_full"])[None]) < bound
+    assert relative_error(x.grad, torch.from_numpy(data["grad_x_full"])[None]) < position_bound
+
+
+@pytest.mark.parametrize("state_dim", [1, 3, 16, 21])
+@pytest.mark.parametrize("box", BOXES)
+@pytest.mark.parametrize("space_dim", [2, 3])
+@pytest.mark.parametrize("dtype", DTYPES, ids=("float32", "float64"))
+def test_perception_and_its_adjoints_equal_the_oracle(dtype, space_dim, box, state_dim, device):
+    x, s = random_world(3, 83, space_dim, state_dim, dtype=dtype, device=device)
+    box = sides(box, space_dim)
+    exact_x, exact_s = x.cpu().double().requires_grad_(), s.cpu().double().requires_grad_()
+    expected = oracle.perceive(exact_x, exact_s, 0.3, 0.2, box, detach_positions=False)
+    cotangent = torch.randn(
+        expected.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1)
+    )
+    expected.backward(cotangent)
+
+    x.requires_grad_()
+    s.requires_grad_()
+    z = npa_envs.perceive(x, s, 0.3, 0.2, box, detach_positions=False)
+    z.backward(cotangent.to(z))
+    assert relative_error(z, expected) < FORWARD[dtype]
+    assert relative_error(s.grad, exact_s.grad) < GRADIENT[dtype]
+    assert relative_error(x.grad, exact_x.grad) < POSITION_GRADIENT[dtype]
+
+
+@pytest.mark.parametrize("space_dim", [2, 3])
+@pytest.mark.parametrize("dtype", DTYPES, ids=("float32", "float64"))
+def test_degenerate_geometry_equals_the_oracle(dtype, space_dim, device):
+    x, s = degenerate_world(space_dim, 4, dtype=dtype, device=device)
+    exact_x, exact_s = x.cpu().double().requires_grad_(), s.cpu().double().requires_grad_()
+    expected = oracle.perceive(exact_x, exact_s, 0.15, 0.15, detach_positions=False)
+    expected.backward(torch.ones_like(expected))
+    x.requires_grad_()
+    s.requires_grad_()
+    z = npa_envs.perceive(x, s, 0.15, 0.15, detach_positions=False)
+    z.backward(torch.ones_like(z))
+    assert torch.isfinite(z).all()
+    assert torch.isfinite(x.grad).all()
+    assert relative_error(z, expected) < FORWARD[dtype]
+    assert relative_error(s.grad, exact_s.grad) < GRADIENT[dtype]
+    assert relative_error(x.grad, exact_x.grad) < POSITION_GRADIENT[dtype]
+
+
+@pytest.mark.parametrize("space_dim", [2, 3])
+def test_gradients_pass_gradcheck(space_dim, device):
+    x, s = random_world(1, 9, space_dim, 3, dtype=torch.float64, device=device)
+    x, s = (0.4 * x).requires_grad_(), s.requires_grad_()
+    # Without the moment correction: that is a stopped gradient, which differences would see.
+    assert torch.autograd.gradcheck(
+        lambda x, s: npa_envs.perceive(
+            x, s, 0.3, detach_positions=False, moment_correction=False
+        ),
+        (x, s),
+    )
+
+
+def test_detached_positions_get_no_gradient(device):
+    x, s = random_world(1, 20, 2, 4, dtype=torch.float32, device=device)
+    x.requires_grad_()
+    s.requires_grad_()
+    npa_envs.perceive(x, s, 0.3).sum().backward()
+    assert x.grad is None
+    assert s.grad.abs().sum() > 0
+
+
+def test_isolated_particle_sees_itself_only(device):
+    x = torch.zeros(1, 1, 2, dtype=torch.float64, device=device)
+    s = torch.tensor([[[0.3, -2.0]]], dtype=torch.float64, device=device)
+    z = npa_envs.perceive(x, s, 0.1)
+    expected = torch.tensor([0.3, -2.0, 0.3, -2.0, 0, 0, 0, 0, 0, 0], dtype=torch.float64)
+    torch.testing.assert_close(z[0, 0].cpu(), expected, rtol=1e-15, atol=0)
+
+
+def test_smoothing_kernel_integrates_to_one():
+    axis = torch.linspace(-0.3, 0.3, 121, dtype=torch.float64)
+    for space_dim in (2, 3):
+        grid = torch.cartesian_prod(*(axis,) * space_dim)
+        weight = oracle.smoothing_kernel((grid**2).sum(-1), 0.25, space_dim)
+        integral = float(weight.sum()) * (axis[1] - axis[0]) ** space_dim
+        assert integral == pytest.approx(1.0, abs=1e-4)
+
+
+def test_skipped_groups_leave_the_others_unchanged(device):
+    x, s = random_world(2, 60, 2, 5, dtype=torch.float64, device=device)
+    full = npa_envs.perceive(x, s, 0.3)
+    no_density = npa_envs.perceive(x, s, 0.3, density_gradient=False)
+    no_gradient = npa_envs.perceive(x, s, 0.3, state_gradient=False)
+    neither = npa_envs.perceive(x, s, 0.3, state_gradient=False, density_gradient=False)
+    assert torch.equal(no_density, full[..., :20])
+    assert torch.equal(no_gradient, torch.cat((full[..., :10], full[..., 20:]), dim=-1))
+    assert torch.equal(neither, full[..., :10])
+
+
+def test_gradients_of_skipped_groups_equal_those_of_zero_cotangents(device):
+    x, s = random_world(2, 60, 2, 5, dtype=torch.float64, device=device)
+    gradients = []
+    for options, columns in ((dict(state_gradient=False), 12), (dict(), 22)):
+        s_, x_ = s.clone().requires_grad_(), x.clone().requires_grad_()
+        z = npa_envs.perceive(x_, s_, 0.3, detach_positions=False, **options)
+        assert z.shape[-1] == columns
+        (z[..., :10].square().sum() + z[..., -2:].square().sum()).backward()
+        gradients.append((x_.grad, s_.grad))
+    assert relative_error(gradients[0][0], gradients[1][0]) < 1e-13
+    assert relative_error(gradients[0][1], gradients[1][1]) < 1e-13
+
+
+class TestInvariance:
+    """What must not change when a world is moved, turned or renumbered."""
+
+    @pytest.fixture
+    def world(self, device):
+        return random_world(2, 120, 2, 5, dtype=torch.float64, device=device)
+
+    def test_permutation(self, world):
+        x, s = world
+        order = torch.randperm(120, generator=torch.Generator().manual_seed(3)).to(x.device)
+        z = npa_envs.perceive(x, s, 0.3)
+        permuted = npa_envs.perceive(x[:, order], s[:, order], 0.3)
+        assert relative_error(permuted, z[:, order]) < 1e-14
+
+    def test_translation(self, world):
+        x, s = world
+        moved = npa_envs.perceive(x + torch.tensor([37.2, -18.9]).to(x), s, 0.3)
+        assert relative_error(moved, npa_envs.perceive(x, s, 0.3)) < 1e-12
+
+    def test_translation_through_the_seam_of_a_box(self, world):
+        x, s = world
+        z = npa_envs.perceive(x, s, 0.3, box=(1.4, 2.0))
+        moved = npa_envs.perceive(x + torch.tensor([0.9, 3.1]).to(x), s, 0.3, box=(1.4, 2.0))
+        assert relative_error(moved, z) < 1e-12
+
+    def test_rotation_turns_vectors_and_keeps_scalars(self, world):
+        x, s = world
+        turn = torch.tensor([[0.6, -0.8], [0.8, 0.6]], dtype=torch.float64).to(x)
+        z = npa_envs.perceive(x, s, 0.3)
+        turned = npa_envs.perceive(x @ turn.T, s, 0.3)
+        assert relative_error(turned[..., :10], z[..., :10]) < 1e-13
+        vectors = z[..., 10:].unflatten(-1, (-1, 2)) @ turn.T
+        assert relative_error(turned[..., 10:], vectors.flatten(2)) < 1e-12
+
+    def test_common_scale_of_lengths(self, world):
+        """With c = 1 only the density gradient keeps a length; the state gradient another."""
+        x, s = world
+        fields = npa_envs.perception_fields(x, s, 0.3)
+        scaled = npa_envs.perception_fields(8.0 * x, s, 2.4)
+        assert relative_error(scaled.rho * 64.0, fields.rho) < 1e-13
+        assert relative_error(scaled.blur, fields.blur) < 1e-13
+        assert relative_error(scaled.moment, fields.moment) < 1e-13
+        assert relative_error(scaled.grad1 * 8.0, fields.grad1) < 1e-12
+        assert relative_error(scaled.drho * 512.0, fields.drho) < 1e-12
+
+
+class TestDeterminism:
+    """Exact equality: same sums in the same order, whatever else is in the batch."""
+
+    @pytest.mark.parametrize("dtype", DTYPES, ids=("float32", "float64"))
+    @pytest.mark.parametrize("space_dim", [2, 3])
+    def test_runs_are_bit_identical(self, space_dim, dtype, device):
+        x, s = random_world(3, 700, space_dim, 16, dtype=dtype, device=device)
+        results = []
+        for _ in range(3):
+            x_, s_ = x.clone().requires_grad_(), s.clone().requires_grad_()
+            z = npa_envs.perceive(x_, s_, 0.2, detach_positions=False)
+            z.square().sum().backward()
+            results.append((z.detach(), s_.grad, x_.grad))
+        for other in results[1:]:
+            assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+    @pytest.mark.parametrize("box", [None, (1.4, 1.8)])
+    def test_a_world_of_a_batch_equals_that_world_alone(self, box, device):
+        x, s = random_world(5, 333, 2, 16, dtype=torch.float32, device=device)
+        cotangent = torch.randn(5, 333, 66, generator=torch.Generator().manual_seed(2)).to(x)
+
+        def run(x, s, cotangent):
+            x, s = x.clone().requires_grad_(), s.clone().requires_grad_()
+            z = npa_envs.perceive(x, s, 0.2, box=box, detach_positions=False)
+            z.backward(cotangent)
+            return z.detach(), s.grad, x.grad
+
+        together = run(x, s, cotangent)
+        for k in range(5):
+            alone = run(x[k : k + 1], s[k : k + 1], cotangent[k : k + 1])
+            for batched, single in zip(together, alone, strict=True):
+                assert torch.equal(batched[k], single[0])
+
+
+class TestGeometryLimits:
+    """Any position is legal in open space; boxes may be as small as 2 eps."""
+
+    @pytest.mark.parametrize("dtype", DTYPES, ids=("float32", "float64"))
+    def test_particles_far_outside_still_see_each_other(self, dtype, device):
+        x, s = random_world(1, 50, 2, 3, dtype=dtype, device=device)
+        near = npa_envs.perceive(x, s, 0.3)
+        far = torch.cat((x, torch.full_like(x[:, :1], 1e30)), dim=1)
+        other = torch.cat((s, s[:, :1]), dim=1)
+        z = npa_envs.perceive(far, other, 0.3)
+        scalars = torch.cat((near[..., :6], near[..., 6:12]), dim=-1)
+        assert relative_error(z[:, :50, :12], scalars) < FORWARD[dtype]
+        torch.testing.assert_close(z[0, 50, :3], s[0, 0])
+        torch.testing.assert_close(z[0, 50, 3:6], s[0, 0])
+        assert z[0, 50, 6:].abs().max() == 0
+
+    def test_coincident_particles_far_away_are_neighbours(self, device):
+        x = torch.full((1, 4, 2), 3.0e8, device=device)
+        s = torch.arange(4.0, device=device)[None, :, None]
+        fields = npa_envs.perception_fields(x, s, 0.1)
+        torch.testing.assert_close(fields.blur, torch.full_like(fields.blur, 1.5))
+        assert fields.grad0.abs().max() == 0
+
+    def test_neighbours_across_a_million_are_found(self, device):
+        generator = torch.Generator().manual_seed(5)
+        x = (torch.rand(1, 200, 2, generator=generator, dtype=torch.float64) * 0.6).to(device)
+        s = torch.randn(1, 200, 4, generator=generator, dtype=torch.float64).to(device)
+        near = npa_envs.perception_fields(x, s, 0.1)
+        far = npa_envs.perception_fields(x + 2.0**20, s, 0.1)
+        assert relative_error(far.rho, near.rho) < 1e-7
+
+    @pytest.mark.parametrize("space_dim", [2, 3])
+    def test_a_box_of_exactly_two_eps_counts_every_pair_once(self, space_dim, device):
+        x, s = random_world(2, 64, space_dim, 4, dtype=torch.float64, device=device)
+        box = (0.6,) * space_dim
+        expected = oracle.perceive(x.cpu(), s.cpu(), 0.3, 0.3, box)
+        assert relative_error(npa_envs.perceive(x, s, 0.3, box=box), expected) < 1e-13
+
+    def test_positions_outside_a_box_are_wrapped(self, device):
+        x, s = random_world(1, 80, 2, 4, dtype=torch.float64, device=device)
+        shift = torch.tensor([1.5, -3.0]).to(x)
+        z = npa_envs.perceive(x, s, 0.3, box=1.5)
+        assert relative_error(npa_envs.perceive(x + shift, s, 0.3, box=1.5), z) < 1e-12
+
+    def test_a_clump_of_all_particles_is_handled(self, device):
+        s = torch.randn(1, 500, 3, generator=torch.Generator().manual_seed(0)).to(device)
+        x = torch.zeros(1, 500, 2, device=device)
+        fields = npa_envs.perception_fields(x, s, 0.1)
+        torch.testing.assert_close(
+            fields.blur, s.mean(dim=1, keepdim=True).expand_as(s), rtol=1e-4, atol=1e-6
+        )
+
+
+class TestTorchGlue:
+    """Non-contiguous input, other streams, retained graphs, no_grad and torch.compile."""
+
+    def test_non_contiguous_inputs_and_cotangents(self, device):
+        x, s = random_world(2, 64, 2, 6, dtype=torch.float64, device=device)
+        z = npa_envs.perceive(x, s, 0.3)
+        x_strided = x.permute(2, 1, 0).contiguous().permute(2, 1, 0)
+        s_strided = s.permute(2, 1, 0).contiguous().permute(2, 1, 0).requires_grad_()
+        strided = npa_envs.perceive(x_strided, s_strided, 0.3)
+        assert torch.equal(strided, z)
+        strided.sum().backward()  # an expanded cotangent of stride 0
+        s_ = s.clone().requires_grad_()
+        npa_envs.perceive(x, s_, 0.3).backward(torch.ones_like(z))
+        assert torch.equal(s_strided.grad, s_.grad)
+
+    def test_a_retained_graph_gives_the_same_gradient_twice(self, device):
+        x, s = random_world(1, 64, 2, 6, dtype=torch.float32, device=device)
+        s.requires_grad_()
+        loss = npa_envs.perceive(x, s, 0.3).square().sum()
+        (first,) = torch.autograd.grad(loss, s, retain_graph=True)
+        (second,) = torch.autograd.grad(loss, s)
+        assert torch.equal(first, second)
+
+    def test_nothing_is_recorded_without_gradients(self, device):
+        x, s = random_world(1, 64, 2, 6, dtype=torch.float32, device=device)
+        s.requires_grad_()
+        with torch.no_grad():
+            assert npa_envs.perceive(x, s, 0.3).grad_fn is None
+
+    def test_compiled_function_equals_eager(self, device):
+        x, s = random_world(1, 64, 2, 6, dtype=torch.float32, device=device)
+
+        def loss(x, s):
+            return npa_envs.perceive(x, s, 0.3).square().sum()
+
+        compiled = torch.compile(loss, backend="aot_eager")
+        s1, s2 = s.clone().requires_grad_(), s.clone().requires_grad_()
+        value, expected = compiled(x, s1), loss(x, s2)
+        value.backward()
+        expected.backward()
+        assert torch.equal(value, expected)
+        assert torch.equal(s1.grad, s2.grad)
+
+    def test_another_stream_gives_the_same_result(self, device):
+        if device.type != "cuda":
+            pytest.skip("streams are CUDA's")
+        x, s = random_world(2, 2000, 2, 16, dtype=torch.float32, device=device)
+        expected = npa_envs.perceive(x, s, 0.1)
+        stream = torch.cuda.Stream()
+        stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(stream):
+            z = npa_envs.perceive(x, s, 0.1)
+        torch.cuda.current_stream().wait_stream(stream)
+        assert torch.equal(z, expected)
