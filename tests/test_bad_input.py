@@ -15,7 +15,9 @@ def world(**options):
 class TestOperators:
     def test_missing_world_dimension(self, function):
         x, s = world()
-        with pytest.raises(NPAError, match=r"x must have shape \[B, N, D\], got \(4, 2\).*x\[None\]"):
+        with pytest.raises(
+            NPAError, match=r"x must have shape \[B, N, D\], got \(4, 2\).*x\[None\]"
+        ):
             function(x[0], s, 0.1)
         with pytest.raises(NPAError, match=r"s must have shape \[B, N, C\]"):
             function(x, s[0], 0.1)

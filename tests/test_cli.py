@@ -62,7 +62,7 @@ def test_no_command_is_a_usage_error_and_a_misspelt_one_is_suggested(
 ) -> None:
     assert main([]) == 2
     capsys.readouterr()
-    assert "unknown command 'trian': did you mean 'train'?" in error_of(capsys, ["trian"])
+    assert "unknown command 'demoo': did you mean 'demo'?" in error_of(capsys, ["demoo"])
 
 
 def test_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:

@@ -169,12 +169,8 @@ def test_masked_gradients_equal_plain_torch(device):
     twin = small_rule("cpu", moment_correction=False)
     s0 = s.cpu().clone().requires_grad_()
     expected = plain_rollout_without_moment(twin, x.cpu(), s0, 3, eps=0.3, masks=masks)
-    got = torch.autograd.grad(
-        sum(v.square().sum() for v in values), [s1, *rule.parameters()]
-    )
-    want = torch.autograd.grad(
-        sum(v.square().sum() for v in expected), [s0, *twin.parameters()]
-    )
+    got = torch.autograd.grad(sum(v.square().sum() for v in values), [s1, *rule.parameters()])
+    want = torch.autograd.grad(sum(v.square().sum() for v in expected), [s0, *twin.parameters()])
     for value, answer in zip(got, want, strict=True):
         assert relative_error(value, answer) < 1e-11
 

@@ -108,9 +108,7 @@ def test_gradients_pass_gradcheck(space_dim, device):
     x, s = (0.4 * x).requires_grad_(), s.requires_grad_()
     # Without the moment correction: that is a stopped gradient, which differences would see.
     assert torch.autograd.gradcheck(
-        lambda x, s: npa_envs.perceive(
-            x, s, 0.3, detach_positions=False, moment_correction=False
-        ),
+        lambda x, s: npa_envs.perceive(x, s, 0.3, detach_positions=False, moment_correction=False),
         (x, s),
     )
 

@@ -145,9 +145,7 @@ def test_a_wrong_file_of_ours_is_refused(tmp_path: Path, case: str) -> None:
     change, message = BAD_HEADERS[case]
     path = tmp_path / "rule.safetensors"
     write_raw(path, NPARule(), change)
-    with pytest.raises(
-        NPAError, match=f"cannot load a rule from .*: .*{message}"
-    ):
+    with pytest.raises(NPAError, match=f"cannot load a rule from .*: .*{message}"):
         load_rule(path)
 
 

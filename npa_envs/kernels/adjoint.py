@@ -141,10 +141,9 @@ def adjoint_kernels(
                 offset = minimum_image(domain, position - row_positions[row])
                 squared = wp.dot(offset, offset)
                 if squared < domain.squared_eps:
-                    total += (
-                        smoothing(squared, domain.inverse_squared_eps, domain.smoothing_norm)
-                        * load_group(blur_bar, row * group_count + g)
-                    )
+                    total += smoothing(
+                        squared, domain.inverse_squared_eps, domain.smoothing_norm
+                    ) * load_group(blur_bar, row * group_count + g)
                     if wp.static(state_gradient):
                         kernel = offset * spiky_factor(
                             wp.sqrt(squared), domain.inverse_eps, domain.spiky_norm
@@ -199,9 +198,7 @@ def adjoint_kernels(
                 squared = wp.dot(offset, offset)
                 row = row_of[source[j]]
                 if squared < domain.squared_eps and row >= 0:
-                    weight = smoothing(
-                        squared, domain.inverse_squared_eps, domain.smoothing_norm
-                    )
+                    weight = smoothing(squared, domain.inverse_squared_eps, domain.smoothing_norm)
                     kernel = offset * spiky_factor(
                         wp.sqrt(squared), domain.inverse_eps, domain.spiky_norm
                     )
@@ -210,7 +207,8 @@ def adjoint_kernels(
                         volume_bar += weight * wp.dot(own, blur_bar[row * group_count + g])
                         if wp.static(state_gradient):
                             volume_bar += wp.dot(
-                                own - states[j * group_count + g], kernel * gradient_bar[row * group_count + g]
+                                own - states[j * group_count + g],
+                                kernel * gradient_bar[row * group_count + g],
                             )
         density_bar[k] = -volume * volume * volume_bar
 
@@ -278,9 +276,13 @@ def adjoint_kernels(
                         seen = states[j * group_count + g]
                         if row >= 0:
                             as_neighbour += volume * wp.dot(own, blur_bar[row * group_count + g])
-                            neighbour_kernel += volume * (gradient_bar[row * group_count + g] * (own - seen))
+                            neighbour_kernel += volume * (
+                                gradient_bar[row * group_count + g] * (own - seen)
+                            )
                         if own_row >= 0:
-                            as_centre += other_volume * wp.dot(seen, blur_bar[own_row * group_count + g])
+                            as_centre += other_volume * wp.dot(
+                                seen, blur_bar[own_row * group_count + g]
+                            )
                             centre_kernel += other_volume * (
                                 gradient_bar[own_row * group_count + g] * (seen - own)
                             )

@@ -93,9 +93,7 @@ def cell_kernels(space_dim: int, scalar: type, share: int) -> SimpleNamespace:
             j = arrived[other]
             if j < i:
                 rank += 1
-                if masked == 0:
-                    active_rank += 1
-                elif mask[j] != wp.uint8(0):
+                if masked == 0 or mask[j] != wp.uint8(0):
                     active_rank += 1
         place = begin + rank
 
@@ -124,4 +122,3 @@ def cell_kernels(space_dim: int, scalar: type, share: int) -> SimpleNamespace:
         place_by_arrival=place_by_arrival,
         order_particles=order_particles,
     )
-

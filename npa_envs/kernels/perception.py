@@ -111,9 +111,7 @@ def perception_kernels(
                 offset = minimum_image(domain, neighbour - position)
                 squared = wp.dot(offset, offset)
                 if squared < domain.squared_eps and j != k:
-                    density += smoothing(
-                        squared, domain.inverse_squared_eps, domain.smoothing_norm
-                    )
+                    density += smoothing(squared, domain.inverse_squared_eps, domain.smoothing_norm)
                     if row >= 0:
                         gradient += spiky_wide(domain, position, neighbour, squared)
         # A particle always sees itself: a position that is not finite would otherwise have rho 0.
@@ -158,9 +156,7 @@ def perception_kernels(
                 if squared < domain.squared_eps:
                     volume = entry[wp.static(space_dim)]
                     state = load_group(states, j * group_count + g)
-                    weight = smoothing(
-                        squared, domain.inverse_squared_eps, domain.smoothing_norm
-                    )
+                    weight = smoothing(squared, domain.inverse_squared_eps, domain.smoothing_norm)
                     blur += (volume * weight) * state
                     if wp.static(state_gradient):
                         kernel = offset * spiky_factor(
@@ -212,7 +208,9 @@ def perception_kernels(
         """
         row, g, lane = wp.tid()
         if row >= starts[starts.shape[0] - 1] - row_base:
-            for column in range(g * wp.static(lanes) + lane, perception.shape[1], group_count * wp.static(lanes)):
+            for column in range(
+                g * wp.static(lanes) + lane, perception.shape[1], group_count * wp.static(lanes)
+            ):
                 perception[row, column] = scalar(0.0)
             return
         k = row_place[row]

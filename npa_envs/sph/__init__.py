@@ -2,5 +2,6 @@
 
 from npa_envs.sph.fields import PerceptionFields, perceive, perception_fields
 from npa_envs.sph.splat import splat
+from npa_envs.sph.warmup import warmup
 
-__all__ = ["PerceptionFields", "perceive", "perception_fields", "splat"]
+__all__ = ["PerceptionFields", "perceive", "perception_fields", "splat", "warmup"]

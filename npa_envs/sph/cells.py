@@ -104,7 +104,9 @@ def sort_worlds(plan: Plan, x: Tensor, s: Tensor, mask: Tensor | None) -> Sorted
     device, total = x.device, plan.total
     cell, arrival, arrived = torch.empty(3, total, dtype=torch.int32, device=device).unbind()
     cell_total = plan.world_count * int(plan.domain.cell_count)
-    counts = torch.zeros(cell_total * (2 if plan.masked else 1) + 1, dtype=torch.int32, device=device)
+    counts = torch.zeros(
+        cell_total * (2 if plan.masked else 1) + 1, dtype=torch.int32, device=device
+    )
     positions = x.view(total, plan.space_dim)
     states = s.view(total, plan.state_dim)
     flat_mask = None if mask is None else mask.view(total)
@@ -131,9 +133,7 @@ def sort_worlds(plan: Plan, x: Tensor, s: Tensor, mask: Tensor | None) -> Sorted
     row_place = torch.empty_like(row_source)
     sorted_positions = torch.empty_like(positions)
     row_positions = torch.empty(plan.row_capacity, plan.space_dim, dtype=x.dtype, device=device)
-    sorted_states = torch.empty(
-        total, plan.group_count * plan.width, dtype=s.dtype, device=device
-    )
+    sorted_states = torch.empty(total, plan.group_count * plan.width, dtype=s.dtype, device=device)
     launch(
         kernels.order_particles,
         (total, plan.group_count * plan.lanes),

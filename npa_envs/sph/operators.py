@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from npa_envs.kernels.adjoint import adjoint_kernels
+from npa_envs.kernels.domain import make_domain
 from npa_envs.kernels.perception import perception_kernels
 from npa_envs.kernels.update import update_kernels
-from npa_envs.kernels.domain import make_domain
 from npa_envs.sph.bridge import lane_count, launch, scalar_type
 from npa_envs.sph.cells import Plan, compute_density, make_plan, sort_worlds
 
@@ -62,9 +62,7 @@ def _perceive_rows(
     moment_correction: bool,
     density_gradient: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    plan = make_plan(
-        x, s, row_capacity, mask is not None, eps, None if box is None else tuple(box)
-    )
+    plan = make_plan(x, s, row_capacity, mask is not None, eps, None if box is None else tuple(box))
     kernels = perception_kernels(
         plan.space_dim, plan.scalar, plan.width, plan.lanes, state_gradient
     )
@@ -121,9 +119,7 @@ def _(
     moment_correction: bool,
     density_gradient: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    plan = make_plan(
-        x, s, row_capacity, mask is not None, eps, None if box is None else tuple(box)
-    )
+    plan = make_plan(x, s, row_capacity, mask is not None, eps, None if box is None else tuple(box))
     cells = plan.world_count * int(plan.domain.cell_count) * (2 if plan.masked else 1)
     integers = torch.int32
     return (
@@ -318,9 +314,7 @@ class PerceiveRows(torch.autograd.Function):
             row_positions,
             row_kernel_sum,
             states,
-        ) = _perceive_rows(
-            x, s, mask, row_capacity, row_width, eps, scale, box, *terms
-        )
+        ) = _perceive_rows(x, s, mask, row_capacity, row_width, eps, scale, box, *terms)
         ctx.mark_non_differentiable(row_of, row_source, starts)
         ctx.set_materialize_grads(False)
         if any(ctx.needs_input_grad):

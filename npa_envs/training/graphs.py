@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import gc
+from collections.abc import Iterator
 from typing import Any, Literal, Protocol
 
 import torch
@@ -15,6 +18,19 @@ from npa_envs.training.config import TrainConfig
 
 WARM_UP_STEPS = 2
 """Steps of the eager rollout that loads every kernel before the first capture."""
+
+
+@contextlib.contextmanager
+def _no_garbage_collection() -> Iterator[None]:
+    """Collect garbage now and none inside: freeing an old graph would break a capture."""
+    gc.collect()
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 class Rollout(Protocol):
@@ -151,11 +167,14 @@ class GraphedIteration(EagerIteration):
         # Without this every replay would draw the masks of the capture again.
         graph.register_generator_state(self._generator)
         # The backward pass runs on a thread of its own, whose calls the strict mode would refuse.
-        with torch.cuda.graph(
-            graph,
-            pool=self._memory_pool,
-            stream=self._stream,
-            capture_error_mode="thread_local",
+        with (
+            _no_garbage_collection(),
+            torch.cuda.graph(
+                graph,
+                pool=self._memory_pool,
+                stream=self._stream,
+                capture_error_mode="thread_local",
+            ),
         ):
             self._forward_backward(steps)
         return graph

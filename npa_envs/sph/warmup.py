@@ -1,0 +1,48 @@
+"""Compiling kernels before they are needed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import torch
+
+from npa_envs.sph.fields import perceive
+from npa_envs.sph.operators import Rows, update_particles
+from npa_envs.sph.splat import splat
+
+
+def warmup(
+    device: str | torch.device = "cpu",
+    *,
+    space_dims: Iterable[int] = (2,),
+    dtypes: Iterable[torch.dtype] = (torch.float32,),
+    state_dim: int = 16,
+) -> None:
+    """Compile and load every kernel that worlds of these kinds need; cached on disk by Warp.
+
+    Args:
+        device: Device to compile for.
+        space_dims: Space dimensions, 2 or 3 each.
+        dtypes: `torch.float32`, `torch.float64` or both.
+        state_dim: State channels C; kernels serve groups of 4, 8 or 16 channels.
+    """
+    for dtype in dtypes:
+        for space_dim in space_dims:
+            x = torch.zeros(1, 2, space_dim, dtype=dtype, device=device, requires_grad=True)
+            s = torch.zeros(1, 2, state_dim, dtype=dtype, device=device, requires_grad=True)
+            perceive(x, s, 0.1, detach_positions=False).sum().backward()
+            _warm_update(x, s)
+            if space_dim == 2:
+                splat(x, x.new_zeros(1, 2, 3), resolution=8, pixel_size=0.1).sum().backward()
+
+
+def _warm_update(x: torch.Tensor, s: torch.Tensor) -> None:
+    none = torch.full((x.shape[1],), -1, dtype=torch.int32, device=x.device)
+    rows = Rows(row_of=none, row_source=none, starts=torch.zeros_like(none), row_base=0)
+    update = torch.zeros(
+        x.shape[1], x.shape[2] + s.shape[2], dtype=x.dtype, device=x.device, requires_grad=True
+    )
+    moved = update_particles(
+        update, x, s, x.new_zeros(x.shape[:2]), rows=rows, reach=0.1, dt=1.0, moving=True, box=None
+    )
+    moved[0].sum().backward()
