@@ -1,8 +1,8 @@
 """Time and memory of rollouts on the workloads of the paper's table; run with --help.
 
 Positions are uniform in a square of half-width 0.7 sqrt(N / 4096) (a cube of half-width 0.8 in 3D),
-eps 0.1, update probability 0.5; the loss is a random linear functional of the final x and s. On CUDA
-the whole rollout (and its backward pass) is captured in one graph and replayed.
+eps 0.1, update probability 0.5; the loss is a random linear functional of the final x and s. On
+CUDA the whole rollout (and its backward pass) is captured in one graph and replayed.
 """
 
 from __future__ import annotations

@@ -12,7 +12,8 @@ from torch.utils.checkpoint import checkpoint
 from npa_envs.errors import NPAError
 from npa_envs.rule import FoldedRule, NPARule
 from npa_envs.sph.checks import Box, check_finite_positions, check_world, checked_box, checked_eps
-from npa_envs.sph.operators import Terms, perceive_rows, update_particles
+from npa_envs.sph.operators import Terms, perceive_rows
+from npa_envs.sph.update import update_particles
 
 Memory = Literal["store", "recompute"]
 

@@ -28,7 +28,7 @@ class ReferenceFields(NamedTuple):
 
 
 def differences(x: Tensor, box: tuple[float, ...] | None = None) -> Tensor:
-    """Return r_ji = x_j - x_i [length units], shape [B, N (i), N (j), D]; the minimum image in a box.
+    """Return r_ji = x_j - x_i [length units], the minimum image in a box, shape [B, N, N, D].
 
     Args:
         x: Positions [length units], shape [B, N, D].

@@ -56,6 +56,12 @@ class _BlockedProduct(torch.autograd.Function):
         hidden, weight = ctx.saved_tensors
         return update_bar @ weight, update_bar.T @ hidden
 
+    @classmethod
+    def product(cls, hidden: Tensor, weight: Tensor) -> Tensor:
+        """Return the product of hidden units, [K, H], and weights, [A, H]: [K, A]."""
+        result: Tensor = cls.apply(hidden, weight)
+        return result
+
 
 class FoldedRule(NamedTuple):
     """A rule's weights as two plain products: the bias is one more column of the first.
@@ -77,14 +83,14 @@ class FoldedRule(NamedTuple):
     def __call__(self, rows: Tensor) -> Tensor:
         """Map rows [z | 1 | 0], shape [K, row_width], to raw updates [y | 0], shape [K, A']."""
         hidden = torch.relu(rows @ self.hidden_weight.T)
-        update: Tensor = _BlockedProduct.apply(hidden, self.output_weight)  # type: ignore[no-untyped-call]
-        return update
+        return _BlockedProduct.product(hidden, self.output_weight)
 
 
 class NPARule(nn.Module):
     """The update rule of Neural Particle Automata: y = W2 relu(W1 z + b1).
 
-    z is a particle's perception vector and y = [δ (D) ; Δs (C)] its update (no δ where `static`).
+    z is a particle's perception vector and y = [δ (D) ; Δs (C)] its update (no δ if
+    `static`).
     Source: arXiv 2601.16096, section 3; the same network for every particle and every step.
 
     Args:
@@ -203,7 +209,7 @@ class NPARule(nn.Module):
         return outputs
 
     def colour(self, states: Tensor) -> Tensor:
-        """Return RGB colours, dimensionless and not clipped, shape [..., 3]: the last three outputs.
+        """Return RGB colours from the last three outputs, dimensionless, unclipped, [..., 3].
 
         Args:
             states: Particle states, dimensionless, shape [..., C], C at least 3 without read-out.
@@ -211,7 +217,7 @@ class NPARule(nn.Module):
         return self.read_out(states)[..., -3:] + COLOUR_OFFSET
 
     def hyper_parameters(self) -> RuleHyperParameters:
-        """Return everything besides the weights: `NPARule(**rule.hyper_parameters())` has its shape."""
+        """Return all that `NPARule` takes: `NPARule(**rule.hyper_parameters())` has this shape."""
         return RuleHyperParameters(
             space_dim=self.space_dim,
             state_dim=self.state_dim,

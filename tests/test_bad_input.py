@@ -46,7 +46,7 @@ class TestOperators:
     def test_positions_that_are_not_finite(self, function, value):
         x, s = world()
         x[0, 2, 1] = value
-        with pytest.raises(NPAError, match="x must be finite.*world 0, particle 2"):
+        with pytest.raises(NPAError, match=r"x must be finite.*world 0, particle 2"):
             function(x, s, 0.1)
 
     @pytest.mark.parametrize("eps", [0.0, -0.1, float("nan"), float("inf")])
@@ -56,7 +56,7 @@ class TestOperators:
 
     @pytest.mark.parametrize("box", [0.19, (1.0, 0.1), (1.0, float("nan"))])
     def test_box_too_small(self, function, box):
-        with pytest.raises(NPAError, match="at least 2 eps = 0.2"):
+        with pytest.raises(NPAError, match=r"at least 2 eps = 0\.2"):
             function(*world(), 0.1, box=box)
 
     def test_box_with_wrong_number_of_sides(self, function):

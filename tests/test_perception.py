@@ -153,7 +153,7 @@ def test_skipped_groups_leave_the_others_unchanged(device):
 def test_gradients_of_skipped_groups_equal_those_of_zero_cotangents(device):
     x, s = random_world(2, 60, 2, 5, dtype=torch.float64, device=device)
     gradients = []
-    for options, columns in ((dict(state_gradient=False), 12), (dict(), 22)):
+    for options, columns in (({"state_gradient": False}, 12), ({}, 22)):
         s_, x_ = s.clone().requires_grad_(), x.clone().requires_grad_()
         z = npa_envs.perceive(x_, s_, 0.3, detach_positions=False, **options)
         assert z.shape[-1] == columns

@@ -1,0 +1,1 @@
+"""Warp kernels: cells, perception, its adjoints, updates and pictures. Imports warp alone."""

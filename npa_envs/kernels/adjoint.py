@@ -6,7 +6,8 @@ gradient of centre i; the moment correction is a stopped gradient, so it has no 
 
 State:     s_k += v_k (sum_i W b_i + G_i K_ik) - G_k sum_j v_j K_kj
 Volume:    v_k += sum_i W s_k b_i + (s_k - s_i) G_i K_ik,     rho_k = -v_k^2 v_k
-Positions: pair (i, j) pulls r by (rho_i + v_j s_j b_i) dW/dr + (dK/dr)^T (v_j (s_j - s_i) G_i + q_i)
+Positions: pair (i, j) pulls r by
+           (rho_i + v_j s_j b_i) dW/dr + (dK/dr)^T (v_j (s_j - s_i) G_i + q_i)
            with q the cotangent of the density gradient.
 """
 
@@ -27,7 +28,7 @@ from npa_envs.kernels.domain import (
 from npa_envs.kernels.lanes import make_lane_scatter, make_wide_load
 
 CUDA_REGISTERS = 64
-"""Registers of a thread that gathers state cotangents: it waits for memory more than it computes."""
+"""Registers of a thread that gathers state cotangents: it mostly waits for memory."""
 
 
 @functools.cache

@@ -79,7 +79,7 @@ def cell_kernels(space_dim: int, scalar: type, share: int) -> SimpleNamespace:
         row_positions: wp.array(dtype=vector),
         sorted_states: wp.array(dtype=scalar, ndim=2),
     ):
-        """Move every particle to its rank by index within its cell; make the rows of active ones."""
+        """Move every particle to its rank by index within its cell; give active ones rows."""
         k, part = wp.tid()
         i = arrived[k]
         c = cell[i]

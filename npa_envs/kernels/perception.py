@@ -56,7 +56,6 @@ def perception_kernels(
     add_square = make_lane_sum(square, scalar, lanes)
     scatter_group = make_lane_scatter(group, scalar, lanes)
     scatter_gradient = make_lane_scatter(group_gradient, scalar, lanes)
-    group_share = share_type(group, scalar, lanes)
     gradient_share = share_type(group_gradient, scalar, lanes)
 
     @wp.func
@@ -90,7 +89,7 @@ def perception_kernels(
         particles: wp.array(dtype=particle),
         row_density_gradient: wp.array(dtype=wide),
     ):
-        """Write each sorted particle's position and volume 1 / rho, and each row's density gradient.
+        """Write every particle's position and volume 1 / rho, and every row's density gradient.
 
         The density gradient cancels almost fully where particles are dense, and rules amplify its
         rounding error: it stays in float64 up to its scaling, which costs little.
@@ -277,7 +276,7 @@ def perception_kernels(
         k, g, lane = wp.tid()
         i = source[k]
         entry = particles[k]
-        blur, gradient, kernel_sum, moment = sum_neighbours(
+        blur, gradient, _kernel_sum, moment = sum_neighbours(
             domain,
             starts,
             particles,

@@ -1,8 +1,10 @@
-"""Pictures of 2D worlds: every particle is a small Gaussian; forward gathers over particles for each
-pixel, the adjoint gathers over pixels for each particle.
+"""Pictures of 2D worlds: every particle is a small Gaussian.
+
+The picture gathers over particles for each pixel, its adjoint over pixels for each particle.
 
 A particle at pixel p covers the patch of pixels q with |q - round(p)| <= r in both directions; its
-weights exp(-|q - p|^2 / 2 sigma^2) are normalised to sum 1 over the patch, inside the picture or not.
+weights exp(-|q - p|^2 / 2 sigma^2) are normalised to sum 1 over the patch, be it inside the picture
+or not.
 """
 
 import functools

@@ -173,7 +173,8 @@ def compute_density(
 ) -> tuple[Tensor, Tensor]:
     """Return sorted positions with volumes 1 / rho, [B N, D + 1], and the rows' density gradients.
 
-    `kernels` are those of the perception that follows. The latter, float64, [K, D], are undefined beyond the last active row and where not asked for.
+    The latter, float64, [K, D], are undefined beyond the last active row and where not asked for.
+    `kernels` are those of the perception that follows.
     """
     positions = ordered.positions
     particles = positions.new_empty(plan.total, plan.space_dim + 1)
@@ -193,3 +194,8 @@ def compute_density(
         row_density_gradient,
     )
     return particles, row_density_gradient
+
+
+def density_scale(scale: float, space_dim: int, particle_count: int) -> float:
+    """Return c^(1+D) / N, by which the density gradient is scaled before the logarithm."""
+    return scale ** (1 + space_dim) / particle_count

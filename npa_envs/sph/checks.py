@@ -13,7 +13,7 @@ from npa_envs.errors import NPAError
 DTYPES = (torch.float32, torch.float64)
 
 Box = float | Sequence[float] | None
-"""Sides of a periodic box centred on the origin [length units]; one number for a cube; None: open."""
+"""Sides of a periodic box centred on the origin [length units], one number for all; None: open."""
 
 
 def check_world(x: Tensor, s: Tensor) -> None:

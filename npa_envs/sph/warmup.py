@@ -7,8 +7,9 @@ from collections.abc import Iterable
 import torch
 
 from npa_envs.sph.fields import perceive
-from npa_envs.sph.operators import Rows, update_particles
+from npa_envs.sph.operators import Rows
 from npa_envs.sph.splat import splat
+from npa_envs.sph.update import update_particles
 
 
 def warmup(

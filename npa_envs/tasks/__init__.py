@@ -1,0 +1,1 @@
+"""Tasks: what to grow, from which seed, and how far it is from the goal."""

@@ -25,59 +25,54 @@ from npa_envs.tasks.canvas import (
 
 def draw_gecko() -> Image.Image:
     """A gecko from above: spots, four legs with splayed toes, a tail that curls."""
-    canvas, line = Canvas(), 0.024
-    spine = [(0.06, 0.52), (-0.05, 0.28), (-0.12, 0.0), (-0.04, -0.26), (0.1, -0.44)]
+    canvas, line = Canvas(), 0.03
+    spine = [(0.06, 0.5), (-0.03, 0.26), (-0.08, 0.0), (-0.03, -0.24), (0.08, -0.42)]
     tail = [
-        (0.1, -0.44), (0.18, -0.64), (0.1, -0.82), (-0.12, -0.87), (-0.36, -0.78),
-        (-0.56, -0.84), (-0.7, -0.76),
+        (0.08, -0.42), (0.16, -0.62), (0.08, -0.79), (-0.12, -0.84), (-0.34, -0.77),
+        (-0.52, -0.8),
     ]  # fmt: skip
     head = [
-        (0.04, 0.42), (-0.1, 0.58), (-0.06, 0.8), (0.13, 0.94), (0.3, 0.85), (0.34, 0.66),
-        (0.22, 0.46),
+        (0.04, 0.4), (-0.12, 0.58), (-0.08, 0.8), (0.12, 0.94), (0.31, 0.86), (0.36, 0.66),
+        (0.24, 0.44),
     ]  # fmt: skip
     legs = [
-        ([(0.0, 0.3), (0.26, 0.24), (0.48, 0.4)], 40),
-        ([(-0.06, 0.3), (-0.32, 0.34), (-0.5, 0.56)], 130),
-        ([(0.02, -0.3), (0.3, -0.26), (0.5, -0.46)], -40),
-        ([(-0.02, -0.26), (-0.32, -0.16), (-0.55, -0.32)], -135),
+        ([(0.02, 0.28), (0.28, 0.22), (0.5, 0.36)], 38),
+        ([(-0.06, 0.28), (-0.32, 0.3), (-0.52, 0.5)], 132),
+        ([(0.02, -0.28), (0.3, -0.24), (0.5, -0.42)], -42),
+        ([(-0.02, -0.24), (-0.32, -0.18), (-0.54, -0.34)], -135),
     ]
 
     def silhouette(grow: float) -> Image.Image:
         parts = [
-            stroke(spine, [0.2, 0.28, 0.38, 0.34, 0.2], grow=grow),
-            stroke(tail, [0.2, 0.19, 0.17, 0.14, 0.11, 0.08, 0.06], grow=grow),
+            stroke(spine, [0.28, 0.36, 0.46, 0.4, 0.28], grow=grow),
+            stroke(tail, [0.28, 0.25, 0.22, 0.19, 0.16, 0.11], grow=grow),
             polygon(smooth_curve(head, closed=True), grow=grow),
         ]
         for path, facing in legs:
-            parts.append(stroke(path, [0.17, 0.14, 0.11], grow=grow))
+            parts.append(stroke(path, [0.22, 0.19, 0.16], grow=grow))
             foot = path[-1]
-            for spread in (-84, -42, 0, 42, 84):
-                tip = place([(0.18, 0.0)], centre=foot, angle=facing + spread)[0]
-                parts.append(stroke([foot, tip], [0.06, 0.055], grow=grow))
-                parts.append(ellipse(tip, (0.042, 0.042), grow=grow))
+            for spread in (-72, -24, 24, 72):
+                tip = place([(0.19, 0.0)], centre=foot, angle=facing + spread)[0]
+                parts.append(stroke([foot, tip], [0.1, 0.085], grow=grow))
+                parts.append(ellipse(tip, (0.055, 0.055), grow=grow))
         return union(*parts)
 
-    canvas.paint(silhouette(line), "#14532d")
+    canvas.paint(silhouette(line), "#15803d")
     body = silhouette(0)
     _, y = grid()
     canvas.paint(body, gradient((0.95 - y) / 1.9, "#a3e635", "#4ade80", "#22c55e", "#0d9488"))
-    canvas.paint(stroke(spine, [0.05, 0.1, 0.14, 0.1, 0.05]), "#bef264", within=body)
+    canvas.paint(stroke(spine, [0.08, 0.13, 0.18, 0.13, 0.08]), "#d9f99d", within=body)
     spots = (
-        (-0.03, 0.36, 0.05), (0.1, 0.26, 0.038), (-0.17, 0.2, 0.042), (-0.07, 0.12, 0.052),
-        (-0.2, -0.03, 0.045), (0.03, 0.0, 0.042), (-0.11, -0.14, 0.054), (0.06, -0.2, 0.04),
-        (-0.03, -0.3, 0.045), (0.08, -0.4, 0.042), (0.06, 0.58, 0.036), (0.19, 0.55, 0.036),
+        (0.03, 0.38, 0.062), (-0.12, 0.17, 0.066), (0.05, 0.06, 0.07), (-0.14, -0.1, 0.068),
+        (0.03, -0.22, 0.066), (0.08, -0.46, 0.058),
     )  # fmt: skip
     canvas.paint_dots("#f97316", spots, within=body)
-    bands = (
-        (0.17, -0.58, 15), (0.14, -0.76, -35), (-0.01, -0.86, -85), (-0.21, -0.85, -110),
-        (-0.38, -0.785, -95), (-0.55, -0.835, -80),
-    )  # fmt: skip
+    bands = ((0.13, -0.66, -10), (-0.02, -0.83, -80), (-0.24, -0.81, -105), (-0.42, -0.78, -90))
     for bx, by, angle in bands:
-        canvas.paint(ellipse((bx, by), (0.14, 0.028), angle=angle), "#fde047", within=body)
-    for centre in ((0.0, 0.74), (0.29, 0.77)):
-        canvas.paint(ellipse(centre, (0.085, 0.085)), "#14532d")
-        canvas.paint(ellipse(centre, (0.062, 0.062)), "#fde047")
-        canvas.paint(ellipse(centre, (0.03, 0.05), angle=-15), "#111827")
+        canvas.paint(ellipse((bx, by), (0.16, 0.04), angle=angle), "#fde047", within=body)
+    for centre in ((0.0, 0.73), (0.27, 0.76)):
+        canvas.paint(ellipse(centre, (0.09, 0.09)), "#fef08a")
+        canvas.paint(ellipse(centre, (0.05, 0.06), angle=-15), "#1e293b")
     return canvas.finish()
 
 

@@ -1,0 +1,168 @@
+"""The adjoint of perception as an opaque torch operator."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from npa_envs.kernels.adjoint import adjoint_kernels
+from npa_envs.kernels.domain import make_domain
+from npa_envs.sph.bridge import lane_count, launch, scalar_type
+from npa_envs.sph.cells import Plan, density_scale
+
+
+@torch.library.custom_op("npa::perceive_rows_backward", mutates_args=())
+def perceive_rows_backward(
+    perception_bar: Tensor,
+    perception: Tensor,
+    row_of: Tensor,
+    starts: Tensor,
+    source: Tensor,
+    particles: Tensor,
+    row_positions: Tensor,
+    row_kernel_sum: Tensor,
+    states: Tensor | None,
+    particle_count: int,
+    state_dim: int,
+    width: int,
+    masked: bool,
+    eps: float,
+    scale: float,
+    box: list[float] | None,
+    state_gradient: bool,
+    density_gradient: bool,
+) -> tuple[Tensor, Tensor]:
+    """Return the cotangents of states, [B N, C], and of positions, [B N, D] or empty.
+
+    Everything saved by the forward pass comes as it left it; `states` None skips positions.
+    """
+    total, space_dim = particles.shape[0], particles.shape[1] - 1
+    row_capacity = perception.shape[0]
+    scalar = scalar_type(particles.dtype)
+    sides = None if box is None else tuple(box)
+    plan = Plan(
+        scalar=scalar,
+        width=width,
+        lanes=lane_count(particles.device),
+        world_count=total // particle_count,
+        particle_count=particle_count,
+        space_dim=space_dim,
+        state_dim=state_dim,
+        row_capacity=row_capacity,
+        masked=masked,
+        domain=make_domain(space_dim, scalar, eps, sides, particle_count),
+    )
+    kernels = adjoint_kernels(space_dim, scalar, width, plan.lanes, state_gradient)
+    device = particles.device
+    bar = perception_bar.contiguous()
+    blur_bar = bar.new_empty(row_capacity * plan.group_count, width)
+    gradient_bar = bar.new_empty(row_capacity * plan.group_count, space_dim, width)
+    density_gradient_bar = bar.new_empty(0 if states is None else row_capacity, space_dim)
+    launch(
+        kernels.unscale_cotangents,
+        (row_capacity, plan.group_count * width),
+        device,
+        state_dim,
+        int(density_gradient),
+        scale,
+        density_scale(scale, space_dim, particle_count),
+        plan.row_base,
+        plan.group_count,
+        starts,
+        perception,
+        bar,
+        blur_bar.view(-1),
+        gradient_bar.view(-1),
+        density_gradient_bar,
+    )
+    states_bar = bar.new_empty(total, state_dim)
+    launch(
+        kernels.gather_state_cotangents,
+        (total, plan.group_count, plan.lanes),
+        device,
+        plan.domain,
+        particle_count,
+        state_dim,
+        plan.active_offset,
+        plan.row_base,
+        row_capacity,
+        plan.group_count,
+        starts,
+        particles,
+        source,
+        row_of,
+        row_positions,
+        row_kernel_sum,
+        bar,
+        blur_bar,
+        gradient_bar,
+        gradient_bar.view(-1),
+        states_bar,
+    )
+    if states is None:
+        return states_bar, bar.new_empty(0)
+    density_bar = bar.new_empty(total)
+    launch(
+        kernels.gather_density_cotangents,
+        total,
+        device,
+        plan.domain,
+        particle_count,
+        plan.group_count,
+        starts,
+        particles,
+        states,
+        source,
+        row_of,
+        blur_bar,
+        gradient_bar,
+        density_bar,
+    )
+    positions_bar = bar.new_empty(total, space_dim)
+    launch(
+        kernels.gather_position_cotangents,
+        total,
+        device,
+        plan.domain,
+        particle_count,
+        plan.group_count,
+        starts,
+        particles,
+        states,
+        source,
+        row_of,
+        density_bar,
+        blur_bar,
+        gradient_bar,
+        density_gradient_bar,
+        positions_bar,
+    )
+    return states_bar, positions_bar
+
+
+@perceive_rows_backward.register_fake
+def _(
+    perception_bar: Tensor,
+    perception: Tensor,
+    row_of: Tensor,
+    starts: Tensor,
+    source: Tensor,
+    particles: Tensor,
+    row_positions: Tensor,
+    row_kernel_sum: Tensor,
+    states: Tensor | None,
+    particle_count: int,
+    state_dim: int,
+    width: int,
+    masked: bool,
+    eps: float,
+    scale: float,
+    box: list[float] | None,
+    state_gradient: bool,
+    density_gradient: bool,
+) -> tuple[Tensor, Tensor]:
+    total, space_dim = particles.shape[0], particles.shape[1] - 1
+    positions_bar = (
+        particles.new_empty(0) if states is None else particles.new_empty(total, space_dim)
+    )
+    return particles.new_empty(total, state_dim), positions_bar

@@ -1,0 +1,186 @@
+"""The update of particles from a rule's outputs as an opaque torch operator with its adjoint."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from npa_envs.kernels.update import update_kernels
+from npa_envs.sph.bridge import launch, scalar_type
+from npa_envs.sph.operators import Rows
+
+
+@torch.library.custom_op("npa::update_particles", mutates_args=())
+def _update_particles(
+    update: Tensor,
+    x: Tensor,
+    s: Tensor,
+    path_length: Tensor,
+    row_of: Tensor,
+    reach: float,
+    dt: float,
+    moving: bool,
+    box: list[float] | None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    space_dim, state_dim = x.shape[2], s.shape[2]
+    total = x.shape[0] * x.shape[1]
+    kernels = update_kernels(space_dim, scalar_type(x.dtype))
+    outputs = torch.empty_like(x), torch.empty_like(s), torch.empty_like(path_length)
+    launch(
+        kernels.apply_update,
+        total * (1 + state_dim),
+        x.device,
+        reach * dt,
+        dt,
+        int(box is not None),
+        tuple(box) if box is not None else (1.0,) * space_dim,
+        int(moving),
+        row_of,
+        update.contiguous(),
+        x.view(total, space_dim),
+        s.view(total, state_dim),
+        path_length.view(total),
+        outputs[0].view(total, space_dim),
+        outputs[1].view(total, state_dim),
+        outputs[2].view(total),
+    )
+    return outputs
+
+
+@_update_particles.register_fake
+def _(
+    update: Tensor,
+    x: Tensor,
+    s: Tensor,
+    path_length: Tensor,
+    row_of: Tensor,
+    reach: float,
+    dt: float,
+    moving: bool,
+    box: list[float] | None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    return torch.empty_like(x), torch.empty_like(s), torch.empty_like(path_length)
+
+
+@torch.library.custom_op("npa::update_particles_backward", mutates_args=())
+def _update_particles_backward(
+    update: Tensor,
+    new_x_bar: Tensor,
+    new_s_bar: Tensor,
+    new_path_bar: Tensor,
+    row_source: Tensor,
+    starts: Tensor,
+    row_base: int,
+    reach: float,
+    dt: float,
+    moving: bool,
+) -> Tensor:
+    space_dim, state_dim = new_x_bar.shape[2], new_s_bar.shape[2]
+    kernels = update_kernels(space_dim, scalar_type(update.dtype))
+    update_bar = torch.empty_like(update, memory_format=torch.contiguous_format)
+    launch(
+        kernels.pull_back_update,
+        tuple(update.shape),
+        update.device,
+        reach * dt,
+        dt,
+        int(moving),
+        row_base,
+        starts,
+        row_source,
+        update.contiguous(),
+        new_x_bar.contiguous().view(-1, space_dim),
+        new_s_bar.contiguous().view(-1, state_dim),
+        new_path_bar.contiguous().view(-1),
+        update_bar,
+    )
+    return update_bar
+
+
+@_update_particles_backward.register_fake
+def _(
+    update: Tensor,
+    new_x_bar: Tensor,
+    new_s_bar: Tensor,
+    new_path_bar: Tensor,
+    row_source: Tensor,
+    starts: Tensor,
+    row_base: int,
+    reach: float,
+    dt: float,
+    moving: bool,
+) -> Tensor:
+    return torch.empty_like(update, memory_format=torch.contiguous_format)
+
+
+class _UpdateParticles(torch.autograd.Function):
+    """Positions, states and path lengths after one update of the active particles."""
+
+    @staticmethod
+    def forward(  # type: ignore[override]
+        ctx: Any,
+        update: Tensor,
+        x: Tensor,
+        s: Tensor,
+        path_length: Tensor,
+        rows: Rows,
+        reach: float,
+        dt: float,
+        moving: bool,
+        box: list[float] | None,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        ctx.options = (rows.row_base, reach, dt, moving)
+        ctx.save_for_backward(update, rows.row_source, rows.starts)
+        outputs: tuple[Tensor, Tensor, Tensor] = _update_particles(
+            update, x, s, path_length, rows.row_of, reach, dt, moving, box
+        )
+        return outputs
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *bars: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        update, row_source, starts = ctx.saved_tensors
+        update_bar = _update_particles_backward(update, *bars, row_source, starts, *ctx.options)
+        return (update_bar, *bars, None, None, None, None, None)
+
+
+def update_particles(
+    update: Tensor,
+    x: Tensor,
+    s: Tensor,
+    path_length: Tensor,
+    *,
+    rows: Rows,
+    reach: float,
+    dt: float,
+    moving: bool,
+    box: tuple[float, ...] | None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Apply a rule's outputs to the particles that have rows.
+
+    Args:
+        update: Raw updates [δ (D) ; Δs (C)], dimensionless, shape [K, A] or wider; the columns
+            beyond A are not read.
+        x: Positions [length units], shape [B, N, D].
+        s: States, dimensionless, shape [B, N, C].
+        path_length: Length of each particle's path so far [length units], shape [B, N].
+        rows: Which particles the rows stand for.
+        reach: Largest displacement alpha eps of a unit step [length units].
+        dt: Time step, dimensionless.
+        moving: Updates begin with δ; otherwise there is none and positions stay.
+        box: Sides of the periodic box, into which positions are wrapped, or None.
+    """
+    outputs: tuple[Tensor, Tensor, Tensor] = _UpdateParticles.apply(  # type: ignore[no-untyped-call]
+        update,
+        x.contiguous(),
+        s.contiguous(),
+        path_length,
+        rows,
+        reach,
+        dt,
+        moving,
+        None if box is None else list(box),
+    )
+    return outputs
