@@ -44,22 +44,22 @@ class _BlockedProduct(torch.autograd.Function):
     """hidden @ weight.T, summed in blocks: less rounding, which rules amplify step by step."""
 
     @staticmethod
-    def forward(ctx: Any, hidden: Tensor, weight: Tensor) -> Tensor:  # type: ignore[override]
+    def forward(ctx: Any, hidden: Tensor, weight: Tensor) -> Tensor:
         ctx.save_for_backward(hidden, weight)
         blocks = OUTPUT_BLOCKS if hidden.shape[1] % OUTPUT_BLOCKS == 0 else 1
-        left = hidden.unflatten(1, (blocks, -1)).transpose(0, 1)
-        right = weight.unflatten(1, (blocks, -1)).permute(1, 2, 0)
+        left = hidden.view(hidden.shape[0], blocks, -1).transpose(0, 1)
+        right = weight.view(weight.shape[0], blocks, -1).permute(1, 2, 0)
         return torch.bmm(left, right).sum(dim=0)
 
     @staticmethod
-    def backward(ctx: Any, update_bar: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
+    def backward(ctx: Any, update_bar: Tensor) -> tuple[Tensor, Tensor]:
         hidden, weight = ctx.saved_tensors
         return update_bar @ weight, update_bar.T @ hidden
 
     @classmethod
     def product(cls, hidden: Tensor, weight: Tensor) -> Tensor:
         """Return the product of hidden units, [K, H], and weights, [A, H]: [K, A]."""
-        result: Tensor = cls.apply(hidden, weight)
+        result: Tensor = cls.apply(hidden, weight)  # type: ignore[no-untyped-call]
         return result
 
 

@@ -51,6 +51,7 @@ LADDER = {
         8, "torch numpy tqdm yaml", never=("npa_envs.kernels", "npa_envs.reference")
     ),
     "npa_envs.diagnostics": rung(8, "torch PIL imageio_ffmpeg", never=INSIDES),
+    "npa_envs.api": rung(8, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
     "npa_envs": rung(9, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
     "npa_envs.cli": rung(
         10, "torch numpy tqdm tyro", never=("npa_envs.kernels", "npa_envs.reference")

@@ -17,7 +17,8 @@ from circle_task import CircleTask, circle_config, plain_rollout
 from PIL import Image
 
 from npa_envs.errors import NPAError
-from npa_envs.rule_io import load_rule, rule_metadata
+from npa_envs.rule import NPARule
+from npa_envs.rule_io import load_rule, rule_metadata, save_rule
 from npa_envs.training import (
     DivergedError,
     JsonlLog,
@@ -78,6 +79,22 @@ def test_training_learns_the_circle(tmp_path):
     assert log[0]["distance"] > 0.1
     # Seen over ten seeds: 0.0024 to 0.0047.
     assert log[-1]["distance"] < 0.01
+
+
+def test_training_starts_from_an_initial_rule(tmp_path):
+    first = train(circle_config(tmp_path / "first", iterations=3))
+    path = tmp_path / "first" / "rule.safetensors"
+    config = circle_config(tmp_path / "second", iterations=3, initial_rule=str(path))
+    trainer = trainer_of(config)
+    for name, value in trainer.rule.state_dict().items():
+        assert torch.equal(value, first.rule.state_dict()[name]), name
+
+
+def test_an_initial_rule_of_another_shape_is_refused(tmp_path):
+    save_rule(NPARule(2, 5, 7), tmp_path / "other.safetensors")
+    config = circle_config(tmp_path / "run", initial_rule=str(tmp_path / "other.safetensors"))
+    with pytest.raises(NPAError, match=r"initial_rule must be .* differs in .*hidden_dim"):
+        trainer_of(config)
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from npa_envs.tasks.damage import clump, cut, erase_state, random_particle
 if TYPE_CHECKING:
     from npa_envs.tasks.task import PictureTask
 
-DAMAGE_SIZES = {"erase": 0.2, "cut": 0.05, "clump": 0.2}
+DAMAGE_SIZES = {"erase": 0.2, "cut": 0.1, "clump": 0.2}
 """Kinds of damage with their usual size: radius, gap, radius [length units]."""
 
 CLUMP_FACTOR = 0.9

@@ -24,7 +24,7 @@ class RolloutOptions:
     """Steps to run."""
 
     damage: tuple[str, ...] = ()
-    """Damage on the way, STEP:KIND or STEP:KIND:SIZE: 200:cut (gap 0.05), 300:erase (radius 0.2),
+    """Damage on the way, STEP:KIND or STEP:KIND:SIZE: 200:cut (gap 0.1), 300:erase (radius 0.2),
     400:clump (radius 0.2); sizes in length units."""
 
     out: Path = Path("runs/rollout")

@@ -40,7 +40,7 @@ def lane_count(device: torch.device) -> int:
 @functools.cache
 def _quiet_init() -> None:
     wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)  # no banner in pipelines
-    wp.init()
+    wp.init()  # type: ignore[no-untyped-call]
 
 
 def warp_device(device: torch.device) -> Any:

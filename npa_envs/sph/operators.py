@@ -133,7 +133,7 @@ class _PerceiveRows(torch.autograd.Function):
     """Perception of the active particles, with gathered adjoints for states and positions."""
 
     @staticmethod
-    def forward(  # type: ignore[override]
+    def forward(
         ctx: Any,
         x: Tensor,
         s: Tensor,
@@ -167,7 +167,7 @@ class _PerceiveRows(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *bars: Tensor | None) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+    def backward(ctx: Any, *bars: Tensor | None) -> tuple[Tensor | None, ...]:
         if bars[0] is None:
             return (None,) * 9
         saved = ctx.saved_tensors

@@ -150,9 +150,8 @@ def _(
 
 class _Splat(torch.autograd.Function):
     @staticmethod
-    def forward(  # type: ignore[override]
-        ctx: Any, x: Tensor, colours: Tensor, resolution: int, *lens: float
-    ) -> Tensor:
+    def forward(ctx: Any, x: Tensor, colours: Tensor, resolution: int, *lens: float) -> Tensor:
+        picture: Tensor
         picture, *saved = _splat(x, colours, resolution, *lens)
         ctx.lens = lens
         ctx.shapes = (x.shape, colours.shape)
@@ -161,7 +160,7 @@ class _Splat(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, picture_bar: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+    def backward(ctx: Any, picture_bar: Tensor) -> tuple[Tensor | None, ...]:
         positions_bar, colours_bar = _splat_backward(picture_bar, *ctx.saved_tensors, *ctx.lens)
         x_shape, colour_shape = ctx.shapes
         gradients = (positions_bar.view(x_shape), colours_bar.view(colour_shape))

@@ -119,7 +119,7 @@ class _UpdateParticles(torch.autograd.Function):
     """Positions, states and path lengths after one update of the active particles."""
 
     @staticmethod
-    def forward(  # type: ignore[override]
+    def forward(
         ctx: Any,
         update: Tensor,
         x: Tensor,
@@ -140,7 +140,7 @@ class _UpdateParticles(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *bars: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+    def backward(ctx: Any, *bars: Tensor) -> tuple[Tensor | None, ...]:
         update, row_source, starts = ctx.saved_tensors
         update_bar = _update_particles_backward(update, *bars, row_source, starts, *ctx.options)
         return (update_bar, *bars, None, None, None, None, None)

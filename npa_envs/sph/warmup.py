@@ -31,10 +31,10 @@ def warmup(
         for space_dim in space_dims:
             x = torch.zeros(1, 2, space_dim, dtype=dtype, device=device, requires_grad=True)
             s = torch.zeros(1, 2, state_dim, dtype=dtype, device=device, requires_grad=True)
-            perceive(x, s, 0.1, detach_positions=False).sum().backward()
+            _pull_back(perceive(x, s, 0.1, detach_positions=False))
             _warm_update(x, s)
             if space_dim == 2:
-                splat(x, x.new_zeros(1, 2, 3), resolution=8, pixel_size=0.1).sum().backward()
+                _pull_back(splat(x, x.new_zeros(1, 2, 3), resolution=8, pixel_size=0.1))
 
 
 def _warm_update(x: torch.Tensor, s: torch.Tensor) -> None:
@@ -46,4 +46,8 @@ def _warm_update(x: torch.Tensor, s: torch.Tensor) -> None:
     moved = update_particles(
         update, x, s, x.new_zeros(x.shape[:2]), rows=rows, reach=0.1, dt=1.0, moving=True, box=None
     )
-    moved[0].sum().backward()
+    _pull_back(moved[0])
+
+
+def _pull_back(value: torch.Tensor) -> None:
+    torch.autograd.backward(value.sum())

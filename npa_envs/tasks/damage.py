@@ -64,7 +64,11 @@ def erase_state(x: Tensor, s: Tensor, *, centre: Tensor, radius: float | Tensor)
 def cut(
     x: Tensor, s: Tensor, *, centre: Tensor, normal: Tensor, gap: float | Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Open a slit: push what lies on either side of a line (a plane in 3D) apart by half the gap.
+    """Open a slit along a line (a plane in 3D), as a knife would.
+
+    Particles within `gap` of the line move away from it, those on the line by half the gap and
+    those at the distance `gap` not at all: none is left within half the gap, the bands beside the
+    slit are twice as dense, and everything further away stays where it is.
 
     Args:
         x: Particle positions [length units], shape [B, N, D].
@@ -88,7 +92,8 @@ def cut(
     direction = normal / torch.where(length > 0, length, torch.ones_like(length))
     height = ((x - centre[:, None]) * direction[:, None]).sum(dim=-1, keepdim=True)
     side = (height >= 0).to(x.dtype) - 0.5
-    return x + side * width * direction[:, None], s
+    push = side * (width - height.abs()).clamp_min(0.0)
+    return x + push * direction[:, None], s
 
 
 def clump(

@@ -26,6 +26,9 @@ class TrainConfig(Generic[TaskConfigT]):
     task: TaskConfigT
     """The task's own configuration."""
 
+    initial_rule: str = ""
+    """Start from this rule, a shipped one's name or a file, instead of random weights."""
+
     iterations: int = 10_000
     """Optimiser steps in one repeat."""
 

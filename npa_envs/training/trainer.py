@@ -15,7 +15,7 @@ from tqdm import tqdm
 from npa_envs.errors import NPAError
 from npa_envs.files import write_text
 from npa_envs.rule import NPARule
-from npa_envs.rule_io import save_rule
+from npa_envs.rule_io import load_rule, save_rule
 from npa_envs.tasks.task import Task
 from npa_envs.training.checkpoint import check_same_run, load_checkpoint, save_checkpoint
 from npa_envs.training.config import TrainConfig
@@ -92,7 +92,7 @@ class Trainer:
         self._schedule_generator = torch.Generator().manual_seed(config.seed)
         self._world_generator = torch.Generator(device).manual_seed(config.seed + 1)
         self._mask_generator = torch.Generator(device).manual_seed(config.seed + 2)
-        self.rule = task.make_rule(self._schedule_generator).to(device, config.torch_dtype)
+        self.rule = self._make_rule().to(device, config.torch_dtype)
         x, s = self._seeds(config.pool_size)
         self.pool = WorldPool(x, s, runaway_limit=config.runaway_limit)
         graphed = device.type == "cuda" and config.cuda_graph
@@ -210,6 +210,21 @@ class Trainer:
         self._meter.observe(self.iteration + 1, steps, replaced)
         self._optimiser.step(self.iteration)
         self.iteration += 1
+
+    def _make_rule(self) -> NPARule:
+        rule = self.task.make_rule(self._schedule_generator)
+        if not self.config.initial_rule:
+            return rule
+        source = self.config.initial_rule
+        initial = load_rule(source)
+        wanted, given = rule.hyper_parameters(), initial.hyper_parameters()
+        wrong = [name for name, value in given.items() if value != wanted.get(name)]
+        if wrong:
+            raise NPAError(
+                f"initial_rule must be a rule of the task's shape, but {source!r} differs in "
+                f"{', '.join(wrong)}: change those fields, or start from another rule"
+            )
+        return initial
 
     def _seeds(self, world_count: int) -> tuple[Tensor, Tensor]:
         device = self._world_generator.device
