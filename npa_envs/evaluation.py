@@ -12,7 +12,7 @@ from torch import Tensor
 
 from npa_envs.dynamics import rollout
 from npa_envs.errors import NPAError
-from npa_envs.render.tables import table_json, table_text
+from npa_envs.render.tables import table_text, tables_json
 from npa_envs.rule import NPARule
 from npa_envs.tasks.damage import cut, erase_state, random_particle
 from npa_envs.tasks.task import PictureTask
@@ -26,8 +26,8 @@ __all__ = [
     "healing",
     "measure",
     "psnr",
-    "table_json",
     "table_text",
+    "tables_json",
 ]
 
 CHECKPOINTS = (64, 128, 256, 512, 1024, 2048, 4096)

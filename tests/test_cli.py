@@ -319,7 +319,7 @@ def test_evaluate_prints_a_row_for_each_checkpoint(
     words += [str(tmp_path / "table.json"), "--seed-count", "3", "--no-progress"]
     assert main(words) == 0
     text = capsys.readouterr().out
-    rows = json.loads((tmp_path / "table.json").read_text())
+    rows = json.loads((tmp_path / "table.json").read_text())["growth"]
     assert [row["step"] for row in rows] == [2, 5]
     for row in rows:
         assert row["loss_worst"] >= row["loss"] > 0

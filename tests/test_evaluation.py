@@ -17,8 +17,8 @@ from npa_envs.evaluation import (
     evaluate,
     healing,
     psnr,
-    table_json,
     table_text,
+    tables_json,
 )
 from npa_envs.rule import NPARule
 
@@ -181,6 +181,6 @@ def test_tables_as_text_line_up_and_as_json_can_be_read_back():
     assert lines[1].split() == ["64", "0.125", "0.25", "inf", "31.42", "0", "1.5"]
     assert len({len(line) for line in lines}) == 1
     assert "never" in table_text([hurt])
-    (back,) = json.loads(table_json([ROW]))
+    (back,) = json.loads(tables_json({"growth": [ROW]}))["growth"]
     assert (back["step"], back["psnr"], back["psnr_worst"]) == (64, None, 31.4159)
-    assert json.loads(table_json([hurt]))[0]["steps_to_heal"] is None
+    assert json.loads(tables_json({"healing": [hurt]}))["healing"][0]["steps_to_heal"] is None

@@ -18,6 +18,8 @@ HEAL_STEPS = 384
 FRAME_STEPS = 8
 
 SMALL_RUN: dict[str, Any] = {
+    "world_count": 4,
+    "seed_radius": 0.2,
     "particle_count": 256,
     "target_point_count": 256,
     "eps": 0.28,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
@@ -82,7 +82,7 @@ def run(options: EvaluateOptions) -> int:
     """
     from npa_envs.cli.progress import StepBar
     from npa_envs.cli.worlds import task_of_rule
-    from npa_envs.evaluation import check_steps, evaluate, healing, table_json, table_text
+    from npa_envs.evaluation import check_steps, evaluate, healing, table_text, tables_json
     from npa_envs.files import write_text
     from npa_envs.rule_io import load_rule
     from npa_envs.training import check_device
@@ -119,11 +119,13 @@ def run(options: EvaluateOptions) -> int:
         )
     print(f"{options.rule}: {options.seed_count} worlds")
     print(table_text(rows))
-    if options.json is not None:
-        write_text(options.json, table_json(rows))
-        print(f"wrote {options.json}")
+    tables: dict[str, Sequence[Any]] = {"growth": rows}
     if options.healing:
         with StepBar(None, show=options.progress) as bar:
             healed = healing(rule, trained.task, seeds=seeds, device=device, progress=bar.advance)
         print(table_text(healed))
+        tables["healing"] = healed
+    if options.json is not None:
+        write_text(options.json, tables_json(tables))
+        print(f"wrote {options.json}")
     return 0

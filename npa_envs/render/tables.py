@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 
@@ -28,17 +28,20 @@ def table_text(rows: Sequence[Any]) -> str:
     )
 
 
-def table_json(rows: Sequence[Any]) -> str:
-    """Return rows as a JSON list of objects; a number that is not finite becomes null.
+def tables_json(tables: Mapping[str, Sequence[Any]]) -> str:
+    """Return tables as a JSON object of lists; a number that is not finite becomes null.
 
     Args:
-        rows: Instances of dataclasses.
+        tables: Rows, instances of dataclasses, by the table's name.
     """
 
     def plain(value: Any) -> Any:
         return None if isinstance(value, float) and not math.isfinite(value) else value
 
-    objects = [{k: plain(v) for k, v in dataclasses.asdict(row).items()} for row in rows]
+    objects = {
+        name: [{k: plain(v) for k, v in dataclasses.asdict(row).items()} for row in rows]
+        for name, rows in tables.items()
+    }
     return json.dumps(objects, indent=2, allow_nan=False) + "\n"
 
 

@@ -185,9 +185,12 @@ class Trainer:
                 "random_states": {n: g.get_state() for n, g in self._generators().items()},
             },
         )
+        # A rule is passed on: where and on what it was trained is nobody's business.
+        told = config_to_dict(self.config)
+        told = {name: told[name] for name in told if name not in ("out", "device", "initial_rule")}
         metadata = {
             "task": self.task_name,
-            "config": json.dumps(config_to_dict(self.config)),
+            "config": json.dumps(told),
             "iteration": str(self.iteration),
         }
         save_rule(self.rule, self.folder.rule, metadata=metadata)
