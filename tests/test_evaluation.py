@@ -102,10 +102,10 @@ def test_healing_counts_the_steps_until_the_loss_is_back(monkeypatch):
         heal_steps=205,
         every=25,
         seeds=[0, 1, 2],
-        cut_gap=0.4,
+        cut_gap=1.0,
     )
     cut, erased = rows
-    assert (cut.damage, erased.damage) == ("cut, gap 0.4", "erased disk, radius 0.2")
+    assert (cut.damage, erased.damage) == ("cut, gap 1", "erased disk, radius 0.2")
     # The loss is the mean square of the distances, so 25 steps multiply it by 0.98**50.
     needed = math.log(1.2 * cut.before / cut.after) / math.log(0.98) / 2
     assert cut.after > 3 * cut.before
