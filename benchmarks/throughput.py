@@ -11,6 +11,7 @@ import argparse
 import json
 import math
 import statistics
+import sys
 import time
 from collections.abc import Callable
 from datetime import date
@@ -115,11 +116,11 @@ def measure(
     if device.type == "cuda":
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
-        before = torch.cuda.memory_reserved()
+        reserved, allocated = torch.cuda.memory_reserved(), torch.cuda.memory_allocated()
         replay = captured(train, device, generator)
         row["train_us"] = timed(replay, device, repeats) * scale
-        row["peak_reserved_mib"] = (torch.cuda.max_memory_reserved() - before) / 2**20
-        row["peak_allocated_mib"] = torch.cuda.max_memory_allocated() / 2**20
+        row["peak_reserved_mib"] = (torch.cuda.max_memory_reserved() - reserved) / 2**20
+        row["peak_allocated_mib"] = (torch.cuda.max_memory_allocated() - allocated) / 2**20
         del replay
         torch.cuda.empty_cache()
     else:
@@ -146,7 +147,7 @@ def main() -> None:
             print({k: round(v, 1) if isinstance(v, float) else v for k, v in row.items()})
     machine = torch.cuda.get_device_name() if device.type == "cuda" else "CPU, 1 thread of kernels"
     report = {
-        "command": f"python benchmarks/throughput.py --device {device.type}",
+        "command": " ".join(["python", *sys.argv]),
         "commit": arguments.commit,
         "date": date.today().isoformat(),
         "machine": machine,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from numbers import Integral
 from typing import Literal, NamedTuple, overload
 
 import torch
@@ -11,7 +12,16 @@ from torch.utils.checkpoint import checkpoint
 
 from npa_envs.errors import NPAError
 from npa_envs.rule import FoldedRule, NPARule
-from npa_envs.sph.checks import Box, check_finite_positions, check_world, checked_box, checked_eps
+from npa_envs.sph.checks import (
+    Box,
+    check_finite_positions,
+    check_generator,
+    check_scale,
+    check_world,
+    checked_box,
+    checked_eps,
+    checked_number,
+)
 from npa_envs.sph.operators import Terms, perceive_rows
 from npa_envs.sph.update import update_particles
 
@@ -72,7 +82,11 @@ def _checked_options(
             f"the rule must share dtype and device with x, got {weight.dtype} on {weight.device} "
             f"and {x.dtype} on {x.device}: move it with rule.to(x)"
         )
-    radius = checked_eps("eps", rule.eps0 if eps is None else eps)
+    radius = checked_eps("eps", rule.eps0 if eps is None else eps, x.dtype)
+    check_scale(radius, rule.eps0, rule.space_dim, x.dtype)
+    update_prob = checked_number("update_prob", update_prob)
+    dt = checked_number("dt", dt)
+    position_noise = checked_number("position_noise", position_noise)
     if not 0.0 < update_prob <= 1.0:
         raise NPAError(f"update_prob must lie in (0, 1], got {update_prob}")
     if not (math.isfinite(dt) and dt > 0.0):
@@ -81,9 +95,7 @@ def _checked_options(
         raise NPAError(f"position_noise must be finite and not negative, got {position_noise}")
     sides = checked_box(box, rule.space_dim, radius)
     check_finite_positions(x)
-    return StepOptions(
-        radius, sides, float(update_prob), float(dt), float(position_noise), detach_positions
-    )
+    return StepOptions(radius, sides, update_prob, dt, position_noise, detach_positions)
 
 
 def _draw(
@@ -155,7 +167,7 @@ def step(
     detach_positions: bool = True,
     generator: torch.Generator | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Advance worlds by one step: `rollout` with steps=1, same arguments and errors.
+    """Advance worlds by one step: `rollout` with steps=1; its arguments and errors.
 
     Returns:
         Positions [length units], shape [B, N, D], and states, dimensionless, shape [B, N, C].
@@ -261,33 +273,36 @@ def rollout(
         NPAError: Shapes, dtypes or devices do not fit each other or the rule, a position is not
             finite, or a number is out of its range.
     """
-    if isinstance(steps, bool) or not isinstance(steps, int) or steps < 0:
+    if isinstance(steps, bool) or not isinstance(steps, Integral) or steps < 0:
         raise NPAError(f"steps must be an integer of at least 0, got {steps!r}")
     if memory not in ("store", "recompute"):
         raise NPAError(f"memory must be 'store' or 'recompute', got {memory!r}")
     options = _checked_options(
         rule, x, s, eps, box, update_prob, dt, position_noise, detach_positions
     )
+    check_generator(generator, x.device)
     path_length = x.new_zeros(x.shape[:2])
-    # A rule that overrides the network runs as it is.
-    folded = rule.folded() if type(rule).forward is NPARule.forward else None
+    # Any other rule runs as the module that it is.
+    folded = rule.folded() if rule.is_plain() else None
     recompute = memory == "recompute" and torch.is_grad_enabled()
-    for _ in range(steps):
-        mask, noise = _draw(x, options, generator)
-        if recompute:
-            x, s, path_length = checkpoint(
-                _advance,
-                rule,
-                folded,
-                options,
-                x,
-                s,
-                path_length,
-                mask,
-                noise,
-                use_reentrant=False,
-                preserve_rng_state=False,
-            )
-        else:
-            x, s, path_length = _advance(rule, folded, options, x, s, path_length, mask, noise)
+    # Worlds keep their dtype under autocast: the kernels read what the rule writes.
+    with torch.autocast(x.device.type, enabled=False):
+        for _ in range(steps):
+            mask, noise = _draw(x, options, generator)
+            if recompute:
+                x, s, path_length = checkpoint(
+                    _advance,
+                    rule,
+                    folded,
+                    options,
+                    x,
+                    s,
+                    path_length,
+                    mask,
+                    noise,
+                    use_reentrant=False,
+                    preserve_rng_state=False,
+                )
+            else:
+                x, s, path_length = _advance(rule, folded, options, x, s, path_length, mask, noise)
     return (x, s, path_length) if return_path_length else (x, s)

@@ -127,6 +127,9 @@ class NPARule(nn.Module):
         density_gradient: bool = True,
     ) -> None:
         super().__init__()
+        sizes = (space_dim, state_dim, hidden_dim, readout_dim, readout_hidden_dim)
+        if any(isinstance(size, bool) or not isinstance(size, int) for size in sizes):
+            raise NPAError(f"dimensions of a rule must be integers, got {sizes}")
         if space_dim not in (2, 3):
             raise NPAError(f"space_dim must be 2 or 3, got {space_dim}")
         for name, value in (("state_dim", state_dim), ("hidden_dim", hidden_dim)):
@@ -143,8 +146,8 @@ class NPARule(nn.Module):
         self.space_dim = space_dim
         self.state_dim = state_dim
         self.hidden_dim = hidden_dim
-        self.eps0 = eps0
-        self.alpha = alpha
+        self.eps0 = float(eps0)
+        self.alpha = float(alpha)
         self.static = static
         self.readout_dim = readout_dim
         self.readout_hidden_dim = readout_hidden_dim
@@ -189,6 +192,22 @@ class NPARule(nn.Module):
         """
         update: Tensor = self.output(torch.relu(self.hidden(perception)))
         return update
+
+    def is_plain(self) -> bool:
+        """Return whether the rule is just its two layers, so that `folded` may stand in for it.
+
+        A rule that overrides the network, has hooks, or whose layers were replaced is not.
+        """
+        modules = (self, self.hidden, self.output)
+        hooks = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
+        return (
+            type(self).forward is NPARule.forward
+            and "forward" not in vars(self)
+            and type(self.hidden) is nn.Linear
+            and type(self.output) is nn.Linear
+            and self.output.bias is None
+            and not any(getattr(module, name) for module in modules for name in hooks)
+        )
 
     def folded(self) -> FoldedRule:
         """Return the weights as two plain products, differentiable in the parameters."""

@@ -1,5 +1,6 @@
 """What the operators and the dynamics refuse, and what they say."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -54,6 +55,26 @@ class TestOperators:
         with pytest.raises(NPAError, match="eps must be positive and finite"):
             function(*world(), eps)
 
+    @pytest.mark.parametrize("eps", ["a", None, [0.1], True])
+    def test_eps_that_is_no_number(self, function, eps):
+        with pytest.raises(NPAError, match="eps must be a number"):
+            function(*world(), eps)
+
+    @pytest.mark.parametrize("eps", [1e-170, 1e-20, 1e20, 1e200])
+    def test_eps_beyond_the_dtype(self, function, eps):
+        with pytest.raises(NPAError, match=r"eps must lie in .* for torch\.float32"):
+            function(*world(), eps)
+
+    @pytest.mark.parametrize("box", [np.float32(2.0), torch.tensor(2.0), np.array([2.0, 3.0])])
+    def test_numbers_of_other_libraries_are_numbers(self, function, box):
+        x, s = world()
+        assert torch.isfinite(function(x, s, np.float64(0.1), box=box)[0]).all()
+
+    @pytest.mark.parametrize("box", ["ab", ("a", 1.0), object()])
+    def test_box_that_is_no_number(self, function, box):
+        with pytest.raises(NPAError, match="must be a number"):
+            function(*world(), 0.1, box=box)
+
     @pytest.mark.parametrize("box", [0.19, (1.0, 0.1), (1.0, float("nan"))])
     def test_box_too_small(self, function, box):
         with pytest.raises(NPAError, match=r"at least 2 eps = 0\.2"):
@@ -64,12 +85,27 @@ class TestOperators:
             function(*world(), 0.1, box=(1.0, 1.0, 1.0))
 
 
+def test_eps0_far_from_eps():
+    with pytest.raises(NPAError, match="eps / eps0 must be a moderate ratio"):
+        perceive(torch.zeros(1, 4, 3), torch.zeros(1, 4, 2), 1e7, 1e-7)
+
+
 def test_eps0_out_of_range():
     with pytest.raises(NPAError, match="eps0 must be positive"):
         perceive(*world(), 0.1, 0.0)
 
 
 class TestRollout:
+    def test_counts_of_other_libraries_are_counts(self):
+        x, s = rollout(NPARule(), *world(), np.int64(2))
+        assert torch.isfinite(x).all()
+        assert torch.isfinite(s).all()
+
+    def test_numbers_of_other_libraries_survive_in_a_rule(self, tmp_path):
+        rule = NPARule(alpha=np.float32(0.5))
+        npa_envs.save_rule(rule, tmp_path / "rule.safetensors")
+        assert npa_envs.load_rule(tmp_path / "rule.safetensors").alpha == 0.5
+
     @pytest.mark.parametrize(
         ("options", "message"),
         [
@@ -80,6 +116,8 @@ class TestRollout:
             ({"position_noise": -1.0}, "position_noise"),
             ({"eps": -0.1}, "eps must be positive"),
             ({"box": 0.1}, "box sides"),
+            ({"dt": "fast"}, "dt must be a number"),
+            ({"generator": 3}, "generator must be a torch.Generator, got int"),
             ({"memory": "forget"}, "memory must be 'store' or 'recompute'"),
         ],
     )
@@ -115,6 +153,8 @@ class TestRollout:
         ({"eps0": 0.0}, "eps0"),
         ({"alpha": float("inf")}, "alpha"),
         ({"readout_dim": 3}, "readout_hidden_dim"),
+        ({"space_dim": 2.0}, "dimensions of a rule must be integers"),
+        ({"hidden_dim": True}, "dimensions of a rule must be integers"),
     ],
 )
 def test_rules_out_of_range(options, message):

@@ -9,6 +9,8 @@ import npa_envs
 from npa_envs import reference as oracle
 from npa_envs.dynamics import row_capacity
 from npa_envs.sph import splat
+from npa_envs.sph.operators import Rows
+from npa_envs.sph.update import update_particles
 from npa_envs.tasks.seeds import uniform_ball
 
 
@@ -247,6 +249,58 @@ def test_periodic_positions_stay_in_the_box(device):
     assert (x[..., 0].abs() <= 0.7).all()
     assert (x[..., 1].abs() <= 0.8).all()
     assert path.max() > 0.3  # far enough that some crossed the seam
+
+
+def test_particles_that_are_off_are_wrapped_too(device):
+    rule = small_rule(device)
+    x, s = random_world(1, 60, 2, 5, dtype=torch.float64, device=device)
+    wrapped, same = npa_envs.step(rule, x + 5.0, s, box=1.0, update_prob=1e-9)
+    assert wrapped.abs().max() <= 0.5
+    turns = (x + 5.0 - wrapped).round()
+    torch.testing.assert_close(wrapped + turns, x + 5.0)
+    assert torch.equal(same, s)
+
+
+def test_rows_beyond_the_last_active_one_pull_nothing_back(device):
+    x, s = random_world(1, 6, 2, 3, dtype=torch.float64, device=device)
+    integers = {"dtype": torch.int32, "device": device}
+    rows = Rows(
+        row_of=torch.tensor([-1, 1, -1, 0, -1, -1], **integers),
+        row_source=torch.tensor([3, 1, 2**30, -(2**30)], **integers),
+        starts=torch.tensor([0, 6, 8], **integers),
+        row_base=6,
+    )
+    update = torch.randn(4, 5, dtype=torch.float64, device=device, requires_grad=True)
+    path = x.new_zeros(1, 6)
+    moved = update_particles(
+        update, x, s, path, rows=rows, reach=0.1, dt=1.0, moving=True, box=None
+    )
+    (gradient,) = torch.autograd.grad(sum(value.sum() for value in moved), update)
+    assert (gradient[2:] == 0).all()
+    assert (gradient[:2] != 0).all()
+
+
+def test_a_rule_with_a_hook_is_run_as_a_module(device):
+    rule = small_rule(device)
+    x, s = random_world(1, 50, 2, 5, dtype=torch.float64, device=device)
+    _, plain = npa_envs.step(rule, x, s, update_prob=1.0)
+    handle = rule.register_forward_hook(lambda module, inputs, output: 2.0 * output)
+    _, hooked = npa_envs.step(rule, x, s, update_prob=1.0)
+    torch.testing.assert_close(hooked - s, 2.0 * (plain - s), rtol=1e-12, atol=1e-13)
+    handle.remove()
+    assert rule.is_plain()
+    rule.output = torch.nn.Linear(12, 7, dtype=torch.float64, device=device)
+    assert not rule.is_plain()
+
+
+def test_worlds_keep_their_precision_under_autocast(device):
+    rule = small_rule(device, dtype=torch.float32)
+    x, s = random_world(1, 50, 2, 5, dtype=torch.float32, device=device)
+    expected = npa_envs.rollout(rule, x, s, 2, update_prob=1.0)
+    with torch.autocast(device.type, dtype=torch.bfloat16):
+        values = npa_envs.rollout(rule, x, s, 2, update_prob=1.0)
+    assert torch.equal(values[0], expected[0])
+    assert torch.equal(values[1], expected[1])
 
 
 def test_displacement_never_exceeds_alpha_eps(device):

@@ -7,6 +7,7 @@ from worlds import degenerate_world, random_world, relative_error
 
 import npa_envs
 from npa_envs import reference as oracle
+from npa_envs.sph.operators import Terms, perceive_rows
 
 # Worst error measured on CPU and CUDA, then the bound of the test: a few times larger.
 FORWARD = {torch.float32: 2e-6, torch.float64: 5e-15}  # 3.1e-7, 5e-16
@@ -161,6 +162,101 @@ def test_gradients_of_skipped_groups_equal_those_of_zero_cotangents(device):
         gradients.append((x_.grad, s_.grad))
     assert relative_error(gradients[0][0], gradients[1][0]) < 1e-13
     assert relative_error(gradients[0][1], gradients[1][1]) < 1e-13
+
+
+@pytest.mark.parametrize(
+    ("space_dim", "state_dim", "box"),
+    [
+        (2, 21, None),
+        (2, 17, (0.6, 0.6)),
+        (2, 5, (0.6, 2.9)),
+        (3, 33, (0.6, 0.7, 0.9)),
+        (3, 4, None),
+    ],
+)
+@pytest.mark.parametrize("spare_rows", [False, True])
+def test_rows_of_active_particles_equal_the_oracle(spare_rows, space_dim, state_dim, box, device):
+    """With gradients for states and positions, an idle world, and poison beyond the last row."""
+    x, s = random_world(3, 37, space_dim, state_dim, dtype=torch.float64, device=device)
+    mask = torch.rand(3, 37, generator=torch.Generator().manual_seed(4)) < 0.4
+    mask[0] = False
+    mask = mask.to(device)
+    active = int(mask.sum())
+    exact_x, exact_s = x.cpu().requires_grad_(), s.cpu().requires_grad_()
+    expected = oracle.perceive(exact_x, exact_s, 0.3, 0.2, box, detach_positions=False)
+    width = expected.shape[-1]
+    cotangent = torch.randn(
+        expected.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1)
+    )
+    (expected * cotangent * mask.cpu()[..., None]).sum().backward()
+
+    x, s = x.detach().clone().requires_grad_(), s.detach().clone().requires_grad_()
+    perception, rows = perceive_rows(
+        x,
+        s,
+        mask=mask.to(torch.uint8),
+        row_capacity=111 if spare_rows else active,
+        row_width=width + 3,
+        eps=0.3,
+        eps0=0.2,
+        box=box,
+        terms=Terms(),
+    )
+    assert (perception[:active, width] == 1).all()
+    assert (perception[:active, width + 1 :] == 0).all()
+    assert (perception[active:] == 0).all()
+    source = rows.row_source[:active].long()
+    assert torch.equal(source.sort().values, mask.view(-1).nonzero()[:, 0])
+    poisoned = torch.full_like(perception, float("nan"))
+    poisoned[:active, :width] = cotangent.view(-1, width).to(device)[source]
+    perception.backward(poisoned)
+    wanted = expected.view(-1, width)[source.cpu()]
+    assert relative_error(perception[:active, :width], wanted) < 1e-14
+    assert relative_error(s.grad, exact_s.grad) < 1e-14
+    assert relative_error(x.grad, exact_x.grad) < 1e-14
+
+
+def test_particles_beyond_the_row_capacity_are_left_out_cleanly(device):
+    x, s = random_world(2, 30, 2, 4, dtype=torch.float64, device=device)
+    s.requires_grad_()
+    perception, rows = perceive_rows(
+        x,
+        s,
+        mask=torch.ones(2, 30, dtype=torch.uint8, device=device),
+        row_capacity=41,
+        row_width=18,
+        eps=0.3,
+        eps0=0.3,
+        box=None,
+        terms=Terms(),
+    )
+    assert int((rows.row_of >= 0).sum()) == 41
+    assert int(rows.row_of.max()) == 40
+    source = rows.row_source.long().cpu()
+    exact = s.detach().cpu().requires_grad_()
+    expected = oracle.perceive(x.cpu(), exact, 0.3, 0.3).view(-1, 18)[source]
+    assert relative_error(perception, expected) < 1e-14
+    (got,) = torch.autograd.grad(perception.square().sum(), s)
+    (want,) = torch.autograd.grad(expected.square().sum(), exact)
+    assert relative_error(got, want) < 1e-14
+
+
+@pytest.mark.parametrize(
+    "pair",
+    [
+        ((-0.053246427, 0.0), (1.3467536, 1e-9)),
+        ((-0.7, 0.0), (0.69999994, 1e-9)),
+        ((-0.7, 0.0), (0.6999998, 1e-9)),
+    ],
+)
+def test_close_pairs_across_a_seam_have_the_right_density_gradient(pair, device):
+    """The box's rounding exceeds their distance across it: float32 alone has no direction here."""
+    x = torch.tensor([pair], dtype=torch.float32, device=device)
+    s = torch.zeros(1, 2, 1, device=device)
+    got = npa_envs.perception_fields(x, s, 0.3, 1.4).drho
+    side = float(torch.tensor(1.4, dtype=torch.float32))
+    want = oracle.fields(x.cpu().double(), s.cpu().double(), 0.3, (side, side)).drho
+    assert relative_error(got, want) < 1e-6
 
 
 class TestInvariance:
@@ -338,6 +434,15 @@ class TestTorchGlue:
         expected.backward()
         assert torch.equal(value, expected)
         assert torch.equal(s1.grad, s2.grad)
+
+    def test_a_compiled_function_takes_worlds_of_several_sizes(self, device):
+        compiled = torch.compile(
+            lambda x, s: npa_envs.perceive(x, s, 0.3).square().sum(), backend="aot_eager"
+        )
+        for particle_count in (20, 31, 44):
+            x, s = random_world(1, particle_count, 2, 6, dtype=torch.float32, device=device)
+            expected = npa_envs.perceive(x, s, 0.3).square().sum()
+            assert torch.equal(compiled(x, s), expected)
 
     def test_another_stream_gives_the_same_result(self, device):
         if device.type != "cuda":

@@ -81,6 +81,15 @@ def test_particles_far_away_or_not_finite_leave_the_picture_alone(device):
         assert torch.equal(splat(hostile, colours, resolution=40, pixel_size=0.06), expected)
 
 
+@pytest.mark.parametrize("sigma", [0.3, 0.04, 1e-3])
+def test_narrow_gaussians_keep_their_area(sigma, device):
+    x, colour = scattered(1, 40, torch.float32, device)
+    x = 0.6 * x
+    picture = splat(x, colour, resolution=64, pixel_size=0.03125, sigma=sigma)
+    assert torch.isfinite(picture).all()
+    assert float(picture[..., 3].sum()) == pytest.approx(40.0, rel=1e-5)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -137,7 +137,6 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
 
     @wp.struct
     class Domain:
-        eps: scalar
         inverse_eps: scalar
         squared_eps: scalar
         inverse_squared_eps: scalar
@@ -259,8 +258,8 @@ def cell_grid(
     """Return the number of cells along each dimension.
 
     Open space gets about one cell for each particle (a power of two along each dimension: the grid
-    wraps around); a periodic box is divided into cells no smaller than eps / reach, and into no
-    more than about that many.
+    wraps around). A periodic box is divided into cells no smaller than eps / reach, and into at
+    most four times as many as open space has.
     """
     open_side = 8
     while open_side**space_dim < particle_count:
@@ -268,8 +267,11 @@ def cell_grid(
     if box is None:
         return (open_side,) * space_dim
     size = eps / reach * CELL_SLACK
-    limit = 4 * open_side
-    return tuple(min(max(int(side / size), 1), limit) for side in box)
+    shape = [max(int(side / size), 1) for side in box]
+    while math.prod(shape) > 4 * open_side**space_dim:
+        longest = shape.index(max(shape))
+        shape[longest] = -(-shape[longest] // 2)
+    return tuple(shape)
 
 
 @functools.lru_cache(maxsize=256)
@@ -293,7 +295,6 @@ def make_domain(
     """
     types = domain_types(space_dim, scalar)
     domain = types.Domain()
-    domain.eps = eps
     domain.inverse_eps = 1.0 / eps
     domain.squared_eps = eps * eps
     domain.inverse_squared_eps = 1.0 / (eps * eps)

@@ -28,11 +28,17 @@ CUDA_REGISTERS = 128
 
 @functools.cache
 def perception_kernels(
-    space_dim: int, scalar: type, width: int, lanes: int, state_gradient: bool
+    space_dim: int,
+    scalar: type,
+    width: int,
+    lanes: int,
+    state_gradient: bool,
+    moment_correction: bool,
 ) -> SimpleNamespace:
     """Return the kernels of one variant: groups of `width` channels, `lanes` to a particle.
 
-    A variant without `state_gradient` neither sums nor holds what only that needs.
+    A variant without `state_gradient`, or without `moment_correction` of it, neither sums nor holds
+    what only that needs.
     """
     types = domain_types(space_dim, scalar)
     vector, particle, Domain = types.vector, types.particle, types.Domain
@@ -47,7 +53,9 @@ def perception_kernels(
     group_gradient = wp.types.matrix((space_dim, width), scalar)
     square = wp.types.matrix((space_dim, space_dim), scalar)
     share = width // lanes
-    topic = "perception" if state_gradient else "smoothing"
+    topic = "smoothing"
+    if state_gradient:
+        topic = "perception" if moment_correction else "uncorrected_perception"
     module = kernel_module(topic, space_dim, scalar, width, lanes)
     load_group = make_wide_load(group, scalar)
     add_scalar = make_lane_sum(scalar, scalar, lanes)
@@ -59,18 +67,21 @@ def perception_kernels(
     gradient_share = share_type(group_gradient, scalar, lanes)
 
     @wp.func
-    def spiky_wide(domain: Domain, centre: vector, neighbour: vector, squared: scalar):
+    def spiky_wide(domain: Domain, centre: vector, neighbour: vector):
         """Spiky gradient kernel of a pair in float64: a Newton step refines 1 / distance."""
         kernel = wide()
-        if squared > scalar(0.0):
-            r = wide()
-            for d in range(wp.static(space_dim)):
-                r[d] = wp.float64(neighbour[d]) - wp.float64(centre[d])
-                if domain.periodic != 0:
-                    images = wp.round((neighbour[d] - centre[d]) * domain.inverse_box[d])
-                    r[d] -= wp.float64(images) * wp.float64(domain.box[d])
-            exact = wp.dot(r, r)
-            inverse = wp.float64(scalar(1.0) / wp.sqrt(squared))
+        r = wide()
+        for d in range(wp.static(space_dim)):
+            r[d] = wp.float64(neighbour[d]) - wp.float64(centre[d])
+            if domain.periodic != 0:
+                images = wp.round((neighbour[d] - centre[d]) * domain.inverse_box[d])
+                r[d] -= wp.float64(images) * wp.float64(domain.box[d])
+        exact = wp.dot(r, r)
+        # The start must be near this very distance: across a seam that of the float32 positions
+        # may be off by a rounding of the box's size.
+        rounded = scalar(exact)
+        if rounded > scalar(0.0):
+            inverse = wp.float64(scalar(1.0) / wp.sqrt(rounded))
             inverse *= wp.float64(1.5) - wp.float64(0.5) * exact * inverse * inverse
             falloff = wp.float64(1.0) - exact * inverse * wp.float64(domain.inverse_eps)
             kernel = (wp.float64(domain.spiky_norm) * falloff * falloff * inverse) * r
@@ -112,7 +123,7 @@ def perception_kernels(
                 if squared < domain.squared_eps and j != k:
                     density += smoothing(squared, domain.inverse_squared_eps, domain.smoothing_norm)
                     if row >= 0:
-                        gradient += spiky_wide(domain, position, neighbour, squared)
+                        gradient += spiky_wide(domain, position, neighbour)
         # A particle always sees itself: a position that is not finite would otherwise have rho 0.
         density = domain.smoothing_norm + add_scalar(density)
         gradient = add_wide(gradient)
@@ -164,12 +175,14 @@ def perception_kernels(
                         weighted = volume * kernel
                         kernel_sum += weighted
                         gradient += wp.outer(weighted, state - own)
-                        moment += wp.outer(offset, weighted)
+                        if wp.static(moment_correction):
+                            moment += wp.outer(offset, weighted)
         gradients = gradient_share()
         if wp.static(state_gradient):
             gradients = scatter_gradient(gradient)
             kernel_sum = add_vector(kernel_sum)
-            moment = add_square(moment)
+            if wp.static(moment_correction):
+                moment = add_square(moment)
         return scatter_group(blur), gradients, kernel_sum, moment
 
     @wp.func
@@ -185,7 +198,6 @@ def perception_kernels(
         domain: Domain,
         particle_count: wp.int32,
         state_dim: wp.int32,
-        moment_correction: wp.int32,
         density_gradient: wp.int32,
         gradient_scale: scalar,
         density_scale: wp.float64,
@@ -225,7 +237,7 @@ def perception_kernels(
             position_of(particles[k]),
             load_group(states, k * group_count + g),
         )
-        if moment_correction != 0:
+        if wp.static(state_gradient and moment_correction):
             gradient = corrected(gradient, moment)
         mine = g * wp.static(width) + lane * wp.static(share)
         for c in range(wp.static(share)):

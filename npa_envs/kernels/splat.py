@@ -41,6 +41,11 @@ def splat_kernels(scalar: type) -> SimpleNamespace:
             wp.clamp(wp.floor(place[1] + scalar(0.5)), -limit, limit),
         )
 
+    @wp.func
+    def patch_weight(away: vector, near: vector, falloff: scalar):
+        """Gaussian relative to the patch's nearest pixel, so that narrow ones do not vanish."""
+        return wp.exp(falloff * (wp.dot(near, near) - wp.dot(away, away)))
+
     @wp.kernel(enable_backward=False, module=module)
     def prepare_splats(
         sorted_positions: wp.array(dtype=vector),
@@ -62,8 +67,9 @@ def splat_kernels(scalar: type) -> SimpleNamespace:
         sums = vector()
         for o in range(-radius, radius + 1):
             for d in range(2):
-                away = centre[d] + scalar(o) - place[d]
-                sums[d] += wp.exp(-falloff * away * away)
+                near = centre[d] - place[d]
+                away = near + scalar(o)
+                sums[d] += wp.exp(falloff * (near * near - away * away))
         footprints[k] = footprint_type(place[0], place[1], area / (sums[0] * sums[1]))
 
     @wp.kernel(enable_backward=False, module=module)
@@ -95,7 +101,7 @@ def splat_kernels(scalar: type) -> SimpleNamespace:
                 centre = patch_centre(place)
                 if wp.abs(centre[0] - x) < reach and wp.abs(centre[1] - y) < reach:
                     away = vector(x - place[0], y - place[1])
-                    weight = footprint[2] * wp.exp(-falloff * wp.dot(away, away))
+                    weight = footprint[2] * patch_weight(away, centre - place, falloff)
                     total += weight * colours[j]
         picture[world, row, column] = total
 
@@ -131,7 +137,7 @@ def splat_kernels(scalar: type) -> SimpleNamespace:
                     centre[0] + scalar(column_offset) - place[0],
                     centre[1] + scalar(row_offset) - place[1],
                 )
-                weight = footprint[2] * wp.exp(-falloff * wp.dot(away, away))
+                weight = footprint[2] * patch_weight(away, centre - place, falloff)
                 patch_sum += weight
                 patch_pull += weight * away
                 row = wp.int32(centre[1]) + row_offset

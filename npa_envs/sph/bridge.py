@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
+from collections.abc import Iterator
 from typing import Any
 
 import torch
@@ -37,15 +39,26 @@ def lane_count(device: torch.device) -> int:
     return CUDA_LANES if device.type == "cuda" else 1
 
 
+@contextlib.contextmanager
+def _quiet_warp() -> Iterator[None]:
+    """Keep Warp's banner and its notes on loading modules out of the caller's output."""
+    level = wp.config.log_level
+    wp.config.log_level = max(level, wp.LOG_WARNING)
+    try:
+        yield
+    finally:
+        wp.config.log_level = level
+
+
 @functools.cache
-def _quiet_init() -> None:
-    wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)  # no banner in pipelines
-    wp.init()  # type: ignore[no-untyped-call]
+def _start_warp() -> None:
+    with _quiet_warp():
+        wp.init()  # type: ignore[no-untyped-call]
 
 
 def warp_device(device: torch.device) -> Any:
     """Return Warp's device for a torch device, starting Warp (silently) where needed."""
-    _quiet_init()
+    _start_warp()
     return wp.device_from_torch(device)
 
 
@@ -70,6 +83,9 @@ def _warp_stream(device: torch.device, handle: int) -> Any:
     return wp.Stream(wp.device_from_torch(device), cuda_stream=handle)
 
 
+_launched: set[tuple[Any, torch.device]] = set()
+
+
 def launch(kernel: Any, size: int | tuple[int, ...], device: torch.device, *arguments: Any) -> None:
     """Launch a kernel on torch's current stream of a device.
 
@@ -88,12 +104,16 @@ def launch(kernel: Any, size: int | tuple[int, ...], device: torch.device, *argu
     stream = None
     if where.is_cuda:
         stream = _warp_stream(device, torch.cuda.current_stream(device).cuda_stream)
-    wp.launch(
-        kernel,
-        size,
-        inputs=converted,
-        device=where,
-        stream=stream,
-        record_tape=False,
-        block_dim=CUDA_BLOCK if where.is_cuda else None,
-    )
+    # The first launch of a kernel loads its module.
+    first = (kernel, device) not in _launched
+    _launched.add((kernel, device))
+    with _quiet_warp() if first else contextlib.nullcontext():
+        wp.launch(
+            kernel,
+            size,
+            inputs=converted,
+            device=where,
+            stream=stream,
+            record_tape=False,
+            block_dim=CUDA_BLOCK if where.is_cuda else None,
+        )

@@ -7,9 +7,13 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from npa_envs.errors import NPAError
 from npa_envs.kernels.cells import cell_kernels
 from npa_envs.kernels.domain import make_domain
 from npa_envs.sph.bridge import channel_width, lane_count, launch, scalar_type
+
+LARGEST_INDEX = 2**31 - 1
+"""Kernels index with 32 bits."""
 
 
 class Plan(NamedTuple):
@@ -81,20 +85,29 @@ def make_plan(
 
     Channels are grouped by `width`, by default as suits the device.
     """
-    world_count, particle_count, space_dim = x.shape
+    # As integers: a shape that torch.compile left open is fixed here, another one compiled anew.
+    world_count, particle_count, space_dim = (int(size) for size in x.shape)
     scalar = scalar_type(x.dtype)
-    return Plan(
+    plan = Plan(
         scalar=scalar,
-        width=width or channel_width(s.shape[2]),
+        width=width or channel_width(int(s.shape[2])),
         lanes=lane_count(x.device),
         world_count=world_count,
         particle_count=particle_count,
         space_dim=space_dim,
-        state_dim=s.shape[2],
+        state_dim=int(s.shape[2]),
         row_capacity=row_capacity,
         masked=masked,
         domain=make_domain(space_dim, scalar, eps, box, particle_count),
     )
+    largest = max(2 * world_count * int(plan.domain.cell_count), plan.total * (1 + plan.state_dim))
+    if largest >= LARGEST_INDEX:
+        raise NPAError(
+            f"worlds must stay below {LARGEST_INDEX} cells and state entries in one batch, got "
+            f"{world_count} worlds of {particle_count} particles and {plan.state_dim} channels: "
+            f"split the batch"
+        )
+    return plan
 
 
 def sort_worlds(plan: Plan, x: Tensor, s: Tensor, mask: Tensor | None) -> SortedWorlds:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,6 +13,9 @@ from torch import Tensor
 from npa_envs.errors import NPAError
 
 DTYPES = (torch.float32, torch.float64)
+
+LENGTH_RANGE = {torch.float32: (1e-8, 1e8), torch.float64: (1e-60, 1e60)}
+"""Perception radii [length units] whose powers in the kernels stay numbers of the dtype."""
 
 Box = float | Sequence[float] | None
 """Sides of a periodic box centred on the origin [length units], one number for all; None: open."""
@@ -74,31 +79,69 @@ def check_finite_positions(x: Tensor) -> None:
         )
 
 
-def checked_eps(name: str, eps: float) -> float:
-    """Return a perception radius as a float [length units].
+def checked_number(name: str, value: Any) -> float:
+    """Return a number as a float; zero-dimensional tensors and NumPy scalars are numbers too.
 
     Raises:
-        NPAError: It is not positive and finite.
+        NPAError: It is no number.
     """
-    value = float(eps)
+    if not isinstance(value, str | bytes | bool):
+        with contextlib.suppress(TypeError, ValueError, RuntimeError, OverflowError):
+            return float(value)
+    raise NPAError(f"{name} must be a number, got {value!r}")
+
+
+def checked_eps(name: str, eps: float, dtype: torch.dtype) -> float:
+    """Return a perception radius as a float [length units].
+
+    Args:
+        name: What the caller calls it.
+        eps: The radius.
+        dtype: Floating dtype of the worlds, in which powers of the radius must not overflow.
+
+    Raises:
+        NPAError: It is not positive and finite, or too small or large for the dtype.
+    """
+    value = checked_number(name, eps)
     if not (math.isfinite(value) and value > 0.0):
         raise NPAError(f"{name} must be positive and finite [length units], got {eps}")
+    low, high = LENGTH_RANGE[dtype]
+    if not low <= value <= high:
+        raise NPAError(
+            f"{name} must lie in [{low:g}, {high:g}] length units for {dtype}, got {eps}: "
+            f"choose another unit of length"
+        )
     return value
+
+
+def check_scale(eps: float, eps0: float, space_dim: int, dtype: torch.dtype) -> None:
+    """Check that (eps / eps0)^(1+D), which scales the density gradient, is a number of the dtype.
+
+    Raises:
+        NPAError: It over- or underflows.
+    """
+    limits = torch.finfo(dtype)
+    scale = (eps / eps0) ** (1 + space_dim)
+    if not 1e6 * limits.tiny < scale < 1e-6 * limits.max:
+        raise NPAError(
+            f"eps / eps0 must be a moderate ratio, got {eps:g} / {eps0:g}: perceive at a radius "
+            f"nearer to the one that the rule was trained with"
+        )
 
 
 def checked_box(box: Box, space_dim: int, eps: float) -> tuple[float, ...] | None:
     """Return the sides of a periodic box as a tuple of D floats, or None in open space.
 
     Raises:
-        NPAError: Wrong number of sides, or a side below 2 eps, where a particle would see another
-            one twice.
+        NPAError: No numbers, a wrong number of sides, or a side below 2 eps, where a particle would
+            see another one twice.
     """
     if box is None:
         return None
-    if isinstance(box, int | float):
-        sides: tuple[float, ...] = (float(box),) * space_dim
+    if isinstance(box, Iterable) and getattr(box, "ndim", 1) != 0 and not isinstance(box, str):
+        sides = tuple(checked_number("a side of box", side) for side in box)
     else:
-        sides = tuple(float(side) for side in box)
+        sides = (checked_number("box", box),) * space_dim
     if len(sides) != space_dim:
         raise NPAError(f"box must have {space_dim} sides, got {len(sides)}: {sides}")
     # Ten digits of grace: a box of exactly 2 eps must pass however both were rounded.
@@ -108,3 +151,23 @@ def checked_box(box: Box, space_dim: int, eps: float) -> tuple[float, ...] | Non
             f"enlarge the box or perceive at a smaller eps"
         )
     return sides
+
+
+def check_generator(generator: torch.Generator | None, device: torch.device) -> None:
+    """Check that a source of randomness is one, on the device where it is used.
+
+    Raises:
+        NPAError: It is no torch.Generator, or on another kind of device.
+    """
+    if generator is None:
+        return
+    if not isinstance(generator, torch.Generator):
+        raise NPAError(
+            f"generator must be a torch.Generator, got {type(generator).__name__}: "
+            f"make it with torch.Generator({device.type!r}).manual_seed(0)"
+        )
+    if generator.device.type != device.type:
+        raise NPAError(
+            f"generator must be on the worlds' device, {device}, got {generator.device}: "
+            f"make it with torch.Generator({device.type!r})"
+        )

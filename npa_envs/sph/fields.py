@@ -13,6 +13,7 @@ from npa_envs.sph.cells import compute_density, make_plan, sort_worlds
 from npa_envs.sph.checks import (
     Box,
     check_finite_positions,
+    check_scale,
     check_world,
     checked_box,
     checked_eps,
@@ -76,8 +77,9 @@ def perceive(
             not positive and finite, or a box side is below 2 eps.
     """
     check_world(x, s)
-    radius = checked_eps("eps", eps)
-    radius0 = radius if eps0 is None else checked_eps("eps0", eps0)
+    radius = checked_eps("eps", eps, x.dtype)
+    radius0 = radius if eps0 is None else checked_eps("eps0", eps0, x.dtype)
+    check_scale(radius, radius0, x.shape[2], x.dtype)
     sides = checked_box(box, x.shape[2], radius)
     check_finite_positions(x)
     terms = Terms(state_gradient, moment_correction, density_gradient)
@@ -109,14 +111,14 @@ def perception_fields(x: Tensor, s: Tensor, eps: float, box: Box = None) -> Perc
         NPAError: As `perceive`.
     """
     check_world(x, s)
-    radius = checked_eps("eps", eps)
+    radius = checked_eps("eps", eps, x.dtype)
     sides = checked_box(box, x.shape[2], radius)
     check_finite_positions(x)
     x, s = x.contiguous(), s.contiguous()
     world_count, particle_count, space_dim = x.shape
     state_dim = s.shape[2]
     plan = make_plan(x, s, x.shape[0] * x.shape[1], False, radius, sides)
-    kernels = perception_kernels(space_dim, plan.scalar, plan.width, plan.lanes, True)
+    kernels = perception_kernels(space_dim, plan.scalar, plan.width, plan.lanes, True, True)
     ordered = sort_worlds(plan, x, s, None)
     particles, row_density_gradient = compute_density(plan, ordered, kernels, density_gradient=True)
     fields = PerceptionFields(

@@ -58,7 +58,12 @@ def _perceive_rows(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     plan = make_plan(x, s, row_capacity, mask is not None, eps, None if box is None else tuple(box))
     kernels = perception_kernels(
-        plan.space_dim, plan.scalar, plan.width, plan.lanes, state_gradient
+        plan.space_dim,
+        plan.scalar,
+        plan.width,
+        plan.lanes,
+        state_gradient,
+        moment_correction,
     )
     ordered = sort_worlds(plan, x, s, mask)
     particles, row_density_gradient = compute_density(plan, ordered, kernels, density_gradient)
@@ -71,7 +76,6 @@ def _perceive_rows(
         plan.domain,
         plan.particle_count,
         plan.state_dim,
-        int(moment_correction and state_gradient),
         int(density_gradient),
         scale,
         density_scale(scale, plan.space_dim, plan.particle_count),

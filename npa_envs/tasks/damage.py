@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
+from npa_envs.sph.checks import check_generator
 
 
 def random_particle(x: Tensor, generator: torch.Generator | None = None) -> Tensor:
@@ -27,11 +28,7 @@ def random_particle(x: Tensor, generator: torch.Generator | None = None) -> Tens
         NPAError: A wrong shape or dtype, no particles, or a generator on another device.
     """
     _check_positions(x)
-    if generator is not None and generator.device.type != x.device.type:
-        raise NPAError(
-            f"generator must be on the device of x, {x.device}, got {generator.device}: "
-            f"make it with torch.Generator({x.device.type!r})"
-        )
+    check_generator(generator, x.device)
     world_count, particle_count, _ = x.shape
     if particle_count == 0:
         raise NPAError("x must hold at least one particle, got N = 0: give a world with particles")

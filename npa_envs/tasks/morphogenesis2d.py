@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.rule import NPARule
+from npa_envs.rule import COLOUR_OFFSET, NPARule
 from npa_envs.sph import splat
 from npa_envs.tasks.damage import erase_state, random_particle
 from npa_envs.tasks.morphogenesis2d_config import Morphogenesis2DConfig
@@ -113,7 +113,7 @@ class Morphogenesis2D:
         """
         if centred:
             x = x - x.mean(dim=1, keepdim=True) + self.target.points.mean(dim=0).to(x)
-        return self._splat(x, s[..., -3:] + 0.5)
+        return self._splat(x, s[..., -3:] + COLOUR_OFFSET)
 
     def splat_losses(self, x: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return each world's density loss and colour loss, dimensionless, shape [B] each.

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from npa_envs.sph.checks import check_generator
+
 
 def uniform_ball(
     world_count: int,
@@ -26,7 +28,11 @@ def uniform_ball(
         generator: Source of randomness, on `device`.
         device: Where the points are made.
         dtype: Their floating dtype.
+
+    Raises:
+        NPAError: The generator is on another device.
     """
+    check_generator(generator, torch.device(device))
     shape = (world_count, particle_count)
     direction = torch.randn(*shape, space_dim, generator=generator, device=device, dtype=dtype)
     # randn is never exactly zero in all coordinates in practice; the floor keeps 0 / 0 away.
