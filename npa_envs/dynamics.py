@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from numbers import Integral
 from typing import Literal, NamedTuple, overload
 
 import torch
@@ -19,6 +18,7 @@ from npa_envs.sph.checks import (
     check_scale,
     check_world,
     checked_box,
+    checked_count,
     checked_eps,
     checked_number,
 )
@@ -273,8 +273,7 @@ def rollout(
         NPAError: Shapes, dtypes or devices do not fit each other or the rule, a position is not
             finite, or a number is out of its range.
     """
-    if isinstance(steps, bool) or not isinstance(steps, Integral) or steps < 0:
-        raise NPAError(f"steps must be an integer of at least 0, got {steps!r}")
+    steps = checked_count("steps", steps)
     if memory not in ("store", "recompute"):
         raise NPAError(f"memory must be 'store' or 'recompute', got {memory!r}")
     options = _checked_options(

@@ -205,7 +205,7 @@ class NPARule(nn.Module):
             and "forward" not in vars(self)
             and type(self.hidden) is nn.Linear
             and type(self.output) is nn.Linear
-            and self.output.bias is None
+            and getattr(self.output, "bias", None) is None
             and not any(getattr(module, name) for module in modules for name in hooks)
         )
 

@@ -13,7 +13,10 @@ import binascii
 import io
 import json
 import math
+import pickle
+import reprlib
 import struct
+import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -26,6 +29,9 @@ from npa_envs.errors import NPAError, suggest
 _DEMO_SPACE_DIM = 2
 _TEXEL = 4
 """The web demo keeps its weights in RGBA textures: rows are padded to a multiple of this."""
+
+_ZIP_MARK = b"PK\x03\x04"
+"""What a file of torch.save begins with, unless it is in torch's legacy format."""
 
 _WEIGHT_NAMES = {
     "model.0.weight": "hidden.weight",
@@ -148,8 +154,17 @@ def read_demo_json(data: bytes, name: str | None) -> RuleParts:
 
 
 def _unpickle(data: bytes) -> Mapping[Any, Any]:
+    is_zip = data.startswith(_ZIP_MARK)
+    if is_zip:
+        _check_zip(data)
     try:
         state = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError as error:
+        doubt = "" if is_zip else "is no state dict, is damaged, or "
+        raise NPAError(
+            f"the file {doubt}holds objects other than tensors, which could run code: export a "
+            "plain state dict with torch.save(model.state_dict(), path)"
+        ) from error
     except Exception as error:
         # What torch raises for garbage depends on where in its readers the garbage lands.
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
@@ -162,11 +177,34 @@ def _unpickle(data: bytes) -> Mapping[Any, Any]:
     return state
 
 
+def _check_zip(data: bytes) -> None:
+    """Compare the checksums, which torch does not look at."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            bad = archive.testzip()
+    except Exception as error:
+        # What zipfile raises depends on where the damage lies.
+        raise NPAError(
+            f"the file is damaged or truncated ({type(error).__name__}): fetch or save it again"
+        ) from error
+    if bad is not None:
+        raise NPAError(f"the file is damaged (wrong checksum of {bad!r}): fetch or save it again")
+
+
+def _check_plain(name: str, tensor: Tensor) -> None:
+    if tensor.layout != torch.strided or tensor.is_meta or tensor.is_nested or tensor.is_quantized:
+        raise NPAError(
+            f"{name} must be a dense tensor with data, got a sparse, meta, nested or quantised "
+            "one: export the state dict with plain tensors"
+        )
+
+
 def _matrix(name: str, value: Any) -> Tensor:
     """Return a weight or a bias; some of the authors' matrices come as 1x1 convolutions."""
     rank = 1 if name.endswith("bias") else 2
     if not isinstance(value, Tensor):
         raise NPAError(f"{name} must be a tensor, got a {type(value).__name__}")
+    _check_plain(name, value)
     if value.ndim == 4 and rank == 2 and value.shape[2:] == (1, 1):
         value = value[:, :, 0, 0]
     if value.ndim != rank:
@@ -197,11 +235,17 @@ def _infer_dimensions(
 
 def _scalar(name: str, value: Any) -> float:
     """Return a number that the authors' tools may have rounded to float32 as the decimal meant."""
-    if isinstance(value, Tensor) and value.numel() == 1:
-        value = value.item()
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise NPAError(f"{name} must be a finite number, got {value!r}")
-    number = float(value)
+    if isinstance(value, Tensor):
+        _check_plain(name, value)
+        value = value.item() if value.numel() == 1 else value
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise NPAError(f"{name} must be a finite number, got {reprlib.repr(value)}")
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
+    if not math.isfinite(number):
+        raise NPAError(f"{name} must be a finite number, got {reprlib.repr(value)}")
     for digits in range(1, 10):
         rounded = float(f"{number:.{digits}g}")
         if _as_float32(rounded) == number:

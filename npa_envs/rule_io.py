@@ -8,6 +8,7 @@ authors' formats are read by `npa_envs.rule_formats`.
 from __future__ import annotations
 
 import json
+import reprlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -17,6 +18,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as serialise
 from torch import Tensor
 
+from npa_envs.devices import check_device
 from npa_envs.errors import NPAError, suggest
 from npa_envs.files import write_bytes
 from npa_envs.rule import NPARule, RuleHyperParameters
@@ -42,7 +44,7 @@ def load_rule(source: str | Path, *, device: str | torch.device = "cpu") -> NPAR
         source: The name of a shipped rule (`shipped_rules()`), or the path of a `.safetensors`
             file that `save_rule` wrote, of the authors' state dict (`.pth`, `.pt`; no code in it
             is run), or of their web demo's collection: `"models.json#name"`.
-        device: Where the weights go.
+        device: Where the weights go: "cpu", "cuda", "cuda:1", or torch's own device.
 
     Returns:
         The rule, its weights in the precision of the file (float32 or float64). Torch's random
@@ -50,8 +52,10 @@ def load_rule(source: str | Path, *, device: str | torch.device = "cpu") -> NPAR
 
     Raises:
         NPAError: The name is unknown, the file is missing, garbage, truncated, of an unknown
-            version, does not hold a rule, or holds weights that are not finite.
+            version, does not hold a rule, or holds weights that are not finite; or there is no
+            such device.
     """
+    target = check_device(device)
     path, name = _locate(source)
     try:
         if path.suffix == ".safetensors":
@@ -62,7 +66,7 @@ def load_rule(source: str | Path, *, device: str | torch.device = "cpu") -> NPAR
             rule = _assemble(read_state_dict(_read_file(path)))
     except NPAError as error:
         raise NPAError(f"cannot load a rule from {str(source)!r}: {error}") from error
-    return rule.to(device)
+    return rule.to(target)
 
 
 def save_rule(
@@ -119,36 +123,55 @@ def _locate(source: str | Path) -> tuple[Path, str | None]:
     """Find the file that `source` means, and the name after '#'."""
     text = str(source)
     known = shipped_rules()
+    suffixes = ", ".join(_SUFFIXES)
+    if not text:
+        raise NPAError(
+            "source must be the name of a shipped rule or the path of a file that ends in "
+            f"{suffixes}, got '': names: {', '.join(known)}"
+        )
     if text in known:
         return known[text], None
     base, mark, name = text.rpartition("#")
     path, inner = (Path(base), name) if mark and base.endswith(".json") else (Path(text), None)
     if path.suffix in _SUFFIXES:
         return path, inner
-    if path.exists():
-        raise NPAError(f"a rule's file must end in {', '.join(_SUFFIXES)}, got {text!r}: rename it")
+    try:
+        exists = path.exists()
+    except (OSError, ValueError) as error:
+        raise NPAError(
+            "source must be the name of a shipped rule or the path of a file that ends in "
+            f"{suffixes}, got {reprlib.repr(text)}, which cannot be a path "
+            f"({_reason(error)}): names: {', '.join(known)}"
+        ) from error
+    if exists:
+        raise NPAError(f"a rule's file must end in {suffixes}, got {text!r}: rename it")
     raise NPAError(
         f"unknown rule {text!r}: {suggest(text, known)}; or give the path of a file that ends in "
-        f"{', '.join(_SUFFIXES)}"
+        f"{suffixes}"
     )
 
 
 def _read_file(path: Path) -> bytes:
     try:
         return path.read_bytes()
-    except OSError as error:
+    except (OSError, ValueError) as error:
         raise NPAError(_explain_unreadable(error)) from error
 
 
-def _explain_unreadable(error: OSError) -> str:
-    return f"the file cannot be read ({error.strerror or error}): check the path"
+def _explain_unreadable(error: OSError | ValueError) -> str:
+    return f"the file cannot be read ({_reason(error)}): check the path"
+
+
+def _reason(error: OSError | ValueError) -> str:
+    """Return the system's words without the path, or Python's for a path with a zero byte."""
+    return (isinstance(error, OSError) and error.strerror) or str(error)
 
 
 def _read_header(path: Path) -> dict[str, str]:
     try:
         with safe_open(path, framework="pt") as file:
             header: dict[str, str] = file.metadata() or {}
-    except OSError as error:
+    except (OSError, ValueError) as error:
         raise NPAError(_explain_unreadable(error)) from error
     except SafetensorError as error:
         raise NPAError(f"this is no safetensors file, or a truncated one ({error})") from error
@@ -185,10 +208,10 @@ def _parse(header: Mapping[str, str], name: str, kind: type) -> Any:
         raise NPAError(f"the metadata lacks {name!r}: save the rule again with npa_envs.save_rule")
     try:
         value = json.loads(header[name])
-    except ValueError:
+        if kind is float and type(value) is int:
+            value = float(value)
+    except (ValueError, OverflowError, RecursionError):
         value = None
-    if kind is float and type(value) is int:
-        value = float(value)
     if type(value) is not kind:
         raise NPAError(
             f"the metadata's {name!r} must be a JSON {kind.__name__}, got {header[name]!r}"

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +18,8 @@ import torch
 from PIL import Image
 
 from npa_envs.cli import COMMANDS, main
+from npa_envs.cli.film import Film
+from npa_envs.cli.rollout import RolloutOptions
 from npa_envs.errors import NPAError
 from npa_envs.rule import NPARule
 from npa_envs.rule_io import load_rule, save_rule
@@ -223,7 +226,7 @@ def test_ctrl_c_leaves_a_checkpoint_and_says_how_to_go_on(tmp_path: Path) -> Non
         time.sleep(0.1)
     process.send_signal(signal.SIGINT)
     text, _ = process.communicate(timeout=60)
-    assert process.returncode == 0
+    assert process.returncode == 130
     assert re.search(r"stopped at iteration [1-9]", text)
     assert f"--out {folder} --resume" in text
     assert (folder / "checkpoint.pt").is_file()
@@ -238,6 +241,7 @@ def test_rollout_writes_films_that_open(
         "--damage",
         "0:cut",
         "8:cut",
+        "--damage",
         "10:erase:0.3",
         "10:clump",
         "--out",
@@ -248,12 +252,13 @@ def test_rollout_writes_films_that_open(
     text = capsys.readouterr().out
     assert re.search(r"step 20: loss \d+\.\d+, PSNR +\d+\.\d+ dB", text)
     with Image.open(out / "growth.gif") as film:
-        assert film.size == (32, 32)
+        # The rule was trained at 32 pixels.
+        assert film.size == (256, 256)
         # 0, cut, 5, 8, cut, 10, erase, clump, 15, 20
         assert getattr(film, "n_frames", 1) == 10
     assert (out / "growth.mp4").stat().st_size > 500
     with Image.open(out / "growth-filmstrip.png") as strip:
-        assert strip.width > 8 * 32
+        assert strip.width == 7 * (256 + 8) + 8
     for name in ("growth.gif", "growth.mp4", "growth-filmstrip.png"):
         assert f"wrote {out / name}" in text
 
@@ -312,6 +317,73 @@ def test_rollout_refuses_a_mistake_in_one_line(
     assert not (tmp_path / "film" / "growth.gif").exists()
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("fps", 51.0, r"fps must be in \[0\.1, 50\], got 51"),
+        ("fps", float("nan"), r"fps must be in \[0\.1, 50\], got nan"),
+        ("seed", -1, r"seed must be in \[0, 2\^63\), got -1"),
+        ("seed", 2**63, r"seed must be in \[0, 2\^63\)"),
+    ],
+)
+def test_rollout_refuses_numbers_out_of_range_before_it_starts(
+    name: str, value: float, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(NPAError, match=message):
+        RolloutOptions(**{"rule": "gecko", name: value})
+    with pytest.raises(SystemExit) as ended:
+        main(["rollout", "gecko", f"--{name}", str(value)])
+    assert ended.value.code == 2
+    assert f"{name} must be in" in capsys.readouterr().err
+
+
+def test_rollout_notices_before_the_first_step_that_it_cannot_write(
+    trained: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def refuse(**_: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("npa_envs.cli.rollout.tempfile.TemporaryFile", refuse)
+    monkeypatch.setattr("npa_envs.cli.film.rollout", lambda *_, **__: pytest.fail("a step ran"))
+    words = ["rollout", str(trained / "rule.safetensors"), "--steps", "9", "--out", str(tmp_path)]
+    assert "out must be a folder that can be written to" in error_of(capsys, words)
+
+
+def test_rollout_makes_about_150_frames(tmp_path: Path, trained: Path) -> None:
+    words = ["rollout", str(trained / "rule.safetensors"), "--steps", "299", "--no-progress"]
+    assert main([*words, "--resolution", "16", "--out", str(tmp_path)]) == 0
+    with Image.open(tmp_path / "growth.gif") as film:
+        assert film.size == (16, 16)
+        assert getattr(film, "n_frames", 1) == 151
+
+
+@pytest.mark.parametrize(
+    ("steps", "every", "damages", "shown"),
+    [
+        (400, 2, {200, 300}, ["0", "16", "32", "64", "128", "200!", "250", "300!", "350", "400"]),
+        (512, 4, set(), ["0", "16", "32", "64", "128", "176", "224", "320", "416", "512"]),
+        (130, 50, {60}, ["0", "50", "60", "60!", "100", "130"]),
+        (70, 10, set(), ["0", "10", "20", "30", "40", "50", "60", "70"]),
+    ],
+)
+def test_filmstrip_shows_growth_damage_and_the_end(
+    steps: int, every: int, damages: set[int], shown: list[str]
+) -> None:
+    film = Film()
+    task = SimpleNamespace(picture=lambda *_: torch.zeros(1, 4, 4, 4))
+    x = s = torch.zeros(1, 1, 2)
+    for step in sorted({*range(0, steps, every), *damages, steps}):
+        film.shoot(task, x, s, f"{step}", step=step)
+        if step in damages:
+            film.shoot(task, x, s, f"{step}!", mark=True)
+    frames, captions = film.strip()
+    assert captions == shown
+    assert len(frames) == len(shown)
+
+
 def test_evaluate_prints_a_row_for_each_checkpoint(
     trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -324,6 +396,16 @@ def test_evaluate_prints_a_row_for_each_checkpoint(
     for row in rows:
         assert row["loss_worst"] >= row["loss"] > 0
         assert re.search(rf"^ *{row['step']} ", text, re.MULTILINE)
+
+
+@pytest.mark.parametrize("config", ["{", "null", "[]", '{"colour": 3}', '{"state_dim": "many"}'])
+def test_a_rule_with_damaged_metadata_is_refused(
+    config: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "damaged.safetensors"
+    save_rule(NPARule(), path, metadata={"task": "morphogenesis2d", "config": config})
+    assert main(["evaluate", str(path), "--checkpoints", "1", "--no-progress"]) == 2
+    assert f"the metadata of '{path}'" in capsys.readouterr().err
 
 
 def test_evaluate_wants_to_know_the_target(

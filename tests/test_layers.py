@@ -35,6 +35,7 @@ INSIDES = ("npa_envs.kernels", "npa_envs.sph", "npa_envs.reference")
 LADDER = {
     "npa_envs._checkout": rung(0),
     "npa_envs.errors": rung(0),
+    "npa_envs.devices": rung(1, "torch"),
     "npa_envs.files": rung(1),
     "npa_envs.kernels": rung(1, "warp"),
     "npa_envs.reference": rung(1, "torch"),

@@ -180,11 +180,25 @@ def test_filmstrip_writes_a_caption_below_each_frame_and_none_beside_it(tmp_path
     strip = np.asarray(Image.open(tmp_path / "strip.png")).min(axis=-1)
     below = strip[8 + 64 :]
     assert (strip[: 8 + 64] == 255).all()
-    ink = [(below[:, 8 + 104 * k : 8 + 104 * k + 96] < 128).sum() for k in range(3)]
+    pitch = (strip.shape[1] - 8) // 3
+    assert pitch >= 96 + 8
+    ink = [(below[:, 8 + pitch * k : pitch * (k + 1)] < 128).sum() for k in range(3)]
     assert ink[0] > 30
     assert ink[1] == 0
     assert ink[2] > ink[0]
     assert (below[-2:] == 255).all()
+
+
+def test_filmstrip_of_small_frames_keeps_captions_apart(tmp_path):
+    frames = [np.zeros((32, 32, 3), np.uint8)] * 3
+    write_filmstrip(tmp_path / "strip.png", frames, ["step 200: erase 0.2"] * 3)
+    strip = np.asarray(Image.open(tmp_path / "strip.png")).min(axis=-1)
+    pitch = (strip.shape[1] - 8) // 3
+    for k in range(4):
+        assert (strip[:, pitch * k : pitch * k + 8] > 200).all()
+    dark = np.flatnonzero((strip[24] == 0)[8:pitch])
+    assert len(dark) == 32
+    assert dark[0] == (pitch - 8 - 32) // 2
 
 
 def test_filmstrip_of_one_frame_needs_no_further_arguments(tmp_path):

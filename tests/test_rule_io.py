@@ -126,6 +126,7 @@ BAD_HEADERS: dict[str, tuple[Callable[[dict, dict], Any], str]] = {
     "a wrong type": (lambda h, w: h.update(static="0"), "'static' must be a JSON bool, got '0'"),
     "no JSON": (lambda h, w: h.update(eps0="0,1"), "'eps0' must be a JSON float"),
     "a wrong value": (lambda h, w: h.update(space_dim="4"), "space_dim must be 2 or 3"),
+    "huge radius": (lambda h, w: h.update(eps0="9" * 400), "'eps0' must be a JSON float"),
     "NaN radius": (lambda h, w: h.update(eps0="NaN"), "eps0 must be positive and finite"),
     "a huge size": (lambda h, w: h.update(hidden_dim="9" * 30), "no rule has|shapes"),
     "another shape": (lambda h, w: h.update(hidden_dim="64"), r"\(128, 66\) instead of \(64, 66\)"),
@@ -201,9 +202,32 @@ class Trap:
 
 def test_code_in_a_state_dict_is_not_run(tmp_path: Path) -> None:
     torch.save({"model.0.weight": Trap(tmp_path / "ran")}, tmp_path / "npa.pth")
-    with pytest.raises(NPAError, match="without running code"):
+    with pytest.raises(
+        NPAError, match="holds objects other than tensors, which could run code: export"
+    ):
         load_rule(tmp_path / "npa.pth")
     assert not (tmp_path / "ran").exists()
+    state = {"model.0.weight": Trap(tmp_path / "ran")}
+    torch.save(state, tmp_path / "npa.pth", _use_new_zipfile_serialization=False)
+    with pytest.raises(NPAError, match="is damaged, or holds objects other than tensors") as caught:
+        load_rule(tmp_path / "npa.pth")
+    assert "weights_only" not in str(caught.value)
+    assert not (tmp_path / "ran").exists()
+
+
+def test_a_changed_byte_in_a_state_dict_is_noticed_and_the_legacy_format_is_read(
+    tmp_path: Path,
+) -> None:
+    rule = NPARule()
+    path = tmp_path / "npa.pth"
+    torch.save(authors_state(rule), path)
+    data = bytearray(path.read_bytes())
+    data[data.index(rule.hidden.weight.detach().numpy().tobytes()) + 1000] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(NPAError, match=r"npa\.pth.*damaged \(wrong checksum of .*again"):
+        load_rule(path)
+    torch.save(authors_state(rule), path, _use_new_zipfile_serialization=False)
+    assert_same_rule(load_rule(path), rule)
 
 
 BAD_STATES: dict[str, tuple[Callable[[dict], Any], str]] = {
@@ -217,6 +241,19 @@ BAD_STATES: dict[str, tuple[Callable[[dict], Any], str]] = {
     "odd outputs": (lambda s: s.update({"model.2.weight": torch.ones(17, 128)}), "17 outputs"),
     "no radius": (lambda s: s.update(eps0=torch.tensor(math.nan)), "eps0 must be a finite number"),
     "NaN weights": (lambda s: s["model.0.bias"].fill_(math.nan), "must be finite"),
+    "sparse weights": (
+        lambda s: s.update({"model.0.weight": s["model.0.weight"].to_sparse()}),
+        "model.0.weight must be a dense tensor",
+    ),
+    "meta weights": (
+        lambda s: s.update({"model.0.bias": s["model.0.bias"].to("meta")}),
+        "model.0.bias must be a dense tensor",
+    ),
+    "a meta number": (
+        lambda s: s.update(eps0=torch.ones((), device="meta")),
+        "eps0 must be a dense tensor",
+    ),
+    "a huge number": (lambda s: s.update(alpha=10**400), "alpha must be a finite number"),
 }
 
 
@@ -280,6 +317,7 @@ BAD_ENTRIES: dict[str, tuple[Callable[[dict], Any], str]] = {
     "another dtype": (lambda e: e["w1.bias"].update(dtype="float16"), "must be float32"),
     "a bad shape": (lambda e: e["w1.bias"].update(shape=[-1]), "must be float32 with 1 dim"),
     "shapes at odds": (lambda e: e.update({"w2.weight.T": pack(np.ones((128, 16)))}), "must agree"),
+    "a huge radius": (lambda e: e.update(eps0=10**400), "eps0 must be a finite number, got 1000"),
     "no radius": (lambda e: e.pop("eps0"), "eps0 must be a finite number, got None"),
     "NaN weights": (lambda e: e.update({"w1.bias": pack(np.full(128, np.nan))}), "must be finite"),
 }
@@ -335,6 +373,30 @@ def test_missing_files_and_folders_are_named(tmp_path: Path) -> None:
     (tmp_path / "rule.bin").touch()
     with pytest.raises(NPAError, match=r"must end in \.safetensors, \.pth, \.pt, \.json"):
         load_rule(tmp_path / "rule.bin")
+
+
+@pytest.mark.parametrize("source", ["", "x" * 5000, Path("x" * 5000)])
+def test_what_can_be_no_path_is_refused_with_what_is_accepted(source: str | Path) -> None:
+    expected = r"name of a shipped rule or the path of a file that ends in \.safetensors"
+    with pytest.raises(NPAError, match=expected) as caught:
+        load_rule(source)
+    assert len(str(caught.value)) < 400 + len(", ".join(shipped_rules()))
+
+
+@pytest.mark.parametrize("suffix", ["", ".safetensors", ".pth", ".json"])
+@pytest.mark.parametrize("name", ["x" * 5000, "a\0b", "\udcff\ud800"])
+def test_no_name_leads_to_another_error(name: str, suffix: str) -> None:
+    with pytest.raises(NPAError):
+        load_rule(name + suffix)
+
+
+@pytest.mark.parametrize("device", ["banana", "mps", "cpu:3", "cuda:99", None])
+def test_a_device_that_is_not_there_is_refused(tmp_path: Path, device: Any) -> None:
+    save_rule(NPARule(), tmp_path / "rule.safetensors")
+    with pytest.raises(NPAError, match="device must"):
+        load_rule(tmp_path / "rule.safetensors", device=device)
+    loaded = load_rule(tmp_path / "rule.safetensors", device=torch.device("cpu"))
+    assert loaded.hidden.weight.device.type == "cpu"
 
 
 def test_an_unknown_name_suggests_a_shipped_rule(

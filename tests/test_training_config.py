@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 
 import pytest
+import torch
 
 from npa_envs.errors import NPAError
 from npa_envs.tasks.morphogenesis2d_config import Morphogenesis2DConfig
@@ -71,11 +72,15 @@ def test_no_field_of_the_run_hides_one_of_the_task(name):
         ("steps", 5, "steps must be a list, got 5"),
         ("milestones", [5, 2], "milestones must be positive and increasing"),
         ("world_count", 1000, "world_count must be at most pool_size"),
-        ("seed", -1, "seed must be a whole number of at least 0, got -1"),
+        ("seed", -1, r"seed must be a whole number of at least 0 and below 2\*\*63, got -1"),
+        ("seed", 2**63, r"at least 0 and below 2\*\*63, got 9223372036854775808"),
+        ("picture_interval", -1, "picture_interval must be a whole number of at least 0, got -1"),
         ("dtype", "float16", "dtype must be one of float32, float64, got 'float16'"),
         ("memory", "disk", "memory must be one of store, recompute, got 'disk'"),
         ("device", "gpu", "device must name a device, got 'gpu'"),
         ("device", "meta", "device must be 'cpu' or 'cuda', got 'meta'"),
+        ("device", "cpu:3", "device must be 'cpu' without a number, got 'cpu:3'"),
+        ("device", "cuda:256", "device must have a number that torch can count to"),
         ("target", "", "target must be a built-in name, an emoji or a path, got ''"),
         ("eps", -0.1, "eps must be a finite number greater than 0, got -0.1"),
         ("update_prob", 0.0, r"update_prob must lie in \(0, 1\], got 0.0"),
@@ -87,6 +92,12 @@ def test_no_field_of_the_run_hides_one_of_the_task(name):
 def test_each_wrong_value_is_named(field, value, rule):
     with pytest.raises(NPAError, match=rule):
         override(PAPER, **{field: value})
+
+
+def test_the_largest_seed_and_a_device_that_is_not_here_are_accepted():
+    config = override(PAPER, seed=2**63 - 1, device="cuda:7")
+    assert (config.seed, config.device) == (2**63 - 1, "cuda:7")
+    torch.Generator().manual_seed(config.seed + 2)
 
 
 def test_unknown_field_gets_a_suggestion():

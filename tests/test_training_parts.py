@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import math
+import zipfile
 
 import pytest
 import torch
 from circle_task import CircleTask, circle_config, plain_rollout
 from torch import nn
 
+from npa_envs.devices import check_device, parse_device
+from npa_envs.errors import NPAError
+from npa_envs.training.checkpoint import check_same_run, load_checkpoint, save_checkpoint
+from npa_envs.training.folder import JsonlLog
 from npa_envs.training.graphs import EagerIteration, GraphedIteration
 from npa_envs.training.meter import LossMeter
 from npa_envs.training.optimiser import RuleOptimiser, normalise_gradients
+from npa_envs.training.overrides import config_to_dict
 from npa_envs.training.pool import WorldPool
 
 
@@ -212,3 +218,116 @@ def test_replayed_graphs_give_what_eager_launches_give(tmp_path):
             torch.testing.assert_close(ours.grad, theirs.grad, rtol=1e-9, atol=1e-12)
         seen.append(graphed.x.clone())
     assert not torch.equal(seen[0], seen[2])
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["banana", "", "mps", "meta", "cpu:3", "cpu:256", "cuda:-1", "cuda:256", "cuda:99999", None, 0],
+)
+def test_what_names_no_device_is_refused(name):
+    for check in (parse_device, check_device):
+        with pytest.raises(NPAError, match=r"device must .*use 'cpu'"):
+            check(name)
+    with pytest.raises(NPAError, match="device must be 'cpu' or 'cuda', got 'mps'"):
+        check_device(torch.device("mps"))
+
+
+def test_a_cuda_device_must_be_there(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    for name in ("cuda", "cuda:0", torch.device("cuda", 1)):
+        with pytest.raises(NPAError, match=r"got 'cuda.*sees 0 CUDA devices: use device='cpu'"):
+            check_device(name)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    assert check_device("cuda") == torch.device("cuda:0")
+    assert check_device(torch.device("cuda:1")) == torch.device("cuda:1")
+    with pytest.raises(NPAError, match="got 'cuda:2', but it sees 2 CUDA devices"):
+        check_device("cuda:2")
+    assert check_device("cpu") == torch.device("cpu") == check_device(torch.device("cpu"))
+
+
+def flip_a_byte(path, offset):
+    data = bytearray(path.read_bytes())
+    data[offset] ^= 1
+    path.write_bytes(data)
+
+
+def test_a_changed_byte_anywhere_in_a_checkpoints_tensors_is_noticed(tmp_path):
+    path = tmp_path / "checkpoint.pt"
+    save_checkpoint(path, {"pool": torch.zeros(1000)})
+    load_checkpoint(path)
+    flip_a_byte(path, path.read_bytes().index(bytes(4000)) + 2000)
+    with pytest.raises(NPAError, match=r"checkpoint\.pt' is not a checkpoint or is damaged"):
+        load_checkpoint(path)
+
+
+@pytest.mark.parametrize("error", [IndexError, AttributeError, AssertionError, MemoryError])
+def test_whatever_torch_raises_names_the_checkpoint(tmp_path, monkeypatch, error):
+    def fail(*args, **kwargs):
+        raise error("garbage")
+
+    save_checkpoint(tmp_path / "checkpoint.pt", {})
+    monkeypatch.setattr(torch, "load", fail)
+    with pytest.raises(NPAError, match=r"checkpoint\.pt' is not a checkpoint or is damaged"):
+        load_checkpoint(tmp_path / "checkpoint.pt")
+
+
+def test_a_zip_file_of_another_kind_is_no_checkpoint(tmp_path):
+    path = tmp_path / "checkpoint.pt"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("a.txt", "text")
+    with pytest.raises(NPAError, match="is not a checkpoint or is damaged"):
+        load_checkpoint(path)
+    torch.save({"format": "npa-envs checkpoint"}, path)
+    with pytest.raises(NPAError, match="has checkpoint format None, this version reads 1"):
+        load_checkpoint(path)
+
+
+def complete_content(config):
+    return {
+        "task_name": "circle",
+        "config": config_to_dict(config),
+        "iteration": 0,
+        "seconds": 0.0,
+        "rule": {},
+        "optimiser": {},
+        "pool": {"x": torch.zeros(1), "s": torch.zeros(1)},
+        "meter": {},
+        "random_states": dict.fromkeys(("schedule", "worlds", "masks"), torch.zeros(1)),
+    }
+
+
+def test_a_checkpoint_must_hold_all_that_is_read(tmp_path):
+    config = circle_config(tmp_path)
+    path = tmp_path / "checkpoint.pt"
+    check_same_run(complete_content(config), "circle", config, path)
+    for name in complete_content(config):
+        content = complete_content(config)
+        content.pop(name)
+        with pytest.raises(NPAError, match=rf"checkpoint\.pt' .*lacks {name} or"):
+            check_same_run(content, "circle", config, path)
+        with pytest.raises(NPAError, match=f"lacks {name} or"):
+            check_same_run(content | {name: None}, "circle", config, path)
+    for outer, name in (("pool", "s"), ("random_states", "masks"), ("config", "task")):
+        content = complete_content(config)
+        del content[outer][name]
+        with pytest.raises(NPAError, match=rf"lacks {outer}\.{name} or"):
+            check_same_run(content, "circle", config, path)
+
+
+def test_a_line_that_does_not_fit_on_the_disk_leaves_the_log_as_it_was(tmp_path):
+    resource = pytest.importorskip("resource")
+    log = JsonlLog(tmp_path / "log.jsonl")
+    log.append({"iteration": 1})
+    before = log.path.read_bytes()
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    # Part of the second line fits, and is written.
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) + 10, hard))
+    try:
+        with pytest.raises(NPAError, match=r"cannot write the log .*log\.jsonl"):
+            log.append({"iteration": 2, "loss": 0.25})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert log.path.read_bytes() == before
+    log.append({"iteration": 2})
+    assert log.records() == [{"iteration": 1}, {"iteration": 2}]

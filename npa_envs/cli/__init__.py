@@ -46,6 +46,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # end must not complain about that either.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except OSError as error:
+        where = f" {error.filename!r}" if error.filename else ""
+        print(
+            f"npa-envs: error: {error.strerror or error}{where}: make room or choose another "
+            "folder (that of compiled kernels is WARP_CACHE_PATH)",
+            file=sys.stderr,
+        )
+        return USAGE_ERROR
 
 
 def _dispatch(words: list[str]) -> int:

@@ -271,6 +271,8 @@ def train_small(options: DemoOptions, report: Report) -> None:
             progress=options.progress,
             max_seconds=options.train_seconds,
         )
+    if result.interrupted:
+        raise KeyboardInterrupt
     report.line(f"  {result.iteration} iterations in {watch.seconds:.1f} s")
     device = check_device(options.device)
     task = task_entry(task_name).make(override(config, resolution=SCREEN).task, device)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,6 +25,9 @@ if TYPE_CHECKING:
 
 DAMAGE_SIZES = {"erase": 0.2, "cut": 0.1, "clump": 0.2}
 """Kinds of damage with their usual size: radius, gap, radius [length units]."""
+
+EARLY_STEPS = (0, 16, 32, 64, 128)
+"""Steps that a filmstrip shows, or the frames nearest to them: most of the growth is there."""
 
 CLUMP_FACTOR = 0.9
 """Share of its distance from the centre that a particle loses when it is clumped."""
@@ -110,8 +114,18 @@ class Film:
     marked: list[int] = field(default_factory=list)
     """Frames that show fresh damage."""
 
+    steps: dict[int, int] = field(default_factory=dict)
+    """Steps from the seed of each frame for which they are known, in order."""
+
     def shoot(
-        self, task: PictureTask, x: Tensor, s: Tensor, caption: str, *, mark: bool = False
+        self,
+        task: PictureTask,
+        x: Tensor,
+        s: Tensor,
+        caption: str,
+        *,
+        mark: bool = False,
+        step: int | None = None,
     ) -> None:
         """Add a frame.
 
@@ -121,21 +135,34 @@ class Film:
             s: States, shape [1, N, C].
             caption: What it shows.
             mark: Whether it must be in the filmstrip.
+            step: Steps from the seed, if the frame may stand for them in the filmstrip.
         """
         if mark:
             self.marked.append(len(self.frames))
+        if step is not None:
+            self.steps[len(self.frames)] = step
         self.frames.append(to_uint8(task.picture(x, s)[0]))
         self.captions.append(caption)
 
-    def strip(self, count: int = 8) -> tuple[list[NDArray[np.uint8]], list[str]]:
-        """Return frames for a filmstrip: those with damage, and others evenly spread.
+    def strip(self, count: int = 10) -> tuple[list[NDArray[np.uint8]], list[str]]:
+        """Return frames for a filmstrip: early ones, those with damage, the last, some between.
+
+        A film that ends with the early steps gives those with damage, and others evenly spread.
 
         Args:
             count: Frames to take in all, if there are as many.
         """
-        others = max(count - len(self.marked), 2)
-        even = np.linspace(0, len(self.frames) - 1, min(others, len(self.frames)))
-        chosen = sorted({*self.marked, *(round(float(k)) for k in even)})
+        last = len(self.frames) - 1
+        if max(self.steps.values(), default=0) <= EARLY_STEPS[-1]:
+            others = max(count - 2 - len(self.marked), 2)
+            even = np.linspace(0, last, min(others, len(self.frames)))
+            chosen = sorted({*self.marked, *(round(float(k)) for k in even)})
+        else:
+            early = {min(self.steps, key=lambda k: abs(self.steps[k] - n)) for n in EARLY_STEPS}
+            chosen = sorted({*early, *self.marked, last})
+            while len(chosen) < min(count, len(self.frames)):
+                start, end = max(pairwise(chosen), key=lambda pair: pair[1] - pair[0])
+                chosen = sorted([*chosen, (start + end) // 2])
         return [self.frames[k] for k in chosen], [self.captions[k] for k in chosen]
 
 
@@ -194,7 +221,7 @@ def film_world(
             progress(step - now)
             now = step
             if not film.frames or step > first_step:
-                film.shoot(task, x, s, f"step {step}")
+                film.shoot(task, x, s, f"step {step}", step=step)
             for damage in hurts.get(step, ()) if step < last else ():
                 x, s = apply_damage(damage, x, s, generator)
                 film.shoot(task, x, s, f"step {step}: {damage.text}", mark=True)
@@ -219,5 +246,6 @@ def write_film(film: Film, folder: Path, name: str, *, fps: float = 25.0) -> lis
     paths = [folder / f"{name}.gif", folder / f"{name}.mp4", folder / f"{name}-filmstrip.png"]
     write_gif(paths[0], film.frames, fps)
     write_mp4(paths[1], film.frames, fps)
-    write_filmstrip(paths[2], strip, captions)
+    rows = math.ceil(len(strip) / 8)
+    write_filmstrip(paths[2], strip, captions, columns=math.ceil(len(strip) / rows))
     return paths

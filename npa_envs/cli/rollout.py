@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +12,12 @@ from typing import Annotated
 import tyro
 
 from npa_envs.errors import NPAError
+
+SCREEN = 256
+"""Least pixels on each side of a film whose resolution is not asked for."""
+
+FRAME_COUNT = 150
+"""Frames of a film whose pace is not asked for, without those of damage."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,7 +31,7 @@ class RolloutOptions:
     steps: int = 512
     """Steps to run."""
 
-    damage: tuple[str, ...] = ()
+    damage: Annotated[tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction] = ()
     """Damage on the way, STEP:KIND or STEP:KIND:SIZE: 200:cut (gap 0.1), 300:erase (radius 0.2),
     400:clump (radius 0.2); sizes in length units."""
 
@@ -43,16 +51,16 @@ class RolloutOptions:
     """Probability of each particle's update in a step; default: as trained."""
 
     resolution: int | None = None
-    """Pixels on each side of the film; default: as trained."""
+    """Pixels on each side of the film; default: as trained, but at least 256."""
 
     every: int | None = None
     """Steps between two frames; default: as many as make about 150 frames."""
 
     fps: float = 25.0
-    """Frames a second."""
+    """Frames a second, 0.1 to 50."""
 
     seed: int = 0
-    """Randomness; the same seed gives the same film."""
+    """Randomness, 0 to 2^63 - 1; the same seed gives the same film."""
 
     device: str = "cpu"
     """Where to run: cpu, cuda, cuda:1."""
@@ -70,6 +78,11 @@ class RolloutOptions:
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise NPAError(f"{name} must be at least 1, got {value}")
+        if not 0 <= self.seed < 2**63:
+            raise NPAError(f"seed must be in [0, 2^63), got {self.seed}: try 0")
+        from npa_envs.render.film import GIF_HIGHEST_RATE, check_rate
+
+        check_rate(self.fps, highest=GIF_HIGHEST_RATE)
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -108,7 +121,7 @@ def run(options: RolloutOptions) -> int:
     from npa_envs.training.interrupt import stop_flag
 
     device = check_device(options.device)
-    damages = [parse_damage(text) for text in options.damage]
+    damages = [parse_damage(text) for words in options.damage for text in words]
     late = [damage for damage in damages if damage.step >= options.steps]
     if late:
         raise NPAError(
@@ -116,19 +129,20 @@ def run(options: RolloutOptions) -> int:
             f"raise --steps above {late[0].step}"
         )
     rule = load_rule(options.rule, device=device).float()
-    trained = task_of_rule(
-        options.rule,
-        rule,
-        device,
-        target=options.target,
-        particle_count=options.particle_count,
-        target_point_count=options.particle_count,
-        eps=options.eps,
-        update_prob=options.update_prob,
-        resolution=options.resolution,
-    )
-    task = trained.task
+    fields = {
+        "target": options.target,
+        "particle_count": options.particle_count,
+        "target_point_count": options.particle_count,
+        "eps": options.eps,
+        "update_prob": options.update_prob,
+    }
+    trained = task_of_rule(options.rule, rule, device, **fields, resolution=options.resolution)
+    # Drawn large enough to be seen; measured as trained, so that the figures can be compared.
+    task = shown = trained.task
+    if options.resolution is None and len(task.target_picture) < SCREEN:
+        shown = task_of_rule(options.rule, rule, device, **fields, resolution=SCREEN).task
     folder = make_folder(options.out)
+    check_writable(folder)
     generator = torch.Generator(device).manual_seed(options.seed)
     x, s = task.seed(1, generator=generator, device=device)
     with (
@@ -137,13 +151,13 @@ def run(options: RolloutOptions) -> int:
     ):
         x, s, film = film_world(
             rule,
-            task,
+            shown,
             x,
             s,
             options.steps,
             generator=generator,
             damages=damages,
-            every=options.every or max(options.steps // 150, 1),
+            every=options.every or math.ceil(options.steps / FRAME_COUNT),
             progress=bar.advance,
             stop=lambda: flag.requested,
         )
@@ -158,3 +172,22 @@ def run(options: RolloutOptions) -> int:
     for path in write_film(film, folder, "growth", fps=options.fps):
         print(f"wrote {path}")
     return 0
+
+
+def check_writable(folder: Path) -> None:
+    """Check that files can be made in a folder, before work is done that would be lost.
+
+    Args:
+        folder: An existing folder.
+
+    Raises:
+        NPAError: They cannot.
+    """
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise NPAError(
+            f"out must be a folder that can be written to, got {str(folder)!r} "
+            f"({error.strerror or error}): choose another one"
+        ) from error

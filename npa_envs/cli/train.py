@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import tyro
 
+from npa_envs.cli import INTERRUPTED
 from npa_envs.errors import NPAError
 
 if TYPE_CHECKING:
@@ -165,7 +166,7 @@ def run(task_name: str, options: TrainOptions, config: TrainConfig[Any]) -> int:
         print(f"interrupted; the last checkpoint is {folder.checkpoint}\ngo on: {resume_command}")
         raise
     _report(result, folder.checkpoint, resume_command)
-    return 0
+    return INTERRUPTED if result.interrupted else 0
 
 
 def _report(result: TrainResult, checkpoint: Path, resume_command: str) -> None:

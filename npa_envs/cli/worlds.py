@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -58,7 +59,7 @@ def task_of_rule(source: str, rule: NPARule, device: torch.device, **fields: Any
     own: dict[str, Any] = {"state_dim": rule.state_dim, "hidden_dim": rule.hidden_dim}
     own |= {"eps": rule.eps0, "alpha": rule.alpha}
     told = "config" in metadata
-    config = preset("paper", task_name, **(json.loads(metadata["config"]) if told else own))
+    config = preset("paper", task_name, **own) if not told else _told_config(path, metadata)
     config = override(config, **{k: v for k, v in fields.items() if v is not None})
     make = task_entry(task_name).make
     chosen = fields.get("target") is not None
@@ -70,6 +71,22 @@ def task_of_rule(source: str, rule: NPARule, device: torch.device, **fields: Any
             raise
         stand_in = override(config, target=builtin_targets()[0])
         return TrainedTask(make(stand_in.task, device), f"its target cannot be loaded: {error}")
+
+
+def _told_config(path: Path, metadata: Mapping[str, str]) -> Any:
+    """The configuration that a rule's file says it was trained with."""
+    from npa_envs.training import preset
+
+    try:
+        fields = json.loads(metadata["config"])
+        if not isinstance(fields, dict):
+            raise NPAError(f"config must be an object, got {type(fields).__name__}")
+        return preset("paper", metadata.get("task", "morphogenesis2d"), **fields)
+    except (ValueError, TypeError) as error:
+        raise NPAError(
+            f"the metadata of {str(path)!r} must say how the rule was trained, but it is damaged "
+            f"or of another version ({error}): save the rule again with npa_envs.save_rule"
+        ) from error
 
 
 def make_folder(path: Path) -> Path:

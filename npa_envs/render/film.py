@@ -17,7 +17,9 @@ from npa_envs.files import atomic_path
 
 Frame = NDArray[np.uint8]
 
-_GIF_LONGEST_RATE = 50
+GIF_HIGHEST_RATE = 50
+"""Most frames a second that players show of a GIF."""
+
 _PALETTE_SAMPLE = 2**20
 _MARGIN = 8
 
@@ -50,7 +52,7 @@ def write_gif(path: str | Path, frames: Iterable[Frame], fps: float = 25) -> Non
         NPAError: No frames, a wrong shape, dtype or rate, or the file cannot be written.
     """
     pictures = _check_frames(frames)
-    _check_rate(fps, highest=_GIF_LONGEST_RATE)
+    check_rate(fps, highest=GIF_HIGHEST_RATE)
     palette, background, entry = _shared_palette(pictures)
     indexed = []
     for picture in pictures:
@@ -84,7 +86,7 @@ def write_mp4(path: str | Path, frames: Iterable[Frame], fps: float = 25) -> Non
         MissingDependencyError: imageio or its ffmpeg is not installed.
     """
     pictures = _check_frames(frames)
-    _check_rate(fps)
+    check_rate(fps)
     imageio, ffmpeg = _import_imageio()
     height, width, _ = pictures[0].shape
     padding = ((0, height % 2), (0, width % 2), (0, 0))
@@ -106,6 +108,8 @@ def write_filmstrip(
     columns: int | None = None,
 ) -> None:
     """Write frames side by side into one PNG, each with a caption below.
+
+    Where a caption is wider than the frames, white on either side of each makes room for it.
 
     Args:
         path: The PNG file.
@@ -132,18 +136,33 @@ def write_filmstrip(
     font = _caption_font(captions or [], width)
     _, top, _, bottom = font.getbbox("Ågjy")
     text_height = math.ceil(bottom - top) + _MARGIN if captions else 0
-    pitch_x, pitch_y = width + _MARGIN, height + text_height + _MARGIN
+    cell = max([width, *(math.ceil(font.getlength(caption)) for caption in captions or [])])
+    pitch_x, pitch_y = cell + _MARGIN, height + text_height + _MARGIN
     down = -(-count // across)
     strip = Image.new("RGB", (across * pitch_x + _MARGIN, down * pitch_y + _MARGIN), "white")
     draw = ImageDraw.Draw(strip)
     for k, picture in enumerate(pictures):
         left, upper = _MARGIN + (k % across) * pitch_x, _MARGIN + (k // across) * pitch_y
-        strip.paste(Image.fromarray(picture), (left, upper))
+        strip.paste(Image.fromarray(picture), (left + (cell - width) // 2, upper))
         if captions:
-            middle = (left + width / 2, upper + height + _MARGIN / 2)
+            middle = (left + cell / 2, upper + height + _MARGIN / 2)
             draw.text(middle, captions[k], fill="#333333", font=font, anchor="ma")
     with atomic_path(path) as temporary:
         strip.save(temporary, format="PNG", optimize=True)
+
+
+def check_rate(fps: float, *, highest: float = 1000) -> None:
+    """Check a film's rate.
+
+    Args:
+        fps: Frames a second.
+        highest: The most that are allowed; `GIF_HIGHEST_RATE` for a GIF.
+
+    Raises:
+        NPAError: It is not in [0.1, highest].
+    """
+    if not (math.isfinite(fps) and 0.1 <= fps <= highest):
+        raise NPAError(f"fps must be in [0.1, {highest}], got {fps}: try 25")
 
 
 def _check_frames(frames: Iterable[Frame]) -> list[Frame]:
@@ -165,11 +184,6 @@ def _check_frames(frames: Iterable[Frame]) -> list[Frame]:
                 f"{picture.shape}: render them at one resolution"
             )
     return pictures
-
-
-def _check_rate(fps: float, *, highest: float = 1000) -> None:
-    if not (math.isfinite(fps) and 0.1 <= fps <= highest):
-        raise NPAError(f"fps must be in [0.1, {highest}], got {fps}: try 25")
 
 
 def _shared_palette(pictures: list[Frame]) -> tuple[Image.Image, Frame, int]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import operator
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -91,6 +92,20 @@ def checked_number(name: str, value: Any) -> float:
     raise NPAError(f"{name} must be a number, got {value!r}")
 
 
+def checked_count(name: str, value: Any) -> int:
+    """Return a number of things as an int; NumPy's integers are integers too.
+
+    Raises:
+        NPAError: It is no integer of at least 0.
+    """
+    if not isinstance(value, bool):
+        with contextlib.suppress(TypeError):
+            count = operator.index(value)
+            if count >= 0:
+                return count
+    raise NPAError(f"{name} must be an integer of at least 0, got {value!r}")
+
+
 def checked_eps(name: str, eps: float, dtype: torch.dtype) -> float:
     """Return a perception radius as a float [length units].
 
@@ -138,10 +153,11 @@ def checked_box(box: Box, space_dim: int, eps: float) -> tuple[float, ...] | Non
     """
     if box is None:
         return None
-    if isinstance(box, Iterable) and getattr(box, "ndim", 1) != 0 and not isinstance(box, str):
-        sides = tuple(checked_number("a side of box", side) for side in box)
+    given: Any = box
+    if isinstance(given, Iterable) and getattr(given, "ndim", 1) != 0:
+        sides = tuple(checked_number("a side of box", side) for side in given)
     else:
-        sides = (checked_number("box", box),) * space_dim
+        sides = (checked_number("box", given),) * space_dim
     if len(sides) != space_dim:
         raise NPAError(f"box must have {space_dim} sides, got {len(sides)}: {sides}")
     # Ten digits of grace: a box of exactly 2 eps must pass however both were rounded.

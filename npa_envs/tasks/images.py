@@ -127,7 +127,7 @@ def cut_out_background(image: Image.Image, *, label: str) -> Image.Image:
     return cut
 
 
-def resample(image: Image.Image, point_count: int) -> Image.Image:
+def resample(image: Image.Image, point_count: int, *, label: str = "picture") -> Image.Image:
     """Scale a picture so that the number of its opaque pixels is nearest to `point_count`.
 
     The scale is continuous: the picture is sampled with a pitch found by bisection, on a square
@@ -137,6 +137,10 @@ def resample(image: Image.Image, point_count: int) -> Image.Image:
     Args:
         image: An RGBA picture with at least one opaque pixel.
         point_count: The number of opaque pixels aimed at.
+        label: The name of the picture in error messages.
+
+    Raises:
+        NPAError: Nothing opaque is left at the scale nearest to `point_count`.
     """
     image = image.crop(image.getchannel("A").getbbox())
     area = _opaque_count(image)
@@ -169,6 +173,11 @@ def resample(image: Image.Image, point_count: int) -> Image.Image:
         if best_miss == 0:
             break
         fine, coarse = (middle, coarse) if found > point_count else (fine, middle)
+    if best_miss == point_count and count(best) == 0:
+        raise NPAError(
+            f"target {label!r} is too thin to be resampled to {point_count} points, no opaque "
+            "pixel would be left: thicken it or raise target_point_count"
+        )
     return _sample(padded, span, best)
 
 

@@ -10,7 +10,7 @@ from npa_envs.tasks.checks import check_fraction, check_non_negative, check_posi
 
 @dataclass(frozen=True, kw_only=True)
 class Morphogenesis2DConfig:
-    """2D morphogenesis: a disk of blank particles grows into a picture (design section 4).
+    """2D morphogenesis: a disk of blank particles grows into a picture (arXiv 2601.16096).
 
     The defaults are the paper's. Lengths are in length units: the target's picture spans
     [-1, 1] x [-1, 1].

@@ -74,8 +74,8 @@ def load_target(
 
     Raises:
         NPAError: The name is unknown, the file is missing, unreadable, damaged or fully
-            transparent, it has neither transparency nor a plain background, or a number is out of
-            range.
+            transparent, it has neither transparency nor a plain background, it is too thin for so
+            few points, or a number is out of range.
         MissingDependencyError: An emoji is asked for, and no colour-emoji font is installed.
     """
     if isinstance(point_count, bool) or not isinstance(point_count, int) or point_count < 1:
@@ -136,11 +136,11 @@ def target_from_image(
         device: Where the tensors are made.
 
     Raises:
-        NPAError: No pixel is opaque.
+        NPAError: No pixel is opaque, or the opaque part is too thin for so few points.
     """
     rgba = image.convert("RGBA")
     require_opaque_pixels(rgba, label=name)
-    pixels = np.array(resample(rgba, point_count))
+    pixels = np.array(resample(rgba, point_count, label=name))
     rows, columns = np.nonzero(pixels[..., 3] >= OPAQUE)
     grid = np.stack([columns, -rows], axis=1).astype(np.float64)
     grid -= grid.mean(axis=0)

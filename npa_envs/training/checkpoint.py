@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import pickle
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -33,6 +32,26 @@ MAY_DIFFER = frozenset(
     }
 )
 """Fields that a resumed run may set anew: they do not change what is learned, only how long."""
+
+NEEDED: dict[str, tuple[type, ...]] = {
+    "task_name": (str,),
+    "config": (dict,),
+    "iteration": (int,),
+    "seconds": (int, float),
+    "rule": (dict,),
+    "optimiser": (dict,),
+    "pool": (dict,),
+    "meter": (dict,),
+    "random_states": (dict,),
+}
+"""What a run is resumed from, and of what types it is."""
+
+NEEDED_WITHIN = {
+    "config": {"task"},
+    "pool": {"x", "s"},
+    "random_states": {"schedule", "worlds", "masks"},
+}
+"""What some of it must hold in turn."""
 
 
 def save_checkpoint(path: Path, content: dict[str, Any]) -> None:
@@ -66,26 +85,26 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
             "earlier run as `out`, or start a new run"
         )
     try:
+        # Torch does not look at the checksums.
+        with zipfile.ZipFile(path) as archive:
+            bad = archive.testzip()
+        if bad is not None:
+            raise zipfile.BadZipFile(f"wrong checksum of {bad!r}")
         content = torch.load(path, map_location="cpu", weights_only=True)
     except OSError as error:
         raise NPAError(f"cannot read the checkpoint {str(path)!r}: {error}") from error
-    except (
-        RuntimeError,
-        EOFError,
-        ValueError,
-        KeyError,
-        pickle.UnpicklingError,
-        zipfile.BadZipFile,
-    ) as error:
+    except Exception as error:
+        # What is raised for garbage depends on where in the readers the garbage lands.
         raise NPAError(
             f"{str(path)!r} is not a checkpoint or is damaged ({type(error).__name__}): "
             "start a new run with overwrite, or put a copy of it in its place"
         ) from error
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise NPAError(f"{str(path)!r} is not a checkpoint of npa-envs: choose another folder")
-    if content["format_version"] != FORMAT_VERSION:
+    version = content.get("format_version")
+    if version != FORMAT_VERSION:
         raise NPAError(
-            f"{str(path)!r} has checkpoint format {content['format_version']}, this version reads "
+            f"{str(path)!r} has checkpoint format {version}, this version reads "
             f"{FORMAT_VERSION}: resume it with the version of npa-envs that wrote it"
         )
     return content
@@ -103,8 +122,10 @@ def check_same_run(
         path: Where the checkpoint lies, for the error.
 
     Raises:
-        NPAError: It is of another task, of another configuration, or further than the run goes.
+        NPAError: It lacks something, is of another task, of another configuration, or further
+            than the run goes.
     """
+    _check_complete(content, path)
     if content["task_name"] != task_name:
         raise NPAError(
             f"the checkpoint {str(path)!r} is of task {content['task_name']!r}, "
@@ -126,6 +147,21 @@ def check_same_run(
         raise NPAError(
             f"the checkpoint {str(path)!r} is at iteration {content['iteration']}, beyond the "
             f"{config.total_iterations} of this run: raise repeats"
+        )
+
+
+def _check_complete(content: dict[str, Any], path: Path) -> None:
+    wrong = [name for name, kinds in NEEDED.items() if not isinstance(content.get(name), kinds)]
+    for outer, names in NEEDED_WITHIN.items():
+        if outer not in wrong:
+            wrong += [f"{outer}.{name}" for name in sorted(names - content[outer].keys())]
+    if not wrong and not isinstance(content["config"]["task"], dict):
+        wrong = ["config.task"]
+    if wrong:
+        raise NPAError(
+            f"the checkpoint {str(path)!r} must hold all that a run needs to go on, but lacks "
+            f"{', '.join(wrong)} or has it of a wrong type: start a new run with overwrite, or put "
+            "a copy of it in its place"
         )
 
 

@@ -8,6 +8,7 @@ from typing import Generic, Literal, TypeVar
 
 import torch
 
+from npa_envs.devices import parse_device
 from npa_envs.errors import NPAError
 from npa_envs.tasks.checks import check_fraction, check_non_negative, check_positive, is_whole
 from npa_envs.tasks.morphogenesis2d_config import Morphogenesis2DConfig
@@ -19,7 +20,7 @@ TaskConfigT = TypeVar("TaskConfigT")
 class TrainConfig(Generic[TaskConfigT]):
     """A training run: the schedule, the pool, the optimiser, the machine, what is written.
 
-    The defaults are the paper's for 2D morphogenesis (design section 4). Fields of the task lie
+    The defaults are the paper's for 2D morphogenesis (arXiv 2601.16096). Fields of the task lie
     in `task`; `npa_envs.training.override` and configuration files take both kinds by plain name.
     """
 
@@ -69,7 +70,7 @@ class TrainConfig(Generic[TaskConfigT]):
     """A world with |x| or |s| above this, or not finite, is replaced by a seed in the pool."""
 
     seed: int = 0
-    """Seed of every random number of the run."""
+    """Seed of every random number of the run, in [0, 2**63)."""
 
     device: str = "cpu"
     """Where to train: "cpu", "cuda", "cuda:1", ..."""
@@ -109,10 +110,16 @@ class TrainConfig(Generic[TaskConfigT]):
         check_positive(self, float, "learning_rate", "runaway_limit")
         check_fraction(self, "decay")
         check_non_negative(self, "weight_decay")
-        for name in ("seed", "picture_interval"):
-            value = getattr(self, name)
-            if not is_whole(value) or value < 0:
-                raise NPAError(f"{name} must be a whole number of at least 0, got {value!r}")
+        interval = self.picture_interval
+        if not is_whole(interval) or interval < 0:
+            raise NPAError(
+                f"picture_interval must be a whole number of at least 0, got {interval!r}"
+            )
+        if not is_whole(self.seed) or not 0 <= self.seed < 2**63:
+            raise NPAError(
+                f"seed must be a whole number of at least 0 and below 2**63, got {self.seed!r}: "
+                "for example seed=0"
+            )
         self._check_schedule()
         if self.world_count > self.pool_size:
             raise NPAError(
@@ -122,14 +129,7 @@ class TrainConfig(Generic[TaskConfigT]):
             )
         self._check_choice("dtype", ("float32", "float64"))
         self._check_choice("memory", ("store", "recompute"))
-        try:
-            kind = torch.device(self.device).type
-        except (RuntimeError, TypeError) as error:
-            raise NPAError(
-                f"device must name a device, got {self.device!r}: 'cpu' or 'cuda' ({error})"
-            ) from error
-        if kind not in ("cpu", "cuda"):
-            raise NPAError(f"device must be 'cpu' or 'cuda', got {self.device!r}")
+        parse_device(self.device)
         if not isinstance(self.out, Path):
             raise NPAError(f"out must be a pathlib.Path, got {self.out!r}: Path({self.out!r})")
 

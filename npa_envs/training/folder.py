@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
@@ -92,16 +93,26 @@ class JsonlLog:
     def append(self, record: dict[str, Any]) -> None:
         """Add a line and hand it to the system, so that a kill right after it does not lose it.
 
+        If that fails, the file is cut back to what it held before.
+
         Args:
             record: Numbers and strings; all of them finite.
 
         Raises:
             NPAError: The file cannot be written.
         """
-        line = json.dumps(record, allow_nan=False) + "\n"
+        line = (json.dumps(record, allow_nan=False) + "\n").encode()
         try:
-            with self.path.open("a", encoding="utf-8") as file:
-                file.write(line)
+            # Without a buffer: one would be written again when the file closes.
+            with self.path.open("ab", buffering=0) as file:
+                size = file.tell()
+                try:
+                    while line:
+                        line = line[file.write(line) :]
+                except OSError:
+                    with contextlib.suppress(OSError):
+                        file.truncate(size)
+                    raise
         except OSError as error:
             raise NPAError(
                 f"cannot write the log {str(self.path)!r} ({error.strerror or error}): free disk "

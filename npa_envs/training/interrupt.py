@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -32,6 +33,7 @@ def stop_flag() -> Iterator[StopFlag]:
 
     def stop(number: int, frame: FrameType | None) -> None:
         flag.requested = True
+        print("\nstopping after this iteration; once more to stop at once", file=sys.stderr)
         for signal_number, handler in previous.items():
             signal.signal(signal_number, handler)
 

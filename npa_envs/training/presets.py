@@ -89,7 +89,7 @@ MORPHOGENESIS2D_PRESETS: Mapping[str, Morphogenesis2DTrainConfig] = {
         tensorboard=False,
     ),
 }
-"""2D morphogenesis: `paper` (design section 4), `fast` (minutes on one core), `tiny` (tests)."""
+"""2D morphogenesis: `paper` (arXiv 2601.16096), `fast` (minutes on one core), `tiny` (tests)."""
 
 TASKS: Mapping[str, TaskEntry] = {
     "morphogenesis2d": TaskEntry(

@@ -44,6 +44,9 @@ class TrainResult:
     finished: bool
     """Whether these were all of them; if not, the run was stopped and can be resumed."""
 
+    interrupted: bool
+    """Whether Ctrl-C or SIGTERM stopped it."""
+
     record: dict[str, Any]
     """The last line of the log: loss terms (means over the interval), learning rate, seconds."""
 
@@ -159,7 +162,12 @@ class Trainer:
             if board is not None:
                 board.close()
         return TrainResult(
-            self.rule, self.iteration, self.iteration >= total, record, self.folder.path
+            self.rule,
+            self.iteration,
+            self.iteration >= total,
+            flag.requested,
+            record,
+            self.folder.path,
         )
 
     def save(self) -> None:

@@ -1,0 +1,55 @@
+"""The device that a name stands for."""
+
+from __future__ import annotations
+
+import torch
+
+from npa_envs.errors import NPAError
+
+
+def parse_device(name: str) -> torch.device:
+    """Return the device of that name, whether or not this machine has it.
+
+    Args:
+        name: "cpu", "cuda" or "cuda:1".
+
+    Raises:
+        NPAError: It names no such device.
+    """
+    cure = "use 'cpu', 'cuda' or 'cuda:1'"
+    if not isinstance(name, str):
+        raise NPAError(f"device must be text, got {name!r}: {cure}")
+    try:
+        device = torch.device(name)
+    except (RuntimeError, TypeError) as error:
+        raise NPAError(f"device must name a device, got {name!r}: {cure}") from error
+    if device.type not in ("cpu", "cuda"):
+        raise NPAError(f"device must be 'cpu' or 'cuda', got {name!r}: {cure}")
+    if device.type == "cpu" and name not in ("cpu", "cpu:0"):
+        raise NPAError(f"device must be 'cpu' without a number, got {name!r}: {cure}")
+    # Torch keeps the number in eight bits: "cuda:256" would be the first device.
+    if str(device) != name:
+        raise NPAError(f"device must have a number that torch can count to, got {name!r}: {cure}")
+    return device
+
+
+def check_device(name: str | torch.device) -> torch.device:
+    """Return the device of that name, with its number where it is a CUDA device.
+
+    Args:
+        name: "cpu", "cuda" or "cuda:1", or torch's own device.
+
+    Raises:
+        NPAError: It names no device, or one that this machine does not have.
+    """
+    device = parse_device(str(name) if isinstance(name, torch.device) else name)
+    if device.type != "cuda":
+        return device
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    index = 0 if device.index is None else device.index
+    if index >= count:
+        raise NPAError(
+            f"device must be one that torch sees, got {str(name)!r}, but it sees {count} CUDA "
+            "devices: use device='cpu', or see `npa-envs doctor`"
+        )
+    return torch.device("cuda", index)
