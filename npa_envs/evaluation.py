@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from npa_envs.devices import check_device
 from npa_envs.dynamics import rollout
 from npa_envs.errors import NPAError
 from npa_envs.render.tables import table_text, tables_json
@@ -119,7 +120,7 @@ def evaluate(
         NPAError: `checkpoints` or `seeds` are empty or out of order.
     """
     check_steps("checkpoints", checkpoints)
-    worlds = _Worlds(rule, task, seeds, torch.device(device), progress)
+    worlds = _Worlds(rule, task, seeds, check_device(device), progress)
     x, s = worlds.x, worlds.s
     rows = []
     for step, before in zip(checkpoints, (0, *checkpoints), strict=False):
@@ -201,7 +202,7 @@ def healing(
     check_steps("grow_steps", [grow_steps])
     check_steps("heal_steps", [heal_steps])
     check_steps("every", [every])
-    worlds = _Worlds(rule, task, seeds, torch.device(device), progress)
+    worlds = _Worlds(rule, task, seeds, check_device(device), progress)
     x, s = worlds.grow(worlds.x, worlds.s, grow_steps)
     before = task.metric(x, s)
     normal = torch.randn(

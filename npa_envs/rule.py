@@ -181,6 +181,11 @@ class NPARule(nn.Module):
         """Length A of the update: D+C, or C where particles are static."""
         return self.state_dim + (0 if self.static else self.space_dim)
 
+    @property
+    def weight_count(self) -> int:
+        """Numbers that the rule is made of."""
+        return sum(parameter.numel() for parameter in self.parameters())
+
     def forward(self, perception: Tensor) -> Tensor:
         """Map perception vectors to raw updates, row by row.
 

@@ -1,30 +1,42 @@
-"""What Warp says about itself, for `npa-envs doctor`."""
+"""Starting Warp without its notes, and what it says about itself for `npa-envs doctor`."""
 
 from __future__ import annotations
 
+import contextlib
+import functools
+from collections.abc import Iterator
 from pathlib import Path
 
 import warp as wp
 
 
+@contextlib.contextmanager
+def quiet_warp() -> Iterator[None]:
+    """Keep Warp's banner and its notes on loading modules out of the caller's output."""
+    level = wp.config.log_level
+    wp.config.log_level = max(level, wp.LOG_WARNING)
+    try:
+        yield
+    finally:
+        wp.config.log_level = level
+
+
+@functools.cache
+def start_warp() -> None:
+    """Start Warp, quietly; does nothing from the second call on."""
+    with quiet_warp():
+        wp.init()  # type: ignore[no-untyped-call]
+
+
 def warp_devices() -> list[str]:
     """Return one line for each device that Warp sees; starts Warp, quietly."""
-    _start()
+    start_warp()
     return [f"{device.alias}: {device.name}" for device in wp.get_devices()]
 
 
 def kernel_cache_folder() -> Path:
     """Return the folder that compiled kernels are kept in; starts Warp, quietly."""
-    _start()
+    start_warp()
     folder = wp.config.kernel_cache_dir
     assert folder is not None, "Warp sets its cache folder when it starts"
     return Path(folder)
-
-
-def _start() -> None:
-    before = wp.config.log_level
-    wp.config.log_level = max(before, wp.LOG_WARNING)
-    try:
-        wp.init()  # type: ignore[no-untyped-call]
-    finally:
-        wp.config.log_level = before

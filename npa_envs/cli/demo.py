@@ -190,7 +190,7 @@ def grow_and_heal(options: DemoOptions, report: Report) -> None:
     task = trained.task
     generator = torch.Generator(device).manual_seed(options.seed)
     x, s = task.seed(1, generator=generator, device=device)
-    report.line(f"{options.rule}: {x.shape[1]} particles, {weight_count(rule)} weights")
+    report.line(f"{options.rule}: {x.shape[1]} particles, {rule.weight_count} weights")
 
     def figures(step: int) -> str:
         if trained.doubt is not None:
@@ -291,12 +291,3 @@ def train_small(options: DemoOptions, report: Report) -> None:
     frames = [to_uint8(task.target_picture), film.frames[-1]]
     write_filmstrip(comparison, frames, ["target", f"step {steps}"])
     report.wrote(comparison, RunFolder(result.folder).rule)
-
-
-def weight_count(rule: Any) -> int:
-    """Return how many numbers a rule is made of.
-
-    Args:
-        rule: Any torch module.
-    """
-    return sum(parameter.numel() for parameter in rule.parameters())

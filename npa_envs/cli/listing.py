@@ -39,9 +39,8 @@ def main(arguments: Sequence[str]) -> int:
     print("rules (npa-envs rollout NAME)")
     for name in shipped_rules():
         rule = load_rule(name)
-        weights = sum(parameter.numel() for parameter in rule.parameters())
         shape = f"{rule.space_dim}D, {rule.state_dim} channels, {rule.hidden_dim} hidden units"
-        print(f"  {name}: {shape}, {weights} weights, eps0 {rule.eps0:g}")
+        print(f"  {name}: {shape}, {rule.weight_count} weights, eps0 {rule.eps0:g}")
     if not shipped_rules():
         print("  none")
     return 0

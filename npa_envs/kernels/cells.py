@@ -42,9 +42,8 @@ def cell_kernels(space_dim: int, scalar: type, share: int) -> SimpleNamespace:
         index += cell_index(domain, cell_of(domain, positions[i]))
         cell[i] = index
         arrival[i] = wp.atomic_add(counts, index + 1, 1)
-        if masked != 0:
-            if mask[i] != wp.uint8(0):
-                wp.atomic_add(counts, active_offset + index + 1, 1)
+        if masked != 0 and mask[i] != wp.uint8(0):
+            wp.atomic_add(counts, active_offset + index + 1, 1)
 
     @wp.kernel(enable_backward=False, module=module)
     def place_by_arrival(
@@ -84,9 +83,7 @@ def cell_kernels(space_dim: int, scalar: type, share: int) -> SimpleNamespace:
         i = arrived[k]
         c = cell[i]
         begin = starts[c]
-        active = wp.bool(True)
-        if masked != 0:
-            active = mask[i] != wp.uint8(0)
+        active = masked == 0 or mask[i] != wp.uint8(0)
         rank = wp.int32(0)
         active_rank = wp.int32(0)
         for other in range(begin, starts[c + 1]):

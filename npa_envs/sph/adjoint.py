@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
 from npa_envs.kernels.adjoint import adjoint_kernels
-from npa_envs.kernels.domain import make_domain
-from npa_envs.sph.bridge import lane_count, launch, scalar_type
-from npa_envs.sph.cells import Plan, density_scale
+from npa_envs.sph.bridge import launch
+from npa_envs.sph.cells import density_scale, make_plan
 
 
 @torch.library.custom_op("npa::perceive_rows_backward", mutates_args=())
@@ -24,7 +25,6 @@ def perceive_rows_backward(
     states: Tensor | None,
     particle_count: int,
     state_dim: int,
-    width: int,
     masked: bool,
     eps: float,
     scale: float,
@@ -38,21 +38,17 @@ def perceive_rows_backward(
     """
     total, space_dim = particles.shape[0], particles.shape[1] - 1
     row_capacity = perception.shape[0]
-    scalar = scalar_type(particles.dtype)
-    sides = None if box is None else tuple(box)
-    plan = Plan(
-        scalar=scalar,
-        width=width,
-        lanes=lane_count(particles.device),
-        world_count=total // particle_count,
-        particle_count=particle_count,
-        space_dim=space_dim,
-        state_dim=state_dim,
-        row_capacity=row_capacity,
-        masked=masked,
-        domain=make_domain(space_dim, scalar, eps, sides, particle_count),
+    plan = make_plan(
+        particles,
+        (total // particle_count, particle_count, space_dim),
+        state_dim,
+        row_capacity,
+        masked,
+        eps,
+        box,
     )
-    kernels = adjoint_kernels(space_dim, scalar, width, plan.lanes, state_gradient)
+    width = plan.width
+    kernels = adjoint_kernels(space_dim, plan.scalar, width, plan.lanes, state_gradient)
     device = particles.device
     bar = perception_bar.contiguous()
     blur_bar = bar.new_empty(row_capacity * plan.group_count, width)
@@ -153,13 +149,7 @@ def _(
     states: Tensor | None,
     particle_count: int,
     state_dim: int,
-    width: int,
-    masked: bool,
-    eps: float,
-    scale: float,
-    box: list[float] | None,
-    state_gradient: bool,
-    density_gradient: bool,
+    *options: Any,
 ) -> tuple[Tensor, Tensor]:
     total, space_dim = particles.shape[0], particles.shape[1] - 1
     positions_bar = (

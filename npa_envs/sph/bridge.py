@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-from collections.abc import Iterator
 from typing import Any
 
 import torch
@@ -12,6 +11,7 @@ import warp as wp
 from torch import Tensor
 
 from npa_envs.kernels.lanes import CUDA_LANES
+from npa_envs.warp_report import quiet_warp, start_warp
 
 SCALARS: dict[torch.dtype, Any] = {torch.float32: wp.float32, torch.float64: wp.float64}
 """Warp's scalar type for each floating dtype that the operators take."""
@@ -39,26 +39,9 @@ def lane_count(device: torch.device) -> int:
     return CUDA_LANES if device.type == "cuda" else 1
 
 
-@contextlib.contextmanager
-def _quiet_warp() -> Iterator[None]:
-    """Keep Warp's banner and its notes on loading modules out of the caller's output."""
-    level = wp.config.log_level
-    wp.config.log_level = max(level, wp.LOG_WARNING)
-    try:
-        yield
-    finally:
-        wp.config.log_level = level
-
-
-@functools.cache
-def _start_warp() -> None:
-    with _quiet_warp():
-        wp.init()  # type: ignore[no-untyped-call]
-
-
 def warp_device(device: torch.device) -> Any:
     """Return Warp's device for a torch device, starting Warp (silently) where needed."""
-    _start_warp()
+    start_warp()
     return wp.device_from_torch(device)
 
 
@@ -107,7 +90,7 @@ def launch(kernel: Any, size: int | tuple[int, ...], device: torch.device, *argu
     # The first launch of a kernel loads its module.
     first = (kernel, device) not in _launched
     _launched.add((kernel, device))
-    with _quiet_warp() if first else contextlib.nullcontext():
+    with quiet_warp() if first else contextlib.nullcontext():
         wp.launch(
             kernel,
             size,

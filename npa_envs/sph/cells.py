@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -41,9 +42,19 @@ class Plan(NamedTuple):
         return -(-self.state_dim // self.width)
 
     @property
+    def cell_total(self) -> int:
+        """Cells of all worlds."""
+        return self.world_count * int(self.domain.cell_count)
+
+    @property
     def active_offset(self) -> int:
         """Where the starts of the active rows begin within `starts`."""
-        return self.world_count * int(self.domain.cell_count) if self.masked else 0
+        return self.cell_total if self.masked else 0
+
+    @property
+    def start_count(self) -> int:
+        """Entries of `starts`: one for each cell, once more for active rows, and the end."""
+        return self.cell_total + self.active_offset + 1
 
     @property
     def row_base(self) -> int:
@@ -73,34 +84,35 @@ class SortedWorlds(NamedTuple):
 
 
 def make_plan(
-    x: Tensor,
-    s: Tensor,
+    like: Tensor,
+    shape: Sequence[int],
+    state_dim: int,
     row_capacity: int,
     masked: bool,
     eps: float,
-    box: tuple[float, ...] | None,
-    width: int | None = None,
+    box: Sequence[float] | None,
 ) -> Plan:
-    """Return the plan of a call on positions [B, N, D] and states [B, N, C].
+    """Return the plan of a call on positions of a shape [B, N, D] and `state_dim` channels.
 
-    Channels are grouped by `width`, by default as suits the device.
+    `like` is any tensor of the call: its dtype and device are the worlds'.
     """
     # As integers: a shape that torch.compile left open is fixed here, another one compiled anew.
-    world_count, particle_count, space_dim = (int(size) for size in x.shape)
-    scalar = scalar_type(x.dtype)
+    world_count, particle_count, space_dim = (int(size) for size in shape)
+    scalar = scalar_type(like.dtype)
+    sides = None if box is None else tuple(box)
     plan = Plan(
         scalar=scalar,
-        width=width or channel_width(int(s.shape[2])),
-        lanes=lane_count(x.device),
+        width=channel_width(int(state_dim)),
+        lanes=lane_count(like.device),
         world_count=world_count,
         particle_count=particle_count,
         space_dim=space_dim,
-        state_dim=int(s.shape[2]),
+        state_dim=int(state_dim),
         row_capacity=row_capacity,
         masked=masked,
-        domain=make_domain(space_dim, scalar, eps, box, particle_count),
+        domain=make_domain(space_dim, scalar, eps, sides, particle_count),
     )
-    largest = max(2 * world_count * int(plan.domain.cell_count), plan.total * (1 + plan.state_dim))
+    largest = max(2 * plan.cell_total, plan.total * (1 + plan.state_dim))
     if largest >= LARGEST_INDEX:
         raise NPAError(
             f"worlds must stay below {LARGEST_INDEX} cells and state entries in one batch, got "
@@ -116,10 +128,7 @@ def sort_worlds(plan: Plan, x: Tensor, s: Tensor, mask: Tensor | None) -> Sorted
     kernels = cell_kernels(plan.space_dim, plan.scalar, share)
     device, total = x.device, plan.total
     cell, arrival, arrived = torch.empty(3, total, dtype=torch.int32, device=device).unbind()
-    cell_total = plan.world_count * int(plan.domain.cell_count)
-    counts = torch.zeros(
-        cell_total * (2 if plan.masked else 1) + 1, dtype=torch.int32, device=device
-    )
+    counts = torch.zeros(plan.start_count, dtype=torch.int32, device=device)
     positions = x.view(total, plan.space_dim)
     states = s.view(total, plan.state_dim)
     flat_mask = None if mask is None else mask.view(total)

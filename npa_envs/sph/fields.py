@@ -117,7 +117,7 @@ def perception_fields(x: Tensor, s: Tensor, eps: float, box: Box = None) -> Perc
     x, s = x.contiguous(), s.contiguous()
     world_count, particle_count, space_dim = x.shape
     state_dim = s.shape[2]
-    plan = make_plan(x, s, x.shape[0] * x.shape[1], False, radius, sides)
+    plan = make_plan(x, x.shape, state_dim, x.shape[0] * x.shape[1], False, radius, sides)
     kernels = perception_kernels(space_dim, plan.scalar, plan.width, plan.lanes, True, True)
     ordered = sort_worlds(plan, x, s, None)
     particles, row_density_gradient = compute_density(plan, ordered, kernels, density_gradient=True)

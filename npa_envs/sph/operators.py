@@ -56,7 +56,7 @@ def _perceive_rows(
     moment_correction: bool,
     density_gradient: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    plan = make_plan(x, s, row_capacity, mask is not None, eps, None if box is None else tuple(box))
+    plan = make_plan(x, x.shape, s.shape[2], row_capacity, mask is not None, eps, box)
     kernels = perception_kernels(
         plan.space_dim,
         plan.scalar,
@@ -113,18 +113,15 @@ def _(
     eps: float,
     scale: float,
     box: list[float] | None,
-    state_gradient: bool,
-    moment_correction: bool,
-    density_gradient: bool,
+    *terms: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    plan = make_plan(x, s, row_capacity, mask is not None, eps, None if box is None else tuple(box))
-    cells = plan.world_count * int(plan.domain.cell_count) * (2 if plan.masked else 1)
+    plan = make_plan(x, x.shape, s.shape[2], row_capacity, mask is not None, eps, box)
     integers = torch.int32
     return (
         x.new_empty(row_capacity, row_width),
         x.new_empty(plan.total, dtype=integers),
         x.new_empty(row_capacity, dtype=integers),
-        x.new_empty(cells + 1, dtype=integers),
+        x.new_empty(plan.start_count, dtype=integers),
         x.new_empty(plan.total, dtype=integers),
         x.new_empty(plan.total, plan.space_dim + 1),
         x.new_empty(row_capacity, plan.space_dim),
@@ -164,7 +161,7 @@ class _PerceiveRows(torch.autograd.Function):
         ctx.set_materialize_grads(False)
         if any(ctx.needs_input_grad):
             ctx.options = (eps, scale, box, terms)
-            ctx.shapes = (x.shape, s.shape, states.shape[-1], mask is not None)
+            ctx.shapes = (x.shape, s.shape, mask is not None)
             saved = (perception, row_of, starts, source, particles, row_positions, row_kernel_sum)
             ctx.save_for_backward(*saved, *((states,) if ctx.needs_input_grad[0] else ()))
         return perception, row_of, row_source, starts
@@ -177,14 +174,13 @@ class _PerceiveRows(torch.autograd.Function):
         saved = ctx.saved_tensors
         states = saved[7] if len(saved) == 8 else None
         eps, scale, box, terms = ctx.options
-        x_shape, s_shape, width, masked = ctx.shapes
+        x_shape, s_shape, masked = ctx.shapes
         states_bar, positions_bar = perceive_rows_backward(
             bars[0],
             *saved[:7],
             states,
             x_shape[1],
             s_shape[2],
-            width,
             masked,
             eps,
             scale,

@@ -45,7 +45,7 @@ def _splat(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     lens = _Lens(resolution, pixel_size, sigma, low, high)
     total = x.shape[0] * x.shape[1]
-    plan = make_plan(x, colours, total, False, lens.reach_length, None, width=CHANNELS)
+    plan = make_plan(x, x.shape, CHANNELS, total, False, lens.reach_length, None)
     kernels = splat_kernels(plan.scalar)
     ordered = sort_worlds(plan, x, colours, None)
     footprints = x.new_empty(total, 3)
@@ -82,13 +82,7 @@ def _splat(
 
 @_splat.register_fake
 def _(
-    x: Tensor,
-    colours: Tensor,
-    resolution: int,
-    pixel_size: float,
-    sigma: float,
-    low: float,
-    high: float,
+    x: Tensor, colours: Tensor, resolution: int, *lens: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     total = x.shape[0] * x.shape[1]
     return (
@@ -136,14 +130,7 @@ def _splat_backward(
 
 @_splat_backward.register_fake
 def _(
-    picture_bar: Tensor,
-    footprints: Tensor,
-    sorted_colours: Tensor,
-    source: Tensor,
-    pixel_size: float,
-    sigma: float,
-    low: float,
-    high: float,
+    picture_bar: Tensor, footprints: Tensor, sorted_colours: Tensor, *rest: Any
 ) -> tuple[Tensor, Tensor]:
     return footprints.new_empty(footprints.shape[0], 2), torch.empty_like(sorted_colours)
 

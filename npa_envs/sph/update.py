@@ -51,15 +51,7 @@ def _update_particles(
 
 @_update_particles.register_fake
 def _(
-    update: Tensor,
-    x: Tensor,
-    s: Tensor,
-    path_length: Tensor,
-    row_of: Tensor,
-    reach: float,
-    dt: float,
-    moving: bool,
-    box: list[float] | None,
+    update: Tensor, x: Tensor, s: Tensor, path_length: Tensor, *rest: Any
 ) -> tuple[Tensor, Tensor, Tensor]:
     return torch.empty_like(x), torch.empty_like(s), torch.empty_like(path_length)
 
@@ -100,18 +92,7 @@ def _update_particles_backward(
 
 
 @_update_particles_backward.register_fake
-def _(
-    update: Tensor,
-    new_x_bar: Tensor,
-    new_s_bar: Tensor,
-    new_path_bar: Tensor,
-    row_source: Tensor,
-    starts: Tensor,
-    row_base: int,
-    reach: float,
-    dt: float,
-    moving: bool,
-) -> Tensor:
+def _(update: Tensor, *rest: Any) -> Tensor:
     return torch.empty_like(update, memory_format=torch.contiguous_format)
 
 

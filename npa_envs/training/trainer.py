@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from npa_envs.devices import check_device
 from npa_envs.errors import NPAError
 from npa_envs.files import write_text
 from npa_envs.rule import NPARule
@@ -19,7 +20,6 @@ from npa_envs.rule_io import load_rule, save_rule
 from npa_envs.tasks.task import Task
 from npa_envs.training.checkpoint import check_same_run, load_checkpoint, save_checkpoint
 from npa_envs.training.config import TrainConfig
-from npa_envs.training.device import check_device
 from npa_envs.training.divergence import divergence_error
 from npa_envs.training.folder import JsonlLog, RunFolder, open_tensorboard
 from npa_envs.training.graphs import EagerIteration, GraphedIteration, Rollout
