@@ -1,12 +1,13 @@
 """Neural Particle Automata: differentiable SPH particle worlds.
 
-Names are imported when they are first used, so that importing the package starts neither torch nor
-Warp, and the command line answers at once.
+Importing it registers the Gymnasium environments `npa/...`. Names are imported when they are first
+used, so that the import starts neither torch nor Warp, and the command line answers at once.
 """
 
 from typing import TYPE_CHECKING, Any
 
 from npa_envs._checkout import extend_path as _extend_path
+from npa_envs.registration import register_environments as _register_environments
 
 if TYPE_CHECKING:
     from npa_envs.api import (
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
         NPAError,
         NPARule,
         PerceptionFields,
+        WorldRandom,
         load_rule,
         perceive,
         perception_fields,
@@ -21,9 +23,11 @@ if TYPE_CHECKING:
         save_rule,
         shipped_rules,
         step,
+        world_mean,
     )
 
 _extend_path(__path__, __file__)
+_register_environments()
 
 __version__ = "0.1.0"
 
@@ -32,6 +36,7 @@ __all__ = [
     "NPAError",
     "NPARule",
     "PerceptionFields",
+    "WorldRandom",
     "load_rule",
     "perceive",
     "perception_fields",
@@ -39,6 +44,7 @@ __all__ = [
     "save_rule",
     "shipped_rules",
     "step",
+    "world_mean",
 ]
 
 

@@ -2,15 +2,17 @@
 
 from npa_envs.dynamics import rollout, step
 from npa_envs.errors import MissingDependencyError, NPAError
+from npa_envs.randomness import WorldRandom
 from npa_envs.rule import NPARule
 from npa_envs.rule_io import load_rule, save_rule, shipped_rules
-from npa_envs.sph import PerceptionFields, perceive, perception_fields
+from npa_envs.sph import PerceptionFields, perceive, perception_fields, world_mean
 
 __all__ = [
     "MissingDependencyError",
     "NPAError",
     "NPARule",
     "PerceptionFields",
+    "WorldRandom",
     "load_rule",
     "perceive",
     "perception_fields",
@@ -18,4 +20,5 @@ __all__ = [
     "save_rule",
     "shipped_rules",
     "step",
+    "world_mean",
 ]

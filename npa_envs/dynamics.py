@@ -10,11 +10,11 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from npa_envs.errors import NPAError
+from npa_envs.randomness import Randomness, WorldRandom, check_generator
 from npa_envs.rule import FoldedRule, NPARule
 from npa_envs.sph.checks import (
     Box,
     check_finite_positions,
-    check_generator,
     check_scale,
     check_world,
     checked_box,
@@ -99,10 +99,18 @@ def _checked_options(
 
 
 def _draw(
-    x: Tensor, options: StepOptions, generator: torch.Generator | None
+    x: Tensor, options: StepOptions, generator: Randomness | None
 ) -> tuple[Tensor | None, Tensor | None]:
     """Draw a step's update mask (uint8, [B, N], None for all) and position noise, in this order."""
     mask = noise = None
+    if isinstance(generator, WorldRandom):
+        generator.advance()
+        if options.update_prob < 1.0:
+            mask = generator.bernoulli(options.update_prob, x.shape[1])
+        if options.position_noise > 0.0:
+            noise = generator.normal(*x.shape[1:], dtype=x.dtype)
+            noise *= options.position_noise
+        return mask, noise
     if options.update_prob < 1.0:
         mask = torch.empty(x.shape[:2], dtype=torch.uint8, device=x.device)
         mask.bernoulli_(options.update_prob, generator=generator)
@@ -165,7 +173,7 @@ def step(
     dt: float = 1.0,
     position_noise: float = 0.0,
     detach_positions: bool = True,
-    generator: torch.Generator | None = None,
+    generator: Randomness | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Advance worlds by one step: `rollout` with steps=1; its arguments and errors.
 
@@ -201,7 +209,7 @@ def rollout(
     position_noise: float = ...,
     detach_positions: bool = ...,
     memory: Memory = ...,
-    generator: torch.Generator | None = ...,
+    generator: Randomness | None = ...,
     return_path_length: Literal[False] = ...,
 ) -> tuple[Tensor, Tensor]: ...
 
@@ -220,7 +228,7 @@ def rollout(
     position_noise: float = ...,
     detach_positions: bool = ...,
     memory: Memory = ...,
-    generator: torch.Generator | None = ...,
+    generator: Randomness | None = ...,
     return_path_length: Literal[True],
 ) -> tuple[Tensor, Tensor, Tensor]: ...
 
@@ -238,7 +246,7 @@ def rollout(
     position_noise: float = 0.0,
     detach_positions: bool = True,
     memory: Memory = "store",
-    generator: torch.Generator | None = None,
+    generator: Randomness | None = None,
     return_path_length: bool = False,
 ) -> tuple[Tensor, Tensor] | tuple[Tensor, Tensor, Tensor]:
     """Run a rule for a number of steps; differentiable, and particle i stays particle i.
@@ -263,6 +271,8 @@ def rollout(
         memory: "store" what the backward pass reads, or "recompute" it from each step's worlds:
             several times less memory, about one more forward pass of time. Same gradients.
         generator: Source of the masks and the noise, on x's device; default: torch's global one.
+            A `WorldRandom` advances by one step before each step's draws, so that every world
+            draws what it would draw alone.
         return_path_length: Also return how far each particle travelled.
 
     Returns:
@@ -279,7 +289,7 @@ def rollout(
     options = _checked_options(
         rule, x, s, eps, box, update_prob, dt, position_noise, detach_positions
     )
-    check_generator(generator, x.device)
+    check_generator(generator, x.device, x.shape[0])
     path_length = x.new_zeros(x.shape[:2])
     # Any other rule runs as the module that it is.
     folded = rule.folded() if rule.is_plain() else None

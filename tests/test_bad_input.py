@@ -117,7 +117,7 @@ class TestRollout:
             ({"eps": -0.1}, "eps must be positive"),
             ({"box": 0.1}, "box sides"),
             ({"dt": "fast"}, "dt must be a number"),
-            ({"generator": 3}, "generator must be a torch.Generator, got int"),
+            ({"generator": 3}, "generator must be a torch.Generator or a WorldRandom, got int"),
             ({"memory": "forget"}, "memory must be 'store' or 'recompute'"),
         ],
     )

@@ -208,5 +208,5 @@ def test_damage_can_be_captured_in_a_cuda_graph():
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_generator_of_another_device_is_a_clear_error():
-    with pytest.raises(NPAError, match=r"generator must be on the device of x"):
+    with pytest.raises(NPAError, match=r"generator must be on the worlds' device"):
         random_particle(torch.zeros(1, 4, 2, device="cuda"), torch.Generator())

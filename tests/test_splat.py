@@ -6,7 +6,10 @@ from worlds import relative_error
 
 from npa_envs import NPAError
 from npa_envs import reference as oracle
+from npa_envs.kernels.lens import make_lens
 from npa_envs.sph import splat
+from npa_envs.sph.bridge import launch, scalar_type
+from npa_envs.sph.splat import Splats, device_kernels, gather_threads, scatter_splats, sort_splats
 
 # Worst error measured, then the bound.
 BOUND = {torch.float32: 5e-6, torch.float64: 1e-13}  # 8e-7, 4e-16
@@ -45,6 +48,49 @@ def test_gradients_pass_gradcheck(device):
         lambda x, c: splat(x, c, resolution=12, pixel_size=0.2),
         (x.requires_grad_(), colour.requires_grad_()),
     )
+
+
+@pytest.mark.parametrize("pixel_size", [0.02, 0.09, 0.25])
+@pytest.mark.parametrize("resolution", [8, 13, 33, 38])
+def test_gathered_and_scattered_pictures_are_the_same(resolution, pixel_size, device):
+    x, colour = scattered(2, 61, torch.float64, device)
+    x[1, 3] = torch.nan
+    lens = make_lens(scalar_type(x.dtype), resolution, pixel_size, 1.0, -1.0, 1.0)
+    expected, *_ = scatter_splats(Splats(x, colour), lens)
+    starts, footprints, source = sort_splats(Splats(x, colour), lens)
+    assert sorted(source.tolist()) == list(range(122))
+    picture = torch.full_like(expected, torch.nan)
+    launch(
+        device_kernels(x).gather_splats,
+        gather_threads(2, resolution, x.device),
+        x.device,
+        lens,
+        starts,
+        footprints,
+        picture.view(-1, 4),
+    )
+    torch.testing.assert_close(picture, expected, rtol=1e-12, atol=1e-13)
+
+
+def test_hidden_particles_have_no_gradient(device):
+    x, colour = scattered(1, 20, torch.float32, device)
+    x[0, :4, 0] = torch.tensor([3.0, 1e30, torch.inf, torch.nan])
+    x.requires_grad_()
+    colour.requires_grad_()
+    (splat(x, colour, resolution=40, pixel_size=0.06) ** 2).sum().backward()
+    assert float(x.grad[0, :4].abs().max()) == 0.0
+    assert float(colour.grad[0, :4].abs().max()) == 0.0
+    assert float(x.grad[0, 4:].abs().max()) > 1.0
+
+
+def test_cotangents_may_lie_anywhere_in_memory(device):
+    x, colour = scattered(1, 20, torch.float32, device)
+    x.requires_grad_()
+    picture = splat(x, colour, resolution=10, pixel_size=0.2)
+    generator = torch.Generator().manual_seed(2)
+    shifted = torch.randn(401, generator=generator).to(device)[1:].view(1, 10, 10, 4)
+    (expected,) = torch.autograd.grad(picture, x, shifted.clone(), retain_graph=True)
+    assert torch.equal(torch.autograd.grad(picture, x, shifted)[0], expected)
 
 
 def test_a_particle_inside_the_window_has_the_area_of_a_target_pixel(device):

@@ -177,11 +177,12 @@ def grow_and_heal(options: DemoOptions, report: Report) -> None:
     """
     import torch
 
-    from npa_envs.cli.film import DAMAGE_SIZES, Damage, apply_damage, film_world, write_film
+    from npa_envs.cli.film import film_world, write_film
     from npa_envs.cli.progress import StepBar
     from npa_envs.cli.worlds import task_of_rule
     from npa_envs.evaluation import measure
     from npa_envs.rule_io import load_rule
+    from npa_envs.tasks.damage import DamageEvent, damage_worlds
     from npa_envs.training import check_device
 
     device = check_device(options.device)
@@ -209,8 +210,8 @@ def grow_and_heal(options: DemoOptions, report: Report) -> None:
         lines = [f"  grown for {GROW_STEPS} steps in {watch.seconds:4.1f} s: {figures(GROW_STEPS)}"]
         step = GROW_STEPS
         for kind in ("cut", "erase"):
-            damage = Damage(step, kind, DAMAGE_SIZES[kind])
-            x, s = apply_damage(damage, x, s, generator)
+            damage = DamageEvent(step, kind)
+            x, s = damage_worlds(x, s, kind=kind, generator=generator)
             film.shoot(task, x, s, f"step {step}: {damage.text}", mark=True)
             lines.append(f"  {damage.text}: {figures(step)}")
             with report.timed() as watch:

@@ -15,90 +15,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.dynamics import rollout
-from npa_envs.errors import NPAError, suggest
 from npa_envs.render import to_uint8, write_filmstrip, write_gif, write_mp4
 from npa_envs.rule import NPARule
-from npa_envs.tasks.damage import clump, cut, erase_state, random_particle
+from npa_envs.tasks.damage import DamageEvent, damage_worlds
 
 if TYPE_CHECKING:
     from npa_envs.tasks.task import PictureTask
 
-DAMAGE_SIZES = {"erase": 0.2, "cut": 0.1, "clump": 0.2}
-"""Kinds of damage with their usual size: radius, gap, radius [length units]."""
-
 EARLY_STEPS = (0, 16, 32, 64, 128)
 """Steps that a filmstrip shows, or the frames nearest to them: most of the growth is there."""
-
-CLUMP_FACTOR = 0.9
-"""Share of its distance from the centre that a particle loses when it is clumped."""
-
-
-@dataclass(frozen=True)
-class Damage:
-    """Something done to the worlds after a number of steps."""
-
-    step: int
-    """Steps from the seed."""
-
-    kind: str
-    """One of `DAMAGE_SIZES`."""
-
-    size: float
-    """Radius or gap [length units]."""
-
-    @property
-    def text(self) -> str:
-        """The damage in a few words, for captions."""
-        return f"{self.kind} {self.size:g}"
-
-
-def parse_damage(text: str) -> Damage:
-    """Read "STEP:KIND" or "STEP:KIND:SIZE".
-
-    Args:
-        text: For example "300:cut" or "500:erase:0.3".
-
-    Raises:
-        NPAError: It is written in another way, or the kind is unknown.
-    """
-    parts = text.split(":")
-    kind = parts[1] if len(parts) > 1 else ""
-    if kind and kind not in DAMAGE_SIZES:
-        raise NPAError(f"unknown damage {kind!r} in {text!r}: {suggest(kind, DAMAGE_SIZES)}")
-    try:
-        step = int(parts[0])
-        size = float(parts[2]) if len(parts) == 3 else DAMAGE_SIZES[kind]
-        valid = len(parts) in (2, 3) and step >= 0 and 0 < size < math.inf
-    except (ValueError, KeyError):
-        valid = False
-    if not valid:
-        raise NPAError(
-            f"damage must be STEP:KIND or STEP:KIND:SIZE with a positive size, got {text!r}: "
-            "for example 300:cut or 500:erase:0.3"
-        )
-    return Damage(step, kind, size)
-
-
-def apply_damage(
-    damage: Damage, x: Tensor, s: Tensor, generator: torch.Generator
-) -> tuple[Tensor, Tensor]:
-    """Damage worlds at a random place, or cut them through the middle at a random angle.
-
-    Args:
-        damage: What to do.
-        x: Positions [length units], shape [B, N, D].
-        s: States, shape [B, N, C].
-        generator: Where the place comes from.
-    """
-    if damage.kind == "cut":
-        normal = torch.randn(
-            (len(x), x.shape[2]), generator=generator, device=x.device, dtype=x.dtype
-        )
-        return cut(x, s, centre=x.mean(1), normal=normal, gap=damage.size)
-    centre = random_particle(x, generator)
-    if damage.kind == "clump":
-        return clump(x, s, centre=centre, radius=damage.size, factor=CLUMP_FACTOR)
-    return x, erase_state(x, s, centre=centre, radius=damage.size)
 
 
 @dataclass
@@ -174,7 +99,7 @@ def film_world(
     steps: int,
     *,
     generator: torch.Generator,
-    damages: Sequence[Damage] = (),
+    damages: Sequence[DamageEvent] = (),
     every: int = 8,
     first_step: int = 0,
     film: Film | None = None,
@@ -223,7 +148,7 @@ def film_world(
             if not film.frames or step > first_step:
                 film.shoot(task, x, s, f"step {step}", step=step)
             for damage in hurts.get(step, ()) if step < last else ():
-                x, s = apply_damage(damage, x, s, generator)
+                x, s = damage_worlds(x, s, kind=damage.kind, size=damage.size, generator=generator)
                 film.shoot(task, x, s, f"step {step}: {damage.text}", mark=True)
             if stop():
                 break

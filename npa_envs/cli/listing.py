@@ -10,7 +10,7 @@ import tyro
 
 @dataclass(frozen=True)
 class ListOptions:
-    """Tasks and their presets, built-in targets, shipped rules."""
+    """Tasks and their presets, environments, built-in targets, shipped rules."""
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -23,6 +23,7 @@ def main(arguments: Sequence[str]) -> int:
         0.
     """
     tyro.cli(ListOptions, prog="npa-envs list", args=arguments)
+    from npa_envs.registration import ENVIRONMENTS
     from npa_envs.rule_io import load_rule, shipped_rules
     from npa_envs.tasks.targets import builtin_targets
     from npa_envs.training import TASKS
@@ -34,6 +35,9 @@ def main(arguments: Sequence[str]) -> int:
             print(
                 f"    {preset}: {config.total_iterations} iterations of {config.world_count} worlds"
             )
+    print("environments (gymnasium.make(NAME), gymnasium.make_vec(NAME, num_envs=64))")
+    for environment in ENVIRONMENTS:
+        print(f"  {environment.id}: episodes of {environment.max_episode_steps} steps")
     print("targets (--target NAME, the path of a picture, or one emoji)")
     print(f"  {', '.join(builtin_targets())}")
     print("rules (npa-envs rollout NAME)")

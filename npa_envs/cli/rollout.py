@@ -112,11 +112,12 @@ def run(options: RolloutOptions) -> int:
     """
     import torch
 
-    from npa_envs.cli.film import film_world, parse_damage, write_film
+    from npa_envs.cli.film import film_world, write_film
     from npa_envs.cli.progress import StepBar
     from npa_envs.cli.worlds import make_folder, task_of_rule
     from npa_envs.evaluation import measure
     from npa_envs.rule_io import load_rule
+    from npa_envs.tasks.damage import parse_damage
     from npa_envs.training import check_device
     from npa_envs.training.interrupt import stop_flag
 

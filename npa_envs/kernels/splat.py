@@ -1,10 +1,13 @@
-"""Pictures of 2D worlds: every particle is a small Gaussian.
-
-The picture gathers over particles for each pixel, its adjoint over pixels for each particle.
+"""Pictures of 2D worlds: every particle is a small Gaussian. Their errors against a target.
 
 A particle at pixel p covers the patch of pixels q with |q - round(p)| <= r in both directions; its
 weights exp(-|q - p|^2 / 2 sigma^2) are normalised to sum 1 over the patch, be it inside the picture
-or not.
+or not. They are products of a row's weight and a column's.
+
+On CUDA a few threads gather a tile of pixels. Particles are sorted by the tile that their patch's
+centre lies in, counted from r pixels before the picture: all that cover the tiles of a row of cells
+are then one contiguous run. On the CPU a thread draws a whole world, particle by particle. Either
+way a pixel's sum has an order that depends on its own world alone.
 """
 
 import functools
@@ -12,149 +15,437 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from npa_envs.kernels.domain import domain_types, kernel_module
-
-CHANNELS = 4
-"""Red, green, blue and density."""
+from npa_envs.kernels.domain import scalar_name
+from npa_envs.kernels.lanes import make_lane_scatter, make_lane_sum, make_wide_load
+from npa_envs.kernels.lens import (
+    CHANNELS,
+    GROUP_HEIGHT,
+    GROUP_WIDTH,
+    TILE_HEIGHT,
+    TILE_WIDTH,
+    splat_types,
+)
+from npa_envs.kernels.wide import make_fast_exp2, make_warp_sum, make_wide_store
 
 
 @functools.cache
-def splat_kernels(scalar: type) -> SimpleNamespace:
-    """Return the kernels of one scalar type."""
-    types = domain_types(2, scalar)
-    vector, Domain = types.vector, types.Domain
-    cell_of, segment_count, segment_cells = (
-        types.cell_of,
-        types.segment_count,
-        types.segment_cells,
-    )
-    colour_type = wp.types.vector(CHANNELS, scalar)
-    footprint_type = wp.types.vector(3, scalar)
-    module = kernel_module("splat", 2, scalar)
+def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
+    """Return the kernels of one scalar type; `lanes` threads share a tile, or a particle."""
+    types = splat_types(scalar)
+    Lens, vector, colour_type = types.Lens, types.vector, types.colour
+    footprint_type, pulls_type = types.footprint, types.pulls
+    columns_type, rows_type = types.columns, types.rows
+    weights_type, tile_type = types.weights, types.tile
+    group_tiles = GROUP_WIDTH * GROUP_HEIGHT
+    share = TILE_WIDTH * TILE_HEIGHT // lanes
+    module = wp.get_module(f"npa_envs.kernels.splat_{scalar_name(scalar)}_l{lanes}")
+    load_footprint = make_wide_load(footprint_type, scalar)
+    store_footprint = make_wide_store(footprint_type, scalar)
+    load_colour = make_wide_load(colour_type, scalar)
+    store_colour = make_wide_store(colour_type, scalar)
+    group_sum = make_warp_sum(wp.vec2d)
+    share_out = make_lane_scatter(tile_type, scalar, lanes)
+    lane_sum = make_lane_sum(pulls_type, scalar, lanes)
+    fast_exp2 = make_fast_exp2(scalar)
+
+    @wp.func
+    def patch_weight(falloff: scalar, slope: scalar, offset: scalar):
+        """Gaussian along one direction at a pixel's offset from the patch's centre.
+
+        It is relative to the centre's, so that narrow ones stay finite: with n from the place to
+        the centre the exponent n^2 - (n + o)^2 is -o (2 n + o), and `slope` is -2 n falloff.
+        """
+        return fast_exp2(offset * (slope - falloff * offset))
+
+    @wp.func
+    def pixel_place(
+        lens: Lens,
+        position: vector,
+        centred: wp.int32,
+        means: wp.array(dtype=vector),
+        goal: wp.array(dtype=vector),
+        world: wp.int32,
+    ):
+        """Place of a particle in pixels, its world's mean moved to the goal where asked for."""
+        moved = position
+        if centred != 0:
+            moved = (position - means[world]) + goal[0]
+        return vector(
+            (moved[0] - lens.low) * lens.pixels_per_length,
+            (moved[1] - lens.low) * lens.pixels_per_length,
+        )
 
     @wp.func
     def patch_centre(place: vector):
-        """Nearest pixel of a place in pixels, clamped so that it converts to an integer."""
-        limit = scalar(1.0e6)
-        return vector(
-            wp.clamp(wp.floor(place[0] + scalar(0.5)), -limit, limit),
-            wp.clamp(wp.floor(place[1] + scalar(0.5)), -limit, limit),
-        )
+        return vector(wp.floor(place[0] + scalar(0.5)), wp.floor(place[1] + scalar(0.5)))
 
     @wp.func
-    def patch_weight(away: vector, near: vector, falloff: scalar):
-        """Gaussian relative to the patch's nearest pixel, so that narrow ones do not vanish."""
-        return wp.exp(falloff * (wp.dot(near, near) - wp.dot(away, away)))
+    def visible(lens: Lens, centre: vector):
+        """Whether a patch covers a pixel of the picture; False where its centre is not finite."""
+        begin = -scalar(lens.radius)
+        end = scalar(lens.resolution - 1 + lens.radius)
+        across = centre[0] >= begin and centre[0] <= end
+        return across and centre[1] >= begin and centre[1] <= end
+
+    @wp.func
+    def cell_of_centre(lens: Lens, centre: vector):
+        """Cell of a patch's centre; the last one where it is not visible."""
+        cell = lens.cell_count - 1
+        if visible(lens, centre):
+            cell = (wp.int32(centre[1]) + lens.radius) / wp.static(TILE_HEIGHT) * lens.cell_columns
+            cell += (wp.int32(centre[0]) + lens.radius) / wp.static(TILE_WIDTH)
+        return cell
+
+    @wp.func
+    def footprint_of(
+        lens: Lens,
+        place: vector,
+        i: wp.int32,
+        states: wp.array(dtype=scalar, ndim=2),
+        shift: scalar,
+    ):
+        """Footprint of a particle whose colours are its last three states plus a shift."""
+        centre = patch_centre(place)
+        near = centre - place
+        slope = scalar(-2.0) * lens.falloff * near
+        sums = vector()
+        for o in range(-lens.radius, lens.radius + 1):
+            for d in range(2):
+                sums[d] += patch_weight(lens.falloff, slope[d], scalar(o))
+        factor = lens.area / (sums[0] * sums[1])
+        result = footprint_type()
+        for d in range(2):
+            result[d] = near[d]
+            result[2 + d] = centre[d]
+        for c in range(3):
+            result[4 + c] = factor * (states[i, states.shape[1] - 3 + c] + shift)
+        result[7] = factor
+        return result
+
+    @wp.func
+    def footprint_colours(footprint: footprint_type):
+        return colour_type(footprint[4], footprint[5], footprint[6], footprint[7])
+
+    @wp.func
+    def growth(difference: scalar):
+        size = wp.abs(difference)
+        return size + size * size
+
+    @wp.func
+    def pixel_errors(value: colour_type, target: colour_type):
+        """Density error and weighted colour error of a pixel."""
+        density = growth(value[3] - target[3])
+        colour = growth(value[0] - target[0]) + growth(value[1] - target[1])
+        colour = (colour + growth(value[2] - target[2])) / scalar(3.0) * wp.exp(-density)
+        return wp.vec2d(wp.float64(density), wp.float64(colour))
 
     @wp.kernel(enable_backward=False, module=module)
-    def prepare_splats(
-        sorted_positions: wp.array(dtype=vector),
-        low: scalar,
-        pixels_per_length: scalar,
-        falloff: scalar,
-        radius: wp.int32,
-        area: scalar,
+    def count_splats(
+        lens: Lens,
+        particle_count: wp.int32,
+        positions: wp.array(dtype=vector),
+        centred: wp.int32,
+        means: wp.array(dtype=vector),
+        goal: wp.array(dtype=vector),
+        # outputs
+        cell: wp.array(dtype=wp.int32),
+        arrival: wp.array(dtype=wp.int32),
+        counts: wp.array(dtype=wp.int32),
+    ):
+        """Count the particles of each cell; counts[0] stays zero."""
+        i = wp.tid()
+        world = i / particle_count
+        place = pixel_place(lens, positions[i], centred, means, goal, world)
+        index = world * lens.cell_count + cell_of_centre(lens, patch_centre(place))
+        cell[i] = index
+        arrival[i] = wp.atomic_add(counts, index + 1, 1)
+
+    @wp.kernel(enable_backward=False, module=module)
+    def place_splats(
+        cell: wp.array(dtype=wp.int32),
+        arrival: wp.array(dtype=wp.int32),
+        starts: wp.array(dtype=wp.int32),
+        # outputs
+        arrived: wp.array(dtype=wp.int32),
+    ):
+        """List the particles of each cell in the order in which they were counted."""
+        i = wp.tid()
+        arrived[starts[cell[i]] + arrival[i]] = i
+
+    @wp.kernel(enable_backward=False, module=module)
+    def order_splats(
+        lens: Lens,
+        particle_count: wp.int32,
+        positions: wp.array(dtype=vector),
+        states: wp.array(dtype=scalar, ndim=2),
+        shift: scalar,
+        centred: wp.int32,
+        means: wp.array(dtype=vector),
+        goal: wp.array(dtype=vector),
+        cell: wp.array(dtype=wp.int32),
+        arrived: wp.array(dtype=wp.int32),
+        starts: wp.array(dtype=wp.int32),
         # outputs
         footprints: wp.array(dtype=footprint_type),
+        source: wp.array(dtype=wp.int32),
     ):
-        """Write each particle's place in pixels and its weight's factor: area over patch sum."""
+        """Write each particle's footprint at its rank by index within its cell."""
         k = wp.tid()
-        position = sorted_positions[k]
-        place = vector(
-            (position[0] - low) * pixels_per_length, (position[1] - low) * pixels_per_length
-        )
-        centre = patch_centre(place)
-        sums = vector()
-        for o in range(-radius, radius + 1):
-            for d in range(2):
-                near = centre[d] - place[d]
-                away = near + scalar(o)
-                sums[d] += wp.exp(falloff * (near * near - away * away))
-        footprints[k] = footprint_type(place[0], place[1], area / (sums[0] * sums[1]))
+        i = arrived[k]
+        c = cell[i]
+        world = i / particle_count
+        place = pixel_place(lens, positions[i], centred, means, goal, world)
+        footprint = footprint_of(lens, place, i, states, shift)
+        begin = starts[c]
+        target = k
+        # What nobody sees may lie in any order: there can be many of them.
+        if c != (world + 1) * lens.cell_count - 1:
+            target = begin
+            for other in range(begin, starts[c + 1]):
+                if arrived[other] < i:
+                    target += 1
+        store_footprint(footprints, target, footprint)
+        source[target] = i
+
+    @wp.func
+    def gather_tile(
+        lens: Lens,
+        world: wp.int32,
+        tile_row: wp.int32,
+        tile_column: wp.int32,
+        lane: wp.int32,
+        starts: wp.array(dtype=wp.int32),
+        footprints: wp.array(dtype=footprint_type),
+    ):
+        """Return a lane's share of a tile's pixels, each the weighted sum over its particles."""
+        x = scalar(tile_column * wp.static(TILE_WIDTH))
+        y = scalar(tile_row * wp.static(TILE_HEIGHT))
+        reach = scalar(lens.radius) + scalar(0.5)
+        totals = tile_type()
+        base = world * lens.cell_count + tile_row * lens.cell_columns + tile_column
+        for cell_row in range(lens.cells_down):
+            first = base + cell_row * lens.cell_columns
+            end = starts[first + lens.cells_across]
+            for j in range(starts[first] + lane, end, wp.static(lanes)):
+                footprint = load_footprint(footprints, j)
+                slope_x = scalar(-2.0) * lens.falloff * footprint[0]
+                slope_y = scalar(-2.0) * lens.falloff * footprint[1]
+                columns = columns_type()
+                for c in range(wp.static(TILE_WIDTH)):
+                    offset = (x - footprint[2]) + scalar(c)
+                    weight = patch_weight(lens.falloff, slope_x, offset)
+                    columns[c] = wp.where(wp.abs(offset) < reach, weight, scalar(0.0))
+                rows = rows_type()
+                for r in range(wp.static(TILE_HEIGHT)):
+                    offset = (y - footprint[3]) + scalar(r)
+                    weight = patch_weight(lens.falloff, slope_y, offset)
+                    rows[r] = wp.where(wp.abs(offset) < reach, weight, scalar(0.0))
+                weights = weights_type()
+                for k in range(wp.static(TILE_WIDTH * TILE_HEIGHT)):
+                    weights[k] = (
+                        rows[k / wp.static(TILE_WIDTH)] * columns[k % wp.static(TILE_WIDTH)]
+                    )
+                totals += wp.outer(footprint_colours(footprint), weights)
+        return share_out(totals)
+
+    @wp.func
+    def tile_of(lens: Lens, t: wp.int32):
+        """World, group in the picture, row and column of tiles, and lane of a thread."""
+        across = (lens.tile_columns + wp.static(GROUP_WIDTH - 1)) / wp.static(GROUP_WIDTH)
+        down = (lens.tile_rows + wp.static(GROUP_HEIGHT - 1)) / wp.static(GROUP_HEIGHT)
+        tile = t / wp.static(lanes)
+        group = tile / wp.static(group_tiles)
+        tile -= group * wp.static(group_tiles)
+        world = group / (across * down)
+        group -= world * across * down
+        row = group / across * wp.static(GROUP_HEIGHT) + tile / wp.static(GROUP_WIDTH)
+        column = group % across * wp.static(GROUP_WIDTH) + tile % wp.static(GROUP_WIDTH)
+        return world, group, row, column, t % wp.static(lanes)
+
+    @wp.func
+    def pixel_of(lens: Lens, tile_row: wp.int32, tile_column: wp.int32, k: wp.int32):
+        """Index of a tile's k-th pixel within its picture, -1 where it lies outside."""
+        row = tile_row * wp.static(TILE_HEIGHT) + k / wp.static(TILE_WIDTH)
+        column = tile_column * wp.static(TILE_WIDTH) + k % wp.static(TILE_WIDTH)
+        pixel = row * lens.resolution + column
+        if row >= lens.resolution or column >= lens.resolution:
+            pixel = wp.int32(-1)
+        return pixel
 
     @wp.kernel(enable_backward=False, module=module)
     def gather_splats(
-        domain: Domain,
-        low: scalar,
-        pixel_length: scalar,
-        falloff: scalar,
-        radius: wp.int32,
+        lens: Lens,
         starts: wp.array(dtype=wp.int32),
         footprints: wp.array(dtype=footprint_type),
-        colours: wp.array(dtype=colour_type),
         # outputs
-        picture: wp.array(dtype=colour_type, ndim=3),
+        picture: wp.array(dtype=colour_type),
     ):
-        """Write each pixel: the weighted sum over the particles whose patch covers it."""
-        world, row, column = wp.tid()
-        x = scalar(column)
-        y = scalar(row)
-        reach = scalar(radius) + scalar(0.5)
-        total = colour_type()
-        base = world * domain.cell_count
-        cell = cell_of(domain, vector(low + x * pixel_length, low + y * pixel_length))
-        for segment in range(segment_count(domain, cell)):
-            first, last = segment_cells(domain, cell, segment)
-            for j in range(starts[base + first], starts[base + last]):
-                footprint = footprints[j]
-                place = vector(footprint[0], footprint[1])
-                centre = patch_centre(place)
-                if wp.abs(centre[0] - x) < reach and wp.abs(centre[1] - y) < reach:
-                    away = vector(x - place[0], y - place[1])
-                    weight = footprint[2] * patch_weight(away, centre - place, falloff)
-                    total += weight * colours[j]
-        picture[world, row, column] = total
+        """Write each pixel of the pictures."""
+        world, _group, row, column, lane = tile_of(lens, wp.tid())
+        if row < lens.tile_rows and column < lens.tile_columns:
+            values = gather_tile(lens, world, row, column, lane, starts, footprints)
+            begin = world * lens.resolution * lens.resolution
+            for k in range(wp.static(share)):
+                pixel = pixel_of(lens, row, column, lane * wp.static(share) + k)
+                if pixel >= 0:
+                    value = colour_type(values[0, k], values[1, k], values[2, k], values[3, k])
+                    store_colour(picture, begin + pixel, value)
+
+    @wp.kernel(enable_backward=False, module=module)
+    def gather_errors(
+        lens: Lens,
+        starts: wp.array(dtype=wp.int32),
+        footprints: wp.array(dtype=footprint_type),
+        target: wp.array(dtype=colour_type),
+        # outputs
+        partial_sums: wp.array(dtype=wp.vec2d, ndim=2),
+    ):
+        """Write the sums of both errors over each group of tiles; no picture is written."""
+        t = wp.tid()
+        world, group, row, column, lane = tile_of(lens, t)
+        sums = wp.vec2d()
+        if row < lens.tile_rows and column < lens.tile_columns:
+            values = gather_tile(lens, world, row, column, lane, starts, footprints)
+            for k in range(wp.static(share)):
+                pixel = pixel_of(lens, row, column, lane * wp.static(share) + k)
+                if pixel >= 0:
+                    value = colour_type(values[0, k], values[1, k], values[2, k], values[3, k])
+                    sums += pixel_errors(value, load_colour(target, pixel))
+        sums = group_sum(sums)
+        if t % wp.static(group_tiles * lanes) == 0:
+            partial_sums[world, group] = sums
+
+    @wp.kernel(enable_backward=False, module=module)
+    def scatter_splats(
+        lens: Lens,
+        particle_count: wp.int32,
+        positions: wp.array(dtype=vector),
+        states: wp.array(dtype=scalar, ndim=2),
+        shift: scalar,
+        centred: wp.int32,
+        means: wp.array(dtype=vector),
+        goal: wp.array(dtype=vector),
+        scratch: wp.array(dtype=scalar, ndim=2),
+        # added to
+        picture: wp.array(dtype=colour_type, ndim=3),
+        # outputs
+        footprints: wp.array(dtype=footprint_type),
+        source: wp.array(dtype=wp.int32),
+    ):
+        """Draw a whole world, particle after particle; for devices of few threads."""
+        world = wp.tid()
+        for i in range(world * particle_count, (world + 1) * particle_count):
+            place = pixel_place(lens, positions[i], centred, means, goal, world)
+            footprint = footprint_of(lens, place, i, states, shift)
+            footprints[i] = footprint
+            source[i] = i
+            if visible(lens, patch_centre(place)):
+                column = wp.int32(footprint[2])
+                row = wp.int32(footprint[3])
+                left = wp.max(column - lens.radius, 0)
+                right = wp.min(column + lens.radius, lens.resolution - 1) + 1
+                slope_x = scalar(-2.0) * lens.falloff * footprint[0]
+                slope_y = scalar(-2.0) * lens.falloff * footprint[1]
+                for q in range(left, right):
+                    weight = patch_weight(lens.falloff, slope_x, scalar(q - column))
+                    scratch[world, q - left] = weight
+                colours = footprint_colours(footprint)
+                low = wp.max(row - lens.radius, 0)
+                for p in range(low, wp.min(row + lens.radius, lens.resolution - 1) + 1):
+                    along = patch_weight(lens.falloff, slope_y, scalar(p - row)) * colours
+                    for q in range(left, right):
+                        drawn = picture[world, p, q]
+                        picture[world, p, q] = drawn + scratch[world, q - left] * along
+
+    @wp.kernel(enable_backward=False, module=module)
+    def sum_errors(
+        picture: wp.array(dtype=colour_type, ndim=3),
+        target: wp.array(dtype=colour_type, ndim=2),
+        # outputs
+        partial_sums: wp.array(dtype=wp.vec2d, ndim=2),
+    ):
+        """Write the sums of both errors over each row of the pictures."""
+        world, row = wp.tid()
+        sums = wp.vec2d()
+        for column in range(picture.shape[2]):
+            sums += pixel_errors(picture[world, row, column], target[row, column])
+        partial_sums[world, row] = sums
 
     @wp.kernel(enable_backward=False, module=module)
     def pull_back_splats(
+        lens: Lens,
         particle_count: wp.int32,
-        resolution: wp.int32,
-        pixels_per_length: scalar,
-        falloff: scalar,
-        radius: wp.int32,
         footprints: wp.array(dtype=footprint_type),
-        colours: wp.array(dtype=colour_type),
         source: wp.array(dtype=wp.int32),
-        picture_bar: wp.array(dtype=colour_type, ndim=3),
+        picture_bar: wp.array(dtype=colour_type),
         # outputs
         positions_bar: wp.array(dtype=vector),
-        colours_bar: wp.array(dtype=colour_type),
+        colours_bar: wp.array(dtype=scalar, ndim=2),
     ):
-        """Write the cotangents of each particle's position and colour from its patch."""
-        k = wp.tid()
+        """Write the cotangents of each particle's position and colours from its patch."""
+        k, lane = wp.tid()
         world = k / particle_count
-        footprint = footprints[k]
-        place = vector(footprint[0], footprint[1])
-        centre = patch_centre(place)
-        colour = colours[k]
-        colour_bar = colour_type()
-        pull = vector()
-        patch_sum = scalar(0.0)
-        patch_pull = vector()
-        for row_offset in range(-radius, radius + 1):
-            for column_offset in range(-radius, radius + 1):
-                away = vector(
-                    centre[0] + scalar(column_offset) - place[0],
-                    centre[1] + scalar(row_offset) - place[1],
-                )
-                weight = footprint[2] * patch_weight(away, centre - place, falloff)
-                patch_sum += weight
-                patch_pull += weight * away
-                row = wp.int32(centre[1]) + row_offset
-                column = wp.int32(centre[0]) + column_offset
-                inside = row >= 0 and row < resolution and column >= 0 and column < resolution
-                if inside:
-                    bar = picture_bar[world, row, column]
-                    colour_bar += weight * bar
-                    pull += (weight * wp.dot(bar, colour)) * away
-        # The normalisation keeps the patch's sum: its derivative subtracts the patch's mean pull.
-        pull -= (wp.dot(colour_bar, colour) / patch_sum) * patch_pull
-        i = source[k]
-        positions_bar[i] = (scalar(2.0) * falloff * pixels_per_length) * pull
-        colours_bar[i] = colour_bar
+        footprint = load_footprint(footprints, k)
+        colours = footprint_colours(footprint)
+        centre = vector(footprint[2], footprint[3])
+        near = vector(footprint[0], footprint[1])
+        slope = scalar(-2.0) * lens.falloff * near
+        seen = visible(lens, centre)
+        pulls = pulls_type()
+        if seen:
+            column = wp.int32(centre[0])
+            row = wp.int32(centre[1])
+            left = wp.max(column - lens.radius, 0)
+            right = wp.min(column + lens.radius, lens.resolution - 1) + 1
+            low = wp.max(row - lens.radius, 0)
+            high = wp.min(row + lens.radius, lens.resolution - 1) + 1
+            for p in range(low + lane, high, wp.static(lanes)):
+                away_y = near[1] + scalar(p - row)
+                begin = (world * lens.resolution + p) * lens.resolution
+                along = colour_type()
+                pull = scalar(0.0)
+                for q in range(left, right):
+                    away_x = near[0] + scalar(q - column)
+                    weight = patch_weight(lens.falloff, slope[0], scalar(q - column))
+                    bar = weight * load_colour(picture_bar, begin + q)
+                    along += bar
+                    pull += wp.dot(bar, colours) * away_x
+                weight = patch_weight(lens.falloff, slope[1], scalar(p - row))
+                for c in range(wp.static(CHANNELS)):
+                    pulls[c] += weight * along[c]
+                pulls[4] += weight * pull
+                pulls[5] += weight * wp.dot(along, colours) * away_y
+        pulls = lane_sum(pulls)
+        if lane == 0:
+            position_bar = vector()
+            colour_bar = colour_type()
+            if seen:
+                # The normalisation keeps the patch's sum: its derivative subtracts the mean pull.
+                sums = vector()
+                moments = vector()
+                for o in range(-lens.radius, lens.radius + 1):
+                    for d in range(2):
+                        weight = patch_weight(lens.falloff, slope[d], scalar(o))
+                        sums[d] += weight
+                        moments[d] += weight * (near[d] + scalar(o))
+                for c in range(wp.static(CHANNELS)):
+                    colour_bar[c] = pulls[c]
+                gained = wp.dot(colour_bar, colours)
+                for d in range(2):
+                    position_bar[d] = pulls[4 + d] - gained * moments[d] / sums[d]
+                colour_bar *= footprint[7]
+            i = source[k]
+            positions_bar[i] = lens.pull * position_bar
+            for c in range(3):
+                colours_bar[i, c] = colour_bar[c]
 
     return SimpleNamespace(
-        prepare_splats=prepare_splats,
+        count_splats=count_splats,
+        place_splats=place_splats,
+        order_splats=order_splats,
         gather_splats=gather_splats,
+        gather_errors=gather_errors,
+        scatter_splats=scatter_splats,
+        sum_errors=sum_errors,
         pull_back_splats=pull_back_splats,
     )

@@ -1,6 +1,7 @@
-"""One step's update of positions and states from the rule's outputs, and its adjoint.
+"""One step's update of positions and states: from a rule's outputs, with its adjoint, or actions.
 
-A displacement is alpha eps delta / (1 + |delta|): it never exceeds alpha eps.
+A displacement is alpha eps delta / (1 + |delta|): it never exceeds alpha eps. An action gives it
+as a fraction of alpha eps.
 Source: arXiv 2601.16096, section 3.
 """
 
@@ -11,6 +12,9 @@ import warp as wp
 
 from npa_envs.kernels.domain import domain_types, kernel_module
 
+CHANNEL_SHARE = 4
+"""Channels of a particle that one thread of `apply_actions` changes."""
+
 
 @functools.cache
 def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
@@ -18,7 +22,43 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
     types = domain_types(space_dim, scalar)
     vector = types.vector
     wide = wp.types.vector(space_dim, wp.float64)
+    share = wp.types.vector(CHANNEL_SHARE, scalar)
     module = kernel_module("update", space_dim, scalar)
+
+    @wp.func
+    def displaced(position: vector, factor: wp.float64, direction: wide):
+        """Return a position moved by factor times direction.
+
+        In float64: the position is then rounded once, and rules amplify its rounding.
+        """
+        result = position
+        for d in range(wp.static(space_dim)):
+            result[d] = scalar(wp.float64(position[d]) + factor * direction[d])
+        return result
+
+    @wp.func
+    def wrapped(position: vector, box: vector):
+        """Return a position's image in the periodic box around the origin."""
+        result = position
+        for d in range(wp.static(space_dim)):
+            result[d] -= box[d] * wp.floor(position[d] / box[d] + scalar(0.5))
+        return result
+
+    @wp.func
+    def held(value: scalar, limit: scalar):
+        """Return a value within its limit, 0 where it is not a number, and whether it was moved."""
+        result = value
+        moved = wp.int32(0)
+        if wp.isnan(value):
+            result = scalar(0.0)
+            moved = wp.int32(1)
+        elif value > limit:
+            result = limit
+            moved = wp.int32(1)
+        elif value < -limit:
+            result = -limit
+            moved = wp.int32(1)
+        return result, moved
 
     @wp.kernel(enable_backward=False, module=module)
     def apply_update(
@@ -57,18 +97,15 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
             position = positions[t]
             path = path_length[t]
             if row >= 0 and moving != 0:
-                # In float64: the position is then rounded once, and rules amplify its rounding.
                 delta = wide()
                 for d in range(wp.static(space_dim)):
                     delta[d] = wp.float64(update[row, d])
                 length = wp.length(delta)
                 step = largest_step / (wp.float64(1.0) + length)
-                for d in range(wp.static(space_dim)):
-                    position[d] = scalar(wp.float64(position[d]) + step * delta[d])
+                position = displaced(position, step, delta)
                 path += scalar(step * length)
             if periodic != 0:
-                for d in range(wp.static(space_dim)):
-                    position[d] -= box[d] * wp.floor(position[d] / box[d] + scalar(0.5))
+                position = wrapped(position, box)
             new_positions[t] = position
             new_path_length[t] = path
 
@@ -112,4 +149,109 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
                 bar = largest_step * (shrink * pull[a] + radial * delta[a])
         update_bar[row, a] = bar
 
-    return SimpleNamespace(apply_update=apply_update, pull_back_update=pull_back_update)
+    @wp.kernel(enable_backward=False, module=module)
+    def apply_actions(
+        particle_count: wp.int32,
+        largest_step: wp.float64,
+        largest_change: wp.float64,
+        periodic: wp.int32,
+        box: vector,
+        moving: wp.int32,
+        position_limit: scalar,
+        state_limit: scalar,
+        masked: wp.int32,
+        mask: wp.array(dtype=wp.uint8),
+        noisy: wp.int32,
+        noise: wp.array(dtype=vector),
+        switched: wp.int32,
+        enabled: wp.array(dtype=wp.uint8),
+        state_dim: wp.int32,
+        actions: wp.array(dtype=scalar),
+        # changed in place
+        positions: wp.array(dtype=vector),
+        states: wp.array(dtype=scalar),
+        # outputs
+        diverged: wp.array(dtype=wp.uint8),
+    ):
+        """Move and change the particles that act, and mark the worlds that had to be held back."""
+        # All that is read is asked for before any of it is used: the kernel waits for memory.
+        t = wp.tid()
+        total = positions.shape[0]
+        happens = wp.uint8(1)
+        if switched != 0:
+            happens = enabled[0]
+        held_back = wp.int32(0)
+        i = t
+        if t >= total:
+            # The threads after the first B N: some for each particle, each for every so-manyth of
+            # its channels, so that neighbouring threads touch neighbouring numbers.
+            sharers = (state_dim + wp.static(CHANNEL_SHARE - 1)) / wp.static(CHANNEL_SHARE)
+            i = (t - total) / sharers
+            first = t - total - i * sharers
+            acting = wp.uint8(1)
+            if masked != 0:
+                acting = mask[i]
+            states_begin = i * state_dim
+            actions_begin = states_begin
+            if moving != 0:
+                actions_begin += (i + 1) * wp.static(space_dim)
+            before = share()
+            change = share()
+            for k in range(wp.static(CHANNEL_SHARE)):
+                # The last thread of a particle may have fewer channels, and repeats its first.
+                c = wp.where(first + k * sharers < state_dim, first + k * sharers, first)
+                before[k] = states[states_begin + c]
+                change[k] = actions[actions_begin + c]
+            if happens != wp.uint8(0):
+                for k in range(wp.static(CHANNEL_SHARE)):
+                    c = first + k * sharers
+                    state = before[k]
+                    if acting != wp.uint8(0):
+                        # Comparisons let a value through that is not a number; a clamp would not.
+                        part = change[k]
+                        if part > scalar(1.0):
+                            part = scalar(1.0)
+                        if part < scalar(-1.0):
+                            part = scalar(-1.0)
+                        state = scalar(wp.float64(state) + largest_change * wp.float64(part))
+                    state, state_held = held(state, state_limit)
+                    if c < state_dim:
+                        held_back += state_held
+                        if acting != wp.uint8(0) or state_held != 0:
+                            states[states_begin + c] = state
+        else:
+            position = positions[t]
+            push = vector()
+            if noisy != 0:
+                push = noise[t]
+            acting = wp.uint8(0)
+            direction = wide()
+            if moving != 0:
+                acting = wp.uint8(1)
+                if masked != 0:
+                    acting = mask[t]
+                for d in range(wp.static(space_dim)):
+                    own = t * (wp.static(space_dim) + state_dim) + d
+                    direction[d] = wp.float64(actions[own])
+            if happens != wp.uint8(0):
+                if noisy != 0:
+                    position += push
+                if acting != wp.uint8(0):
+                    length = wp.length(direction)
+                    step = largest_step
+                    if length > wp.float64(1.0):
+                        step = largest_step / length
+                    position = displaced(position, step, direction)
+                if periodic != 0:
+                    position = wrapped(position, box)
+                for d in range(wp.static(space_dim)):
+                    coordinate, coordinate_held = held(position[d], position_limit)
+                    position[d] = coordinate
+                    held_back += coordinate_held
+                positions[t] = position
+        if held_back != 0:
+            diverged[i / particle_count] = wp.uint8(1)
+
+    return SimpleNamespace(
+        apply_update=apply_update, pull_back_update=pull_back_update, apply_actions=apply_actions
+    )

@@ -167,23 +167,3 @@ def checked_box(box: Box, space_dim: int, eps: float) -> tuple[float, ...] | Non
             f"enlarge the box or perceive at a smaller eps"
         )
     return sides
-
-
-def check_generator(generator: torch.Generator | None, device: torch.device) -> None:
-    """Check that a source of randomness is one, on the device where it is used.
-
-    Raises:
-        NPAError: It is no torch.Generator, or on another kind of device.
-    """
-    if generator is None:
-        return
-    if not isinstance(generator, torch.Generator):
-        raise NPAError(
-            f"generator must be a torch.Generator, got {type(generator).__name__}: "
-            f"make it with torch.Generator({device.type!r}).manual_seed(0)"
-        )
-    if generator.device.type != device.type:
-        raise NPAError(
-            f"generator must be on the worlds' device, {device}, got {generator.device}: "
-            f"make it with torch.Generator({device.type!r})"
-        )

@@ -3,92 +3,153 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.kernels.splat import CHANNELS, splat_kernels
+from npa_envs.kernels.lens import (
+    CHANNELS,
+    FOOTPRINT,
+    GROUP_HEIGHT,
+    GROUP_WIDTH,
+    TILE_LANES,
+    group_count,
+    make_lens,
+)
+from npa_envs.kernels.splat import splat_kernels
 from npa_envs.sph.bridge import launch, scalar_type
-from npa_envs.sph.cells import make_plan, sort_worlds
+from npa_envs.sph.cells import LARGEST_INDEX
 from npa_envs.sph.checks import check_world
 
-PATCH_SIGMAS = 3.0
-"""A particle's patch reaches this many standard deviations from its centre."""
+
+class Splats(NamedTuple):
+    """What is drawn: contiguous tensors. Colours are the last three states plus a shift."""
+
+    x: Tensor
+    """Positions [length units], shape [B, N, 2]."""
+    states: Tensor
+    """States, dimensionless, shape [B, N, C]."""
+    shift: float = 0.0
+    """What is added to the states to give colours, dimensionless."""
+    means: Tensor | None = None
+    """Where there are, each world's mean [length units], shape [B, 2], is moved to `goal`."""
+    goal: Tensor | None = None
+    """A position [length units], shape [2]."""
+
+    @property
+    def total(self) -> int:
+        """Particles of all worlds, B N."""
+        return self.x.shape[0] * self.x.shape[1]
+
+    def places(self) -> tuple[Any, ...]:
+        """Arguments of the kernels that say where particles lie."""
+        goal = None if self.goal is None else self.goal.view(1, 2)
+        return int(self.means is not None), self.means, goal
+
+    def contents(self) -> tuple[Any, ...]:
+        """Arguments of the kernels that write footprints."""
+        states = self.states.view(self.total, -1)
+        return self.x.shape[1], self.x.view(-1, 2), states, self.shift, *self.places()
 
 
-class _Lens:
-    """Sizes that follow from a picture's resolution, window and Gaussian."""
+def splat_lanes(device: torch.device) -> int:
+    """Return how many threads of a device share a tile, or a particle."""
+    return TILE_LANES if device.type == "cuda" else 1
 
-    def __init__(
-        self, resolution: int, pixel_size: float, sigma: float, low: float, high: float
-    ) -> None:
-        pixels = resolution * pixel_size / (high - low)
-        self.falloff = 0.5 / (sigma * pixels) ** 2
-        self.radius = math.ceil(PATCH_SIGMAS * sigma * pixels)
-        self.area = pixels * pixels
-        self.low = low
-        self.pixel_length = (high - low) / (resolution - 1)
-        self.reach_length = (self.radius + 0.5) * self.pixel_length
+
+def device_kernels(like: Tensor) -> Any:
+    """Return the kernels for a tensor's dtype and device."""
+    return splat_kernels(scalar_type(like.dtype), splat_lanes(like.device))
+
+
+def gather_threads(world_count: int, resolution: int, device: torch.device) -> int:
+    """Return how many threads gather pictures."""
+    group = GROUP_WIDTH * GROUP_HEIGHT * splat_lanes(device)
+    return world_count * group_count(resolution) * group
+
+
+def aligned(tensor: Tensor) -> Tensor:
+    """Return a contiguous tensor that can be read 16 bytes at a time."""
+    tensor = tensor.contiguous()
+    return tensor if tensor.data_ptr() % 16 == 0 else tensor.clone()
+
+
+def _check_size(largest: int, world_count: int, lens: Any) -> None:
+    if largest >= LARGEST_INDEX:
+        raise NPAError(
+            f"pictures must stay below {LARGEST_INDEX} numbers in one batch, got {world_count} "
+            f"worlds of {lens.resolution} x {lens.resolution} pixels: split the batch"
+        )
+
+
+def sort_splats(splats: Splats, lens: Any) -> tuple[Tensor, Tensor, Tensor]:
+    """Return starts of the cells [B cells + 1], sorted footprints [B N, 8], their sources [B N]."""
+    x, total = splats.x, splats.total
+    kernels = device_kernels(x)
+    cell_total = x.shape[0] * lens.cell_count
+    _check_size(max(cell_total, x.numel()), x.shape[0], lens)
+    cell, arrival, arrived, source = torch.empty(
+        4, total, dtype=torch.int32, device=x.device
+    ).unbind()
+    counts = torch.zeros(cell_total + 1, dtype=torch.int32, device=x.device)
+    places = (x.shape[1], x.view(-1, 2), *splats.places())
+    launch(kernels.count_splats, total, x.device, lens, *places, cell, arrival, counts)
+    starts = torch.cumsum(counts, 0, dtype=torch.int32)
+    launch(kernels.place_splats, total, x.device, cell, arrival, starts, arrived)
+    footprints = x.new_empty(total, FOOTPRINT)
+    sorted_splats = (cell, arrived, starts, footprints, source)
+    launch(kernels.order_splats, total, x.device, lens, *splats.contents(), *sorted_splats)
+    return starts, footprints, source
+
+
+def scatter_splats(splats: Splats, lens: Any) -> tuple[Tensor, Tensor, Tensor]:
+    """Return pictures [B, R, R, 4] with footprints [B N, 8] and their sources [B N]."""
+    x, total = splats.x, splats.total
+    picture = x.new_zeros(x.shape[0], lens.resolution, lens.resolution, CHANNELS)
+    footprints = x.new_empty(total, FOOTPRINT)
+    source = torch.empty(total, dtype=torch.int32, device=x.device)
+    scratch = x.new_empty(x.shape[0], min(2 * lens.radius + 1, lens.resolution))
+    drawn = (*splats.contents(), scratch, picture, footprints, source)
+    launch(device_kernels(x).scatter_splats, x.shape[0], x.device, lens, *drawn)
+    return picture, footprints, source
+
+
+def _draw(splats: Splats, lens: Any) -> tuple[Tensor, Tensor, Tensor]:
+    """As `scatter_splats`, by what suits the device."""
+    x = splats.x
+    if x.device.type != "cuda":
+        return scatter_splats(splats, lens)
+    _check_size(x.shape[0] * CHANNELS * lens.resolution**2, x.shape[0], lens)
+    starts, footprints, source = sort_splats(splats, lens)
+    picture = x.new_empty(x.shape[0], lens.resolution, lens.resolution, CHANNELS)
+    threads = gather_threads(x.shape[0], lens.resolution, x.device)
+    flat = picture.view(-1, CHANNELS)
+    launch(device_kernels(x).gather_splats, threads, x.device, lens, starts, footprints, flat)
+    return picture, footprints, source
 
 
 @torch.library.custom_op("npa::splat", mutates_args=())
 def _splat(
     x: Tensor,
-    colours: Tensor,
+    colour: Tensor,
     resolution: int,
     pixel_size: float,
     sigma: float,
     low: float,
     high: float,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    lens = _Lens(resolution, pixel_size, sigma, low, high)
-    total = x.shape[0] * x.shape[1]
-    plan = make_plan(x, x.shape, CHANNELS, total, False, lens.reach_length, None)
-    kernels = splat_kernels(plan.scalar)
-    ordered = sort_worlds(plan, x, colours, None)
-    footprints = x.new_empty(total, 3)
-    sorted_colours = ordered.states.view(total, CHANNELS)
-    launch(
-        kernels.prepare_splats,
-        total,
-        x.device,
-        ordered.positions,
-        low,
-        1.0 / lens.pixel_length,
-        lens.falloff,
-        lens.radius,
-        lens.area,
-        footprints,
-    )
-    picture = x.new_empty(x.shape[0], resolution, resolution, CHANNELS)
-    launch(
-        kernels.gather_splats,
-        (x.shape[0], resolution, resolution),
-        x.device,
-        plan.domain,
-        low,
-        lens.pixel_length,
-        lens.falloff,
-        lens.radius,
-        ordered.starts,
-        footprints,
-        sorted_colours,
-        picture,
-    )
-    return picture, footprints, sorted_colours, ordered.source
+) -> tuple[Tensor, Tensor, Tensor]:
+    lens = make_lens(scalar_type(x.dtype), resolution, pixel_size, sigma, low, high)
+    return _draw(Splats(x, colour), lens)
 
 
 @_splat.register_fake
-def _(
-    x: Tensor, colours: Tensor, resolution: int, *lens: float
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _(x: Tensor, colour: Tensor, resolution: int, *lens: float) -> tuple[Tensor, Tensor, Tensor]:
     total = x.shape[0] * x.shape[1]
     return (
         x.new_empty(x.shape[0], resolution, resolution, CHANNELS),
-        x.new_empty(total, 3),
-        x.new_empty(total, CHANNELS),
+        x.new_empty(total, FOOTPRINT),
         x.new_empty(total, dtype=torch.int32),
     )
 
@@ -97,7 +158,6 @@ def _(
 def _splat_backward(
     picture_bar: Tensor,
     footprints: Tensor,
-    sorted_colours: Tensor,
     source: Tensor,
     pixel_size: float,
     sigma: float,
@@ -105,23 +165,18 @@ def _splat_backward(
     high: float,
 ) -> tuple[Tensor, Tensor]:
     world_count, resolution = picture_bar.shape[:2]
-    lens = _Lens(resolution, pixel_size, sigma, low, high)
     total = footprints.shape[0]
     positions_bar = footprints.new_empty(total, 2)
-    colours_bar = torch.empty_like(sorted_colours)
+    colours_bar = footprints.new_empty(total, 3)
     launch(
-        splat_kernels(scalar_type(footprints.dtype)).pull_back_splats,
-        total,
+        device_kernels(footprints).pull_back_splats,
+        (total, splat_lanes(footprints.device)),
         footprints.device,
+        make_lens(scalar_type(footprints.dtype), resolution, pixel_size, sigma, low, high),
         total // world_count,
-        resolution,
-        1.0 / lens.pixel_length,
-        lens.falloff,
-        lens.radius,
         footprints,
-        sorted_colours,
         source,
-        picture_bar.contiguous(),
+        aligned(picture_bar).view(-1, CHANNELS),
         positions_bar,
         colours_bar,
     )
@@ -129,19 +184,18 @@ def _splat_backward(
 
 
 @_splat_backward.register_fake
-def _(
-    picture_bar: Tensor, footprints: Tensor, sorted_colours: Tensor, *rest: Any
-) -> tuple[Tensor, Tensor]:
-    return footprints.new_empty(footprints.shape[0], 2), torch.empty_like(sorted_colours)
+def _(picture_bar: Tensor, footprints: Tensor, *rest: Any) -> tuple[Tensor, Tensor]:
+    total = footprints.shape[0]
+    return footprints.new_empty(total, 2), footprints.new_empty(total, 3)
 
 
 class _Splat(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, x: Tensor, colours: Tensor, resolution: int, *lens: float) -> Tensor:
+    def forward(ctx: Any, x: Tensor, colour: Tensor, resolution: int, *lens: float) -> Tensor:
         picture: Tensor
-        picture, *saved = _splat(x, colours, resolution, *lens)
+        picture, *saved = _splat(x, colour, resolution, *lens)
         ctx.lens = lens
-        ctx.shapes = (x.shape, colours.shape)
+        ctx.shapes = (x.shape, colour.shape)
         ctx.save_for_backward(*saved)
         return picture
 
@@ -187,21 +241,33 @@ def splat(
     Raises:
         NPAError: A shape does not fit or a number is out of its range.
     """
+    check_particles(x, colour, 3)
+    check_window(resolution, pixel_size, sigma, lo, hi)
+    picture: Tensor = _Splat.apply(  # type: ignore[no-untyped-call]
+        x.contiguous(), colour.contiguous(), resolution, pixel_size, sigma, lo, hi
+    )
+    return picture
+
+
+def check_particles(x: Tensor, colour: Tensor, width: int | None) -> None:
+    """Check positions with colours of a width, or with states where that is None."""
     check_world(x, colour)
-    if x.shape[2] != 2 or colour.shape[2] != 3:
+    fits = colour.shape[2] >= 3 if width is None else colour.shape[2] == width
+    if x.shape[2] != 2 or not fits:
+        names = "x and states" if width is None else "x and colour"
+        last = "C of at least 3" if width is None else width
         raise NPAError(
-            f"x and colour must have shapes [B, N, 2] and [B, N, 3], "
+            f"{names} must have shapes [B, N, 2] and [B, N, {last}], "
             f"got {tuple(x.shape)} and {tuple(colour.shape)}"
         )
+
+
+def check_window(resolution: int, pixel_size: float, sigma: float, low: float, high: float) -> None:
+    """Check what pictures are drawn by."""
     if resolution < 2:
         raise NPAError(f"resolution must be at least 2 pixels, got {resolution}")
-    if not (lo < hi and math.isfinite(hi - lo)):
-        raise NPAError(f"the window must have lo < hi, got lo={lo} and hi={hi}")
+    if not (low < high and math.isfinite(high - low)):
+        raise NPAError(f"the window must have lo < hi, got lo={low} and hi={high}")
     for name, value in (("pixel_size", pixel_size), ("sigma", sigma)):
         if not (math.isfinite(value) and value > 0.0):
             raise NPAError(f"{name} must be positive and finite, got {value}")
-    channels = torch.cat((colour, torch.ones_like(colour[..., :1])), dim=-1)
-    picture: Tensor = _Splat.apply(  # type: ignore[no-untyped-call]
-        x.contiguous(), channels, resolution, pixel_size, sigma, lo, hi
-    )
-    return picture

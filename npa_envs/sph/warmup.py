@@ -6,10 +6,15 @@ from collections.abc import Iterable
 
 import torch
 
+from npa_envs.sph.actions import apply_actions
+from npa_envs.sph.draws import bernoulli_draw, integer_draw, normal_draw, uniform_draw
 from npa_envs.sph.fields import perceive
+from npa_envs.sph.finite import mark_finite
 from npa_envs.sph.operators import Rows
+from npa_envs.sph.picture_losses import picture_losses
 from npa_envs.sph.splat import splat
 from npa_envs.sph.update import update_particles
+from npa_envs.sph.worlds import world_mean
 
 
 def warmup(
@@ -27,14 +32,36 @@ def warmup(
         dtypes: `torch.float32`, `torch.float64` or both.
         state_dim: State channels C; kernels serve groups of 4, 8 or 16 channels.
     """
+    keys = torch.zeros(1, dtype=torch.int64, device=device)
+    counts = torch.zeros(1, dtype=torch.int32, device=device)
+    bernoulli_draw(keys, counts, counts, 0, 1, 0.5)
+    integer_draw(keys, counts, counts, 0, 1, 2)
     for dtype in dtypes:
+        uniform_draw(keys, counts, counts, 0, 1, dtype)
+        normal_draw(keys, counts, counts, 0, 1, dtype)
+        world_mean(torch.zeros(1, 1, 1, dtype=dtype, device=device))
+        mark_finite(
+            torch.zeros(1, dtype=dtype, device=device),
+            torch.zeros(1, dtype=torch.uint8, device=device),
+        )
         for space_dim in space_dims:
             x = torch.zeros(1, 2, space_dim, dtype=dtype, device=device, requires_grad=True)
             s = torch.zeros(1, 2, state_dim, dtype=dtype, device=device, requires_grad=True)
             _pull_back(perceive(x, s, 0.1, detach_positions=False))
             _warm_update(x, s)
+            _warm_actions(x, s)
             if space_dim == 2:
-                _pull_back(splat(x, x.new_zeros(1, 2, 3), resolution=8, pixel_size=0.1))
+                _warm_pictures(x)
+
+
+def _warm_pictures(x: torch.Tensor) -> None:
+    colours = x.new_zeros(1, x.shape[1], 3)
+    picture = splat(x, colours, resolution=8, pixel_size=0.1)
+    _pull_back(picture)
+    middle = x.new_zeros(2)
+    picture_losses(
+        x.detach(), colours, picture.detach()[0], goal=middle, shift=0.0, pixel_size=0.1
+    )
 
 
 def _warm_update(x: torch.Tensor, s: torch.Tensor) -> None:
@@ -47,6 +74,25 @@ def _warm_update(x: torch.Tensor, s: torch.Tensor) -> None:
         update, x, s, x.new_zeros(x.shape[:2]), rows=rows, reach=0.1, dt=1.0, moving=True, box=None
     )
     _pull_back(moved[0])
+
+
+def _warm_actions(x: torch.Tensor, s: torch.Tensor) -> None:
+    apply_actions(
+        x.new_zeros(*x.shape[:2], x.shape[2] + s.shape[2]),
+        x.detach().clone(),
+        s.detach().clone(),
+        mask=None,
+        noise=None,
+        reach=0.1,
+        dt=1.0,
+        state_scale=1.0,
+        moving=True,
+        box=None,
+        position_limit=1.0,
+        state_limit=1.0,
+        enabled=None,
+        diverged=torch.zeros(x.shape[0], dtype=torch.uint8, device=x.device),
+    )
 
 
 def _pull_back(value: torch.Tensor) -> None:

@@ -6,35 +6,156 @@ Nothing here reads a value back from the device, so all of it may be captured in
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from npa_envs.errors import NPAError
-from npa_envs.sph.checks import check_generator
+from npa_envs.errors import NPAError, suggest
+from npa_envs.randomness import Randomness, WorldRandom, check_generator
+from npa_envs.sph import world_mean
+from npa_envs.tasks.checks import is_real, is_whole
+
+DAMAGE_SIZES = {"erase": 0.2, "cut": 0.1, "clump": 0.2, "noise": 0.05}
+"""Kinds of damage with their usual size: radius, gap, radius, standard deviation [length units]."""
+
+CLUMP_FACTOR = 0.9
+"""Share of its distance from the centre that a particle loses when it is clumped."""
 
 
-def random_particle(x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+@dataclass(frozen=True)
+class DamageEvent:
+    """Something done to worlds after a number of steps."""
+
+    step: int
+    """Steps from the seed."""
+
+    kind: str
+    """One of `DAMAGE_SIZES`."""
+
+    size: float | None = None
+    """Radius, gap or standard deviation [length units]; None is the usual one."""
+
+    def __post_init__(self) -> None:
+        """Check every field.
+
+        Raises:
+            NPAError: The kind is unknown, the step negative, or the size not positive and finite.
+        """
+        if self.kind not in DAMAGE_SIZES:
+            raise NPAError(f"unknown damage {self.kind!r}: {suggest(str(self.kind), DAMAGE_SIZES)}")
+        if not is_whole(self.step) or self.step < 0:
+            raise NPAError(f"step must be a whole number of at least 0, got {self.step!r}")
+        if not is_real(self.extent) or self.extent <= 0:
+            raise NPAError(f"size must be positive and finite, got {self.size}: try 0.1")
+
+    @property
+    def extent(self) -> float:
+        """The size [length units], be it given or the usual one."""
+        return DAMAGE_SIZES[self.kind] if self.size is None else self.size
+
+    @property
+    def text(self) -> str:
+        """The damage in a few words, for captions."""
+        return f"{self.kind} {self.extent:g}"
+
+    def __str__(self) -> str:
+        """The event as `parse_damage` reads it."""
+        return f"{self.step}:{self.kind}" + ("" if self.size is None else f":{self.size!r}")
+
+
+def parse_damage(text: str) -> DamageEvent:
+    """Read "STEP:KIND" or "STEP:KIND:SIZE".
+
+    Args:
+        text: For example "300:cut" or "500:erase:0.3".
+
+    Raises:
+        NPAError: It is written in another way, or the kind is unknown.
+    """
+    parts = text.split(":")
+    kind = parts[1] if len(parts) > 1 else ""
+    if kind and kind not in DAMAGE_SIZES:
+        raise NPAError(f"unknown damage {kind!r} in {text!r}: {suggest(kind, DAMAGE_SIZES)}")
+    if len(parts) in (2, 3):
+        with suppress(ValueError):
+            size = float(parts[2]) if len(parts) == 3 else None
+            return DamageEvent(int(parts[0]), kind, size)
+    raise NPAError(
+        f"damage must be STEP:KIND or STEP:KIND:SIZE with a positive size, got {text!r}: "
+        "for example 300:cut or 500:erase:0.3"
+    )
+
+
+def damage_worlds(
+    x: Tensor,
+    s: Tensor,
+    *,
+    kind: str,
+    size: float | None = None,
+    generator: Randomness | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Damage worlds at a random place, or cut them through the middle at a random angle.
+
+    Args:
+        x: Particle positions [length units], shape [B, N, D].
+        s: Particle states (dimensionless), shape [B, N, C].
+        kind: "erase", "cut", "clump", or "noise" on every position.
+        size: Radius, gap or standard deviation [length units]; None is the usual one.
+        generator: Where the place comes from, on the device of `x`; None is torch's own.
+
+    Returns:
+        The new positions, shape [B, N, D], and states, shape [B, N, C].
+
+    Raises:
+        NPAError: An unknown kind, a wrong shape or dtype, or a size that is negative or not finite.
+    """
+    if kind not in DAMAGE_SIZES:
+        raise NPAError(f"unknown damage {kind!r}: {suggest(str(kind), DAMAGE_SIZES)}")
+    _check_world(x, s)
+    check_generator(generator, x.device, x.shape[0])
+    extent = DAMAGE_SIZES[kind] if size is None else size
+    if not (math.isfinite(extent) and extent >= 0):
+        raise NPAError(f"the size of a damage must be finite and at least 0, got {extent}: try 0.1")
+    if kind == "noise":
+        return x + extent * _normal(x, x.shape, generator), s
+    if kind == "cut":
+        normal = _normal(x, (len(x), x.shape[2]), generator)
+        return cut(x, s, centre=world_mean(x), normal=normal, gap=extent)
+    centre = random_particle(x, generator)
+    if kind == "clump":
+        return clump(x, s, centre=centre, radius=extent, factor=CLUMP_FACTOR)
+    return x, erase_state(x, s, centre=centre, radius=extent)
+
+
+def random_particle(x: Tensor, generator: Randomness | None = None) -> Tensor:
     """Return the position of one particle of each world, each as likely as the others.
 
     Args:
         x: Particle positions [length units], shape [B, N, D].
         generator: Where the choice comes from, on the device of `x`; None is torch's own.
+            A `WorldRandom` of B worlds chooses in each world what it would choose alone.
 
     Returns:
         The chosen positions [length units], shape [B, D].
 
     Raises:
-        NPAError: A wrong shape or dtype, no particles, or a generator on another device.
+        NPAError: A wrong shape or dtype, no particles, or a generator on another device or for
+            another number of worlds.
     """
     _check_positions(x)
-    check_generator(generator, x.device)
+    check_generator(generator, x.device, x.shape[0])
     world_count, particle_count, _ = x.shape
     if particle_count == 0:
         raise NPAError("x must hold at least one particle, got N = 0: give a world with particles")
-    chosen = torch.randint(
-        particle_count, (world_count, 1, 1), generator=generator, device=x.device
-    )
+    if isinstance(generator, WorldRandom):
+        chosen = generator.integers(particle_count, 1, 1)
+    else:
+        chosen = torch.randint(
+            particle_count, (world_count, 1, 1), generator=generator, device=x.device
+        )
     return x.take_along_dim(chosen, dim=1).squeeze(1)
 
 
@@ -118,6 +239,12 @@ def clump(
     share = _per_world("factor", factor, x, highest=1.0)
     pulled = x + share * (centre[:, None] - x)
     return torch.where(inside[..., None], pulled, x), s
+
+
+def _normal(x: Tensor, shape: Sequence[int], generator: Randomness | None) -> Tensor:
+    if isinstance(generator, WorldRandom):
+        return generator.normal(*shape[1:], dtype=x.dtype)
+    return torch.randn(tuple(shape), generator=generator, device=x.device, dtype=x.dtype)
 
 
 def _inside_ball(x: Tensor, centre: Tensor, radius: float | Tensor) -> Tensor:

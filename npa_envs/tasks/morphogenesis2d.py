@@ -6,18 +6,27 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
+from npa_envs.randomness import Randomness
 from npa_envs.rule import COLOUR_OFFSET, NPARule
-from npa_envs.sph import splat
+from npa_envs.sph import splat, world_mean
+from npa_envs.sph.picture_losses import picture_losses
 from npa_envs.tasks.damage import erase_state, random_particle
 from npa_envs.tasks.morphogenesis2d_config import Morphogenesis2DConfig
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.tasks.targets import PointTarget, load_target
+
+UNOWNED = 0.05
+"""Density that belongs to nobody when a pixel's error is shared out among particles."""
 
 
 def _growth(difference: Tensor) -> Tensor:
     """|d| + d^2 of every pixel: linear near the goal, quadratic far from it."""
     size = difference.abs()
     return size + size * size
+
+
+def _pixel_mean(errors: Tensor) -> Tensor:
+    return world_mean(errors.flatten(1)[..., None])[:, 0]
 
 
 class Morphogenesis2D:
@@ -44,6 +53,7 @@ class Morphogenesis2D:
             target = load_target(self.config.target, point_count=self.config.target_point_count)
         self.target = target.to(device)
         """What is to be grown."""
+        self._target_mean = self.target.points.mean(dim=0)
         self.target_picture = self._splat(self.target.points[None], self.target.colours[None])[0]
         """Its picture: rgb sums and density, dimensionless, shape [R, R, 4]."""
 
@@ -75,7 +85,7 @@ class Morphogenesis2D:
             )
 
     def seed(
-        self, world_count: int, *, generator: torch.Generator, device: str | torch.device = "cpu"
+        self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
     ) -> tuple[Tensor, Tensor]:
         """Return fresh worlds: particles uniform in a disk around the origin, all states zero.
 
@@ -93,7 +103,7 @@ class Morphogenesis2D:
         )
         return x, x.new_zeros(world_count, count, self.config.state_dim)
 
-    def damage(self, x: Tensor, s: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    def damage(self, x: Tensor, s: Tensor, generator: Randomness) -> tuple[Tensor, Tensor]:
         """Return the worlds with the states in a disk around one random particle set to zero."""
         if self.config.damage_radius == 0.0:
             return x, s
@@ -111,21 +121,69 @@ class Morphogenesis2D:
         Returns:
             Colour sums and density, dimensionless, shape [B, R, R, 4].
         """
-        if centred:
-            x = x - x.mean(dim=1, keepdim=True) + self.target.points.mean(dim=0).to(x)
-        return self._splat(x, s[..., -3:] + COLOUR_OFFSET)
+        return self._splat(self._centred(x) if centred else x, s[..., -3:] + COLOUR_OFFSET)
+
+    def splat_errors(self, x: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Return each pixel's density error and colour error, dimensionless, shape [B, R, R] each.
+
+        Both are |d| + d^2 between the centred picture and the target's, the second averaged over
+        the colours. The colour error is weighted by exp(-(density error)), without gradient:
+        colours count where there is something to colour. World k's errors are the same, bit for
+        bit, in every batch.
+
+        Args:
+            x: Positions [length units], shape [B, N, 2].
+            s: States, dimensionless, shape [B, N, C].
+        """
+        difference = self.picture(x, s) - self.target_picture.to(x)
+        density = _growth(difference[..., 3])
+        # Added one by one: the order of torch's own sums is not promised.
+        red, green, blue = _growth(difference[..., :3]).unbind(dim=-1)
+        colour = (red + green + blue) / 3.0
+        return density, colour * torch.exp(-density.detach())
 
     def splat_losses(self, x: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return each world's density loss and colour loss, dimensionless, shape [B] each.
 
-        Both are means over pixels (and colours) of |d| + d^2 between the centred picture and the
-        target's. The colour loss weighs a pixel by exp(-(its density loss)), without gradient:
-        colours count where there is something to colour.
+        They are the means of `splat_errors` over the pixels; its arguments. Where no gradient is
+        asked for, no picture is kept.
         """
-        difference = self.picture(x, s) - self.target_picture.to(x)
-        density = _growth(difference[..., 3])
-        colour = _growth(difference[..., :3]).mean(dim=-1) * torch.exp(-density.detach())
-        return density.mean(dim=(1, 2)), colour.mean(dim=(1, 2))
+        if not (torch.is_grad_enabled() and (x.requires_grad or s.requires_grad)):
+            return picture_losses(
+                x,
+                s,
+                self.target_picture,
+                goal=self._target_mean,
+                shift=COLOUR_OFFSET,
+                pixel_size=self.target.pixel_size,
+                sigma=self.config.sigma,
+            )
+        density, colour = self.splat_errors(x, s)
+        return _pixel_mean(density), _pixel_mean(colour)
+
+    def particle_shares(self, x: Tensor, s: Tensor) -> Tensor:
+        """Return each particle's share of its world's splat loss, times N; [B, N].
+
+        A pixel's error is shared out among the particles that cover it, by their weights there;
+        what no particle covers is shared by all alike. The mean over the particles is `metric`, up
+        to rounding.
+
+        Args:
+            x: Positions [length units], shape [B, N, 2].
+            s: States, dimensionless, shape [B, N, C].
+        """
+        with torch.no_grad():
+            density, colour = self.splat_errors(x, s)
+            errors = density + self.config.colour_weight * colour
+        blank = x.new_zeros(*x.shape[:2], 3).requires_grad_()
+        with torch.enable_grad():
+            picture = self._splat(self._centred(x.detach()), blank)
+            owned = errors / (picture[..., 3].detach() + UNOWNED)
+            # The picture is linear in the colours: its pull-back sums over a particle's patch.
+            (pulled,) = torch.autograd.grad(picture[..., 0], blank, owned)
+        pixel_count = self.config.resolution**2
+        unowned = _pixel_mean(UNOWNED * owned)
+        return pulled[..., 0] * (x.shape[1] / pixel_count) + unowned[:, None]
 
     def metric(self, x: Tensor, s: Tensor) -> Tensor:
         """Return each world's splat loss: density + colour_weight x colour, shape [B]."""
@@ -163,6 +221,9 @@ class Morphogenesis2D:
             + config.bound_weight * parts["bound"]
         )
         return total, parts
+
+    def _centred(self, x: Tensor) -> Tensor:
+        return x - world_mean(x)[:, None] + self._target_mean.to(x)
 
     def _splat(self, x: Tensor, colour: Tensor) -> Tensor:
         return splat(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from npa_envs.sph.checks import check_generator
+from npa_envs.randomness import Randomness, WorldRandom, check_generator
 
 
 def uniform_ball(
@@ -14,7 +14,7 @@ def uniform_ball(
     space_dim: int,
     radius: float,
     *,
-    generator: torch.Generator | None = None,
+    generator: Randomness | None = None,
     device: str | torch.device = "cpu",
     dtype: torch.dtype = torch.float32,
 ) -> Tensor:
@@ -25,17 +25,35 @@ def uniform_ball(
         particle_count: Particles in each world N.
         space_dim: Space dimension D.
         radius: Radius of the ball [length units].
-        generator: Source of randomness, on `device`.
+        generator: Source of randomness, on `device`; a `WorldRandom` of B worlds makes each world
+            what it would be alone.
         device: Where the points are made.
         dtype: Their floating dtype.
 
     Raises:
-        NPAError: The generator is on another device.
+        NPAError: The generator is on another device or for another number of worlds.
     """
-    check_generator(generator, torch.device(device))
+    check_generator(generator, torch.device(device), world_count)
+    if isinstance(generator, WorldRandom):
+        return radius * _unit_ball_by_world(generator, particle_count, space_dim, dtype)
     shape = (world_count, particle_count)
     direction = torch.randn(*shape, space_dim, generator=generator, device=device, dtype=dtype)
     # randn is never exactly zero in all coordinates in practice; the floor keeps 0 / 0 away.
     direction /= direction.norm(dim=-1, keepdim=True).clamp_min(1e-12)
     distance = torch.rand(*shape, 1, generator=generator, device=device, dtype=dtype)
     return radius * distance ** (1.0 / space_dim) * direction
+
+
+def _unit_ball_by_world(
+    generator: WorldRandom, particle_count: int, space_dim: int, dtype: torch.dtype
+) -> Tensor:
+    """Return points uniform in the unit ball, by operations that round alike wherever they run.
+
+    Torch's powers round differently at the end of a tensor, which lies elsewhere in other batches.
+    The largest of D uniform numbers is distributed as a D-th root of one.
+    """
+    direction = generator.normal(particle_count, space_dim, dtype=dtype)
+    squares = direction * direction
+    length = sum(squares.unbind(dim=-1), torch.zeros_like(squares[..., 0])).sqrt()
+    distance = generator.uniform(particle_count, space_dim, dtype=dtype).amax(dim=-1)
+    return direction * (distance / length.clamp_min(1e-12))[..., None]

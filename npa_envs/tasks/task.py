@@ -7,6 +7,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from npa_envs.randomness import Randomness
 from npa_envs.rule import NPARule
 
 
@@ -33,11 +34,11 @@ class Task(Protocol):
         """Return an untrained rule on the CPU; its weights are drawn from `generator`."""
 
     def seed(
-        self, world_count: int, *, generator: torch.Generator, device: torch.device
+        self, world_count: int, *, generator: Randomness, device: torch.device
     ) -> tuple[Tensor, Tensor]:
         """Return fresh worlds: positions x [B, N, D] [length units] and states s [B, N, C]."""
 
-    def damage(self, x: Tensor, s: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    def damage(self, x: Tensor, s: Tensor, generator: Randomness) -> tuple[Tensor, Tensor]:
         """Return the worlds damaged, as the pool's are before a rollout, so that they heal."""
 
     def loss(self, x: Tensor, s: Tensor, path_length: Tensor) -> tuple[Tensor, dict[str, Tensor]]:

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import gc
-from collections.abc import Iterator
 from typing import Any, Literal, Protocol
 
 import torch
@@ -12,25 +9,13 @@ from torch import Tensor
 
 import npa_envs.dynamics
 from npa_envs.dynamics import Memory
+from npa_envs.replay import no_garbage_collection
 from npa_envs.rule import NPARule
 from npa_envs.tasks.task import Task
 from npa_envs.training.config import TrainConfig
 
 WARM_UP_STEPS = 2
 """Steps of the eager rollout that loads every kernel before the first capture."""
-
-
-@contextlib.contextmanager
-def _no_garbage_collection() -> Iterator[None]:
-    """Collect garbage now and none inside: freeing an old graph would break a capture."""
-    gc.collect()
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()
 
 
 class Rollout(Protocol):
@@ -168,7 +153,7 @@ class GraphedIteration(EagerIteration):
         graph.register_generator_state(self._generator)
         # The backward pass runs on a thread of its own, whose calls the strict mode would refuse.
         with (
-            _no_garbage_collection(),
+            no_garbage_collection(),
             torch.cuda.graph(
                 graph,
                 pool=self._memory_pool,

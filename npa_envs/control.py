@@ -1,0 +1,181 @@
+"""Worlds whose updates come from outside: what particles perceive, and what an action does.
+
+The same dynamics as `npa_envs.rollout`, with the rule taken out: an action stands where a rule's
+bounded output stands. Nothing here waits for the device, so all of it may be captured in a CUDA
+graph.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from npa_envs.randomness import WorldRandom
+from npa_envs.sph.actions import apply_actions
+from npa_envs.sph.finite import mark_finite
+from npa_envs.sph.operators import Terms, perceive_rows
+from npa_envs.sph.rows import gather_rows
+
+
+@dataclass(frozen=True, kw_only=True)
+class Physics:
+    """The constants of a world that is acted upon."""
+
+    space_dim: int
+    """Space dimension D."""
+
+    state_dim: int
+    """State channels C."""
+
+    eps: float
+    """Perception radius ε [length units]."""
+
+    eps0: float
+    """Radius that perception is scaled to, that of the rule's training [length units]."""
+
+    reach: float
+    """Largest displacement of a step, α ε [length units]."""
+
+    state_scale: float
+    """State step of an action of 1, dimensionless."""
+
+    update_prob: float
+    """Probability p of a particle's update in a step, dimensionless."""
+
+    dt: float
+    """Time step, dimensionless."""
+
+    position_noise: float
+    """Standard deviation of the noise on every position in a step [length units]."""
+
+    box: tuple[float, ...] | None
+    """Sides of the periodic box [length units], or None in open space."""
+
+    moving: bool
+    """Whether particles move; otherwise an action has no displacement."""
+
+    perception_limit: float
+    """What is perceived is clipped to plus and minus this, dimensionless."""
+
+    position_limit: float
+    """A coordinate beyond this is out of bounds [length units]."""
+
+    state_limit: float
+    """A state beyond this is out of bounds, dimensionless."""
+
+    @property
+    def perception_dim(self) -> int:
+        """Length P of a perception vector."""
+        return Terms().perception_dim(self.space_dim, self.state_dim)
+
+    @property
+    def action_dim(self) -> int:
+        """Length A of an action: D + C, or C where particles are static."""
+        return self.state_dim + (self.space_dim if self.moving else 0)
+
+
+def perceive_worlds(x: Tensor, s: Tensor, physics: Physics) -> tuple[Tensor, Tensor]:
+    """Return what every particle perceives as rows in cell order, and the row of each particle.
+
+    Args:
+        x: Positions [length units], shape [B, N, D], finite.
+        s: States, dimensionless, shape [B, N, C], finite.
+        physics: The worlds' constants.
+
+    Returns:
+        Rows, dimensionless, shape [B N, P], and their numbers, int32, shape [B N].
+    """
+    rows, which = perceive_rows(
+        x,
+        s,
+        mask=None,
+        row_capacity=x.shape[0] * x.shape[1],
+        row_width=physics.perception_dim,
+        eps=physics.eps,
+        eps0=physics.eps0,
+        box=physics.box,
+        terms=Terms(),
+    )
+    return rows, which.row_of
+
+
+def place_perception(
+    rows: Tensor, row_of: Tensor, physics: Physics, shape: Sequence[int], out: Tensor | None = None
+) -> Tensor:
+    """Return perception in the particles' own order, clipped, shape [B, N, P].
+
+    Args:
+        rows: Rows of `perceive_worlds`.
+        row_of: The row of each particle.
+        physics: The worlds' constants.
+        shape: B and N, and whatever follows.
+        out: Where to write it; a new tensor otherwise.
+    """
+    if out is None:
+        out = rows.new_empty(shape[0], shape[1], rows.shape[1])
+    gather_rows(rows, row_of, physics.perception_limit, out.view(rows.shape))
+    return out
+
+
+@torch.no_grad()
+def observe(x: Tensor, s: Tensor, physics: Physics) -> Tensor:
+    """Return what every particle perceives, clipped: z of `npa_envs.perceive`, [B, N, P].
+
+    Args:
+        x: Positions [length units], shape [B, N, D], finite.
+        s: States, dimensionless, shape [B, N, C], finite.
+        physics: The worlds' constants.
+    """
+    return place_perception(*perceive_worlds(x, s, physics), physics, x.shape)
+
+
+@torch.no_grad()
+def act(
+    x: Tensor,
+    s: Tensor,
+    action: Tensor,
+    physics: Physics,
+    random: WorldRandom,
+    *,
+    enabled: Tensor,
+    diverged: Tensor,
+) -> None:
+    """Apply one step's actions in place: draws the masks and the noise as `rollout` does.
+
+    Args:
+        x: Positions [length units], shape [B, N, D], finite.
+        s: States, dimensionless, shape [B, N, C], finite.
+        action: Displacement as a fraction of α ε (D, norm clipped to 1), then state step as a
+            fraction of `state_scale` (C, clipped to [-1, 1]); shape [B, N, A].
+        physics: The worlds' constants.
+        random: Where masks and noise come from; advanced by one step.
+        enabled: Set to whether all actions are finite; where not, no world changes; uint8, [1].
+        diverged: Set to 1 for worlds in which a number left its bounds or is not finite, uint8,
+            shape [B]; such numbers are moved back to the bounds, NaN to 0.
+    """
+    mark_finite(action, enabled)
+    random.advance()
+    mask = noise = None
+    if physics.update_prob < 1.0:
+        mask = random.bernoulli(physics.update_prob, x.shape[1])
+    if physics.position_noise > 0.0:
+        noise = random.normal(*x.shape[1:], dtype=x.dtype) * physics.position_noise
+    apply_actions(
+        action,
+        x,
+        s,
+        mask=mask,
+        noise=noise,
+        reach=physics.reach,
+        dt=physics.dt,
+        state_scale=physics.state_scale,
+        moving=physics.moving,
+        box=physics.box,
+        position_limit=physics.position_limit,
+        state_limit=physics.state_limit,
+        enabled=enabled,
+        diverged=diverged,
+    )

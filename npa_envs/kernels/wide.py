@@ -1,0 +1,109 @@
+"""Native snippets beside those of `lanes`: what plain Warp cannot say on CUDA.
+
+Stores of 16 bytes at a time, sums over a warp, the hardware's own exponential.
+"""
+
+import functools
+from typing import Any
+
+import warp as wp
+
+from npa_envs.kernels.domain import scalar_name
+
+_STORE = """
+#if defined(__CUDA_ARCH__)
+    struct alignas(16) Chunk { unsigned part[4]; };
+    Chunk* to = reinterpret_cast<Chunk*>(entries.data + index);
+    const unsigned* from = reinterpret_cast<const unsigned*>(&value);
+    #pragma unroll
+    for (unsigned i = 0; i < sizeof(value) / 16; ++i) {
+        Chunk chunk;
+        #pragma unroll
+        for (unsigned k = 0; k < 4; ++k) chunk.part[k] = from[4 * i + k];
+        to[i] = chunk;
+    }
+#else
+    entries.data[index] = value;
+#endif
+"""
+
+_WARP_SUM = """
+#if defined(__CUDA_ARCH__)
+    auto parts = value;
+    double* sums = reinterpret_cast<double*>(&parts);
+    #pragma unroll
+    for (unsigned i = 0; i < sizeof(parts) / sizeof(double); ++i) {
+        #pragma unroll
+        for (unsigned offset = 16; offset > 0; offset >>= 1) {
+            sums[i] += __shfl_xor_sync(0xffffffffu, sums[i], offset);
+        }
+    }
+    return parts;
+#else
+    return value;
+#endif
+"""
+
+_EXP2 = """
+#if defined(__CUDA_ARCH__)
+    return ::exp2(value);
+#else
+    return wp::exp(value * 0.69314718055994530942);
+#endif
+"""
+
+_FAST_EXP2 = """
+#if defined(__CUDA_ARCH__)
+    float power;
+    asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(power) : "f"(value));
+    return power;
+#else
+    return wp::exp(value * 0.69314718f);
+#endif
+"""
+
+
+@functools.cache
+def make_wide_store(value_type: type, scalar: type) -> Any:
+    """Return a Warp function that writes an entry of a flat array 16 bytes at a time on CUDA.
+
+    Args:
+        value_type: A vector or matrix type of a multiple of 16 bytes.
+        scalar: The scalar type that it is made of.
+    """
+
+    @wp.func_native(_STORE)
+    def wide_store(entries: wp.array(dtype=value_type), index: wp.int32, value: value_type): ...
+
+    return wide_store
+
+
+@functools.cache
+def make_warp_sum(value_type: type) -> Any:
+    """Return a Warp function that adds a value over the 32 threads of a warp; each gets the sum.
+
+    All 32 must call it. On the CPU it returns its argument.
+
+    Args:
+        value_type: `wp.float64` or a vector of it.
+    """
+
+    @wp.func_native(_WARP_SUM)
+    def warp_sum(value: value_type) -> value_type: ...
+
+    return warp_sum
+
+
+@functools.cache
+def make_fast_exp2(scalar: type) -> Any:
+    """Return a Warp function for powers of two, in float32 on CUDA right to about 2e-7.
+
+    Args:
+        scalar: `wp.float32` or `wp.float64`.
+    """
+    snippet = {"f32": _FAST_EXP2, "f64": _EXP2}[scalar_name(scalar)]
+
+    @wp.func_native(snippet)
+    def fast_exp2(value: scalar) -> scalar: ...
+
+    return fast_exp2

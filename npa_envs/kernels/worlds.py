@@ -1,0 +1,59 @@
+"""Means over each world whose order of summation depends on nothing but the world's own size.
+
+On CUDA the threads of a warp share a sum, first of a chunk of values, then of the chunks' sums.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from npa_envs.kernels.domain import scalar_name
+from npa_envs.kernels.wide import make_warp_sum
+
+CHUNK = 256
+"""Values whose sum is one partial sum."""
+
+MEAN_LANES = 32
+"""CUDA threads that share a sum: a warp; one on the CPU."""
+
+
+@functools.cache
+def mean_kernels(scalar: type, lanes: int) -> SimpleNamespace:
+    """Return the kernels of one scalar type; `lanes` threads share a sum."""
+    module = wp.get_module(f"npa_envs.kernels.worlds_{scalar_name(scalar)}_l{lanes}")
+    lane_sum = make_warp_sum(wp.float64)
+
+    @wp.kernel(enable_backward=False, module=module)
+    def sum_chunks(
+        values: wp.array(dtype=scalar, ndim=3),
+        # outputs
+        partial_sums: wp.array(dtype=wp.float64, ndim=3),
+    ):
+        """Sum each chunk of a world's values."""
+        world, k, chunk, lane = wp.tid()
+        total = wp.float64(0.0)
+        end = wp.min((chunk + 1) * wp.static(CHUNK), values.shape[1])
+        for m in range(chunk * wp.static(CHUNK) + lane, end, wp.static(lanes)):
+            total += wp.float64(values[world, m, k])
+        total = lane_sum(total)
+        if lane == 0:
+            partial_sums[world, chunk, k] = total
+
+    @wp.kernel(enable_backward=False, module=module)
+    def average_sums(
+        value_count: wp.float64,
+        partial_sums: wp.array(dtype=wp.float64, ndim=3),
+        # outputs
+        means: wp.array(dtype=scalar, ndim=2),
+    ):
+        """Add the partial sums of each world and divide by the number of values."""
+        world, k, lane = wp.tid()
+        total = wp.float64(0.0)
+        for part in range(lane, partial_sums.shape[1], wp.static(lanes)):
+            total += partial_sums[world, part, k]
+        total = lane_sum(total)
+        if lane == 0:
+            means[world, k] = scalar(total / value_count)
+
+    return SimpleNamespace(sum_chunks=sum_chunks, average_sums=average_sums)

@@ -1,0 +1,246 @@
+"""Randomness of batched worlds: one stream for each world, the same on every device."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from npa_envs.errors import NPAError
+from npa_envs.sph.checks import DTYPES, checked_count, checked_number
+from npa_envs.sph.draws import bernoulli_draw, integer_draw, normal_draw, uniform_draw
+
+
+class WorldRandom:
+    """Random streams of batched worlds.
+
+    A draw is a function of its world's seed, episode, step and the number of draws before it in
+    this step, and never of the other worlds: world k of a batch draws what it draws alone.
+    Integers and uniform numbers are the same on every device, bit for bit; normal numbers up to
+    the last bit. Nothing here waits for the device, and a CUDA graph that begins with `advance`
+    draws anew at each replay.
+
+    Args:
+        seeds: Seed of each world, integers of at least 0; one integer is one world.
+        device: Where the numbers are drawn.
+
+    Raises:
+        NPAError: A seed is no integer of at least 0, or there is none.
+
+    Attributes:
+        keys: Key of each world, the seed's first 64 random bits, int64, shape [B].
+        episodes: Episode of each world, from 0 on, int32, shape [B].
+        steps: Step of each world within its episode, int32, shape [B]; an episode is seeded in
+            step 0.
+    """
+
+    def __init__(self, seeds: int | Sequence[int], *, device: str | torch.device = "cpu") -> None:
+        given = list(seeds) if isinstance(seeds, Sequence | np.ndarray) else [seeds]
+        if not given:
+            raise NPAError("seeds must hold at least one seed, got none: give one for each world")
+        # The first draw of NumPy's generator is what Gymnasium's seeding gives as well.
+        keys = [
+            np.random.default_rng(checked_count("a seed", seed)).integers(2**64, dtype=np.uint64)
+            for seed in given
+        ]
+        bits = torch.from_numpy(np.array(keys, dtype=np.uint64).view(np.int64))
+        self._start(bits.to(device))
+
+    def _start(self, keys: Tensor) -> None:
+        self.keys = keys
+        self.episodes = torch.zeros(keys.shape, dtype=torch.int32, device=keys.device)
+        self.steps = torch.zeros_like(self.episodes)
+        self._draw_count = 0
+
+    @classmethod
+    def from_keys(cls, keys: Tensor) -> WorldRandom:
+        """Return streams with given keys, at their beginning.
+
+        Args:
+            keys: Any 64 bits for each world, int64, shape [B]; copied.
+
+        Raises:
+            NPAError: The keys are no int64 tensor of shape [B].
+        """
+        if not isinstance(keys, Tensor) or keys.dtype != torch.int64 or keys.ndim != 1:
+            came = (
+                f"{keys.dtype} of shape {tuple(keys.shape)}"
+                if isinstance(keys, Tensor)
+                else type(keys).__name__
+            )
+            raise NPAError(
+                f"keys must be an int64 tensor of shape [B], got {came}: "
+                f"make streams from integers with WorldRandom(seeds)"
+            )
+        made = cls.__new__(cls)
+        made._start(keys.clone(memory_format=torch.contiguous_format))
+        return made
+
+    @property
+    def device(self) -> torch.device:
+        """Where the numbers are drawn."""
+        return self.keys.device
+
+    @property
+    def world_count(self) -> int:
+        """Worlds B."""
+        return self.keys.shape[0]
+
+    def advance(self) -> None:
+        """Begin the next step of every world, in place; its draws begin anew."""
+        self.steps += 1
+        self._draw_count = 0
+
+    def restart(self) -> None:
+        """Begin the next episode of every world, in place, at step 0; its draws begin anew."""
+        self.episodes += 1
+        self.steps.zero_()
+        self._draw_count = 0
+
+    def take(self, worlds: Tensor | slice) -> WorldRandom:
+        """Return a copy of the streams of some worlds, which goes on where these stand.
+
+        Args:
+            worlds: Indices of the worlds, int64, shape [K], or a slice.
+        """
+        made = WorldRandom.__new__(WorldRandom)
+        made.keys = self.keys[worlds].clone()
+        made.episodes = self.episodes[worlds].clone()
+        made.steps = self.steps[worlds].clone()
+        made._draw_count = self._draw_count
+        return made
+
+    def put(self, worlds: Tensor | slice, other: WorldRandom) -> None:
+        """Write the keys, episodes and steps of other streams into some worlds, in place.
+
+        All worlds share the number of the next draw, so draws are what these worlds would draw
+        alone from the next `advance` on; until then no number is drawn twice.
+
+        Args:
+            worlds: Indices of the worlds, int64, shape [K], or a slice.
+            other: Streams of K worlds.
+        """
+        self.keys[worlds] = other.keys
+        self.episodes[worlds] = other.episodes
+        self.steps[worlds] = other.steps
+        self._draw_count = max(self._draw_count, other._draw_count)
+
+    def uniform(self, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+        """Return numbers uniform in [0, 1), shape [B, *shape].
+
+        Args:
+            shape: Shape of each world's numbers.
+            dtype: `torch.float32`, with 24 random bits, or `torch.float64`, with 53.
+
+        Raises:
+            NPAError: A size is no integer of at least 0, or the dtype is another one.
+        """
+        _check_dtype(dtype)
+        count = _element_count(shape)
+        drawn: Tensor = uniform_draw(*self._next(), count, dtype)
+        return drawn.view(self.world_count, *shape)
+
+    def normal(self, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+        """Return standard normal numbers, always finite, shape [B, *shape].
+
+        Args:
+            shape: Shape of each world's numbers.
+            dtype: `torch.float32` or `torch.float64`.
+
+        Raises:
+            NPAError: A size is no integer of at least 0, or the dtype is another one.
+        """
+        _check_dtype(dtype)
+        count = _element_count(shape)
+        drawn: Tensor = normal_draw(*self._next(), count, dtype)
+        return drawn.view(self.world_count, *shape)
+
+    def bernoulli(self, probability: float, *shape: int) -> Tensor:
+        """Return ones with a probability and zeros otherwise, uint8, shape [B, *shape].
+
+        Args:
+            probability: Probability of a one, in [0, 1], held to 2^-32.
+            shape: Shape of each world's numbers.
+
+        Raises:
+            NPAError: The probability lies elsewhere, or a size is no integer of at least 0.
+        """
+        chance = checked_number("probability", probability)
+        if not 0.0 <= chance <= 1.0:
+            raise NPAError(f"probability must lie in [0, 1], got {probability}: try 0.5")
+        count = _element_count(shape)
+        drawn: Tensor = bernoulli_draw(*self._next(), count, chance)
+        return drawn.view(self.world_count, *shape)
+
+    def integers(self, high: int, *shape: int) -> Tensor:
+        """Return integers uniform in [0, high), int64, shape [B, *shape].
+
+        Args:
+            high: One more than the largest, from 1 to 2^63 - 1.
+            shape: Shape of each world's numbers.
+
+        Raises:
+            NPAError: `high` lies elsewhere, or a size is no integer of at least 0.
+        """
+        limit = checked_count("high", high)
+        if not 1 <= limit < 2**63:
+            raise NPAError(f"high must lie in [1, 2^63 - 1], got {high}: draw from [0, high)")
+        count = _element_count(shape)
+        drawn: Tensor = integer_draw(*self._next(), count, limit)
+        return drawn.view(self.world_count, *shape)
+
+    def _next(self) -> tuple[Tensor, Tensor, Tensor, int]:
+        draw = self._draw_count
+        self._draw_count += 1
+        return self.keys, self.episodes, self.steps, draw
+
+
+Randomness = torch.Generator | WorldRandom
+"""What random draws can come from."""
+
+
+def check_generator(generator: Randomness | None, device: torch.device, world_count: int) -> None:
+    """Check that a source of randomness is one, for these worlds, on the device where it is used.
+
+    Args:
+        generator: The source; None is torch's own.
+        device: Where the numbers are needed.
+        world_count: Worlds B.
+
+    Raises:
+        NPAError: It is no source of randomness, on another device, or for other worlds.
+    """
+    if generator is None:
+        return
+    if not isinstance(generator, Randomness):
+        raise NPAError(
+            f"generator must be a torch.Generator or a WorldRandom, "
+            f"got {type(generator).__name__}: "
+            f"make it with torch.Generator({device.type!r}).manual_seed(0)"
+        )
+    by_world = isinstance(generator, WorldRandom)
+    made = f"WorldRandom(seeds, device={str(device)!r})" if by_world else ""
+    here = generator.device
+    elsewhere = by_world and None not in (here.index, device.index) and here.index != device.index
+    if here.type != device.type or elsewhere:
+        raise NPAError(
+            f"generator must be on the worlds' device, {device}, got {here}: "
+            f"make it with {made or f'torch.Generator({device.type!r})'}"
+        )
+    if isinstance(generator, WorldRandom) and generator.world_count != world_count:
+        raise NPAError(
+            f"generator must have one stream for each world, B = {world_count}, "
+            f"got {generator.world_count}: make it with {made} of {world_count} seeds"
+        )
+
+
+def _check_dtype(dtype: torch.dtype) -> None:
+    if dtype not in DTYPES:
+        raise NPAError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
+
+
+def _element_count(shape: tuple[int, ...]) -> int:
+    return math.prod(checked_count("a size", size) for size in shape)

@@ -1,0 +1,55 @@
+"""The one table of Gymnasium environments; importing `npa_envs` registers them.
+
+Entry points are strings: nothing of torch or Warp is imported before an environment is made.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import gymnasium
+
+
+class Registration(NamedTuple):
+    """One environment."""
+
+    id: str
+    """What `gym.make` takes."""
+
+    module: str
+    """Module of the classes."""
+
+    name: str
+    """The single environment's class is this with `Env` behind it, the batched with `VectorEnv`."""
+
+    max_episode_steps: int
+    """Steps after which an episode is truncated."""
+
+    @property
+    def entry_point(self) -> str:
+        """Where the single environment is."""
+        return f"{self.module}:{self.name}Env"
+
+    @property
+    def vector_entry_point(self) -> str:
+        """Where the batched environment is."""
+        return f"{self.module}:{self.name}VectorEnv"
+
+
+ENVIRONMENTS = (
+    Registration("npa/Morphogenesis2D-v0", "npa_envs.envs.morphogenesis2d", "Morphogenesis2D", 256),
+    Registration("npa/Regeneration2D-v0", "npa_envs.envs.regeneration2d", "Regeneration2D", 128),
+)
+"""All of them. A change of behaviour is a new version of the id."""
+
+
+def register_environments() -> None:
+    """Put the table into Gymnasium's registry; what is there already is left as it is."""
+    for environment in ENVIRONMENTS:
+        if environment.id not in gymnasium.registry:
+            gymnasium.register(
+                environment.id,
+                entry_point=environment.entry_point,
+                vector_entry_point=environment.vector_entry_point,
+                max_episode_steps=environment.max_episode_steps,
+            )

@@ -1,0 +1,143 @@
+"""Colours that say something: an even ramp for densities, a fixed map for states.
+
+Both are mixed in OKLab (B. Ottosson, 2020), whose distances are about those that the eye sees.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+RAMP_STOPS = ("#2a1858", "#792a86", "#cc4a70", "#f2985f", "#fbe6bd")
+"""The ramp's colours from dark to light; over a light background it runs the other way."""
+
+RAMP_LENGTH = 1024
+"""Entries of a ramp's table: several for each step of an 8-bit channel."""
+
+LIGHT_BACKGROUND = 0.6
+"""OKLab lightness from which on a ramp gets darker with density, not lighter."""
+
+GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
+"""Angle between the hues of neighbouring channels: any first few spread over the circle."""
+
+STATE_LIGHTNESS = (0.67, 0.2)
+"""OKLab lightness of a blank particle, and how far a state may move it."""
+
+STATE_CHROMA = 0.16
+"""Largest OKLab chroma of a state along each of the two axes."""
+
+STATE_GAIN = 2.8
+"""States of this inverse size, the usual one, take the tanh to its bend (dimensionless)."""
+
+_LMS_FROM_RGB = (
+    (0.4122214708, 0.5363325363, 0.0514459929),
+    (0.2119034982, 0.6806995451, 0.1073969566),
+    (0.0883024619, 0.2817188376, 0.6299787005),
+)
+_LAB_FROM_ROOTS = (
+    (0.2104542553, 0.7936177850, -0.0040720468),
+    (1.9779984951, -2.4285922050, 0.4505937099),
+    (0.0259040371, 0.7827717662, -0.8086757660),
+)
+_ROOTS_FROM_LAB = (
+    (1.0, 0.3963377774, 0.2158037573),
+    (1.0, -0.1055613458, -0.0638541728),
+    (1.0, -0.0894841775, -1.2914855480),
+)
+_RGB_FROM_LMS = (
+    (4.0767416621, -3.3077115913, 0.2309699292),
+    (-1.2684380046, 2.6097574011, -0.3413193965),
+    (-0.0041960863, -0.7034186147, 1.7076147010),
+)
+
+
+def density_colours(density: Tensor, background: tuple[float, float, float]) -> NDArray[np.uint8]:
+    """Return the ramp's colour for each density.
+
+    Density 0 is the background, 1 the middle of the ramp; crowding nears its end.
+
+    Args:
+        density: Finite densities of 0 or more (dimensionless), any shape.
+        background: Red, green and blue in [0, 1].
+
+    Returns:
+        Colours, shape [..., 3].
+    """
+    share = 1.0 - torch.exp2(-density.clamp(min=0.0))
+    entry = (share * (RAMP_LENGTH - 1)).round().to(torch.int32).cpu().numpy()
+    colours: NDArray[np.uint8] = ramp(background)[entry]
+    return colours
+
+
+@functools.lru_cache(maxsize=16)
+def ramp(background: tuple[float, float, float]) -> NDArray[np.uint8]:
+    """Return a table of colours in even steps, from the background to the far end of the stops.
+
+    Args:
+        background: Red, green and blue in [0, 1].
+
+    Returns:
+        Colours, shape [`RAMP_LENGTH`, 3].
+    """
+    stops = [[int(stop[k : k + 2], 16) / 255 for k in (1, 3, 5)] for stop in RAMP_STOPS]
+    first = oklab(torch.tensor([background], dtype=torch.float64))
+    if first[0, 0] > LIGHT_BACKGROUND:
+        stops.reverse()
+    knots = torch.cat([first, oklab(torch.tensor(stops, dtype=torch.float64))]).numpy()
+    walked = np.cumsum([0.0, *np.linalg.norm(np.diff(knots, axis=0), axis=1)])
+    places = np.linspace(0.0, walked[-1], RAMP_LENGTH)
+    lab = np.stack([np.interp(places, walked, knots[:, k]) for k in range(3)], axis=1)
+    colours = (srgb(torch.from_numpy(lab)) * 255).round().to(torch.uint8).numpy()
+    # Kept for every later picture, so nobody may write into it.
+    colours.setflags(write=False)
+    return colours
+
+
+def state_colours(hidden: Tensor) -> Tensor:
+    """Return a colour for each hidden state; the same state has the same colour everywhere.
+
+    Each channel pulls towards a hue of its own, in its negative towards the opposite one, and
+    lighter or darker. A state of zeros, as every seed has, is grey.
+
+    Args:
+        hidden: States without their colour channels (dimensionless), shape [..., H]; H may be 0.
+
+    Returns:
+        Red, green and blue in [0, 1], shape [..., 3].
+    """
+    count = hidden.shape[-1]
+    pull = []
+    for part in range(3):
+        total = hidden.new_zeros(hidden.shape[:-1])
+        # A fixed order of additions: a matrix product's would depend on the device and on B.
+        for channel in range(count):
+            angle = channel * GOLDEN_ANGLE
+            weight = (math.cos(1.5 * angle + 1.0), math.cos(angle), math.sin(angle))[part]
+            total = total + weight * hidden[..., channel]
+        pull.append(torch.tanh(total * (STATE_GAIN / math.sqrt(max(count, 1)))))
+    middle, swing = STATE_LIGHTNESS
+    lab = (middle + swing * pull[0], STATE_CHROMA * pull[1], STATE_CHROMA * pull[2])
+    return srgb(torch.stack(lab, dim=-1))
+
+
+def oklab(rgb: Tensor) -> Tensor:
+    """Return OKLab lightness, a and b of sRGB colours in [0, 1], shape [..., 3]."""
+    linear = torch.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    return _mix(_mix(linear, _LMS_FROM_RGB).pow(1.0 / 3.0), _LAB_FROM_ROOTS)
+
+
+def srgb(lab: Tensor) -> Tensor:
+    """Return sRGB colours, clipped to [0, 1], of OKLab lightness, a and b, shape [..., 3]."""
+    linear = _mix(_mix(lab, _ROOTS_FROM_LAB).pow(3.0), _RGB_FROM_LMS).clamp(0.0, 1.0)
+    curved = 1.055 * linear.clamp(min=0.0031308).pow(1.0 / 2.4) - 0.055
+    return torch.where(linear <= 0.0031308, 12.92 * linear, curved)
+
+
+def _mix(channels: Tensor, matrix: tuple[tuple[float, float, float], ...]) -> Tensor:
+    red, green, blue = channels.unbind(-1)
+    return torch.stack([r * red + g * green + b * blue for r, g, b in matrix], dim=-1)

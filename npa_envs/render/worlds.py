@@ -1,0 +1,198 @@
+"""Pictures of worlds as they are, without legend or axes: what environments show."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from npa_envs.errors import NPAError, suggest
+from npa_envs.render.colours import density_colours, state_colours
+from npa_envs.render.picture import Background, background_colour, to_uint8
+from npa_envs.rule import COLOUR_OFFSET
+from npa_envs.sph import splat
+from npa_envs.sph.checks import check_world
+
+STYLES = ("particles", "density", "states")
+"""What a picture can show: the particles' own colours, how dense they are, their hidden states."""
+
+COLOUR_CHANNELS = 3
+"""The last channels of a state are its colour, less `COLOUR_OFFSET`."""
+
+LAYERS = 24
+"""Layers that a 3D world is cut into, from near to far, as many particles in each."""
+
+OPACITY = 5.0
+"""Optical depth of a layer of density 1 in 3D (dimensionless)."""
+
+BEAD = 0.7
+"""Size of a particle in 3D as a share of its size in 2D: there, nothing has to close the gaps."""
+
+SHADE = 0.45
+"""Share of its light that a particle loses at the far end of the view."""
+
+
+def draw_worlds(
+    x: Tensor,
+    s: Tensor,
+    *,
+    style: str = "particles",
+    resolution: int = 256,
+    pixel_size: float,
+    sigma: float = 1.0,
+    centre: Tensor | Sequence[float] | None = None,
+    half_width: float = 1.0,
+    azimuth: float = 0.0,
+    elevation: float = 20.0,
+    background: Background = "white",
+) -> NDArray[np.uint8]:
+    """Draw worlds: every particle is a soft spot, y is up.
+
+    Colours mean the same in every picture: nothing is fitted to a frame, so films do not flicker.
+    A picture depends on its own world only, not on the others of the batch. Particles whose
+    position (or state, where the style shows it) is not finite are left out.
+
+    3D worlds are seen from afar, without perspective, by a camera that turns around the vertical
+    axis through `centre`. Near particles cover far ones, and far ones are darker.
+
+    Args:
+        x: Particle positions [length units], shape [B, N, D], D = 2 or 3, on any device.
+        s: Particle states (dimensionless), shape [B, N, C].
+        style: "particles" shows the last three channels plus 0.5 as red, green and blue, clipped;
+            "density" how dense the particles stand, with 1, as dense as the target's pixels, in the
+            middle of the colour ramp (in 3D: along the line of sight, with 1 where half the depth
+            of the view is full); "states" all other channels, each pulling towards a hue of its own
+            (grey: a blank particle).
+        resolution: Pixels R along each side, 2 or more.
+        pixel_size: Side of a pixel of the target, or how far particles usually stand apart [length
+            units].
+        sigma: Standard deviation of a particle's spot in `pixel_size`, dimensionless.
+        centre: What lies in the middle of the picture [length units], shape [D] or [B, D]; None is
+            the origin.
+        half_width: From the middle of the picture to its edge [length units].
+        azimuth: 3D only: how far the camera has gone round [degrees], seen from above against the
+            clock; 0 has x to the right and z towards the viewer.
+        elevation: 3D only: how far above the horizon the camera is [degrees].
+        background: A colour name such as "black", "#rrggbb", or red, green and blue in [0, 1].
+
+    Returns:
+        Pixels of shape [B, R, R, 3]; the first row is the highest y.
+
+    Raises:
+        NPAError: An unknown style or colour, a shape that does not fit, or a number out of range.
+    """
+    check_world(x, s)
+    if style not in STYLES:
+        raise NPAError(f"style must be one that exists, got {style!r}: {suggest(style, STYLES)}")
+    for name, value in (("half_width", half_width), ("pixel_size", pixel_size), ("sigma", sigma)):
+        if not (math.isfinite(value) and value > 0.0):
+            raise NPAError(f"{name} must be positive and finite, got {value}")
+    for name, value in (("azimuth", azimuth), ("elevation", elevation)):
+        if not math.isfinite(value):
+            raise NPAError(f"{name} must be a finite angle in degrees, got {value}")
+    behind = background_colour(background)
+    with torch.no_grad():
+        places = (x - _middle(centre, x)).float()
+        colour = _colours(s.float(), style)
+        depth = None
+        if x.shape[2] == 3:
+            places, depth = _seen_from(places, azimuth, elevation)
+        limit = 1e3 * (half_width + sigma * pixel_size)
+        shown = (places.abs() <= limit).all(-1, keepdim=True)
+        if style != "density":
+            shown = shown & s.isfinite().all(-1, keepdim=True)
+        places, colour = places.where(shown, limit), colour.where(shown, 0.0)
+        lens = _Lens(resolution, pixel_size, sigma, half_width)
+        if style == "density":
+            density = lens.draw(places, colour)[..., 3]
+            if depth is not None:
+                density = density * (pixel_size / half_width)
+            return density_colours(density.flip(-2), behind)
+        if depth is None:
+            return to_uint8(lens.draw(places, colour), behind)
+        return to_uint8(_stack_layers(lens, places, depth.where(shown, 0.0), colour), behind)
+
+
+@dataclass(frozen=True)
+class _Lens:
+    """The square around the origin that is drawn, and how."""
+
+    resolution: int
+    pixel_size: float
+    sigma: float
+    half_width: float
+
+    def draw(self, x: Tensor, colour: Tensor, *, scale: float = 1.0) -> Tensor:
+        """Return colour sums and density, [B, R, R, 4], of spots `scale` times their size."""
+        return splat(
+            x,
+            colour,
+            resolution=self.resolution,
+            pixel_size=self.pixel_size,
+            sigma=self.sigma * scale,
+            lo=-self.half_width,
+            hi=self.half_width,
+        )
+
+
+def _middle(centre: Tensor | Sequence[float] | None, x: Tensor) -> Tensor:
+    world_count, _, space_dim = x.shape
+    if centre is None:
+        return x.new_zeros(space_dim)
+    middle = torch.as_tensor(centre).to(x)
+    if middle.shape not in ((space_dim,), (world_count, space_dim)):
+        raise NPAError(
+            f"centre must have shape [{space_dim}] or [{world_count}, {space_dim}], "
+            f"got {tuple(middle.shape)}: for example x.mean(dim=1)"
+        )
+    return middle if middle.ndim == 1 else middle[:, None]
+
+
+def _colours(s: Tensor, style: str) -> Tensor:
+    if style == "density":
+        return s.new_zeros(*s.shape[:2], 3)
+    if style == "states":
+        return state_colours(s[..., :-COLOUR_CHANNELS])
+    if s.shape[2] < COLOUR_CHANNELS:
+        raise NPAError(
+            f"style 'particles' needs states of at least 3 channels, got {s.shape[2]}: "
+            "draw the style 'density'"
+        )
+    return (s[..., -COLOUR_CHANNELS:] + COLOUR_OFFSET).clamp(0.0, 1.0)
+
+
+def _seen_from(x: Tensor, azimuth: float, elevation: float) -> tuple[Tensor, Tensor]:
+    """Return places on the picture, [B, N, 2], and how near they are, [B, N, 1]."""
+    turn, tilt = (math.radians(angle % 360.0) for angle in (azimuth, elevation))
+    right, height, outward = x.unbind(-1)
+    across = math.cos(turn) * right - math.sin(turn) * outward
+    ahead = math.sin(turn) * right + math.cos(turn) * outward
+    up = math.cos(tilt) * height - math.sin(tilt) * ahead
+    near = math.sin(tilt) * height + math.cos(tilt) * ahead
+    return torch.stack((across, up), dim=-1), near[..., None]
+
+
+def _stack_layers(lens: _Lens, places: Tensor, depth: Tensor, colour: Tensor) -> Tensor:
+    """Lay splats of particles at about the same depth over each other, the nearest on top."""
+    light = 1.0 - SHADE * (0.5 - 0.5 * depth / lens.half_width).clamp(0.0, 1.0)
+    order = depth.argsort(dim=1, descending=True, stable=True)
+    places = places.gather(1, order.expand_as(places))
+    colour = (colour * light).gather(1, order.expand_as(colour))
+    picture = places.new_zeros(len(places), lens.resolution, lens.resolution, 4)
+    through = torch.ones_like(picture[..., :1])
+    layers = min(LAYERS, places.shape[1])
+    for part, tint in zip(
+        places.tensor_split(layers, 1), colour.tensor_split(layers, 1), strict=True
+    ):
+        layer = lens.draw(part, tint, scale=BEAD)
+        density = layer[..., 3:]
+        passing = torch.exp(-OPACITY * density)
+        share = through * (1.0 - passing)
+        picture += share * layer / density.clamp(min=torch.finfo(density.dtype).tiny)
+        through = through * passing
+    return picture

@@ -1,0 +1,106 @@
+"""Means over worlds as torch operators: world k's is the same, bit for bit, in every batch."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from npa_envs.errors import NPAError
+from npa_envs.kernels.worlds import CHUNK, MEAN_LANES, mean_kernels
+from npa_envs.sph.bridge import launch, scalar_type
+from npa_envs.sph.checks import DTYPES
+
+
+def average_sums(partial_sums: Tensor, value_count: int, like: Tensor) -> Tensor:
+    """Return means from partial sums, in an order that depends on their number alone.
+
+    Args:
+        partial_sums: Float64, shape [B, L, K].
+        value_count: How many values they sum.
+        like: A tensor of the means' dtype, on their device.
+
+    Returns:
+        The means, shape [B, K].
+    """
+    world_count, _, width = partial_sums.shape
+    lanes = _lanes(like.device)
+    kernels = mean_kernels(scalar_type(like.dtype), lanes)
+    means = like.new_empty(world_count, width)
+    launch(
+        kernels.average_sums,
+        (world_count, width, lanes),
+        like.device,
+        float(value_count),
+        partial_sums,
+        means,
+    )
+    return means
+
+
+def _lanes(device: torch.device) -> int:
+    return MEAN_LANES if device.type == "cuda" else 1
+
+
+@torch.library.custom_op("npa::world_mean", mutates_args=())
+def _world_mean(values: Tensor) -> Tensor:
+    world_count, value_count, width = values.shape
+    lanes = _lanes(values.device)
+    kernels = mean_kernels(scalar_type(values.dtype), lanes)
+    chunk_count = -(-value_count // CHUNK)
+    partial_sums = values.new_empty(world_count, chunk_count, width, dtype=torch.float64)
+    launch(
+        kernels.sum_chunks,
+        (world_count, width, chunk_count, lanes),
+        values.device,
+        values.contiguous(),
+        partial_sums,
+    )
+    return average_sums(partial_sums, value_count, values)
+
+
+@_world_mean.register_fake
+def _(values: Tensor) -> Tensor:
+    return values.new_empty(values.shape[0], values.shape[2])
+
+
+class _WorldMean(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, values: Tensor) -> Tensor:
+        ctx.value_count = values.shape[1]
+        means: Tensor = _world_mean(values)
+        return means
+
+    @staticmethod
+    def backward(ctx: Any, means_bar: Tensor) -> Tensor:
+        count: int = ctx.value_count
+        return (means_bar / count)[:, None].expand(-1, count, -1)
+
+
+def world_mean(values: Tensor) -> Tensor:
+    """Return each world's mean; differentiable, and independent of the other worlds.
+
+    It is accumulated in float64 in an order that depends on M alone; that of torch's own means may
+    change with the number of worlds, and so may their last bit.
+
+    Args:
+        values: What is averaged over its second dimension, shape [B, M, K], float32 or float64.
+
+    Returns:
+        The means, shape [B, K].
+
+    Raises:
+        NPAError: A wrong shape or dtype, or nothing to average.
+    """
+    if values.ndim != 3 or 0 in values.shape:
+        raise NPAError(
+            f"values must have shape [B, M, K] with at least one of each, "
+            f"got {tuple(values.shape)}: reshape it"
+        )
+    if values.dtype not in DTYPES:
+        raise NPAError(
+            f"values must be float32 or float64, got {values.dtype}: convert it with .float()"
+        )
+    means: Tensor = _WorldMean.apply(values)  # type: ignore[no-untyped-call]
+    return means

@@ -1,0 +1,302 @@
+"""Applying actions: the formula, a rule as a policy, masks, noise, boxes, limits, errors."""
+
+import math
+
+import pytest
+import torch
+
+from npa_envs.errors import NPAError
+from npa_envs.sph import apply_actions
+from npa_envs.sph.operators import Rows
+from npa_envs.sph.update import update_particles
+
+B, N, C = 3, 77, 5
+REACH, DT, STATE_SCALE = 0.07, 0.8, 0.6
+LIMITS = {"position_limit": 50.0, "state_limit": 20.0}
+ERRORS = {torch.float32: 1e-6, torch.float64: 3e-15}
+"""Largest difference from the formula in float64, for values of size about 3 (worst seen 2.2e-7
+and 2.2e-16: one rounding)."""
+
+
+@pytest.fixture(params=[2, 3], ids=["2d", "3d"])
+def space_dim(request):
+    return request.param
+
+
+@pytest.fixture(params=ERRORS, ids=("float32", "float64"))
+def dtype(request):
+    return request.param
+
+
+@pytest.fixture
+def world(space_dim, dtype, device):
+    """Actions of which about half are longer than one, positions and states."""
+    g = torch.Generator().manual_seed(1)
+    action = torch.randn(B, N, space_dim + C, generator=g, dtype=torch.float64)
+    x = 2.0 * torch.rand(B, N, space_dim, generator=g, dtype=torch.float64) - 1.0
+    s = torch.randn(B, N, C, generator=g, dtype=torch.float64)
+    return tuple(tensor.to(device, dtype) for tensor in (action, x, s))
+
+
+def applied(action, x, s, **options):
+    """Return new positions and states, and which worlds diverged; x and s are left alone."""
+    x, s = x.clone(), s.clone()
+    diverged = torch.zeros(x.shape[0], dtype=torch.uint8, device=x.device)
+    given = {
+        "mask": None,
+        "noise": None,
+        "reach": REACH,
+        "dt": DT,
+        "state_scale": STATE_SCALE,
+        "moving": True,
+        "box": None,
+        "enabled": None,
+        "diverged": diverged,
+        **LIMITS,
+        **options,
+    }
+    apply_actions(action, x, s, **given)
+    return x, s, given["diverged"]
+
+
+def formula(action, x, s, mask=None, noise=None, moving=True, box=None):
+    """The new positions and states in float64, without limits."""
+    action = action.double() if mask is None else action.double() * mask[..., None]
+    x, s = x if noise is None else x + noise, s.double()
+    x = x.double()
+    if moving:
+        direction, action = action[..., : x.shape[2]], action[..., x.shape[2] :]
+        x = x + REACH * DT * direction / direction.norm(dim=-1, keepdim=True).clamp_min(1.0)
+    if box is not None:
+        sides = torch.tensor(box, dtype=x.dtype, device=x.device)
+        x = x - sides * torch.floor(x / sides + 0.5)
+    return x, s + DT * STATE_SCALE * action.clamp(-1.0, 1.0)
+
+
+def assert_near(values, expected, dtype):
+    for value, right in zip(values, expected, strict=True):
+        assert value.dtype == dtype
+        assert float((value.double() - right).abs().max()) <= ERRORS[dtype]
+
+
+def random_mask(device, probability=0.5):
+    generator = torch.Generator().manual_seed(2)
+    return (torch.rand(B, N, generator=generator) < probability).to(device, torch.uint8)
+
+
+def test_particles_follow_the_formula(world, dtype):
+    *moved, diverged = applied(*world)
+    assert_near(moved, formula(*world), dtype)
+    assert diverged.tolist() == [0] * B
+    step = (moved[0] - world[1]).norm(dim=-1)
+    assert float(step.max()) == pytest.approx(REACH * DT, rel=1e-5)
+
+
+def test_particles_outside_the_mask_stay_as_they_are(world, dtype, device):
+    action, x, s = world
+    mask = random_mask(device)
+    idle = mask == 0
+    action = torch.where(idle[..., None], torch.nan, action)
+    *moved, diverged = applied(action, x, s, mask=mask)
+    assert_near(moved, formula(action.nan_to_num(), x, s, mask), dtype)
+    assert torch.equal(moved[0][idle], x[idle])
+    assert torch.equal(moved[1][idle], s[idle])
+    assert diverged.tolist() == [0] * B
+
+
+def test_noise_moves_every_particle(world, dtype, device):
+    action, x, s = world
+    mask = random_mask(device)
+    noise = 0.01 * torch.randn_like(x)
+    *moved, _ = applied(action, x, s, mask=mask, noise=noise)
+    assert_near(moved, formula(action, x, s, mask, noise), dtype)
+    assert torch.equal(moved[0][mask == 0], (x + noise)[mask == 0])
+
+
+def test_static_particles_change_their_states_alone(world, dtype, device):
+    action, x, s = world
+    action = action[..., :C].contiguous()
+    noise = 0.01 * torch.randn_like(x)
+    moved, changed, _ = applied(action, x, s, moving=False)
+    assert torch.equal(moved, x)
+    assert_near((changed,), formula(action, x, s, moving=False)[1:], dtype)
+    assert torch.equal(applied(action, x, s, moving=False, noise=noise)[0], x + noise)
+
+
+def test_positions_are_wrapped_into_the_box(world, dtype, device):
+    action, x, s = world
+    box = (1.0, 1.5, 0.7)[: x.shape[2]]
+    *moved, _ = applied(action, x, s, box=box)
+    sides = torch.tensor(box, dtype=torch.float64, device=device)
+    assert bool((moved[0].double().abs() <= sides / 2 + 1e-6).all())
+    turn = (moved[0].double() - formula(action, x, s)[0]) / sides
+    assert float((turn - turn.round()).abs().max()) <= 4.0 * ERRORS[dtype]
+    assert float(turn.round().abs().max()) >= 1.0
+    assert_near(moved[1:], formula(action, x, s)[1:], dtype)
+
+
+@pytest.mark.parametrize("box", [None, 1.2], ids=["open", "periodic"])
+def test_a_rule_is_a_policy(world, dtype, device, box):
+    action, x, s = world
+    space_dim = x.shape[2]
+    box = None if box is None else (box,) * space_dim
+    mask = random_mask(device)
+    # Every particle has its own row; those outside the mask have none.
+    own = torch.arange(B * N, dtype=torch.int32, device=device)
+    rows = Rows(torch.where(mask.view(-1) == 1, own, -1), own, own, 0)
+    update = action.reshape(B * N, -1)
+    expected = update_particles(
+        update, x, s, x.new_zeros(B, N), rows=rows, reach=REACH, dt=DT, moving=True, box=box
+    )
+    delta, change = action[..., :space_dim], action[..., space_dim:]
+    scale = float(change.abs().max())
+    policy = torch.cat((delta / (1.0 + delta.norm(dim=-1, keepdim=True)), change / scale), dim=-1)
+    moved, changed, _ = applied(policy, x, s, mask=mask, state_scale=scale, box=box)
+    torch.testing.assert_close(moved, expected[0], rtol=0.0, atol=ERRORS[dtype])
+    torch.testing.assert_close(changed, expected[1], rtol=0.0, atol=2.0 * ERRORS[dtype])
+
+
+def test_values_beyond_their_limits_are_held_and_mark_their_world_alone(world, device):
+    action, x, s = world
+    x[1, 3, 0], x[1, 4, 0], s[1, 5, 1] = 0.999, -0.999, -0.99
+    action[1, 3:6] = 0.0
+    action[1, 3, 0], action[1, 4, 0], action[1, 5, x.shape[2] + 1] = 2.0, -2.0, -1.0
+    s.clamp_(-0.5, 0.5)
+    s[1, 5, 1] = -0.99
+    action[..., x.shape[2] :] *= 0.01
+    action[1, 5, x.shape[2] + 1] = -1.0
+    limits = {"position_limit": 1.02, "state_limit": 1.0}
+    for world_index in (0, 2):
+        x[world_index] *= 0.5
+    moved, changed, diverged = applied(action, x, s, **limits)
+    assert diverged.tolist() == [0, 1, 0]
+    assert moved[1, 3, 0] == torch.tensor(1.02, dtype=x.dtype)
+    assert moved[1, 4, 0] == torch.tensor(-1.02, dtype=x.dtype)
+    assert changed[1, 5, 1] == -1.0
+    free, free_states, _ = applied(action, x, s)
+    assert torch.equal(moved, free.clamp(-1.02, 1.02))
+    assert torch.equal(changed, free_states.clamp(-1.0, 1.0))
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_actions_that_are_no_numbers_do_not_reach_the_worlds(world, device, bad):
+    action, x, s = world
+    expected = applied(action, x, s)
+    action = action.clone()
+    action[2, 9, 0] = bad
+    moved, changed, diverged = applied(action, x, s)
+    assert diverged.tolist() == [0, 0, 1]
+    # An infinite direction has no unit vector: inf / inf is not a number.
+    assert moved[2, 9, 0] == 0.0
+    moved[2, 9] = expected[0][2, 9]
+    assert torch.equal(moved, expected[0])
+    assert torch.equal(changed, expected[1])
+
+
+def test_a_state_action_that_is_not_a_number_zeroes_that_state(world):
+    action, x, s = world
+    expected = applied(action, x, s)
+    action = action.clone()
+    action[0, 4, -1] = math.nan
+    action[1, 4, -1] = math.inf
+    moved, changed, diverged = applied(action, x, s)
+    assert diverged.tolist() == [1, 0, 0]
+    assert changed[0, 4, -1] == 0.0
+    # An infinite change is clipped to the largest one.
+    right = float(s[1, 4, -1]) + DT * STATE_SCALE
+    assert float(changed[1, 4, -1]) == pytest.approx(right, rel=1e-6)
+    assert torch.equal(moved, expected[0])
+
+
+def test_noise_that_is_not_a_number_is_held_too(world):
+    action, x, s = world
+    noise = torch.zeros_like(x)
+    noise[1, 0, 1] = math.nan
+    moved, _, diverged = applied(action, x, s, noise=noise)
+    assert moved[1, 0, 1] == 0.0
+    assert diverged.tolist() == [0, 1, 0]
+
+
+def test_a_mark_is_never_taken_away(world, device):
+    marks = torch.tensor([1, 0, 0], dtype=torch.uint8, device=device)
+    assert applied(*world, diverged=marks)[2].tolist() == [1, 0, 0]
+
+
+def test_nothing_happens_where_it_is_switched_off(world, device):
+    action, x, s = world
+    off, on = (torch.full((1,), k, dtype=torch.uint8, device=device) for k in (0, 1))
+    wild = torch.full_like(action, math.nan)
+    held = applied(wild, x, s, enabled=off, noise=torch.ones_like(x), position_limit=0.1)
+    assert torch.equal(held[0], x)
+    assert torch.equal(held[1], s)
+    assert held[2].tolist() == [0] * B
+    for value, expected in zip(applied(*world, enabled=on), applied(*world), strict=True):
+        assert torch.equal(value, expected)
+
+
+def test_a_world_moves_in_any_batch_as_it_moves_alone(world, device):
+    together = applied(*world, mask=random_mask(device))
+    for k in range(B):
+        part = slice(k, k + 1)
+        alone = applied(*(tensor[part] for tensor in world), mask=random_mask(device)[part])
+        for value, expected in zip(alone, together, strict=True):
+            assert torch.equal(value, expected[part])
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_both_devices_agree_and_a_graph_can_be_captured():
+    g = torch.Generator().manual_seed(1)
+    action, x, s = (torch.randn(B, N, k, generator=g) for k in (2 + C, 2, C))
+    expected = applied(action, x, s)
+    action, x, s = (tensor.cuda() for tensor in (action, x, s))
+    first = applied(action, x, s)
+    diverged = torch.zeros(B, dtype=torch.uint8, device="cuda")
+    enabled = torch.ones(1, dtype=torch.uint8, device="cuda")
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        moved, changed, _ = applied(action, x, s, diverged=diverged, enabled=enabled)
+    graph.replay()
+    for value, other, right in zip((moved, changed), first[:2], expected[:2], strict=True):
+        assert torch.equal(value, other)
+        torch.testing.assert_close(value.cpu(), right, rtol=0.0, atol=3e-7)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"action": torch.zeros(2, 4, 5)}, r"action must be torch.float32 of shape \(2, 4, 6\)"),
+        ({"action": torch.zeros(2, 4, 6).double()}, "action must be torch.float32"),
+        ({"x": torch.zeros(2, 2, 4).mT}, "x must be contiguous"),
+        ({"mask": torch.zeros(2, 4)}, r"mask must be torch.uint8 of shape \(2, 4\)"),
+        ({"noise": torch.zeros(2, 4, 3)}, r"noise must be torch.float32 of shape \(2, 4, 2\)"),
+        ({"enabled": torch.ones(1)}, r"enabled must be torch.uint8 of shape \(1,\)"),
+        ({"diverged": torch.zeros(3, dtype=torch.uint8)}, r"diverged must be torch.uint8"),
+    ],
+)
+def test_tensors_that_do_not_fit_are_clear_errors(change, message):
+    given = {
+        "action": torch.zeros(2, 4, 6),
+        "x": torch.zeros(2, 4, 2),
+        "s": torch.zeros(2, 4, 4),
+        **change,
+    }
+    with pytest.raises(NPAError, match=message):
+        apply_actions(
+            given.pop("action"),
+            given.pop("x"),
+            given.pop("s"),
+            **{
+                "mask": None,
+                "noise": None,
+                "reach": 0.1,
+                "dt": 1.0,
+                "state_scale": 1.0,
+                "moving": True,
+                "box": None,
+                "enabled": None,
+                "diverged": torch.zeros(2, dtype=torch.uint8),
+                **LIMITS,
+                **given,
+            },
+        )

@@ -1,0 +1,274 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from npa_envs.errors import NPAError
+from npa_envs.render import STYLES, draw_worlds, to_uint8
+from npa_envs.render.colours import RAMP_LENGTH, RAMP_STOPS, ramp
+from npa_envs.sph import splat
+
+RED = (0.5, -0.5, -0.5)
+BLUE = (-0.5, -0.5, 0.5)
+VIEW = {"resolution": 32, "pixel_size": 0.1}
+
+
+def random_worlds(space_dim: int = 2, world_count: int = 3) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(7)
+    x = torch.rand(world_count, 70, space_dim, generator=generator) * 1.6 - 0.8
+    s = torch.rand(world_count, 70, 8, generator=generator) * 2.4 - 1.2
+    return x, s
+
+
+def two_beads(near: float = 0.5, far: float = -0.5) -> tuple[torch.Tensor, torch.Tensor]:
+    """A red particle before a blue one, on the z axis."""
+    return torch.tensor([[[0.0, 0.0, near], [0.0, 0.0, far]]]), torch.tensor([[RED, BLUE]])
+
+
+def middle(picture: np.ndarray) -> np.ndarray:
+    side = picture.shape[1] // 2
+    return picture[:, side - 1 : side + 1, side - 1 : side + 1].mean(axis=(1, 2))
+
+
+def test_particles_look_as_the_splat_of_their_clipped_colours():
+    x, s = random_worlds()
+    colour = (s[..., -3:] + 0.5).clamp(0, 1)
+    expected = to_uint8(splat(x, colour, resolution=32, pixel_size=0.1, sigma=0.7), "navy")
+    np.testing.assert_array_equal(draw_worlds(x, s, sigma=0.7, background="navy", **VIEW), expected)
+    assert expected.std() > 20
+
+
+@pytest.mark.parametrize("style", STYLES)
+@pytest.mark.parametrize("space_dim", [2, 3])
+def test_a_world_looks_the_same_alone_and_in_a_batch(style, space_dim):
+    x, s = random_worlds(space_dim)
+    together = draw_worlds(x, s, style=style, azimuth=40.0, **VIEW)
+    assert together.shape == (3, 32, 32, 3)
+    assert together.dtype == np.uint8
+    for k in range(3):
+        alone = draw_worlds(x[k : k + 1], s[k : k + 1], style=style, azimuth=40.0, **VIEW)
+        np.testing.assert_array_equal(alone[0], together[k])
+    assert (together[0] != together[1]).any()
+
+
+@pytest.mark.parametrize("style", STYLES)
+@pytest.mark.parametrize("space_dim", [2, 3])
+@pytest.mark.parametrize("background", ["white", "black", "#102030"])
+def test_where_no_particle_is_there_is_background(style, space_dim, background):
+    x, s = random_worlds(space_dim)
+    picture = draw_worlds(x * 0.1 - 0.5, s, style=style, background=background, **VIEW)
+    corner = to_uint8(torch.zeros(1, 1, 4), background)[0, 0]
+    assert (picture[:, :4, -4:] == corner).all()
+    assert (picture != corner).any()
+
+
+@pytest.mark.parametrize("style", STYLES)
+@pytest.mark.parametrize("space_dim", [2, 3])
+def test_particles_that_are_not_finite_are_left_out(style, space_dim):
+    x, s = random_worlds(space_dim)
+    broken = x.clone()
+    broken[0, ::3, 0] = float("nan")
+    broken[1, ::3, -1] = float("inf")
+    broken[2, ::3, 0] = -1e38
+    kept = [k for k in range(70) if k % 3]
+    seen = draw_worlds(broken, s, style=style, **VIEW)
+    expected = draw_worlds(x[:, kept], s[:, kept], style=style, **VIEW).astype(int)
+    # The layers of 3D colours are cut elsewhere where particles are missing.
+    layered = space_dim == 3 and style != "density"
+    assert np.abs(seen - expected).mean() <= (1.0 if layered else 0.0)
+    assert np.abs(draw_worlds(x, s, style=style, **VIEW) - expected).mean() > 1.0
+    nothing = draw_worlds(x * float("nan"), s, style=style, **VIEW)
+    assert (nothing == 255).all()
+
+
+@pytest.mark.parametrize("style", ["particles", "states"])
+def test_particles_of_states_that_are_not_finite_are_left_out_where_states_show(style):
+    x, s = random_worlds()
+    assert (draw_worlds(x, s * float("nan"), style=style, **VIEW) == 255).all()
+    some = s.clone()
+    some[:, 1::3, -1] = float("inf")
+    kept = [k for k in range(70) if k % 3 != 1]
+    expected = draw_worlds(x[:, kept], s[:, kept], style=style, **VIEW)
+    np.testing.assert_array_equal(draw_worlds(x, some, style=style, **VIEW), expected)
+    some[:, 1::3] = float("nan")
+    np.testing.assert_array_equal(draw_worlds(x, some, style=style, **VIEW), expected)
+    density = draw_worlds(x, s * float("nan"), style="density", **VIEW)
+    np.testing.assert_array_equal(density, draw_worlds(x, s, style="density", **VIEW))
+
+
+def test_drawing_a_trained_tensor_leaves_it_alone():
+    x, s = random_worlds()
+    x, s = x.requires_grad_(), s.double().float().requires_grad_()
+    before = x.detach().clone()
+    assert draw_worlds(x, s, **VIEW).std() > 10
+    torch.testing.assert_close(x.detach(), before, rtol=0, atol=0)
+
+
+def test_centre_is_what_lies_in_the_middle():
+    x, s = random_worlds()
+    shift = torch.tensor([[0.25, -0.5], [1.0, 0.5], [-2.0, 0.0]])
+    grid = (x * 1024).round() / 1024
+    expected = draw_worlds(grid, s, **VIEW)
+    moved = draw_worlds(grid + shift[:, None], s, centre=shift, **VIEW)
+    np.testing.assert_array_equal(moved, expected)
+    one = draw_worlds(grid + shift[0], s, centre=(0.25, -0.5), **VIEW)
+    np.testing.assert_array_equal(one, expected)
+
+
+def test_half_width_zooms():
+    x, s = random_worlds()
+    wide = draw_worlds(x, s, resolution=32, pixel_size=0.1)
+    np.testing.assert_array_equal(
+        draw_worlds(4 * x, s, resolution=32, pixel_size=0.4, half_width=4.0), wide
+    )
+
+
+@pytest.mark.parametrize("style", STYLES)
+@pytest.mark.parametrize("z", [(), (0.3,)])
+def test_y_points_up_and_x_to_the_right(style, z):
+    x = torch.tensor([[[0.5, 0.75, *z]]])
+    s = torch.tensor([[RED]])
+    picture = draw_worlds(x, s, style=style, resolution=33, pixel_size=0.1, elevation=0.0)[0]
+    row, column = np.unravel_index(picture[..., 1].argmin(), (33, 33))
+    assert (row, column) == (4, 24)
+
+
+def test_density_one_is_the_middle_of_the_ramp_and_crowding_its_end():
+    places = torch.arange(-1.5, 1.5, 0.1)
+    x = torch.cartesian_prod(places, places)[None]
+    s = torch.zeros(1, x.shape[1], 4)
+    once = middle(draw_worlds(x, s, style="density", pixel_size=0.1))[0]
+    table = ramp((1.0, 1.0, 1.0)).astype(int)
+    assert np.abs(once - table[RAMP_LENGTH // 2]).max() <= 2
+    crowd = x.repeat(1, 12, 1)
+    crowded = middle(draw_worlds(crowd, s.repeat(1, 12, 1), style="density", **VIEW))[0]
+    assert np.abs(crowded - table[-1]).max() <= 1
+    darkest = [int(RAMP_STOPS[0][k : k + 2], 16) for k in (1, 3, 5)]
+    assert table[-1].tolist() == darkest
+
+
+def test_states_do_not_show_the_colour_channels_and_need_no_others():
+    x, s = random_worlds()
+    recoloured = torch.cat((s[..., :-3], -s[..., -3:]), dim=-1)
+    expected = draw_worlds(x, s, style="states", **VIEW)
+    np.testing.assert_array_equal(draw_worlds(x, recoloured, style="states", **VIEW), expected)
+    assert (draw_worlds(x, -s, style="states", **VIEW) != expected).any()
+    for state_dim in (1, 2, 3):
+        plain = draw_worlds(x, s[..., :state_dim], style="states", **VIEW)
+        assert np.ptp(plain.astype(int), axis=-1).max() <= 1
+        assert plain.min() < 200
+    one = draw_worlds(x, s[..., -4:], style="states", **VIEW)
+    assert np.ptp(one.astype(int), axis=-1).max() > 20
+
+
+def test_the_near_particle_covers_the_far_one():
+    x, s = two_beads()
+    before, behind = (
+        middle(draw_worlds(x, s, azimuth=angle, elevation=0.0, **VIEW))[0] for angle in (0.0, 180.0)
+    )
+    assert before[0] > before[2] + 60
+    assert behind[2] > behind[0] + 60
+    np.testing.assert_allclose(before, behind[::-1], atol=1.0)
+
+
+def test_the_order_of_the_particles_does_not_matter_in_3d():
+    x, s = random_worlds(3)
+    expected = draw_worlds(x, s, **VIEW).astype(int)
+    turned = draw_worlds(x.flip(1), s.flip(1), **VIEW)
+    assert np.abs(turned - expected).max() <= 1
+
+
+@pytest.mark.parametrize("style", STYLES)
+def test_a_full_turn_changes_nothing(style):
+    x, s = random_worlds(3)
+    start = draw_worlds(x, s, style=style, **VIEW)
+    for angle in (360.0, -720.0, 3.6e15):
+        np.testing.assert_array_equal(draw_worlds(x, s, style=style, azimuth=angle, **VIEW), start)
+    assert (draw_worlds(x, s, style=style, azimuth=90.0, **VIEW) != start).any()
+
+
+def test_turning_the_camera_is_turning_the_world_the_other_way():
+    x, s = random_worlds(3)
+    angle = math.radians(30.0)
+    across, up, ahead = x.unbind(-1)
+    turned = torch.stack(
+        (
+            math.cos(angle) * across - math.sin(angle) * ahead,
+            up,
+            math.sin(angle) * across + math.cos(angle) * ahead,
+        ),
+        dim=-1,
+    )
+    camera = draw_worlds(x, s, azimuth=30.0, **VIEW).astype(int)
+    assert np.abs(draw_worlds(turned, s, **VIEW) - camera).max() <= 2
+
+
+def test_the_camera_looks_from_where_it_is_said_to_be():
+    ends = torch.tensor([[[0.8, 0.0, 0.0], [-0.8, 0.0, 0.0]]])
+    colours = torch.tensor([[RED, BLUE]])
+    from_right = middle(draw_worlds(ends, colours, azimuth=90.0, elevation=0.0, **VIEW))[0]
+    assert from_right[0] > from_right[2] + 60
+    poles = ends[..., [1, 0, 2]]
+    from_above = middle(draw_worlds(poles, colours, elevation=90.0, **VIEW))[0]
+    assert from_above[0] > from_above[2] + 60
+
+
+def test_far_particles_are_darker():
+    near, far = (
+        draw_worlds(
+            torch.tensor([[[0.0, 0.0, depth]]]),
+            torch.full((1, 1, 3), 0.5),
+            elevation=0.0,
+            background="black",
+            **VIEW,
+        ).max()
+        for depth in (0.9, -0.9)
+    )
+    assert 60 < far < 0.7 * near
+
+
+def test_an_unknown_style_names_the_nearest():
+    x, s = random_worlds()
+    with pytest.raises(NPAError, match="did you mean 'density'"):
+        draw_worlds(x, s, style="densty", **VIEW)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"half_width": 0.0}, "half_width must be positive"),
+        ({"pixel_size": math.nan}, "pixel_size must be positive"),
+        ({"sigma": -1.0}, "sigma must be positive"),
+        ({"azimuth": math.inf}, "azimuth must be a finite angle"),
+        ({"centre": (0.0, 0.0, 0.0)}, r"centre must have shape \[2\] or \[3, 2\]"),
+        ({"background": "no colour"}, "background must be a colour"),
+        ({"resolution": 1}, "resolution must be at least 2"),
+    ],
+)
+def test_numbers_out_of_range_are_refused(change, message):
+    x, s = random_worlds()
+    with pytest.raises(NPAError, match=message):
+        draw_worlds(x, s, **{**VIEW, **change})
+
+
+def test_worlds_without_colour_are_refused_by_the_style_that_shows_it():
+    x, s = random_worlds()
+    with pytest.raises(NPAError, match="at least 3 channels, got 2"):
+        draw_worlds(x, s[..., :2], **VIEW)
+    assert (draw_worlds(x, s[..., :2], style="density", **VIEW) != 255).any()
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+@pytest.mark.parametrize("style", STYLES)
+@pytest.mark.parametrize("space_dim", [2, 3])
+def test_pictures_of_a_gpu_are_repeatable_and_those_of_the_cpu(style, space_dim):
+    x, s = random_worlds(space_dim)
+    there = draw_worlds(x.cuda(), s.cuda(), style=style, azimuth=40.0, **VIEW)
+    again = draw_worlds(x.cuda(), s.cuda(), style=style, azimuth=40.0, **VIEW)
+    np.testing.assert_array_equal(there, again)
+    here = draw_worlds(x, s, style=style, azimuth=40.0, **VIEW).astype(int)
+    assert np.abs(there - here).max() <= 2

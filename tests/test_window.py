@@ -1,0 +1,167 @@
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+import warnings
+
+import numpy as np
+import pytest
+
+from npa_envs.errors import MissingDependencyError, NPAError
+from npa_envs.render import Window
+
+pygame = pytest.importorskip("pygame")
+
+
+@pytest.fixture
+def screen(monkeypatch):
+    """SDL's driver without a screen, asked for by name."""
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    yield
+    pygame.display.quit()
+
+
+def picture(height: int = 20, width: int = 30) -> np.ndarray:
+    frame = np.zeros((height, width, 3), np.uint8)
+    frame[: height // 2, width // 2 :] = (200, 100, 50)
+    return frame
+
+
+def test_a_frame_appears_as_it_is(screen):
+    with Window("a world", (30, 20)) as window:
+        window.show(picture())
+        shown = pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
+        assert pygame.display.get_caption()[0] == "a world"
+        assert window.visible
+    np.testing.assert_array_equal(shown, picture())
+
+
+def test_a_frame_of_another_size_fills_the_window(screen):
+    with Window("a world", 60) as window:
+        window.show(picture())
+        shown = pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
+    assert shown.shape == (60, 60, 3)
+    assert (shown[:25, 35:] == (200, 100, 50)).all()
+    assert (shown[35:] == 0).all()
+
+
+def test_frames_come_no_faster_than_the_rate(screen):
+    with Window("a world", 32, fps=40) as window:
+        window.show(picture())
+        start = time.perf_counter()
+        for _ in range(8):
+            window.show(picture())
+        assert time.perf_counter() - start > 0.8 * 8 / 40
+
+
+def test_a_click_on_the_cross_closes_the_window(screen):
+    window = Window("a world", 32)
+    window.show(picture())
+    assert not window.closed
+    pygame.event.post(pygame.event.Event(pygame.QUIT))
+    window.show(picture())
+    assert window.closed
+    assert not window.visible
+    window.show(picture())
+
+
+def test_closing_twice_is_fine(screen):
+    window = Window("a world", 32)
+    window.close()
+    window.close()
+    assert window.closed
+    assert not pygame.display.get_init()
+
+
+def test_a_new_window_takes_the_place_of_the_old_one(screen):
+    old = Window("old", 32)
+    new = Window("new", 48)
+    assert old.closed
+    old.close()
+    old.show(picture())
+    new.show(picture())
+    assert new.visible
+    assert pygame.display.get_surface().get_size() == (48, 48)
+    new.close()
+
+
+def test_a_display_that_others_shut_down_closes_the_window(screen):
+    window = Window("a world", 32)
+    pygame.display.quit()
+    window.show(picture())
+    assert window.closed
+
+
+def test_the_environment_is_left_as_it_was(screen, monkeypatch):
+    for name in ("PYGAME_HIDE_SUPPORT_PROMPT", "SDL_NO_SIGNAL_HANDLERS"):
+        monkeypatch.delenv(name, raising=False)
+    before = dict(os.environ)
+    Window("a world", 32).close()
+    assert dict(os.environ) == before
+
+
+@pytest.mark.parametrize("driver", ["not a driver", None])
+def test_without_a_screen_it_warns_once_and_does_nothing(monkeypatch, driver):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
+        monkeypatch.delenv(name, raising=False)
+    if driver is not None:
+        monkeypatch.setenv("SDL_VIDEODRIVER", driver)
+    elif sys.platform != "linux" or os.path.exists("/dev/dri"):
+        pytest.skip("there may be a screen")
+    with pytest.warns(UserWarning, match="there is no screen") as caught:
+        window = Window("a world", 32, fps=1)
+    assert len(caught) == 1
+    assert caught[0].filename == __file__
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        start = time.perf_counter()
+        for _ in range(5):
+            window.show(picture())
+        assert time.perf_counter() - start < 0.5
+        assert not window.closed
+        assert not window.visible
+        window.close()
+        window.close()
+    assert window.closed
+
+
+def test_without_pygame_the_error_names_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    with pytest.raises(MissingDependencyError, match=r"pip install 'npa-envs\[human\]'"):
+        Window("a world", 32)
+
+
+def test_pygame_starts_with_the_first_window_and_without_a_banner():
+    code = (
+        "import os, sys, npa_envs.render as render\n"
+        # Gymnasium, where it was imported, hides the banner as well.
+        "os.environ.pop('PYGAME_HIDE_SUPPORT_PROMPT', None)\n"
+        "assert 'pygame' not in sys.modules\n"
+        "render.Window('a world', 32).close()\n"
+        "assert 'pygame' in sys.modules\n"
+    )
+    environment = {**os.environ, "SDL_VIDEODRIVER": "dummy"}
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout == ""
+
+
+@pytest.mark.parametrize(
+    "frame", [picture()[..., 0], picture().astype(np.float32), picture()[..., :2], picture()[:0]]
+)
+def test_what_is_no_picture_is_refused(screen, frame):
+    with Window("a world", 32) as window, pytest.raises(NPAError, match="frame must be uint8"):
+        window.show(frame)
+
+
+@pytest.mark.parametrize("wrong", [{"size": 0}, {"size": (3, -1)}, {"fps": 0.0}])
+def test_sizes_and_rates_out_of_range_are_refused(screen, wrong):
+    with pytest.raises(NPAError, match="must be"):
+        Window("a world", **wrong)

@@ -1,0 +1,144 @@
+"""Means over worlds: exact values, independence of the batch, gradients; the pictures from them."""
+
+import pytest
+import torch
+
+from npa_envs import WorldRandom
+from npa_envs.errors import NPAError
+from npa_envs.sph import world_mean
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
+
+ERRORS = {torch.float32: 3e-7, torch.float64: 2e-15}
+"""Largest difference from the mean in float64 of numbers of size about 3: one rounding (worst seen
+1.2e-7 and 2.2e-16)."""
+
+
+@pytest.fixture(params=ERRORS, ids=("float32", "float64"))
+def dtype(request):
+    return request.param
+
+
+def numbers(*shape, dtype, device):
+    generator = torch.Generator().manual_seed(4)
+    return torch.randn(shape, generator=generator, dtype=torch.float64).to(device, dtype)
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 333, 4097])
+@pytest.mark.parametrize("width", [1, 2, 5])
+def test_the_mean_is_right_and_the_same_in_every_batch(count, width, dtype, device):
+    values = numbers(7, count, width, dtype=dtype, device=device)
+    means = world_mean(values)
+    assert means.shape == (7, width)
+    assert float((means.double() - values.double().mean(dim=1)).abs().max()) <= ERRORS[dtype]
+    for world in range(7):
+        assert torch.equal(world_mean(values[world : world + 1]), means[world : world + 1])
+    assert torch.equal(world_mean(values[2:5]), means[2:5])
+
+
+def test_float32_values_are_added_in_float64(device):
+    values = torch.ones(2, 10_001, 1, device=device)
+    values[:, 0] = 2.0**26
+    assert world_mean(values).tolist() == [[torch.tensor((2.0**26 + 1e4) / 10_001).item()]] * 2
+
+
+def test_values_may_be_strided(dtype, device):
+    values = numbers(5, 101, 3, dtype=dtype, device=device).transpose(0, 1)
+    assert torch.equal(world_mean(values), world_mean(values.contiguous()))
+
+
+def test_gradients_are_right_to_the_second_order(device):
+    values = numbers(2, 5, 3, dtype=torch.float64, device=device).requires_grad_()
+    assert torch.autograd.gradcheck(world_mean, values)
+    assert torch.autograd.gradgradcheck(lambda v: world_mean(v) ** 2, values)
+
+
+def test_the_gradient_is_one_share_of_the_means(dtype, device):
+    values = numbers(3, 8, 2, dtype=dtype, device=device).requires_grad_()
+    cotangent = numbers(3, 2, dtype=dtype, device=device)
+    world_mean(values).backward(cotangent)
+    assert torch.equal(values.grad, (cotangent / 8)[:, None].expand(3, 8, 2))
+
+
+def test_it_can_be_compiled(device):
+    values = numbers(3, 33, 2, dtype=torch.float32, device=device)
+    compiled = torch.compile(lambda v: world_mean(v) * 2.0, backend="aot_eager", fullgraph=True)
+    assert torch.equal(compiled(values), world_mean(values) * 2.0)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_it_can_be_captured_and_both_devices_agree():
+    values = numbers(3, 4097, 2, dtype=torch.float32, device="cuda")
+    expected = world_mean(values.cpu())
+    world_mean(values)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        means = world_mean(values)
+    graph.replay()
+    assert torch.equal(means.cpu(), expected)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        (torch.zeros(4, 3), r"values must have shape \[B, M, K\] .*, got \(4, 3\)"),
+        (torch.zeros(4, 0, 3), r"got \(4, 0, 3\)"),
+        (torch.zeros(4, 2, 3, dtype=torch.float16), "float32 or float64, got torch.float16"),
+        (torch.zeros(4, 2, 3, dtype=torch.int64), r"convert it with \.float\(\)"),
+    ],
+)
+def test_wrong_values_are_clear_errors(values, message):
+    with pytest.raises(NPAError, match=message):
+        world_mean(values)
+
+
+class TestMorphogenesis2D:
+    """Pictures and metrics of a world, alone and among others."""
+
+    @pytest.fixture(params=[(333, 33), (77, 101)], ids=("33px", "101px"))
+    def worlds(self, request, dtype, device):
+        particle_count, resolution = request.param
+        config = Morphogenesis2DConfig(
+            particle_count=particle_count, resolution=resolution, target_point_count=200
+        )
+        task = Morphogenesis2D(config, device=device)
+        random = WorldRandom(range(5), device=device)
+        x, s = task.seed(5, generator=random, device=device)
+        s = s + 0.3 * random.normal(*s.shape[1:])
+        return task, x.to(dtype), s.to(dtype)
+
+    def test_no_picture_and_no_metric_depends_on_the_batch(self, worlds):
+        task, x, s = worlds
+        functions = (
+            lambda x, s: (task.picture(x, s),),
+            task.splat_errors,
+            task.splat_losses,
+            lambda x, s: (task.metric(x, s),),
+        )
+        for function in functions:
+            together = function(x, s)
+            for world in range(5):
+                alone = function(x[world : world + 1].clone(), s[world : world + 1].clone())
+                for value, expected in zip(alone, together, strict=True):
+                    assert torch.equal(value[0], expected[world])
+
+    def test_losses_are_the_means_of_the_errors(self, worlds):
+        task, x, s = worlds
+        resolution = task.config.resolution
+        for loss, errors in zip(task.splat_losses(x, s), task.splat_errors(x, s), strict=True):
+            assert errors.shape == (5, resolution, resolution)
+            torch.testing.assert_close(loss, errors.mean(dim=(1, 2)))
+
+    def test_errors_are_what_their_formula_says(self, worlds):
+        task, x, s = worlds
+        difference = (task.picture(x, s) - task.target_picture.to(x)).double()
+        growth = difference.abs() + difference**2
+        density, colour = task.splat_errors(x, s)
+        expected = growth[..., :3].mean(dim=-1) * torch.exp(-growth[..., 3])
+        torch.testing.assert_close(density.double(), growth[..., 3], rtol=1e-6, atol=1e-9)
+        torch.testing.assert_close(colour.double(), expected, rtol=1e-5, atol=1e-9)
+
+    def test_a_centred_picture_has_the_targets_mean(self, worlds):
+        task, x, s = worlds
+        moved = task.picture(x + 0.25, s)
+        torch.testing.assert_close(moved, task.picture(x, s), rtol=0.0, atol=2e-3)
