@@ -3,3 +3,28 @@
 Holds reinforcement-learning and evolution-strategy baselines, policies made of gradient-trained
 rules, and scripted ones. They use the public API only.
 """
+
+from npa_envs.agents.evaluation import Episodes, evaluate_policy
+from npa_envs.agents.policy import Interface, Policy, interface_of
+from npa_envs.agents.rule_policy import RulePolicy
+from npa_envs.agents.scripted import (
+    MendPolicy,
+    PaintPolicy,
+    RandomPolicy,
+    SpreadPolicy,
+    ZeroPolicy,
+)
+
+__all__ = [
+    "Episodes",
+    "Interface",
+    "MendPolicy",
+    "PaintPolicy",
+    "Policy",
+    "RandomPolicy",
+    "RulePolicy",
+    "SpreadPolicy",
+    "ZeroPolicy",
+    "evaluate_policy",
+    "interface_of",
+]

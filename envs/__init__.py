@@ -1,6 +1,13 @@
 """Environments over the engine, imported as `npa_envs.envs`.
 
-Holds the Gymnasium environments (one world, or worlds batched on one device) and the PettingZoo
-environments (several species in one world). They define spaces, rewards, termination and rendering
-and call `npa_envs` for everything that moves: no kernels and no physics live here.
+`gym.make` and `gym.make_vec` take the ids of `npa_envs.registration`; the names here are for those
+who write a task of their own (docs/own_environment.md). No kernels and no physics live here: tasks
+say where worlds start and how far they are from the goal, `npa_envs.control` moves the particles.
 """
+
+from npa_envs.envs.config import EnvConfig
+from npa_envs.envs.single import NPAEnv
+from npa_envs.envs.task import EnvTask, Start
+from npa_envs.envs.vector import NPAVectorEnv
+
+__all__ = ["EnvConfig", "EnvTask", "NPAEnv", "NPAVectorEnv", "Start"]

@@ -1,5 +1,49 @@
 """Adapters between environments and the libraries that train on them, as `npa_envs.wrappers`.
 
 Holds Gymnasium and PettingZoo wrappers and the adapters to Stable-Baselines3 and other trainers.
-They use the public API only.
+They use the public API only. Names are imported when they are first used, so that none of these
+libraries is needed for the others.
 """
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from npa_envs.wrappers.damage import DamageEvents, VectorDamageEvents
+    from npa_envs.wrappers.normalize import NormalizePerception, VectorNormalizePerception
+    from npa_envs.wrappers.particles import ParticleVecEnv
+    from npa_envs.wrappers.species import SpeciesTags, VectorSpeciesTags
+    from npa_envs.wrappers.statistics import (
+        TorchNormalizeObservation,
+        TorchNormalizeReward,
+        TorchRecordEpisodeStatistics,
+    )
+
+__all__ = [
+    "DamageEvents",
+    "NormalizePerception",
+    "ParticleVecEnv",
+    "SpeciesTags",
+    "TorchNormalizeObservation",
+    "TorchNormalizeReward",
+    "TorchRecordEpisodeStatistics",
+    "VectorDamageEvents",
+    "VectorNormalizePerception",
+    "VectorSpeciesTags",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name == "ParticleVecEnv":
+        from npa_envs.wrappers import particles
+
+        return particles.ParticleVecEnv
+    from npa_envs.wrappers import damage, normalize, species, statistics
+
+    holders = (damage, normalize, species, statistics)
+    return next(getattr(module, name) for module in holders if hasattr(module, name))
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

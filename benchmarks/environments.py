@@ -1,0 +1,299 @@
+"""Speed of the batched environments: observations, rewards, resets and all; run with --help.
+
+Actions are uniformly random and drawn beforehand. Every episode is 64 steps long, so resets fall
+into the timing: all of them in one step, or (staggered) some in every step. Worlds start from the
+seed, a dense disk (Morphogenesis2D), or as grown and damaged pictures (Regeneration2D). On CUDA
+observations stay on the device and the host reads one byte a world; on a CPU they are NumPy's.
+
+Of a step's wall time, `wait` is what the host spent waiting for the device; the rest of it the host
+was busy. `device` is the sum of the kernels' times, `idle` the share of a step without any.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import json
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from datetime import date
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium
+import peers
+import torch
+from torch.autograd import DeviceType
+from torch.profiler import ProfilerActivity, profile
+
+import npa_envs  # noqa: F401 (registers the environments)
+
+
+class Case(NamedTuple):
+    """Worlds B of particles N, perceiving within eps."""
+
+    world_count: int
+    particle_count: int
+    eps: float = 0.1
+
+
+CUDA = (
+    Case(1, 1024),
+    Case(64, 1024),
+    Case(1024, 1024),
+    Case(1, 4096),
+    Case(64, 4096),
+    Case(16, 16384),
+    Case(16, 16384, eps=0.05),
+    Case(1, 65536),
+    Case(1, 65536, eps=0.025),
+)
+"""The last ones at the default eps, where a particle has some thousand neighbours, and at one where
+it has as many as at N = 4096."""
+CPU = (Case(1, 256), Case(1, 1024), Case(1, 4096), Case(8, 1024), Case(64, 256))
+QUICK = (Case(1, 64), Case(3, 64))
+BROKEN_DOWN = (Case(1024, 1024), Case(64, 4096))
+"""Cases of which the kernels are listed."""
+
+STARTS: dict[str, tuple[str, dict[str, Any]]] = {
+    "seed": ("npa/Morphogenesis2D-v0", {}),
+    "grown": ("npa/Regeneration2D-v0", {"success_loss": 0.0}),
+}
+"""Where episodes start; none ends in success, so that all are equally long."""
+
+EPISODE_STEPS = 64
+ACTION_SETS = 4
+ENOUGH_SECONDS = 2.0
+MAX_EPISODES = 9
+LISTED_KERNELS = 12
+
+
+class TimedEvent:
+    """A CUDA event that adds up how long the host waits for it.
+
+    Args:
+        event: The event.
+    """
+
+    def __init__(self, event: Any) -> None:
+        self.record = event.record
+        self.waited = 0.0
+        self._event = event
+
+    def synchronize(self) -> None:
+        """Wait for the event."""
+        start = time.perf_counter()
+        self._event.synchronize()
+        self.waited += time.perf_counter() - start
+
+
+def make(case: Case, start: str, device: torch.device, quick: bool) -> Any:
+    """Return the environment of a case."""
+    name, keywords = STARTS[start]
+    if start == "grown":
+        keywords = keywords | {"seed_pool": min(case.world_count, 4)}
+        keywords["grow_steps"] = 4 if quick else 256
+    return gymnasium.make_vec(
+        name,
+        num_envs=case.world_count,
+        vectorization_mode="vector_entry_point",
+        particle_count=case.particle_count,
+        eps=case.eps,
+        max_episode_steps=EPISODE_STEPS,
+        device=str(device),
+        output="torch" if device.type == "cuda" else "numpy",
+        **keywords,
+    )
+
+
+def random_actions(env: Any, device: torch.device) -> list[Any]:
+    """Return some sets of actions, where and as the environment takes them."""
+    config, physics = env.unwrapped.config, env.unwrapped.worlds.physics
+    generator = torch.Generator(device).manual_seed(0)
+    shape = (env.num_envs, config.particle_count, physics.action_dim)
+    drawn = torch.rand((ACTION_SETS, *shape), generator=generator, device=device)
+    sets = list(2.0 * drawn - 1.0)
+    return sets if config.output == "torch" else [actions.numpy() for actions in sets]
+
+
+def synchronize(device: torch.device) -> None:
+    """Wait until the device has done all its work."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def run_steps(env: Any, actions: list[Any], device: torch.device, steps: int) -> float:
+    """Return the wall time of some steps, in seconds."""
+    synchronize(device)
+    start = time.perf_counter()
+    for k in range(steps):
+        env.step(actions[k % len(actions)])
+    synchronize(device)
+    return time.perf_counter() - start
+
+
+def timed_episodes(run: Callable[[int], float], quick: bool) -> list[float]:
+    """Return the times of several episodes, enough of them for a median."""
+    times = [run(EPISODE_STEPS)]
+    while (
+        not quick and len(times) < MAX_EPISODES and (len(times) < 3 or sum(times) < ENOUGH_SECONDS)
+    ):
+        times.append(run(EPISODE_STEPS))
+    return times
+
+
+def neighbour_count(env: Any) -> float:
+    """Return the mean number of particles within eps of one, in the first world."""
+    x = env.unwrapped.particles()[0][0]
+    return float((torch.cdist(x[:256], x) < env.unwrapped.config.eps).sum(dim=1).float().mean())
+
+
+class Prepared(NamedTuple):
+    """A case whose kernels are compiled and captured."""
+
+    env: Any
+    run: Callable[[int], float]
+    """Takes so many steps and returns their wall time in seconds."""
+
+
+def prepare(case: Case, start: str, staggered: bool, device: torch.device, quick: bool) -> Prepared:
+    """Return a case that is ready to be timed."""
+    gc.collect()
+    synchronize(device)
+    if device.type == "cuda":
+        torch.cuda.empty_cache()
+        torch.cuda.reset_peak_memory_stats(device)
+    env = make(case, start, device, quick)
+    env.reset(seed=0)
+    if staggered:
+        ages = torch.arange(case.world_count, device=device) * EPISODE_STEPS // case.world_count
+        env.unwrapped.worlds.elapsed.copy_(ages)
+    actions = random_actions(env, device)
+
+    def run(steps: int) -> float:
+        return run_steps(env, actions, device, steps)
+
+    # The first episode compiles and captures; the second does what only follows a reset.
+    run(2 * EPISODE_STEPS)
+    return Prepared(env, run)
+
+
+def measure(
+    case: Case, start: str, staggered: bool, device: torch.device, quick: bool
+) -> dict[str, Any]:
+    """Return the row of one case."""
+    env, run = prepare(case, start, staggered, device, quick)
+    worlds, scale = env.unwrapped.worlds, 1e6 / EPISODE_STEPS
+    event = worlds._read = TimedEvent(worlds._read) if device.type == "cuda" else None
+    times = timed_episodes(run, quick)
+    wall = statistics.median(times) * scale
+    row = {
+        **case._asdict(),
+        "start": start,
+        "resets": "staggered" if staggered else "together",
+        "step_us": wall,
+        "step_us_range": [min(times) * scale, max(times) * scale],
+        "particle_steps_per_s": case.world_count * case.particle_count / wall * 1e6,
+    }
+    if event is not None:
+        row["wait_us"] = event.waited * scale / len(times)
+        row["host_us"] = statistics.mean(times) * scale - row["wait_us"]
+        row["peak_allocated_mib"] = torch.cuda.max_memory_allocated(device) / 2**20
+        row["peak_reserved_mib"] = torch.cuda.max_memory_reserved(device) / 2**20
+    # Half-way through an episode worlds are as they typically are.
+    run(EPISODE_STEPS // 2)
+    row["neighbours"] = neighbour_count(env)
+    env.close()
+    return row
+
+
+def add_kernels(row: dict[str, Any], device: torch.device, quick: bool) -> None:
+    """Add a row's device time, idle share and kernels; print the longest of these.
+
+    On a CPU, torch's operations stand in for kernels. Done after all timings, which a profiler that
+    was once at work may slow down.
+    """
+    case = Case(*(row[name] for name in Case._fields))
+    env, run = prepare(case, row["start"], row["resets"] == "staggered", device, quick)
+    cuda = device.type == "cuda"
+    kind = DeviceType.CUDA if cuda else DeviceType.CPU
+    with profile(activities=[ProfilerActivity.CUDA if cuda else ProfilerActivity.CPU]) as profiler:
+        run(EPISODE_STEPS)
+    env.close()
+    kernels = [
+        {
+            "name": entry.key,
+            "us": (entry.self_device_time_total if cuda else entry.self_cpu_time_total)
+            / EPISODE_STEPS,
+            "launches": entry.count / EPISODE_STEPS,
+        }
+        for entry in profiler.key_averages()
+        if entry.device_type == kind
+    ]
+    kernels.sort(key=lambda kernel: -kernel["us"])
+    row["device_us"] = total = sum(kernel["us"] for kernel in kernels)
+    row["idle"] = max(0.0, 1.0 - total / row["step_us"])
+    row["launches"] = sum(kernel["launches"] for kernel in kernels)
+    print(
+        f"{tuple(case)} from {row['start']}, resets {row['resets']}: device {total:.1f} µs, "
+        f"{row['launches']:.0f} launches, idle {row['idle']:.0%} of {row['step_us']:.1f} µs",
+        flush=True,
+    )
+    if case in BROKEN_DOWN or quick:
+        row["kernels"] = kernels[:LISTED_KERNELS]
+        for kernel in row["kernels"]:
+            spent, count = kernel["us"], kernel["launches"]
+            print(f"  {spent:9.2f} µs {spent / total:6.1%} {count:6.1f} x  {kernel['name'][:80]}")
+
+
+def show(row: dict[str, Any]) -> None:
+    """Print a row, numbers shortened."""
+    hidden = ("kernels", "step_us_range")
+    short = {k: f"{v:.4g}" if isinstance(v, float) else v for k, v in row.items()}
+    print("  ".join(f"{k} {v}" for k, v in short.items() if k not in hidden), flush=True)
+
+
+def main() -> None:
+    """Measure, print and write JSON."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    parser.add_argument("--threads", type=int, default=1, help="CPU threads of torch")
+    parser.add_argument("--quick", action="store_true", help="tiny worlds: does it run?")
+    parser.add_argument("--skip-peers", action="store_true", help="only these environments")
+    parser.add_argument("--skip-own", action="store_true", help="only the peers")
+    parser.add_argument("--commit", default="unknown", help="commit that is measured")
+    parser.add_argument("--output", type=Path, help="JSON file to write")
+    arguments = parser.parse_args()
+    torch.set_num_threads(arguments.threads)
+    device = torch.device(arguments.device)
+    cuda = device.type == "cuda"
+    rows: list[dict[str, Any]] = []
+    cases = QUICK if arguments.quick else CUDA if cuda else CPU
+    for case in () if arguments.skip_own else cases:
+        for start in STARTS:
+            for staggered in (False, True) if case.world_count > 1 else (False,):
+                rows.append(measure(case, start, staggered, device, arguments.quick))
+                show(rows[-1])
+    for row in rows if cuda or arguments.quick else ():
+        add_kernels(row, device, arguments.quick)
+    peer_rows = [] if arguments.skip_peers else list(peers.measure_all(device, arguments.quick))
+    for row in peer_rows:
+        show(row)
+    report = {
+        "command": " ".join(["python", *sys.argv]),
+        "commit": arguments.commit,
+        "date": date.today().isoformat(),
+        "machine": torch.cuda.get_device_name(device) if cuda else "CPU, 1 thread of kernels",
+        "torch": torch.__version__,
+        "episode_steps": EPISODE_STEPS,
+        "rows": rows,
+        "peers": peer_rows,
+    }
+    if arguments.output:
+        arguments.output.write_text(json.dumps(report, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,269 @@
+"""Write the pages of the environments, `docs/environments/`, from docstrings and configurations.
+
+    python docs/build_environment_pages.py          write the pages
+    python docs/build_environment_pages.py --check  fail where a page is not current
+
+A page is the docstring of an environment's class. Added are the spaces' numbers, which are computed
+from the default configuration, and the tables of arguments, whose meanings are the docstrings of
+the configuration's fields. A section that begins with "As in `OtherEnv`." stands for that section
+of the other environment, so that nothing is written twice.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import importlib
+import inspect
+import json
+import re
+import sys
+import textwrap
+import typing
+from collections.abc import Sequence
+from dataclasses import MISSING, fields
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Literal
+
+from draw_environment_pictures import FILMS, picture_path
+
+from npa_envs.envs.config import EnvConfig
+from npa_envs.envs.single import NPAEnv
+from npa_envs.envs.spaces import action_space, observation_space
+from npa_envs.envs.vector import NPAVectorEnv
+from npa_envs.envs.worlds import make_physics
+from npa_envs.registration import ENVIRONMENTS, Registration
+
+DOCS = Path(__file__).resolve().parent
+PAGES = DOCS / "environments"
+EXAMPLE = """\
+```python
+import gymnasium as gym
+import npa_envs
+
+env = gym.make("{id}")
+observation, info = env.reset(seed=0)
+observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
+
+# Eight worlds as one batch; device="cuda" puts it on a GPU.
+envs = gym.make_vec("{id}", num_envs=8)
+```"""
+NOTE = "<!-- Made by docs/build_environment_pages.py from the docstrings: edit those. -->"
+SAME_AS = re.compile(r"As in `(\w+)`\.\s*")
+COLUMNS = re.compile(r"\| `([^`]+) : ([^`]+)` \|")
+
+
+def environment_class(registration: Registration) -> type[NPAEnv]:
+    """Return the class of a single environment."""
+    found: type[NPAEnv] = getattr(
+        importlib.import_module(registration.module), f"{registration.name}Env"
+    )
+    return found
+
+
+def sections(env_class: type) -> dict[str, str]:
+    """Return the sections of a class's docstring by their headings; the first has none."""
+    parts = re.split(r"^## (.+)\n", inspect.cleandoc(env_class.__doc__ or ""), flags=re.MULTILINE)
+    return {"": parts[0].strip()} | {
+        heading: text.strip() for heading, text in zip(parts[1::2], parts[2::2], strict=True)
+    }
+
+
+def resolved_sections(env_class: type) -> dict[str, str]:
+    """Return the sections with those of other environments put where they are meant."""
+    classes = {cls.__name__: cls for cls in map(environment_class, ENVIRONMENTS)}
+    found = sections(env_class)
+    for heading, text in found.items():
+        if same := SAME_AS.match(text):
+            other = resolved_sections(classes[same[1]])[heading]
+            found[heading] = "\n\n".join(filter(None, (other, text[same.end() :])))
+    return found
+
+
+def field_meanings(config_type: type) -> dict[str, str]:
+    """Return the docstring of each field of a configuration, as its source has it.
+
+    Args:
+        config_type: A dataclass; what a subclass says goes before what its bases say.
+    """
+    meanings: dict[str, str] = {}
+    for cls in reversed(config_type.__mro__[:-1]):
+        body = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0].body
+        for field, text in pairwise(body):
+            if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
+                meanings[field.target.id] = inspect.cleandoc(text.value.value)
+    return meanings
+
+
+def kind_text(annotation: Any) -> str:
+    """Return a type in words: Literals are the strings that they hold."""
+    if typing.get_origin(annotation) is Literal:
+        return "str"
+    parts = typing.get_args(annotation) or (annotation,)
+    return " or ".join("None" if part is type(None) else part.__name__ for part in parts)
+
+
+def default_text(default: Any) -> str:
+    """Return a default as code; strings in double quotes."""
+    return f"`{json.dumps(default) if isinstance(default, str) else default}`"
+
+
+def table(heading: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
+    """Return a Markdown table."""
+    lines = [heading, ("---",) * len(heading), *rows]
+    cells = ((re.sub(r"\s+", " ", cell).replace("|", "\\|") for cell in line) for line in lines)
+    return "\n".join(f"| {' | '.join(line)} |" for line in cells)
+
+
+def argument_tables(config_type: type[EnvConfig]) -> str:
+    """Return the fields of a configuration as tables: the task's own, then those that all have."""
+    meanings, kinds = field_meanings(config_type), typing.get_type_hints(config_type)
+    own: list[tuple[str, ...]] = []
+    shared: list[tuple[str, ...]] = []
+    for field in fields(config_type):
+        assert field.default is not MISSING, f"{field.name} has no default"
+        row = (
+            f"`{field.name}`",
+            kind_text(kinds[field.name]),
+            default_text(field.default),
+            meanings[field.name],
+        )
+        changed = any(field.name in cls.__annotations__ for cls in task_bases(config_type))
+        (own if changed else shared).append(row)
+    heading = ("Name", "Type", "Default", "Meaning")
+    tables = ("Of this task:", table(heading, own), "Of every environment:", table(heading, shared))
+    return "\n\n".join(tables)
+
+
+def task_bases(config_type: type[EnvConfig]) -> list[type]:
+    """Return the classes of a configuration below the one that all environments share."""
+    return [cls for cls in config_type.__mro__ if issubclass(cls, EnvConfig) and cls != EnvConfig]
+
+
+def vector_table() -> str:
+    """Return what only `gym.make_vec` takes as a table, from the docstring of the base class."""
+    text = inspect.cleandoc(NPAVectorEnv.__doc__ or "").split("Args:\n")[1].split("\n\n")[0]
+    parts = re.split(r"^    (\w+): ", text, flags=re.MULTILINE)
+    meanings = dict(zip(parts[1::2], parts[2::2], strict=True))
+    rows = [
+        (f"`{name}`", default_text(parameter.default), meanings[name].strip())
+        for name, parameter in inspect.signature(NPAVectorEnv).parameters.items()
+        if parameter.kind is not parameter.VAR_KEYWORD
+    ]
+    opening = "Only `gym.make_vec` takes these; it gives `max_episode_steps` by itself:"
+    return f"{opening}\n\n{table(('Name', 'Default', 'Meaning'), rows)}"
+
+
+def numbered_columns(text: str, letters: dict[str, int], width: int) -> str:
+    """Give tables of columns such as `C : 2C` a second column with the numbers.
+
+    Args:
+        text: A section with such a table.
+        letters: What the letters stand for.
+        width: How many columns there are; the table has to name each once, in order.
+    """
+    reached = 0
+
+    def number(formula: str) -> int:
+        product = re.sub(r"(?<=\d)(?=[A-Z])", "*", formula)
+        return int(eval(product, {"__builtins__": {}}, letters))
+
+    def with_numbers(match: re.Match[str]) -> str:
+        nonlocal reached
+        first, end = number(match[1]), number(match[2])
+        assert first == reached, f"columns {match[0]} do not follow on {reached}"
+        reached = end
+        return f"{match[0]} {first} to {end - 1} |"
+
+    text = text.replace("| Columns |", "| Columns | By default |").replace("|---|", "|---|---|", 1)
+    text = COLUMNS.sub(with_numbers, text)
+    assert reached == width, f"the table names {reached} columns of {width}"
+    return text
+
+
+def page(registration: Registration) -> str:
+    """Return the page of an environment, Markdown."""
+    env_class = environment_class(registration)
+    task = env_class.task_type
+    config = task.config_type()
+    physics = make_physics(config, task)
+    count = config.particle_count
+    spaces = {
+        "Observation space": observation_space(physics, count),
+        "Action space": action_space(physics, count),
+    }
+    letters = {"C": config.state_dim, "D": task.space_dim, "N": count}
+    text = resolved_sections(env_class)
+    for heading, space in spaces.items():
+        text[heading] = numbered_columns(text[heading], letters, space.shape[1])
+    text["Arguments"] += "\n\n" + argument_tables(task.config_type)
+    text["Vectorized environment"] += "\n\n" + vector_table()
+    facts = table(
+        ("", "By default"),
+        [
+            ("Particles N, channels C", f"{count}, {config.state_dim}"),
+            *((heading, f"`{space}`") for heading, space in spaces.items()),
+            ("Steps of an episode", str(registration.max_episode_steps)),
+            ("Classes", f"`{registration.entry_point}`, `{registration.vector_entry_point}`"),
+        ],
+    )
+    opening = (f"# {registration.id}", text.pop(""), picture(registration), facts)
+    example = EXAMPLE.format(id=registration.id)
+    body = [f"## {heading}\n\n{content}" for heading, content in text.items()]
+    return "\n\n".join((NOTE, *opening, example, *body)) + "\n"
+
+
+def picture(registration: Registration) -> str:
+    """Return the picture with its caption, Markdown."""
+    caption = FILMS[registration.name].caption
+    return f"![{caption}](../images/{picture_path(registration).name})\n\n*{caption}*"
+
+
+def index() -> str:
+    """Return the list of the pages, Markdown."""
+    rows = []
+    for registration in ENVIRONMENTS:
+        text = sections(environment_class(registration))[""]
+        rows.append((f"[`{registration.id}`]({registration.name}.md)", text))
+    opening = (
+        "One page each: observation, action, reward, episodes, arguments. Words and letters are "
+        "explained in [the mathematics](../mathematics.md#glossary). To make one of your own: "
+        "[your own task as an environment](../own_environment.md)."
+    )
+    listing = table(("Environment", "Task"), rows)
+    return "\n\n".join((NOTE, "# Environments", opening, listing)) + "\n"
+
+
+def pages() -> dict[str, str]:
+    """Return all pages by their file names."""
+    made = {f"{registration.name}.md": page(registration) for registration in ENVIRONMENTS}
+    return made | {"README.md": index()}
+
+
+def stale_pages(folder: Path = PAGES) -> list[str]:
+    """Return the names of pages in a folder that are missing, not current, or nobody's."""
+    made = pages()
+    there = {path.name: path.read_text(encoding="utf-8") for path in folder.glob("*.md")}
+    return sorted(name for name in made | there if made.get(name) != there.get(name))
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Write or check the pages; return the exit status."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--check", action="store_true", help="write nothing; fail if not current")
+    chosen = parser.parse_args(arguments)
+    if chosen.check:
+        stale = stale_pages()
+        if stale:
+            cure = "python docs/build_environment_pages.py"
+            print(f"not current: {', '.join(stale)}: run {cure}", file=sys.stderr)
+        return int(bool(stale))
+    PAGES.mkdir(exist_ok=True)
+    for name, text in pages().items():
+        (PAGES / name).write_text(text, encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

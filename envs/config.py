@@ -1,0 +1,172 @@
+"""What every environment can be told: flat keywords of `gym.make`, checked before all else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Any, Literal, Self
+
+import torch
+
+from npa_envs.devices import check_device
+from npa_envs.errors import NPAError, suggest
+from npa_envs.render import STYLES
+from npa_envs.tasks.checks import check_fraction, check_non_negative, check_positive, is_whole
+
+Boundary = Literal["open", "periodic"]
+Reward = Literal["dense", "sparse", "particle"]
+Output = Literal["numpy", "torch"]
+
+CHOICES = {
+    "boundary": ("open", "periodic"),
+    "reward": ("dense", "sparse", "particle"),
+    "output": ("numpy", "torch"),
+    "render_mode": (None, "rgb_array", "human"),
+    "render_style": STYLES,
+}
+"""Fields that take one of a few words."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EnvConfig:
+    """The fields that all environments share; a task adds its own.
+
+    Lengths are in length units: pictures show [-1, 1] x [-1, 1].
+    """
+
+    particle_count: int = 1024
+    """Particles in a world, N."""
+
+    state_dim: int = 16
+    """State channels of a particle, C; the last three are its colour (less 0.5)."""
+
+    eps: float = 0.1
+    """Perception radius ε [length units]."""
+
+    eps0: float = 0.1
+    """Radius ε0 that perception is scaled to: that of the rules run here [length units]."""
+
+    alpha: float = 0.5
+    """Largest displacement in one step, as a fraction of ε (dimensionless)."""
+
+    state_scale: float = 1.0
+    """State step of an action of 1 (dimensionless)."""
+
+    update_prob: float = 0.5
+    """Probability p that a particle's action takes effect in a step (dimensionless)."""
+
+    dt: float = 1.0
+    """Time step (dimensionless)."""
+
+    position_noise: float = 0.0
+    """Standard deviation of the noise added to every position in a step [length units]."""
+
+    boundary: Boundary = "open"
+    """"open" space, or a "periodic" box into which positions are wrapped."""
+
+    box_size: float = 2.0
+    """Side of the periodic box around the origin [length units]."""
+
+    observation_limit: float = 16.0
+    """Observations are clipped to ± this; a state beyond it has diverged (dimensionless)."""
+
+    position_limit: float = 4.0
+    """A particle with a coordinate beyond ± this has diverged [length units]."""
+
+    reward: Reward = "dense"
+    """"dense": each step's improvement of the loss; "sparse": minus the loss at the episode's end;
+    "particle": as dense, with each particle's own share in `info["particle_reward"]`."""
+
+    episode_steps: int = 256
+    """Length of an episode where reward is "sparse", which a single environment cannot know from
+    `max_episode_steps`: change both together. Vector environments know it."""
+
+    success_loss: float | None = None
+    """The episode ends in success once the loss is at most this; None: the task's own choice."""
+
+    seed_pool: int = 0
+    """Episodes start from one of so many worlds, made once; 0: from a fresh one each time."""
+
+    device: str = "cpu"
+    """Where the worlds live: "cpu", "cuda" or "cuda:1"."""
+
+    output: Output = "numpy"
+    """Arrays that come out: "numpy", or "torch" tensors on the device."""
+
+    render_mode: str | None = None
+    """None, "rgb_array" or "human" (a window, with pygame)."""
+
+    render_style: str = "particles"
+    """What pictures show: "particles" (colours), "density" or "states" (hidden channels)."""
+
+    render_size: int = 256
+    """Pixels on each side of a rendered picture."""
+
+    def __post_init__(self) -> None:
+        """Check every field.
+
+        Raises:
+            NPAError: A field has the wrong type or lies outside its range, or this machine does not
+                have the device.
+        """
+        check_positive(self, int, "particle_count", "state_dim", "episode_steps")
+        check_positive(self, int, "render_size", at_least=8)
+        check_positive(
+            self,
+            float,
+            "eps",
+            "eps0",
+            "alpha",
+            "state_scale",
+            "dt",
+            "box_size",
+            "observation_limit",
+            "position_limit",
+        )
+        check_fraction(self, "update_prob")
+        check_non_negative(self, "position_noise")
+        if self.success_loss is not None:
+            check_non_negative(self, "success_loss")
+        if not is_whole(self.seed_pool) or self.seed_pool < 0:
+            raise NPAError(
+                f"seed_pool must be a whole number of at least 0, got {self.seed_pool!r}: "
+                "0 makes a fresh start for each episode"
+            )
+        for name, words in CHOICES.items():
+            value = getattr(self, name)
+            if value not in words:
+                known = [word for word in words if word is not None]
+                raise NPAError(
+                    f"{name} must be a known word, got {value!r}: {suggest(str(value), known)}"
+                )
+        if self.boundary == "periodic" and self.box_size < 2.0 * self.eps:
+            raise NPAError(
+                f"box_size must be at least 2 eps = {2.0 * self.eps:g}, got {self.box_size}: "
+                "enlarge the box or perceive at a smaller eps"
+            )
+        check_device(self.device)
+
+    @property
+    def box(self) -> float | None:
+        """Side of the periodic box [length units], or None in open space."""
+        return self.box_size if self.boundary == "periodic" else None
+
+    @property
+    def torch_device(self) -> torch.device:
+        """The device of the worlds."""
+        return check_device(self.device)
+
+    @classmethod
+    def from_keywords(cls, keywords: dict[str, Any]) -> Self:
+        """Return the configuration with some fields changed.
+
+        Args:
+            keywords: Fields by name.
+
+        Raises:
+            NPAError: There is no field of that name, or a field is wrong.
+        """
+        known = [field.name for field in fields(cls)]
+        for name in keywords:
+            if name not in known:
+                raise NPAError(f"unknown keyword {name!r}: {suggest(name, known)}")
+        return replace(cls(), **keywords)

@@ -1,0 +1,69 @@
+"""Whether worlds fit into memory, asked before anything is allocated."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import torch
+
+from npa_envs.control import Physics
+from npa_envs.errors import NPAError
+
+OBSERVATION_COPIES = 4
+"""Observations alive at once: the rows, the arrays handed out, the last ones, one to spare."""
+
+LARGEST_INDEX = 2**31 - 1
+"""Kernels index the particles' states with 32 bits."""
+
+
+def needed_bytes(world_count: int, particle_count: int, physics: Physics) -> int:
+    """Return about how much memory worlds take while they are stepped [bytes]."""
+    particles = world_count * particle_count
+    worlds = 6 * (physics.space_dim + physics.state_dim)
+    numbers = OBSERVATION_COPIES * physics.perception_dim + 2 * physics.action_dim + worlds + 16
+    return 4 * particles * numbers
+
+
+def free_bytes(device: torch.device) -> int | None:
+    """Return the memory that is free on a device [bytes], or None where nobody says."""
+    if device.type == "cuda":
+        free, _ = torch.cuda.mem_get_info(device)
+        cached = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+        return int(free) + cached
+    try:
+        for line in Path("/proc/meminfo").read_text().splitlines():
+            if line.startswith("MemAvailable:"):
+                return int(line.split()[1]) * 1024
+    except (OSError, ValueError, IndexError):
+        pass
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):
+        return None
+
+
+def check_memory(
+    world_count: int, particle_count: int, physics: Physics, device: torch.device
+) -> None:
+    """Check that worlds fit into a device's memory and into the kernels' indices.
+
+    Args:
+        world_count: Worlds B.
+        particle_count: Particles in each, N.
+        physics: The worlds' constants.
+        device: Where they shall live.
+
+    Raises:
+        NPAError: They do not.
+    """
+    what = f"{world_count} world(s) of {particle_count} particles"
+    cure = "choose a smaller particle_count or fewer worlds"
+    if world_count * particle_count * (1 + physics.state_dim) > LARGEST_INDEX:
+        raise NPAError(f"particle_count is too large: {what} exceed 32-bit indices: {cure}")
+    needed, free = needed_bytes(world_count, particle_count, physics), free_bytes(device)
+    if free is not None and needed > free:
+        raise NPAError(
+            f"particle_count must fit into memory: {what} need about {needed / 2**30:.1f} GiB, "
+            f"and {device} has {free / 2**30:.1f} GiB free: {cure}"
+        )

@@ -1,0 +1,265 @@
+"""`npa/Morphogenesis2D-v0`: a disk of blank particles grows into a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TypeVar
+
+import torch
+from torch import Tensor
+
+from npa_envs.envs.config import EnvConfig
+from npa_envs.envs.single import NPAEnv
+from npa_envs.envs.task import EnvTask
+from npa_envs.envs.vector import NPAVectorEnv
+from npa_envs.errors import NPAError
+from npa_envs.randomness import WorldRandom
+from npa_envs.tasks.checks import check_non_negative, check_positive
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
+from npa_envs.tasks.morphogenesis2d_config import Morphogenesis2DConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class Morphogenesis2DEnvConfig(EnvConfig):
+    """What 2D morphogenesis can be told besides."""
+
+    target: str = "gecko"
+    """What to grow: a built-in name (`npa-envs list`), an emoji, or the path of a picture."""
+
+    resolution: int = 64
+    """Pixels on each side of the picture that the loss compares."""
+
+    sigma: float = 1.0
+    """Standard deviation of a particle's splat, in pixels of the target (dimensionless)."""
+
+    colour_weight: float = 5.0
+    """Weight of the colour error against the density error (dimensionless)."""
+
+    seed_radius: float = 0.2
+    """Radius of the disk that the particles start in [length units]."""
+
+    def __post_init__(self) -> None:
+        """Check every field.
+
+        Raises:
+            NPAError: A field has the wrong type or lies outside its range.
+        """
+        super().__post_init__()
+        if not isinstance(self.target, str) or not self.target:
+            raise NPAError(
+                f"target must be a built-in name, an emoji or a path, got {self.target!r}: "
+                "for example target='gecko'"
+            )
+        check_positive(self, int, "state_dim", at_least=3)
+        check_positive(self, int, "resolution", at_least=8)
+        check_positive(self, float, "sigma", "seed_radius")
+        check_non_negative(self, "colour_weight")
+
+
+Config = TypeVar("Config", bound=Morphogenesis2DEnvConfig)
+
+
+class PictureTask(EnvTask[Config]):
+    """A picture to grow, compared by the splat loss of `npa_envs.tasks.morphogenesis2d`.
+
+    Args:
+        config: The environment's configuration.
+        device: Where the worlds live.
+
+    Raises:
+        NPAError: The target cannot be loaded.
+    """
+
+    config_type = Morphogenesis2DEnvConfig
+
+    def __init__(self, config: Config, device: torch.device) -> None:
+        super().__init__(config, device)
+        self.goal = Morphogenesis2D(
+            Morphogenesis2DConfig(
+                target=config.target,
+                target_point_count=config.particle_count,
+                particle_count=config.particle_count,
+                state_dim=config.state_dim,
+                eps=config.eps,
+                alpha=config.alpha,
+                seed_radius=config.seed_radius,
+                resolution=config.resolution,
+                sigma=config.sigma,
+                colour_weight=config.colour_weight,
+            ),
+            device=device,
+        )
+        """The task with its target and its loss."""
+
+    def seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
+        """Return particles uniform in a disk around the origin, all states zero."""
+        return self.goal.seed(random.world_count, generator=random, device=self.device)
+
+    def losses(self, x: Tensor, s: Tensor) -> Mapping[str, Tensor]:
+        """Return the density error and the weighted colour error of each world."""
+        density, colour = self.goal.splat_losses(x, s)
+        return {"density": density, "colour": self.config.colour_weight * colour}
+
+    def particle_losses(self, x: Tensor, s: Tensor) -> Tensor:
+        """Return each particle's share of the splat loss."""
+        return self.goal.particle_shares(x, s)
+
+    @property
+    def pixel_size(self) -> float:
+        """Size of a particle in pictures: the distance of the target's points."""
+        return self.goal.target.pixel_size
+
+
+class Morphogenesis2DEnv(NPAEnv):
+    """Grow a picture from a disk of blank particles.
+
+    ## Description
+
+    A world holds N particles in the plane. Each has a position and a state of C numbers, of which
+    the last three, plus 0.5, are its colour: red, green and blue. In every step the policy tells
+    each particle where to move and how to change its state. An episode begins with a small disk of
+    grey particles; at its end they should look like the target picture.
+
+    No particle sees the whole. A row of the observation tells what one particle perceives within
+    the radius ε around it, as averages that smoothed particle hydrodynamics (SPH) defines; it does
+    not tell where the particle is, which one it is, or how many steps have passed. So a policy is
+    usually one small network, applied to every row alike.
+
+    That this can be done is known: update rules trained by gradient do it, and one is shipped.
+    `npa_envs.agents.RulePolicy(npa_envs.load_rule("gecko"), env)` makes a policy of it. The task is
+    2D morphogenesis of Neural Particle Automata, section 4.1 of the paper below.
+
+    ## Observation space
+
+    `Box(-16, 16, (N, P), float32)` with P = 4C + 2: one row for each particle, always in the same
+    order. Numbers beyond ±`observation_limit` are clipped.
+
+    | Columns | Perceived | Unit |
+    |---|---|---|
+    | `0 : C` | the particle's own state s | dimensionless |
+    | `C : 2C` | mean state of the neighbourhood, itself included | dimensionless |
+    | `2C : 4C` | gradient of the state: x, y of channel 0, then of channel 1, ... | 1 / length |
+    | `4C : 4C + 2` | gradient of the density over N, x and y: where it gets denser | 1 / length³ |
+
+    Gradients are on a logarithmic scale: a vector v becomes log(1 + |v|) v / |v|. They are first
+    scaled by powers of ε / ε0, so that a policy can be used at another ε than it was trained at.
+    Formulas: [perception](../mathematics.md#perception); the same numbers come from
+    `npa_envs.perceive`.
+
+    ## Action space
+
+    `Box(-1, 1, (N, A), float32)` with A = 2 + C: one row for each particle.
+
+    | Columns | Action a | An action of 1 is | Effect on an updated particle |
+    |---|---|---|---|
+    | `0 : 2` | displacement along x and y | α ε, a length | x ← x + dt α ε a |
+    | `2 : 2 + C` | change of the state | `state_scale`, no unit | s ← s + dt `state_scale` a |
+
+    In every step each particle is updated with probability `update_prob`, on its own; the rows of
+    the others are ignored in this step. A displacement longer than 1 is shortened to length 1, and
+    state entries are clipped to [-1, 1]. A number that is not finite raises `NPAError` and leaves
+    the world as it was. An update rule's output [δ; Δs] is the action
+    [δ / (1 + |δ|); Δs / `state_scale`]; see [one step](../mathematics.md#one-step).
+
+    ## Reward
+
+    The particles' picture is compared with the target's on `resolution` × `resolution` pixels. The
+    loss L is the sum of a density error (is there something where there should be?) and
+    `colour_weight` times a colour error; 0 is a perfect picture. The picture's middle is moved onto
+    the target's first, so where the whole thing lies does not count. Formula:
+    [pictures](../mathematics.md#pictures).
+
+    | `reward` | Reward of step t |
+    |---|---|
+    | `"dense"` | L before the step minus L after it |
+    | `"sparse"` | 0, and minus L in the last step |
+    | `"particle"` | as dense; besides, `info["particle_reward"]` has each particle's own |
+
+    Dense rewards telescope: their sum over an episode is L at its start minus L at its end. So the
+    undiscounted return is largest where the last picture is best, whatever the way there. `info`
+    holds the reward's two parts, as `reward_density` and `reward_colour`. A particle's own reward
+    comes from the errors of the pixels that it covers; the mean of all is the dense reward, up to
+    rounding. In a step that diverges L counts as at least its value at the start, so that leaving
+    the world never pays; the parts in `info` are as they are.
+
+    ## Starting state
+
+    Particles are uniform in a disk of radius `seed_radius` around the origin, all states are zero.
+    `reset(seed=k)` begins the sequence of episodes that belongs to k, and `reset()` goes on with
+    the next one. With `seed_pool=K` there are only K different starts.
+
+    ## Episode end
+
+    | Cause | Returned as | `info["reason"]` |
+    |---|---|---|
+    | the loss is at most `success_loss` | terminated | `"success"` |
+    | a particle has left the world, or its state has run away | terminated | `"diverged"` |
+    | `max_episode_steps` steps are done, by default 256 | truncated | `"time limit"` |
+
+    `success_loss` is None by default: growth has no natural end, and the picture should last. A
+    particle has left where a coordinate is beyond ±`position_limit`, and its state has run away
+    beyond ±`observation_limit`. The steps of a single environment are counted by Gymnasium, which
+    truncates without a reason; with `reward="sparse"` such an environment has to be told the number
+    of steps twice, as `max_episode_steps` and as `episode_steps`.
+
+    ## Info
+
+    | Key | In | Value |
+    |---|---|---|
+    | `loss` | reset, step | L as it is now |
+    | `loss_density`, `loss_colour` | reset, step | its two parts |
+    | `reward_density`, `reward_colour` | step | how much each part improved in this step |
+    | `success`, `diverged` | step | whether the episode ended in this way, bool |
+    | `reason` | last step | why the episode ended, see above |
+    | `particle_reward` | step, where `reward="particle"` | each particle's own reward, shape [N] |
+
+    ## Rendering
+
+    `render_mode="rgb_array"` makes uint8 pictures of shape [R, R, 3], R = `render_size`, that show
+    [-1, 1] × [-1, 1] with y up. `render_mode="human"` shows them in a window while the environment
+    is stepped; it needs `pip install 'npa-envs[human]'` and a screen: without one, it warns once
+    and goes on. `render_style` chooses between the particles' colours, how dense they lie, and
+    their hidden channels.
+
+    ## Arguments
+
+    All are keywords of `gym.make` and `gym.make_vec`. An unknown name, or a value out of range,
+    raises an `NPAError` that says what would be right.
+
+    ## Vectorized environment
+
+    `gym.make_vec(id, num_envs=B)` makes B worlds that one call steps together, on the CPU or, with
+    `device="cuda"`, on a GPU. Observations have shape [B, N, P], actions [B, N, A], rewards and
+    flags [B]. World k after `reset(seed=s)` is the single environment after `reset(seed=s + k)`,
+    bit for bit, for every B.
+
+    - With `output="torch"` everything that comes out is a tensor on the device, and actions may be
+      tensors as well: nothing but the episodes' ends is copied to the host.
+    - Infos are arrays of shape [B], each with a mask of the same name behind an underscore, as
+      Gymnasium's vector environments have them.
+    - With `autoreset_mode="same-step"`, the default, a world whose episode is over starts the next
+      one at once: the last observation is in `infos["final_obs"]`, the last infos, with the reason,
+      in `infos["final_info"]`.
+    - `reset(options={"reset_mask": mask})` resets some worlds and leaves the others alone.
+
+    `env.unwrapped.particles()` returns positions and states, and `place_particles(x, s)` replaces
+    them, at no reward; single environments have both as well.
+
+    ## References
+
+    H. Kim, E. Pajouheshgar, S. Süsstrunk, W. Jakob, J. Park: Neural Particle Automata: Learning
+    Self-Organizing Particle Dynamics. [arXiv 2601.16096](https://arxiv.org/abs/2601.16096), 2026.
+
+    ## Version history
+
+    - v0: first version.
+    """
+
+    task_type = PictureTask
+
+
+class Morphogenesis2DVectorEnv(NPAVectorEnv):
+    """Worlds of `Morphogenesis2DEnv`, batched on one device; its docstring describes both."""
+
+    task_type = PictureTask

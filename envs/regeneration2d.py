@@ -1,0 +1,255 @@
+"""`npa/Regeneration2D-v0`: a grown picture is damaged, and is to heal."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from npa_envs.dynamics import rollout
+from npa_envs.envs.morphogenesis2d import Morphogenesis2DEnvConfig, PictureTask
+from npa_envs.envs.single import NPAEnv
+from npa_envs.envs.task import Start
+from npa_envs.envs.vector import NPAVectorEnv
+from npa_envs.errors import NPAError, suggest
+from npa_envs.randomness import WorldRandom
+from npa_envs.rule import COLOUR_OFFSET, NPARule
+from npa_envs.rule_io import load_rule, shipped_rules
+from npa_envs.tasks.checks import check_fraction, check_positive
+from npa_envs.tasks.damage import DAMAGE_SIZES, damage_worlds
+
+RANDOM_DAMAGE = "random"
+"""Each episode draws its kind of damage."""
+
+RANDOM_KINDS = ("erase", "cut", "clump")
+"""Kinds that it draws from."""
+
+PICTURE = "picture"
+"""Worlds start as the target's own points."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Regeneration2DEnvConfig(Morphogenesis2DEnvConfig):
+    """What 2D regeneration can be told besides."""
+
+    seed_pool: int = 4
+    """Episodes start from one of so many grown worlds, made once; 0: from a new one each time,
+    which takes `grow_steps` steps of the rule."""
+
+    episode_steps: int = 128
+    """As elsewhere; it equals the registered `max_episode_steps`."""
+
+    damage: str = RANDOM_DAMAGE
+    """What is done to the worlds: "erase", "cut", "clump", "noise", or "random" for one of the
+    first three."""
+
+    damage_size: float | None = None
+    """Radius of the erased or clumped disk, width of the cut, or standard deviation of the noise
+    [length units]; None: 0.2, 0.1, 0.2 and 0.05."""
+
+    rule: str | None = None
+    """What grows the worlds: a shipped rule, a rule's file, or "picture" to start from the target's
+    own points with blank hidden states; None: the shipped rule with the target's name."""
+
+    grow_steps: int = 256
+    """Steps of the rule from the seed to the grown world."""
+
+    healed_share: float = 0.8
+    """The episode ends in success once so much of what the damage added to the loss is gone, unless
+    `success_loss` is given (dimensionless, in (0, 1])."""
+
+    def __post_init__(self) -> None:
+        """Check every field.
+
+        Raises:
+            NPAError: A field has the wrong type or lies outside its range.
+        """
+        super().__post_init__()
+        kinds = (*DAMAGE_SIZES, RANDOM_DAMAGE)
+        if self.damage not in kinds:
+            hint = suggest(str(self.damage), kinds)
+            raise NPAError(f"damage must be a known kind, got {self.damage!r}: {hint}")
+        check_positive(self, int, "grow_steps")
+        check_fraction(self, "healed_share")
+        if self.damage_size is not None:
+            check_positive(self, float, "damage_size")
+
+
+class RegenerationTask(PictureTask[Regeneration2DEnvConfig]):
+    """A grown picture, damaged.
+
+    Args:
+        config: The environment's configuration.
+        device: Where the worlds live.
+
+    Raises:
+        NPAError: The target or the rule cannot be loaded, or the rule does not fit the worlds.
+    """
+
+    config_type = Regeneration2DEnvConfig
+
+    def __init__(self, config: Regeneration2DEnvConfig, device: torch.device) -> None:
+        super().__init__(config, device)
+        self._rule = None if config.rule == PICTURE else self._load_rule()
+
+    def seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
+        """Return grown worlds, not damaged yet."""
+        x, s = super().seed(random)
+        if self._rule is None:
+            return self._picture_worlds(x, s)
+        grown = [self._grow(x[k : k + 1], s[k : k + 1], random, k) for k in range(len(x))]
+        return torch.cat([x for x, _ in grown]), torch.cat([s for _, s in grown])
+
+    def start(self, random: WorldRandom) -> Start:
+        """Return damaged worlds; they are healed once their loss is near the undamaged one."""
+        x, s, threshold = super().start(random)
+        kinds = RANDOM_KINDS if self.config.damage == RANDOM_DAMAGE else (self.config.damage,)
+        chosen = random.integers(len(kinds), 1, 1)
+        hurt_x, hurt_s = x, s
+        for k, kind in enumerate(kinds):
+            size = self.config.damage_size
+            new_x, new_s = damage_worlds(x, s, kind=kind, size=size, generator=random)
+            hurt_x = torch.where(chosen == k, new_x, hurt_x)
+            hurt_s = torch.where(chosen == k, new_s, hurt_s)
+        if threshold is None:
+            whole, hurt = self._loss(x, s), self._loss(hurt_x, hurt_s)
+            threshold = whole + (1.0 - self.config.healed_share) * (hurt - whole).clamp_min(0.0)
+        return Start(hurt_x, hurt_s, threshold)
+
+    def _loss(self, x: Tensor, s: Tensor) -> Tensor:
+        return torch.stack(list(self.losses(x, s).values())).sum(0)
+
+    @torch.no_grad()
+    def _grow(self, x: Tensor, s: Tensor, random: WorldRandom, k: int) -> tuple[Tensor, Tensor]:
+        """Grow world k alone: a rule's products change in the last bit with the batch's size."""
+        assert self._rule is not None, "worlds of the target's points are not grown"
+        return rollout(
+            self._rule,
+            x,
+            s,
+            self.config.grow_steps,
+            eps=self.config.eps,
+            box=self.config.box,
+            update_prob=self.config.update_prob,
+            generator=random.take(slice(k, k + 1)),
+        )
+
+    def _picture_worlds(self, x: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        points, colours = self.goal.target.points, self.goal.target.colours
+        # The target's points are about as many as the particles: some stand twice, or are left out.
+        chosen = torch.linspace(0, len(points) - 1, x.shape[1], device=x.device).round().long()
+        s[..., -3:] = colours[chosen] - COLOUR_OFFSET
+        return points[chosen].expand_as(x).clone(), s
+
+    def _load_rule(self) -> NPARule:
+        config = self.config
+        if config.rule is None and config.target not in shipped_rules():
+            raise NPAError(
+                f"rule must say what grows the worlds, as no shipped rule grows {config.target!r} "
+                f"({', '.join(shipped_rules())}): give rule='PATH', or rule={PICTURE!r} to start "
+                "from the target's own points"
+            )
+        rule = load_rule(config.rule or config.target, device=self.device)
+        wanted = {"space_dim": 2, "state_dim": config.state_dim, "static": False}
+        for name, value in wanted.items():
+            if getattr(rule, name) != value:
+                raise NPAError(
+                    f"rule must have {name}={value} like the world, got {getattr(rule, name)}: "
+                    "choose another rule, or the same state_dim"
+                )
+        return rule
+
+
+class Regeneration2DEnv(NPAEnv):
+    """Heal a picture that was damaged.
+
+    ## Description
+
+    A picture was grown from N particles, and then hurt: a disk lost its state, a knife went
+    through it, or a disk was drawn together. The policy tells each particle where to move and how
+    to change its state, so that the picture becomes whole again. As in `npa/Morphogenesis2D-v0`, a
+    particle perceives its neighbourhood alone: nobody tells it that there was damage.
+
+    Update rules that grow pictures can also heal them. The worlds are what such a rule has grown,
+    so that their hidden states mean something to it;
+    `npa_envs.agents.RulePolicy(npa_envs.load_rule("gecko"), env)` shows what it can do. To another
+    policy these hidden states are somebody else's notes: `rule="picture"` starts from the target's
+    own points instead, with blank hidden states.
+
+    ## Observation space
+
+    As in `Morphogenesis2DEnv`.
+
+    ## Action space
+
+    As in `Morphogenesis2DEnv`.
+
+    ## Reward
+
+    As in `Morphogenesis2DEnv`.
+
+    ## Starting state
+
+    The rule grows a world for `grow_steps` steps from a disk of blank particles, and one kind of
+    damage is done to it. With the default `seed_pool=4` there are four grown worlds, made at the
+    first reset, which takes some seconds on a CPU; the damage is drawn anew for each episode.
+
+    | `damage` | What is done |
+    |---|---|
+    | `"erase"` | the states in a disk around a random particle become zero: grey |
+    | `"cut"` | particles near a line through the middle, at a random angle, move off it |
+    | `"clump"` | the particles in a disk around a random one come ten times nearer to its centre |
+    | `"noise"` | every position gets normal noise |
+    | `"random"` | one of the first three, drawn for each episode |
+
+    `damage_size` is the disk's radius, the width of the cut, or the noise's standard deviation
+    [length units]; see [damage](../mathematics.md#damage). `reset(seed=k)` begins the sequence of
+    episodes that belongs to k, and `reset()` goes on with the next one.
+
+    ## Episode end
+
+    | Cause | Returned as | `info["reason"]` |
+    |---|---|---|
+    | `healed_share` of what the damage added to the loss is gone | terminated | `"success"` |
+    | a particle has left the world, or its state has run away | terminated | `"diverged"` |
+    | `max_episode_steps` steps are done, by default 128 | truncated | `"time limit"` |
+
+    With `success_loss` given, success is a loss of at most this instead. A particle has left where
+    a coordinate is beyond ±`position_limit`, and its state has run away beyond
+    ±`observation_limit`. The steps of a single environment are counted by Gymnasium, which
+    truncates without a reason; with `reward="sparse"` such an environment has to be told the number
+    of steps twice, as `max_episode_steps` and as `episode_steps`.
+
+    ## Info
+
+    As in `Morphogenesis2DEnv`.
+
+    ## Rendering
+
+    As in `Morphogenesis2DEnv`.
+
+    ## Arguments
+
+    As in `Morphogenesis2DEnv`.
+
+    ## Vectorized environment
+
+    As in `Morphogenesis2DEnv`.
+
+    ## References
+
+    As in `Morphogenesis2DEnv`.
+
+    ## Version history
+
+    - v0: first version.
+    """
+
+    task_type = RegenerationTask
+
+
+class Regeneration2DVectorEnv(NPAVectorEnv):
+    """Worlds of `Regeneration2DEnv`, batched on one device; its docstring describes both."""
+
+    task_type = RegenerationTask

@@ -1,0 +1,153 @@
+"""What an environment asks of its task: where worlds start, and how far they are from the goal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import ClassVar, Generic, NamedTuple, TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from npa_envs.envs.config import EnvConfig
+from npa_envs.errors import NPAError
+from npa_envs.randomness import WorldRandom
+from npa_envs.render import draw_worlds
+
+Config = TypeVar("Config", bound=EnvConfig)
+
+SHARPNESS = 0.7
+"""Standard deviation of a particle's spot in pictures, in distances between particles."""
+
+TURN = 2.0
+"""Degrees by which the camera turns around a 3D world in one step."""
+
+
+class Start(NamedTuple):
+    """Worlds at the beginning of their episodes."""
+
+    x: Tensor
+    """Positions [length units], shape [B, N, D]."""
+
+    s: Tensor
+    """States, dimensionless, shape [B, N, C]."""
+
+    success_loss: Tensor | None = None
+    """Loss at which each world's episode ends in success, shape [B]; None: never."""
+
+
+class EnvTask(Generic[Config]):
+    """One task as environments see it; subclass it, and name the subclass in an `NPAEnv`.
+
+    `seed` and `losses` are all that a task must have. None of the methods may wait for the device
+    (no `.item()`, no branch on a tensor's value), and the result for one world must not depend on
+    the others: take means over particles or pixels with `npa_envs.world_mean`.
+
+    Args:
+        config: The environment's configuration.
+        device: Where the worlds live.
+    """
+
+    config_type: ClassVar[type[EnvConfig]] = EnvConfig
+    """The configuration's class: its fields are the keywords of `gym.make`."""
+
+    space_dim: ClassVar[int] = 2
+    """Space dimension D."""
+
+    static: ClassVar[bool] = False
+    """Whether particles stay where they are; actions are then state steps alone."""
+
+    def __init__(self, config: Config, device: torch.device) -> None:
+        self.config = config
+        self.device = device
+        self._pool: Start | None = None
+
+    def seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
+        """Return fresh worlds: positions [B, N, D] and states [B, N, C].
+
+        Args:
+            random: Where they come from, one stream a world; B is `random.world_count`.
+        """
+        raise NotImplementedError
+
+    def losses(self, x: Tensor, s: Tensor) -> Mapping[str, Tensor]:
+        """Return the named parts of each world's loss, shape [B] each; their sum is the loss.
+
+        Args:
+            x: Positions [length units], shape [B, N, D].
+            s: States, dimensionless, shape [B, N, C].
+        """
+        raise NotImplementedError
+
+    def particle_losses(self, x: Tensor, s: Tensor) -> Tensor:
+        """Return each particle's share of its world's loss, shape [B, N]; their mean is the loss.
+
+        Args:
+            x: Positions [length units], shape [B, N, D].
+            s: States, dimensionless, shape [B, N, C].
+
+        Raises:
+            NPAError: The task has none.
+        """
+        raise NPAError(
+            f"{type(self).__name__} has no losses of single particles: choose reward='dense' or "
+            "'sparse', or give it a particle_losses method"
+        )
+
+    def start(self, random: WorldRandom) -> Start:
+        """Return worlds at the beginning of their episodes: fresh ones, or some from the pool.
+
+        Args:
+            random: Where they come from, one stream a world.
+        """
+        if self.config.seed_pool == 0:
+            x, s = self.seed(random)
+        else:
+            pool = self.pool()
+            chosen = random.integers(self.config.seed_pool, 1)[:, 0]
+            x, s = pool.x[chosen], pool.s[chosen]
+        return Start(x, s, self._constant_success(len(x)))
+
+    def pool(self) -> Start:
+        """Return the worlds that episodes start from, made when first asked for."""
+        if self._pool is None:
+            seeds = range(self.config.seed_pool)
+            self._pool = Start(*self.seed(WorldRandom(seeds, device=self.device)))
+        return self._pool
+
+    def draw(self, x: Tensor, s: Tensor, steps: NDArray[np.int64]) -> NDArray[np.uint8]:
+        """Return a picture of each world, shape [B, R, R, 3]; a camera turns around 3D worlds.
+
+        Args:
+            x: Positions [length units], shape [B, N, D].
+            s: States, dimensionless, shape [B, N, C].
+            steps: Steps since each episode's start, shape [B].
+        """
+        # All 2D worlds at once; in 3D each is seen from an angle of its own.
+        batches = [slice(None)] if self.space_dim == 2 else [slice(k, k + 1) for k in range(len(x))]
+        pictures = [
+            draw_worlds(
+                x[batch],
+                s[batch],
+                style=self.config.render_style,
+                resolution=self.config.render_size,
+                pixel_size=self.pixel_size,
+                sigma=SHARPNESS,
+                azimuth=TURN * float(steps[batch][0]),
+            )
+            for batch in batches
+        ]
+        return np.concatenate(pictures)
+
+    @property
+    def pixel_size(self) -> float:
+        """Size of a particle in pictures: their distance where N fill the unit disk or ball."""
+        volume = np.pi if self.space_dim == 2 else 4.0 * np.pi / 3.0
+        return float((volume / self.config.particle_count) ** (1.0 / self.space_dim))
+
+    def _constant_success(self, world_count: int) -> Tensor | None:
+        threshold = self.config.success_loss
+        if threshold is None:
+            return None
+        return torch.full((world_count,), threshold, device=self.device)

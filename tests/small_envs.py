@@ -1,0 +1,31 @@
+"""Every registered environment, made small."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+
+from npa_envs.registration import ENVIRONMENTS
+
+IDS = [environment.id for environment in ENVIRONMENTS]
+
+SMALL: dict[str, Any] = {"particle_count": 61, "eps": 0.3, "resolution": 16, "render_size": 24}
+SPECIAL: dict[str, dict[str, Any]] = {"npa/Regeneration2D-v0": {"rule": "picture"}}
+
+
+def small(name: str, **keywords: Any) -> dict[str, Any]:
+    return SMALL | SPECIAL.get(name, {}) | keywords
+
+
+def make(name: str, **keywords: Any) -> gymnasium.Env:
+    return gymnasium.make(name, **small(name, **keywords))
+
+
+def make_vec(name: str, world_count: int, **keywords: Any) -> gymnasium.vector.VectorEnv:
+    return gymnasium.make_vec(
+        name,
+        num_envs=world_count,
+        vectorization_mode="vector_entry_point",
+        **small(name, **keywords),
+    )

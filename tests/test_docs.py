@@ -1,0 +1,237 @@
+"""The documentation is true: pages are current, tables name what is there, code runs."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+
+import npa_envs
+from npa_envs.registration import ENVIRONMENTS
+
+ROOT = Path(__file__).resolve().parent.parent
+DOCS = ROOT / "docs"
+OWN = DOCS / "own_environment.md"
+PAGES = [DOCS / "environments" / f"{registration.name}.md" for registration in ENVIRONMENTS]
+TEXTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
+SMALL = {"particle_count": 64, "eps": 0.3, "resolution": 16}
+BY_ID = {registration.id: registration for registration in ENVIRONMENTS}
+
+
+def code_blocks(path: Path) -> list[str]:
+    return re.findall(r"^```python\n(.*?)^```", path.read_text(), re.MULTILINE | re.DOTALL)
+
+
+def section(path: Path, heading: str) -> str:
+    return path.read_text().split(f"\n## {heading}\n")[1].split("\n## ")[0]
+
+
+def first_cells(text: str) -> list[str]:
+    """Return the names in code that the first cells of a section's tables hold."""
+    cells = re.findall(r"^\| ([^|]+) \|", text, re.MULTILINE)
+    return [name for cell in cells for name in re.findall(r"`([^`]+)`", cell)]
+
+
+def anchors(path: Path) -> set[str]:
+    titles = re.findall(r"^#+ (.+)$", path.read_text(), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title).strip().lower().replace(" ", "-") for title in titles}
+
+
+@pytest.fixture(scope="module")
+def builder():
+    """The script that makes the pages."""
+    sys.path.insert(0, str(DOCS))
+    try:
+        import build_environment_pages
+    finally:
+        sys.path.remove(str(DOCS))
+    return build_environment_pages
+
+
+@pytest.fixture(scope="module")
+def ring(tmp_path_factory):
+    """The module that the page about own environments shows."""
+    path = tmp_path_factory.mktemp("own") / "ring.py"
+    path.write_text(code_blocks(OWN)[0])
+    spec = importlib.util.spec_from_file_location("ring", path)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["ring"] = module
+    spec.loader.exec_module(module)
+    yield module
+    gym.registry.pop("my/Ring-v0")
+    del sys.modules["ring"]
+
+
+def test_pages_of_environments_are_current(builder, capsys):
+    status = builder.main(["--check"])
+    assert status == 0, capsys.readouterr().err
+
+
+def test_check_finds_pages_that_are_changed_missing_or_nobodys(builder, tmp_path):
+    made = builder.pages()
+    for name, text in made.items():
+        (tmp_path / name).write_text(text)
+    assert builder.stale_pages(tmp_path) == []
+    changed = tmp_path / "Morphogenesis2D.md"
+    changed.write_text(changed.read_text().replace("1024", "1023", 1))
+    (tmp_path / "README.md").unlink()
+    (tmp_path / "Forgotten.md").write_text("# An environment of the past\n")
+    assert builder.stale_pages(tmp_path) == ["Forgotten.md", "Morphogenesis2D.md", "README.md"]
+
+
+def test_a_table_of_columns_must_name_each_column_once(builder):
+    text = "| Columns | What |\n|---|---|\n| `0 : C` | state |\n| `C : 2C + 2` | rest |\n"
+    letters = {"C": 16, "D": 2}
+    numbered = builder.numbered_columns(text, letters, 34)
+    assert "| `0 : C` | 0 to 15 | state |" in numbered
+    assert "| `C : 2C + 2` | 16 to 33 | rest |" in numbered
+    with pytest.raises(AssertionError, match="34 columns of 35"):
+        builder.numbered_columns(text, letters, 35)
+    with pytest.raises(AssertionError, match="do not follow on 16"):
+        builder.numbered_columns(text.replace("`C :", "`17 :"), letters, 34)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.stem)
+def test_a_page_has_every_section(page):
+    headings = re.findall(r"^## (.+)$", page.read_text(), re.MULTILINE)
+    assert headings == [
+        "Description",
+        "Observation space",
+        "Action space",
+        "Reward",
+        "Starting state",
+        "Episode end",
+        "Info",
+        "Rendering",
+        "Arguments",
+        "Vectorized environment",
+        "References",
+        "Version history",
+    ]
+    assert not re.search(r"As in `\w+Env`", page.read_text())
+
+
+@pytest.mark.parametrize("registration", ENVIRONMENTS, ids=lambda row: row.name)
+def test_a_page_lists_the_arguments_with_their_defaults(registration, builder):
+    page = DOCS / "environments" / f"{registration.name}.md"
+    config = builder.environment_class(registration).task_type.config_type()
+    arguments = section(page, "Arguments")
+    assert sorted(first_cells(arguments)) == sorted(vars(config))
+    assert '| `target` | str | `"gecko"` |' in arguments
+    assert "| `success_loss` | float or None | `None` |" in arguments
+
+
+@pytest.mark.parametrize("registration", ENVIRONMENTS, ids=lambda row: row.name)
+def test_a_page_lists_the_keys_of_info(registration):
+    keywords = {"reward": "particle", "success_loss": 1e6, **SMALL}
+    if registration.name == "Regeneration2D":
+        keywords["rule"] = "picture"
+    env = gym.make(registration.id, **keywords)
+    _, at_reset = env.reset(seed=0)
+    *_, terminated, _, at_step = env.step(np.zeros(env.action_space.shape, np.float32))
+    assert terminated
+    listed = section(DOCS / "environments" / f"{registration.name}.md", "Info")
+    rows = [line for line in listed.splitlines() if line.startswith("| `")]
+    in_reset = [name for row in rows if "| reset" in row for name in first_cells(row)]
+    assert sorted(in_reset) == sorted(at_reset)
+    assert sorted(first_cells(listed)) == sorted(at_step)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.stem)
+def test_the_example_of_a_page_runs(page):
+    (example,) = code_blocks(page)
+    # Small worlds: what is tested is that the calls are right.
+    small = ", ".join(f"{name}={value}" for name, value in SMALL.items())
+    names = {}
+    exec(re.sub(r'(-v\d+")', rf"\1, {small}", example), names)
+    assert names["observation"].shape == (64, 66)
+    assert names["envs"].num_envs == 8
+
+
+def test_an_own_environment_takes_at_most_40_lines():
+    assert len(code_blocks(OWN)[0].splitlines()) <= 40
+
+
+def test_the_own_environment_passes_the_check_of_gymnasium(ring, monkeypatch, recwarn):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    check_env(gym.make("my/Ring-v0", particle_count=64).unwrapped)
+    assert [str(warning.message) for warning in recwarn] == []
+
+
+def test_a_batch_of_the_own_environment_equals_single_ones(ring):
+    keywords = {"particle_count": 61, "position_noise": 0.01}
+    envs = gym.make_vec("my/Ring-v0", num_envs=3, max_episode_steps=5, **keywords)
+    singles = [gym.make("my/Ring-v0", max_episode_steps=5, **keywords) for _ in range(3)]
+    actions = np.random.default_rng(0).uniform(-1, 1, (8, *envs.action_space.shape))
+    together, _ = envs.reset(seed=4)
+    for k, env in enumerate(singles):
+        alone, _ = env.reset(seed=4 + k)
+        assert np.array_equal(together[k], alone)
+    for action in actions.astype(np.float32):
+        together, rewards, _, truncated, infos = envs.step(action)
+        last = infos.get("final_info", infos)
+        for k, env in enumerate(singles):
+            alone, reward, _, cut_off, info = env.step(action[k])
+            assert reward == rewards[k]
+            assert info["loss_ring"] == last["loss_ring"][k]
+            assert cut_off == truncated[k]
+            if cut_off:
+                assert np.array_equal(infos["final_obs"][k], alone)
+                alone, _ = env.reset()
+            assert np.array_equal(together[k], alone)
+
+
+def test_the_own_environment_measures_the_distance_from_the_ring(ring):
+    env = gym.make("my/Ring-v0", particle_count=60, ring_radius=0.25).unwrapped
+    env.reset(seed=0)
+    angle = torch.arange(60) * (2 * torch.pi / 60)
+    circle = torch.stack((angle.cos(), angle.sin()), dim=1)
+    env.place_particles(0.25 * circle + 0.5, torch.zeros(60, 16))
+    assert env.worlds.loss.item() == pytest.approx(0.0, abs=1e-12)
+    env.place_particles(0.35 * circle, torch.zeros(60, 16))
+    assert env.worlds.loss.item() == pytest.approx(0.01, rel=1e-5)
+    with pytest.raises(npa_envs.NPAError, match="did you mean 'ring_radius'"):
+        gym.make("my/Ring-v0", ringradius=0.3)
+
+
+def test_the_other_code_about_own_environments_runs_as_it_says(ring, monkeypatch, capsys):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    names = {"gym": gym}
+    for block in code_blocks(OWN)[1:]:
+        exec(block, names)
+    first, last = map(float, capsys.readouterr().out.split(" -> "))
+    told = re.search(r"from (0\.\d+)\s+to (0\.\d+)", OWN.read_text())
+    assert first == pytest.approx(float(told[1]), abs=1e-3)
+    assert last == pytest.approx(float(told[2]), abs=2e-3)
+
+
+def test_the_code_of_the_readme_runs():
+    operators, environments = code_blocks(ROOT / "README.md")
+    names = {}
+    exec(operators.replace("4096", "256").replace("steps=512", "steps=8"), names)
+    assert names["colours"].shape == (1, 256, 3)
+    assert names["z"].shape == (1, 256, 66)
+    names = {}
+    exec(environments, names)
+    assert names["truncated"]
+    assert names["info"]["loss"] < 0.3
+    assert names["envs"].num_envs == 8
+
+
+@pytest.mark.parametrize("path", TEXTS, ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_links_lead_somewhere(path):
+    for target in re.findall(r"\]\(([^)\s]+)\)", path.read_text()):
+        if target.startswith("http"):
+            continue
+        name, _, anchor = target.partition("#")
+        there = (path.parent / name).resolve() if name else path
+        assert there.exists(), f"{target} is not there"
+        if anchor:
+            assert anchor in anchors(there), f"{there.name} has no heading {anchor}"

@@ -1,0 +1,437 @@
+"""Every registered environment: Gymnasium's rules, seeds, rewards, endings, bad input."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import subprocess
+import sys
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from gymnasium.wrappers import FlattenObservation
+from small_envs import IDS, make, make_vec, small
+
+import npa_envs
+from npa_envs.errors import NPAError
+
+every_id = pytest.mark.parametrize("name", IDS)
+
+
+@pytest.fixture(autouse=True)
+def _no_screen(monkeypatch):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+
+
+def actions(env, count, seed=0, scale=1.0):
+    random = np.random.default_rng(seed)
+    low, high = -scale, scale
+    return random.uniform(low, high, (count, *env.action_space.shape)).astype(np.float32)
+
+
+def episode(env, seed, count=12):
+    observation, info = env.reset(seed=seed)
+    trace = [observation, info["loss"]]
+    for action in actions(env, count):
+        observation, reward, terminated, truncated, info = env.step(action)
+        trace += [observation, reward, terminated, truncated, info["loss"]]
+    return trace
+
+
+def same(left, right):
+    return all(np.array_equal(a, b) for a, b in zip(left, right, strict=True))
+
+
+@every_id
+def test_gymnasium_finds_nothing_to_complain_of(name):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(make(name).unwrapped)
+
+
+@every_id
+def test_sb3_finds_nothing_to_complain_of_in_flat_observations(name):
+    checker = pytest.importorskip("stable_baselines3.common.env_checker")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        checker.check_env(FlattenObservation(make(name)))
+    # As they are, [N, P], they pass with the one advice to flatten them.
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        checker.check_env(make(name))
+    assert [str(w.message) for w in caught if "flatten the observation" not in str(w.message)] == []
+
+
+@every_id
+def test_spec_survives_pickling_and_json(name):
+    spec = make(name).spec
+    again = pickle.loads(pickle.dumps(spec))
+    assert again == spec
+    read = gymnasium.envs.registration.EnvSpec.from_json(spec.to_json())
+    assert json.loads(read.to_json()) == json.loads(spec.to_json())
+    assert same(episode(gymnasium.make(read), 3, 2), episode(make(name), 3, 2))
+    batched = pickle.loads(pickle.dumps(make_vec(name, 2).spec))
+    assert gymnasium.make_vec(batched).num_envs == 2
+
+
+@pytest.mark.parametrize(
+    "program",
+    [
+        "import gymnasium; gymnasium.make('npa_envs:npa/Morphogenesis2D-v0', particle_count=8)",
+        "import npa_envs, gymnasium; gymnasium.make('npa/Morphogenesis2D-v0', particle_count=8)",
+        "import gymnasium, npa_envs; gymnasium.make_vec('npa/Morphogenesis2D-v0', 2, "
+        "vectorization_mode='vector_entry_point', particle_count=8)",
+    ],
+)
+def test_ids_are_found_in_a_fresh_process(program):
+    done = subprocess.run([sys.executable, "-W", "error", "-c", program], capture_output=True)
+    assert done.returncode == 0, done.stderr.decode()
+
+
+@every_id
+def test_same_seed_gives_the_same_episode_and_another_seed_another(name):
+    first, second = make(name), make(name)
+    trace = episode(first, 5)
+    assert same(trace, episode(second, 5))
+    assert same(trace, episode(first, 5))
+    assert not same(trace, episode(second, 6))
+
+
+@every_id
+def test_two_environments_do_not_touch_each_other(name):
+    alone, left, right = make(name), make(name), make(name)
+    expected, _ = alone.reset(seed=1)
+    first, _ = left.reset(seed=1)
+    right.reset(seed=2)
+    assert np.array_equal(first, expected)
+    for k, action in enumerate(actions(alone, 6)):
+        expected = alone.step(action)[0]
+        seen = left.step(action)[0]
+        right.step(actions(right, 1, seed=k + 9)[0])
+        assert np.array_equal(seen, expected)
+
+
+@every_id
+def test_episodes_follow_from_the_seed_and_differ(name):
+    env = make(name)
+    firsts = [env.reset(seed=7)[0], env.reset()[0], env.reset()[0]]
+    again = [env.reset(seed=7)[0], env.reset()[0], env.reset()[0]]
+    assert same(firsts, again)
+    assert not np.array_equal(firsts[0], firsts[1])
+    assert not np.array_equal(firsts[1], firsts[2])
+
+
+@every_id
+def test_a_generator_put_into_np_random_decides_what_follows(name):
+    env = make(name)
+    seeded, _ = env.reset(seed=11)
+    env.reset(seed=3)
+    env.unwrapped.np_random = np.random.default_rng(11)
+    assert np.array_equal(env.reset()[0], seeded)
+
+
+@every_id
+def test_observations_and_actions_stay_in_their_spaces(name):
+    env = make(name, observation_limit=1.5, position_limit=100.0)
+    env.reset(seed=0)
+    for action in actions(env, 10):
+        observation, *_ = env.step(action)
+        assert observation.dtype == np.float32
+        assert env.observation_space.contains(observation)
+    assert np.abs(observation).max() == 1.5
+
+
+@every_id
+def test_dense_rewards_add_up_to_the_total_improvement(name):
+    env = make(name, success_loss=0.0, observation_limit=100.0)
+    _, info = env.reset(seed=0)
+    first, total, parts = info["loss"], 0.0, 0.0
+    for action in actions(env, 20, scale=0.2):
+        _, reward, _, _, info = env.step(action)
+        total += reward
+        parts += sum(v for k, v in info.items() if k.startswith("reward_"))
+    assert total == pytest.approx(first - info["loss"], rel=1e-4, abs=1e-5)
+    assert total != 0.0
+    assert parts == pytest.approx(total, rel=1e-4, abs=1e-5)
+    components = [v for k, v in info.items() if k.startswith("loss_")]
+    assert sum(components) == pytest.approx(info["loss"], rel=1e-5)
+
+
+@every_id
+def test_sparse_reward_is_the_loss_at_the_end(name):
+    env = make(name, reward="sparse", max_episode_steps=5, episode_steps=5, success_loss=0.0)
+    env.reset(seed=0)
+    rewards = []
+    for action in actions(env, 5, scale=0.2):
+        _, reward, _, truncated, info = env.step(action)
+        rewards.append(reward)
+    assert truncated
+    assert rewards[:4] == [0.0] * 4
+    assert rewards[4] == -info["loss"]
+
+
+def test_sparse_reward_that_was_cut_off_is_told():
+    env = make(IDS[0], reward="sparse", max_episode_steps=3)
+    env.reset(seed=0)
+    for action in actions(env, 3, scale=0.2):
+        env.step(action)
+    with pytest.warns(UserWarning, match="episode_steps=3"):
+        env.reset()
+
+
+@every_id
+def test_particle_rewards_average_to_the_dense_reward(name):
+    env, dense = make(name, reward="particle"), make(name)
+    env.reset(seed=0)
+    dense.reset(seed=0)
+    for action in actions(env, 10, scale=0.2):
+        _, reward, _, _, info = env.step(action)
+        assert reward == dense.step(action)[1]
+        own = info["particle_reward"]
+        assert own.shape == (61,)
+        assert own.mean() == pytest.approx(reward, rel=1e-3, abs=2e-6)
+        assert own.std() > 0
+
+
+@every_id
+def test_success_ends_the_episode_with_its_reason(name):
+    env = make(name, success_loss=1e9)
+    env.reset(seed=0)
+    _, _, terminated, _, info = env.step(actions(env, 1)[0])
+    assert terminated
+    assert (info["success"], info["diverged"], info["reason"]) == (True, False, "success")
+
+
+@every_id
+@pytest.mark.parametrize(
+    "limits", [{"observation_limit": 1e-3}, {"position_limit": 0.05}, {"position_noise": 1e30}]
+)
+def test_divergence_ends_the_episode_and_does_not_pay(name, limits):
+    env = make(name, update_prob=1.0, **limits)
+    env.reset(seed=0)
+    observation, reward, terminated, _, info = env.step(actions(env, 1)[0])
+    assert terminated
+    assert (info["success"], info["diverged"], info["reason"]) == (False, True, "diverged")
+    assert reward <= 0.0
+    assert np.isfinite(observation).all()
+    assert np.isfinite(info["loss"])
+
+
+@every_id
+def test_step_limit_is_the_registered_one(name):
+    env = make(name, success_loss=0.0)
+    env.reset(seed=0)
+    still = np.zeros(env.action_space.shape, np.float32)
+    ends = [env.step(still)[3] for _ in range(env.spec.max_episode_steps)]
+    assert ends.index(True) == len(ends) - 1
+
+
+@every_id
+def test_zero_action_leaves_the_world_as_it_is(name):
+    env = make(name)
+    start, _ = env.reset(seed=0)
+    observation, reward, *_ = env.step(np.zeros(env.action_space.shape, np.float32))
+    assert np.array_equal(start, observation)
+    assert reward == 0.0
+
+
+def test_action_moves_masked_particles_by_the_documented_amount():
+    env = make(IDS[0], update_prob=0.5, alpha=0.5, state_scale=0.25, dt=0.5)
+    env.reset(seed=0)
+    x, s = env.unwrapped.particles()
+    action = np.zeros(env.action_space.shape, np.float32)
+    action[:, 0], action[:, 1], action[:, 2:] = 3.0, 4.0, -1.0
+    env.step(action)
+    new_x, new_s = env.unwrapped.particles()
+    moved = (new_x != x).any(-1)
+    assert 10 < int(moved.sum()) < 51
+    step = torch.tensor([0.6, 0.8]) * 0.5 * 0.3 * 0.5
+    assert torch.allclose((new_x - x)[moved], step.expand(int(moved.sum()), 2), atol=1e-6)
+    assert torch.allclose((new_s - s)[moved], torch.tensor(-0.125))
+    assert torch.equal(new_s[~moved], s[~moved])
+
+
+def test_periodic_boundary_wraps_positions():
+    env = make(IDS[0], boundary="periodic", box_size=0.7, seed_radius=0.34, update_prob=1.0)
+    env.reset(seed=0)
+    action = np.zeros(env.action_space.shape, np.float32)
+    action[:, 0] = 1.0
+    for _ in range(5):
+        _, _, terminated, *_ = env.step(action)
+        assert not terminated
+    x, _ = env.unwrapped.particles()
+    assert float(x.abs().max()) <= 0.35
+    assert float(x[:, 0].min()) < -0.3
+
+
+def test_seed_pool_repeats_its_starts():
+    env = make(IDS[0], seed_pool=3)
+    starts = {env.reset(seed=seed)[0].tobytes() for seed in range(20)}
+    assert len(starts) == 3
+
+
+def test_regeneration_starts_grown_and_damaged():
+    grown = npa_envs.load_rule("gecko")
+    env = gymnasium.make(
+        "npa/Regeneration2D-v0", particle_count=512, grow_steps=48, seed_pool=1, damage="erase"
+    )
+    env.reset(seed=0)
+    x, s = env.unwrapped.particles()
+    erased = (s == 0).all(-1)
+    assert 10 < int(erased.sum()) < 400
+    assert float((x.amax(0) - x.amin(0)).max()) > 1.0
+    task = env.unwrapped.task
+    random = npa_envs.WorldRandom([0])
+    start_x, start_s = task.goal.seed(1, generator=random)
+    with torch.no_grad():
+        expected = npa_envs.rollout(grown, start_x, start_s, 48, generator=random)
+    assert torch.equal(task.pool().x, expected[0])
+    assert torch.equal(x, expected[0][0])
+
+
+@pytest.mark.parametrize("damage", ["erase", "cut", "clump", "random"])
+def test_every_damage_raises_the_loss(damage):
+    env = gymnasium.make(
+        "npa/Regeneration2D-v0", particle_count=256, rule="picture", damage=damage, damage_size=0.4
+    )
+    whole = float(sum(env.unwrapped.task.losses(*env.unwrapped.task.pool()[:2]).values())[0])
+    for seed in range(6):
+        _, info = env.reset(seed=seed)
+        assert info["loss"] > 1.05 * whole
+        start = env.unwrapped.task.start(npa_envs.WorldRandom([seed]))
+        assert float(start.success_loss) == pytest.approx(
+            0.8 * whole + 0.2 * info["loss"], rel=1e-5
+        )
+
+
+@every_id
+def test_torch_output_stays_torch(name):
+    env, plain = make(name, output="torch").unwrapped, make(name)
+    observation, _ = env.reset(seed=0)
+    expected, _ = plain.reset(seed=0)
+    assert isinstance(observation, torch.Tensor)
+    assert np.array_equal(observation.numpy(), expected)
+    action = actions(plain, 1)[0]
+    assert np.array_equal(env.step(torch.from_numpy(action))[0], plain.step(action)[0])
+
+
+@every_id
+def test_replaced_particles_are_perceived_and_pay_nothing(name):
+    env = make(name)
+    env.reset(seed=0)
+    x, s = env.unwrapped.particles()
+    observation = env.unwrapped.place_particles(x * 2.0, s)
+    expected = npa_envs.perceive(2.0 * x[None], s[None], 0.3, 0.1)[0].clamp(-16, 16)
+    assert np.array_equal(observation, expected.numpy())
+    _, reward, *_ = env.step(np.zeros(env.action_space.shape, np.float32))
+    assert reward == 0.0
+
+
+@every_id
+def test_action_that_is_no_number_is_an_error_and_changes_nothing(name):
+    env, other = make(name), make(name)
+    env.reset(seed=0)
+    other.reset(seed=0)
+    bad, good = actions(env, 2)
+    bad[4, 1] = np.nan
+    with pytest.raises(NPAError, match="action must be finite, got nan at world 0, particle 4"):
+        env.unwrapped.step(bad)
+    assert np.array_equal(env.unwrapped.step(good)[0], other.unwrapped.step(good)[0])
+
+
+@every_id
+@pytest.mark.parametrize("shape", [(61,), (60, 18), (61, 17), (1, 61, 18)])
+def test_action_of_another_shape_is_an_error(name, shape):
+    env = make(name).unwrapped
+    env.reset(seed=0)
+    with pytest.raises(NPAError, match=r"action must have shape \[N, A\] = \(61, 18\)"):
+        env.step(np.zeros(shape, np.float32))
+    with pytest.raises(NPAError, match="action must be an array of numbers"):
+        env.step("left")
+
+
+@every_id
+@pytest.mark.parametrize(
+    ("keywords", "message"),
+    [
+        ({"particle_coumt": 5}, "unknown keyword 'particle_coumt': did you mean 'particle_count'"),
+        ({"target": "geko"}, "did you mean 'gecko'"),
+        ({"target": "nowhere.png"}, "nowhere.png"),
+        ({"particle_count": 0}, "particle_count must be a whole number of at least 1, got 0"),
+        ({"particle_count": 10**8}, "particle_count"),
+        ({"particle_count": 1.5}, "particle_count must be a whole number"),
+        ({"device": "cuda:99"}, "device must be one that torch sees"),
+        ({"device": "tpu"}, "device must"),
+        ({"reward": "denze"}, "did you mean 'dense'"),
+        ({"output": "jax"}, "output must be a known word"),
+        ({"boundary": "wall"}, "boundary must be a known word"),
+        ({"boundary": "periodic", "box_size": 0.1}, "box_size must be at least 2 eps"),
+        ({"render_mode": "ansi"}, "render_mode must be a known word"),
+        ({"eps": -1.0}, "eps must be"),
+        ({"update_prob": 0.0}, "update_prob must lie in"),
+        ({"seed_pool": -1}, "seed_pool must be"),
+        ({"state_dim": 2}, "state_dim must be"),
+    ],
+)
+def test_bad_keyword_is_a_clear_error(name, keywords, message):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for factory in (gymnasium.make, gymnasium.make_vec):
+            with pytest.raises(NPAError, match=message):
+                factory(name, **(small(name) | keywords))
+
+
+def test_particles_beyond_memory_are_refused_before_they_are_made():
+    many = 2**31 // 17 - 1
+    with pytest.raises(NPAError, match="particle_count must fit into memory: 1 world"):
+        gymnasium.make(IDS[0], particle_count=many)
+
+
+@pytest.mark.parametrize(
+    ("keywords", "message"),
+    [
+        ({"damage": "burn"}, "damage must be a known kind"),
+        ({"target": "heart"}, "rule must say what grows the worlds"),
+        ({"state_dim": 8}, "rule must have state_dim=8"),
+        ({"rule": "geko"}, "gecko"),
+        ({"healed_share": 0.0}, "healed_share must lie in"),
+    ],
+)
+def test_bad_keyword_of_regeneration_is_a_clear_error(keywords, message):
+    with pytest.raises(NPAError, match=message):
+        gymnasium.make("npa/Regeneration2D-v0", **keywords)
+
+
+@every_id
+@pytest.mark.parametrize("style", ["particles", "density", "states"])
+def test_pictures_show_the_world(name, style):
+    env = make(name, render_mode="rgb_array", render_style=style)
+    env.reset(seed=0)
+    picture = env.render()
+    assert picture.shape == (24, 24, 3)
+    assert picture.dtype == np.uint8
+    assert (picture != 255).any()
+    assert (picture[0, 0] == 255).all()
+
+
+@every_id
+def test_frames_come_as_a_list(name):
+    env = make(name, render_mode="rgb_array_list")
+    env.reset(seed=0)
+    for action in actions(env, 3):
+        env.step(action)
+    assert len(env.render()) == 4
+
+
+@every_id
+def test_window_opens_and_closes_twice(name):
+    env = make(name, render_mode="human")
+    env.reset(seed=0)
+    env.step(actions(env, 1)[0])
+    assert env.render() is None
+    env.close()
+    env.close()

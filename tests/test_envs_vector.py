@@ -1,0 +1,330 @@
+"""Batched environments: world k is the single environment, whatever else the batch does."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.vector import AutoresetMode
+from small_envs import IDS, make, make_vec
+
+from npa_envs.errors import NPAError
+
+every_id = pytest.mark.parametrize("name", IDS)
+
+
+@pytest.fixture
+def where(device):
+    """Keywords that put worlds on the device of the numerical tests."""
+    return {"device": str(device)}
+
+
+def batches(env, count, seed=0, scale=1.0):
+    random = np.random.default_rng(seed)
+    shape = (env.num_envs, *env.single_action_space.shape)
+    return [random.uniform(-scale, scale, shape).astype(np.float32) for _ in range(count)]
+
+
+def assert_info_equal(infos, k, info):
+    for name, value in info.items():
+        assert np.array_equal(infos[name][k], value), name
+        assert infos[f"_{name}"][k], name
+
+
+@every_id
+@pytest.mark.parametrize("reward", ["dense", "sparse", "particle"])
+def test_vector_equals_single_over_200_steps_with_autoresets(name, reward, where):
+    """Some worlds succeed, some diverge, the others run into the limit."""
+    keywords = {"reward": reward, "episode_steps": 13, "observation_limit": 3.5} | where
+    if "Morphogenesis" in name:
+        keywords |= {"success_loss": 1.2}
+    envs = make_vec(name, 3, max_episode_steps=13, **keywords)
+    singles = [make(name, max_episode_steps=13, **keywords) for _ in range(3)]
+    observations, infos = envs.reset(seed=40)
+    for k, env in enumerate(singles):
+        observation, info = env.reset(seed=40 + k)
+        assert np.array_equal(observations[k], observation)
+        assert_info_equal(infos, k, info)
+    reasons = set()
+    for t, action in enumerate(batches(envs, 200)):
+        # One world in three lives to the step limit, one may succeed, one soon diverges.
+        action[t // 13 % 3] *= 0.05
+        action[(t // 13 + 1) % 3, :, 2:] *= 0.5
+        observations, rewards, terminations, truncations, infos = envs.step(action)
+        for k, env in enumerate(singles):
+            observation, reward_k, terminated, truncated, info = env.step(action[k])
+            assert rewards[k] == reward_k
+            assert terminations[k] == terminated
+            assert truncations[k] == truncated
+            if terminated or truncated:
+                assert infos["_final_obs"][k]
+                assert np.array_equal(infos["final_obs"][k], observation)
+                reasons.add(infos["final_info"]["reason"][k])
+                info.setdefault("reason", "time limit")
+                assert_info_equal(infos["final_info"], k, info)
+                observation, info = env.reset()
+                assert not infos["_success"][k]
+            elif "_final_obs" in infos:
+                assert not infos["_final_obs"][k]
+            assert np.array_equal(observations[k], observation)
+            assert_info_equal(infos, k, info)
+    assert reasons >= {"time limit", "diverged"}
+    assert ("success" in reasons) == ("success_loss" in keywords)
+
+
+@every_id
+def test_world_does_not_depend_on_the_number_of_worlds(name, where):
+    few, many = make_vec(name, 2, **where), make_vec(name, 9, **where)
+    left, _ = few.reset(seed=3)
+    right, _ = many.reset(seed=3)
+    assert np.array_equal(left, right[:2])
+    for action in batches(many, 10):
+        left, left_reward, *_ = few.step(action[:2])
+        right, right_reward, *_ = many.step(action)
+        assert np.array_equal(left, right[:2])
+        assert np.array_equal(left_reward, right_reward[:2])
+
+
+@every_id
+def test_same_seed_gives_the_same_worlds(name, where):
+    runs = []
+    for _ in range(2):
+        envs = make_vec(name, 3, max_episode_steps=5, **where)
+        trace = [envs.reset(seed=1)[0]]
+        for action in batches(envs, 12):
+            observation, reward, *_ = envs.step(action)
+            trace += [observation, reward]
+        runs.append(trace)
+    assert all(np.array_equal(a, b) for a, b in zip(*runs, strict=True))
+
+
+@every_id
+def test_next_step_mode_resets_one_step_later(name):
+    envs = make_vec(name, 2, max_episode_steps=4, autoreset_mode="next-step", success_loss=0.0)
+    same = make_vec(name, 2, max_episode_steps=4, success_loss=0.0)
+    first, _ = envs.reset(seed=0)
+    same.reset(seed=0)
+    action = np.zeros((2, *envs.single_action_space.shape), np.float32)
+    for _ in range(3):
+        envs.step(action)
+        same.step(action)
+    observation, _, _, truncated, infos = envs.step(action)
+    restarted, _, _, _, same_infos = same.step(action)
+    assert truncated.all()
+    assert "final_obs" not in infos
+    assert np.array_equal(observation, same_infos["final_obs"])
+    # The action of the step in which worlds restart does not count.
+    observation, reward, terminated, truncated, _ = envs.step(action + 1.0)
+    assert np.array_equal(observation, restarted)
+    assert not np.array_equal(observation, first)
+    assert (reward == 0.0).all()
+    assert not terminated.any()
+    assert not truncated.any()
+    one, other = envs.step(action + 0.1)[0], same.step(action + 0.1)[0]
+    assert np.array_equal(one, other)
+
+
+@every_id
+@pytest.mark.parametrize("output", ["numpy", "torch"])
+def test_disabled_mode_resets_only_the_worlds_of_the_mask(name, output):
+    envs = make_vec(name, 4, max_episode_steps=3, autoreset_mode="disabled", output=output)
+    others = make_vec(name, 4, max_episode_steps=30, autoreset_mode="disabled", output=output)
+    envs.reset(seed=0)
+    others.reset(seed=0)
+    actions = batches(envs, 8, scale=0.1)
+    for action in actions[:3]:
+        before, _, _, truncated, _ = envs.step(action)
+        others.step(action)
+    assert truncated.all()
+    mask = np.array([True, False, False, True])
+    given = torch.from_numpy(mask) if output == "torch" else mask
+    after, _ = envs.reset(options={"reset_mask": given})
+    fresh, _ = make_vec(name, 4, output=output).reset(seed=0)
+    for k in range(4):
+        assert np.array_equal(after[k], before[k]) is not mask[k]
+        assert not np.array_equal(after[k], fresh[k])
+    for action in actions[3:]:
+        left, right = envs.step(action)[0], others.step(action)[0]
+        assert np.array_equal(left[1:3], right[1:3])
+
+
+@every_id
+def test_masked_reset_with_a_seed_starts_that_seed(name):
+    envs = make_vec(name, 3)
+    fresh, _ = envs.reset(seed=5)
+    fresh = fresh.copy()
+    envs.step(batches(envs, 1)[0])
+    again, _ = envs.reset(seed=5, options={"reset_mask": np.array([False, True, False])})
+    assert np.array_equal(again[1], fresh[1])
+    assert not np.array_equal(again[0], fresh[0])
+
+
+def test_reset_mode_is_declared_twice():
+    for word, mode in (
+        ("same-step", AutoresetMode.SAME_STEP),
+        ("next-step", AutoresetMode.NEXT_STEP),
+        ("disabled", AutoresetMode.DISABLED),
+        (AutoresetMode.DISABLED, AutoresetMode.DISABLED),
+    ):
+        envs = make_vec(IDS[0], 2, autoreset_mode=word)
+        assert envs.metadata["autoreset_mode"] is mode
+        assert envs.autoreset_mode is mode
+    assert type(envs).metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+
+
+@every_id
+@pytest.mark.parametrize("mode", ["same-step", "next-step"])
+def test_gymnasiums_own_batches_of_single_worlds_agree(name, mode):
+    ours = make_vec(name, 2, max_episode_steps=4, autoreset_mode=mode)
+    theirs = gymnasium.vector.SyncVectorEnv(
+        [lambda: make(name, max_episode_steps=4)] * 2,
+        autoreset_mode=ours.metadata["autoreset_mode"],
+    )
+    assert ours.observation_space == theirs.observation_space
+    assert ours.action_space == theirs.action_space
+    left, left_infos = ours.reset(seed=0)
+    right, right_infos = theirs.reset(seed=0)
+    assert np.array_equal(left, right)
+    assert left_infos.keys() == right_infos.keys()
+    for action in batches(ours, 11, scale=0.2):
+        left, right = ours.step(action), theirs.step(action)
+        for one, other in zip(left[:4], right[:4], strict=True):
+            assert np.array_equal(one, other)
+        for key in right[4]:
+            if key == "final_obs":
+                both = zip(left[4][key], right[4][key], strict=True)
+                assert all(np.array_equal(one, other) for one, other in both)
+            elif not isinstance(right[4][key], dict):
+                assert np.array_equal(left[4][key], right[4][key]), key
+
+
+@every_id
+def test_torch_output_stays_on_the_device(name, where, device):
+    envs = make_vec(name, 3, output="torch", max_episode_steps=2, **where)
+    plain = make_vec(name, 3, max_episode_steps=2)
+    observation, infos = envs.reset(seed=0)
+    plain.reset(seed=0)
+    for action in batches(envs, 6, scale=0.1):
+        given = torch.from_numpy(action).to(device)
+        observation, reward, terminated, truncated, infos = envs.step(given)
+        expected = plain.step(action)
+        for value in (observation, reward, terminated, truncated, infos["loss"], infos["_loss"]):
+            assert isinstance(value, torch.Tensor)
+            assert value.device.type == device.type
+        assert (reward.dtype, terminated.dtype) == (torch.float32, torch.bool)
+        assert np.allclose(reward.cpu(), expected[1], rtol=1e-3, atol=1e-5)
+        if device.type == "cpu":
+            assert np.array_equal(observation.numpy(), expected[0])
+    assert isinstance(infos["final_obs"], torch.Tensor)
+
+
+@every_id
+def test_arrays_are_the_callers_unless_told_otherwise(name):
+    action = batches(make_vec(name, 2), 1, scale=0.2)[0]
+    for copy, kept in ((True, True), (False, False)):
+        envs = make_vec(name, 2, copy=copy)
+        envs.reset(seed=0)
+        observation, reward, *_ = envs.step(action)
+        observation_then, reward_then = observation.copy(), reward.copy()
+        envs.step(-action)
+        assert np.array_equal(observation, observation_then) is kept
+        assert np.array_equal(reward, reward_then) is kept
+        envs.reset(seed=9)
+        assert np.array_equal(observation, observation_then) is kept
+
+
+@every_id
+@pytest.mark.parametrize("mode", ["same-step", "next-step", "disabled"])
+def test_shared_arrays_hold_what_new_ones_would(name, mode):
+    given = {"autoreset_mode": mode, "max_episode_steps": 3, "reward": "particle"}
+    own, shared = make_vec(name, 3, **given), make_vec(name, 3, copy=False, **given)
+    first = shared.reset(seed=0)[0]
+    own.reset(seed=0)
+    for action in batches(own, 8, scale=0.2):
+        left, right = own.step(action), shared.step(action)
+        for one, other in zip(left[:4], right[:4], strict=True):
+            assert np.array_equal(one, other)
+        assert left[4].keys() == right[4].keys()
+        for key in left[4].keys() - {"final_info"}:
+            assert np.array_equal(left[4][key], right[4][key]), key
+        for key, value in left[4].get("final_info", {}).items():
+            assert np.array_equal(value, right[4]["final_info"][key]), key
+        assert np.shares_memory(first, right[0])
+    mask = {"reset_mask": np.array([True, False, True])}
+    assert np.array_equal(own.reset(options=mask)[0], shared.reset(options=dict(mask))[0])
+
+
+@every_id
+def test_bad_action_in_one_world_changes_none(name, where):
+    envs, others = make_vec(name, 3, **where), make_vec(name, 3, **where)
+    envs.reset(seed=0)
+    others.reset(seed=0)
+    for action in batches(envs, 4):
+        bad = action.copy()
+        bad[2, 7, 3] = np.inf
+        with pytest.raises(NPAError, match="got inf at world 2, particle 7, entry 3"):
+            envs.step(bad)
+        assert np.array_equal(envs.step(action)[0], others.step(action)[0])
+
+
+@every_id
+def test_wrong_use_is_a_clear_error(name):
+    envs = make_vec(name, 3)
+    zeros = np.zeros((3, *envs.single_action_space.shape), np.float32)
+    with pytest.raises(NPAError, match="call reset first"):
+        envs.step(zeros)
+    with pytest.raises(NPAError, match="reset all of them first"):
+        envs.reset(options={"reset_mask": np.array([True, False, False])})
+    envs.reset(seed=0)
+    with pytest.raises(NPAError, match=r"action must have shape \[B, N, A\]"):
+        envs.step(zeros[:2])
+    with pytest.raises(NPAError, match="reset_mask must be bool"):
+        envs.reset(options={"reset_mask": np.array([1, 0, 0])})
+    with pytest.raises(NPAError, match="reset_mask must choose"):
+        envs.reset(options={"reset_mask": np.zeros(3, bool)})
+    with pytest.raises(NPAError, match="seed must be one number or one for each of 3"):
+        envs.reset(seed=[1, 2])
+    with pytest.raises(NPAError, match="num_envs must be"):
+        make_vec(name, 0)
+    with pytest.raises(NPAError, match="max_episode_steps must be"):
+        make_vec(name, 1, max_episode_steps=0)
+    with pytest.raises(NPAError, match="did you mean 'disabled'"):
+        make_vec(name, 1, autoreset_mode="disable")
+
+
+@every_id
+def test_each_world_has_its_picture(name):
+    envs = make_vec(name, 3, render_mode="rgb_array")
+    envs.reset(seed=0)
+    envs.step(batches(envs, 1)[0])
+    pictures = envs.render()
+    assert [picture.shape for picture in pictures] == [(24, 24, 3)] * 3
+    single = make(name, render_mode="rgb_array")
+    single.reset(seed=1)
+    single.step(batches(envs, 1)[0][1])
+    assert np.array_equal(pictures[1], single.render())
+
+
+@every_id
+def test_window_shows_worlds_side_by_side(name, monkeypatch):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    envs = make_vec(name, 3, render_mode="human")
+    envs.reset(seed=0)
+    assert envs.render() is None
+    envs.close()
+    envs.close()
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@every_id
+def test_cpu_and_cuda_agree(name):
+    cpu, cuda = make_vec(name, 3), make_vec(name, 3, device="cuda")
+    left, _ = cpu.reset(seed=0)
+    right, _ = cuda.reset(seed=0)
+    assert np.allclose(left, right, atol=1e-4)
+    for action in batches(cpu, 20, scale=0.2):
+        left, right = cpu.step(action), cuda.step(action)
+        assert np.allclose(left[0], right[0], atol=2e-3)
+        assert np.allclose(left[1], right[1], rtol=1e-3, atol=1e-4)

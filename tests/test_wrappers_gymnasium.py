@@ -1,0 +1,173 @@
+"""Gymnasium's own wrappers over the environments."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import wrappers
+from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
+from gymnasium.wrappers import vector
+
+import npa_envs  # noqa: F401 (registers the environments)
+
+IDS = ["npa/Morphogenesis2D-v0", "npa/Regeneration2D-v0"]
+SMALL = {"particle_count": 64, "eps": 0.3, "resolution": 16}
+STEPS = 8
+ACTIONS = 18
+
+
+def single(id="npa/Morphogenesis2D-v0", **keywords):
+    rule = {"rule": "picture"} if "Regeneration" in id else {}
+    return gym.make(id, **{"max_episode_steps": STEPS, **SMALL, **rule, **keywords})
+
+
+def batched(count=3, **keywords):
+    return gym.make_vec(
+        "npa/Morphogenesis2D-v0",
+        num_envs=count,
+        vectorization_mode="vector_entry_point",
+        max_episode_steps=STEPS,
+        **SMALL,
+        **keywords,
+    )
+
+
+def actions(step, *shape):
+    return np.random.default_rng(step).uniform(-1, 1, (*shape, 64, ACTIONS)).astype(np.float32)
+
+
+@pytest.mark.parametrize("id", IDS)
+def test_record_episode_statistics(id):
+    env = wrappers.RecordEpisodeStatistics(single(id))
+    env.reset(seed=0)
+    total = 0.0
+    for step in range(STEPS):
+        _, reward, _, truncated, info = env.step(actions(step))
+        total += reward
+    assert truncated
+    assert info["episode"]["l"] == STEPS
+    assert info["episode"]["r"] == pytest.approx(total, abs=1e-6)
+
+
+def test_time_limit():
+    env = wrappers.TimeLimit(single(max_episode_steps=-1), 3)
+    env.reset(seed=0)
+    assert [env.step(actions(step))[3] for step in range(3)] == [False, False, True]
+
+
+def test_clip_and_rescale_action():
+    plain = single()
+    clipped = wrappers.ClipAction(single())
+    rescaled = wrappers.RescaleAction(single(), np.float32(0.0), np.float32(1.0))
+    for env in (plain, clipped, rescaled):
+        env.reset(seed=0)
+    action = actions(0)
+    expected, *_ = plain.step(action)
+    np.testing.assert_allclose(rescaled.step((action + 1) / 2)[0], expected, atol=1e-4)
+    expected, *_ = plain.step(np.clip(3 * action, -1, 1))
+    clipped.step(action)
+    np.testing.assert_array_equal(clipped.step(3 * action)[0], expected)
+
+
+def test_flatten_observation_and_normalize_reward():
+    env = wrappers.NormalizeReward(wrappers.FlattenObservation(single()))
+    assert env.observation_space.shape == (64 * 66,)
+    observation, _ = env.reset(seed=0)
+    assert env.observation_space.contains(observation)
+    for step in range(STEPS):
+        observation, reward, *_ = env.step(actions(step))
+    assert observation.shape == (64 * 66,)
+    assert np.isfinite(reward)
+
+
+def test_autoreset_goes_on_with_the_sequence_of_episodes():
+    env, plain = wrappers.Autoreset(single()), single()
+    env.reset(seed=3)
+    plain.reset(seed=3)
+    for step in range(STEPS):
+        env.step(actions(step))
+    expected, _ = plain.reset()
+    np.testing.assert_array_equal(env.step(actions(0))[0], expected)
+
+
+def test_render_collection():
+    env = wrappers.RenderCollection(single(render_mode="rgb_array", render_size=32))
+    env.reset(seed=0)
+    for step in range(3):
+        env.step(actions(step))
+    frames = env.render()
+    assert len(frames) == 4
+    assert {frame.shape for frame in frames} == {(32, 32, 3)}
+    assert (frames[0] != frames[-1]).any()
+
+
+def test_the_render_mode_of_lists():
+    env = single(render_mode="rgb_array_list", render_size=32)
+    env.reset(seed=0)
+    env.step(actions(0))
+    assert [frame.dtype for frame in env.render()] == [np.uint8] * 2
+
+
+def test_record_video(tmp_path):
+    pytest.importorskip("moviepy")
+    env = wrappers.RecordVideo(single(render_mode="rgb_array", render_size=32), str(tmp_path))
+    env.reset(seed=0)
+    for step in range(STEPS):
+        env.step(actions(step))
+    env.close()
+    assert [path.suffix for path in tmp_path.glob("*.mp4")] == [".mp4"]
+
+
+def test_sync_vector_env_gives_what_the_batched_one_gives():
+    sync = SyncVectorEnv([single, single], autoreset_mode="SameStep")
+    ours = batched(2)
+    np.testing.assert_array_equal(sync.reset(seed=5)[0], ours.reset(seed=5)[0])
+    for step in range(STEPS + 3):
+        expected, seen = sync.step(actions(step, 2)), ours.step(actions(step, 2))
+        for one, other in zip(expected[:4], seen[:4], strict=True):
+            np.testing.assert_array_equal(one, other)
+        if "final_obs" in seen[4]:
+            np.testing.assert_array_equal(
+                np.stack(list(expected[4]["final_obs"])), seen[4]["final_obs"]
+            )
+    sync.close()
+
+
+@pytest.mark.slow
+def test_async_vector_env_gives_what_the_batched_one_gives():
+    # Spawned: processes forked from one in which torch has threads may hang.
+    env = AsyncVectorEnv([single, single], context="spawn")
+    ours = batched(2)
+    try:
+        np.testing.assert_array_equal(env.reset(seed=5)[0], ours.reset(seed=5)[0])
+        for step in range(3):
+            expected, seen = env.step(actions(step, 2)), ours.step(actions(step, 2))
+            np.testing.assert_array_equal(expected[0], seen[0])
+            np.testing.assert_allclose(expected[1], seen[1])
+    finally:
+        env.close()
+
+
+def test_vector_wrappers():
+    env = vector.NormalizeReward(
+        vector.ClipAction(vector.RescaleAction(batched(), np.float32(-2.0), np.float32(2.0)))
+    )
+    env = vector.RecordEpisodeStatistics(env)
+    plain = batched()
+    env.reset(seed=0)
+    plain.reset(seed=0)
+    for step in range(STEPS):
+        observations, *_, infos = env.step(2 * actions(step, 3))
+        expected, *_ = plain.step(actions(step, 3))
+        np.testing.assert_allclose(observations, expected, atol=1e-3)
+    assert infos["episode"]["l"].tolist() == [STEPS] * 3
+
+
+def test_partial_resets_pass_through_gymnasiums_statistics():
+    from npa_envs.wrappers import VectorDamageEvents
+
+    env = VectorDamageEvents(vector.RecordEpisodeStatistics(batched()), "0:cut")
+    env.reset(seed=0)
+    options = {"reset_mask": np.array([True, False, False])}
+    _, infos = env.reset(options=options)
+    assert infos["_loss_damage"].tolist() == [True, False, False]
+    assert "reset_mask" in options

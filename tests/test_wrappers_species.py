@@ -1,0 +1,132 @@
+"""Species tags."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+import npa_envs  # noqa: F401 (registers the environments)
+from npa_envs.errors import NPAError
+from npa_envs.wrappers import SpeciesTags, VectorSpeciesTags
+
+SMALL = {"particle_count": 64, "eps": 0.3, "resolution": 16}
+STEPS = 8
+ACTION = np.full((64, 18), 0.1, np.float32)
+
+
+def single(**keywords):
+    return gym.make("npa/Morphogenesis2D-v0", max_episode_steps=STEPS, **SMALL, **keywords)
+
+
+def batched(count=3, **keywords):
+    return gym.make_vec(
+        "npa/Morphogenesis2D-v0",
+        num_envs=count,
+        vectorization_mode="vector_entry_point",
+        max_episode_steps=STEPS,
+        **SMALL,
+        **keywords,
+    )
+
+
+def test_tags_stand_behind_the_observation():
+    env, plain = SpeciesTags(single(), 2), single()
+    observation, _ = env.reset(seed=0)
+    np.testing.assert_array_equal(observation[:, :66], plain.reset(seed=0)[0])
+    np.testing.assert_array_equal(env.species, np.repeat([0, 1], 32))
+    np.testing.assert_array_equal(observation[:, 66:], np.eye(2, dtype=np.float32)[env.species])
+    later, *_ = env.step(ACTION)
+    np.testing.assert_array_equal(later[:, 66:], observation[:, 66:])
+    assert env.observation_space.shape == (64, 68)
+    assert env.observation_space.contains(later)
+    assert env.observation_space.high[0, -1] == 1.0
+    assert env.observation_space.low[0, -1] == 0.0
+
+
+@pytest.mark.parametrize("assignment", ["blocks", "random"])
+def test_fractions_are_kept(assignment):
+    env = SpeciesTags(single(), 3, fractions=[2, 1, 1], assignment=assignment)
+    env.reset(seed=0)
+    assert np.bincount(env.species).tolist() == [32, 16, 16]
+
+
+def test_random_species_are_drawn_for_each_episode_and_hold_through_it():
+    env = SpeciesTags(single(), 2, assignment="random")
+    first, _ = env.reset(seed=4)
+    species = env.species
+    for _ in range(3):
+        observation, *_ = env.step(ACTION)
+        np.testing.assert_array_equal(observation[:, 66:], first[:, 66:])
+    env.reset()
+    assert (env.species != species).any()
+    env.reset(seed=4)
+    np.testing.assert_array_equal(env.species, species)
+
+
+def test_tags_leave_the_worlds_as_they_are():
+    env, plain = SpeciesTags(single(), 2, assignment="random"), single()
+    env.reset(seed=0)
+    plain.reset(seed=0)
+    for _ in range(3):
+        np.testing.assert_array_equal(env.step(ACTION)[0][:, :66], plain.step(ACTION)[0])
+
+
+@pytest.mark.parametrize("mode", ["same-step", "next-step", "disabled"])
+@pytest.mark.parametrize("output", ["numpy", "torch"])
+def test_world_k_has_the_species_of_the_single_environment(mode, output):
+    envs = VectorSpeciesTags(batched(autoreset_mode=mode, output=output), 3, assignment="random")
+    wanted = []
+    for k in range(3):
+        env = SpeciesTags(single(), 3, assignment="random")
+        env.reset(seed=20 + k)
+        one = env.species
+        env.reset()
+        wanted.append((one, env.species))
+    one, two = (np.stack(each) for each in zip(*wanted, strict=True))
+    actions = np.stack([ACTION] * 3)
+    envs.reset(seed=20)
+    np.testing.assert_array_equal(np.asarray(envs.species), one)
+    for _ in range(STEPS):
+        before = np.asarray(envs.species)
+        observations, _, _, truncations, infos = envs.step(actions)
+    np.testing.assert_array_equal(before, one)
+    assert truncations.all()
+    tags = np.asarray(observations)[..., 66:]
+    if mode == "same-step":
+        final = np.asarray(infos["final_obs"])[..., 66:]
+        np.testing.assert_array_equal(final.argmax(axis=-1), one)
+        np.testing.assert_array_equal(tags.argmax(axis=-1), two)
+        np.testing.assert_array_equal(np.asarray(envs.species), two)
+        return
+    np.testing.assert_array_equal(tags.argmax(axis=-1), one)
+    if mode == "next-step":
+        observations, *_ = envs.step(actions)
+    else:
+        mask = np.array([True, False, True])
+        observations, _ = envs.reset(options={"reset_mask": mask})
+        two[1] = one[1]
+    assert isinstance(observations, torch.Tensor) == (output == "torch")
+    np.testing.assert_array_equal(np.asarray(observations)[..., 66:].argmax(axis=-1), two)
+
+
+def test_the_batched_space_holds_the_tags():
+    envs = VectorSpeciesTags(batched(), 2)
+    assert envs.observation_space.shape == (3, 64, 68)
+    observations, _ = envs.reset(seed=0)
+    assert envs.observation_space.contains(observations)
+    assert envs.single_observation_space.shape == (64, 68)
+
+
+@pytest.mark.parametrize(
+    ("keywords", "message"),
+    [
+        ({"species_count": 0}, "species_count must be a whole number"),
+        ({"species_count": 2, "fractions": [1.0]}, "fractions must be 2 numbers"),
+        ({"species_count": 2, "fractions": [1.0, -1.0]}, "greater than 0"),
+        ({"species_count": 2, "fractions": [1.0, 1e-4]}, "leave each species a particle"),
+        ({"species_count": 2, "assignment": "block"}, "did you mean 'blocks'"),
+    ],
+)
+def test_a_mistake_is_named(keywords, message):
+    with pytest.raises(NPAError, match=message):
+        SpeciesTags(single(), **keywords)

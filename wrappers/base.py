@@ -1,0 +1,246 @@
+"""What the wrappers share: checks, the episodes' clock, and random streams of their own."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.spaces import Space
+from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+from torch import Tensor
+
+from npa_envs.envs.single import NPAEnv
+from npa_envs.envs.vector import NPAVectorEnv
+from npa_envs.errors import NPAError
+from npa_envs.randomness import WorldRandom
+
+if TYPE_CHECKING:
+    AnyWrapper = gymnasium.Wrapper[Any, Any, Any, Any]
+    AnyVectorEnv = VectorEnv[Any, Any, Any]
+    AnyVectorWrapper = VectorWrapper[Any, Any, Any, Any, Any]
+else:
+    # Older releases of Gymnasium have no type parameters here.
+    AnyWrapper, AnyVectorEnv, AnyVectorWrapper = gymnasium.Wrapper, VectorEnv, VectorWrapper
+
+GOLDEN = 0x9E3779B97F4A7C15
+"""Any odd number of 64 bits: its multiples tell the streams of different purposes apart."""
+
+
+def single_env(env: Any, wrapper: str) -> NPAEnv:
+    """Return the environment of this package that lies under wrappers.
+
+    Args:
+        env: A Gymnasium environment of one world.
+        wrapper: Name of the wrapper that needs it, for the error.
+
+    Raises:
+        NPAError: It is none of this package, or a vector environment.
+    """
+    base = getattr(env, "unwrapped", None)
+    if not isinstance(base, NPAEnv):
+        cure = (
+            f"use Vector{wrapper} for vector environments"
+            if isinstance(base, NPAVectorEnv)
+            else "make one with gym.make('npa/...')"
+        )
+        raise NPAError(f"env must be an environment of npa_envs, got {type(base).__name__}: {cure}")
+    return base
+
+
+def vector_env(env: Any, wrapper: str) -> NPAVectorEnv:
+    """Return the vector environment of this package that lies under wrappers.
+
+    Args:
+        env: A Gymnasium vector environment.
+        wrapper: Name of the wrapper that needs it, for the error.
+
+    Raises:
+        NPAError: It is none of this package.
+    """
+    base = getattr(env, "unwrapped", None)
+    if not isinstance(base, NPAVectorEnv):
+        cure = "make it with gym.make_vec(..., vectorization_mode='vector_entry_point')"
+        if isinstance(base, NPAEnv) and wrapper.startswith("Vector"):
+            cure = f"use {wrapper.removeprefix('Vector')} for a single environment"
+        raise NPAError(
+            f"env must be a vector environment of npa_envs, got {type(base).__name__}: {cure}"
+        )
+    return base
+
+
+def check_untouched(env: Any, wrapper: str) -> None:
+    """Check that the wrappers beneath leave observations as the environment gives them.
+
+    Args:
+        env: A wrapped environment of one world or of many.
+        wrapper: Name of the wrapper that is to lie there, for the error.
+
+    Raises:
+        NPAError: They have another space.
+    """
+    name = "single_observation_space" if isinstance(env, VectorEnv) else "observation_space"
+    here, there = getattr(env, name), getattr(env.unwrapped, name)
+    if here != there:
+        raise NPAError(
+            f"env must give observations as the environment makes them, {there}, got {here}: "
+            f"put {wrapper} under the wrappers that change observations"
+        )
+
+
+def autoreset_mode(env: AnyVectorEnv) -> AutoresetMode:
+    """Return what a vector environment does with worlds whose episodes are over.
+
+    Args:
+        env: The environment.
+    """
+    return AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
+
+
+def to_host(values: Any) -> NDArray[Any]:
+    """Return an array or tensor as an array; a tensor on a device is waited for."""
+    return values.cpu().numpy() if isinstance(values, Tensor) else np.asarray(values)
+
+
+def world_indices(mask: NDArray[np.bool_], device: torch.device) -> Tensor:
+    """Return the numbers of the worlds where a mask of shape [B] is True, int64, shape [M]."""
+    return torch.from_numpy(np.flatnonzero(mask)).to(device)
+
+
+def side_stream(random: WorldRandom, worlds: Tensor, purpose: int) -> WorldRandom:
+    """Return streams beside those of some worlds, from which drawing leaves theirs as they are.
+
+    A world's draws depend on its seed, episode and step and on the purpose, and on nothing else:
+    not on the other worlds, and not on what was drawn before.
+
+    Args:
+        random: The worlds' own streams.
+        worlds: Which worlds, int64, shape [M].
+        purpose: A number from 1 on; each has streams of its own.
+    """
+    salt = purpose * GOLDEN % 2**64
+    signed = salt - 2**64 if salt >= 2**63 else salt
+    made = WorldRandom.from_keys(random.keys[worlds] ^ signed)
+    made.episodes = random.episodes[worlds]
+    made.steps = random.steps[worlds]
+    return made
+
+
+class EpisodeClock:
+    """Where each world of a vector environment stands in its episode, kept on the host.
+
+    With `AutoresetMode.SAME_STEP` the device is waited for only in steps in which episodes end.
+
+    Args:
+        env: The vector environment.
+
+    Attributes:
+        elapsed: Steps since the start of the running episode, int64, shape [B].
+        lengths: Steps of the episode that the last step belonged to, int64, shape [B].
+        ended: Whether the last step ended an episode, bool, shape [B].
+        restarted: Whether the last observation is the first of an episode, bool, shape [B].
+    """
+
+    def __init__(self, env: AnyVectorEnv) -> None:
+        self._mode = autoreset_mode(env)
+        self.elapsed = np.zeros(env.num_envs, dtype=np.int64)
+        self.lengths = np.zeros_like(self.elapsed)
+        self.ended = np.zeros(env.num_envs, dtype=bool)
+        self.restarted = np.zeros(env.num_envs, dtype=bool)
+
+    def reset(self, options: dict[str, Any] | None) -> None:
+        """Follow a reset.
+
+        Args:
+            options: What the environment was given; `reset_mask` says which worlds.
+        """
+        mask = None if options is None else options.get("reset_mask")
+        self.restarted = np.ones_like(self.ended) if mask is None else to_host(mask).copy()
+        self.elapsed = np.where(self.restarted, 0, self.elapsed)
+        self.lengths = self.elapsed.copy()
+        self.ended = self.ended & ~self.restarted
+
+    def step(self, terminations: Any, truncations: Any, infos: dict[str, Any]) -> None:
+        """Follow a step.
+
+        Args:
+            terminations: Of the step, bool, shape [B], arrays or tensors.
+            truncations: Likewise.
+            infos: Of the step.
+        """
+        next_step = self._mode is AutoresetMode.NEXT_STEP
+        self.restarted = self.ended if next_step else np.zeros_like(self.ended)
+        self.lengths = np.where(self.restarted, 0, self.elapsed + 1)
+        self.elapsed = self.lengths.copy()
+        same_step = self._mode is AutoresetMode.SAME_STEP
+        if same_step and "final_obs" not in infos:
+            self.ended = np.zeros_like(self.ended)
+            return
+        self.ended = to_host(terminations | truncations).copy()
+        if same_step:
+            self.restarted = self.ended
+            self.elapsed[self.ended] = 0
+
+
+class VectorObservations(AnyVectorWrapper):
+    """A wrapper of vector environments that changes observations, the final ones included.
+
+    Args:
+        env: The vector environment.
+    """
+
+    def __init__(self, env: AnyVectorEnv) -> None:
+        super().__init__(env)
+        self.clock = EpisodeClock(env)
+        """Where each world stands in its episode."""
+
+    @property
+    def observation_space(self) -> Space[Any]:
+        """Observations of all worlds; made when asked for, as it is large."""
+        if self._observation_space is None:
+            self._observation_space = batch_space(self.single_observation_space, self.num_envs)
+        return self._observation_space
+
+    @observation_space.setter
+    def observation_space(self, space: Space[Any]) -> None:
+        self._observation_space = space
+
+    @abstractmethod
+    def observations(self, observations: Any) -> Any:
+        """Return the observations of all worlds changed.
+
+        Args:
+            observations: As they are, shape [B, N, P].
+        """
+
+    @abstractmethod
+    def final_observations(self, observations: Any) -> Any:
+        """Return observations changed, of which those of ended episodes are the last ones.
+
+        Called after `observations` of the same step.
+
+        Args:
+            observations: As they are, shape [B, N, P].
+        """
+
+    def reset(
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start episodes; as for the environment itself."""
+        # A copy: wrappers of Gymnasium take the mask out of what they are given.
+        observations, infos = self.env.reset(seed=seed, options=options and dict(options))
+        self.clock.reset(options)
+        return self.observations(observations), infos
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Step; as for the environment itself."""
+        observations, rewards, terminations, truncations, infos = self.env.step(actions)
+        self.clock.step(terminations, truncations, infos)
+        observations = self.observations(observations)
+        if "final_obs" in infos:
+            infos = infos | {"final_obs": self.final_observations(infos["final_obs"])}
+        return observations, rewards, terminations, truncations, infos

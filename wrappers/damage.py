@@ -1,0 +1,238 @@
+"""Damage on a schedule: worlds are hurt in the midst of their episodes, and are to heal."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.utils import RecordConstructorArgs
+from numpy.typing import NDArray
+from torch import Tensor
+
+from npa_envs.envs.arrays import to_output
+from npa_envs.envs.single import NPAEnv
+from npa_envs.envs.vector import NPAVectorEnv
+from npa_envs.errors import NPAError
+from npa_envs.tasks.checks import is_whole
+from npa_envs.tasks.damage import DamageEvent, damage_worlds, parse_damage
+from npa_envs.wrappers.base import (
+    AnyVectorEnv,
+    AnyVectorWrapper,
+    AnyWrapper,
+    EpisodeClock,
+    check_untouched,
+    side_stream,
+    single_env,
+    vector_env,
+    world_indices,
+)
+
+Event = str | DamageEvent
+"""What an event is given as: "STEP:KIND", "STEP:KIND:SIZE", or a `DamageEvent`."""
+
+
+class Schedule:
+    """When worlds are damaged.
+
+    Args:
+        events: One or several.
+        every: Each event comes again after so many steps, and again; None: it comes once.
+
+    Raises:
+        NPAError: There is no event, one is wrong, or `every` is no whole number of at least 1.
+    """
+
+    def __init__(self, events: Event | Sequence[Event], every: int | None) -> None:
+        given = [events] if isinstance(events, str | DamageEvent) else list(events)
+        if not given:
+            raise NPAError("events must hold at least one event, got none: for example '100:cut'")
+        if every is not None and not (is_whole(every) and every >= 1):
+            raise NPAError(f"every must be a whole number of at least 1, got {every!r}")
+        for event in given:
+            if not isinstance(event, str | DamageEvent):
+                raise NPAError(
+                    f"an event must be text or a DamageEvent, got {type(event).__name__}: "
+                    "for example '100:cut'"
+                )
+        self.events = tuple(parse_damage(e) if isinstance(e, str) else e for e in given)
+        """The events, in the order in which those of one step are applied."""
+        self.every = every
+        """Steps after which each event comes again."""
+
+    def due(self, elapsed: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return which events are due in which worlds, shape [E, B].
+
+        Args:
+            elapsed: Steps of each world's episode, shape [B].
+        """
+        late = elapsed - np.array([[event.step] for event in self.events])
+        due = late == 0 if self.every is None else (late >= 0) & (late % self.every == 0)
+        return np.asarray(due, dtype=bool)
+
+
+class DamageEvents(AnyWrapper, RecordConstructorArgs):
+    """Damage the world after certain steps of each episode.
+
+    An event comes after the step whose number it has: the observation of that step shows the
+    damage, its reward does not know of it. A step of 0 damages the world that an episode starts
+    from. Places and angles come from the world's own seed, and are the same in a vector environment
+    (`VectorDamageEvents`). An episode that is over is left alone, so put the wrapper around what
+    `gym.make` returns, whose step limit it then sees.
+
+    On such steps `info` holds `loss_damage`, by how much the loss rose; `info["loss"]` and its
+    parts are those of the damaged world.
+
+    Args:
+        env: An environment of this package, under no wrapper that changes observations.
+        events: "STEP:KIND", "STEP:KIND:SIZE" or `DamageEvent`; one or several.
+        every: Each event comes again after so many steps, and again; None: it comes once.
+
+    Raises:
+        NPAError: An event or the environment is wrong.
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.Env[Any, Any],
+        events: Event | Sequence[Event],
+        *,
+        every: int | None = None,
+    ) -> None:
+        self.schedule = Schedule(events, every)
+        """When the world is damaged."""
+        texts = [str(event) for event in self.schedule.events]
+        RecordConstructorArgs.__init__(self, events=texts, every=every)
+        self._base = single_env(env, type(self).__name__)
+        super().__init__(env)
+        check_untouched(env, type(self).__name__)
+        self._elapsed = 0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start an episode; as for the environment itself."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._elapsed = 0
+        return self._damaged(observation, info)
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Step; as for the environment itself."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self._elapsed += 1
+        if not (terminated or truncated):
+            observation, info = self._damaged(observation, info)
+        return observation, reward, terminated, truncated, info
+
+    def _damaged(self, observation: Any, info: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
+        due = self.schedule.due(np.array([self._elapsed]))
+        if not due.any():
+            return observation, info
+        worlds = self._base.worlds
+        before = float(worlds.loss[0])
+        x, s = damaged_particles(self._base, self.schedule.events, due)
+        observation = self._base.place_particles(x[0], s[0])
+        loss, *parts = worlds.numbers[1 : 2 + len(worlds.part_names), 0].tolist()
+        info = info | {"loss": loss, "loss_damage": loss - before}
+        info |= {f"loss_{n}": value for n, value in zip(worlds.part_names, parts, strict=True)}
+        return observation, info
+
+
+class VectorDamageEvents(AnyVectorWrapper, RecordConstructorArgs):
+    """`DamageEvents` for vector environments: each world by the steps of its own episode.
+
+    World k is damaged as the single environment with the same seed, bit for bit.
+
+    Args:
+        env: A vector environment of this package, under no wrapper that changes observations.
+        events: "STEP:KIND", "STEP:KIND:SIZE" or `DamageEvent`; one or several.
+        every: Each event comes again after so many steps, and again; None: it comes once.
+
+    Raises:
+        NPAError: An event or the environment is wrong.
+    """
+
+    def __init__(
+        self, env: AnyVectorEnv, events: Event | Sequence[Event], *, every: int | None = None
+    ) -> None:
+        self.schedule = Schedule(events, every)
+        """When worlds are damaged."""
+        texts = [str(event) for event in self.schedule.events]
+        RecordConstructorArgs.__init__(self, events=texts, every=every)
+        self._base = vector_env(env, type(self).__name__)
+        super().__init__(env)
+        check_untouched(env, type(self).__name__)
+        self._clock = EpisodeClock(env)
+
+    def reset(
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start episodes; as for the environment itself."""
+        # A copy: wrappers of Gymnasium take the mask out of what they are given.
+        observations, infos = self.env.reset(seed=seed, options=options and dict(options))
+        self._clock.reset(options)
+        due = self.schedule.due(self._clock.elapsed) & self._clock.restarted
+        return self._damaged(due, observations, infos) if due.any() else (observations, infos)
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Step; as for the environment itself."""
+        observations, rewards, terminations, truncations, infos = self.env.step(actions)
+        clock = self._clock
+        clock.step(terminations, truncations, infos)
+        due = self.schedule.due(clock.elapsed) & (clock.restarted | ~clock.ended)
+        if due.any():
+            # With copy=False these are the buffers that placing particles writes to.
+            rewards, terminations, truncations = map(_copy, (rewards, terminations, truncations))
+            observations, infos = self._damaged(due, observations, infos)
+        return observations, rewards, terminations, truncations, infos
+
+    def _damaged(
+        self, due: NDArray[np.bool_], observations: Any, infos: dict[str, Any]
+    ) -> tuple[Any, dict[str, Any]]:
+        base, worlds = self._base, self._base.worlds
+        infos = {name: _copy(value) for name, value in infos.items()}
+        before = worlds.loss.clone()
+        hurt = np.asarray(due.any(axis=0))
+        chosen = world_indices(hurt, base.task.device)
+        x, s = damaged_particles(base, self.schedule.events, due)
+        observations = base.place_particles(x[chosen], s[chosen], chosen)
+        output = base.config.output
+        now = {"loss": worlds.loss.clone(), "loss_damage": worlds.loss - before}
+        for k, name in enumerate(worlds.part_names):
+            now[f"loss_{name}"] = worlds.numbers[2 + k].clone()
+        infos |= {name: to_output(value, output) for name, value in now.items()}
+        mask = torch.from_numpy(hurt).to(base.task.device) if output == "torch" else hurt
+        return observations, infos | {"_loss_damage": mask}
+
+
+def damaged_particles(
+    env: NPAEnv | NPAVectorEnv, events: Sequence[DamageEvent], due: NDArray[np.bool_]
+) -> tuple[Tensor, Tensor]:
+    """Return the particles of all worlds, damaged where damage is due.
+
+    Args:
+        env: The environment.
+        events: The events, shape [E].
+        due: Which are due in which worlds, shape [E, B].
+
+    Returns:
+        Positions [length units], [B, N, D], and states, [B, N, C].
+    """
+    worlds = env.worlds
+    x, s = worlds.x.clone(), worlds.s.clone()
+    for k, (event, mask) in enumerate(zip(events, due, strict=True)):
+        if mask.any():
+            chosen = world_indices(mask, x.device)
+            stream = side_stream(worlds.random, chosen, 1 + k)
+            x[chosen], s[chosen] = damage_worlds(
+                x[chosen], s[chosen], kind=event.kind, size=event.size, generator=stream
+            )
+    return x, s
+
+
+def _copy(value: Any) -> Any:
+    if isinstance(value, Tensor):
+        return value.clone()
+    return value.copy() if isinstance(value, np.ndarray) else value

@@ -1,0 +1,233 @@
+"""Perception brought to one scale, group by group, alike for all particles."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.spaces import Box
+from torch import Tensor
+
+from npa_envs.control import Physics
+from npa_envs.errors import NPAError
+from npa_envs.tasks.checks import is_real
+from npa_envs.wrappers.base import (
+    AnyVectorEnv,
+    AnyWrapper,
+    VectorObservations,
+    single_env,
+    vector_env,
+)
+from npa_envs.wrappers.moments import RunningMoments, as_tensor, like
+
+
+class PerceptionStatistics:
+    """Running statistics of perception vectors z = [s; s̄; L(∇s); L(∇ρ)].
+
+    There is one scale for each channel of the states, the smoothed states and the state gradients,
+    and one for the density gradient, each shared by all particles. States are centred as well.
+    Gradients are not, and the components of one have one scale, so that directions stay what they
+    are.
+
+    Args:
+        physics: The constants of the world that is perceived.
+        clip: What is normalised is clipped to plus and minus this (dimensionless).
+        epsilon: Added to variances (dimensionless).
+
+    Raises:
+        NPAError: `clip` or `epsilon` is not finite or not positive.
+    """
+
+    def __init__(self, physics: Physics, *, clip: float = 10.0, epsilon: float = 1e-8) -> None:
+        for name, value in (("clip", clip), ("epsilon", epsilon)):
+            if not is_real(value) or value <= 0:
+                raise NPAError(f"{name} must be a finite number greater than 0, got {value!r}")
+        self.clip, self.epsilon = clip, epsilon
+        self.space_dim, self.state_dim = physics.space_dim, physics.state_dim
+        self.perception_dim = physics.perception_dim
+        self.moments = RunningMoments(3 * self.state_dim + 1)
+        """Of the states, smoothed states, state gradients (C each) and the density gradient."""
+
+    def update(self, observation: Any) -> None:
+        """Take in what particles perceive.
+
+        Args:
+            observation: Array or tensor of shape [..., P].
+        """
+        z = as_tensor(observation).flatten(0, -2)
+        var, mean = torch.var_mean(z, dim=0, correction=0)
+        centred = 2 * self.state_dim
+        # About zero, which is the mean of a direction that the world does not prefer.
+        square = (var + mean.square())[centred:]
+        gradients = square[: -self.space_dim].view(self.state_dim, self.space_dim).mean(dim=1)
+        density = square[-self.space_dim :].mean(dim=0, keepdim=True)
+        self.moments.update(
+            torch.cat((mean[:centred], torch.zeros_like(square[: self.state_dim + 1]))),
+            torch.cat((var[:centred], gradients, density)),
+            len(z),
+        )
+
+    def normalize(self, observation: Any) -> Any:
+        """Return perception on one scale, clipped, as new float32 numbers.
+
+        Args:
+            observation: Array or tensor of shape [..., P].
+        """
+        z = as_tensor(observation)
+        mean = self._spread(self.moments.mean).to(z)
+        scale = self._spread((self.moments.var + self.epsilon).rsqrt()).to(z)
+        return like(((z - mean) * scale).clamp_(-self.clip, self.clip), observation)
+
+    def space(self, space: Box) -> Box:
+        """Return the space of normalised observations.
+
+        Args:
+            space: The space of the observations as they are.
+
+        Raises:
+            NPAError: It holds more than perception.
+        """
+        if space.shape[-1] != self.perception_dim:
+            raise NPAError(
+                f"observations must be perception vectors of length {self.perception_dim}, "
+                f"got {space.shape[-1]}: normalise before other wrappers add to them"
+            )
+        return Box(-self.clip, self.clip, space.shape, np.float32)
+
+    def _spread(self, statistics: Tensor) -> Tensor:
+        """Return the number of each entry of a perception vector, shape [P]."""
+        centred = 2 * self.state_dim
+        gradients = statistics[centred:].repeat_interleave(self.space_dim)
+        return torch.cat((statistics[:centred], gradients))
+
+
+class NormalizePerception(AnyWrapper):
+    """Bring perception to one scale, by running statistics.
+
+    Args:
+        env: An environment of this package.
+        clip: What is normalised is clipped to plus and minus this (dimensionless).
+        epsilon: Added to variances (dimensionless).
+        training: Whether the statistics follow what is seen.
+        statistics: Those of another wrapper, to share; None makes new ones.
+
+    Raises:
+        NPAError: The environment or a number is wrong.
+
+    Attributes:
+        training: Whether the statistics follow what is seen; set it to False to freeze them.
+        statistics: The running statistics.
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.Env[Any, Any],
+        *,
+        clip: float = 10.0,
+        epsilon: float = 1e-8,
+        training: bool = True,
+        statistics: PerceptionStatistics | None = None,
+    ) -> None:
+        physics = single_env(env, type(self).__name__).worlds.physics
+        super().__init__(env)
+        self.statistics = statistics or PerceptionStatistics(physics, clip=clip, epsilon=epsilon)
+        self.training = training
+        assert isinstance(env.observation_space, Box), "environments of this package have boxes"
+        self.observation_space = self.statistics.space(env.observation_space)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start an episode; as for the environment itself."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        return self._normalized(observation), info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Step; as for the environment itself."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return self._normalized(observation), reward, terminated, truncated, info
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return the statistics, for `torch.save` or safetensors."""
+        return self.statistics.moments.state_dict()
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Take over the statistics of another wrapper.
+
+        Args:
+            state: What its `state_dict` returned.
+
+        Raises:
+            NPAError: It belongs to other observations.
+        """
+        self.statistics.moments.load_state_dict(state)
+
+    def _normalized(self, observation: Any) -> Any:
+        if self.training:
+            self.statistics.update(observation)
+        return self.statistics.normalize(observation)
+
+
+class VectorNormalizePerception(VectorObservations):
+    """`NormalizePerception` for vector environments, of NumPy arrays or tensors on a device.
+
+    Final observations are normalised, and not counted. Nothing waits for the device.
+
+    Args:
+        env: A vector environment of this package.
+        clip: What is normalised is clipped to plus and minus this (dimensionless).
+        epsilon: Added to variances (dimensionless).
+        training: Whether the statistics follow what is seen.
+        statistics: Those of another wrapper, to share; None makes new ones.
+
+    Raises:
+        NPAError: The environment or a number is wrong.
+
+    Attributes:
+        training: Whether the statistics follow what is seen; set it to False to freeze them.
+        statistics: The running statistics.
+    """
+
+    def __init__(
+        self,
+        env: AnyVectorEnv,
+        *,
+        clip: float = 10.0,
+        epsilon: float = 1e-8,
+        training: bool = True,
+        statistics: PerceptionStatistics | None = None,
+    ) -> None:
+        physics = vector_env(env, type(self).__name__).worlds.physics
+        super().__init__(env)
+        self.statistics = statistics or PerceptionStatistics(physics, clip=clip, epsilon=epsilon)
+        self.training = training
+        assert isinstance(env.single_observation_space, Box), "ours are boxes"
+        self.single_observation_space = self.statistics.space(env.single_observation_space)
+
+    def observations(self, observations: Any) -> Any:
+        """Return observations normalised, and count them while training."""
+        if self.training:
+            self.statistics.update(observations)
+        return self.statistics.normalize(observations)
+
+    def final_observations(self, observations: Any) -> Any:
+        """Return observations normalised."""
+        return self.statistics.normalize(observations)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return the statistics, for `torch.save` or safetensors."""
+        return self.statistics.moments.state_dict()
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Take over the statistics of another wrapper.
+
+        Args:
+            state: What its `state_dict` returned.
+
+        Raises:
+            NPAError: It belongs to other observations.
+        """
+        self.statistics.moments.load_state_dict(state)

@@ -1,0 +1,258 @@
+"""Gymnasium's statistics wrappers for vector environments whose arrays are torch tensors.
+
+They do what `gymnasium.wrappers.vector` does for NumPy, under the same names behind "Torch", stay
+on the device, and know all three ways in which worlds begin their next episode.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode
+from torch import Tensor
+
+from npa_envs.errors import NPAError
+from npa_envs.tasks.checks import is_real, is_whole
+from npa_envs.wrappers.base import (
+    AnyVectorEnv,
+    AnyVectorWrapper,
+    EpisodeClock,
+    VectorObservations,
+    autoreset_mode,
+    world_indices,
+)
+from npa_envs.wrappers.moments import RunningMoments
+
+
+class TorchRecordEpisodeStatistics(AnyVectorWrapper):
+    """Keep track of returns and lengths of episodes.
+
+    A step in which episodes end has `infos["episode"]` with the tensors `r` (returns), `l` (lengths
+    in steps) and `t` (time [s]), shape [B], 0 for the other worlds, and `infos["_episode"]`, True
+    where an episode ended.
+
+    Args:
+        env: A vector environment with torch tensors.
+        buffer_length: Episodes that the queues hold.
+        stats_key: The key in `infos`.
+
+    Raises:
+        NPAError: `buffer_length` is no whole number of at least 1.
+    """
+
+    def __init__(
+        self, env: AnyVectorEnv, buffer_length: int = 100, stats_key: str = "episode"
+    ) -> None:
+        super().__init__(env)
+        if not is_whole(buffer_length) or buffer_length < 1:
+            raise NPAError(
+                f"buffer_length must be a whole number of at least 1, got {buffer_length!r}"
+            )
+        self._key = stats_key
+        self._clock = EpisodeClock(env)
+        self.episode_count = 0
+        """Episodes that have ended."""
+        self.episode_returns: Tensor | None = None
+        """Sum of the rewards of each running episode, float64, shape [B]."""
+        self.length_queue: deque[int] = deque(maxlen=buffer_length)
+        """Lengths of the last episodes [steps]."""
+        self.time_queue: deque[float] = deque(maxlen=buffer_length)
+        """Times that the last episodes took [s]."""
+        self._returns: deque[float] = deque(maxlen=buffer_length)
+        # Left on the device until somebody asks: each entry has one episode at least.
+        self._unread: deque[Tensor] = deque(maxlen=buffer_length)
+        self._began = np.full(env.num_envs, time.perf_counter())
+
+    @property
+    def return_queue(self) -> deque[float]:
+        """Returns of the last episodes; reading it waits for the device."""
+        if self._unread:
+            self._returns.extend(torch.cat(tuple(self._unread)).tolist())
+            self._unread.clear()
+        return self._returns
+
+    def reset(
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start episodes; as for the environment itself."""
+        observations, infos = self.env.reset(seed=seed, options=options and dict(options))
+        self._clock.reset(options)
+        self._restart(self._clock.restarted)
+        return observations, infos
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Step; as for the environment itself."""
+        observations, rewards, terminations, truncations, infos = self.env.step(actions)
+        check_tensor(rewards, type(self).__name__)
+        self._clock.step(terminations, truncations, infos)
+        returns = rewards.double()
+        if self.episode_returns is not None:
+            returns = self.episode_returns + returns
+        self.episode_returns = returns
+        if self._clock.ended.any():
+            infos = infos | self._ended(returns, rewards.device)
+        # Where the next step begins an episode, that step is none of the episode's own.
+        self._restart(self._clock.restarted)
+        return observations, rewards, terminations, truncations, infos
+
+    def _ended(self, returns: Tensor, device: torch.device) -> dict[str, Any]:
+        ended, lengths = self._clock.ended, self._clock.lengths
+        seconds = np.where(ended, np.round(time.perf_counter() - self._began, 6), 0.0)
+        mask = torch.from_numpy(ended).to(device)
+        self.episode_count += int(ended.sum())
+        self.length_queue.extend(lengths[ended].tolist())
+        self.time_queue.extend(seconds[ended].tolist())
+        self._unread.append(returns[world_indices(ended, device)])
+        episode = {
+            "r": torch.where(mask, returns, 0.0),
+            "l": torch.from_numpy(np.where(ended, lengths, 0)).to(device),
+            "t": torch.from_numpy(seconds).to(device),
+        }
+        return {self._key: episode, f"_{self._key}": mask}
+
+    def _restart(self, worlds: Any) -> None:
+        if not worlds.any():
+            return
+        self._began[worlds] = time.perf_counter()
+        if self.episode_returns is not None:
+            chosen = world_indices(worlds, self.episode_returns.device)
+            self.episode_returns = self.episode_returns.index_fill(0, chosen, 0.0)
+
+
+class TorchNormalizeObservation(VectorObservations):
+    """Centre each entry of the observations and scale it to unit variance, by running statistics.
+
+    As in Gymnasium each particle has statistics of its own; `VectorNormalizePerception` has one for
+    all. Final observations are normalised, and not counted.
+
+    Args:
+        env: A vector environment with torch tensors.
+        epsilon: Added to variances (dimensionless).
+
+    Raises:
+        NPAError: `epsilon` is not finite or not positive.
+    """
+
+    def __init__(self, env: AnyVectorEnv, epsilon: float = 1e-8) -> None:
+        super().__init__(env)
+        self.epsilon = check_above_zero("epsilon", epsilon)
+        shape = env.single_observation_space.shape
+        assert shape is not None, "only arrays can be normalised"
+        self.single_observation_space = Box(-np.inf, np.inf, shape, np.float32)
+        self.obs_rms = RunningMoments(*shape)
+        """Running mean and variance of each entry."""
+        self.update_running_mean = True
+        """Whether the statistics follow what is seen."""
+
+    def observations(self, observations: Any) -> Any:
+        """Return observations normalised, and count them unless frozen."""
+        check_tensor(observations, type(self).__name__)
+        if self.update_running_mean:
+            var, mean = torch.var_mean(observations, dim=0, correction=0)
+            self.obs_rms.update(mean, var, len(observations))
+        return self.final_observations(observations)
+
+    def final_observations(self, observations: Any) -> Any:
+        """Return observations normalised."""
+        scale = (self.obs_rms.var + self.epsilon).rsqrt().to(observations)
+        return (observations - self.obs_rms.mean.to(observations)) * scale
+
+
+class TorchNormalizeReward(AnyVectorWrapper):
+    """Divide rewards by the running standard deviation of the discounted return.
+
+    The return begins anew with each episode, however the one before it ended.
+
+    Args:
+        env: A vector environment with torch tensors.
+        gamma: Discount of the return, in [0, 1] (dimensionless).
+        epsilon: Added to the variance (dimensionless).
+
+    Raises:
+        NPAError: `gamma` lies elsewhere, or `epsilon` is not finite or not positive.
+    """
+
+    def __init__(self, env: AnyVectorEnv, gamma: float = 0.99, epsilon: float = 1e-8) -> None:
+        super().__init__(env)
+        if not is_real(gamma) or not 0.0 <= gamma <= 1.0:
+            raise NPAError(f"gamma must lie in [0, 1], got {gamma!r}: try 0.99")
+        self.gamma, self.epsilon = gamma, check_above_zero("epsilon", epsilon)
+        self.return_rms = RunningMoments()
+        """Running mean and variance of the discounted return."""
+        self.accumulated_reward: Tensor | None = None
+        """Discounted return of each running episode, float64, shape [B]."""
+        self.update_running_mean = True
+        """Whether the statistics follow what is seen."""
+        self._clock = EpisodeClock(env)
+        self._same_step = autoreset_mode(env) is AutoresetMode.SAME_STEP
+
+    def reset(
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start episodes; as for the environment itself."""
+        observations, infos = self.env.reset(seed=seed, options=options and dict(options))
+        self._clock.reset(options)
+        self._forget(self._clock.restarted)
+        return observations, infos
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Step; as for the environment itself."""
+        observations, rewards, terminations, truncations, infos = self.env.step(actions)
+        check_tensor(rewards, type(self).__name__)
+        clock = self._clock
+        clock.step(terminations, truncations, infos)
+        before = self.accumulated_reward
+        returns = rewards.double() if before is None else before * self.gamma + rewards.double()
+        counted = returns
+        if not self._same_step and clock.restarted.any():
+            # The step that begins an episode is none of its steps.
+            counted = returns[world_indices(~clock.restarted, returns.device)]
+        if self.update_running_mean and len(counted):
+            var, mean = torch.var_mean(counted, dim=0, correction=0)
+            self.return_rms.update(mean, var, len(counted))
+        self.accumulated_reward = returns
+        self._forget(clock.restarted)
+        scale = (self.return_rms.var + self.epsilon).rsqrt().to(rewards)
+        return observations, rewards * scale, terminations, truncations, infos
+
+    def _forget(self, worlds: Any) -> None:
+        if self.accumulated_reward is not None and worlds.any():
+            chosen = world_indices(worlds, self.accumulated_reward.device)
+            self.accumulated_reward = self.accumulated_reward.index_fill(0, chosen, 0.0)
+
+
+def check_tensor(values: Any, wrapper: str) -> None:
+    """Check that an environment hands out tensors.
+
+    Args:
+        values: What it handed out.
+        wrapper: The wrapper that asks, for the error.
+
+    Raises:
+        NPAError: It does not.
+    """
+    if not isinstance(values, Tensor):
+        raise NPAError(
+            f"{wrapper} needs torch tensors, got {type(values).__name__}: make the environment "
+            f"with output='torch', or use gymnasium.wrappers.vector.{wrapper.removeprefix('Torch')}"
+        )
+
+
+def check_above_zero(name: str, value: float) -> float:
+    """Return a number that must be finite and greater than 0.
+
+    Args:
+        name: Its name, for the error.
+        value: The number.
+
+    Raises:
+        NPAError: It is not.
+    """
+    if not is_real(value) or value <= 0:
+        raise NPAError(f"{name} must be a finite number greater than 0, got {value!r}")
+    return value
