@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from npa_envs.agents.policy import unwrapped
 from npa_envs.errors import NPAError
+from npa_envs.randomness import WorldRandom
 
 
 class Episodes(NamedTuple):
@@ -45,7 +46,7 @@ class Episodes(NamedTuple):
         return float(self.returns.std(ddof=1)) / math.sqrt(count) if count > 1 else math.inf
 
 
-def evaluate_policy(env: Any, policy: Callable[[Any], Any], seeds: Sequence[int]) -> Episodes:
+def evaluate_policy(env: Any, policy: Callable[[Any], Any], seeds: Iterable[int]) -> Episodes:
     """Run one episode from each seed, as many at a time as the environment has worlds.
 
     Each is the first episode after a reset with its seed, so short episodes count no more than
@@ -55,25 +56,31 @@ def evaluate_policy(env: Any, policy: Callable[[Any], Any], seeds: Sequence[int]
         env: A vector environment of `npa_envs`, wrapped or not, in the autoreset mode "same-step"
             and with `max_episode_steps`.
         policy: Maps observations, [B, N, P], to actions, [B, N, A].
-        seeds: One for each episode.
+        seeds: One for each episode, integers of at least 0.
 
     Raises:
-        NPAError: There are no seeds, or the environment is another one.
+        NPAError: There are no seeds or wrong ones, or the environment is another one.
     """
     worlds = unwrapped(env).worlds
     if getattr(env, "autoreset_mode", None) is not AutoresetMode.SAME_STEP:
         raise NPAError(
             f"env must be a vector environment that resets in the same step, got "
-            f"{type(env).__name__}: make it with gymnasium.make_vec(...)"
+            f"{type(env).__name__}: make it with gymnasium.make_vec(..., "
+            "vectorization_mode='vector_entry_point', autoreset_mode='same-step')"
         )
     if worlds.episode_steps is None:
         raise NPAError("env must end its episodes: make it with max_episode_steps=256")
-    if len(seeds) == 0:
+    if not isinstance(seeds, Iterable):
+        raise NPAError(f"seeds must be one for each episode, got {seeds!r}: give seeds=range(8)")
+    given = list(seeds)
+    if not given:
         raise NPAError("seeds must hold at least one seed, got none: give seeds=range(8)")
+    # Before the first episode, not in the midst of them.
+    WorldRandom(given)
     count = env.num_envs
-    batches = [list(seeds[k : k + count]) for k in range(0, len(seeds), count)]
+    batches = [given[k : k + count] for k in range(0, len(given), count)]
     ran = [_run(env, policy, [*batch, *batch[-1:] * (count - len(batch))]) for batch in batches]
-    joined = [np.concatenate(column)[: len(seeds)] for column in zip(*ran, strict=True)]
+    joined = [np.concatenate(column)[: len(given)] for column in zip(*ran, strict=True)]
     returns, start_losses, final_losses, steps, endings = joined
     return Episodes(returns, start_losses, final_losses, steps, tuple(endings.tolist()))
 

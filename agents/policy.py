@@ -6,6 +6,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
+from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -80,9 +81,14 @@ def unwrapped(env: Any) -> Any:
     """
     inner = getattr(env, "unwrapped", None)
     if not hasattr(inner, "worlds"):
+        cure = "gymnasium.make('npa/Morphogenesis2D-v0')"
+        if isinstance(env, VectorEnv):
+            cure = (
+                "gymnasium.make_vec('npa/Morphogenesis2D-v0', num_envs=8, "
+                "vectorization_mode='vector_entry_point')"
+            )
         raise NPAError(
-            f"env must be an environment of npa_envs, got {type(env).__name__}: "
-            "make it with gymnasium.make('npa/Morphogenesis2D-v0')"
+            f"env must be an environment of npa_envs, got {type(env).__name__}: make it with {cure}"
         )
     return inner
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from npa_envs.agents.policy import Policy, interface_of, unwrapped
 from npa_envs.errors import NPAError
-from npa_envs.randomness import WorldRandom
+from npa_envs.randomness import Purpose, WorldRandom
 from npa_envs.rule import COLOUR_OFFSET
 
 
@@ -56,10 +56,9 @@ class RandomPolicy(Policy):
         world_count, particle_count, _ = observation.shape
         random = self._random
         if random is None or random.world_count != world_count:
-            keys = WorldRandom(range(self._seed, self._seed + world_count)).keys
-            # An environment with the same seed draws from these keys: its masks would be the same
-            # numbers as the actions.
-            random = WorldRandom.from_keys(~keys.to(observation.device))
+            seeds = range(self._seed, self._seed + world_count)
+            # Beside, as an environment with the same seed draws its masks from the very streams.
+            random = WorldRandom(seeds, device=observation.device).beside(Purpose.POLICY)
         self._random = random
         random.advance()
         return 2.0 * random.uniform(particle_count, self.interface.action_dim) - 1.0

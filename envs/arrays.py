@@ -8,6 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from npa_envs.control import Physics
+from npa_envs.envs.task import Start
 from npa_envs.errors import NPAError
 
 
@@ -36,7 +38,10 @@ def checked_action(action: Any, shape: tuple[int, ...], batched: bool) -> Tensor
     letters = "[B, N, A]" if batched else "[N, A]"
     if not isinstance(action, Tensor):
         try:
-            action = torch.from_numpy(np.ascontiguousarray(action, dtype=np.float32))
+            if np.iscomplexobj(action):
+                raise TypeError("complex numbers")
+            # Torch cannot read what may not be written.
+            action = torch.from_numpy(np.require(action, np.float32, ("C", "W")))
         except (TypeError, ValueError) as error:
             raise NPAError(
                 f"action must be an array of numbers of shape {letters} = {wanted}, "
@@ -48,6 +53,42 @@ def checked_action(action: Any, shape: tuple[int, ...], batched: bool) -> Tensor
             "see env.action_space"
         )
     if action.dtype.is_complex:
-        raise NPAError(f"action must be real, got {action.dtype}: see env.action_space")
+        raise NPAError(f"action must be an array of numbers that are real, got {action.dtype}")
     checked: Tensor = action.detach().to(torch.float32).view(shape)
     return checked
+
+
+def checked_particles(
+    x: Any, s: Any, world_count: int, particle_count: int, physics: Physics, device: torch.device
+) -> Start:
+    """Return particles to be put into worlds, float32 on their device.
+
+    Args:
+        x: Positions [length units], shape [M, N, D].
+        s: States, dimensionless, shape [M, N, C].
+        world_count: Worlds M.
+        particle_count: Particles N.
+        physics: The worlds' constants.
+        device: Where the worlds live.
+
+    Raises:
+        NPAError: A shape is another one, or a number is not finite or beyond its limit.
+    """
+    given = []
+    shapes = (("x", x, physics.space_dim, physics.position_limit, "position_limit"),)
+    shapes += (("s", s, physics.state_dim, physics.state_limit, "observation_limit"),)
+    for name, value, width, limit, limit_name in shapes:
+        tensor = torch.as_tensor(value, dtype=torch.float32, device=device)
+        wanted = (world_count, particle_count, width)
+        if tuple(tensor.shape) != wanted:
+            raise NPAError(
+                f"{name} must have shape {wanted} (worlds, particles, entries), "
+                f"got {tuple(tensor.shape)}: see env.unwrapped.particles()"
+            )
+        if not bool((tensor.abs() <= limit).all()):
+            raise NPAError(
+                f"{name} must be finite and within {limit_name} = {limit:g}, got numbers up to "
+                f"{float(tensor.abs().max())}: clip it, or make the environment with a larger limit"
+            )
+        given.append(tensor)
+    return Start(*given)

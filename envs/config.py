@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from typing import Any, Literal, Self
 
+import numpy as np
 import torch
 
 from npa_envs.devices import check_device
@@ -24,6 +25,9 @@ CHOICES = {
     "render_style": STYLES,
 }
 """Fields that take one of a few words."""
+
+LARGEST = 1e9
+"""No number of a configuration is larger: products of them stay finite in float32."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,6 +147,15 @@ class EnvConfig:
                 f"box_size must be at least 2 eps = {2.0 * self.eps:g}, got {self.box_size}: "
                 "enlarge the box or perceive at a smaller eps"
             )
+        if self.boundary == "periodic" and self.position_limit < 0.5 * self.box_size:
+            raise NPAError(
+                f"position_limit must be at least half of box_size = {self.box_size:g}, got "
+                f"{self.position_limit}: particles would be out of bounds inside the box"
+            )
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, float) and value > LARGEST:
+                raise NPAError(f"{field.name} must be at most {LARGEST:g}, got {value}")
         check_device(self.device)
 
     @property
@@ -169,4 +182,6 @@ class EnvConfig:
         for name in keywords:
             if name not in known:
                 raise NPAError(f"unknown keyword {name!r}: {suggest(name, known)}")
-        return replace(cls(), **keywords)
+        # Sweeps give NumPy's numbers.
+        plain = {k: v.item() if isinstance(v, np.generic) else v for k, v in keywords.items()}
+        return replace(cls(), **plain)

@@ -44,7 +44,11 @@ def free_bytes(device: torch.device) -> int | None:
 
 
 def check_memory(
-    world_count: int, particle_count: int, physics: Physics, device: torch.device
+    world_count: int,
+    particle_count: int,
+    physics: Physics,
+    device: torch.device,
+    extra_bytes: int = 0,
 ) -> None:
     """Check that worlds fit into a device's memory and into the kernels' indices.
 
@@ -53,6 +57,7 @@ def check_memory(
         particle_count: Particles in each, N.
         physics: The worlds' constants.
         device: Where they shall live.
+        extra_bytes: What the task needs besides.
 
     Raises:
         NPAError: They do not.
@@ -61,9 +66,10 @@ def check_memory(
     cure = "choose a smaller particle_count or fewer worlds"
     if world_count * particle_count * (1 + physics.state_dim) > LARGEST_INDEX:
         raise NPAError(f"particle_count is too large: {what} exceed 32-bit indices: {cure}")
-    needed, free = needed_bytes(world_count, particle_count, physics), free_bytes(device)
+    needed = needed_bytes(world_count, particle_count, physics) + extra_bytes
+    free = free_bytes(device)
     if free is not None and needed > free:
         raise NPAError(
-            f"particle_count must fit into memory: {what} need about {needed / 2**30:.1f} GiB, "
-            f"and {device} has {free / 2**30:.1f} GiB free: {cure}"
+            f"particle_count must fit into memory: {what} need about {needed / 2**30:.1f} GiB "
+            f"with pictures and pool, and {device} has {free / 2**30:.1f} GiB free: {cure}"
         )

@@ -55,6 +55,11 @@ class Morphogenesis2DEnvConfig(EnvConfig):
         check_positive(self, int, "resolution", at_least=8)
         check_positive(self, float, "sigma", "seed_radius")
         check_non_negative(self, "colour_weight")
+        if self.seed_radius >= self.position_limit:
+            raise NPAError(
+                f"seed_radius must be below position_limit = {self.position_limit:g}, got "
+                f"{self.seed_radius}: worlds would begin out of bounds"
+            )
 
 
 Config = TypeVar("Config", bound=Morphogenesis2DEnvConfig)
@@ -91,6 +96,14 @@ class PictureTask(EnvTask[Config]):
             device=device,
         )
         """The task with its target and its loss."""
+
+    @classmethod
+    def extra_bytes(cls, config: EnvConfig, world_count: int) -> int:
+        """Return about how much memory pool and pictures need [bytes]."""
+        assert isinstance(config, Morphogenesis2DEnvConfig), "the task's own configuration"
+        copies = 4 if config.reward == "particle" else 1
+        pictures = 16 * copies * world_count * config.resolution**2
+        return super().extra_bytes(config, world_count) + pictures
 
     def seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
         """Return particles uniform in a disk around the origin, all states zero."""

@@ -12,18 +12,25 @@ from npa_envs.envs.morphogenesis2d import Morphogenesis2DEnvConfig, PictureTask
 from npa_envs.envs.single import NPAEnv
 from npa_envs.envs.task import Start
 from npa_envs.envs.vector import NPAVectorEnv
+from npa_envs.envs.worlds import total
 from npa_envs.errors import NPAError, suggest
-from npa_envs.randomness import WorldRandom
+from npa_envs.randomness import Purpose, WorldRandom
 from npa_envs.rule import COLOUR_OFFSET, NPARule
 from npa_envs.rule_io import load_rule, shipped_rules
 from npa_envs.tasks.checks import check_fraction, check_positive
-from npa_envs.tasks.damage import DAMAGE_SIZES, damage_worlds
+from npa_envs.tasks.damage import damage_worlds
 
 RANDOM_DAMAGE = "random"
 """Each episode draws its kind of damage."""
 
 RANDOM_KINDS = ("erase", "cut", "clump")
 """Kinds that it draws from."""
+
+SIZES = {"erase": 0.3, "cut": 0.1, "clump": 0.2, "noise": 0.05}
+"""Radius, width, radius and standard deviation where no size is given [length units]."""
+
+LEAST_RISE = 0.02
+"""Damage that raises the loss by a smaller share than this cannot be healed: no success."""
 
 PICTURE = "picture"
 """Worlds start as the target's own points."""
@@ -46,7 +53,7 @@ class Regeneration2DEnvConfig(Morphogenesis2DEnvConfig):
 
     damage_size: float | None = None
     """Radius of the erased or clumped disk, width of the cut, or standard deviation of the noise
-    [length units]; None: 0.2, 0.1, 0.2 and 0.05."""
+    [length units]; None: 0.3, 0.1, 0.2 and 0.05."""
 
     rule: str | None = None
     """What grows the worlds: a shipped rule, a rule's file, or "picture" to start from the target's
@@ -66,7 +73,7 @@ class Regeneration2DEnvConfig(Morphogenesis2DEnvConfig):
             NPAError: A field has the wrong type or lies outside its range.
         """
         super().__post_init__()
-        kinds = (*DAMAGE_SIZES, RANDOM_DAMAGE)
+        kinds = (*SIZES, RANDOM_DAMAGE)
         if self.damage not in kinds:
             hint = suggest(str(self.damage), kinds)
             raise NPAError(f"damage must be a known kind, got {self.damage!r}: {hint}")
@@ -108,17 +115,19 @@ class RegenerationTask(PictureTask[Regeneration2DEnvConfig]):
         chosen = random.integers(len(kinds), 1, 1)
         hurt_x, hurt_s = x, s
         for k, kind in enumerate(kinds):
-            size = self.config.damage_size
+            size = SIZES[kind] if self.config.damage_size is None else self.config.damage_size
             new_x, new_s = damage_worlds(x, s, kind=kind, size=size, generator=random)
             hurt_x = torch.where(chosen == k, new_x, hurt_x)
             hurt_s = torch.where(chosen == k, new_s, hurt_s)
         if threshold is None:
             whole, hurt = self._loss(x, s), self._loss(hurt_x, hurt_s)
-            threshold = whole + (1.0 - self.config.healed_share) * (hurt - whole).clamp_min(0.0)
+            healed = whole + (1.0 - self.config.healed_share) * (hurt - whole)
+            never = torch.full_like(whole, -torch.inf)
+            threshold = torch.where(hurt - whole >= LEAST_RISE * whole, healed, never)
         return Start(hurt_x, hurt_s, threshold)
 
     def _loss(self, x: Tensor, s: Tensor) -> Tensor:
-        return torch.stack(list(self.losses(x, s).values())).sum(0)
+        return total(torch.stack(list(self.losses(x, s).values())))
 
     @torch.no_grad()
     def _grow(self, x: Tensor, s: Tensor, random: WorldRandom, k: int) -> tuple[Tensor, Tensor]:
@@ -132,7 +141,7 @@ class RegenerationTask(PictureTask[Regeneration2DEnvConfig]):
             eps=self.config.eps,
             box=self.config.box,
             update_prob=self.config.update_prob,
-            generator=random.take(slice(k, k + 1)),
+            generator=random.take(slice(k, k + 1)).beside(Purpose.GROWTH),
         )
 
     def _picture_worlds(self, x: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
@@ -215,8 +224,9 @@ class Regeneration2DEnv(NPAEnv):
     | a particle has left the world, or its state has run away | terminated | `"diverged"` |
     | `max_episode_steps` steps are done, by default 128 | truncated | `"time limit"` |
 
-    With `success_loss` given, success is a loss of at most this instead. A particle has left where
-    a coordinate is beyond ±`position_limit`, and its state has run away beyond
+    Damage that raises the loss by less than 2 % cannot be healed, so that the episode runs to its
+    limit. With `success_loss` given, success is a loss of at most this instead. A particle has left
+    where a coordinate is beyond ±`position_limit`, and its state has run away beyond
     ±`observation_limit`. The steps of a single environment are counted by Gymnasium, which
     truncates without a reason; with `reward="sparse"` such an environment has to be told the number
     of steps twice, as `max_episode_steps` and as `episode_steps`.

@@ -11,11 +11,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.envs.arrays import checked_action, to_output
+from npa_envs.envs.arrays import checked_action, checked_particles, to_output
+from npa_envs.envs.screen import Screen
 from npa_envs.envs.spaces import action_space, observation_space
-from npa_envs.envs.task import EnvTask, Start
+from npa_envs.envs.task import EnvTask
 from npa_envs.envs.worlds import DIVERGED, SUCCESS, Worlds, reason
-from npa_envs.render import Window
+from npa_envs.errors import NPAError
 
 
 class NPAEnv(gymnasium.Env[Any, Any]):
@@ -45,8 +46,10 @@ class NPAEnv(gymnasium.Env[Any, Any]):
         self.action_space = action_space(self.worlds.physics, self.config.particle_count)
         self._world = torch.zeros(1, dtype=torch.int64, device=self.task.device)
         self._keyed_from: np.random.Generator | None = None
+        self._started = False
         self._unpaid_steps = 0
-        self._window: Window | None = None
+        self._warned = False
+        self._screen = Screen(self.worlds, self.metadata["render_fps"])
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -71,9 +74,11 @@ class NPAEnv(gymnasium.Env[Any, Any]):
             keys = torch.from_numpy(
                 self.np_random.integers(2**64, size=1, dtype=np.uint64).view(np.int64)
             )
-        observation = self.worlds.start(self._world, keys)
+        with self.worlds.here():
+            observation = self.worlds.start(self._world, keys)
+        self._started = True
         self._show()
-        return to_output(observation[0], self.config.output), self._losses()
+        return self._out(observation[0]), self._losses(self.worlds.numbers[:, 0].tolist())
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Apply an action and perceive.
@@ -88,82 +93,81 @@ class NPAEnv(gymnasium.Env[Any, Any]):
         Raises:
             NPAError: The action has another shape or is not finite; the world is then as it was.
         """
-        shape = (1, self.config.particle_count, self.worlds.physics.action_dim)
-        ending = int(self.worlds.step(checked_action(action, shape, batched=False))[0])
-        observation = self.worlds.observation()[0]
+        if not self._started:
+            raise NPAError("step needs a world: call reset first")
+        worlds, config = self.worlds, self.config
+        checked = checked_action(
+            action, (1, config.particle_count, worlds.physics.action_dim), False
+        )
+        with worlds.here():
+            ending = int(worlds.step(checked)[0])
+            observation = worlds.observation()[0]
         ended = ending & (SUCCESS | DIVERGED) != 0
-        info = self._losses()
-        names, numbers = self.worlds.part_names, self.worlds.numbers[:, 0].tolist()
+        names, numbers = worlds.part_names, worlds.numbers[:, 0].tolist()
+        info = self._losses(numbers)
         info |= {f"reward_{name}": numbers[2 + len(names) + k] for k, name in enumerate(names)}
         info |= {"success": bool(ending & SUCCESS), "diverged": bool(ending & DIVERGED)}
         if ended:
             info["reason"] = reason(ending)
-        if self.worlds.particle_reward is not None:
-            own = self.worlds.particle_reward[0].clone()
-            info["particle_reward"] = to_output(own, self.config.output)
-        paid = ended or int(self.worlds.elapsed[0]) >= self.config.episode_steps
-        self._unpaid_steps = 0 if paid else self._unpaid_steps + 1
+        if worlds.particle_reward is not None:
+            info["particle_reward"] = self._out(worlds.particle_reward[0].clone())
+        if config.reward == "sparse":
+            paid = ended or int(worlds.elapsed[0]) == config.episode_steps
+            self._unpaid_steps = 0 if paid else self._unpaid_steps + 1
         self._show()
-        return to_output(observation, self.config.output), numbers[0], ended, False, info
+        return self._out(observation), numbers[0], ended, False, info
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return the world's picture, shape [R, R, 3], in the mode "rgb_array"."""
-        if self.render_mode is None:
-            gymnasium.logger.warn(
-                "render() draws nothing without a render_mode: make the environment with "
-                "render_mode='rgb_array' or 'human'"
-            )
-            return None
-        if self.render_mode == "human":
-            self._show()
-            return None
-        return self._picture()
+        pictures = self._screen.render()
+        return None if pictures is None else pictures[0]
 
     def close(self) -> None:
         """Close the window, if there is one."""
-        if self._window is not None:
-            self._window.close()
-            self._window = None
+        self._screen.close()
 
     def particles(self) -> tuple[Tensor, Tensor]:
         """Return copies of positions [length units], [N, D], and states, [N, C], on the device."""
         return self.worlds.x[0].clone(), self.worlds.s[0].clone()
 
-    def place_particles(self, x: Tensor, s: Tensor) -> Any:
+    def place_particles(self, x: Any, s: Any) -> Any:
         """Replace the particles, at no reward, and return the new observation, shape [N, P].
 
         Args:
             x: Positions [length units], shape [N, D].
             s: States, dimensionless, shape [N, C].
+
+        Raises:
+            NPAError: A shape is another one, or a number is not finite or beyond its limit.
         """
-        observation = self.worlds.place(self._world, Start(x[None], s[None]))
-        return to_output(observation[0], self.config.output)
+        if not self._started:
+            raise NPAError("particles need a world: call reset first")
+        count, physics = self.config.particle_count, self.worlds.physics
+        x, s = (torch.as_tensor(value)[None] for value in (x, s))
+        start = checked_particles(x, s, 1, count, physics, self.task.device)
+        with self.worlds.here():
+            observation = self.worlds.place(self._world, start)
+        self._show()
+        return self._out(observation[0])
 
-    def _losses(self) -> dict[str, Any]:
-        loss, *rest = self.worlds.numbers[1:, 0].tolist()
-        names = self.worlds.part_names
-        return {"loss": loss} | {f"loss_{n}": v for n, v in zip(names, rest, strict=False)}
+    def _losses(self, numbers: list[float]) -> dict[str, Any]:
+        parts = {f"loss_{n}": numbers[2 + k] for k, n in enumerate(self.worlds.part_names)}
+        return {"loss": numbers[1]} | parts
 
-    def _picture(self) -> NDArray[np.uint8]:
-        worlds = self.worlds
-        picture: NDArray[np.uint8]
-        (picture,) = self.task.draw(worlds.x, worlds.s, worlds.elapsed.cpu().numpy())
-        return picture
+    def _out(self, tensor: Tensor) -> Any:
+        return to_output(tensor, self.config.output)
 
     def _show(self) -> None:
-        if self.render_mode != "human":
-            return
-        if self._window is None:
-            title = self.spec.id if self.spec is not None else type(self).__name__
-            self._window = Window(title, self.config.render_size, fps=self.metadata["render_fps"])
-        self._window.show(self._picture())
+        self._screen.show(self.spec.id if self.spec is not None else type(self).__name__)
 
     def _warn_of_unpaid_rewards(self) -> None:
-        if self.config.reward == "sparse" and self._unpaid_steps > 0:
+        """Warn once where an episode ended by a limit that the environment does not know of."""
+        if self._unpaid_steps > 0 and not self._warned:
+            self._warned = True
             warnings.warn(
-                f"an episode of {self._unpaid_steps} steps was cut off before its sparse reward, "
-                f"which comes at step {self.config.episode_steps}: make the environment with "
-                f"episode_steps={self._unpaid_steps} as well as max_episode_steps",
+                f"an episode ended {self._unpaid_steps} steps after the last sparse reward, which "
+                f"comes at step episode_steps={self.config.episode_steps}: where Gymnasium's "
+                "max_episode_steps is another number, give it as episode_steps as well",
                 stacklevel=3,
             )
         self._unpaid_steps = 0

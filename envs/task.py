@@ -12,7 +12,7 @@ from torch import Tensor
 
 from npa_envs.envs.config import EnvConfig
 from npa_envs.errors import NPAError
-from npa_envs.randomness import WorldRandom
+from npa_envs.randomness import Purpose, WorldRandom
 from npa_envs.render import draw_worlds
 
 Config = TypeVar("Config", bound=EnvConfig)
@@ -63,6 +63,16 @@ class EnvTask(Generic[Config]):
         self.device = device
         self._pool: Start | None = None
 
+    @classmethod
+    def extra_bytes(cls, config: EnvConfig, world_count: int) -> int:
+        """Return about how much memory the task needs besides the worlds [bytes]: their pool.
+
+        Args:
+            config: The environment's configuration.
+            world_count: Worlds B.
+        """
+        return 4 * config.seed_pool * config.particle_count * (cls.space_dim + config.state_dim)
+
     def seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
         """Return fresh worlds: positions [B, N, D] and states [B, N, C].
 
@@ -112,8 +122,9 @@ class EnvTask(Generic[Config]):
     def pool(self) -> Start:
         """Return the worlds that episodes start from, made when first asked for."""
         if self._pool is None:
-            seeds = range(self.config.seed_pool)
-            self._pool = Start(*self.seed(WorldRandom(seeds, device=self.device)))
+            # Not the streams that episodes with these seeds go on with.
+            random = WorldRandom(range(self.config.seed_pool), device=self.device)
+            self._pool = Start(*self.seed(random.beside(Purpose.GROWTH)))
         return self._pool
 
     def draw(self, x: Tensor, s: Tensor, steps: NDArray[np.int64]) -> NDArray[np.uint8]:
@@ -134,6 +145,7 @@ class EnvTask(Generic[Config]):
                 resolution=self.config.render_size,
                 pixel_size=self.pixel_size,
                 sigma=SHARPNESS,
+                half_width=max(1.0, 0.5 * (self.config.box or 0.0)),
                 azimuth=TURN * float(steps[batch][0]),
             )
             for batch in batches

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from functools import cached_property
 from typing import Any, ClassVar
 
-import gymnasium
 import numpy as np
 import torch
 from gymnasium import Space
@@ -16,17 +14,14 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.envs.arrays import checked_action, to_output
+from npa_envs.envs.arrays import checked_action, checked_particles, to_output
+from npa_envs.envs.screen import Screen
 from npa_envs.envs.spaces import action_space, observation_space
-from npa_envs.envs.task import EnvTask, Start
+from npa_envs.envs.task import EnvTask
 from npa_envs.envs.vector_options import autoreset_mode as checked_mode
-from npa_envs.envs.vector_options import check_count, world_keys, worlds_to_reset
+from npa_envs.envs.vector_options import checked_count, world_keys, worlds_to_reset
 from npa_envs.envs.worlds import FLAGS, Worlds, reason
 from npa_envs.errors import NPAError
-from npa_envs.render import Window
-
-SHOWN_ACROSS = 4
-"""A window shows at most so many worlds side by side."""
 
 
 class NPAVectorEnv(VectorEnv[Any, Any, Any]):
@@ -36,7 +31,7 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
 
     Args:
         num_envs: Worlds B.
-        max_episode_steps: Steps after which an episode is truncated, or None for never.
+        max_episode_steps: Steps after which an episode is truncated; None or -1: never.
         autoreset_mode: "same-step": the step that ends an episode returns the next one's first
             observation, the last one is in `infos["final_obs"]`; "next-step": the next step does,
             whatever its action; "disabled": `reset(options={"reset_mask": ...})` does.
@@ -65,24 +60,27 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
         copy: bool = True,
         **keywords: Any,
     ) -> None:
-        check_count("num_envs", num_envs)
-        if max_episode_steps is not None:
-            check_count("max_episode_steps", max_episode_steps)
+        num_envs = checked_count("num_envs", num_envs)
+        # Gymnasium's word for "never" is -1.
+        if max_episode_steps is not None and max_episode_steps != -1:
+            episode_steps = checked_count("max_episode_steps", max_episode_steps)
+        else:
+            episode_steps = None
         self.autoreset_mode = checked_mode(autoreset_mode)
         self.metadata = {**type(self).metadata, "autoreset_mode": self.autoreset_mode}
         self.config = self.task_type.config_type.from_keywords(keywords)
         self.render_mode = self.config.render_mode
         self.num_envs = num_envs
-        self.worlds = Worlds(self.task_type, self.config, num_envs, max_episode_steps)
+        self.worlds = Worlds(self.task_type, self.config, num_envs, episode_steps)
         self.task = self.worlds.task
         physics, count = self.worlds.physics, self.config.particle_count
         self.single_observation_space = observation_space(physics, count)
         self.single_action_space = action_space(physics, count)
         self._copy = copy
-        self._observation: Tensor | None = None
+        self._started = False
+        self._buffer: Tensor | None = None
         self._ended = np.zeros(num_envs, dtype=bool)
-        self._window: Window | None = None
-        self._everyone = self._mask(np.ones(num_envs, dtype=bool))
+        self._screen = Screen(self.worlds, self.metadata["render_fps"])
 
     @cached_property
     def observation_space(self) -> Space[Any]:  # type: ignore[override]
@@ -114,19 +112,25 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
         Raises:
             NPAError: The mask or the seeds have a wrong shape.
         """
+        if isinstance(seed, np.integer):
+            seed = int(seed)
         super().reset(seed=seed if isinstance(seed, int) else None)
         chosen = worlds_to_reset(options, self.num_envs)
-        worlds = torch.from_numpy(chosen).to(self.task.device)
-        keys = None
-        if seed is not None or self._observation is None:
-            keys = world_keys(seed, self.num_envs, self.np_random)[chosen]
-        if self._observation is None and len(chosen) < self.num_envs:
+        if not self._started and len(chosen) < self.num_envs:
             raise NPAError("reset_mask needs worlds to leave alone: reset all of them first")
-        started = self.worlds.start(worlds, keys)
-        self._observation = self._with(worlds, started)
+        keys = None
+        if seed is not None or not self._started:
+            keys = world_keys(seed, self.num_envs, self.np_random)[chosen]
+        worlds = torch.from_numpy(chosen).to(self.task.device)
+        with self.worlds.here():
+            observation = self._collected(self.worlds.start(worlds, keys))
+        self._started = True
         self._ended[chosen] = False
         self._show()
-        return self._out(self._observation), self._losses(self.worlds.numbers.clone())
+        which = np.zeros(self.num_envs, dtype=bool)
+        which[chosen] = True
+        numbers = self._out(self.worlds.numbers.clone())
+        return self._out(observation), self._losses(numbers, self._mask(which))
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Apply an action to each world and perceive.
@@ -141,76 +145,96 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
             NPAError: The actions have another shape or are not finite; the worlds are then as they
                 were.
         """
-        if self._observation is None:
+        if not self._started:
             raise NPAError("step needs worlds: call reset first")
         shape = (self.num_envs, self.config.particle_count, self.worlds.physics.action_dim)
-        endings = self.worlds.step(checked_action(actions, shape, batched=True))
-        observation = self.worlds.observation(None if self._copy else self._observation)
-        stepped = None
-        if self.autoreset_mode is AutoresetMode.NEXT_STEP and self._ended.any():
-            stepped = ~self._ended
-            endings[self._ended] = 0
-            self._restart(self._ended, observation)
-        ended = endings != 0
-        restarting = self.autoreset_mode is AutoresetMode.SAME_STEP and bool(ended.any())
-        # What a restart overwrites is copied first, whatever the caller wants of the rest.
-        numbers, flags, infos = self._report(stepped, copy=self._copy or restarting)
+        action = checked_action(actions, shape, batched=True)
+        with self.worlds.here():
+            return self._step(action)
+
+    def _step(self, action: Tensor) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        over = self._ended
+        if over.any() and self.autoreset_mode is AutoresetMode.DISABLED:
+            raise NPAError(
+                f"the episodes of worlds {np.flatnonzero(over).tolist()} are over: reset them with "
+                "reset(options={'reset_mask': terminations | truncations})"
+            )
+        restarting = self.autoreset_mode is AutoresetMode.NEXT_STEP and bool(over.any())
         if restarting:
+            action = action.clone()
+            action[torch.from_numpy(over).to(action.device)] = 0.0
+        endings = self.worlds.step(action)
+        observation = self.worlds.observation(self._buffer)
+        stepped = None
+        if restarting:
+            stepped, endings = ~over, np.where(over, 0, endings)
+            self._restart(over, observation)
+        ended = endings != 0
+        final = self.autoreset_mode is AutoresetMode.SAME_STEP and bool(ended.any())
+        # What a restart overwrites is copied first, whatever the caller wants of the rest.
+        numbers, flags, infos = self._report(stepped, copy=self._copy or final)
+        if final:
             which, final_observation = self._mask(ended), observation.clone()
-            final_infos = self._ending_infos(infos, endings, which)
+            final_infos = self._ending_infos(infos, endings, ended)
             self._restart(ended, observation)
             _, _, infos = self._report(~ended, copy=self._copy)
             infos |= {"final_obs": self._out(final_observation), "_final_obs": which}
-            infos |= {"final_info": final_infos, "_final_info": which}
-        self._ended, self._observation = ended, observation
+            infos |= {"final_info": final_infos, "_final_info": self._mask(ended)}
+        else:
+            self._ended = ended
         self._show()
-        terminations, truncations = self._out(flags[0]), self._out(flags[1])
-        return self._out(observation), self._out(numbers[0]), terminations, truncations, infos
+        return self._out(observation), numbers[0], flags[0], flags[1], infos
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return a picture of each world, shape [R, R, 3], in the mode "rgb_array"."""
-        if self.render_mode is None:
-            gymnasium.logger.warn(
-                "render() draws nothing without a render_mode: make the environment with "
-                "render_mode='rgb_array' or 'human'"
-            )
-            return None
-        if self.render_mode == "human":
-            self._show()
-            return None
-        return tuple(self._pictures(self.num_envs))
+        pictures = self._screen.render()
+        return None if pictures is None else tuple(pictures)
 
     def close_extras(self, **kwargs: Any) -> None:
         """Close the window, if there is one."""
-        if self._window is not None:
-            self._window.close()
-            self._window = None
+        self._screen.close()
 
     def particles(self) -> tuple[Tensor, Tensor]:
         """Return copies of positions [length units], [B, N, D], and states, [B, N, C]."""
         return self.worlds.x.clone(), self.worlds.s.clone()
 
-    def place_particles(self, x: Tensor, s: Tensor, worlds: Tensor | None = None) -> Any:
+    def place_particles(self, x: Any, s: Any, worlds: Any = None) -> Any:
         """Replace particles, at no reward, and return the new observations of all worlds.
 
         Args:
             x: Positions [length units], shape [M, N, D].
             s: States, dimensionless, shape [M, N, C].
-            worlds: Which worlds, int64, shape [M]; None: all of them.
-        """
-        if self._observation is None:
-            raise NPAError("particles need worlds: call reset first")
-        if worlds is None:
-            worlds = torch.arange(self.num_envs, device=self.task.device)
-        self._observation = self._with(worlds, self.worlds.place(worlds, Start(x, s)))
-        return self._out(self._observation)
+            worlds: Which worlds, indices, shape [M]; None: all of them.
 
-    def _with(self, worlds: Tensor, observation: Tensor) -> Tensor:
-        """Return the observations of all worlds with those of some of them replaced."""
-        if self._observation is None or (self._copy and len(worlds) == self.num_envs):
+        Raises:
+            NPAError: A shape is another one, a number is not finite or beyond its limit, or a world
+                does not exist.
+        """
+        if not self._started:
+            raise NPAError("particles need worlds: call reset first")
+        device, everyone = self.task.device, range(self.num_envs)
+        chosen = torch.as_tensor(list(everyone) if worlds is None else worlds, device=device).long()
+        if chosen.ndim != 1 or not bool(((chosen >= 0) & (chosen < self.num_envs)).all()):
+            raise NPAError(
+                f"worlds must be indices below {self.num_envs}, got {chosen.tolist()}: "
+                "for example worlds=[0, 2]"
+            )
+        count, physics = self.config.particle_count, self.worlds.physics
+        start = checked_particles(x, s, len(chosen), count, physics, device)
+        with self.worlds.here():
+            observation = self._collected(self.worlds.place(chosen, start))
+        self._show()
+        return self._out(observation)
+
+    def _collected(self, observation: Tensor) -> Tensor:
+        """Return the observations of all worlds, given those of worlds that have just changed."""
+        if len(observation) < self.num_envs:
+            observation = self.worlds.perceive()
+        if self._copy:
             return observation
-        last = self._observation.clone() if self._copy else self._observation
-        return last.index_copy_(0, worlds, observation)
+        if self._buffer is None:
+            self._buffer = observation
+        return self._buffer.copy_(observation)
 
     def _restart(self, ended: NDArray[np.bool_], observation: Tensor) -> None:
         worlds = torch.from_numpy(np.flatnonzero(ended)).to(self.task.device)
@@ -218,40 +242,39 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
 
     def _report(
         self, stepped: NDArray[np.bool_] | None, *, copy: bool
-    ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-        """Return numbers, flags and infos as they are.
+    ) -> tuple[Any, Any, dict[str, Any]]:
+        """Return numbers, flags and infos as they are, as they are handed out.
 
         Args:
             stepped: Worlds that have a step behind them; None: all of them.
-            copy: Make new tensors, which later steps and restarts leave alone.
+            copy: Make new arrays, which later steps and restarts leave alone.
         """
         worlds = self.worlds
-        numbers, flags = worlds.numbers, worlds.flags
-        if copy:
-            numbers, flags = numbers.clone(), flags.clone()
-        infos = self._losses(numbers)
-        mask = self._everyone if stepped is None else self._mask(stepped)
-        first = 2 + len(worlds.part_names)
-        own = dict(zip((f"reward_{n}" for n in worlds.part_names), numbers[first:], strict=True))
-        own |= dict(zip(FLAGS, flags[2:], strict=True))
+        buffers = [worlds.numbers, worlds.flags]
         if worlds.particle_reward is not None:
-            shares = worlds.particle_reward
-            own["particle_reward"] = shares.clone() if copy else shares
+            buffers.append(worlds.particle_reward)
+        numbers, flags, *shares = [self._out(b.clone() if copy else b) for b in buffers]
+        infos = self._losses(numbers, self._mask(None))
+        which = self._mask(stepped)
+        first = 2 + len(worlds.part_names)
+        own = {f"reward_{name}": numbers[first + k] for k, name in enumerate(worlds.part_names)}
+        own |= {name: flags[2 + k] for k, name in enumerate(FLAGS)}
+        own |= dict(zip(("particle_reward",), shares, strict=False))
         for name, value in own.items():
-            infos[name], infos[f"_{name}"] = self._out(value), mask
+            infos[name], infos[f"_{name}"] = value, which
         return numbers, flags, infos
 
-    def _losses(self, numbers: Tensor) -> dict[str, Any]:
-        infos = {"loss": self._out(numbers[1]), "_loss": self._everyone}
+    def _losses(self, numbers: Any, which: Any) -> dict[str, Any]:
+        infos = {"loss": numbers[1], "_loss": which}
         for k, name in enumerate(self.worlds.part_names):
-            infos[f"loss_{name}"] = self._out(numbers[2 + k])
-            infos[f"_loss_{name}"] = self._everyone
+            infos[f"loss_{name}"], infos[f"_loss_{name}"] = numbers[2 + k], which
         return infos
 
     def _ending_infos(
-        self, infos: dict[str, Any], endings: NDArray[np.uint8], which: Any
+        self, infos: dict[str, Any], endings: NDArray[np.uint8], ended: NDArray[np.bool_]
     ) -> dict[str, Any]:
         """Return the last infos of the worlds whose episodes are over, with the reasons."""
+        which = self._mask(ended)
         final = {name: which if name.startswith("_") else value for name, value in infos.items()}
         reasons = np.array([reason(int(ending)) for ending in endings], dtype=object)
         return final | {"reason": reasons, "_reason": which}
@@ -259,27 +282,14 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
     def _out(self, tensor: Tensor) -> Any:
         return to_output(tensor, self.config.output)
 
-    def _mask(self, mask: NDArray[np.bool_]) -> Any:
+    def _mask(self, mask: NDArray[np.bool_] | None) -> Any:
+        """Return a mask of worlds, None for all of them, as a new array to hand out."""
+        if self.config.output == "torch" and mask is None:
+            return torch.ones(self.num_envs, dtype=torch.bool, device=self.task.device)
+        given = np.ones(self.num_envs, dtype=bool) if mask is None else mask.copy()
         if self.config.output == "numpy":
-            return mask
-        return torch.from_numpy(mask).to(self.task.device)
-
-    def _pictures(self, count: int) -> NDArray[np.uint8]:
-        worlds = self.worlds
-        steps = worlds.elapsed[:count].cpu().numpy()
-        return self.task.draw(worlds.x[:count], worlds.s[:count], steps)
+            return given
+        return torch.from_numpy(given).to(self.task.device)
 
     def _show(self) -> None:
-        """Show the first worlds side by side."""
-        if self.render_mode != "human":
-            return
-        across = min(math.ceil(math.sqrt(self.num_envs)), SHOWN_ACROSS)
-        shown = min(self.num_envs, across * across)
-        size = self.config.render_size
-        frame = np.full((across * across, size, size, 3), 255, np.uint8)
-        frame[:shown] = self._pictures(shown)
-        frame = frame.reshape(across, across, size, size, 3).swapaxes(1, 2)
-        if self._window is None:
-            title = self.spec.id if self.spec is not None else type(self).__name__
-            self._window = Window(title, across * size, fps=self.metadata["render_fps"])
-        self._window.show(frame.reshape(across * size, across * size, 3))
+        self._screen.show(self.spec.id if self.spec is not None else type(self).__name__)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
 from typing import Any
 
@@ -23,8 +24,8 @@ AUTORESET_MODES = {
 """What happens to worlds whose episodes are over."""
 
 
-def check_count(name: str, value: Any) -> None:
-    """Check that a number of things is a whole number of at least 1.
+def checked_count(name: str, value: Any) -> int:
+    """Return a number of things, a whole number of at least 1.
 
     Args:
         name: What the caller calls it.
@@ -33,10 +34,13 @@ def check_count(name: str, value: Any) -> None:
     Raises:
         NPAError: It is not.
     """
+    if isinstance(value, np.integer):
+        value = int(value)
     if not is_whole(value) or value < 1:
         raise NPAError(
             f"{name} must be a whole number of at least 1, got {value!r}: for example {name}=8"
         )
+    return int(value)
 
 
 def autoreset_mode(given: str | AutoresetMode) -> AutoresetMode:
@@ -51,7 +55,7 @@ def autoreset_mode(given: str | AutoresetMode) -> AutoresetMode:
     if isinstance(given, AutoresetMode):
         return given
     by_name = AUTORESET_MODES | {mode.value: mode for mode in AutoresetMode}
-    if given not in by_name:
+    if not isinstance(given, str) or given not in by_name:
         raise NPAError(
             f"autoreset_mode must be a known word, got {given!r}: "
             f"{suggest(str(given), AUTORESET_MODES)}"
@@ -69,7 +73,11 @@ def worlds_to_reset(options: dict[str, Any] | None, world_count: int) -> NDArray
     Raises:
         NPAError: The mask is no bool array of shape [B], or chooses no world.
     """
-    mask = None if options is None else options.get("reset_mask")
+    options = {} if options is None else options
+    for name in options:
+        if name != "reset_mask":
+            raise NPAError(f"unknown reset option {name!r}: {suggest(str(name), ['reset_mask'])}")
+    mask = options.get("reset_mask")
     if mask is None:
         return np.arange(world_count)
     given = mask.cpu().numpy() if isinstance(mask, Tensor) else np.asarray(mask)
@@ -102,9 +110,11 @@ def world_keys(
         return torch.from_numpy(drawn.view(np.int64))
     if isinstance(seed, int | np.integer):
         seed = [int(seed) + k for k in range(world_count)]
-    if len(seed) != world_count:
-        raise NPAError(
-            f"seed must be one number or one for each of {world_count} worlds, "
-            f"got {len(seed)}: give seed=0"
-        )
-    return WorldRandom(seed).keys
+    cure = f"one whole number, or one for each of {world_count} worlds: give seed=0"
+    try:
+        seeds = [operator.index(number) for number in seed]
+    except TypeError as error:
+        raise NPAError(f"seed must be {cure}, got {seed!r}") from error
+    if len(seeds) != world_count:
+        raise NPAError(f"seed must be {cure}, got {len(seeds)}")
+    return WorldRandom(seeds).keys

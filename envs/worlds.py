@@ -7,6 +7,7 @@ bit, that world alone.
 from __future__ import annotations
 
 import contextlib
+import os
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,11 @@ from npa_envs.envs.task import EnvTask, Start
 from npa_envs.errors import NPAError
 from npa_envs.randomness import WorldRandom
 from npa_envs.replay import Replayed
+
+# Torch's pool of threads does not survive a fork: a forked worker, as Gymnasium's AsyncVectorEnv
+# starts them, would wait for it for ever.
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
 
 SUCCESS, DIVERGED, TIME_LIMIT = 1, 2, 4
 """Bits of an ending: why an episode is over; none is set while it runs."""
@@ -89,7 +95,8 @@ class Worlds:
         device = config.torch_device
         self.physics = physics = make_physics(config, task_type)
         # Before the task, which may make a target of as many points.
-        check_memory(world_count, config.particle_count, physics, device)
+        extra = task_type.extra_bytes(config, world_count)
+        check_memory(world_count, config.particle_count, physics, device, extra)
         self.task = task_type(config, device)
         self.world_count = world_count
         self.episode_steps = episode_steps
@@ -191,6 +198,16 @@ class Worlds:
         self.flags[:, worlds] = False
         return observe(x, s, self.physics)
 
+    def perceive(self) -> Tensor:
+        """Return what is perceived in all worlds as they are, shape [B, N, P]."""
+        return observe(self.x, self.s, self.physics)
+
+    def here(self) -> contextlib.AbstractContextManager[Any]:
+        """Return a context in which the worlds' device is the current one."""
+        if self._read is None:
+            return contextlib.nullcontext()
+        return torch.cuda.device(self.x.device)
+
     @torch.no_grad()
     def step(self, action: Tensor) -> NDArray[np.uint8]:
         """Apply actions to all worlds and return their endings, shape [B].
@@ -206,14 +223,13 @@ class Worlds:
         """
         if self._read is None and not bool(torch.isfinite(action).all()):
             raise self._not_finite(action)
-        with contextlib.nullcontext() if self._read is None else torch.cuda.device(self.x.device):
-            self._action.copy_(action)
-            self._advance_worlds()
-            if self._read is not None:
-                self._read.record()
-            self._perceive_worlds()
-            if self._read is not None:
-                self._read.synchronize()
+        self._action.copy_(action)
+        self._advance_worlds()
+        if self._read is not None:
+            self._read.record()
+        self._perceive_worlds()
+        if self._read is not None:
+            self._read.synchronize()
         if not self._host_endings[-1]:
             self.random.steps -= 1
             self.elapsed -= 1
@@ -261,7 +277,7 @@ class Worlds:
         reward = improvement
         if config.reward == "sparse":
             limit = self.episode_steps or config.episode_steps
-            over = success | diverged | (self.elapsed >= limit)
+            over = success | diverged | (self.elapsed == limit)
             reward = torch.where(over, -loss, torch.zeros_like(loss))
         before = self.numbers[2 : 2 + len(parts)]
         self.numbers.copy_(torch.cat((reward[None], loss[None], parts, before - parts)))

@@ -16,8 +16,8 @@ from torch import Tensor
 from npa_envs.randomness import WorldRandom
 from npa_envs.sph.actions import apply_actions
 from npa_envs.sph.finite import mark_finite
-from npa_envs.sph.operators import Terms, perceive_rows
-from npa_envs.sph.rows import gather_rows
+from npa_envs.sph.passes import Terms
+from npa_envs.sph.rows import Surveyed, survey, write_observation
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,46 +77,32 @@ class Physics:
         return self.state_dim + (self.space_dim if self.moving else 0)
 
 
-def perceive_worlds(x: Tensor, s: Tensor, physics: Physics) -> tuple[Tensor, Tensor]:
-    """Return what every particle perceives as rows in cell order, and the row of each particle.
+def perceive_worlds(x: Tensor, s: Tensor, physics: Physics) -> tuple[Surveyed]:
+    """Return what `place_perception` needs: the worlds sorted, their densities known.
 
     Args:
         x: Positions [length units], shape [B, N, D], finite.
-        s: States, dimensionless, shape [B, N, C], finite.
+        s: States, dimensionless, shape [B, N, C], finite; they may be read again later.
         physics: The worlds' constants.
-
-    Returns:
-        Rows, dimensionless, shape [B N, P], and their numbers, int32, shape [B N].
     """
-    rows, which = perceive_rows(
-        x,
-        s,
-        mask=None,
-        row_capacity=x.shape[0] * x.shape[1],
-        row_width=physics.perception_dim,
-        eps=physics.eps,
-        eps0=physics.eps0,
-        box=physics.box,
-        terms=Terms(),
-    )
-    return rows, which.row_of
+    surveyed = survey(x, s, eps=physics.eps, eps0=physics.eps0, box=physics.box, terms=Terms())
+    return (surveyed,)
 
 
 def place_perception(
-    rows: Tensor, row_of: Tensor, physics: Physics, shape: Sequence[int], out: Tensor | None = None
+    surveyed: Surveyed, physics: Physics, shape: Sequence[int], out: Tensor | None = None
 ) -> Tensor:
-    """Return perception in the particles' own order, clipped, shape [B, N, P].
+    """Return what every particle perceives, clipped, in the particles' order, shape [B, N, P].
 
     Args:
-        rows: Rows of `perceive_worlds`.
-        row_of: The row of each particle.
+        surveyed: What `perceive_worlds` returned, before states change.
         physics: The worlds' constants.
         shape: B and N, and whatever follows.
-        out: Where to write it; a new tensor otherwise.
+        out: Where to write it, contiguous; a new tensor otherwise.
     """
     if out is None:
-        out = rows.new_empty(shape[0], shape[1], rows.shape[1])
-    gather_rows(rows, row_of, physics.perception_limit, out.view(rows.shape))
+        out = surveyed.ordered.positions.new_empty(shape[0], shape[1], physics.perception_dim)
+    write_observation(surveyed, physics.perception_limit, out.view(-1, physics.perception_dim))
     return out
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import enum
 import math
 from collections.abc import Sequence
 
@@ -12,6 +13,22 @@ from torch import Tensor
 from npa_envs.errors import NPAError
 from npa_envs.sph.checks import DTYPES, checked_count, checked_number
 from npa_envs.sph.draws import bernoulli_draw, integer_draw, normal_draw, uniform_draw
+
+
+class Purpose(enum.IntEnum):
+    """What this package draws beside a world's own stream, each kind from streams of its own.
+
+    Numbers below 1000 are the package's; take others for `WorldRandom.beside` in your own code.
+    """
+
+    GROWTH = 1
+    """A trained rule grows the world that an episode starts from."""
+    DAMAGE = 2
+    """Damage in the midst of an episode."""
+    POLICY = 3
+    """A policy acts at random."""
+    SPECIES = 4
+    """Particles are told apart."""
 
 
 class WorldRandom:
@@ -111,6 +128,23 @@ class WorldRandom:
         made.episodes = self.episodes[worlds].clone()
         made.steps = self.steps[worlds].clone()
         made._draw_count = self._draw_count
+        return made
+
+    def beside(self, purpose: int) -> WorldRandom:
+        """Return streams beside these, independent of them and of those of other purposes.
+
+        They stand where these stand now and go on by themselves. Their draws begin anew, so made
+        twice within a step they give the same numbers twice. Nothing is drawn from these.
+
+        Args:
+            purpose: Any integer of at least 0; the package's own are `Purpose`.
+
+        Raises:
+            NPAError: It is none.
+        """
+        made = self.take(slice(None))
+        made.keys = _mixed(self.keys, checked_count("purpose", purpose))
+        made._draw_count = 0
         return made
 
     def put(self, worlds: Tensor | slice, other: WorldRandom) -> None:
@@ -235,6 +269,25 @@ def check_generator(generator: Randomness | None, device: torch.device, world_co
             f"generator must have one stream for each world, B = {world_count}, "
             f"got {generator.world_count}: make it with {made} of {world_count} seeds"
         )
+
+
+GOLDEN = 0x9E3779B97F4A7C15
+MIXERS = ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB), (31, 1))
+
+
+def _mixed(keys: Tensor, number: int) -> Tensor:
+    """Return entry `number`, from 0 on, of the SplitMix64 sequence that begins at each key."""
+    # Steele, Lea and Flood, "Fast splittable pseudorandom number generators" (OOPSLA 2014).
+    bits = keys + _signed((number + 1) * GOLDEN)
+    for shift, factor in MIXERS:
+        # Torch's shift copies the sign, which the mask takes off again.
+        bits = (bits ^ ((bits >> shift) & (2 ** (64 - shift) - 1))) * _signed(factor)
+    return bits
+
+
+def _signed(number: int) -> int:
+    """Return the last 64 bits of a number as torch's integers hold them."""
+    return (number + 2**63) % 2**64 - 2**63
 
 
 def _check_dtype(dtype: torch.dtype) -> None:

@@ -1,5 +1,7 @@
 """Policies: a rule's episodes are its rollouts, and what the scripted ones do and achieve."""
 
+import functools
+
 import gymnasium
 import numpy as np
 import pytest
@@ -387,8 +389,46 @@ def test_environments_whose_episodes_cannot_be_told_apart_are_refused():
     with pytest.raises(NPAError, match="same step"):
         evaluate_policy(disabled, lambda z: z, [0])
     envs = make_vector(particle_count=64)
-    with pytest.raises(NPAError, match="seeds must hold"):
-        evaluate_policy(envs, lambda z: z, [])
+    with pytest.raises(NPAError, match="max_episode_steps=256"):
+        evaluate_policy(make_vector(particle_count=64, max_episode_steps=None), lambda z: z, [0])
+    for seeds, message in (
+        ([], "seeds must hold"),
+        (7, r"one for each episode, got 7: give seeds=range\(8\)"),
+        ([1, 0.5], "a seed must be an integer of at least 0, got 0.5"),
+        ([0, 1, -1], "a seed must be an integer of at least 0, got -1"),
+    ):
+        with pytest.raises(NPAError, match=message):
+            evaluate_policy(envs, never, seeds)
+
+
+def never(_):
+    raise AssertionError("an episode was begun")
+
+
+@pytest.mark.parametrize(
+    "make_seeds",
+    [iter, set, tuple, np.array, torch.tensor, lambda seeds: (seed for seed in seeds)],
+    ids=["iterator", "set", "tuple", "array", "tensor", "generator"],
+)
+def test_seeds_may_be_anything_that_gives_one_after_the_other(make_seeds):
+    envs = make_vector(particle_count=64, max_episode_steps=2)
+    expected = evaluate_policy(envs, ZeroPolicy(envs), [1, 2, 3])
+    episodes = evaluate_policy(envs, ZeroPolicy(envs), make_seeds([1, 2, 3]))
+    np.testing.assert_array_equal(episodes.start_losses, expected.start_losses)
+    assert len(set(episodes.start_losses.tolist())) == 3
+
+
+def test_the_error_about_foreign_vector_environments_says_how_to_make_ours():
+    single = functools.partial(make, particle_count=64)
+    foreign = gymnasium.vector.SyncVectorEnv([single, single], autoreset_mode="SameStep")
+    for use in (interface_of, ZeroPolicy, lambda env: evaluate_policy(env, never, [0])):
+        with pytest.raises(NPAError, match="got SyncVectorEnv: make it with gymnasium") as caught:
+            use(foreign)
+    cure = str(caught.value).split("make it with ")[1]
+    envs = eval(cure, {"gymnasium": gymnasium})
+    assert interface_of(envs) == Interface(2, 16, True, 1.0)
+    with pytest.raises(NPAError, match=r"got CartPoleEnv.*gymnasium\.make\('npa"):
+        interface_of(gymnasium.make("CartPole-v1").unwrapped)
 
 
 def test_the_shipped_rule_grows_the_picture_far_better_than_anything_scripted(gecko):

@@ -18,6 +18,7 @@ from small_envs import IDS, make, make_vec, small
 
 import npa_envs
 from npa_envs.errors import NPAError
+from npa_envs.randomness import Purpose
 
 every_id = pytest.mark.parametrize("name", IDS)
 
@@ -174,12 +175,23 @@ def test_sparse_reward_is_the_loss_at_the_end(name):
     assert rewards[4] == -info["loss"]
 
 
+@every_id
+def test_sparse_reward_is_paid_once(name):
+    env = make(name, reward="sparse", max_episode_steps=8, episode_steps=5, success_loss=0.0)
+    env.reset(seed=0)
+    rewards = [env.step(action)[1] for action in actions(env, 8, scale=0.2)]
+    assert [reward != 0.0 for reward in rewards] == [False] * 4 + [True] + [False] * 3
+
+
 def test_sparse_reward_that_was_cut_off_is_told():
     env = make(IDS[0], reward="sparse", max_episode_steps=3)
     env.reset(seed=0)
     for action in actions(env, 3, scale=0.2):
         env.step(action)
-    with pytest.warns(UserWarning, match="episode_steps=3"):
+    with pytest.warns(
+        UserWarning,
+        match="ended 3 steps after the last sparse reward",
+    ):
         env.reset()
 
 
@@ -208,7 +220,7 @@ def test_success_ends_the_episode_with_its_reason(name):
 
 @every_id
 @pytest.mark.parametrize(
-    "limits", [{"observation_limit": 1e-3}, {"position_limit": 0.05}, {"position_noise": 1e30}]
+    "limits", [{"observation_limit": 1e-3}, {"position_limit": 0.21}, {"position_noise": 1e6}]
 )
 def test_divergence_ends_the_episode_and_does_not_pay(name, limits):
     env = make(name, update_prob=1.0, **limits)
@@ -285,10 +297,11 @@ def test_regeneration_starts_grown_and_damaged():
     assert 10 < int(erased.sum()) < 400
     assert float((x.amax(0) - x.amin(0)).max()) > 1.0
     task = env.unwrapped.task
-    random = npa_envs.WorldRandom([0])
+    random = npa_envs.WorldRandom([0]).beside(Purpose.GROWTH)
     start_x, start_s = task.goal.seed(1, generator=random)
+    growth = random.beside(Purpose.GROWTH)
     with torch.no_grad():
-        expected = npa_envs.rollout(grown, start_x, start_s, 48, generator=random)
+        expected = npa_envs.rollout(grown, start_x, start_s, 48, generator=growth)
     assert torch.equal(task.pool().x, expected[0])
     assert torch.equal(x, expected[0][0])
 
@@ -306,6 +319,20 @@ def test_every_damage_raises_the_loss(damage):
         assert float(start.success_loss) == pytest.approx(
             0.8 * whole + 0.2 * info["loss"], rel=1e-5
         )
+
+
+def test_damage_of_the_default_environment_is_worth_healing():
+    env = gymnasium.make("npa/Regeneration2D-v0", particle_count=512, grow_steps=96, seed_pool=2)
+    still = np.zeros(env.action_space.shape, np.float32)
+    rises = []
+    for seed in range(24):
+        _, info = env.reset(seed=seed)
+        assert not env.step(still)[2]
+        threshold = float(env.unwrapped.worlds._success_loss[0])
+        if threshold > 0:
+            rises.append((info["loss"] - threshold) / threshold)
+    assert len(rises) >= 20
+    assert np.median(rises) > 0.05
 
 
 @every_id
@@ -332,6 +359,31 @@ def test_replaced_particles_are_perceived_and_pay_nothing(name):
 
 
 @every_id
+@pytest.mark.parametrize(
+    ("x", "s", "message"),
+    [
+        ((1, 2), (61, 16), "x must have shape"),
+        ((61, 2), (60, 16), "s must have shape"),
+        ((61, 2), np.nan, "s must be finite and within observation_limit"),
+        (9.0, (61, 16), "x must be finite and within position_limit"),
+    ],
+)
+def test_particles_that_do_not_fit_are_refused(name, x, s, message):
+    env = make(name).unwrapped
+    env.reset(seed=0)
+    x = np.zeros(x) if isinstance(x, tuple) else np.full((61, 2), x)
+    s = np.zeros(s) if isinstance(s, tuple) else np.full((61, 16), s)
+    with pytest.raises(NPAError, match=message):
+        env.place_particles(x, s)
+
+
+def test_numbers_of_numpy_are_numbers():
+    env = make(IDS[0], particle_count=np.int64(9), eps=np.float32(0.3))
+    assert env.observation_space.shape == (9, 66)
+    assert type(env.unwrapped.config.particle_count) is int
+
+
+@every_id
 def test_action_that_is_no_number_is_an_error_and_changes_nothing(name):
     env, other = make(name), make(name)
     env.reset(seed=0)
@@ -350,8 +402,21 @@ def test_action_of_another_shape_is_an_error(name, shape):
     env.reset(seed=0)
     with pytest.raises(NPAError, match=r"action must have shape \[N, A\] = \(61, 18\)"):
         env.step(np.zeros(shape, np.float32))
-    with pytest.raises(NPAError, match="action must be an array of numbers"):
-        env.step("left")
+    for wrong in ("left", np.zeros((61, 18), complex), torch.zeros(61, 18, dtype=torch.complex64)):
+        with pytest.raises(NPAError, match="action must be an array of numbers"):
+            env.step(wrong)
+    fixed = np.zeros((61, 18), np.float32)
+    fixed.flags.writeable = False
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env.step(fixed)
+
+
+@every_id
+def test_step_before_reset_is_an_error(name):
+    env = make(name).unwrapped
+    with pytest.raises(NPAError, match="call reset first"):
+        env.step(np.zeros((61, 18), np.float32))
 
 
 @every_id
@@ -362,7 +427,7 @@ def test_action_of_another_shape_is_an_error(name, shape):
         ({"target": "geko"}, "did you mean 'gecko'"),
         ({"target": "nowhere.png"}, "nowhere.png"),
         ({"particle_count": 0}, "particle_count must be a whole number of at least 1, got 0"),
-        ({"particle_count": 10**8}, "particle_count"),
+        ({"particle_count": 10**9}, "particle_count is too large"),
         ({"particle_count": 1.5}, "particle_count must be a whole number"),
         ({"device": "cuda:99"}, "device must be one that torch sees"),
         ({"device": "tpu"}, "device must"),
@@ -375,6 +440,9 @@ def test_action_of_another_shape_is_an_error(name, shape):
         ({"update_prob": 0.0}, "update_prob must lie in"),
         ({"seed_pool": -1}, "seed_pool must be"),
         ({"state_dim": 2}, "state_dim must be"),
+        ({"boundary": "periodic", "box_size": 9.0}, "position_limit must be at least half of box"),
+        ({"seed_radius": 6.0}, "seed_radius must be below position_limit"),
+        ({"success_loss": 1e308}, "success_loss must be at most"),
     ],
 )
 def test_bad_keyword_is_a_clear_error(name, keywords, message):
@@ -385,10 +453,37 @@ def test_bad_keyword_is_a_clear_error(name, keywords, message):
                 factory(name, **(small(name) | keywords))
 
 
-def test_particles_beyond_memory_are_refused_before_they_are_made():
-    many = 2**31 // 17 - 1
+@pytest.mark.parametrize(
+    "keywords", [{"particle_count": 10**5}, {"resolution": 4096}, {"seed_pool": 10**6}]
+)
+def test_worlds_beyond_memory_are_refused_before_they_are_made(keywords, monkeypatch):
+    monkeypatch.setattr("npa_envs.envs.memory.free_bytes", lambda device: 10**8)
+    make(IDS[0])
     with pytest.raises(NPAError, match="particle_count must fit into memory: 1 world"):
-        gymnasium.make(IDS[0], particle_count=many)
+        make(IDS[0], **keywords)
+
+
+def test_memory_that_is_counted_is_what_worlds_take():
+    from npa_envs.envs.memory import free_bytes
+
+    assert 2**26 < free_bytes(torch.device("cpu")) < 2**44
+
+
+def test_a_forked_worker_steps_after_its_parent_did():
+    """Torch's threads are gone after a fork; worlds of 1024 particles would wait for them."""
+    program = (
+        "import torch; torch.set_num_threads(2)\n"
+        "import gymnasium, npa_envs\n"
+        "name = 'npa/Morphogenesis2D-v0'\n"
+        "env = gymnasium.make(name); env.reset(seed=0); env.step(env.action_space.sample() * 0)\n"
+        "envs = gymnasium.make_vec(name, 2, vectorization_mode='async',\n"
+        "                          vector_kwargs={'context': 'fork'})\n"
+        "print(envs.reset(seed=0)[0].shape); envs.close()\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=120
+    )
+    assert done.stdout == "(2, 1024, 66)\n", done.stderr
 
 
 @pytest.mark.parametrize(

@@ -142,11 +142,20 @@ def test_disabled_mode_resets_only_the_worlds_of_the_mask(name, output):
     after, _ = envs.reset(options={"reset_mask": given})
     fresh, _ = make_vec(name, 4, output=output).reset(seed=0)
     for k in range(4):
-        assert np.array_equal(after[k], before[k]) is not mask[k]
+        assert np.array_equal(after[k], before[k]) != mask[k]
         assert not np.array_equal(after[k], fresh[k])
+    with pytest.raises(NPAError, match=r"the episodes of worlds \[1, 2\] are over"):
+        envs.step(actions[3])
+    # Where the others may go on, they go on as if nothing had happened to their neighbours.
+    longer = make_vec(name, 4, autoreset_mode="disabled", output=output)
+    longer.reset(seed=0)
+    for action in actions[:3]:
+        longer.step(action)
+    longer.reset(options={"reset_mask": given})
     for action in actions[3:]:
-        left, right = envs.step(action)[0], others.step(action)[0]
+        left, right = longer.step(action)[0], others.step(action)[0]
         assert np.array_equal(left[1:3], right[1:3])
+        assert not np.array_equal(left[0], right[0])
 
 
 @every_id
@@ -158,6 +167,43 @@ def test_masked_reset_with_a_seed_starts_that_seed(name):
     again, _ = envs.reset(seed=5, options={"reset_mask": np.array([False, True, False])})
     assert np.array_equal(again[1], fresh[1])
     assert not np.array_equal(again[0], fresh[0])
+
+
+@every_id
+def test_what_was_handed_out_may_be_changed(name):
+    """Callers normalise in place; what follows must not depend on it."""
+    kept, spoilt = make_vec(name, 3), make_vec(name, 3)
+    kept.reset(seed=0)
+    observation, infos = spoilt.reset(seed=0)
+    action = batches(kept, 1, scale=0.2)[0]
+    kept.step(action)
+    observation, reward, _, _, infos = spoilt.step(action)
+    observation *= 0.0
+    reward += 1.0
+    for value in infos.values():
+        value[...] = 0
+    mask = np.array([True, False, False])
+    left, left_infos = kept.reset(options={"reset_mask": mask})
+    right, _ = spoilt.reset(options={"reset_mask": mask})
+    assert np.array_equal(left, right)
+    assert list(left_infos["_loss"]) == [True, False, False]
+    left, right = kept.step(action), spoilt.step(action)
+    for one, other in zip(left[:4], right[:4], strict=True):
+        assert np.array_equal(one, other)
+    assert all(np.array_equal(left[4][key], right[4][key]) for key in left[4])
+    x, s = kept.unwrapped.particles()
+    left = kept.unwrapped.place_particles(x[1:2], s[1:2], worlds=[1])
+    assert np.array_equal(left, kept.unwrapped.worlds.perceive())
+
+
+def test_action_of_a_restarting_world_may_be_anything():
+    envs = make_vec(IDS[0], 2, max_episode_steps=1, autoreset_mode="next-step")
+    envs.reset(seed=0)
+    action = np.zeros((2, *envs.single_action_space.shape), np.float32)
+    envs.step(action)
+    envs.step(action * np.nan)
+    with pytest.raises(NPAError, match="action must be finite"):
+        envs.step(action * np.nan)
 
 
 def test_reset_mode_is_declared_twice():
@@ -237,7 +283,8 @@ def test_arrays_are_the_callers_unless_told_otherwise(name):
 @every_id
 @pytest.mark.parametrize("mode", ["same-step", "next-step", "disabled"])
 def test_shared_arrays_hold_what_new_ones_would(name, mode):
-    given = {"autoreset_mode": mode, "max_episode_steps": 3, "reward": "particle"}
+    steps = 30 if mode == "disabled" else 3
+    given = {"autoreset_mode": mode, "max_episode_steps": steps, "reward": "particle"}
     own, shared = make_vec(name, 3, **given), make_vec(name, 3, copy=False, **given)
     first = shared.reset(seed=0)[0]
     own.reset(seed=0)
@@ -283,8 +330,15 @@ def test_wrong_use_is_a_clear_error(name):
         envs.reset(options={"reset_mask": np.array([1, 0, 0])})
     with pytest.raises(NPAError, match="reset_mask must choose"):
         envs.reset(options={"reset_mask": np.zeros(3, bool)})
-    with pytest.raises(NPAError, match="seed must be one number or one for each of 3"):
+    with pytest.raises(NPAError, match="seed must be one whole number, or one for each of 3"):
         envs.reset(seed=[1, 2])
+    with pytest.raises(NPAError, match=r"seed must be one whole number.*got 1.5"):
+        envs.reset(seed=1.5)
+    with pytest.raises(NPAError, match="unknown reset option 'reset_masks': did you mean"):
+        envs.reset(options={"reset_masks": np.zeros(3, bool)})
+    with pytest.raises(NPAError, match="worlds must be indices below 3"):
+        envs.unwrapped.place_particles(*envs.unwrapped.particles(), worlds=[0, 1, 3])
+    assert make_vec(name, np.int64(2), max_episode_steps=-1).num_envs == 2
     with pytest.raises(NPAError, match="num_envs must be"):
         make_vec(name, 0)
     with pytest.raises(NPAError, match="max_episode_steps must be"):

@@ -7,7 +7,10 @@ from worlds import degenerate_world, random_world, relative_error
 
 import npa_envs
 from npa_envs import reference as oracle
+from npa_envs.kernels import slots
+from npa_envs.sph import bridge
 from npa_envs.sph.operators import Terms, perceive_rows
+from npa_envs.sph.rows import survey, write_observation
 
 # Worst error measured on CPU and CUDA, then the bound of the test: a few times larger.
 FORWARD = {torch.float32: 2e-6, torch.float64: 5e-15}  # 3.1e-7, 5e-16
@@ -112,6 +115,42 @@ def test_gradients_pass_gradcheck(space_dim, device):
         lambda x, s: npa_envs.perceive(x, s, 0.3, detach_positions=False, moment_correction=False),
         (x, s),
     )
+
+
+@pytest.mark.parametrize("dtype", DTYPES, ids=("float32", "float64"))
+@pytest.mark.parametrize(
+    ("space_dim", "state_dim", "box"),
+    [(2, 16, None), (2, 5, (1.4, 1.9)), (2, 32, None), (3, 16, None), (3, 21, (1.4, 1.9, 1.5))],
+)
+def test_observation_is_perception_in_the_callers_order_and_clipped(
+    space_dim, state_dim, box, dtype, device
+):
+    x, s = random_world(3, 83, space_dim, state_dim, dtype=dtype, device=device)
+    expected = oracle.perceive(x.cpu().double(), s.cpu().double(), 0.3, 0.2, box)
+    out = torch.full(expected.shape, float("nan"), dtype=dtype, device=device)
+    surveyed = survey(x, s, eps=0.3, eps0=0.2, box=box, terms=Terms())
+    write_observation(surveyed, 1.5, out.view(-1, out.shape[-1]))
+    assert (expected.abs() > 1.5).any()
+    assert relative_error(out, expected.clamp(-1.5, 1.5)) < FORWARD[dtype]
+
+
+def test_observation_of_a_world_does_not_depend_on_its_batch(device):
+    """333 particles: the worlds begin anywhere within a CUDA warp."""
+    x, s = random_world(5, 333, 2, 16, dtype=torch.float32, device=device)
+
+    def run(x, s):
+        out = x.new_empty(*x.shape[:2], 66)
+        surveyed = survey(x, s, eps=0.2, eps0=0.2, box=None, terms=Terms())
+        write_observation(surveyed, 16.0, out.view(-1, 66))
+        return out
+
+    together = run(x, s)
+    for k in range(5):
+        assert torch.equal(together[k], run(x[k : k + 1], s[k : k + 1])[0])
+
+
+def test_slots_fit_the_blocks_that_are_launched():
+    assert slots.CUDA_BLOCK == bridge.CUDA_BLOCK
 
 
 def test_detached_positions_get_no_gradient(device):

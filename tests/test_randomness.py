@@ -10,7 +10,7 @@ import npa_envs
 from npa_envs import WorldRandom
 from npa_envs.errors import NPAError
 from npa_envs.kernels.draws import draw_words
-from npa_envs.randomness import check_generator
+from npa_envs.randomness import Purpose, check_generator
 from npa_envs.sph.bridge import launch
 from npa_envs.tasks.damage import random_particle
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
@@ -225,6 +225,102 @@ def test_putting_other_keys_back_reseeds_those_worlds_alone(device):
     assert torch.equal(random.uniform(4), WorldRandom([1, 9, 3], device=device).uniform(4))
 
 
+def test_keys_beside_are_splitmixs_published_numbers(device):
+    random = WorldRandom.from_keys(torch.tensor([1234567, 0], device=device))
+    published = (
+        (6457827717110365317, 0xE220A8397B1DCDAF),
+        (3203168211198807973, 0x6E789E6AA1B965F4),
+        (9817491932198370423, 0x06C45D188009454F),
+    )
+    for purpose, expected in enumerate(published):
+        keys = random.beside(purpose).keys.tolist()
+        assert tuple(key % 2**64 for key in keys) == expected
+
+
+def test_streams_beside_draw_apart_from_the_own_and_from_those_of_other_purposes(draw, device):
+    random = WorldRandom([5, 6], device=device)
+    streams = [
+        random,
+        random.beside(1),
+        random.beside(2),
+        random.beside(3),
+        random.beside(1).beside(2),
+        random.beside(2).beside(1),
+    ]
+    seen = [values for stream in streams for values in draw(stream)]
+    for k, values in enumerate(seen):
+        assert all(not torch.equal(values, other) for other in seen[:k])
+
+
+def test_streams_beside_are_the_same_whenever_they_are_made_within_a_step(draw, device):
+    first, second = (WorldRandom([5, 6], device=device) for _ in range(2))
+    for random in (first, second):
+        random.restart()
+        random.advance()
+    second.uniform(3)
+    assert torch.equal(draw(first.beside(7)), draw(second.beside(7)))
+    before = draw(first.beside(7))
+    first.advance()
+    assert not torch.equal(draw(first.beside(7)), before)
+
+
+def test_streams_beside_go_on_from_the_step_they_were_made_in(draw, device):
+    random = WorldRandom([5, 6], device=device)
+    random.restart()
+    early = random.beside(7)
+    for stream in (random, early):
+        stream.advance()
+    assert torch.equal(draw(early), draw(random.beside(7)))
+
+
+def test_streams_beside_leave_the_own_as_they_are(draw, device):
+    random, plain = (WorldRandom([5, 6], device=device) for _ in range(2))
+    for stream in (random, plain):
+        stream.advance()
+        stream.uniform(3)
+    beside = random.beside(1)
+    draw(beside)
+    beside.restart()
+    beside.advance()
+    assert random.episodes.tolist() == [0, 0]
+    assert random.steps.tolist() == [1, 1]
+    assert torch.equal(random.keys, plain.keys)
+    assert torch.equal(draw(random), draw(plain))
+
+
+def test_a_world_draws_beside_in_any_batch_what_it_draws_alone(draw, device):
+    random = WorldRandom(range(4), device=device)
+    random.put(slice(2, 3), _in_episode(WorldRandom(2, device=device), 3))
+    together = draw(random.beside(5))
+    chosen = draw(random.take(torch.tensor([3, 1], device=device)).beside(5))
+    for seed in range(4):
+        alone = _in_episode(WorldRandom(seed, device=device), 3 if seed == 2 else 0)
+        assert torch.equal(draw(alone.beside(5))[0], together[seed])
+    assert torch.equal(chosen, together[[3, 1]])
+
+
+def _in_episode(random, episode):
+    for _ in range(episode):
+        random.restart()
+    return random
+
+
+def test_streams_beside_are_uncorrelated_with_the_own_and_among_each_other(device):
+    random = WorldRandom(range(64), device=device)
+    streams = [random, *(random.beside(purpose) for purpose in range(8))]
+    drawn = torch.stack([stream.normal(2001).double() for stream in streams])
+    for k in range(1, len(drawn)):
+        # Also against the neighbouring worlds of other purposes.
+        for other in (drawn[:k], drawn[:k].roll(1, dims=1)):
+            products = drawn[k] * other
+            assert abs(float(products.mean())) < SIGMAS / math.sqrt(products.numel())
+
+
+def test_no_two_purposes_of_the_package_have_one_number():
+    assert len({purpose.value for purpose in Purpose}) == len(Purpose.__members__) >= 4
+    assert all(0 < purpose < 1000 for purpose in Purpose)
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=("float32", "float64"))
 def test_uniform_and_normal_numbers_have_their_moments(dtype, device):
     random = WorldRandom(range(8), device=device)
@@ -433,6 +529,8 @@ def test_shapes_may_be_empty(device):
             "keys must be an int64 .* got torch.float32",
         ),
         (lambda: WorldRandom.from_keys([1]), "keys must be an int64 tensor .* got list"),
+        (lambda: WorldRandom(1).beside(-1), "purpose must be an integer of at least 0, got -1"),
+        (lambda: WorldRandom(1).beside("x"), "purpose must be an integer of at least 0, got 'x'"),
         (lambda: WorldRandom(1).uniform(-1), "a size must be an integer of at least 0, got -1"),
         (lambda: WorldRandom(1).normal(2, dtype=torch.float16), "dtype must be .* got torch.f.*16"),
         (lambda: WorldRandom(1).bernoulli(1.5, 2), r"probability must lie in \[0, 1\], got 1.5"),

@@ -159,6 +159,49 @@ def test_events_of_one_step_are_drawn_apart():
     assert torch.std(both) == pytest.approx(0.05 * 2**0.5, rel=0.3)
 
 
+@pytest.mark.parametrize("kind", ["erase:0.3", "cut", "clump:0.4", "noise"])
+def test_a_stack_of_wrappers_damages_as_one_with_all_events(kind):
+    one = DamageEvents(single(), [f"2:{kind}", "5:cut", f"2:{kind}"])
+    stack = DamageEvents(single(), [f"2:{kind}", "5:cut"])
+    stack = DamageEvents(gym.wrappers.ClipAction(stack), f"2:{kind}")
+    envs = VectorDamageEvents(batched(2), [f"2:{kind}", "5:cut"])
+    envs = VectorDamageEvents(gym.wrappers.vector.ClipAction(envs), f"2:{kind}")
+    alone = DamageEvents(single(), f"2:{kind}")
+    for env in (one, stack, alone):
+        observation, _ = env.reset(seed=6)
+    envs.reset(seed=6)
+    for step in range(1, 6):
+        action = policy(observation)
+        expected, *_, info = one.step(action)
+        seen, *_, stack_info = stack.step(action)
+        batch, *_, infos = envs.step(np.stack([action] * 2))
+        lone, *_ = alone.step(action)
+        np.testing.assert_array_equal(seen, expected)
+        np.testing.assert_array_equal(batch[0], expected)
+        assert ("loss_damage" in stack_info) == ("loss_damage" in info) == (step in (2, 5))
+        if step == 2:
+            assert not np.array_equal(lone, expected), "the two events damaged one place"
+        if step in (2, 5):
+            assert stack_info["loss_damage"] == pytest.approx(info["loss_damage"], abs=1e-6)
+            assert infos["loss_damage"][0] == pytest.approx(info["loss_damage"], abs=1e-6)
+            assert infos["_loss_damage"].tolist() == [True, True]
+        assert stack_info["loss"] == infos["loss"][0] == info["loss"]
+        observation = expected
+
+
+@pytest.mark.parametrize("output", ["numpy", "torch"])
+def test_a_stack_tells_of_worlds_that_only_one_of_its_wrappers_damaged(output):
+    envs = VectorDamageEvents(batched(output=output), "2:cut")
+    envs = VectorDamageEvents(envs, "3:erase:1")
+    observations, _ = envs.reset(seed=0)
+    envs.step(policy(observations))
+    observations, _ = envs.reset(options={"reset_mask": np.array([True, False, False])})
+    observations, *_ = envs.step(policy(observations))
+    observations, *_, infos = envs.step(policy(observations))
+    assert infos["_loss_damage"].tolist() == [True, True, True]
+    assert all(infos["loss_damage"].tolist())
+
+
 @pytest.mark.parametrize(
     ("events", "every"),
     [
@@ -191,8 +234,9 @@ def test_world_k_is_damaged_as_the_single_environment(events, every):
             if reward is not None:
                 assert reward[k] == expected_reward
             assert info["loss"][k] == expected_info["loss"]
-            if "loss_damage" in expected_info:
-                assert info["_loss_damage"][k]
+            hurt = info.get("_loss_damage", np.zeros(3, bool))[k]
+            assert hurt == ("loss_damage" in expected_info)
+            if hurt:
                 assert info["loss_damage"][k] == pytest.approx(expected_info["loss_damage"])
                 damaged += 1
     assert damaged >= 6

@@ -71,12 +71,16 @@ def test_clip_and_rescale_action():
 def test_flatten_observation_and_normalize_reward():
     env = wrappers.NormalizeReward(wrappers.FlattenObservation(single()))
     assert env.observation_space.shape == (64 * 66,)
+    plain = single()
     observation, _ = env.reset(seed=0)
     assert env.observation_space.contains(observation)
+    plain.reset(seed=0)
     for step in range(STEPS):
         observation, reward, *_ = env.step(actions(step))
-    assert observation.shape == (64 * 66,)
-    assert np.isfinite(reward)
+        expected, unscaled, *_ = plain.step(actions(step))
+        np.testing.assert_array_equal(observation, expected.reshape(-1))
+    scale = np.sqrt(env.return_rms.var + env.epsilon)
+    assert reward == pytest.approx(unscaled / scale, rel=1e-6)
 
 
 def test_autoreset_goes_on_with_the_sequence_of_episodes():

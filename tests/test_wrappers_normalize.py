@@ -1,5 +1,7 @@
 """Running normalisation of perception."""
 
+import json
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -85,6 +87,7 @@ def test_directions_stay_what_they_are():
         (z[:, 2 * C : -D].reshape(64, C, D), normal[:, 2 * C : -D].reshape(64, C, D)),
         (z[:, -D:], normal[:, -D:]),
     ):
+        assert np.abs(before).max() > 0.1
         cross = before[..., 0] * after[..., 1] - before[..., 1] * after[..., 0]
         np.testing.assert_allclose(cross, 0.0, atol=2e-5)
         assert ((before * after).sum(axis=-1) >= 0).all()
@@ -128,6 +131,69 @@ def test_frozen_statistics_stay_and_can_be_saved_and_shared(tmp_path):
         assert torch.equal(value, state[name])
 
 
+@pytest.mark.parametrize("output", ["numpy", "torch"])
+def test_a_reset_of_one_world_counts_only_that_world(output):
+    keywords = {"autoreset_mode": "disabled", "output": output}
+    env = VectorNormalizePerception(batched(4, **keywords))
+    plain = batched(4, autoreset_mode="disabled")
+    env.reset(seed=3)
+    z, _ = plain.reset(seed=3)
+    seen = [z]
+    for _ in range(2):
+        action = policy(z)
+        env.step(action)
+        z, *_ = plain.step(action)
+        seen.append(z)
+    options = {"reset_mask": np.array([False, True, False, False])}
+    normal, _ = env.reset(options=options)
+    z, _ = plain.reset(options=options)
+    assert env.statistics.moments.count == pytest.approx(13 * 64, abs=1e-3)
+    mean, deviation = expected_scales(np.concatenate([*seen, z[1:2]]))
+    wanted = np.clip((z - mean) / deviation, -10, 10)
+    np.testing.assert_allclose(np.asarray(normal), wanted, rtol=1e-3, atol=1e-3)
+    z, *_ = plain.step(policy(z))
+    env.step(np.zeros((4, 64, ACTIONS), np.float32))
+    assert env.statistics.moments.count == pytest.approx(17 * 64, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    "keywords", [{}, {"clip": 2.0, "epsilon": 0.5, "training": False}], ids=["defaults", "given"]
+)
+def test_an_environment_made_from_the_spec_is_wrapped_alike(keywords):
+    env = NormalizePerception(single(), **keywords)
+    spec = gym.envs.registration.EnvSpec.from_json(env.spec.to_json())
+    made = gym.make(spec)
+    assert isinstance(made, NormalizePerception)
+    assert made.training is keywords.get("training", True)
+    first, _ = env.reset(seed=1)
+    np.testing.assert_array_equal(made.reset(seed=1)[0], first)
+    for _ in range(3):
+        action = policy(first)
+        first, *_ = env.step(action)
+        np.testing.assert_array_equal(made.step(action)[0], first)
+    assert np.abs(first).max() <= keywords.get("clip", 10.0)
+
+
+def test_the_spec_of_shared_statistics_holds_their_numbers_and_not_themselves():
+    trained = NormalizePerception(single(), clip=3.0, epsilon=0.1)
+    trained.reset(seed=0)
+    env = NormalizePerception(single(), training=False, statistics=trained.statistics)
+    kwargs = env.spec.additional_wrappers[-1].kwargs
+    assert kwargs == {"clip": 3.0, "epsilon": 0.1, "training": False}
+    assert json.loads(env.spec.to_json())["additional_wrappers"][-1]["kwargs"] == kwargs
+    made = gym.make(env.spec)
+    assert made.statistics.clip == 3.0
+    made.load_state_dict(env.state_dict())
+    np.testing.assert_array_equal(made.reset(seed=4)[0], env.reset(seed=4)[0])
+    vector = VectorNormalizePerception(batched(), statistics=trained.statistics)
+    assert vector.statistics is trained.statistics
+    assert vector._saved_kwargs == {"clip": 3.0, "epsilon": 0.1, "training": True}
+
+
+def shared(wrapper, make, **keywords):
+    return wrapper(make(), statistics=NormalizePerception(single()).statistics, **keywords)
+
+
 def test_final_observations_are_normalised_and_not_counted():
     env, plain = VectorNormalizePerception(batched()), batched()
     env.reset(seed=1)
@@ -150,9 +216,8 @@ def test_blank_worlds_give_finite_numbers():
     assert (normal[:, : 2 * C] == 0).all()
     action = np.zeros((64, ACTIONS), np.float32)
     action[0, -1] = 1.0
-    for _ in range(4):
-        normal, *_ = env.step(action)
-        assert np.abs(normal).max() <= 2.0
+    sizes = [np.abs(env.step(action)[0]).max() for _ in range(4)]
+    assert max(sizes) == 2.0
     assert env.observation_space == gym.spaces.Box(-2.0, 2.0, (64, P), np.float32)
 
 
@@ -164,6 +229,14 @@ def test_blank_worlds_give_finite_numbers():
         (lambda: NormalizePerception(batched()), "use VectorNormalizePerception"),
         (lambda: VectorNormalizePerception(single()), "use NormalizePerception"),
         (lambda: NormalizePerception(SpeciesTags(single())), "normalise before other wrappers"),
+        (
+            lambda: NormalizePerception(gym.wrappers.FlattenObservation(single())),
+            "normalise before other wrappers",
+        ),
+        (lambda: shared(NormalizePerception, single, clip=10.0), "clip belongs to statistics"),
+        (lambda: shared(NormalizePerception, single, epsilon=1e-3), "epsilon belongs to stat"),
+        (lambda: shared(VectorNormalizePerception, batched, clip=5.0), "has 10, got 5.0 as well"),
+        (lambda: NormalizePerception(single(), statistics={}), "got dict: give wrapper.statistics"),
         (lambda: NormalizePerception(single()).load_state_dict({}), "missing statistic"),
         (
             lambda: NormalizePerception(single()).load_state_dict(

@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-import npa_envs  # noqa: F401 (registers the environments)
+import npa_envs
 from npa_envs.errors import MissingDependencyError, NPAError
 from npa_envs.wrappers import VectorDamageEvents, VectorNormalizePerception, VectorSpeciesTags
 
@@ -241,6 +241,25 @@ def test_without_stable_baselines3_the_error_names_the_extra():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "pip install 'npa-envs[sb3]'" in done.stdout
     assert issubclass(MissingDependencyError, ImportError)
+
+
+def test_a_star_imports_every_wrapper_that_needs_no_extra():
+    code = (
+        "import sys\n"
+        "sys.modules['stable_baselines3'] = None\n"
+        "from npa_envs.wrappers import *\n"
+        "print(DamageEvents.__name__, VectorSpeciesTags.__name__, TorchNormalizeReward.__name__)\n"
+        "assert 'ParticleVecEnv' not in globals()\n"
+        "import npa_envs.wrappers as wrappers\n"
+        "assert 'ParticleVecEnv' in dir(wrappers)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["DamageEvents", "VectorSpeciesTags", "TorchNormalizeReward"]
+
+
+def test_an_unknown_wrapper_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="no attribute 'Absent'"):
+        npa_envs.wrappers.Absent  # noqa: B018
 
 
 def test_importing_the_wrappers_imports_no_trainer():

@@ -7,7 +7,7 @@ import torch
 
 import npa_envs  # noqa: F401 (registers the environments)
 from npa_envs.errors import NPAError
-from npa_envs.wrappers import SpeciesTags, VectorSpeciesTags
+from npa_envs.wrappers import NormalizePerception, SpeciesTags, VectorSpeciesTags
 
 SMALL = {"particle_count": 64, "eps": 0.3, "resolution": 16}
 STEPS = 8
@@ -115,6 +115,24 @@ def test_the_batched_space_holds_the_tags():
     observations, _ = envs.reset(seed=0)
     assert envs.observation_space.contains(observations)
     assert envs.single_observation_space.shape == (64, 68)
+
+
+def test_tags_stand_behind_what_other_wrappers_make_of_the_rows():
+    env, plain = SpeciesTags(NormalizePerception(single()), 2), NormalizePerception(single())
+    observation, _ = env.reset(seed=0)
+    np.testing.assert_array_equal(observation[:, :66], plain.reset(seed=0)[0])
+    np.testing.assert_array_equal(observation[:, 66:].argmax(axis=1), env.species)
+
+
+def test_observations_without_a_row_for_each_particle_are_refused():
+    with pytest.raises(NPAError, match=r"each of 64 particles.* put SpeciesTags under"):
+        SpeciesTags(gym.wrappers.FlattenObservation(single()))
+    with pytest.raises(NPAError, match="put VectorSpeciesTags under"):
+        VectorSpeciesTags(
+            gym.wrappers.vector.FlattenObservation(batched(autoreset_mode="disabled"))
+        )
+    with pytest.raises(NPAError, match="a row for each of 64 particles, got Dict"):
+        SpeciesTags(gym.wrappers.TimeAwareObservation(single(), flatten=False))
 
 
 @pytest.mark.parametrize(

@@ -75,7 +75,6 @@ def test_episodes_are_recorded_as_by_gymnasium(mode):
     assert episodes == ours.episode_count == theirs.episode_count
     assert episodes >= 6
     np.testing.assert_allclose(ours.return_queue, theirs.return_queue, atol=1e-6)
-    np.testing.assert_allclose(ours.return_queue, theirs.return_queue, atol=1e-6)
     assert list(ours.length_queue) == list(theirs.length_queue)
     assert len(ours.time_queue) == 5
 
@@ -107,6 +106,27 @@ def test_observations_are_normalised_as_by_gymnasium():
     assert torch.equal(ours.obs_rms.mean, mean)
     assert one.dtype == torch.float32
     assert ours.observation_space.shape == (3, 64, 66)
+
+
+def test_a_reset_of_one_world_counts_only_that_world():
+    ours = TorchNormalizeObservation(batched(4, autoreset_mode="disabled", output="torch"))
+    plain = batched(4, autoreset_mode="disabled", output="torch")
+    seen = [plain.reset(seed=0)[0]]
+    ours.reset(seed=0)
+    for step in range(2):
+        action = np.concatenate((actions(step), actions(step + 100)[:1]))
+        ours.step(action)
+        seen.append(plain.step(action)[0])
+    options = {"reset_mask": np.array([False, False, True, False])}
+    one, _ = ours.reset(options=options)
+    other, _ = plain.reset(options=options)
+    wanted = torch.cat((*seen, other[2:3])).double()
+    rms = ours.obs_rms
+    assert rms.count == pytest.approx(13, abs=1e-3)
+    torch.testing.assert_close(rms.mean, wanted.mean(dim=0), rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(
+        one, ((other - rms.mean) / (rms.var + 1e-8).sqrt()).float(), rtol=1e-4, atol=1e-4
+    )
 
 
 def test_final_observations_are_normalised_too():

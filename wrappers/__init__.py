@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from npa_envs.wrappers.damage import DamageEvents, VectorDamageEvents
     from npa_envs.wrappers.normalize import NormalizePerception, VectorNormalizePerception
-    from npa_envs.wrappers.particles import ParticleVecEnv
+    from npa_envs.wrappers.particles import ParticleVecEnv as ParticleVecEnv
     from npa_envs.wrappers.species import SpeciesTags, VectorSpeciesTags
     from npa_envs.wrappers.statistics import (
         TorchNormalizeObservation,
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 __all__ = [
     "DamageEvents",
     "NormalizePerception",
-    "ParticleVecEnv",
     "SpeciesTags",
     "TorchNormalizeObservation",
     "TorchNormalizeReward",
@@ -30,15 +29,17 @@ __all__ = [
     "VectorNormalizePerception",
     "VectorSpeciesTags",
 ]
+# A star imports all of them, and must not need Stable-Baselines3.
+ON_REQUEST = ("ParticleVecEnv",)
 
 
 def __getattr__(name: str) -> Any:
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    if name == "ParticleVecEnv":
+    if name in ON_REQUEST:
         from npa_envs.wrappers import particles
 
-        return particles.ParticleVecEnv
+        return getattr(particles, name)
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from npa_envs.wrappers import damage, normalize, species, statistics
 
     holders = (damage, normalize, species, statistics)
@@ -46,4 +47,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted({*globals(), *__all__, *ON_REQUEST})

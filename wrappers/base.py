@@ -1,4 +1,4 @@
-"""What the wrappers share: checks, the episodes' clock, and random streams of their own."""
+"""What the wrappers share: checks, and the episodes' clock."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from torch import Tensor
 from npa_envs.envs.single import NPAEnv
 from npa_envs.envs.vector import NPAVectorEnv
 from npa_envs.errors import NPAError
-from npa_envs.randomness import WorldRandom
 
 if TYPE_CHECKING:
     AnyWrapper = gymnasium.Wrapper[Any, Any, Any, Any]
@@ -26,9 +25,6 @@ if TYPE_CHECKING:
 else:
     # Older releases of Gymnasium have no type parameters here.
     AnyWrapper, AnyVectorEnv, AnyVectorWrapper = gymnasium.Wrapper, VectorEnv, VectorWrapper
-
-GOLDEN = 0x9E3779B97F4A7C15
-"""Any odd number of 64 bits: its multiples tell the streams of different purposes apart."""
 
 
 def single_env(env: Any, wrapper: str) -> NPAEnv:
@@ -111,25 +107,6 @@ def world_indices(mask: NDArray[np.bool_], device: torch.device) -> Tensor:
     return torch.from_numpy(np.flatnonzero(mask)).to(device)
 
 
-def side_stream(random: WorldRandom, worlds: Tensor, purpose: int) -> WorldRandom:
-    """Return streams beside those of some worlds, from which drawing leaves theirs as they are.
-
-    A world's draws depend on its seed, episode and step and on the purpose, and on nothing else:
-    not on the other worlds, and not on what was drawn before.
-
-    Args:
-        random: The worlds' own streams.
-        worlds: Which worlds, int64, shape [M].
-        purpose: A number from 1 on; each has streams of its own.
-    """
-    salt = purpose * GOLDEN % 2**64
-    signed = salt - 2**64 if salt >= 2**63 else salt
-    made = WorldRandom.from_keys(random.keys[worlds] ^ signed)
-    made.episodes = random.episodes[worlds]
-    made.steps = random.steps[worlds]
-    return made
-
-
 class EpisodeClock:
     """Where each world of a vector environment stands in its episode, kept on the host.
 
@@ -143,6 +120,8 @@ class EpisodeClock:
         lengths: Steps of the episode that the last step belonged to, int64, shape [B].
         ended: Whether the last step ended an episode, bool, shape [B].
         restarted: Whether the last observation is the first of an episode, bool, shape [B].
+        observed: Whether the last observation is a new one, bool, shape [B]; a reset of some worlds
+            hands out the old ones of the others once more.
     """
 
     def __init__(self, env: AnyVectorEnv) -> None:
@@ -151,6 +130,7 @@ class EpisodeClock:
         self.lengths = np.zeros_like(self.elapsed)
         self.ended = np.zeros(env.num_envs, dtype=bool)
         self.restarted = np.zeros(env.num_envs, dtype=bool)
+        self.observed = np.ones(env.num_envs, dtype=bool)
 
     def reset(self, options: dict[str, Any] | None) -> None:
         """Follow a reset.
@@ -160,6 +140,7 @@ class EpisodeClock:
         """
         mask = None if options is None else options.get("reset_mask")
         self.restarted = np.ones_like(self.ended) if mask is None else to_host(mask).copy()
+        self.observed = self.restarted
         self.elapsed = np.where(self.restarted, 0, self.elapsed)
         self.lengths = self.elapsed.copy()
         self.ended = self.ended & ~self.restarted
@@ -172,6 +153,7 @@ class EpisodeClock:
             truncations: Likewise.
             infos: Of the step.
         """
+        self.observed = np.ones_like(self.ended)
         next_step = self._mode is AutoresetMode.NEXT_STEP
         self.restarted = self.ended if next_step else np.zeros_like(self.ended)
         self.lengths = np.where(self.restarted, 0, self.elapsed + 1)
@@ -208,6 +190,19 @@ class VectorObservations(AnyVectorWrapper):
     @observation_space.setter
     def observation_space(self, space: Space[Any]) -> None:
         self._observation_space = space
+
+    def new_ones(self, observations: Any) -> Any:
+        """Return the observations of those worlds that gave new ones, shape [M, N, P].
+
+        Args:
+            observations: Of all worlds after a reset or a step, shape [B, N, P].
+        """
+        observed = self.clock.observed
+        if observed.all():
+            return observations
+        if isinstance(observations, Tensor):
+            return observations[world_indices(observed, observations.device)]
+        return observations[observed]
 
     @abstractmethod
     def observations(self, observations: Any) -> Any:

@@ -16,6 +16,7 @@ from npa_envs.envs.arrays import to_output
 from npa_envs.envs.single import NPAEnv
 from npa_envs.envs.vector import NPAVectorEnv
 from npa_envs.errors import NPAError
+from npa_envs.randomness import Purpose
 from npa_envs.tasks.checks import is_whole
 from npa_envs.tasks.damage import DamageEvent, damage_worlds, parse_damage
 from npa_envs.wrappers.base import (
@@ -24,7 +25,6 @@ from npa_envs.wrappers.base import (
     AnyWrapper,
     EpisodeClock,
     check_untouched,
-    side_stream,
     single_env,
     vector_env,
     world_indices,
@@ -83,7 +83,8 @@ class DamageEvents(AnyWrapper, RecordConstructorArgs):
     `gym.make` returns, whose step limit it then sees.
 
     On such steps `info` holds `loss_damage`, by how much the loss rose; `info["loss"]` and its
-    parts are those of the damaged world.
+    parts are those of the damaged world. A stack of these wrappers damages as one with all their
+    events, the innermost first.
 
     Args:
         env: An environment of this package, under no wrapper that changes observations.
@@ -108,6 +109,7 @@ class DamageEvents(AnyWrapper, RecordConstructorArgs):
         self._base = single_env(env, type(self).__name__)
         super().__init__(env)
         check_untouched(env, type(self).__name__)
+        self._first = events_beneath(env)
         self._elapsed = 0
 
     def reset(
@@ -132,10 +134,11 @@ class DamageEvents(AnyWrapper, RecordConstructorArgs):
             return observation, info
         worlds = self._base.worlds
         before = float(worlds.loss[0])
-        x, s = damaged_particles(self._base, self.schedule.events, due)
+        x, s = damaged_particles(self._base, self.schedule.events, due, self._first)
         observation = self._base.place_particles(x[0], s[0])
         loss, *parts = worlds.numbers[1 : 2 + len(worlds.part_names), 0].tolist()
-        info = info | {"loss": loss, "loss_damage": loss - before}
+        damage = info.get("loss_damage", 0.0) + loss - before
+        info = info | {"loss": loss, "loss_damage": damage}
         info |= {f"loss_{n}": value for n, value in zip(worlds.part_names, parts, strict=True)}
         return observation, info
 
@@ -164,6 +167,7 @@ class VectorDamageEvents(AnyVectorWrapper, RecordConstructorArgs):
         self._base = vector_env(env, type(self).__name__)
         super().__init__(env)
         check_untouched(env, type(self).__name__)
+        self._first = events_beneath(env)
         self._clock = EpisodeClock(env)
 
     def reset(
@@ -196,19 +200,42 @@ class VectorDamageEvents(AnyVectorWrapper, RecordConstructorArgs):
         before = worlds.loss.clone()
         hurt = np.asarray(due.any(axis=0))
         chosen = world_indices(hurt, base.task.device)
-        x, s = damaged_particles(base, self.schedule.events, due)
+        x, s = damaged_particles(base, self.schedule.events, due, self._first)
         observations = base.place_particles(x[chosen], s[chosen], chosen)
         output = base.config.output
         now = {"loss": worlds.loss.clone(), "loss_damage": worlds.loss - before}
         for k, name in enumerate(worlds.part_names):
             now[f"loss_{name}"] = worlds.numbers[2 + k].clone()
-        infos |= {name: to_output(value, output) for name, value in now.items()}
-        mask = torch.from_numpy(hurt).to(base.task.device) if output == "torch" else hurt
-        return observations, infos | {"_loss_damage": mask}
+        mask = torch.from_numpy(hurt).to(base.task.device)
+        now |= {"_loss_damage": mask}
+        told = {name: to_output(value, output) for name, value in now.items()}
+        if "loss_damage" in infos:
+            told["loss_damage"] = told["loss_damage"] + infos["loss_damage"]
+            told["_loss_damage"] = told["_loss_damage"] | infos["_loss_damage"]
+        return observations, infos | told
+
+
+def events_beneath(env: Any) -> int:
+    """Return how many events the wrappers of an environment hold.
+
+    Events of a stack of wrappers are numbered through, so that no two draw the same place.
+
+    Args:
+        env: An environment, wrapped or not.
+    """
+    count = 0
+    while hasattr(env, "env"):
+        if isinstance(env, DamageEvents | VectorDamageEvents):
+            count += len(env.schedule.events)
+        env = env.env
+    return count
 
 
 def damaged_particles(
-    env: NPAEnv | NPAVectorEnv, events: Sequence[DamageEvent], due: NDArray[np.bool_]
+    env: NPAEnv | NPAVectorEnv,
+    events: Sequence[DamageEvent],
+    due: NDArray[np.bool_],
+    first: int = 0,
 ) -> tuple[Tensor, Tensor]:
     """Return the particles of all worlds, damaged where damage is due.
 
@@ -216,6 +243,7 @@ def damaged_particles(
         env: The environment.
         events: The events, shape [E].
         due: Which are due in which worlds, shape [E, B].
+        first: Number of the first event; events draw apart by their numbers.
 
     Returns:
         Positions [length units], [B, N, D], and states, [B, N, C].
@@ -225,7 +253,7 @@ def damaged_particles(
     for k, (event, mask) in enumerate(zip(events, due, strict=True)):
         if mask.any():
             chosen = world_indices(mask, x.device)
-            stream = side_stream(worlds.random, chosen, 1 + k)
+            stream = worlds.random.take(chosen).beside(Purpose.DAMAGE).beside(first + k)
             x[chosen], s[chosen] = damage_worlds(
                 x[chosen], s[chosen], kind=event.kind, size=event.size, generator=stream
             )

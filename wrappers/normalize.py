@@ -9,6 +9,7 @@ import gymnasium
 import numpy as np
 import torch
 from gymnasium.spaces import Box
+from gymnasium.utils import RecordConstructorArgs
 from torch import Tensor
 
 from npa_envs.control import Physics
@@ -22,6 +23,8 @@ from npa_envs.wrappers.base import (
     vector_env,
 )
 from npa_envs.wrappers.moments import RunningMoments, as_tensor, like
+
+DEFAULT_CLIP, DEFAULT_EPSILON = 10.0, 1e-8
 
 
 class PerceptionStatistics:
@@ -41,7 +44,9 @@ class PerceptionStatistics:
         NPAError: `clip` or `epsilon` is not finite or not positive.
     """
 
-    def __init__(self, physics: Physics, *, clip: float = 10.0, epsilon: float = 1e-8) -> None:
+    def __init__(
+        self, physics: Physics, *, clip: float = DEFAULT_CLIP, epsilon: float = DEFAULT_EPSILON
+    ) -> None:
         for name, value in (("clip", clip), ("epsilon", epsilon)):
             if not is_real(value) or value <= 0:
                 raise NPAError(f"{name} must be a finite number greater than 0, got {value!r}")
@@ -90,10 +95,10 @@ class PerceptionStatistics:
         Raises:
             NPAError: It holds more than perception.
         """
-        if space.shape[-1] != self.perception_dim:
+        if len(space.shape) != 2 or space.shape[1] != self.perception_dim:
             raise NPAError(
-                f"observations must be perception vectors of length {self.perception_dim}, "
-                f"got {space.shape[-1]}: normalise before other wrappers add to them"
+                f"observations must be perception vectors, shape [N, {self.perception_dim}], got "
+                f"shape {space.shape}: normalise before other wrappers change them"
             )
         return Box(-self.clip, self.clip, space.shape, np.float32)
 
@@ -104,18 +109,61 @@ class PerceptionStatistics:
         return torch.cat((statistics[:centred], gradients))
 
 
-class NormalizePerception(AnyWrapper):
+def shared_or_new(
+    statistics: PerceptionStatistics | None,
+    physics: Physics,
+    clip: float | None,
+    epsilon: float | None,
+) -> PerceptionStatistics:
+    """Return the given statistics, or new ones.
+
+    Args:
+        statistics: Those of another wrapper, or None.
+        physics: The constants of the world that is perceived.
+        clip: That of the new ones; None: the default.
+        epsilon: Likewise.
+
+    Raises:
+        NPAError: There are statistics and other numbers beside them, or a number is wrong.
+    """
+    named = (("clip", clip), ("epsilon", epsilon))
+    given = {name: value for name, value in named if value is not None}
+    if statistics is None:
+        return PerceptionStatistics(physics, **given)
+    if not isinstance(statistics, PerceptionStatistics):
+        raise NPAError(
+            f"statistics must be those of another wrapper, got {type(statistics).__name__}: "
+            "give wrapper.statistics, or load a state with load_state_dict"
+        )
+    for name, value in given.items():
+        raise NPAError(
+            f"{name} belongs to statistics, which has {getattr(statistics, name):g}, got "
+            f"{value!r} as well: leave {name} out"
+        )
+    return statistics
+
+
+def recorded(statistics: PerceptionStatistics, training: bool) -> dict[str, Any]:
+    """Return the arguments from which a wrapper alike, with new statistics, can be made."""
+    return {"clip": statistics.clip, "epsilon": statistics.epsilon, "training": training}
+
+
+class NormalizePerception(AnyWrapper, RecordConstructorArgs):
     """Bring perception to one scale, by running statistics.
+
+    The environment's spec holds how, and not the statistics: save those with `state_dict`.
 
     Args:
         env: An environment of this package.
-        clip: What is normalised is clipped to plus and minus this (dimensionless).
-        epsilon: Added to variances (dimensionless).
+        clip: What is normalised is clipped to plus and minus this (dimensionless); None: to 10, or
+            as `statistics` has it.
+        epsilon: Added to variances (dimensionless); None: 1e-8, or as `statistics` has it.
         training: Whether the statistics follow what is seen.
         statistics: Those of another wrapper, to share; None makes new ones.
 
     Raises:
-        NPAError: The environment or a number is wrong.
+        NPAError: The environment or a number is wrong, or `clip` or `epsilon` is given although
+            `statistics` has its own.
 
     Attributes:
         training: Whether the statistics follow what is seen; set it to False to freeze them.
@@ -126,14 +174,15 @@ class NormalizePerception(AnyWrapper):
         self,
         env: gymnasium.Env[Any, Any],
         *,
-        clip: float = 10.0,
-        epsilon: float = 1e-8,
+        clip: float | None = None,
+        epsilon: float | None = None,
         training: bool = True,
         statistics: PerceptionStatistics | None = None,
     ) -> None:
         physics = single_env(env, type(self).__name__).worlds.physics
+        self.statistics = shared_or_new(statistics, physics, clip, epsilon)
+        RecordConstructorArgs.__init__(self, **recorded(self.statistics, training))
         super().__init__(env)
-        self.statistics = statistics or PerceptionStatistics(physics, clip=clip, epsilon=epsilon)
         self.training = training
         assert isinstance(env.observation_space, Box), "environments of this package have boxes"
         self.observation_space = self.statistics.space(env.observation_space)
@@ -171,20 +220,23 @@ class NormalizePerception(AnyWrapper):
         return self.statistics.normalize(observation)
 
 
-class VectorNormalizePerception(VectorObservations):
+class VectorNormalizePerception(VectorObservations, RecordConstructorArgs):
     """`NormalizePerception` for vector environments, of NumPy arrays or tensors on a device.
 
-    Final observations are normalised, and not counted. Nothing waits for the device.
+    Final observations are normalised and not counted, nor are those of worlds that a reset leaves
+    alone. Nothing waits for the device.
 
     Args:
         env: A vector environment of this package.
-        clip: What is normalised is clipped to plus and minus this (dimensionless).
-        epsilon: Added to variances (dimensionless).
+        clip: What is normalised is clipped to plus and minus this (dimensionless); None: to 10, or
+            as `statistics` has it.
+        epsilon: Added to variances (dimensionless); None: 1e-8, or as `statistics` has it.
         training: Whether the statistics follow what is seen.
         statistics: Those of another wrapper, to share; None makes new ones.
 
     Raises:
-        NPAError: The environment or a number is wrong.
+        NPAError: The environment or a number is wrong, or `clip` or `epsilon` is given although
+            `statistics` has its own.
 
     Attributes:
         training: Whether the statistics follow what is seen; set it to False to freeze them.
@@ -195,14 +247,15 @@ class VectorNormalizePerception(VectorObservations):
         self,
         env: AnyVectorEnv,
         *,
-        clip: float = 10.0,
-        epsilon: float = 1e-8,
+        clip: float | None = None,
+        epsilon: float | None = None,
         training: bool = True,
         statistics: PerceptionStatistics | None = None,
     ) -> None:
         physics = vector_env(env, type(self).__name__).worlds.physics
+        self.statistics = shared_or_new(statistics, physics, clip, epsilon)
+        RecordConstructorArgs.__init__(self, **recorded(self.statistics, training))
         super().__init__(env)
-        self.statistics = statistics or PerceptionStatistics(physics, clip=clip, epsilon=epsilon)
         self.training = training
         assert isinstance(env.single_observation_space, Box), "ours are boxes"
         self.single_observation_space = self.statistics.space(env.single_observation_space)
@@ -210,7 +263,7 @@ class VectorNormalizePerception(VectorObservations):
     def observations(self, observations: Any) -> Any:
         """Return observations normalised, and count them while training."""
         if self.training:
-            self.statistics.update(observations)
+            self.statistics.update(self.new_ones(observations))
         return self.statistics.normalize(observations)
 
     def final_observations(self, observations: Any) -> Any:

@@ -8,19 +8,18 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Space
 from gymnasium.utils import RecordConstructorArgs
 from torch import Tensor
 
 from npa_envs.envs.arrays import to_output
 from npa_envs.errors import NPAError, suggest
-from npa_envs.randomness import WorldRandom
+from npa_envs.randomness import Purpose, WorldRandom
 from npa_envs.tasks.checks import is_real, is_whole
 from npa_envs.wrappers.base import (
     AnyVectorEnv,
     AnyWrapper,
     VectorObservations,
-    side_stream,
     single_env,
     vector_env,
     world_indices,
@@ -28,9 +27,6 @@ from npa_envs.wrappers.base import (
 
 ASSIGNMENTS = ("blocks", "random")
 """How particles come by their species."""
-
-PURPOSE = 2**32
-"""Number of the streams that species are drawn from, apart from those of damage."""
 
 
 class SpeciesPlan:
@@ -88,16 +84,26 @@ class SpeciesPlan:
         blocks = self.blocks.to(worlds.device)
         if not self.random:
             return blocks.expand(len(worlds), -1)
-        keys = side_stream(random, worlds, PURPOSE).uniform(len(blocks))
+        keys = random.take(worlds).beside(Purpose.SPECIES).uniform(len(blocks))
         return blocks[keys.argsort(dim=1, stable=True)]
 
-    def space(self, space: Box) -> Box:
+    def space(self, space: Space[Any], wrapper: str) -> Box:
         """Return the space of observations with tags.
 
         Args:
             space: The space of the observations as they are, shape [N, P].
+            wrapper: Name of the wrapper that appends them, for the error.
+
+        Raises:
+            NPAError: It has no row for each particle.
         """
-        shape = (space.shape[0], self.species_count)
+        count = len(self.blocks)
+        if not isinstance(space, Box) or len(space.shape) != 2 or space.shape[0] != count:
+            raise NPAError(
+                f"observations must be a row for each of {count} particles, got {space}: "
+                f"put {wrapper} under the wrappers that reshape observations"
+            )
+        shape = (count, self.species_count)
         low = np.concatenate((space.low, np.zeros(shape, np.float32)), axis=1)
         high = np.concatenate((space.high, np.ones(shape, np.float32)), axis=1)
         return Box(low, high, dtype=np.float32)
@@ -144,8 +150,7 @@ class SpeciesTags(AnyWrapper, RecordConstructorArgs):
         self._base = base = single_env(env, type(self).__name__)
         super().__init__(env)
         self._plan = SpeciesPlan(base.config.particle_count, species_count, fractions, assignment)
-        assert isinstance(env.observation_space, Box), "environments of this package have boxes"
-        self.observation_space = self._plan.space(env.observation_space)
+        self.observation_space = self._plan.space(env.observation_space, type(self).__name__)
         self._world = torch.zeros(1, dtype=torch.int64, device=base.task.device)
         self._assign()
 
@@ -202,8 +207,9 @@ class VectorSpeciesTags(VectorObservations, RecordConstructorArgs):
         self._base = base = vector_env(env, type(self).__name__)
         super().__init__(env)
         self._plan = SpeciesPlan(base.config.particle_count, species_count, fractions, assignment)
-        assert isinstance(env.single_observation_space, Box), "ours are boxes"
-        self.single_observation_space = self._plan.space(env.single_observation_space)
+        self.single_observation_space = self._plan.space(
+            env.single_observation_space, type(self).__name__
+        )
         everyone = torch.arange(env.num_envs, device=base.task.device)
         self._put(self._plan.draw(base.worlds.random, everyone).clone())
 

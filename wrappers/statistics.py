@@ -128,7 +128,8 @@ class TorchNormalizeObservation(VectorObservations):
     """Centre each entry of the observations and scale it to unit variance, by running statistics.
 
     As in Gymnasium each particle has statistics of its own; `VectorNormalizePerception` has one for
-    all. Final observations are normalised, and not counted.
+    all. Final observations are normalised and not counted, nor are those of worlds that a reset
+    leaves alone.
 
     Args:
         env: A vector environment with torch tensors.
@@ -153,8 +154,9 @@ class TorchNormalizeObservation(VectorObservations):
         """Return observations normalised, and count them unless frozen."""
         check_tensor(observations, type(self).__name__)
         if self.update_running_mean:
-            var, mean = torch.var_mean(observations, dim=0, correction=0)
-            self.obs_rms.update(mean, var, len(observations))
+            seen = self.new_ones(observations)
+            var, mean = torch.var_mean(seen, dim=0, correction=0)
+            self.obs_rms.update(mean, var, len(seen))
         return self.final_observations(observations)
 
     def final_observations(self, observations: Any) -> Any:

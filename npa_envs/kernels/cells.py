@@ -71,6 +71,7 @@ def cell_kernels(space_dim: int, scalar: type, share: int) -> SimpleNamespace:
         starts: wp.array(dtype=wp.int32),
         # outputs
         source: wp.array(dtype=wp.int32),
+        sorted_cell: wp.array(dtype=wp.int32),
         row_of: wp.array(dtype=wp.int32),
         row_source: wp.array(dtype=wp.int32),
         row_place: wp.array(dtype=wp.int32),
@@ -78,7 +79,10 @@ def cell_kernels(space_dim: int, scalar: type, share: int) -> SimpleNamespace:
         row_positions: wp.array(dtype=vector),
         sorted_states: wp.array(dtype=scalar, ndim=2),
     ):
-        """Move every particle to its rank by index within its cell; give active ones rows."""
+        """Move every particle to its rank by index within its cell; give active ones rows.
+
+        States and rows are left out where their arrays are empty.
+        """
         k, part = wp.tid()
         i = arrived[k]
         c = cell[i]
@@ -94,15 +98,18 @@ def cell_kernels(space_dim: int, scalar: type, share: int) -> SimpleNamespace:
                     active_rank += 1
         place = begin + rank
 
-        for c_local in range(wp.static(share)):
-            channel = part * wp.static(share) + c_local
-            state = scalar(0.0)
-            if channel < states.shape[1]:
-                state = states[i, channel]
-            sorted_states[place, channel] = state
+        if sorted_states.shape[0] > 0:
+            for c_local in range(wp.static(share)):
+                channel = part * wp.static(share) + c_local
+                state = scalar(0.0)
+                if channel < states.shape[1]:
+                    state = states[i, channel]
+                sorted_states[place, channel] = state
         if part == 0:
             source[place] = i
+            sorted_cell[place] = c
             sorted_positions[place] = positions[i]
+        if part == 0 and row_of.shape[0] > 0:
             row = wp.int32(-1)
             if active:
                 row = starts[active_offset + c] + active_rank - row_base

@@ -175,6 +175,18 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
         return index
 
     @wp.func
+    def cell_place(domain: Domain, index: wp.int32):
+        """Cell of an index in row-major order within its world."""
+        cell = cell_vector()
+        rest = index
+        for d in range(wp.static(space_dim - 1)):
+            above = wp.int32(wp.uint32(rest) / wp.uint32(domain.cell_shape[d]))
+            cell[d] = rest - above * domain.cell_shape[d]
+            rest = above
+        cell[wp.static(space_dim - 1)] = rest
+        return cell
+
+    @wp.func
     def row_width(domain: Domain, d: wp.int32):
         return wp.min(wp.int32(2) * domain.reach + 1, domain.cell_shape[d])
 
@@ -214,22 +226,31 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
             else:
                 begin = 0
                 end = first + width - nx
-        y_width = row_width(domain, 1)
-        y = wrapped(cell[1] - domain.reach + row % y_width, domain.cell_shape[1])
-        base = y * nx
+        y_row = row
+        base = wp.int32(0)
         if wp.static(space_dim == 3):
             last = wp.static(space_dim - 1)
+            y_width = row_width(domain, 1)
+            y_row = row % y_width
             z = wrapped(cell[last] - domain.reach + row / y_width, domain.cell_shape[last])
-            base += z * domain.cell_shape[1] * nx
+            base = z * domain.cell_shape[1] * nx
+        base += wrapped(cell[1] - domain.reach + y_row, domain.cell_shape[1]) * nx
         return base + begin, base + end
+
+    @wp.func
+    def periodic_image(domain: Domain, difference: vector):
+        """Shortest image of a difference of positions in a periodic box [length units]."""
+        result = difference
+        for d in range(wp.static(space_dim)):
+            result[d] -= domain.box[d] * wp.round(difference[d] * domain.inverse_box[d])
+        return result
 
     @wp.func
     def minimum_image(domain: Domain, difference: vector):
         """Shortest periodic image of a difference of positions [length units]."""
         result = difference
         if domain.periodic != 0:
-            for d in range(wp.static(space_dim)):
-                result[d] -= domain.box[d] * wp.round(difference[d] * domain.inverse_box[d])
+            result = periodic_image(domain, difference)
         return result
 
     @wp.func
@@ -245,9 +266,11 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
         Domain=Domain,
         cell_of=cell_of,
         cell_index=cell_index,
+        cell_place=cell_place,
         segment_count=segment_count,
         segment_cells=segment_cells,
         minimum_image=minimum_image,
+        periodic_image=periodic_image,
         position_of=position_of,
     )
 

@@ -77,15 +77,17 @@ _SCATTER = """
 
 _LOAD = """
 #if defined(__CUDA_ARCH__)
-    struct alignas(16) Chunk {{ unsigned part[4]; }};
     {entry} result;
+    constexpr unsigned size = sizeof(result);
+    constexpr unsigned bytes = size % 16 == 0 ? 16 : size % 8 == 0 ? 8 : 4;
+    struct alignas(bytes) Chunk {{ unsigned part[bytes / 4]; }};
     const Chunk* from = reinterpret_cast<const Chunk*>(entries.data + index);
     unsigned* to = reinterpret_cast<unsigned*>(&result);
     #pragma unroll
-    for (unsigned i = 0; i < sizeof(result) / 16; ++i) {{
+    for (unsigned i = 0; i < size / bytes; ++i) {{
         const Chunk chunk = from[i];
         #pragma unroll
-        for (unsigned k = 0; k < 4; ++k) to[4 * i + k] = chunk.part[k];
+        for (unsigned k = 0; k < bytes / 4; ++k) to[bytes / 4 * i + k] = chunk.part[k];
     }}
     return result;
 #else
@@ -95,10 +97,14 @@ _LOAD = """
 
 
 def _c_scalar(scalar: type) -> str:
+    if scalar is wp.int32:
+        return "int"
     return {"f32": "float", "f64": "double"}[scalar_name(scalar)]
 
 
 def _c_type(value_type: type, scalar: type) -> str:
+    if value_type is scalar:
+        return _c_scalar(scalar)
     shape = value_type._shape_
     kind = "vec_t" if len(shape) == 1 else "mat_t"
     return f"wp::{kind}<{', '.join(str(size) for size in shape)}, {_c_scalar(scalar)}>"
@@ -160,11 +166,14 @@ def make_lane_scatter(value_type: type, scalar: type, lanes: int) -> Any:
 
 @functools.cache
 def make_wide_load(value_type: type, scalar: type) -> Any:
-    """Return a Warp function that reads an entry of a flat array 16 bytes at a time on CUDA.
+    """Return a Warp function that reads an entry of a flat array, on CUDA in few, wide loads.
+
+    The array must be dense and its memory aligned to an entry, or to 16 bytes; the index must not
+    be negative. Warp's own indexing, which knows neither, takes several instructions more.
 
     Args:
-        value_type: A vector or matrix type of a multiple of 16 bytes.
-        scalar: The scalar type that it is made of.
+        value_type: A scalar, vector or matrix type.
+        scalar: The scalar type that it is made of, `wp.int32` included.
     """
 
     @wp.func_native(_LOAD.format(entry=_c_type(value_type, scalar)))

@@ -193,6 +193,13 @@ def perception_kernels(
             result = wp.inverse(moment) * gradient
         return result
 
+    @wp.func
+    def clipped(value: scalar, limit: scalar):
+        result = value
+        if limit > scalar(0.0):
+            result = wp.clamp(value, -limit, limit)
+        return result
+
     @wp.kernel(enable_backward=False, module=module, cuda_max_registers=CUDA_REGISTERS)
     def perceive(
         domain: Domain,
@@ -203,11 +210,13 @@ def perception_kernels(
         density_scale: wp.float64,
         row_base: wp.int32,
         group_count: wp.int32,
+        limit: scalar,
         starts: wp.array(dtype=wp.int32),
         particles: wp.array(dtype=particle),
         states: wp.array(dtype=group),
         flat_states: wp.array(dtype=scalar, ndim=2),
         row_place: wp.array(dtype=wp.int32),
+        row_destination: wp.array(dtype=wp.int32),
         row_density_gradient: wp.array(dtype=wide),
         # outputs
         perception: wp.array(dtype=scalar, ndim=2),
@@ -215,7 +224,8 @@ def perception_kernels(
     ):
         """Write the perception vector of each row, a one and zeros up to the row's width.
 
-        Rows beyond the last active one are zero.
+        Rows beyond the last active one are zero. Rows are written where `row_destination` says, or
+        in their own order if it is empty; clipped to plus and minus `limit` unless that is zero.
         """
         row, g, lane = wp.tid()
         if row >= starts[starts.shape[0] - 1] - row_base:
@@ -224,7 +234,12 @@ def perception_kernels(
             ):
                 perception[row, column] = scalar(0.0)
             return
-        k = row_place[row]
+        k = row
+        if row_place.shape[0] > 0:
+            k = row_place[row]
+        to = row
+        if row_destination.shape[0] > 0:
+            to = row_destination[row]
         blur, gradient, kernel_sum, moment = sum_neighbours(
             domain,
             starts,
@@ -243,8 +258,8 @@ def perception_kernels(
         for c in range(wp.static(share)):
             channel = mine + c
             if channel < state_dim:
-                perception[row, channel] = flat_states[k, channel]
-                perception[row, state_dim + channel] = blur[c]
+                perception[to, channel] = clipped(flat_states[k, channel], limit)
+                perception[to, state_dim + channel] = clipped(blur[c], limit)
                 if wp.static(state_gradient):
                     along = vector()
                     for d in range(wp.static(space_dim)):
@@ -252,9 +267,10 @@ def perception_kernels(
                     along *= log_scale_factor(wp.length(along))
                     place = 2 * state_dim + channel * wp.static(space_dim)
                     for d in range(wp.static(space_dim)):
-                        perception[row, place + d] = along[d]
+                        perception[to, place + d] = clipped(along[d], limit)
         if g == 0 and lane == 0:
-            row_kernel_sum[row] = kernel_sum
+            if row_kernel_sum.shape[0] > 0:
+                row_kernel_sum[row] = kernel_sum
             column = 2 * state_dim
             if wp.static(state_gradient):
                 column += state_dim * wp.static(space_dim)
@@ -262,10 +278,10 @@ def perception_kernels(
                 scaled = density_scale * row_density_gradient[row]
                 scaled *= log_scale_factor(wp.length(scaled))
                 for d in range(wp.static(space_dim)):
-                    perception[row, column + d] = scalar(scaled[d])
+                    perception[to, column + d] = clipped(scalar(scaled[d]), limit)
                 column += wp.static(space_dim)
             for padding in range(column, perception.shape[1]):
-                perception[row, padding] = wp.where(padding == column, scalar(1.0), scalar(0.0))
+                perception[to, padding] = wp.where(padding == column, scalar(1.0), scalar(0.0))
 
     @wp.kernel(enable_backward=False, module=module)
     def gather_fields(

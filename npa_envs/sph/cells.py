@@ -32,6 +32,16 @@ class Plan(NamedTuple):
     domain: Any
 
     @property
+    def listed(self) -> bool:
+        """Whether neighbours are listed in a CUDA block's fast memory, which float32 fits into."""
+        return self.lanes > 1 and self.scalar is scalar_type(torch.float32)
+
+    @property
+    def periodic(self) -> bool:
+        """Whether space is a periodic box."""
+        return bool(self.domain.periodic)
+
+    @property
     def total(self) -> int:
         """Particles of all worlds, B N."""
         return self.world_count * self.particle_count
@@ -69,6 +79,8 @@ class SortedWorlds(NamedTuple):
     """First sorted place of every cell, then first row of every cell (shifted), int32."""
     source: Tensor
     """Caller's index of each sorted particle, int32, shape [B N]."""
+    cell: Tensor
+    """Cell of each sorted particle, counted through all worlds, int32, shape [B N]."""
     row_of: Tensor
     """Row of each particle, -1 where it is not active, int32, shape [B N]."""
     row_source: Tensor
@@ -122,15 +134,20 @@ def make_plan(
     return plan
 
 
-def sort_worlds(plan: Plan, x: Tensor, s: Tensor, mask: Tensor | None) -> SortedWorlds:
-    """Sort contiguous worlds into cells; `mask` (uint8, [B, N]) says which particles get rows."""
+def sort_worlds(
+    plan: Plan, x: Tensor, s: Tensor | None, mask: Tensor | None, *, with_rows: bool = True
+) -> SortedWorlds:
+    """Sort contiguous worlds into cells; `mask` (uint8, [B, N]) says which particles get rows.
+
+    What is left out is empty: states without `s`, everything about rows without `with_rows`.
+    """
     share = plan.width // plan.lanes
     kernels = cell_kernels(plan.space_dim, plan.scalar, share)
     device, total = x.device, plan.total
     cell, arrival, arrived = torch.empty(3, total, dtype=torch.int32, device=device).unbind()
     counts = torch.zeros(plan.start_count, dtype=torch.int32, device=device)
     positions = x.view(total, plan.space_dim)
-    states = s.view(total, plan.state_dim)
+    states = None if s is None else s.view(total, plan.state_dim)
     flat_mask = None if mask is None else mask.view(total)
     launch(
         kernels.count_cells,
@@ -149,16 +166,17 @@ def sort_worlds(plan: Plan, x: Tensor, s: Tensor, mask: Tensor | None) -> Sorted
     starts = torch.cumsum(counts, 0, dtype=torch.int32)
     launch(kernels.place_by_arrival, total, device, cell, arrival, starts, arrived)
 
-    source = torch.empty(total, dtype=torch.int32, device=device)
-    row_of = torch.empty_like(source)
-    row_source = torch.empty(plan.row_capacity, dtype=torch.int32, device=device)
+    source, sorted_cell = torch.empty(2, total, dtype=torch.int32, device=device).unbind()
+    row_capacity = plan.row_capacity if with_rows else 0
+    row_of = source.new_empty(total if with_rows else 0)
+    row_source = source.new_empty(row_capacity)
     row_place = torch.empty_like(row_source)
     sorted_positions = torch.empty_like(positions)
-    row_positions = torch.empty(plan.row_capacity, plan.space_dim, dtype=x.dtype, device=device)
-    sorted_states = torch.empty(total, plan.group_count * plan.width, dtype=s.dtype, device=device)
+    row_positions = x.new_empty(row_capacity, plan.space_dim)
+    sorted_states = x.new_empty(0 if s is None else total, plan.group_count * plan.width)
     launch(
         kernels.order_particles,
-        (total, plan.group_count * plan.lanes),
+        (total, 1 if s is None else plan.group_count * plan.lanes),
         device,
         positions,
         states,
@@ -171,6 +189,7 @@ def sort_worlds(plan: Plan, x: Tensor, s: Tensor, mask: Tensor | None) -> Sorted
         arrived,
         starts,
         source,
+        sorted_cell,
         row_of,
         row_source,
         row_place,
@@ -181,6 +200,7 @@ def sort_worlds(plan: Plan, x: Tensor, s: Tensor, mask: Tensor | None) -> Sorted
     return SortedWorlds(
         starts,
         source,
+        sorted_cell,
         row_of,
         row_source,
         row_place,
@@ -188,34 +208,6 @@ def sort_worlds(plan: Plan, x: Tensor, s: Tensor, mask: Tensor | None) -> Sorted
         row_positions,
         sorted_states.view(-1, plan.width),
     )
-
-
-def compute_density(
-    plan: Plan, ordered: SortedWorlds, kernels: Any, density_gradient: bool
-) -> tuple[Tensor, Tensor]:
-    """Return sorted positions with volumes 1 / rho, [B N, D + 1], and the rows' density gradients.
-
-    The latter, float64, [K, D], are undefined beyond the last active row and where not asked for.
-    `kernels` are those of the perception that follows.
-    """
-    positions = ordered.positions
-    particles = positions.new_empty(plan.total, plan.space_dim + 1)
-    row_density_gradient = torch.empty_like(ordered.row_positions, dtype=torch.float64)
-    launch(
-        kernels.compute_density,
-        (plan.total, plan.lanes),
-        positions.device,
-        plan.domain,
-        plan.particle_count,
-        int(density_gradient),
-        ordered.starts,
-        ordered.source,
-        ordered.row_of,
-        positions,
-        particles,
-        row_density_gradient,
-    )
-    return particles, row_density_gradient
 
 
 def density_scale(scale: float, space_dim: int, particle_count: int) -> float:

@@ -7,9 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from npa_envs.kernels.perception import perception_kernels
 from npa_envs.sph.bridge import launch
-from npa_envs.sph.cells import compute_density, make_plan, sort_worlds
+from npa_envs.sph.cells import make_plan, sort_worlds
 from npa_envs.sph.checks import (
     Box,
     check_finite_positions,
@@ -18,7 +17,8 @@ from npa_envs.sph.checks import (
     checked_box,
     checked_eps,
 )
-from npa_envs.sph.operators import Terms, perceive_rows
+from npa_envs.sph.operators import perceive_rows
+from npa_envs.sph.passes import Terms, compute_density_gradients, plain_kernels
 
 
 class PerceptionFields(NamedTuple):
@@ -118,9 +118,8 @@ def perception_fields(x: Tensor, s: Tensor, eps: float, box: Box = None) -> Perc
     world_count, particle_count, space_dim = x.shape
     state_dim = s.shape[2]
     plan = make_plan(x, x.shape, state_dim, x.shape[0] * x.shape[1], False, radius, sides)
-    kernels = perception_kernels(space_dim, plan.scalar, plan.width, plan.lanes, True, True)
     ordered = sort_worlds(plan, x, s, None)
-    particles, row_density_gradient = compute_density(plan, ordered, kernels, density_gradient=True)
+    particles, row_density_gradient = compute_density_gradients(plan, ordered, Terms())
     fields = PerceptionFields(
         rho=x.new_empty(plan.total),
         blur=x.new_empty(plan.total, state_dim),
@@ -130,7 +129,7 @@ def perception_fields(x: Tensor, s: Tensor, eps: float, box: Box = None) -> Perc
         drho=row_density_gradient[ordered.row_of].to(x.dtype),
     )
     launch(
-        kernels.gather_fields,
+        plain_kernels(plan, Terms()).gather_fields,
         (plan.total, plan.group_count, plan.lanes),
         x.device,
         plan.domain,

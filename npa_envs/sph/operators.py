@@ -11,23 +11,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from npa_envs.kernels.perception import perception_kernels
 from npa_envs.sph.adjoint import perceive_rows_backward
-from npa_envs.sph.bridge import launch
-from npa_envs.sph.cells import compute_density, density_scale, make_plan, sort_worlds
+from npa_envs.sph.cells import make_plan, sort_worlds
+from npa_envs.sph.passes import Terms, compute_density, write_perception
 
-
-class Terms(NamedTuple):
-    """Which groups of the perception vector a rule reads: the others are not computed."""
-
-    state_gradient: bool = True
-    moment_correction: bool = True
-    density_gradient: bool = True
-
-    def perception_dim(self, space_dim: int, state_dim: int) -> int:
-        """Length P of a perception vector with these groups."""
-        gradients = state_dim * space_dim * self.state_gradient
-        return 2 * state_dim + gradients + space_dim * self.density_gradient
+__all__ = ["Rows", "Terms", "perceive_rows"]
 
 
 class Rows(NamedTuple):
@@ -57,38 +45,13 @@ def _perceive_rows(
     density_gradient: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     plan = make_plan(x, x.shape, s.shape[2], row_capacity, mask is not None, eps, box)
-    kernels = perception_kernels(
-        plan.space_dim,
-        plan.scalar,
-        plan.width,
-        plan.lanes,
-        state_gradient,
-        moment_correction,
-    )
+    terms = Terms(state_gradient, moment_correction, density_gradient)
     ordered = sort_worlds(plan, x, s, mask)
-    particles, row_density_gradient = compute_density(plan, ordered, kernels, density_gradient)
+    densities = compute_density(plan, ordered, terms)
     perception = x.new_empty(row_capacity, row_width)
     row_kernel_sum = x.new_empty(row_capacity, plan.space_dim)
-    launch(
-        kernels.perceive,
-        (row_capacity, plan.group_count, plan.lanes),
-        x.device,
-        plan.domain,
-        plan.particle_count,
-        plan.state_dim,
-        int(density_gradient),
-        scale,
-        density_scale(scale, plan.space_dim, plan.particle_count),
-        plan.row_base,
-        plan.group_count,
-        ordered.starts,
-        particles,
-        ordered.states,
-        ordered.states.view(plan.total, -1),
-        ordered.row_place,
-        row_density_gradient,
-        perception,
-        row_kernel_sum,
+    write_perception(
+        plan, ordered, densities, terms, scale, perception, row_kernel_sum=row_kernel_sum
     )
     return (
         perception,
@@ -96,7 +59,7 @@ def _perceive_rows(
         ordered.row_source,
         ordered.starts,
         ordered.source,
-        particles,
+        densities.particles,
         ordered.row_positions,
         row_kernel_sum,
         ordered.states,

@@ -1,21 +1,76 @@
-"""Rows of perception brought back into the order of the particles."""
+"""Perception of every particle, in the caller's order and clipped; without gradients."""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from torch import Tensor
 
-from npa_envs.kernels.rows import row_kernels
-from npa_envs.sph.bridge import launch, scalar_type
+from npa_envs.sph.cells import Plan, SortedWorlds, make_plan, sort_worlds
+from npa_envs.sph.passes import Densities, Terms, compute_density, write_perception
+
+DENSITY_LANES = 1
+"""Threads of a particle in the density pass: whole batches fill the device without more."""
 
 
-def gather_rows(rows: Tensor, row_of: Tensor, limit: float, out: Tensor) -> None:
-    """Write the row of every particle, clipped; not differentiable.
+class Surveyed(NamedTuple):
+    """Worlds made ready for perception: sorted, their densities known."""
+
+    plan: Plan
+    ordered: SortedWorlds
+    densities: Densities
+    states: Tensor | None
+    """States in the caller's order, where they are read in place."""
+    terms: Terms
+    scale: float
+
+
+def survey(
+    x: Tensor,
+    s: Tensor,
+    *,
+    eps: float,
+    eps0: float,
+    box: tuple[float, ...] | None,
+    terms: Terms,
+) -> Surveyed:
+    """Sort checked worlds and compute their densities.
+
+    The result may read `s` where it is: it serves until the states change.
 
     Args:
-        rows: Rows, dimensionless, shape [K, P], contiguous.
-        row_of: Row of each particle, int32, shape [M].
-        limit: Entries are clipped to plus and minus this.
-        out: Where to write, shape [M, P], contiguous.
+        x: Positions [length units], shape [B, N, D].
+        s: States, dimensionless, shape [B, N, C].
+        eps: Perception radius [length units].
+        eps0: Radius at which the rule was trained [length units].
+        box: Sides of the periodic box [length units], or None in open space.
+        terms: Groups of the perception vector.
     """
-    kernels = row_kernels(scalar_type(rows.dtype))
-    launch(kernels.gather_rows, tuple(out.shape), rows.device, rows, row_of, limit, out)
+    x, s = x.contiguous(), s.contiguous()
+    plan = make_plan(x, x.shape, s.shape[2], x.shape[0] * x.shape[1], False, eps, box)
+    in_place = plan.listed and plan.state_dim % plan.width == 0 and s.data_ptr() % 16 == 0
+    ordered = sort_worlds(plan, x, None if in_place else s, None, with_rows=not plan.listed)
+    densities = compute_density(plan, ordered, terms, lanes=DENSITY_LANES)
+    return Surveyed(plan, ordered, densities, s if in_place else None, terms, eps / eps0)
+
+
+def write_observation(surveyed: Surveyed, limit: float, out: Tensor) -> None:
+    """Write what every particle perceives, clipped; not differentiable.
+
+    Args:
+        surveyed: Worlds made ready by `survey`.
+        limit: Entries are clipped to plus and minus this, positive.
+        out: Where to write, shape [B N, P], contiguous.
+    """
+    plan, ordered, densities, states, terms, scale = surveyed
+    write_perception(
+        plan,
+        ordered,
+        densities,
+        terms,
+        scale,
+        out,
+        states=states,
+        destination=ordered.source,
+        limit=limit,
+    )

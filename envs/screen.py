@@ -1,0 +1,72 @@
+"""Pictures of an environment's worlds, and the window that shows them side by side."""
+
+from __future__ import annotations
+
+import math
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from npa_envs.envs.worlds import Worlds
+from npa_envs.render import Window
+
+SHOWN_ACROSS = 4
+"""A window shows at most so many worlds side by side."""
+
+
+class Screen:
+    """What `render` of an environment returns or shows.
+
+    Args:
+        worlds: The environment's worlds.
+        fps: Most frames a second that the window shows.
+    """
+
+    def __init__(self, worlds: Worlds, fps: float) -> None:
+        self._worlds = worlds
+        self._config = worlds.task.config
+        self._fps = fps
+        self._window: Window | None = None
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Return a picture of each world, uint8, shape [B, R, R, 3]; None unless "rgb_array"."""
+        if self._config.render_mode is None:
+            gymnasium.logger.warn(
+                "render() draws nothing without a render_mode: make the environment with "
+                "render_mode='rgb_array' or 'human'"
+            )
+        # A window already shows the worlds as they are.
+        if self._config.render_mode != "rgb_array":
+            return None
+        return self._pictures(self._worlds.world_count)
+
+    def show(self, title: str) -> None:
+        """Show the worlds as they are, the first ones where they are many; only if "human".
+
+        Args:
+            title: What the window's bar says when it is opened.
+        """
+        if self._config.render_mode != "human":
+            return
+        count, size = self._worlds.world_count, self._config.render_size
+        across = min(math.ceil(math.sqrt(count)), SHOWN_ACROSS)
+        shown = min(count, across * across)
+        frame = np.full((across * across, size, size, 3), 255, np.uint8)
+        frame[:shown] = self._pictures(shown)
+        frame = frame.reshape(across, across, size, size, 3).swapaxes(1, 2)
+        if self._window is None:
+            self._window = Window(title, across * size, fps=self._fps)
+        self._window.show(frame.reshape(across * size, across * size, 3))
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._window is not None:
+            self._window.close()
+            self._window = None
+
+    def _pictures(self, count: int) -> NDArray[np.uint8]:
+        worlds = self._worlds
+        steps = worlds.elapsed[:count].cpu().numpy()
+        pictures: NDArray[np.uint8] = worlds.task.draw(worlds.x[:count], worlds.s[:count], steps)
+        return pictures

@@ -1,0 +1,396 @@
+"""Density and perception on CUDA in float32, by lists of neighbours in fast memory.
+
+The same sums as `perception`, in another order of work. The lanes of a particle first list who is
+within eps, then weigh the listed ones, a neighbour for each lane, and then run through the list
+together, a few channels for each lane: weights are computed once, and only for neighbours; a
+neighbour's state is read once, by adjacent lanes. Rows leave through fast memory too, in whole
+transactions.
+"""
+
+import functools
+import math
+
+import warp as wp
+
+from npa_envs.kernels.domain import MOMENT_THRESHOLD, domain_types, kernel_module
+from npa_envs.kernels.lanes import make_lane_sum, make_wide_load, share_type
+from npa_envs.kernels.slots import (
+    SLOT_ENTRIES,
+    any_in_warp,
+    inverse_root,
+    largest_in_warp,
+    log_scale_of_square,
+    make_slots,
+    make_stage,
+    meet_warp,
+    of_lane,
+    thread_number,
+    within,
+)
+
+CUDA_REGISTERS = 80
+"""Registers of a thread of the perception pass."""
+
+load_scalar = make_wide_load(wp.float32, wp.float32)
+load_integer = make_wide_load(wp.int32, wp.int32)
+
+
+@functools.cache
+def listed_density(space_dim: int, lanes: int, periodic: bool) -> wp.Kernel:
+    """Return the density kernel with `lanes` to a particle, of a box or of open space."""
+    scalar = wp.float32
+    types = domain_types(space_dim, scalar)
+    vector, particle, Domain = types.vector, types.particle, types.Domain
+    cell_place, segment_count, segment_cells = (
+        types.cell_place,
+        types.segment_count,
+        types.segment_cells,
+    )
+    periodic_image = types.periodic_image
+    load_vector = make_wide_load(vector, scalar)
+    add_scalar = make_lane_sum(scalar, scalar, lanes)
+
+    topic = "listed_density_in_box" if periodic else "listed_density"
+
+    @wp.kernel(enable_backward=False, module=kernel_module(topic, space_dim, scalar, 0, lanes))
+    def compute_density(
+        domain: Domain,
+        starts: wp.array(dtype=wp.int32),
+        sorted_cell: wp.array(dtype=wp.int32),
+        sorted_positions: wp.array(dtype=vector),
+        # outputs
+        particles: wp.array(dtype=particle),
+    ):
+        """Write every particle's position and volume 1 / rho."""
+        thread = wp.tid()
+        k = thread >> wp.static(lanes.bit_length() - 1)
+        lane = thread & wp.static(lanes - 1)
+        position = load_vector(sorted_positions, k)
+        index = load_integer(sorted_cell, k)
+        local = wp.int32(wp.uint32(index) % wp.uint32(domain.cell_count))
+        base = index - local
+        cell = cell_place(domain, local)
+        total = scalar(0.0)
+        for segment in range(segment_count(domain, cell)):
+            first, last = segment_cells(domain, cell, segment)
+            end = load_integer(starts, base + last)
+            for j in range(load_integer(starts, base + first) + lane, end, wp.static(lanes)):
+                offset = load_vector(sorted_positions, j) - position
+                if wp.static(periodic):
+                    offset = periodic_image(domain, offset)
+                squared = wp.dot(offset, offset)
+                falloff = scalar(1.0) - squared * domain.inverse_squared_eps
+                falloff = wp.max(falloff, scalar(0.0))
+                total += falloff * falloff * falloff
+        # A particle always sees itself: a position that is not finite would otherwise have rho 0.
+        total = wp.max(add_scalar(total), scalar(1.0))
+        if lane == 0:
+            entry = particle()
+            for d in range(wp.static(space_dim)):
+                entry[d] = position[d]
+            entry[wp.static(space_dim)] = scalar(1.0) / (domain.smoothing_norm * total)
+            particles[k] = entry
+
+    return compute_density
+
+
+@functools.cache
+def listed_perception(
+    space_dim: int,
+    width: int,
+    lanes: int,
+    state_gradient: bool,
+    moment_correction: bool,
+    periodic: bool,
+    grouped: bool,
+) -> wp.Kernel:
+    """Return the perception kernel of one variant, as `perception_kernels` does.
+
+    A variant is also made for a box or open space, and for channels that come in several groups.
+    """
+    scalar = wp.float32
+    types = domain_types(space_dim, scalar)
+    vector, Domain = types.vector, types.Domain
+    cell_place, segment_count, segment_cells = (
+        types.cell_place,
+        types.segment_count,
+        types.segment_cells,
+    )
+    periodic_image = types.periodic_image
+    wide = wp.types.vector(space_dim, wp.float64)
+    group = wp.types.vector(width, scalar)
+    share = share_type(group, scalar, lanes)
+    share_gradient = share_type(wp.types.matrix((space_dim, width), scalar), scalar, lanes)
+    share_rows = wp.types.vector(width // lanes * space_dim, scalar)
+    square = wp.types.matrix((space_dim, space_dim), scalar)
+    topic = "listed_smoothing"
+    if state_gradient:
+        topic = "listed_perception" if moment_correction else "listed_uncorrected_perception"
+    topic += "_in_box" * periodic + "_grouped" * grouped
+    module = kernel_module(topic, space_dim, scalar, width, lanes)
+    load_share = make_wide_load(share, scalar)
+    load_vector = make_wide_load(vector, scalar)
+    add_vector = make_lane_sum(vector, scalar, lanes)
+    add_square = make_lane_sum(square, scalar, lanes)
+    add_wide = make_lane_sum(wide, wp.float64, lanes)
+    slots = make_slots(space_dim, width, lanes, state_gradient, grouped)
+    slot_address, append_number, number_at = (
+        slots.slot_address,
+        slots.append_number,
+        slots.number_at,
+    )
+    put_entry, entry_at, as_number = slots.put_entry, slots.entry_at, slots.as_number
+    write_rows = slots.write_rows
+    stage_share, stage_rows = make_stage(share), make_stage(share_rows)
+
+    @wp.func
+    def spiky_wide(domain: Domain, centre: vector, neighbour: vector, squared: scalar):
+        """Spiky factor and distance vector of a pair in float64, as in `perception`."""
+        r = wide()
+        start = squared
+        for d in range(wp.static(space_dim)):
+            r[d] = wp.float64(neighbour[d]) - wp.float64(centre[d])
+        if wp.static(periodic):
+            for d in range(wp.static(space_dim)):
+                images = wp.round((neighbour[d] - centre[d]) * domain.inverse_box[d])
+                r[d] -= wp.float64(images) * wp.float64(domain.box[d])
+            start = scalar(wp.dot(r, r))
+        exact = wp.dot(r, r)
+        apart = wp.where(start > scalar(0.0), inverse_root(start), scalar(0.0))
+        inverse = wp.float64(apart)
+        inverse *= wp.float64(1.5) - wp.float64(0.5) * exact * inverse * inverse
+        falloff = wp.float64(1.0) - exact * inverse * wp.float64(domain.inverse_eps)
+        return wp.float64(domain.spiky_norm) * falloff * falloff * inverse, r
+
+    @wp.func
+    def add_listed(
+        domain: Domain,
+        sorted_positions: wp.array(dtype=vector),
+        volumes: wp.array(dtype=scalar),
+        states: wp.array(dtype=share),
+        state_place: wp.array(dtype=wp.int32),
+        part: wp.int32,
+        part_count: wp.int32,
+        lane: wp.int32,
+        slot: wp.uint32,
+        begin: wp.int32,
+        count: wp.int32,
+        position: vector,
+        own: share,
+        blur: share,
+        gradient: share_gradient,
+        kernel_sum: vector,
+        moment: square,
+        density_gradient: wide,
+    ):
+        """Add what the listed neighbours contribute to this lane's share of all sums."""
+        meet_warp()
+        padded = (count + wp.int32(3)) & ~wp.int32(3)
+        for entry in range(lane, padded, wp.static(lanes)):
+            listed = entry >= begin and entry < count
+            j = wp.where(listed, number_at(slot, entry), wp.int32(0))
+            neighbour = wp.where(listed, load_vector(sorted_positions, j), position)
+            volume = load_scalar(volumes, j * wp.static(space_dim + 1) + wp.static(space_dim))
+            volume = wp.where(listed, volume, scalar(0.0))
+            number = j
+            if state_place.shape[0] > 0:
+                number = load_integer(state_place, j)
+            offset = neighbour - position
+            if wp.static(periodic):
+                offset = periodic_image(domain, offset)
+            squared = wp.dot(offset, offset)
+            falloff = scalar(1.0) - squared * domain.inverse_squared_eps
+            weight = volume * domain.smoothing_norm * falloff * falloff * falloff
+            factor, r = spiky_wide(domain, position, neighbour, squared)
+            density_gradient += factor * r
+            weighted = vector()
+            if wp.static(state_gradient):
+                weighted = (volume * scalar(factor)) * offset
+                kernel_sum += weighted
+                if wp.static(moment_correction):
+                    for row in range(wp.static(space_dim)):
+                        for column in range(row, wp.static(space_dim)):
+                            moment[row, column] += offset[row] * weighted[column]
+            put_entry(slot, entry, weight, weighted, number * part_count)
+        meet_warp()
+        for entry in range(padded):
+            packed = entry_at(slot, entry)
+            place = as_number(packed[wp.static(space_dim + 1)])
+            state = load_share(states, place + part)
+            blur += packed[0] * state
+            if wp.static(state_gradient):
+                difference = state - own
+                for d in range(wp.static(space_dim)):
+                    for c in range(wp.static(width // lanes)):
+                        gradient[d, c] += packed[d + 1] * difference[c]
+        meet_warp()
+        return blur, gradient, kernel_sum, moment, density_gradient
+
+    @wp.kernel(enable_backward=False, module=module, cuda_max_registers=CUDA_REGISTERS)
+    def perceive(
+        domain: Domain,
+        state_dim: wp.int32,
+        density_gradient: wp.int32,
+        gradient_scale: scalar,
+        density_scale: scalar,
+        row_base: wp.int32,
+        row_capacity: wp.int32,
+        group_count: wp.int32,
+        limit: scalar,
+        starts: wp.array(dtype=wp.int32),
+        sorted_cell: wp.array(dtype=wp.int32),
+        sorted_positions: wp.array(dtype=vector),
+        volumes: wp.array(dtype=scalar),
+        states: wp.array(dtype=share),
+        state_place: wp.array(dtype=wp.int32),
+        row_place: wp.array(dtype=wp.int32),
+        row_destination: wp.array(dtype=wp.int32),
+        # outputs
+        perception: wp.array(dtype=scalar, ndim=2),
+        row_kernel_sum: wp.array(dtype=vector),
+    ):
+        """Write the perception vector of each row, as `perception_kernels` does.
+
+        Threads come in whole warps: lanes, groups, rows, some of them beyond the last row. Volumes
+        are the last entries of particles. States are read where `state_place` says, or in sorted
+        order if it is empty; rows are written where `row_destination` says, or in their own order;
+        clipped to plus and minus `limit` unless that is zero.
+        """
+        thread = thread_number()
+        lane = thread & wp.static(lanes - 1)
+        row = thread >> wp.static(lanes.bit_length() - 1)
+        g = wp.int32(0)
+        if wp.static(grouped):
+            g = row % group_count
+            row = row / group_count
+        slot = slot_address()
+        part = g * wp.static(lanes) + lane
+        part_count = group_count * wp.static(lanes)
+        row_count = load_integer(starts, starts.shape[0] - 1) - row_base
+        present = row < wp.min(row_count, row_capacity)
+        blur = share()
+        gradient = share_gradient()
+        kernel_sum = vector()
+        moment = square()
+        wide_sum = wide()
+        # Rows beyond the last one look at the first particle, and list nobody.
+        safe_row = wp.where(present, row, wp.int32(0))
+        k = safe_row
+        if row_place.shape[0] > 0:
+            k = wp.where(present, load_integer(row_place, safe_row), wp.int32(0))
+        destination = wp.where(row < row_capacity, row, wp.int32(-1))
+        if row_destination.shape[0] > 0:
+            destination = wp.where(present, load_integer(row_destination, safe_row), destination)
+        own_place = k
+        if state_place.shape[0] > 0:
+            own_place = load_integer(state_place, k)
+        own = load_share(states, own_place * part_count + part)
+        position = load_vector(sorted_positions, k)
+        index = load_integer(sorted_cell, k)
+        local = wp.int32(wp.uint32(index) % wp.uint32(domain.cell_count))
+        base = index - local
+        cell = cell_place(domain, local)
+        segments = wp.where(present, segment_count(domain, cell), wp.int32(0))
+        # Each lane looks up one run of cells; the runs are then walked one after another.
+        run_count = largest_in_warp(segments)
+        run = wp.int32(0)
+        run_begin = wp.int32(0)
+        run_end = wp.int32(0)
+        j = lane
+        end = wp.int32(0)
+        # What a round leaves over of a multiple of the lanes is kept free in the next: a
+        # neighbour's lane is then its number among all, whatever the rest of the warp does.
+        begin = wp.int32(0)
+        working = wp.bool(True)
+        while working:
+            count = wp.int32(begin)
+            filling = wp.bool(True)
+            while filling:
+                while run < run_count and not any_in_warp(j - lane < end):
+                    if run % wp.static(lanes) == 0:
+                        mine = wp.min(run + lane, wp.max(segments - 1, wp.int32(0)))
+                        first, last = segment_cells(domain, cell, mine)
+                        run_begin = load_integer(starts, base + first)
+                        run_end = load_integer(starts, base + last)
+                        run_end = wp.where(run + lane < segments, run_end, wp.int32(0))
+                    turn = run % wp.static(lanes)
+                    j = of_lane(run_begin, turn, wp.uint32(lanes)) + lane
+                    end = of_lane(run_end, turn, wp.uint32(lanes))
+                    run += 1
+                inside = j < end
+                neighbour = load_vector(sorted_positions, wp.where(inside, j, wp.int32(0)))
+                offset = neighbour - position
+                if wp.static(periodic):
+                    offset = periodic_image(domain, offset)
+                near = wp.dot(offset, offset) < domain.squared_eps
+                count = append_number(slot, count, inside and near, j)
+                j += wp.static(lanes)
+                working = run < run_count or any_in_warp(j - lane < end)
+                filling = working and not any_in_warp(count > wp.static(SLOT_ENTRIES - lanes))
+            blur, gradient, kernel_sum, moment, wide_sum = add_listed(
+                domain,
+                sorted_positions,
+                volumes,
+                states,
+                state_place,
+                part,
+                part_count,
+                lane,
+                slot,
+                begin,
+                count,
+                position,
+                own,
+                blur,
+                gradient,
+                kernel_sum,
+                moment,
+                wide_sum,
+            )
+            begin = count & wp.static(lanes - 1)
+        wide_sum = add_wide(wide_sum)
+        if wp.static(state_gradient and moment_correction):
+            moment = add_square(moment)
+            for r in range(1, wp.static(space_dim)):
+                for c in range(r):
+                    moment[r, c] = moment[c, r]
+            if wp.abs(wp.determinant(moment)) >= scalar(wp.static(MOMENT_THRESHOLD)):
+                gradient = wp.inverse(moment) * gradient
+        mine = lane * wp.static(width // lanes)
+        stage_share(slot, mine, wp.where(present, own, share()))
+        stage_share(slot, wp.static(width) + mine, blur)
+        if wp.static(state_gradient):
+            scaled = share_rows()
+            for c in range(wp.static(width // lanes)):
+                along = vector()
+                for d in range(wp.static(space_dim)):
+                    along[d] = gradient_scale * gradient[d, c]
+                along *= log_scale_of_square(wp.dot(along, along))
+                for d in range(wp.static(space_dim)):
+                    scaled[c * wp.static(space_dim) + d] = along[d]
+            stage_rows(slot, wp.static(2 * width) + mine * wp.static(space_dim), scaled)
+        bound = wp.where(limit > scalar(0.0), limit, scalar(wp.static(math.nan)))
+        write_rows(slot, destination, g, state_dim, bound, perception)
+        if row_kernel_sum.shape[0] > 0:
+            kernel_sum = add_vector(kernel_sum)
+            if destination >= 0 and part == 0:
+                row_kernel_sum[row] = kernel_sum
+        column = 2 * state_dim
+        if wp.static(state_gradient):
+            column += state_dim * wp.static(space_dim)
+        if density_gradient != 0:
+            along = vector()
+            for d in range(wp.static(space_dim)):
+                along[d] = scalar(wide_sum[d]) * density_scale
+            along *= log_scale_of_square(wp.dot(along, along))
+            if destination >= 0 and part == 0:
+                for d in range(wp.static(space_dim)):
+                    perception[destination, column + d] = within(along[d], bound)
+            column += wp.static(space_dim)
+        if column < perception.shape[1] and destination >= 0 and g == 0:
+            for padding in range(column + lane, perception.shape[1], wp.static(lanes)):
+                perception[destination, padding] = wp.where(
+                    padding == column and present, scalar(1.0), scalar(0.0)
+                )
+
+    return perceive

@@ -1,0 +1,191 @@
+"""The two passes of perception over sorted worlds: which kernels run, and with what."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from npa_envs.kernels.listed import listed_density, listed_perception
+from npa_envs.kernels.perception import perception_kernels
+from npa_envs.sph.bridge import launch
+from npa_envs.sph.cells import Plan, SortedWorlds, density_scale
+
+WARP_ROWS = 8
+"""Rows that a CUDA warp serves, and writes together."""
+
+
+class Terms(NamedTuple):
+    """Which groups of the perception vector a rule reads: the others are not computed."""
+
+    state_gradient: bool = True
+    moment_correction: bool = True
+    density_gradient: bool = True
+
+    def perception_dim(self, space_dim: int, state_dim: int) -> int:
+        """Length P of a perception vector with these groups."""
+        gradients = state_dim * space_dim * self.state_gradient
+        return 2 * state_dim + gradients + space_dim * self.density_gradient
+
+
+class Densities(NamedTuple):
+    """What the density pass leaves for perception."""
+
+    particles: Tensor
+    """Sorted positions with volumes 1 / rho, shape [B N, D + 1]."""
+    row_density_gradient: Tensor
+    """Density gradients of the rows, float64, [K, D]; empty where perception computes them."""
+
+
+def plain_kernels(plan: Plan, terms: Terms) -> Any:
+    """Return the plain kernels of a plan."""
+    return perception_kernels(
+        plan.space_dim,
+        plan.scalar,
+        plan.width,
+        plan.lanes,
+        terms.state_gradient,
+        terms.moment_correction,
+    )
+
+
+def compute_density(
+    plan: Plan, ordered: SortedWorlds, terms: Terms, *, lanes: int | None = None
+) -> Densities:
+    """Compute densities, and the rows' density gradients unless perception does.
+
+    Args:
+        plan: Plan of the call.
+        ordered: The sorted worlds.
+        terms: Groups of the perception that follows.
+        lanes: Threads of a particle where neighbours are listed; default: the plan's.
+    """
+    positions = ordered.positions
+    particles = positions.new_empty(plan.total, plan.space_dim + 1)
+    if plan.listed:
+        lanes = lanes or plan.lanes
+        launch(
+            listed_density(plan.space_dim, lanes, plan.periodic),
+            plan.total * lanes,
+            positions.device,
+            plan.domain,
+            ordered.starts,
+            ordered.cell,
+            positions,
+            particles,
+        )
+        return Densities(particles, positions.new_empty(0, plan.space_dim, dtype=torch.float64))
+    return compute_density_gradients(plan, ordered, terms)
+
+
+def compute_density_gradients(plan: Plan, ordered: SortedWorlds, terms: Terms) -> Densities:
+    """Compute densities and the rows' density gradients, undefined beyond the last active row."""
+    positions = ordered.positions
+    particles = positions.new_empty(plan.total, plan.space_dim + 1)
+    row_density_gradient = positions.new_empty(
+        plan.row_capacity, plan.space_dim, dtype=torch.float64
+    )
+    launch(
+        plain_kernels(plan, terms).compute_density,
+        (plan.total, plan.lanes),
+        positions.device,
+        plan.domain,
+        plan.particle_count,
+        int(terms.density_gradient),
+        ordered.starts,
+        ordered.source,
+        ordered.row_of,
+        positions,
+        particles,
+        row_density_gradient,
+    )
+    return Densities(particles, row_density_gradient)
+
+
+def write_perception(
+    plan: Plan,
+    ordered: SortedWorlds,
+    densities: Densities,
+    terms: Terms,
+    scale: float,
+    out: Tensor,
+    *,
+    states: Tensor | None = None,
+    destination: Tensor | None = None,
+    limit: float = 0.0,
+    row_kernel_sum: Tensor | None = None,
+) -> None:
+    """Write the perception of each row.
+
+    Args:
+        plan: Plan of the call.
+        ordered: The sorted worlds.
+        densities: Their densities.
+        terms: Groups of the perception vector.
+        scale: c = eps / eps0, dimensionless.
+        out: Rows to write, shape [K, row_width].
+        states: States in the caller's order, where `ordered` has none; see `reads_in_place`.
+        destination: Row of `out` for each row, int32, shape [K]; default: its own.
+        limit: Entries are clipped to plus and minus this; 0: they are not.
+        row_kernel_sum: Where to write the rows' sums of v K, shape [K, D], for the adjoint.
+    """
+    common = (
+        plan.domain,
+        *(() if plan.listed else (plan.particle_count,)),
+        plan.state_dim,
+        int(terms.density_gradient),
+        scale,
+        density_scale(scale, plan.space_dim, plan.particle_count),
+        plan.row_base,
+    )
+    row_place = ordered.row_place if plan.masked else None
+    if plan.listed:
+        kernel = listed_perception(
+            plan.space_dim,
+            plan.width,
+            plan.lanes,
+            terms.state_gradient,
+            terms.moment_correction,
+            plan.periodic,
+            plan.group_count > 1,
+        )
+        rows = -(-plan.row_capacity // WARP_ROWS) * WARP_ROWS
+        source = ordered.states if states is None else states
+        launch(
+            kernel,
+            rows * plan.group_count * plan.lanes,
+            out.device,
+            *common,
+            plan.row_capacity,
+            plan.group_count,
+            limit,
+            ordered.starts,
+            ordered.cell,
+            ordered.positions,
+            densities.particles.view(-1),
+            source.view(-1, plan.width // plan.lanes),
+            None if states is None else ordered.source,
+            row_place,
+            destination,
+            out,
+            row_kernel_sum,
+        )
+        return
+    launch(
+        plain_kernels(plan, terms).perceive,
+        (plan.row_capacity, plan.group_count, plan.lanes),
+        out.device,
+        *common,
+        plan.group_count,
+        limit,
+        ordered.starts,
+        densities.particles,
+        ordered.states,
+        ordered.states.view(plan.total, -1),
+        row_place,
+        destination,
+        densities.row_density_gradient,
+        out,
+        row_kernel_sum,
+    )
