@@ -1,12 +1,14 @@
 """Speed of the batched environments: observations, rewards, resets and all; run with --help.
 
-Actions are uniformly random and drawn beforehand. Every episode is 64 steps long, so resets fall
-into the timing: all of them in one step, or (staggered) some in every step. Worlds start from the
-seed, a dense disk (Morphogenesis2D), or as grown and damaged pictures (Regeneration2D). On CUDA
+Actions are random, drawn beforehand. Every episode is 64 steps long, so resets fall into the
+timing: all of them in one step, or (staggered) some in every step. Worlds start from the seed, a
+dense disk (Morphogenesis2D), or as grown and damaged pictures (Regeneration2D). On CUDA
 observations stay on the device and the host reads one byte a world; on a CPU they are NumPy's.
 
 Of a step's wall time, `wait` is what the host spent waiting for the device; the rest of it the host
-was busy. `device` is the sum of the kernels' times, `idle` the share of a step without any.
+was busy. `calm_step` is a step without resets, `queued` the same work queued on the device without
+anything of Python's between: the difference is what Python costs. `device` is the sum of the
+kernels' times, `idle` the share of a step without any.
 """
 
 from __future__ import annotations
@@ -28,7 +30,7 @@ import torch
 from torch.autograd import DeviceType
 from torch.profiler import ProfilerActivity, profile
 
-import npa_envs  # noqa: F401 (registers the environments)
+from npa_envs.control import place_perception
 
 
 class Case(NamedTuple):
@@ -64,29 +66,55 @@ STARTS: dict[str, tuple[str, dict[str, Any]]] = {
 """Where episodes start; none ends in success, so that all are equally long."""
 
 EPISODE_STEPS = 64
+CALM = 0.25
+"""Actions are uniform in plus and minus this: full ones let states run away within an episode."""
 ACTION_SETS = 4
 ENOUGH_SECONDS = 2.0
 MAX_EPISODES = 9
 LISTED_KERNELS = 12
 
 
-class TimedEvent:
-    """A CUDA event that adds up how long the host waits for it.
+class TimedWait:
+    """Adds up how long the host waits for the device in the steps of some worlds.
 
     Args:
-        event: The event.
+        worlds: The worlds of an environment on CUDA.
     """
 
-    def __init__(self, event: Any) -> None:
-        self.record = event.record
+    def __init__(self, worlds: Any) -> None:
         self.waited = 0.0
-        self._event = event
+        self._wait = worlds._beside.wait
+        worlds._beside.wait = self._timed
 
-    def synchronize(self) -> None:
-        """Wait for the event."""
+    def _timed(self) -> None:
         start = time.perf_counter()
-        self._event.synchronize()
+        self._wait()
         self.waited += time.perf_counter() - start
+
+
+def queued_time(env: Any, device: torch.device) -> float:
+    """Return the time of a step [s] where the host only queues it: no reading, no infos, no resets.
+
+    What a whole step without resets takes longer is what the device waits for Python.
+    """
+    worlds = env.unwrapped.worlds
+    worlds._action.mul_(CALM)
+    out = worlds.perceive()
+
+    def queue() -> None:
+        worlds._act()
+        worlds._beside.run(worlds._measure)
+        worlds._survey()
+        place_perception(*worlds._surveyed, worlds.physics, worlds.x.shape, out)
+        torch.cuda.current_stream(device).wait_event(worlds._beside._done)
+
+    queue()
+    synchronize(device)
+    start = time.perf_counter()
+    for _ in range(EPISODE_STEPS):
+        queue()
+    synchronize(device)
+    return (time.perf_counter() - start) / EPISODE_STEPS
 
 
 def make(case: Case, start: str, device: torch.device, quick: bool) -> Any:
@@ -114,7 +142,7 @@ def random_actions(env: Any, device: torch.device) -> list[Any]:
     generator = torch.Generator(device).manual_seed(0)
     shape = (env.num_envs, config.particle_count, physics.action_dim)
     drawn = torch.rand((ACTION_SETS, *shape), generator=generator, device=device)
-    sets = list(2.0 * drawn - 1.0)
+    sets = list(CALM * (2.0 * drawn - 1.0))
     return sets if config.output == "torch" else [actions.numpy() for actions in sets]
 
 
@@ -186,7 +214,7 @@ def measure(
     """Return the row of one case."""
     env, run = prepare(case, start, staggered, device, quick)
     worlds, scale = env.unwrapped.worlds, 1e6 / EPISODE_STEPS
-    event = worlds._read = TimedEvent(worlds._read) if device.type == "cuda" else None
+    wait = TimedWait(worlds) if device.type == "cuda" else None
     times = timed_episodes(run, quick)
     wall = statistics.median(times) * scale
     row = {
@@ -197,14 +225,19 @@ def measure(
         "step_us_range": [min(times) * scale, max(times) * scale],
         "particle_steps_per_s": case.world_count * case.particle_count / wall * 1e6,
     }
-    if event is not None:
-        row["wait_us"] = event.waited * scale / len(times)
+    if wait is not None:
+        row["wait_us"] = wait.waited * scale / len(times)
         row["host_us"] = statistics.mean(times) * scale - row["wait_us"]
         row["peak_allocated_mib"] = torch.cuda.max_memory_allocated(device) / 2**20
         row["peak_reserved_mib"] = torch.cuda.max_memory_reserved(device) / 2**20
     # Half-way through an episode worlds are as they typically are.
     run(EPISODE_STEPS // 2)
     row["neighbours"] = neighbour_count(env)
+    if wait is not None:
+        # Without a reset in between: the quarter of an episode that follows.
+        quarter = EPISODE_STEPS // 4
+        row["calm_step_us"] = run(quarter) / quarter * 1e6
+        row["queued_us"] = queued_time(env, device) * 1e6
     env.close()
     return row
 
@@ -261,6 +294,7 @@ def main() -> None:
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--threads", type=int, default=1, help="CPU threads of torch")
     parser.add_argument("--quick", action="store_true", help="tiny worlds: does it run?")
+    parser.add_argument("--case", type=int, nargs=2, metavar=("B", "N"), help="only this one")
     parser.add_argument("--skip-peers", action="store_true", help="only these environments")
     parser.add_argument("--skip-own", action="store_true", help="only the peers")
     parser.add_argument("--commit", default="unknown", help="commit that is measured")
@@ -271,6 +305,8 @@ def main() -> None:
     cuda = device.type == "cuda"
     rows: list[dict[str, Any]] = []
     cases = QUICK if arguments.quick else CUDA if cuda else CPU
+    if arguments.case:
+        cases = (Case(*arguments.case),)
     for case in () if arguments.skip_own else cases:
         for start in STARTS:
             for staggered in (False, True) if case.world_count > 1 else (False,):

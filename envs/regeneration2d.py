@@ -108,6 +108,11 @@ class RegenerationTask(PictureTask[Regeneration2DEnvConfig]):
         grown = [self._grow(x[k : k + 1], s[k : k + 1], random, k) for k in range(len(x))]
         return torch.cat([x for x, _ in grown]), torch.cat([s for _, s in grown])
 
+    @property
+    def start_is_short(self) -> bool:
+        """Whether a start takes few operations: not where it grows a world."""
+        return self._rule is None or self.config.seed_pool > 0
+
     def start(self, random: WorldRandom) -> Start:
         """Return damaged worlds; they are healed once their loss is near the undamaged one."""
         x, s, threshold = super().start(random)

@@ -100,8 +100,8 @@ class NPAEnv(gymnasium.Env[Any, Any]):
             action, (1, config.particle_count, worlds.physics.action_dim), False
         )
         with worlds.here():
-            ending = int(worlds.step(checked)[0])
-            observation = worlds.observation()[0]
+            endings, observation = worlds.step(checked)
+        ending = int(endings[0])
         ended = ending & (SUCCESS | DIVERGED) != 0
         names, numbers = worlds.part_names, worlds.numbers[:, 0].tolist()
         info = self._losses(numbers)
@@ -115,7 +115,7 @@ class NPAEnv(gymnasium.Env[Any, Any]):
             paid = ended or int(worlds.elapsed[0]) == config.episode_steps
             self._unpaid_steps = 0 if paid else self._unpaid_steps + 1
         self._show()
-        return self._out(observation), numbers[0], ended, False, info
+        return self._out(observation[0]), numbers[0], ended, False, info
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return the world's picture, shape [R, R, 3], in the mode "rgb_array"."""

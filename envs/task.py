@@ -105,6 +105,11 @@ class EnvTask(Generic[Config]):
             "'sparse', or give it a particle_losses method"
         )
 
+    @property
+    def start_is_short(self) -> bool:
+        """Whether `start` takes few operations, so that restarts are recorded on CUDA."""
+        return True
+
     def start(self, random: WorldRandom) -> Start:
         """Return worlds at the beginning of their episodes: fresh ones, or some from the pool.
 

@@ -163,12 +163,11 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
         if restarting:
             action = action.clone()
             action[torch.from_numpy(over).to(action.device)] = 0.0
-        endings = self.worlds.step(action)
-        observation = self.worlds.observation(self._buffer)
+        endings, observation = self.worlds.step(action, self._buffer)
         stepped = None
         if restarting:
             stepped, endings = ~over, np.where(over, 0, endings)
-            self._restart(over, observation)
+            self.worlds.restart(np.flatnonzero(over), observation)
         ended = endings != 0
         final = self.autoreset_mode is AutoresetMode.SAME_STEP and bool(ended.any())
         # What a restart overwrites is copied first, whatever the caller wants of the rest.
@@ -176,7 +175,7 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
         if final:
             which, final_observation = self._mask(ended), observation.clone()
             final_infos = self._ending_infos(infos, endings, ended)
-            self._restart(ended, observation)
+            self.worlds.restart(np.flatnonzero(ended), observation)
             _, _, infos = self._report(~ended, copy=self._copy)
             infos |= {"final_obs": self._out(final_observation), "_final_obs": which}
             infos |= {"final_info": final_infos, "_final_info": self._mask(ended)}
@@ -235,10 +234,6 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
         if self._buffer is None:
             self._buffer = observation
         return self._buffer.copy_(observation)
-
-    def _restart(self, ended: NDArray[np.bool_], observation: Tensor) -> None:
-        worlds = torch.from_numpy(np.flatnonzero(ended)).to(self.task.device)
-        observation[worlds] = self.worlds.start(worlds)
 
     def _report(
         self, stepped: NDArray[np.bool_] | None, *, copy: bool

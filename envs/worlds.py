@@ -18,10 +18,11 @@ from torch import Tensor
 from npa_envs.control import Physics, act, observe, perceive_worlds, place_perception
 from npa_envs.envs.config import EnvConfig
 from npa_envs.envs.memory import check_memory
+from npa_envs.envs.restarts import Restarts
 from npa_envs.envs.task import EnvTask, Start
 from npa_envs.errors import NPAError
 from npa_envs.randomness import WorldRandom
-from npa_envs.replay import Replayed
+from npa_envs.replay import Beside, Replayed
 
 # Torch's pool of threads does not survive a fork: a forked worker, as Gymnasium's AsyncVectorEnv
 # starts them, would wait for it for ever.
@@ -134,11 +135,12 @@ class Worlds:
         self._host_endings = torch.zeros(
             world_count + 1, dtype=torch.uint8, pin_memory=device.type == "cuda"
         )
-        self._read: torch.cuda.Event | None = None
-        if device.type == "cuda":
-            self._read = torch.cuda.Event()  # type: ignore[no-untyped-call]
-        self._advance_worlds = Replayed(self._advance, device)
-        self._perceive_worlds = Replayed(self._perceive, device)
+        self._act = Replayed(self._move, device)
+        self._measure = Replayed(self._judge, device)
+        self._survey = Replayed(self._sort, device)
+        self.restart = Restarts(self.start, world_count, device, recorded=self.task.start_is_short)
+        """Starts the next episodes of some worlds: restart(indices, observation)."""
+        self._beside = Beside(device) if device.type == "cuda" else None
 
     @property
     def reward(self) -> Tensor:
@@ -166,12 +168,13 @@ class Worlds:
             random.restart()
         start = self.task.start(random)
         self.random.put(worlds, random)
-        self.elapsed[worlds] = 0
+        self.elapsed.index_fill_(0, worlds, 0)
         observation = self.place(worlds, start)
         self._start_loss[worlds] = self.loss[worlds]
-        self._success_loss[worlds] = (
-            -torch.inf if start.success_loss is None else start.success_loss
-        )
+        if start.success_loss is None:
+            self._success_loss.index_fill_(0, worlds, -torch.inf)
+        else:
+            self._success_loss[worlds] = start.success_loss
         return observation
 
     @torch.no_grad()
@@ -188,14 +191,14 @@ class Worlds:
             self.part_names = tuple(parts)
             self.numbers = self.numbers.new_zeros(2 + 2 * len(parts), self.world_count)
         self.x[worlds], self.s[worlds] = x, s
-        self.numbers[:, worlds] = 0.0
+        self.numbers.index_fill_(1, worlds, 0.0)
         values = torch.stack(list(parts.values()))
         self.numbers[1, worlds] = total(values)
         self.numbers[2 : 2 + len(values), worlds] = values
         if self.particle_loss is not None and self.particle_reward is not None:
             self.particle_loss[worlds] = self.task.particle_losses(x, s)
-            self.particle_reward[worlds] = 0.0
-        self.flags[:, worlds] = False
+            self.particle_reward.index_fill_(0, worlds, 0.0)
+        self.flags.index_fill_(1, worlds, False)
         return observe(x, s, self.physics)
 
     def perceive(self) -> Tensor:
@@ -204,49 +207,44 @@ class Worlds:
 
     def here(self) -> contextlib.AbstractContextManager[Any]:
         """Return a context in which the worlds' device is the current one."""
-        if self._read is None:
-            return contextlib.nullcontext()
-        return torch.cuda.device(self.x.device)
+        return (
+            contextlib.nullcontext() if self._beside is None else torch.cuda.device(self.x.device)
+        )
 
     @torch.no_grad()
-    def step(self, action: Tensor) -> NDArray[np.uint8]:
-        """Apply actions to all worlds and return their endings, shape [B].
+    def step(self, action: Tensor, out: Tensor | None = None) -> tuple[NDArray[np.uint8], Tensor]:
+        """Apply actions to all worlds; return their endings, [B], and what is perceived, [B, N, P].
 
-        Nothing but the endings is brought to the host, and the device goes on perceiving while it
-        is: take the result with `observation`.
+        The endings are all that the host reads, one byte a world. On CUDA the worlds are judged
+        and perceived side by side, and the device goes on perceiving while the host reads.
 
         Args:
             action: Float32, shape [B, N, A], on any device.
+            out: Where to write what is perceived; a new tensor otherwise.
 
         Raises:
             NPAError: An action is not finite; the worlds are then as they were.
         """
-        if self._read is None and not bool(torch.isfinite(action).all()):
+        if self._beside is None and not bool(torch.isfinite(action).all()):
             raise self._not_finite(action)
         self._action.copy_(action)
-        self._advance_worlds()
-        if self._read is not None:
-            self._read.record()
-        self._perceive_worlds()
-        if self._read is not None:
-            self._read.synchronize()
+        self._act()
+        if self._beside is None:
+            self._measure()
+        else:
+            self._beside.run(self._measure)
+        self._survey()
+        observation = place_perception(*self._surveyed, self.physics, self.x.shape, out)
+        if self._beside is not None:
+            self._beside.wait()
         if not self._host_endings[-1]:
             self.random.steps -= 1
             self.elapsed -= 1
             raise self._not_finite(action)
-        return self._host_endings[:-1].numpy().copy()
+        return self._host_endings[:-1].numpy().copy(), observation
 
-    def observation(self, out: Tensor | None = None) -> Tensor:
-        """Return what was perceived after the last step, shape [B, N, P].
-
-        Args:
-            out: Where to write it; a new tensor otherwise.
-        """
-        return place_perception(*self._perceived, self.physics, self.x.shape, out)
-
-    def _advance(self) -> None:
-        """One step of all worlds up to rewards and endings, into the buffers."""
-        config, task = self.task.config, self.task
+    def _move(self) -> None:
+        """Apply the actions."""
         self._diverged.zero_()
         act(
             self.x,
@@ -258,6 +256,10 @@ class Worlds:
             diverged=self._diverged,
         )
         self.elapsed += 1
+
+    def _judge(self) -> None:
+        """Write rewards, losses and endings of the worlds as they now are."""
+        config, task = self.task.config, self.task
         diverged = self._diverged.bool()
         parts = torch.stack(list(task.losses(self.x, self.s).values()))
         loss = total(parts)
@@ -284,8 +286,8 @@ class Worlds:
         ending = SUCCESS * success.byte() + DIVERGED * diverged.byte() + TIME_LIMIT * late.byte()
         self._host_endings.copy_(torch.cat((ending, self._enabled)), non_blocking=True)
 
-    def _perceive(self) -> None:
-        self._perceived = perceive_worlds(self.x, self.s, self.physics)
+    def _sort(self) -> None:
+        self._surveyed = perceive_worlds(self.x, self.s, self.physics)
 
     def _not_finite(self, action: Tensor) -> NPAError:
         bad = ~torch.isfinite(action)

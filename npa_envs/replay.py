@@ -1,4 +1,4 @@
-"""Work that is recorded once as a CUDA graph and replayed from then on."""
+"""Work on CUDA that is recorded once and replayed from then on, or done beside other work."""
 
 from __future__ import annotations
 
@@ -51,3 +51,33 @@ class Replayed:
                 self._function()
             self._graph = graph
         self._graph.replay()
+
+
+class Beside:
+    """Work on a stream of its own, beside what the current stream does meanwhile.
+
+    Args:
+        device: A CUDA device.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self._device = device
+        # First in line, so that the host can read its results soon.
+        self._stream = torch.cuda.Stream(device, priority=-1)  # type: ignore[no-untyped-call]
+        self._done = torch.cuda.Event()  # type: ignore[no-untyped-call]
+
+    def run(self, work: Callable[[], None]) -> None:
+        """Start work once the current stream has done what it was given so far.
+
+        Args:
+            work: Launches kernels; never waits for the device.
+        """
+        self._stream.wait_stream(torch.cuda.current_stream(self._device))
+        with torch.cuda.stream(self._stream):
+            work()
+            self._done.record()
+
+    def wait(self) -> None:
+        """Wait on the host until the work is done, and let the current stream wait as well."""
+        torch.cuda.current_stream(self._device).wait_event(self._done)
+        self._done.synchronize()

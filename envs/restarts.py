@@ -1,0 +1,79 @@
+"""Next episodes for some worlds of a batch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from npa_envs.replay import Replayed
+
+GROWTH = 4
+"""Each recorded size is so many times the one before it."""
+
+
+class Restarts:
+    """Starts of next episodes, as one launch on CUDA instead of some hundred.
+
+    A recorded start serves a fixed number of worlds. Fewer are filled up by repeating the last one:
+    it is then started twice in the same way, which is the same as once.
+
+    Args:
+        start: Starts the next episodes of worlds (indices, int64, shape [M]) and returns what is
+            perceived there, [M, N, P].
+        world_count: Worlds B.
+        device: Where they live.
+        recorded: Whether `start` may be recorded: it never waits for the device.
+    """
+
+    def __init__(
+        self,
+        start: Callable[[Tensor], Tensor],
+        world_count: int,
+        device: torch.device,
+        *,
+        recorded: bool,
+    ) -> None:
+        self._start = start
+        self._world_count = world_count
+        self._device = device
+        self._recorded = recorded and device.type == "cuda"
+        self._chunks: dict[int, _Chunk] = {}
+
+    def __call__(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
+        """Start the next episodes of some worlds.
+
+        Args:
+            worlds: Which, shape [M].
+            observation: Where to write what is perceived in them, shape [B, N, P].
+        """
+        if not self._recorded:
+            index = torch.from_numpy(worlds).to(self._device)
+            observation[index] = self._start(index)
+            return
+        size = 1
+        while size < len(worlds):
+            size = min(size * GROWTH, self._world_count)
+        if size not in self._chunks:
+            self._chunks[size] = _Chunk(self._start, size, self._device)
+        chunk = self._chunks[size]
+        filled = np.pad(worlds, (0, size - len(worlds)), mode="edge")
+        chunk.index.copy_(torch.from_numpy(filled))
+        chunk.replayed()
+        observation.index_copy_(0, chunk.index[: len(worlds)], chunk.perceived[: len(worlds)])
+
+
+class _Chunk:
+    """The recorded start of a fixed number of worlds."""
+
+    def __init__(self, start: Callable[[Tensor], Tensor], size: int, device: torch.device) -> None:
+        self.index = torch.zeros(size, dtype=torch.int64, device=device)
+        self.perceived = torch.empty(0)
+        self.replayed = Replayed(self._run, device)
+        self._start = start
+
+    def _run(self) -> None:
+        self.perceived = self._start(self.index)
