@@ -105,8 +105,8 @@ def queued_time(env: Any, device: torch.device) -> float:
         worlds._act()
         worlds._beside.run(worlds._measure)
         worlds._survey()
+        worlds._beside.join()
         place_perception(*worlds._surveyed, worlds.physics, worlds.x.shape, out)
-        torch.cuda.current_stream(device).wait_event(worlds._beside._done)
 
     queue()
     synchronize(device)

@@ -60,7 +60,8 @@ class Restarts:
         if size not in self._chunks:
             self._chunks[size] = _Chunk(self._start, size, self._device)
         chunk = self._chunks[size]
-        filled = np.pad(worlds, (0, size - len(worlds)), mode="edge")
+        filled = np.full(size, worlds[-1])
+        filled[: len(worlds)] = worlds
         chunk.index.copy_(torch.from_numpy(filled))
         chunk.replayed()
         observation.index_copy_(0, chunk.index[: len(worlds)], chunk.perceived[: len(worlds)])

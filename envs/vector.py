@@ -129,7 +129,7 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
         self._show()
         which = np.zeros(self.num_envs, dtype=bool)
         which[chosen] = True
-        numbers = self._out(self.worlds.numbers.clone())
+        numbers = list(self._out(self.worlds.numbers.clone()))
         return self._out(observation), self._losses(numbers, self._mask(which))
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
@@ -237,7 +237,7 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
 
     def _report(
         self, stepped: NDArray[np.bool_] | None, *, copy: bool
-    ) -> tuple[Any, Any, dict[str, Any]]:
+    ) -> tuple[list[Any], list[Any], dict[str, Any]]:
         """Return numbers, flags and infos as they are, as they are handed out.
 
         Args:
@@ -249,17 +249,20 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
         if worlds.particle_reward is not None:
             buffers.append(worlds.particle_reward)
         numbers, flags, *shares = [self._out(b.clone() if copy else b) for b in buffers]
-        infos = self._losses(numbers, self._mask(None))
-        which = self._mask(stepped)
-        first = 2 + len(worlds.part_names)
-        own = {f"reward_{name}": numbers[first + k] for k, name in enumerate(worlds.part_names)}
-        own |= {name: flags[2 + k] for k, name in enumerate(FLAGS)}
+        # One view for each quantity, made at once.
+        numbers, flags = list(numbers), list(flags)
+        everyone = self._mask(None)
+        which = everyone if stepped is None else self._mask(stepped)
+        infos = self._losses(numbers, everyone)
+        improvements = numbers[2 + len(worlds.part_names) :]
+        own = {f"reward_{n}": v for n, v in zip(worlds.part_names, improvements, strict=True)}
+        own |= dict(zip(FLAGS, flags[2:], strict=True))
         own |= dict(zip(("particle_reward",), shares, strict=False))
         for name, value in own.items():
             infos[name], infos[f"_{name}"] = value, which
         return numbers, flags, infos
 
-    def _losses(self, numbers: Any, which: Any) -> dict[str, Any]:
+    def _losses(self, numbers: list[Any], which: Any) -> dict[str, Any]:
         infos = {"loss": numbers[1], "_loss": which}
         for k, name in enumerate(self.worlds.part_names):
             infos[f"loss_{name}"], infos[f"_loss_{name}"] = numbers[2 + k], which
@@ -271,7 +274,9 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
         """Return the last infos of the worlds whose episodes are over, with the reasons."""
         which = self._mask(ended)
         final = {name: which if name.startswith("_") else value for name, value in infos.items()}
-        reasons = np.array([reason(int(ending)) for ending in endings], dtype=object)
+        reasons = np.full(self.num_envs, None, dtype=object)
+        for k in np.flatnonzero(ended):
+            reasons[k] = reason(int(endings[k]))
         return final | {"reason": reasons, "_reason": which}
 
     def _out(self, tensor: Tensor) -> Any:

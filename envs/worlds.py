@@ -38,11 +38,8 @@ FLAGS = ("success", "diverged")
 
 def reason(ending: int) -> str | None:
     """Return why an episode ended, in words, or None where it has not."""
-    if ending & DIVERGED:
-        return "diverged"
-    if ending & SUCCESS:
-        return "success"
-    return "time limit" if ending & TIME_LIMIT else None
+    words = {DIVERGED: "diverged", SUCCESS: "success", TIME_LIMIT: "time limit"}
+    return next((word for bit, word in words.items() if ending & bit), None)
 
 
 def make_physics(config: EnvConfig, task_type: type[EnvTask[Any]]) -> Physics:
@@ -216,7 +213,7 @@ class Worlds:
         """Apply actions to all worlds; return their endings, [B], and what is perceived, [B, N, P].
 
         The endings are all that the host reads, one byte a world. On CUDA the worlds are judged
-        and perceived side by side, and the device goes on perceiving while the host reads.
+        and sorted side by side, and the device perceives while the host reads.
 
         Args:
             action: Float32, shape [B, N, A], on any device.
@@ -231,9 +228,12 @@ class Worlds:
         self._act()
         if self._beside is None:
             self._measure()
+            self._survey()
         else:
             self._beside.run(self._measure)
-        self._survey()
+            self._survey()
+            # The long perception comes last: the host knows the endings while it still runs.
+            self._beside.join()
         observation = place_perception(*self._surveyed, self.physics, self.x.shape, out)
         if self._beside is not None:
             self._beside.wait()

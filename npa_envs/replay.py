@@ -77,7 +77,10 @@ class Beside:
             work()
             self._done.record()
 
-    def wait(self) -> None:
-        """Wait on the host until the work is done, and let the current stream wait as well."""
+    def join(self) -> None:
+        """Let what the current stream is given from now on wait until the work is done."""
         torch.cuda.current_stream(self._device).wait_event(self._done)
+
+    def wait(self) -> None:
+        """Wait on the host until the work is done."""
         self._done.synchronize()
