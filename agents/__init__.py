@@ -1,7 +1,7 @@
 """Policies and baselines, imported as `npa_envs.agents`.
 
-Holds reinforcement-learning and evolution-strategy baselines, policies made of gradient-trained
-rules, and scripted ones. They use the public API only.
+Holds policies made of gradient-trained rules, scripted and random ones, and their evaluation. They
+use the public API only.
 """
 
 from npa_envs.agents.evaluation import Episodes, evaluate_policy

@@ -62,7 +62,7 @@ def evaluate_policy(env: Any, policy: Callable[[Any], Any], seeds: Iterable[int]
         NPAError: There are no seeds or wrong ones, or the environment is another one.
     """
     worlds = unwrapped(env).worlds
-    if getattr(env, "autoreset_mode", None) is not AutoresetMode.SAME_STEP:
+    if env.metadata.get("autoreset_mode") is not AutoresetMode.SAME_STEP:
         raise NPAError(
             f"env must be a vector environment that resets in the same step, got "
             f"{type(env).__name__}: make it with gymnasium.make_vec(..., "

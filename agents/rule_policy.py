@@ -88,6 +88,15 @@ def _perceived_columns(rule: NPARule) -> Tensor | None:
 
 
 def _check_fit(rule: NPARule, env: Any) -> None:
+    spaces = [
+        getattr(e, "single_observation_space", None) or e.observation_space
+        for e in (env, unwrapped(env))
+    ]
+    if spaces[0] != spaces[1]:
+        raise NPAError(
+            "a rule must see observations as the environment makes them, and a wrapper changes "
+            f"them from {spaces[1]} to {spaces[0]}: give RulePolicy the environment without it"
+        )
     physics, config = unwrapped(env).worlds.physics, unwrapped(env).config
     if rule.space_dim != physics.space_dim:
         raise NPAError(

@@ -48,12 +48,7 @@ CUDA = (
     Case(1, 4096),
     Case(64, 4096),
     Case(16, 16384),
-    Case(16, 16384, eps=0.05),
-    Case(1, 65536),
-    Case(1, 65536, eps=0.025),
 )
-"""The last ones at the default eps, where a particle has some thousand neighbours, and at one where
-it has as many as at N = 4096."""
 CPU = (Case(1, 256), Case(1, 1024), Case(1, 4096), Case(8, 1024), Case(64, 256))
 QUICK = (Case(1, 64), Case(3, 64))
 BROKEN_DOWN = (Case(1024, 1024), Case(64, 4096))

@@ -26,6 +26,14 @@ CHOICES = {
 }
 """Fields that take one of a few words."""
 
+ELSEWHERE = {
+    "seed": "give it to reset(seed=...)",
+    "num_envs": "many worlds at once are made by gymnasium.make_vec",
+    "autoreset_mode": "it is for make_vec(..., vectorization_mode='vector_entry_point'); "
+    "Gymnasium's own vector environments take it in vector_kwargs",
+}
+"""Names that belong to something else, and where they are said."""
+
 LARGEST = 1e9
 """No number of a configuration is larger: products of them stay finite in float32."""
 
@@ -70,7 +78,7 @@ class EnvConfig:
     box_size: float = 2.0
     """Side of the periodic box around the origin [length units]."""
 
-    observation_limit: float = 16.0
+    observation_limit: float = 64.0
     """Observations are clipped to ± this; a state beyond it has diverged (dimensionless)."""
 
     position_limit: float = 4.0
@@ -180,8 +188,16 @@ class EnvConfig:
         """
         known = [field.name for field in fields(cls)]
         for name in keywords:
+            if name in ELSEWHERE:
+                raise NPAError(f"unknown keyword {name!r}: {ELSEWHERE[name]}")
             if name not in known:
-                raise NPAError(f"unknown keyword {name!r}: {suggest(name, known)}")
+                near = suggest(name, [*known, "max_episode_steps"])
+                raise NPAError(f"unknown keyword {name!r}: {near}")
+        if "episode_steps" in keywords and keywords.get("reward") != "sparse":
+            raise NPAError(
+                "episode_steps serves reward='sparse' alone: for longer or shorter episodes give "
+                "max_episode_steps"
+            )
         # Sweeps give NumPy's numbers.
         plain = {k: v.item() if isinstance(v, np.generic) else v for k, v in keywords.items()}
         return replace(cls(), **plain)

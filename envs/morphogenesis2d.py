@@ -145,7 +145,7 @@ class Morphogenesis2DEnv(NPAEnv):
 
     ## Observation space
 
-    `Box(-16, 16, (N, P), float32)` with P = 4C + 2: one row for each particle, always in the same
+    `Box(-64, 64, (N, P), float32)` with P = 4C + 2: one row for each particle, always in the same
     order. Numbers beyond ±`observation_limit` are clipped.
 
     | Columns | Perceived | Unit |

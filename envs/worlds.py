@@ -139,6 +139,10 @@ class Worlds:
         """Starts the next episodes of some worlds: restart(indices, observation)."""
         self._beside = Beside(device) if device.type == "cuda" else None
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out what only the next step needs, and which cannot be pickled."""
+        return self.__dict__ | {"_surveyed": None}
+
     @property
     def reward(self) -> Tensor:
         """Rewards of the last step, shape [B]."""

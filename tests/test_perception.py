@@ -8,7 +8,8 @@ from worlds import degenerate_world, random_world, relative_error
 import npa_envs
 from npa_envs import reference as oracle
 from npa_envs.kernels import slots
-from npa_envs.sph import bridge
+from npa_envs.sph import bridge, cells
+from npa_envs.sph.cells import make_plan, sort_worlds
 from npa_envs.sph.operators import Terms, perceive_rows
 from npa_envs.sph.rows import survey, write_observation
 
@@ -147,6 +148,44 @@ def test_observation_of_a_world_does_not_depend_on_its_batch(device):
     together = run(x, s)
     for k in range(5):
         assert torch.equal(together[k], run(x[k : k + 1], s[k : k + 1])[0])
+
+
+def test_neighbourhoods_may_be_longer_than_lists(device):
+    """On CUDA lists are for 64 neighbours here: some of these particles have more, others fewer."""
+    x, s = random_world(3, 333, 2, 16, dtype=torch.float32, device=device)
+    x[:, :100] *= 0.1
+    neighbours = (torch.cdist(x, x) < 0.2).sum(-1)
+    assert neighbours.min() < 20
+    assert neighbours.max() > 100
+
+    def run(x, s):
+        out = x.new_empty(*x.shape[:2], 66)
+        surveyed = survey(x, s, eps=0.2, eps0=0.2, box=None, terms=Terms())
+        write_observation(surveyed, 16.0, out.view(-1, 66))
+        return out
+
+    together = run(x, s)
+    expected = oracle.perceive(x.cpu().double(), s.cpu().double(), 0.2, 0.2).clamp(-16.0, 16.0)
+    assert relative_error(together, expected) < FORWARD[torch.float32]
+    assert torch.equal(together[1], run(x[1:2], s[1:2])[0])
+
+
+@pytest.mark.parametrize(
+    ("particle_count", "space_dim", "box"),
+    [(1, 2, None), (83, 3, None), (1000, 2, (1.3, 0.9)), (1024, 2, None)],
+)
+def test_small_worlds_are_sorted_as_others_are(particle_count, space_dim, box, device, monkeypatch):
+    """On CUDA a block sorts a small world by itself; elsewhere the two are the same kernels."""
+    x, _ = random_world(3, particle_count, space_dim, 1, dtype=torch.float32, device=device)
+    x[0, : particle_count // 4] = 0.25
+    x[1, 0] = 1e6
+    plan = make_plan(x, x.shape, 16, 3 * particle_count, False, 0.1, box)
+    by_blocks = sort_worlds(plan, x, None, None, with_rows=False)
+    monkeypatch.setattr(cells, "LARGEST_WORLD", 0)
+    for found, expected in zip(
+        by_blocks, sort_worlds(plan, x, None, None, with_rows=False), strict=True
+    ):
+        assert torch.equal(found, expected)
 
 
 def test_slots_fit_the_blocks_that_are_launched():

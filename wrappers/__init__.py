@@ -1,6 +1,6 @@
 """Adapters between environments and the libraries that train on them, as `npa_envs.wrappers`.
 
-Holds Gymnasium and PettingZoo wrappers and the adapters to Stable-Baselines3 and other trainers.
+Holds Gymnasium wrappers and the adapter to Stable-Baselines3.
 They use the public API only. Names are imported when they are first used, so that none of these
 libraries is needed for the others.
 """

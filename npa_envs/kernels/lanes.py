@@ -19,7 +19,7 @@ CUDA_LANES = 4
 
 _SHUFFLES = """
     const unsigned first = threadIdx.x & 31u & ~({lanes}u - 1u);
-    const unsigned mask = ((1u << {lanes}) - 1u) << first;
+    const unsigned mask = {whole} ? ~0u : ((1u << {lanes}) - 1u) << first;
     auto parts = value;
     {part}* sums = reinterpret_cast<{part}*>(&parts);
 """
@@ -120,16 +120,17 @@ def share_type(value_type: type, scalar: type, lanes: int) -> type:
 
 
 @functools.cache
-def make_lane_sum(value_type: type, scalar: type, lanes: int) -> Any:
+def make_lane_sum(value_type: type, scalar: type, lanes: int, whole_warps: bool = False) -> Any:
     """Return a Warp function that adds a value over the lanes of a particle; each gets the sum.
 
     Args:
         value_type: A scalar, vector or matrix type.
         scalar: The scalar type that it is made of.
         lanes: Lanes of a particle, 1 on the CPU.
+        whole_warps: All threads of a warp call it together, which takes fewer instructions.
     """
     part = _c_scalar(scalar)
-    shuffles = _SHUFFLES.format(part=part, lanes=lanes)
+    shuffles = _SHUFFLES.format(part=part, lanes=lanes, whole=int(whole_warps))
 
     @wp.func_native(_ADD.format(part=part, lanes=lanes, shuffles=shuffles))
     def lane_sum(value: value_type) -> value_type: ...
@@ -152,7 +153,7 @@ def make_lane_scatter(value_type: type, scalar: type, lanes: int) -> Any:
     snippet = _SCATTER.format(
         part=part,
         lanes=lanes,
-        shuffles=_SHUFFLES.format(part=part, lanes=lanes),
+        shuffles=_SHUFFLES.format(part=part, lanes=lanes, whole=0),
         share=_c_type(result_type, scalar),
         rows=shape[0] if len(shape) == 2 else 1,
         width=shape[-1],

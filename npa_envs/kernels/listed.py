@@ -1,10 +1,10 @@
-"""Density and perception on CUDA in float32, by lists of neighbours in fast memory.
+"""Perception on CUDA in float32, by lists of neighbours in fast memory.
 
 The same sums as `perception`, in another order of work. The lanes of a particle first list who is
 within eps, then weigh the listed ones, a neighbour for each lane, and then run through the list
 together, a few channels for each lane: weights are computed once, and only for neighbours; a
 neighbour's state is read once, by adjacent lanes. Rows leave through fast memory too, in whole
-transactions.
+transactions. Where the density pass has left lists, nobody is searched for again.
 """
 
 import functools
@@ -14,9 +14,11 @@ import warp as wp
 
 from npa_envs.kernels.domain import MOMENT_THRESHOLD, domain_types, kernel_module
 from npa_envs.kernels.lanes import make_lane_sum, make_wide_load, share_type
+from npa_envs.kernels.listing import RECORD
 from npa_envs.kernels.slots import (
     SLOT_ENTRIES,
     any_in_warp,
+    as_number,
     inverse_root,
     largest_in_warp,
     log_scale_of_square,
@@ -31,67 +33,9 @@ from npa_envs.kernels.slots import (
 CUDA_REGISTERS = 80
 """Registers of a thread of the perception pass."""
 
+load_record = make_wide_load(RECORD, wp.float32)
 load_scalar = make_wide_load(wp.float32, wp.float32)
 load_integer = make_wide_load(wp.int32, wp.int32)
-
-
-@functools.cache
-def listed_density(space_dim: int, lanes: int, periodic: bool) -> wp.Kernel:
-    """Return the density kernel with `lanes` to a particle, of a box or of open space."""
-    scalar = wp.float32
-    types = domain_types(space_dim, scalar)
-    vector, particle, Domain = types.vector, types.particle, types.Domain
-    cell_place, segment_count, segment_cells = (
-        types.cell_place,
-        types.segment_count,
-        types.segment_cells,
-    )
-    periodic_image = types.periodic_image
-    load_vector = make_wide_load(vector, scalar)
-    add_scalar = make_lane_sum(scalar, scalar, lanes)
-
-    topic = "listed_density_in_box" if periodic else "listed_density"
-
-    @wp.kernel(enable_backward=False, module=kernel_module(topic, space_dim, scalar, 0, lanes))
-    def compute_density(
-        domain: Domain,
-        starts: wp.array(dtype=wp.int32),
-        sorted_cell: wp.array(dtype=wp.int32),
-        sorted_positions: wp.array(dtype=vector),
-        # outputs
-        particles: wp.array(dtype=particle),
-    ):
-        """Write every particle's position and volume 1 / rho."""
-        thread = wp.tid()
-        k = thread >> wp.static(lanes.bit_length() - 1)
-        lane = thread & wp.static(lanes - 1)
-        position = load_vector(sorted_positions, k)
-        index = load_integer(sorted_cell, k)
-        local = wp.int32(wp.uint32(index) % wp.uint32(domain.cell_count))
-        base = index - local
-        cell = cell_place(domain, local)
-        total = scalar(0.0)
-        for segment in range(segment_count(domain, cell)):
-            first, last = segment_cells(domain, cell, segment)
-            end = load_integer(starts, base + last)
-            for j in range(load_integer(starts, base + first) + lane, end, wp.static(lanes)):
-                offset = load_vector(sorted_positions, j) - position
-                if wp.static(periodic):
-                    offset = periodic_image(domain, offset)
-                squared = wp.dot(offset, offset)
-                falloff = scalar(1.0) - squared * domain.inverse_squared_eps
-                falloff = wp.max(falloff, scalar(0.0))
-                total += falloff * falloff * falloff
-        # A particle always sees itself: a position that is not finite would otherwise have rho 0.
-        total = wp.max(add_scalar(total), scalar(1.0))
-        if lane == 0:
-            entry = particle()
-            for d in range(wp.static(space_dim)):
-                entry[d] = position[d]
-            entry[wp.static(space_dim)] = scalar(1.0) / (domain.smoothing_norm * total)
-            particles[k] = entry
-
-    return compute_density
 
 
 @functools.cache
@@ -103,12 +47,15 @@ def listed_perception(
     moment_correction: bool,
     periodic: bool,
     grouped: bool,
+    capacity: int = 0,
 ) -> wp.Kernel:
     """Return the perception kernel of one variant, as `perception_kernels` does.
 
-    A variant is also made for a box or open space, and for channels that come in several groups.
+    A variant is also made for a box or open space, for channels that come in several groups, and
+    for lists and records that the density pass left; only overlong lists are then searched anew.
     """
     scalar = wp.float32
+    flat = space_dim == 2
     types = domain_types(space_dim, scalar)
     vector, Domain = types.vector, types.Domain
     cell_place, segment_count, segment_cells = (
@@ -123,23 +70,25 @@ def listed_perception(
     share_gradient = share_type(wp.types.matrix((space_dim, width), scalar), scalar, lanes)
     share_rows = wp.types.vector(width // lanes * space_dim, scalar)
     square = wp.types.matrix((space_dim, space_dim), scalar)
+    cell_vector = wp.types.vector(space_dim, wp.int32)
     topic = "listed_smoothing"
     if state_gradient:
         topic = "listed_perception" if moment_correction else "listed_uncorrected_perception"
     topic += "_in_box" * periodic + "_grouped" * grouped
+    topic += f"_from_lists_{capacity}" * (capacity > 0)
     module = kernel_module(topic, space_dim, scalar, width, lanes)
     load_share = make_wide_load(share, scalar)
     load_vector = make_wide_load(vector, scalar)
-    add_vector = make_lane_sum(vector, scalar, lanes)
-    add_square = make_lane_sum(square, scalar, lanes)
-    add_wide = make_lane_sum(wide, wp.float64, lanes)
-    slots = make_slots(space_dim, width, lanes, state_gradient, grouped)
+    add_vector = make_lane_sum(vector, scalar, lanes, whole_warps=True)
+    add_square = make_lane_sum(square, scalar, lanes, whole_warps=True)
+    add_wide = make_lane_sum(wide, wp.float64, lanes, whole_warps=True)
+    slots = make_slots(space_dim, width, lanes, state_gradient, grouped, capacity)
     slot_address, append_number, number_at = (
         slots.slot_address,
         slots.append_number,
         slots.number_at,
     )
-    put_entry, entry_at, as_number = slots.put_entry, slots.entry_at, slots.as_number
+    put_entry, entry_at, fetch_numbers = slots.put_entry, slots.entry_at, slots.fetch_numbers
     write_rows = slots.write_rows
     stage_share, stage_rows = make_stage(share), make_stage(share_rows)
 
@@ -167,6 +116,7 @@ def listed_perception(
         domain: Domain,
         sorted_positions: wp.array(dtype=vector),
         volumes: wp.array(dtype=scalar),
+        records: wp.array(dtype=RECORD),
         states: wp.array(dtype=share),
         state_place: wp.array(dtype=wp.int32),
         part: wp.int32,
@@ -175,6 +125,7 @@ def listed_perception(
         slot: wp.uint32,
         begin: wp.int32,
         count: wp.int32,
+        k: wp.int32,
         position: vector,
         own: share,
         blur: share,
@@ -188,13 +139,22 @@ def listed_perception(
         padded = (count + wp.int32(3)) & ~wp.int32(3)
         for entry in range(lane, padded, wp.static(lanes)):
             listed = entry >= begin and entry < count
-            j = wp.where(listed, number_at(slot, entry), wp.int32(0))
-            neighbour = wp.where(listed, load_vector(sorted_positions, j), position)
-            volume = load_scalar(volumes, j * wp.static(space_dim + 1) + wp.static(space_dim))
-            volume = wp.where(listed, volume, scalar(0.0))
+            j = wp.where(listed, number_at(slot, entry), k)
             number = j
-            if state_place.shape[0] > 0:
+            if wp.static(capacity > 0):
+                record = load_record(records, j)
+                neighbour = vector()
+                for d in range(wp.static(space_dim)):
+                    neighbour[d] = record[d]
+                volume = record[wp.static(space_dim)]
+                if wp.static(flat):
+                    number = as_number(record[3])
+            else:
+                neighbour = load_vector(sorted_positions, j)
+                volume = load_scalar(volumes, j * wp.static(space_dim + 1) + wp.static(space_dim))
+            if wp.static(not flat or capacity == 0) and state_place.shape[0] > 0:
                 number = load_integer(state_place, j)
+            volume = wp.where(listed, volume, scalar(0.0))
             offset = neighbour - position
             if wp.static(periodic):
                 offset = periodic_image(domain, offset)
@@ -241,10 +201,13 @@ def listed_perception(
         sorted_cell: wp.array(dtype=wp.int32),
         sorted_positions: wp.array(dtype=vector),
         volumes: wp.array(dtype=scalar),
+        records: wp.array(dtype=RECORD),
         states: wp.array(dtype=share),
         state_place: wp.array(dtype=wp.int32),
         row_place: wp.array(dtype=wp.int32),
         row_destination: wp.array(dtype=wp.int32),
+        lists: wp.array(dtype=wp.int16),
+        list_lengths: wp.array(dtype=wp.int32),
         # outputs
         perception: wp.array(dtype=scalar, ndim=2),
         row_kernel_sum: wp.array(dtype=vector),
@@ -252,9 +215,10 @@ def listed_perception(
         """Write the perception vector of each row, as `perception_kernels` does.
 
         Threads come in whole warps: lanes, groups, rows, some of them beyond the last row. Volumes
-        are the last entries of particles. States are read where `state_place` says, or in sorted
-        order if it is empty; rows are written where `row_destination` says, or in their own order;
-        clipped to plus and minus `limit` unless that is zero.
+        are the last entries of particles, or lie in records beside the lists. States are read
+        where `state_place` says, or in sorted order if it is empty; rows are written where
+        `row_destination` says, or in their own order; clipped to plus and minus `limit` unless
+        that is zero.
         """
         thread = thread_number()
         lane = thread & wp.static(lanes - 1)
@@ -286,11 +250,46 @@ def listed_perception(
             own_place = load_integer(state_place, k)
         own = load_share(states, own_place * part_count + part)
         position = load_vector(sorted_positions, k)
-        index = load_integer(sorted_cell, k)
-        local = wp.int32(wp.uint32(index) % wp.uint32(domain.cell_count))
-        base = index - local
-        cell = cell_place(domain, local)
-        segments = wp.where(present, segment_count(domain, cell), wp.int32(0))
+        searching = wp.bool(present)
+        if wp.static(capacity > 0):
+            length = wp.where(present, load_integer(list_lengths, k), wp.int32(0))
+            searching = length > wp.static(capacity)
+            length = wp.where(searching, wp.int32(0), length)
+            longest = largest_in_warp(length)
+            for first_entry in range(0, longest, wp.static(SLOT_ENTRIES)):
+                fetched = wp.clamp(length - first_entry, 0, wp.static(SLOT_ENTRIES))
+                fetch_numbers(slot, lists, k, first_entry, fetched, lane)
+                blur, gradient, kernel_sum, moment, wide_sum = add_listed(
+                    domain,
+                    sorted_positions,
+                    volumes,
+                    records,
+                    states,
+                    state_place,
+                    part,
+                    part_count,
+                    lane,
+                    slot,
+                    0,
+                    fetched,
+                    k,
+                    position,
+                    own,
+                    blur,
+                    gradient,
+                    kernel_sum,
+                    moment,
+                    wide_sum,
+                )
+        base = wp.int32(0)
+        cell = cell_vector()
+        segments = wp.int32(0)
+        if any_in_warp(searching):
+            index = load_integer(sorted_cell, k)
+            local = wp.int32(wp.uint32(index) % wp.uint32(domain.cell_count))
+            base = index - local
+            cell = cell_place(domain, local)
+            segments = wp.where(searching, segment_count(domain, cell), wp.int32(0))
         # Each lane looks up one run of cells; the runs are then walked one after another.
         run_count = largest_in_warp(segments)
         run = wp.int32(0)
@@ -301,7 +300,7 @@ def listed_perception(
         # What a round leaves over of a multiple of the lanes is kept free in the next: a
         # neighbour's lane is then its number among all, whatever the rest of the warp does.
         begin = wp.int32(0)
-        working = wp.bool(True)
+        working = run_count > 0
         while working:
             count = wp.int32(begin)
             filling = wp.bool(True)
@@ -331,6 +330,7 @@ def listed_perception(
                 domain,
                 sorted_positions,
                 volumes,
+                records,
                 states,
                 state_place,
                 part,
@@ -339,6 +339,7 @@ def listed_perception(
                 slot,
                 begin,
                 count,
+                k,
                 position,
                 own,
                 blur,

@@ -63,6 +63,46 @@ _GET = """
     return result;
 """
 
+_LIST_ADDRESS = """
+    __shared__ unsigned short lists[{capacity} * {block}];
+    return (unsigned)__cvta_generic_to_shared(lists + threadIdx.x);
+"""
+
+# As assembly, so that loads of global memory may be moved ahead of it, and without branches.
+_LIST_APPEND = """
+    asm volatile(
+        "{{ .reg .pred near, kept;\\n"
+        "setp.gt.f32 near, %1, 0f00000000;\\n"
+        "setp.lt.and.u32 kept, %0, %2, near;\\n"
+        "@kept st.shared.u16 [%0], %3;\\n"
+        "@near add.u32 %0, %0, %4; }}"
+        : "+r"(place)
+        : "f"(weight), "r"(first + 2 * {block} * {capacity}), "h"((short)step), "n"(2 * {block}));
+    return place;
+"""
+
+_LIST_LEAVE = """
+    const int length = (place - first) / (2 * {block});
+    short* to = lists.data + (size_t)(particle / 32) * (32 * {capacity}) + particle % 32;
+    const int held = length < {capacity} ? length : {capacity};
+    for (int entry = 0; entry < held; ++entry) {{
+        short step;
+        asm volatile("ld.shared.u16 %0, [%1];" : "=h"(step) : "r"(first + 2 * {block} * entry));
+        to[32 * entry] = step;
+    }}
+    return length;
+"""
+
+_LIST_FETCH = """
+    const short* from = lists.data + (size_t)(particle / 32) * (32 * {capacity}) + particle % 32;
+    #pragma unroll 4
+    for (int entry = lane; entry < count; entry += {lanes}) {{
+        const int number = particle + from[32 * (begin + entry)];
+        const unsigned place = slot + {first_number} + {number_stride} * entry;
+        *reinterpret_cast<int*>(__cvta_shared_to_generic(place)) = number;
+    }}
+"""
+
 _STAGE = """
     constexpr unsigned bytes = sizeof(value) % 16 == 0 ? 16 : sizeof(value) % 8 == 0 ? 8 : 4;
     struct alignas(bytes) Chunk {{ unsigned part[bytes / 4]; }};
@@ -76,12 +116,36 @@ _STAGE = """
     }}
 """
 
-# A whole warp writes one slot after another, so that a row leaves in few, full transactions.
+# A whole warp writes one slot after another, so that a row leaves in few, full transactions; in
+# pairs where the channels fill their group, for then a slot holds what a row begins with.
 # fminf and fmaxf return the other operand where one is NaN: such a limit changes nothing.
 _WRITE = """
     __syncwarp();
     const unsigned lane = threadIdx.x & 31u;
     const unsigned slots = slot - lane / {lanes} * {bytes};
+    const bool paired = ((size_t)rows.data | 4 * (size_t)rows.shape[1]) % 8 == 0;
+    if (!{grouped} && state_dim == {width} && paired) {{
+        char* base = reinterpret_cast<char*>(rows.data + 2 * lane);
+        unsigned from = slots + 8 * lane;
+        // What all slots share is computed once, not again beside each.
+        asm volatile("" : "+l"(base), "+r"(from));
+        #pragma unroll
+        for (unsigned s = 0; s < 32 / {lanes}; ++s) {{
+            const int row = __shfl_sync(~0u, destination, s * {lanes});
+            float2* to = reinterpret_cast<float2*>(
+                base + (unsigned long long)(unsigned)row * (4u * rows.shape[1]));
+            #pragma unroll
+            for (unsigned part = 0; part < ({row_words} + 63) / 64; ++part) {{
+                float2 pair;
+                asm volatile("ld.shared.v2.f32 {{%0, %1}}, [%2];"
+                    : "=f"(pair.x), "=f"(pair.y) : "r"(from + s * {bytes} + 256 * part));
+                pair.x = fminf(fmaxf(pair.x, -limit), limit);
+                pair.y = fminf(fmaxf(pair.y, -limit), limit);
+                if (row >= 0 && part * 64 + 2 * lane < {row_words}) to[32 * part] = pair;
+            }}
+        }}
+        return;
+    }}
     #pragma unroll
     for (unsigned s = 0; s < 32 / {lanes}; ++s) {{
         const int row = __shfl_sync(~0u, destination, s * {lanes});
@@ -113,7 +177,7 @@ _WRITE = """
 
 @functools.cache
 def make_slots(
-    space_dim: int, width: int, lanes: int, state_gradient: bool, grouped: bool
+    space_dim: int, width: int, lanes: int, state_gradient: bool, grouped: bool, capacity: int
 ) -> SimpleNamespace:
     """Return the Warp functions on slots of one variant.
 
@@ -123,6 +187,7 @@ def make_slots(
         lanes: Lanes of a particle.
         state_gradient: Whether a row holds the state gradient.
         grouped: Whether channels come in several groups.
+        capacity: Neighbours that a particle's list has room for.
     """
     vector = wp.types.vector(space_dim, wp.float32)
     entry_type = wp.types.vector(space_dim + 2, wp.float32)
@@ -141,6 +206,7 @@ def make_slots(
         "row_words": row_words,
         "grouped": int(grouped),
         "dims": space_dim,
+        "capacity": capacity,
         "last": "__int_as_float(number)" if flat else "kernel[2]",
         "put_number": "",
         "get_number": "",
@@ -162,6 +228,16 @@ def make_slots(
     @wp.func_native(_NUMBER.format(**names))
     def number_at(slot: wp.uint32, entry: wp.int32) -> wp.int32: ...
 
+    @wp.func_native(_LIST_FETCH.format(**names))
+    def fetch_numbers(
+        slot: wp.uint32,
+        lists: wp.array(dtype=wp.int16),
+        particle: wp.int32,
+        begin: wp.int32,
+        count: wp.int32,
+        lane: wp.int32,
+    ): ...
+
     @wp.func_native(_PUT.format(**names))
     def put_entry(
         slot: wp.uint32, entry: wp.int32, smooth: wp.float32, kernel: vector, number: wp.int32
@@ -169,9 +245,6 @@ def make_slots(
 
     @wp.func_native(_GET.format(**names))
     def entry_at(slot: wp.uint32, entry: wp.int32) -> entry_type: ...
-
-    @wp.func_native("return __float_as_int(word);")
-    def as_number(word: wp.float32) -> wp.int32: ...
 
     @wp.func_native(_WRITE.format(**names))
     def write_rows(
@@ -186,12 +259,54 @@ def make_slots(
     return SimpleNamespace(
         slot_address=slot_address,
         append_number=append_number,
+        fetch_numbers=fetch_numbers,
         number_at=number_at,
         put_entry=put_entry,
         entry_at=entry_at,
-        as_number=as_number,
         write_rows=write_rows,
     )
+
+
+@functools.cache
+def make_lists(capacity: int) -> SimpleNamespace:
+    """Return the Warp functions on lists of neighbours, which a thread of a particle each makes.
+
+    A list holds the steps to neighbours in the sorted order, in 16 bits. It is gathered in fast
+    memory and left in an array: 32 particles together, first entries first.
+
+    Args:
+        capacity: Neighbours that a list has room for; more are counted but not kept.
+    """
+    names = {"capacity": capacity, "block": CUDA_BLOCK}
+
+    @wp.func_native(_LIST_ADDRESS.format(**names))
+    def list_address() -> wp.uint32: ...
+
+    @wp.func_native(_LIST_APPEND.format(**names))
+    def append_step(
+        first: wp.uint32, place: wp.uint32, weight: wp.float32, step: wp.int32
+    ) -> wp.uint32: ...
+
+    @wp.func_native(_LIST_LEAVE.format(**names))
+    def leave_list(
+        first: wp.uint32, place: wp.uint32, particle: wp.int32, lists: wp.array(dtype=wp.int16)
+    ) -> wp.int32: ...
+
+    return SimpleNamespace(
+        list_address=list_address, append_step=append_step, leave_list=leave_list
+    )
+
+
+@wp.func_native("return __float_as_int(word);")
+def as_number(word: wp.float32) -> wp.int32:
+    """The integer that was packed into a word."""
+    ...
+
+
+@wp.func_native("return __int_as_float(number);")
+def as_word(number: wp.int32) -> wp.float32:
+    """An integer packed into a word."""
+    ...
 
 
 @functools.cache

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from npa_envs.kernels.domain import domain_types, kernel_module
+from npa_envs.kernels.wide import make_read_at, make_write_at
 
 CHANNEL_SHARE = 4
 """Channels of a particle that one thread of `apply_actions` changes."""
@@ -23,6 +24,9 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
     vector = types.vector
     wide = wp.types.vector(space_dim, wp.float64)
     share = wp.types.vector(CHANNEL_SHARE, scalar)
+    read_states = make_read_at(share, scalar, 16)
+    read_actions = make_read_at(share, scalar, 8)
+    write_states = make_write_at(share, scalar)
     module = kernel_module("update", space_dim, scalar)
 
     @wp.func
@@ -166,6 +170,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         switched: wp.int32,
         enabled: wp.array(dtype=wp.uint8),
         state_dim: wp.int32,
+        aligned: wp.int32,
         actions: wp.array(dtype=scalar),
         # changed in place
         positions: wp.array(dtype=vector),
@@ -175,68 +180,81 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
     ):
         """Move and change the particles that act, and mark the worlds that had to be held back."""
         # All that is read is asked for before any of it is used: the kernel waits for memory.
+        sharers = (state_dim + wp.static(CHANNEL_SHARE - 1)) / wp.static(CHANNEL_SHARE)
         t = wp.tid()
-        total = positions.shape[0]
+        i = t / sharers
+        sharer = t - i * sharers
         happens = wp.uint8(1)
         if switched != 0:
             happens = enabled[0]
-        held_back = wp.int32(0)
-        i = t
-        if t >= total:
-            # The threads after the first B N: some for each particle, each for every so-manyth of
-            # its channels, so that neighbouring threads touch neighbouring numbers.
-            sharers = (state_dim + wp.static(CHANNEL_SHARE - 1)) / wp.static(CHANNEL_SHARE)
-            i = (t - total) / sharers
-            first = t - total - i * sharers
-            acting = wp.uint8(1)
-            if masked != 0:
-                acting = mask[i]
-            states_begin = i * state_dim
-            actions_begin = states_begin
-            if moving != 0:
-                actions_begin += (i + 1) * wp.static(space_dim)
-            before = share()
-            change = share()
+        acting = wp.uint8(1)
+        if masked != 0:
+            acting = mask[i]
+        # A thread has some adjacent channels of a particle, which it reads and writes at once, or
+        # every so-manyth of them, so that neighbouring threads touch neighbouring numbers.
+        first = sharer
+        stride = sharers
+        if aligned != 0:
+            first = sharer * wp.static(CHANNEL_SHARE)
+            stride = wp.int32(1)
+        states_begin = i * state_dim
+        actions_begin = states_begin
+        if moving != 0:
+            actions_begin += (i + 1) * wp.static(space_dim)
+        before = share()
+        change = share()
+        if aligned != 0:
+            before = read_states(states, states_begin + first)
+            change = read_actions(actions, actions_begin + first)
+        else:
             for k in range(wp.static(CHANNEL_SHARE)):
                 # The last thread of a particle may have fewer channels, and repeats its first.
-                c = wp.where(first + k * sharers < state_dim, first + k * sharers, first)
+                c = wp.where(first + k * stride < state_dim, first + k * stride, first)
                 before[k] = states[states_begin + c]
                 change[k] = actions[actions_begin + c]
-            if happens != wp.uint8(0):
-                for k in range(wp.static(CHANNEL_SHARE)):
-                    c = first + k * sharers
-                    state = before[k]
-                    if acting != wp.uint8(0):
-                        # Comparisons let a value through that is not a number; a clamp would not.
-                        part = change[k]
-                        if part > scalar(1.0):
-                            part = scalar(1.0)
-                        if part < scalar(-1.0):
-                            part = scalar(-1.0)
-                        state = scalar(wp.float64(state) + largest_change * wp.float64(part))
-                    state, state_held = held(state, state_limit)
-                    if c < state_dim:
-                        held_back += state_held
-                        if acting != wp.uint8(0) or state_held != 0:
-                            states[states_begin + c] = state
-        else:
-            position = positions[t]
-            push = vector()
+        position = vector()
+        push = vector()
+        direction = wide()
+        # A particle's first thread moves it, too.
+        if sharer == 0:
+            position = positions[i]
             if noisy != 0:
-                push = noise[t]
-            acting = wp.uint8(0)
-            direction = wide()
+                push = noise[i]
             if moving != 0:
-                acting = wp.uint8(1)
-                if masked != 0:
-                    acting = mask[t]
                 for d in range(wp.static(space_dim)):
-                    own = t * (wp.static(space_dim) + state_dim) + d
+                    own = actions_begin - wp.static(space_dim) + d
                     direction[d] = wp.float64(actions[own])
-            if happens != wp.uint8(0):
+        held_back = wp.int32(0)
+        if happens != wp.uint8(0):
+            after = share()
+            changed = wp.int32(0)
+            for k in range(wp.static(CHANNEL_SHARE)):
+                state = before[k]
+                if acting != wp.uint8(0):
+                    # Comparisons let a value through that is not a number; a clamp would not.
+                    part = change[k]
+                    if part > scalar(1.0):
+                        part = scalar(1.0)
+                    if part < scalar(-1.0):
+                        part = scalar(-1.0)
+                    state = scalar(wp.float64(state) + largest_change * wp.float64(part))
+                state, state_held = held(state, state_limit)
+                after[k] = state
+                if first + k * stride < state_dim:
+                    changed += state_held
+            held_back += changed
+            if acting != wp.uint8(0) or changed != 0:
+                if aligned != 0:
+                    write_states(states, states_begin + first, after)
+                else:
+                    for k in range(wp.static(CHANNEL_SHARE)):
+                        c = first + k * stride
+                        if c < state_dim:
+                            states[states_begin + c] = after[k]
+            if sharer == 0:
                 if noisy != 0:
                     position += push
-                if acting != wp.uint8(0):
+                if moving != 0 and acting != wp.uint8(0):
                     length = wp.length(direction)
                     step = largest_step
                     if length > wp.float64(1.0):
@@ -248,7 +266,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
                     coordinate, coordinate_held = held(position[d], position_limit)
                     position[d] = coordinate
                     held_back += coordinate_held
-                positions[t] = position
+                positions[i] = position
         if held_back != 0:
             diverged[i / particle_count] = wp.uint8(1)
 

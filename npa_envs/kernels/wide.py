@@ -27,6 +27,41 @@ _STORE = """
 #endif
 """
 
+_READ = """
+    {entry} result;
+#if defined(__CUDA_ARCH__)
+    struct alignas({bytes}) Chunk {{ unsigned part[{bytes} / 4]; }};
+    const Chunk* from = reinterpret_cast<const Chunk*>(values.data + place);
+    unsigned* to = reinterpret_cast<unsigned*>(&result);
+    #pragma unroll
+    for (unsigned i = 0; i < sizeof(result) / {bytes}; ++i) {{
+        const Chunk chunk = from[i];
+        #pragma unroll
+        for (unsigned k = 0; k < {bytes} / 4; ++k) to[{bytes} / 4 * i + k] = chunk.part[k];
+    }}
+#else
+    for (unsigned k = 0; k < {count}; ++k) result[k] = values.data[place + k];
+#endif
+    return result;
+"""
+
+_WRITE = """
+#if defined(__CUDA_ARCH__)
+    struct alignas(16) Chunk {{ unsigned part[4]; }};
+    Chunk* to = reinterpret_cast<Chunk*>(values.data + place);
+    const unsigned* from = reinterpret_cast<const unsigned*>(&entry);
+    #pragma unroll
+    for (unsigned i = 0; i < sizeof(entry) / 16; ++i) {{
+        Chunk chunk;
+        #pragma unroll
+        for (unsigned k = 0; k < 4; ++k) chunk.part[k] = from[4 * i + k];
+        to[i] = chunk;
+    }}
+#else
+    for (unsigned k = 0; k < {count}; ++k) values.data[place + k] = entry[k];
+#endif
+"""
+
 _WARP_SUM = """
 #if defined(__CUDA_ARCH__)
     auto parts = value;
@@ -76,6 +111,40 @@ def make_wide_store(value_type: type, scalar: type) -> Any:
     def wide_store(entries: wp.array(dtype=value_type), index: wp.int32, value: value_type): ...
 
     return wide_store
+
+
+@functools.cache
+def make_read_at(value_type: type, scalar: type, alignment: int) -> Any:
+    """Return a Warp function that reads a vector from a place of an array of scalars.
+
+    Args:
+        value_type: A vector type of a multiple of `alignment` bytes.
+        scalar: The scalar type that it is made of.
+        alignment: Bytes that the place is a multiple of in memory, and that a load takes: 8 or 16.
+    """
+    count = value_type._length_
+    name = {"f32": "wp::float32", "f64": "wp::float64"}[scalar_name(scalar)]
+    snippet = _READ.format(bytes=alignment, count=count, entry=f"wp::vec_t<{count}, {name}>")
+
+    @wp.func_native(snippet)
+    def read_at(values: wp.array(dtype=scalar), place: wp.int32) -> value_type: ...
+
+    return read_at
+
+
+@functools.cache
+def make_write_at(value_type: type, scalar: type) -> Any:
+    """Return a Warp function that writes a vector to a place of an array of scalars.
+
+    Args:
+        value_type: A vector type of a multiple of 16 bytes; the place is one, too, in memory.
+        scalar: The scalar type that it is made of.
+    """
+
+    @wp.func_native(_WRITE.format(count=value_type._length_))
+    def write_at(values: wp.array(dtype=scalar), place: wp.int32, entry: value_type): ...
+
+    return write_at
 
 
 @functools.cache

@@ -11,6 +11,8 @@ from torch import Tensor
 from npa_envs.errors import NPAError
 from npa_envs.kernels.cells import cell_kernels
 from npa_envs.kernels.domain import make_domain
+from npa_envs.kernels.slots import CUDA_BLOCK
+from npa_envs.kernels.small_worlds import LARGEST_GRID, LARGEST_WORLD, sort_small_worlds
 from npa_envs.sph.bridge import channel_width, lane_count, launch, scalar_type
 
 LARGEST_INDEX = 2**31 - 1
@@ -141,6 +143,9 @@ def sort_worlds(
 
     What is left out is empty: states without `s`, everything about rows without `with_rows`.
     """
+    small = plan.particle_count <= LARGEST_WORLD and plan.domain.cell_count <= LARGEST_GRID
+    if plan.listed and small and not plan.masked and s is None and not with_rows:
+        return _sort_by_blocks(plan, x)
     share = plan.width // plan.lanes
     kernels = cell_kernels(plan.space_dim, plan.scalar, share)
     device, total = x.device, plan.total
@@ -207,6 +212,38 @@ def sort_worlds(
         sorted_positions,
         row_positions,
         sorted_states.view(-1, plan.width),
+    )
+
+
+def _sort_by_blocks(plan: Plan, x: Tensor) -> SortedWorlds:
+    """Sort small worlds, without states and rows, in one launch."""
+    starts = torch.empty(plan.start_count, dtype=torch.int32, device=x.device)
+    source, sorted_cell = torch.empty(2, plan.total, dtype=torch.int32, device=x.device).unbind()
+    positions = x.view(plan.total, plan.space_dim)
+    sorted_positions = torch.empty_like(positions)
+    launch(
+        sort_small_worlds(plan.space_dim),
+        plan.world_count * CUDA_BLOCK,
+        x.device,
+        plan.domain,
+        plan.particle_count,
+        positions,
+        starts,
+        source,
+        sorted_cell,
+        sorted_positions,
+    )
+    none = source.new_empty(0)
+    return SortedWorlds(
+        starts,
+        source,
+        sorted_cell,
+        none,
+        none,
+        none,
+        sorted_positions,
+        x.new_empty(0, plan.space_dim),
+        x.new_empty(0, plan.width),
     )
 
 

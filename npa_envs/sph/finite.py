@@ -41,6 +41,7 @@ def mark_finite(values: Tensor, finite: Tensor) -> None:
             thread_count,
             values.device,
             thread_count,
+            int(values.data_ptr() % 16 == 0),
             values.detach().view(-1),
             finite,
         )

@@ -7,13 +7,26 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from npa_envs.kernels.listed import listed_density, listed_perception
+from npa_envs.kernels.listed import listed_perception
+from npa_envs.kernels.listing import listed_density
 from npa_envs.kernels.perception import perception_kernels
 from npa_envs.sph.bridge import launch
 from npa_envs.sph.cells import Plan, SortedWorlds, density_scale
 
 WARP_ROWS = 8
 """Rows that a CUDA warp serves, and writes together."""
+
+CAPACITY, LARGE_CAPACITY = 64, 128
+"""Neighbours that lists have room for, in small worlds and in larger ones."""
+
+SMALL_WORLD = 2048
+"""Particles of a small world."""
+
+LARGEST_LISTED_WORLD = 2**15
+"""Steps within larger worlds do not fit into the 16 bits of a list's entry."""
+
+LIST_BLOCK = 32
+"""Particles whose lists lie together."""
 
 
 class Terms(NamedTuple):
@@ -29,6 +42,17 @@ class Terms(NamedTuple):
         return 2 * state_dim + gradients + space_dim * self.density_gradient
 
 
+class NeighbourLists(NamedTuple):
+    """The neighbours of each sorted particle, itself included."""
+
+    capacity: int
+    """Neighbours that a list has room for: what is longer, perception searches for again."""
+    steps: Tensor
+    """Steps to neighbours in the sorted order, int16; 32 particles together."""
+    lengths: Tensor
+    """Neighbours of each particle, int32, [B N]."""
+
+
 class Densities(NamedTuple):
     """What the density pass leaves for perception."""
 
@@ -36,6 +60,8 @@ class Densities(NamedTuple):
     """Sorted positions with volumes 1 / rho, shape [B N, D + 1]."""
     row_density_gradient: Tensor
     """Density gradients of the rows, float64, [K, D]; empty where perception computes them."""
+    lists: NeighbourLists | None = None
+    """What the density pass found of neighbours; `particles` are then records, [B N, 4]."""
 
 
 def plain_kernels(plan: Plan, terms: Terms) -> Any:
@@ -48,6 +74,44 @@ def plain_kernels(plan: Plan, terms: Terms) -> Any:
         terms.state_gradient,
         terms.moment_correction,
     )
+
+
+def list_capacity(plan: Plan) -> int:
+    """Return how many neighbours a list has room for, 0 where there are no lists."""
+    if not plan.listed or plan.particle_count > LARGEST_LISTED_WORLD:
+        return 0
+    return CAPACITY if plan.particle_count <= SMALL_WORLD else LARGE_CAPACITY
+
+
+def list_neighbours(plan: Plan, ordered: SortedWorlds, state_place: Tensor | None) -> Densities:
+    """Compute densities and list neighbours, for a perception of all particles.
+
+    Args:
+        plan: Plan of the call, of a positive `list_capacity`.
+        ordered: The sorted worlds.
+        state_place: Where the states of sorted particles are, int32, shape [B N]; None: in order.
+    """
+    capacity = list_capacity(plan)
+    positions = ordered.positions
+    records = positions.new_empty(plan.total, 4)
+    blocks = -(-plan.total // LIST_BLOCK)
+    steps = positions.new_empty(blocks, capacity, LIST_BLOCK, dtype=torch.int16)
+    lengths = positions.new_empty(plan.total, dtype=torch.int32)
+    launch(
+        listed_density(plan.space_dim, 1, plan.periodic, capacity),
+        plan.total,
+        positions.device,
+        plan.domain,
+        ordered.starts,
+        ordered.cell,
+        positions,
+        state_place,
+        records,
+        steps.view(-1),
+        lengths,
+    )
+    no_gradient = positions.new_empty(0, plan.space_dim, dtype=torch.float64)
+    return Densities(records, no_gradient, NeighbourLists(capacity, steps, lengths))
 
 
 def compute_density(
@@ -73,7 +137,10 @@ def compute_density(
             ordered.starts,
             ordered.cell,
             positions,
+            None,
             particles,
+            None,
+            None,
         )
         return Densities(particles, positions.new_empty(0, plan.space_dim, dtype=torch.float64))
     return compute_density_gradients(plan, ordered, terms)
@@ -140,6 +207,7 @@ def write_perception(
         plan.row_base,
     )
     row_place = ordered.row_place if plan.masked else None
+    lists = densities.lists
     if plan.listed:
         kernel = listed_perception(
             plan.space_dim,
@@ -149,6 +217,7 @@ def write_perception(
             terms.moment_correction,
             plan.periodic,
             plan.group_count > 1,
+            0 if lists is None else lists.capacity,
         )
         rows = -(-plan.row_capacity // WARP_ROWS) * WARP_ROWS
         source = ordered.states if states is None else states
@@ -163,11 +232,14 @@ def write_perception(
             ordered.starts,
             ordered.cell,
             ordered.positions,
-            densities.particles.view(-1),
+            densities.particles.view(-1) if lists is None else None,
+            densities.particles if lists is not None else None,
             source.view(-1, plan.width // plan.lanes),
             None if states is None else ordered.source,
             row_place,
             destination,
+            None if lists is None else lists.steps.view(-1),
+            None if lists is None else lists.lengths,
             out,
             row_kernel_sum,
         )

@@ -7,7 +7,14 @@ from typing import NamedTuple
 from torch import Tensor
 
 from npa_envs.sph.cells import Plan, SortedWorlds, make_plan, sort_worlds
-from npa_envs.sph.passes import Densities, Terms, compute_density, write_perception
+from npa_envs.sph.passes import (
+    Densities,
+    Terms,
+    compute_density,
+    list_capacity,
+    list_neighbours,
+    write_perception,
+)
 
 DENSITY_LANES = 1
 """Threads of a particle in the density pass: whole batches fill the device without more."""
@@ -50,7 +57,10 @@ def survey(
     plan = make_plan(x, x.shape, s.shape[2], x.shape[0] * x.shape[1], False, eps, box)
     in_place = plan.listed and plan.state_dim % plan.width == 0 and s.data_ptr() % 16 == 0
     ordered = sort_worlds(plan, x, None if in_place else s, None, with_rows=not plan.listed)
-    densities = compute_density(plan, ordered, terms, lanes=DENSITY_LANES)
+    if list_capacity(plan):
+        densities = list_neighbours(plan, ordered, ordered.source if in_place else None)
+    else:
+        densities = compute_density(plan, ordered, terms, lanes=DENSITY_LANES)
     return Surveyed(plan, ordered, densities, s if in_place else None, terms, eps / eps0)
 
 

@@ -59,9 +59,7 @@ def _warm_pictures(x: torch.Tensor) -> None:
     picture = splat(x, colours, resolution=8, pixel_size=0.1)
     _pull_back(picture)
     middle = x.new_zeros(2)
-    picture_losses(
-        x.detach(), colours, picture.detach()[0], goal=middle, shift=0.0, pixel_size=0.1
-    )
+    picture_losses(x.detach(), colours, picture.detach()[0], goal=middle, shift=0.0, pixel_size=0.1)
 
 
 def _warm_update(x: torch.Tensor, s: torch.Tensor) -> None:

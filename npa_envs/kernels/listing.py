@@ -1,0 +1,132 @@
+"""Density on CUDA in float32, and on the way to it lists of neighbours, for perception.
+
+One thread of a particle finds its neighbours with far fewer instructions than several that must
+agree on where they are in a list. Lists have room for so many; of a longer one, only the length
+is known.
+"""
+
+import functools
+
+import warp as wp
+
+from npa_envs.kernels.domain import domain_types, kernel_module
+from npa_envs.kernels.lanes import make_lane_sum, make_wide_load
+from npa_envs.kernels.slots import as_word, make_lists
+
+AHEAD = 3
+"""Candidates that a thread with lists to make looks at together."""
+
+RECORD = wp.types.vector(4, wp.float32)
+"""What perception reads of a neighbour: position, volume, and in 2D where its state is."""
+
+load_integer = make_wide_load(wp.int32, wp.int32)
+
+
+@functools.cache
+def listed_density(space_dim: int, lanes: int, periodic: bool, capacity: int = 0) -> wp.Kernel:
+    """Return the density kernel with `lanes` to a particle, of a box or of open space.
+
+    With a capacity it also leaves lists of that many neighbours, and records of 16 bytes in place
+    of particles; it then has one lane.
+    """
+    scalar = wp.float32
+    flat = space_dim == 2
+    types = domain_types(space_dim, scalar)
+    vector, particle, Domain = types.vector, types.particle, types.Domain
+    if capacity:
+        particle = RECORD
+    cell_place, segment_count, segment_cells = (
+        types.cell_place,
+        types.segment_count,
+        types.segment_cells,
+    )
+    periodic_image = types.periodic_image
+    load_vector = make_wide_load(vector, scalar)
+    add_scalar = make_lane_sum(scalar, scalar, lanes)
+    positions_ahead = wp.types.matrix((AHEAD, space_dim), scalar)
+    keep = make_lists(capacity)
+    list_address, append_step, leave_list = keep.list_address, keep.append_step, keep.leave_list
+
+    @wp.func
+    def falloff_at(domain: Domain, offset: vector):
+        """1 - r^2 / eps^2 of a candidate, 0 beyond eps."""
+        nearest = offset
+        if wp.static(periodic):
+            nearest = periodic_image(domain, nearest)
+        squared = wp.dot(nearest, nearest)
+        return wp.max(scalar(1.0) - squared * domain.inverse_squared_eps, scalar(0.0))
+
+    topic = "listed_density_in_box" if periodic else "listed_density"
+    topic += f"_listing_{capacity}" * (capacity > 0)
+
+    @wp.kernel(enable_backward=False, module=kernel_module(topic, space_dim, scalar, 0, lanes))
+    def compute_density(
+        domain: Domain,
+        starts: wp.array(dtype=wp.int32),
+        sorted_cell: wp.array(dtype=wp.int32),
+        sorted_positions: wp.array(dtype=vector),
+        state_place: wp.array(dtype=wp.int32),
+        # outputs
+        particles: wp.array(dtype=particle),
+        lists: wp.array(dtype=wp.int16),
+        list_lengths: wp.array(dtype=wp.int32),
+    ):
+        """Write every particle's position and volume 1 / rho."""
+        thread = wp.tid()
+        k = thread >> wp.static(lanes.bit_length() - 1)
+        lane = thread & wp.static(lanes - 1)
+        position = load_vector(sorted_positions, k)
+        index = load_integer(sorted_cell, k)
+        local = wp.int32(wp.uint32(index) % wp.uint32(domain.cell_count))
+        base = index - local
+        cell = cell_place(domain, local)
+        total = scalar(0.0)
+        if wp.static(capacity > 0):
+            list_begin = list_address()
+            list_end = list_begin
+        for segment in range(segment_count(domain, cell)):
+            first, last = segment_cells(domain, cell, segment)
+            end = load_integer(starts, base + last)
+            j = load_integer(starts, base + first) + lane
+            if wp.static(capacity > 0):
+                # Several positions are asked for before the first is used.
+                while j + wp.static(AHEAD - 1) < end:
+                    ahead = positions_ahead()
+                    for step in range(wp.static(AHEAD)):
+                        ahead[step] = load_vector(sorted_positions, j + step)
+                    for step in range(wp.static(AHEAD)):
+                        falloff = falloff_at(domain, ahead[step] - position)
+                        list_end = append_step(list_begin, list_end, falloff, j + step - k)
+                        total += falloff * falloff * falloff
+                    j += wp.static(AHEAD)
+                if j < end:
+                    ahead = positions_ahead()
+                    for step in range(wp.static(AHEAD - 1)):
+                        ahead[step] = load_vector(sorted_positions, wp.min(j + step, end - 1))
+                    for step in range(wp.static(AHEAD - 1)):
+                        falloff = falloff_at(domain, ahead[step] - position)
+                        falloff = wp.where(j + step < end, falloff, scalar(0.0))
+                        list_end = append_step(list_begin, list_end, falloff, j + step - k)
+                        total += falloff * falloff * falloff
+            else:
+                for candidate in range(j, end, wp.static(lanes)):
+                    offset = load_vector(sorted_positions, candidate) - position
+                    falloff = falloff_at(domain, offset)
+                    total += falloff * falloff * falloff
+        # A particle always sees itself: a position that is not finite would otherwise have rho 0.
+        total = wp.max(add_scalar(total), scalar(1.0))
+        if lane == 0:
+            entry = particle()
+            for d in range(wp.static(space_dim)):
+                entry[d] = position[d]
+            entry[wp.static(space_dim)] = scalar(1.0) / (domain.smoothing_norm * total)
+            if wp.static(capacity > 0 and flat):
+                number = k
+                if state_place.shape[0] > 0:
+                    number = load_integer(state_place, k)
+                entry[3] = as_word(number)
+            particles[k] = entry
+            if wp.static(capacity > 0):
+                list_lengths[k] = leave_list(list_begin, list_end, k, lists)
+
+    return compute_density
