@@ -212,6 +212,12 @@ def test_the_other_code_about_own_environments_runs_as_it_says(ring, monkeypatch
     assert last == pytest.approx(float(told[2]), abs=2e-3)
 
 
+def test_the_code_about_training_runs(capsys):
+    (block,) = code_blocks(DOCS / "training.md")
+    exec(compile(block, "training.md", "exec"), {})
+    assert capsys.readouterr().out.startswith("random: ")
+
+
 def test_the_code_of_the_readme_runs():
     operators, environments = code_blocks(ROOT / "README.md")
     names = {}

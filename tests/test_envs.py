@@ -252,7 +252,7 @@ def test_random_actions_live_through_a_default_episode():
     env = gymnasium.make("npa/Morphogenesis2D-v0", particle_count=256)
     env.reset(seed=0)
     for action in actions(env, 256):
-        _, _, terminated, truncated, info = env.step(action)
+        _, _, terminated, truncated, _ = env.step(action)
         assert not terminated
     assert truncated
 

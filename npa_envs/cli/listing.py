@@ -35,9 +35,7 @@ def main(arguments: Sequence[str]) -> int:
             print(
                 f"    {preset}: {config.total_iterations} iterations of {config.world_count} worlds"
             )
-    print(
-        "environments (import npa_envs; gymnasium.make(NAME), gymnasium.make_vec(NAME, num_envs=64))"
-    )
+    print("environments (import npa_envs; gymnasium.make(NAME) or make_vec(NAME, num_envs=64))")
     for environment in ENVIRONMENTS:
         print(f"  {environment.id}: episodes of {environment.max_episode_steps} steps")
     print("targets (--target NAME, the path of a picture, or one emoji)")

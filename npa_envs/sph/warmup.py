@@ -11,7 +11,9 @@ from npa_envs.sph.draws import bernoulli_draw, integer_draw, normal_draw, unifor
 from npa_envs.sph.fields import perceive
 from npa_envs.sph.finite import mark_finite
 from npa_envs.sph.operators import Rows
+from npa_envs.sph.passes import Terms
 from npa_envs.sph.picture_losses import picture_losses
+from npa_envs.sph.rows import survey, write_observation
 from npa_envs.sph.splat import splat
 from npa_envs.sph.update import update_particles
 from npa_envs.sph.worlds import world_mean
@@ -50,6 +52,7 @@ def warmup(
             _pull_back(perceive(x, s, 0.1, detach_positions=False))
             _warm_update(x, s)
             _warm_actions(x, s)
+            _warm_observation(x, s)
             if space_dim == 2:
                 _warm_pictures(x)
 
@@ -60,6 +63,16 @@ def _warm_pictures(x: torch.Tensor) -> None:
     _pull_back(picture)
     middle = x.new_zeros(2)
     picture_losses(x.detach(), colours, picture.detach()[0], goal=middle, shift=0.0, pixel_size=0.1)
+
+
+def _warm_observation(x: torch.Tensor, s: torch.Tensor) -> None:
+    """Small and large worlds have kernels of their own."""
+    for particle_count in (x.shape[1], 4096):
+        places = x.detach()[:, :1].expand(-1, particle_count, -1)
+        states = s.detach()[:, :1].expand(-1, particle_count, -1)
+        surveyed = survey(places, states, eps=0.1, eps0=0.1, box=None, terms=Terms())
+        width = Terms().perception_dim(x.shape[2], s.shape[2])
+        write_observation(surveyed, 1.0, x.new_empty(particle_count, width))
 
 
 def _warm_update(x: torch.Tensor, s: torch.Tensor) -> None:
