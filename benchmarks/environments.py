@@ -309,7 +309,9 @@ def main() -> None:
                 show(rows[-1])
     for row in rows if cuda or arguments.quick else ():
         add_kernels(row, device, arguments.quick)
-    peer_rows = [] if arguments.skip_peers else list(peers.measure_all(device, arguments.quick))
+    peer_rows = (
+        [] if arguments.skip_peers else list(peers.measure_all(device, arguments.quick, CALM))
+    )
     for row in peer_rows:
         show(row)
     report = {

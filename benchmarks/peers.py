@@ -42,14 +42,14 @@ def median_time(run: Callable[[], None], device: torch.device, seconds: float) -
     return statistics.median(times)
 
 
-def measure_gymnasium(mode: str, quick: bool) -> dict[str, Any]:
+def measure_gymnasium(mode: str, quick: bool, calm: float) -> dict[str, Any]:
     """Return the row of Gymnasium's own vectorisation of the single environment, on the CPU."""
     world_count = 2 if quick else GYMNASIUM_WORLDS
     particle_count = 64 if quick else GYMNASIUM_PARTICLES
     # A process that is forked would share locks and a CUDA context with this one.
     options = {"context": "spawn"} if mode == "async" else {}
     env = gymnasium.make_vec(
-        "npa/Morphogenesis2D-v0",
+        "npa_envs:npa/Morphogenesis2D-v0",
         num_envs=world_count,
         vectorization_mode=mode,
         vector_kwargs=options,
@@ -57,12 +57,12 @@ def measure_gymnasium(mode: str, quick: bool) -> dict[str, Any]:
         max_episode_steps=EPISODE_STEPS,
     )
     env.action_space.seed(0)
-    actions = env.action_space.sample()
+    sets = [calm * env.action_space.sample() for _ in range(4)]
     env.reset(seed=0)
 
     def run() -> None:
-        for _ in range(EPISODE_STEPS):
-            env.step(actions)
+        for k in range(EPISODE_STEPS):
+            env.step(sets[k % len(sets)])
 
     taken = median_time(run, torch.device("cpu"), 0.0 if quick else 2.0) / EPISODE_STEPS
     env.close()
@@ -113,11 +113,14 @@ def measure_vmas(
     }
 
 
-def measure_all(device: torch.device, quick: bool) -> Iterator[dict[str, Any]]:
-    """Yield a row for each peer: Gymnasium's on a CPU, and VMAS's on the device."""
+def measure_all(device: torch.device, quick: bool, calm: float) -> Iterator[dict[str, Any]]:
+    """Yield a row for each peer: Gymnasium's on a CPU, and VMAS's on the device.
+
+    `calm` scales the actions in our environments, as in `environments.py`.
+    """
     if device.type == "cpu":
         for mode in ("sync", "async"):
-            yield measure_gymnasium(mode, quick)
+            yield measure_gymnasium(mode, quick, calm)
     if importlib.util.find_spec("vmas") is None:
         print("vmas is not installed, and is left out: pip install vmas")
         return
