@@ -75,8 +75,10 @@ def checked_particles(
         NPAError: A shape is another one, or a number is not finite or beyond its limit.
     """
     given = []
-    shapes = (("x", x, physics.space_dim, physics.position_limit, "position_limit"),)
-    shapes += (("s", s, physics.state_dim, physics.state_limit, "observation_limit"),)
+    shapes = (
+        ("x", x, physics.space_dim, physics.position_limit, "position_limit"),
+        ("s", s, physics.state_dim, physics.state_limit, "observation_limit"),
+    )
     for name, value, width, limit, limit_name in shapes:
         tensor = torch.as_tensor(value, dtype=torch.float32, device=device)
         wanted = (world_count, particle_count, width)

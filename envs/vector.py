@@ -112,9 +112,10 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
         Raises:
             NPAError: The mask or the seeds have a wrong shape.
         """
-        if isinstance(seed, np.integer):
-            seed = int(seed)
-        super().reset(seed=seed if isinstance(seed, int) else None)
+        first: Any = seed
+        if isinstance(first, np.integer):
+            seed = first = int(first)
+        super().reset(seed=first if isinstance(first, int) else None)
         chosen = worlds_to_reset(options, self.num_envs)
         if not self._started and len(chosen) < self.num_envs:
             raise NPAError("reset_mask needs worlds to leave alone: reset all of them first")
