@@ -76,6 +76,8 @@ def test_an_event_without_a_size_has_the_usual_one():
         (lambda: DamageEvents(single(), []), "at least one event"),
         (lambda: DamageEvents(single(), ["3:burn"]), "unknown damage 'burn'"),
         (lambda: DamageEvents(single(), [3]), "text or a DamageEvent"),
+        (lambda: DamageEvents(single(), 5), "text or a DamageEvent, got int"),
+        (lambda: DamageEvents(single(), None), "text or a DamageEvent, got NoneType"),
         (lambda: DamageEvents(single(), "3:cut", every=0), "every must be a whole number"),
         (lambda: DamageEvents(batched(), "3:cut"), "use VectorDamageEvents"),
         (lambda: VectorDamageEvents(single(), "3:cut"), "use DamageEvents for a single"),

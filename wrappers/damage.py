@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import gymnasium
@@ -46,7 +46,10 @@ class Schedule:
     """
 
     def __init__(self, events: Event | Sequence[Event], every: int | None) -> None:
-        given = [events] if isinstance(events, str | DamageEvent) else list(events)
+        several: Any = events
+        if isinstance(events, str | DamageEvent) or not isinstance(several, Iterable):
+            several = [events]
+        given = list(several)
         if not given:
             raise NPAError("events must hold at least one event, got none: for example '100:cut'")
         if every is not None and not (is_whole(every) and every >= 1):
