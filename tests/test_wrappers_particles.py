@@ -39,7 +39,7 @@ def policy(observation):
 def test_rows_are_the_particles_of_the_worlds_in_order():
     rows, envs = ParticleVecEnv(batched()), batched()
     assert rows.num_envs == 128
-    assert rows.observation_space == gym.spaces.Box(-16.0, 16.0, (66,), np.float32)
+    assert rows.observation_space == gym.spaces.Box(-64.0, 64.0, (66,), np.float32)
     assert rows.action_space == gym.spaces.Box(-1.0, 1.0, (18,), np.float32)
     assert rows.seed(3) == [3] * 64 + [4] * 64
     seen, (observation, _) = rows.reset(), envs.reset(seed=3)
