@@ -101,7 +101,7 @@ def queued_time(env: Any, device: torch.device) -> float:
         worlds._beside.run(worlds._measure)
         worlds._survey()
         worlds._beside.join()
-        place_perception(*worlds._surveyed, worlds.physics, worlds.x.shape, out)
+        place_perception(worlds._surveyed, worlds.physics, out)
 
     queue()
     synchronize(device)

@@ -238,7 +238,7 @@ class Worlds:
             self._survey()
             # The long perception comes last: the host knows the endings while it still runs.
             self._beside.join()
-        observation = place_perception(*self._surveyed, self.physics, self.x.shape, out)
+        observation = place_perception(self._surveyed, self.physics, out)
         if self._beside is not None:
             self._beside.wait()
         if not self._host_endings[-1]:

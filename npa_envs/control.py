@@ -7,7 +7,6 @@ graph.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -77,7 +76,7 @@ class Physics:
         return self.state_dim + (self.space_dim if self.moving else 0)
 
 
-def perceive_worlds(x: Tensor, s: Tensor, physics: Physics) -> tuple[Surveyed]:
+def perceive_worlds(x: Tensor, s: Tensor, physics: Physics) -> Surveyed:
     """Return what `place_perception` needs: the worlds sorted, their densities known.
 
     Args:
@@ -85,23 +84,20 @@ def perceive_worlds(x: Tensor, s: Tensor, physics: Physics) -> tuple[Surveyed]:
         s: States, dimensionless, shape [B, N, C], finite; they may be read again later.
         physics: The worlds' constants.
     """
-    surveyed = survey(x, s, eps=physics.eps, eps0=physics.eps0, box=physics.box, terms=Terms())
-    return (surveyed,)
+    return survey(x, s, eps=physics.eps, eps0=physics.eps0, box=physics.box, terms=Terms())
 
 
-def place_perception(
-    surveyed: Surveyed, physics: Physics, shape: Sequence[int], out: Tensor | None = None
-) -> Tensor:
+def place_perception(surveyed: Surveyed, physics: Physics, out: Tensor | None = None) -> Tensor:
     """Return what every particle perceives, clipped, in the particles' order, shape [B, N, P].
 
     Args:
         surveyed: What `perceive_worlds` returned, before states change.
         physics: The worlds' constants.
-        shape: B and N, and whatever follows.
         out: Where to write it, contiguous; a new tensor otherwise.
     """
     if out is None:
-        out = surveyed.ordered.positions.new_empty(shape[0], shape[1], physics.perception_dim)
+        shape = (surveyed.plan.world_count, surveyed.plan.particle_count, physics.perception_dim)
+        out = surveyed.ordered.positions.new_empty(shape)
     write_observation(surveyed, physics.perception_limit, out.view(-1, physics.perception_dim))
     return out
 
@@ -115,7 +111,7 @@ def observe(x: Tensor, s: Tensor, physics: Physics) -> Tensor:
         s: States, dimensionless, shape [B, N, C], finite.
         physics: The worlds' constants.
     """
-    return place_perception(*perceive_worlds(x, s, physics), physics, x.shape)
+    return place_perception(perceive_worlds(x, s, physics), physics)
 
 
 @torch.no_grad()

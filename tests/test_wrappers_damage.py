@@ -4,6 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from wrapped_envs import ACTIONS, SMALL, STEPS, batched, policy, single
 
 import npa_envs  # noqa: F401 (registers the environments)
 from npa_envs.errors import NPAError
@@ -14,31 +15,6 @@ from npa_envs.wrappers import (
     VectorDamageEvents,
     VectorNormalizePerception,
 )
-
-SMALL = {"particle_count": 64, "eps": 0.3, "resolution": 16}
-STEPS = 8
-ACTIONS = 18
-
-
-def single(**keywords):
-    return gym.make("npa/Morphogenesis2D-v0", max_episode_steps=STEPS, **SMALL, **keywords)
-
-
-def batched(count=3, **keywords):
-    return gym.make_vec(
-        "npa/Morphogenesis2D-v0",
-        num_envs=count,
-        vectorization_mode="vector_entry_point",
-        max_episode_steps=STEPS,
-        **{**SMALL, **keywords},
-    )
-
-
-def policy(observation):
-    """Any deterministic function of each particle's observation."""
-    if isinstance(observation, torch.Tensor):
-        return torch.clip(3.0 * observation[..., -ACTIONS:] + 0.1, -1.0, 1.0)
-    return np.clip(3.0 * observation[..., -ACTIONS:] + 0.1, -1.0, 1.0)
 
 
 def episodes_of_one(seed, events, count=2, **keywords):

@@ -1,34 +1,15 @@
 """Gymnasium's own wrappers over the environments."""
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import wrappers
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 from gymnasium.wrappers import vector
+from wrapped_envs import ACTIONS, STEPS, batched, single
 
 import npa_envs  # noqa: F401 (registers the environments)
 
 IDS = ["npa/Morphogenesis2D-v0", "npa/Regeneration2D-v0"]
-SMALL = {"particle_count": 64, "eps": 0.3, "resolution": 16}
-STEPS = 8
-ACTIONS = 18
-
-
-def single(id="npa/Morphogenesis2D-v0", **keywords):
-    rule = {"rule": "picture"} if "Regeneration" in id else {}
-    return gym.make(id, **{"max_episode_steps": STEPS, **SMALL, **rule, **keywords})
-
-
-def batched(count=3, **keywords):
-    return gym.make_vec(
-        "npa/Morphogenesis2D-v0",
-        num_envs=count,
-        vectorization_mode="vector_entry_point",
-        max_episode_steps=STEPS,
-        **SMALL,
-        **keywords,
-    )
 
 
 def actions(step, *shape):

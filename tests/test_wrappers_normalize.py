@@ -6,6 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from wrapped_envs import ACTIONS, STEPS, batched, policy, single
 
 import npa_envs  # noqa: F401 (registers the environments)
 from npa_envs.errors import NPAError
@@ -16,28 +17,7 @@ from npa_envs.wrappers import (
 )
 from npa_envs.wrappers.normalize import PerceptionStatistics
 
-SMALL = {"particle_count": 64, "eps": 0.3, "resolution": 16}
-STEPS = 8
-C, D, P, ACTIONS = 16, 2, 66, 18
-
-
-def single(**keywords):
-    return gym.make("npa/Morphogenesis2D-v0", max_episode_steps=STEPS, **SMALL, **keywords)
-
-
-def batched(count=3, **keywords):
-    return gym.make_vec(
-        "npa/Morphogenesis2D-v0",
-        num_envs=count,
-        vectorization_mode="vector_entry_point",
-        max_episode_steps=STEPS,
-        **SMALL,
-        **keywords,
-    )
-
-
-def policy(observation):
-    return np.clip(3.0 * observation[..., -ACTIONS:] + 0.1, -1.0, 1.0)
+C, D, P = 16, 2, 66
 
 
 def expected_scales(z):

@@ -7,6 +7,8 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
+import wrapped_envs
+from wrapped_envs import ACTIONS, SMALL, STEPS, policy
 
 import npa_envs
 from npa_envs.errors import MissingDependencyError, NPAError
@@ -18,22 +20,9 @@ from stable_baselines3.common.vec_env import VecMonitor, VecNormalize  # noqa: E
 
 from npa_envs.wrappers import ParticleVecEnv  # noqa: E402
 
-SMALL = {"particle_count": 64, "eps": 0.3, "resolution": 16}
-STEPS = 8
-ACTIONS = 18
-
 
 def batched(count=2, **keywords):
-    return gym.make_vec(
-        "npa/Morphogenesis2D-v0",
-        num_envs=count,
-        vectorization_mode="vector_entry_point",
-        **{"max_episode_steps": STEPS, "reward": "particle", **SMALL, **keywords},
-    )
-
-
-def policy(observation):
-    return np.clip(3.0 * observation[..., -ACTIONS:] + 0.1, -1.0, 1.0)
+    return wrapped_envs.batched(count, **{"reward": "particle", **keywords})
 
 
 def test_rows_are_the_particles_of_the_worlds_in_order():

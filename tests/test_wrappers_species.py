@@ -4,29 +4,13 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from wrapped_envs import STEPS, batched, single
 
 import npa_envs  # noqa: F401 (registers the environments)
 from npa_envs.errors import NPAError
 from npa_envs.wrappers import NormalizePerception, SpeciesTags, VectorSpeciesTags
 
-SMALL = {"particle_count": 64, "eps": 0.3, "resolution": 16}
-STEPS = 8
 ACTION = np.full((64, 18), 0.1, np.float32)
-
-
-def single(**keywords):
-    return gym.make("npa/Morphogenesis2D-v0", max_episode_steps=STEPS, **SMALL, **keywords)
-
-
-def batched(count=3, **keywords):
-    return gym.make_vec(
-        "npa/Morphogenesis2D-v0",
-        num_envs=count,
-        vectorization_mode="vector_entry_point",
-        max_episode_steps=STEPS,
-        **SMALL,
-        **keywords,
-    )
 
 
 def test_tags_stand_behind_the_observation():

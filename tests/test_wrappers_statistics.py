@@ -1,6 +1,5 @@
 """Torch versions of Gymnasium's statistics wrappers, held to Gymnasium's own."""
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -9,6 +8,7 @@ from gymnasium.wrappers.vector import (
     NormalizeReward,
     RecordEpisodeStatistics,
 )
+from wrapped_envs import ACTIONS, STEPS, batched
 
 import npa_envs  # noqa: F401 (registers the environments)
 from npa_envs.errors import NPAError
@@ -18,19 +18,7 @@ from npa_envs.wrappers import (
     TorchRecordEpisodeStatistics,
 )
 
-SMALL = {"particle_count": 64, "eps": 0.3, "resolution": 16}
-STEPS = 8
-ACTIONS = 18
 MODES = ["same-step", "next-step", "disabled"]
-
-
-def batched(count=3, **keywords):
-    return gym.make_vec(
-        "npa/Morphogenesis2D-v0",
-        num_envs=count,
-        vectorization_mode="vector_entry_point",
-        **{"max_episode_steps": STEPS, **SMALL, **keywords},
-    )
 
 
 def pair(torch_wrapper, wrapper, mode="same-step", **keywords):

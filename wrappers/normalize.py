@@ -148,7 +148,29 @@ def recorded(statistics: PerceptionStatistics, training: bool) -> dict[str, Any]
     return {"clip": statistics.clip, "epsilon": statistics.epsilon, "training": training}
 
 
-class NormalizePerception(AnyWrapper, RecordConstructorArgs):
+class KeepsStatistics:
+    """What both wrappers offer for saving and loading their statistics."""
+
+    statistics: PerceptionStatistics
+    """The running statistics."""
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return the statistics, for `torch.save` or safetensors."""
+        return self.statistics.moments.state_dict()
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Take over the statistics of another wrapper.
+
+        Args:
+            state: What its `state_dict` returned.
+
+        Raises:
+            NPAError: It belongs to other observations.
+        """
+        self.statistics.moments.load_state_dict(state)
+
+
+class NormalizePerception(KeepsStatistics, AnyWrapper, RecordConstructorArgs):
     """Bring perception to one scale, by running statistics.
 
     The environment's spec holds how, and not the statistics: save those with `state_dict`.
@@ -199,28 +221,13 @@ class NormalizePerception(AnyWrapper, RecordConstructorArgs):
         observation, reward, terminated, truncated, info = self.env.step(action)
         return self._normalized(observation), reward, terminated, truncated, info
 
-    def state_dict(self) -> dict[str, Tensor]:
-        """Return the statistics, for `torch.save` or safetensors."""
-        return self.statistics.moments.state_dict()
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Take over the statistics of another wrapper.
-
-        Args:
-            state: What its `state_dict` returned.
-
-        Raises:
-            NPAError: It belongs to other observations.
-        """
-        self.statistics.moments.load_state_dict(state)
-
     def _normalized(self, observation: Any) -> Any:
         if self.training:
             self.statistics.update(observation)
         return self.statistics.normalize(observation)
 
 
-class VectorNormalizePerception(VectorObservations, RecordConstructorArgs):
+class VectorNormalizePerception(KeepsStatistics, VectorObservations, RecordConstructorArgs):
     """`NormalizePerception` for vector environments, of NumPy arrays or tensors on a device.
 
     Final observations are normalised and not counted, nor are those of worlds that a reset leaves
@@ -269,18 +276,3 @@ class VectorNormalizePerception(VectorObservations, RecordConstructorArgs):
     def final_observations(self, observations: Any) -> Any:
         """Return observations normalised."""
         return self.statistics.normalize(observations)
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """Return the statistics, for `torch.save` or safetensors."""
-        return self.statistics.moments.state_dict()
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Take over the statistics of another wrapper.
-
-        Args:
-            state: What its `state_dict` returned.
-
-        Raises:
-            NPAError: It belongs to other observations.
-        """
-        self.statistics.moments.load_state_dict(state)

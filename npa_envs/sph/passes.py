@@ -125,25 +125,25 @@ def compute_density(
         terms: Groups of the perception that follows.
         lanes: Threads of a particle where neighbours are listed; default: the plan's.
     """
+    if not plan.listed:
+        return compute_density_gradients(plan, ordered, terms)
     positions = ordered.positions
     particles = positions.new_empty(plan.total, plan.space_dim + 1)
-    if plan.listed:
-        lanes = lanes or plan.lanes
-        launch(
-            listed_density(plan.space_dim, lanes, plan.periodic),
-            plan.total * lanes,
-            positions.device,
-            plan.domain,
-            ordered.starts,
-            ordered.cell,
-            positions,
-            None,
-            particles,
-            None,
-            None,
-        )
-        return Densities(particles, positions.new_empty(0, plan.space_dim, dtype=torch.float64))
-    return compute_density_gradients(plan, ordered, terms)
+    lanes = lanes or plan.lanes
+    launch(
+        listed_density(plan.space_dim, lanes, plan.periodic),
+        plan.total * lanes,
+        positions.device,
+        plan.domain,
+        ordered.starts,
+        ordered.cell,
+        positions,
+        None,
+        particles,
+        None,
+        None,
+    )
+    return Densities(particles, positions.new_empty(0, plan.space_dim, dtype=torch.float64))
 
 
 def compute_density_gradients(plan: Plan, ordered: SortedWorlds, terms: Terms) -> Densities:
@@ -192,7 +192,7 @@ def write_perception(
         terms: Groups of the perception vector.
         scale: c = eps / eps0, dimensionless.
         out: Rows to write, shape [K, row_width].
-        states: States in the caller's order, where `ordered` has none; see `reads_in_place`.
+        states: States in the caller's order, where `ordered` has none.
         destination: Row of `out` for each row, int32, shape [K]; default: its own.
         limit: Entries are clipped to plus and minus this; 0: they are not.
         row_kernel_sum: Where to write the rows' sums of v K, shape [K, D], for the adjoint.
