@@ -15,6 +15,7 @@ from npa_envs.envs.arrays import checked_action, checked_particles, to_output
 from npa_envs.envs.screen import Screen
 from npa_envs.envs.spaces import action_space, observation_space
 from npa_envs.envs.task import EnvTask
+from npa_envs.envs.vector_options import world_keys
 from npa_envs.envs.worlds import DIVERGED, SUCCESS, Worlds, reason
 from npa_envs.errors import NPAError
 
@@ -71,9 +72,7 @@ class NPAEnv(gymnasium.Env[Any, Any]):
         keys = None
         if seed is not None or self.np_random is not self._keyed_from:
             self._keyed_from = self.np_random
-            keys = torch.from_numpy(
-                self.np_random.integers(2**64, size=1, dtype=np.uint64).view(np.int64)
-            )
+            keys = world_keys(None, 1, self.np_random)
         with self.worlds.here():
             observation = self.worlds.start(self._world, keys)
         self._started = True

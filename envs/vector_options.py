@@ -1,4 +1,4 @@
-"""What a batched environment is given when it is made and reset, checked."""
+"""What environments, batched ones above all, are given when made and reset, checked."""
 
 from __future__ import annotations
 
