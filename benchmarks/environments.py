@@ -6,9 +6,9 @@ dense disk (Morphogenesis2D), or as grown and damaged pictures (Regeneration2D).
 observations stay on the device and the host reads one byte a world; on a CPU they are NumPy's.
 
 Of a step's wall time, `wait` is what the host spent waiting for the device; the rest of it the host
-was busy. `calm_step` is a step without resets, `queued` the same work queued on the device without
-anything of Python's between: the difference is what Python costs. `device` is the sum of the
-kernels' times, `idle` the share of a step without any.
+was busy. `calm_step` is a step without resets, `queued` the same steps of the same worlds with the
+work queued on the device and nothing of Python's between: the difference is what Python costs.
+`device` is the sum of the kernels' times, `idle` the share of a step without any.
 """
 
 from __future__ import annotations
@@ -29,8 +29,6 @@ import peers
 import torch
 from torch.autograd import DeviceType
 from torch.profiler import ProfilerActivity, profile
-
-from npa_envs.control import place_perception
 
 
 class Case(NamedTuple):
@@ -55,8 +53,8 @@ BROKEN_DOWN = (Case(1024, 1024), Case(64, 4096))
 """Cases of which the kernels are listed."""
 
 STARTS: dict[str, tuple[str, dict[str, Any]]] = {
-    "seed": ("npa/Morphogenesis2D-v0", {}),
-    "grown": ("npa/Regeneration2D-v0", {"success_loss": 0.0}),
+    "seed": ("npa_envs:npa/Morphogenesis2D-v0", {}),
+    "grown": ("npa_envs:npa/Regeneration2D-v0", {"success_loss": 0.0}),
 }
 """Where episodes start; none ends in success, so that all are equally long."""
 
@@ -64,6 +62,8 @@ EPISODE_STEPS = 64
 CALM = 0.25
 """Actions are uniform in plus and minus this: full ones let states run away within an episode."""
 ACTION_SETS = 4
+CALM_STEPS, COMPARISONS = 16, 9
+"""Steps without resets that are timed with and without Python, and how often."""
 ENOUGH_SECONDS = 2.0
 MAX_EPISODES = 9
 LISTED_KERNELS = 12
@@ -73,43 +73,54 @@ class TimedWait:
     """Adds up how long the host waits for the device in the steps of some worlds.
 
     Args:
-        worlds: The worlds of an environment on CUDA.
+        worlds: The worlds of an environment on CUDA, whose event it replaces.
     """
 
     def __init__(self, worlds: Any) -> None:
         self.waited = 0.0
-        self._wait = worlds._beside.wait
-        worlds._beside.wait = self._timed
+        self._event = worlds._judged
+        worlds._judged = self
 
-    def _timed(self) -> None:
+    def record(self) -> None:
+        """Record the event."""
+        self._event.record()
+
+    def synchronize(self) -> None:
+        """Wait for the event."""
         start = time.perf_counter()
-        self._wait()
+        self._event.synchronize()
         self.waited += time.perf_counter() - start
 
 
-def queued_time(env: Any, device: torch.device) -> float:
-    """Return the time of a step [s] where the host only queues it: no reading, no infos, no resets.
+def python_times(env: Any, actions: list[Any], device: torch.device) -> tuple[float, float]:
+    """Return the times of a step [s] as it is, and where the host only queues the device's work.
 
-    What a whole step without resets takes longer is what the device waits for Python.
+    Both are medians over the same steps, from the same worlds, without resets; the second neither
+    reads endings nor makes infos. What the first takes longer is what Python costs.
     """
     worlds = env.unwrapped.worlds
-    worlds._action.mul_(CALM)
+    changing = (worlds.x, worlds.s, worlds.random.steps, worlds.elapsed)
+    before = [tensor.clone() for tensor in changing]
     out = worlds.perceive()
 
-    def queue() -> None:
-        worlds._act()
-        worlds._beside.run(worlds._measure)
-        worlds._survey()
-        worlds._beside.join()
-        place_perception(worlds._surveyed, worlds.physics, out)
+    def queue(action: Any) -> None:
+        worlds._take(action)
+        worlds._advance()
+        worlds._surveyed.perceive(out)
 
-    queue()
-    synchronize(device)
-    start = time.perf_counter()
-    for _ in range(EPISODE_STEPS):
-        queue()
-    synchronize(device)
-    return (time.perf_counter() - start) / EPISODE_STEPS
+    times: dict[Callable[[Any], Any], list[float]] = {env.step: [], queue: []}
+    for _ in range(COMPARISONS):
+        for run, taken in times.items():
+            for tensor, value in zip(changing, before, strict=True):
+                tensor.copy_(value)
+            synchronize(device)
+            start = time.perf_counter()
+            for k in range(CALM_STEPS):
+                run(actions[k % len(actions)])
+            synchronize(device)
+            taken.append((time.perf_counter() - start) / CALM_STEPS)
+    calm, queued = (statistics.median(taken) for taken in times.values())
+    return calm, queued
 
 
 def make(case: Case, start: str, device: torch.device, quick: bool) -> Any:
@@ -229,10 +240,8 @@ def measure(
     run(EPISODE_STEPS // 2)
     row["neighbours"] = neighbour_count(env)
     if wait is not None:
-        # Without a reset in between: the quarter of an episode that follows.
-        quarter = EPISODE_STEPS // 4
-        row["calm_step_us"] = run(quarter) / quarter * 1e6
-        row["queued_us"] = queued_time(env, device) * 1e6
+        calm, queued = python_times(env, random_actions(env, device), device)
+        row["calm_step_us"], row["queued_us"] = calm * 1e6, queued * 1e6
     env.close()
     return row
 

@@ -9,7 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.replay import Replayed
+from npa_envs.control import SurveyedWorlds
+from npa_envs.replay import Replayed, sent
 
 GROWTH = 4
 """Each recorded size is so many times the one before it."""
@@ -22,8 +23,8 @@ class Restarts:
     it is then started twice in the same way, which is the same as once.
 
     Args:
-        start: Starts the next episodes of worlds (indices, int64, shape [M]) and returns what is
-            perceived there, [M, N, P].
+        start: Starts the next episodes of worlds (indices, int64, shape [M]) and returns them made
+            ready for perception in the rows of the whole batch.
         world_count: Worlds B.
         device: Where they live.
         recorded: Whether `start` may be recorded: it never waits for the device.
@@ -31,7 +32,7 @@ class Restarts:
 
     def __init__(
         self,
-        start: Callable[[Tensor], Tensor],
+        start: Callable[[Tensor], SurveyedWorlds],
         world_count: int,
         device: torch.device,
         *,
@@ -51,30 +52,33 @@ class Restarts:
             observation: Where to write what is perceived in them, shape [B, N, P].
         """
         if not self._recorded:
-            index = torch.from_numpy(worlds).to(self._device)
-            observation[index] = self._start(index)
+            self._start(sent(worlds, self._device)).perceive(observation)
             return
         size = 1
         while size < len(worlds):
             size = min(size * GROWTH, self._world_count)
         if size not in self._chunks:
             self._chunks[size] = _Chunk(self._start, size, self._device)
-        chunk = self._chunks[size]
         filled = np.full(size, worlds[-1])
         filled[: len(worlds)] = worlds
-        chunk.index.copy_(torch.from_numpy(filled))
-        chunk.replayed()
-        observation.index_copy_(0, chunk.index[: len(worlds)], chunk.perceived[: len(worlds)])
+        self._chunks[size].restart(sent(filled, self._device), observation)
 
 
 class _Chunk:
     """The recorded start of a fixed number of worlds."""
 
-    def __init__(self, start: Callable[[Tensor], Tensor], size: int, device: torch.device) -> None:
-        self.index = torch.zeros(size, dtype=torch.int64, device=device)
-        self.perceived = torch.empty(0)
-        self.replayed = Replayed(self._run, device)
+    def __init__(
+        self, start: Callable[[Tensor], SurveyedWorlds], size: int, device: torch.device
+    ) -> None:
         self._start = start
+        self._index = torch.zeros(size, dtype=torch.int64, device=device)
+        self._replayed = Replayed(self._run, device)
+
+    def restart(self, worlds: Tensor, observation: Tensor) -> None:
+        """Start the next episodes of as many worlds as the chunk is for."""
+        self._index.copy_(worlds)
+        self._replayed()
+        self._surveyed.perceive(observation)
 
     def _run(self) -> None:
-        self.perceived = self._start(self.index)
+        self._surveyed = self._start(self._index)

@@ -74,10 +74,11 @@ class NPAEnv(gymnasium.Env[Any, Any]):
             self._keyed_from = self.np_random
             keys = world_keys(None, 1, self.np_random)
         with self.worlds.here():
-            observation = self.worlds.start(self._world, keys)
+            self.worlds.start(self._world, keys)
+            observation = self.worlds.perceive()
         self._started = True
         self._show()
-        return self._out(observation[0]), self._losses(self.worlds.numbers[:, 0].tolist())
+        return self._out(observation[0]), self._losses(self.worlds.report.numbers[:, 0].tolist())
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Apply an action and perceive.
@@ -102,7 +103,7 @@ class NPAEnv(gymnasium.Env[Any, Any]):
             endings, observation = worlds.step(checked)
         ending = int(endings[0])
         ended = ending & (SUCCESS | DIVERGED) != 0
-        names, numbers = worlds.part_names, worlds.numbers[:, 0].tolist()
+        names, numbers = worlds.part_names, worlds.report.numbers[:, 0].tolist()
         info = self._losses(numbers)
         info |= {f"reward_{name}": numbers[2 + len(names) + k] for k, name in enumerate(names)}
         info |= {"success": bool(ending & SUCCESS), "diverged": bool(ending & DIVERGED)}
@@ -145,7 +146,8 @@ class NPAEnv(gymnasium.Env[Any, Any]):
         x, s = (torch.as_tensor(value)[None] for value in (x, s))
         start = checked_particles(x, s, 1, count, physics, self.task.device)
         with self.worlds.here():
-            observation = self.worlds.place(self._world, start)
+            self.worlds.place(self._world, start)
+            observation = self.worlds.perceive()
         self._show()
         return self._out(observation[0])
 

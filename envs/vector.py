@@ -22,6 +22,7 @@ from npa_envs.envs.vector_options import autoreset_mode as checked_mode
 from npa_envs.envs.vector_options import checked_count, world_keys, worlds_to_reset
 from npa_envs.envs.worlds import FLAGS, Worlds, reason
 from npa_envs.errors import NPAError
+from npa_envs.replay import sent
 
 
 class NPAVectorEnv(VectorEnv[Any, Any, Any]):
@@ -124,13 +125,16 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
             keys = world_keys(seed, self.num_envs, self.np_random)[chosen]
         worlds = torch.from_numpy(chosen).to(self.task.device)
         with self.worlds.here():
-            observation = self._collected(self.worlds.start(worlds, keys))
+            self.worlds.start(worlds, keys)
+            observation = self.worlds.perceive(self._buffer)
+        if not self._copy:
+            self._buffer = observation
         self._started = True
         self._ended[chosen] = False
         self._show()
         which = np.zeros(self.num_envs, dtype=bool)
         which[chosen] = True
-        numbers = list(self._out(self.worlds.numbers.clone()))
+        numbers = list(self._out(self.worlds.report.copy().numbers))
         return self._out(observation), self._losses(numbers, self._mask(which))
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
@@ -163,7 +167,7 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
         restarting = self.autoreset_mode is AutoresetMode.NEXT_STEP and bool(over.any())
         if restarting:
             action = action.clone()
-            action[torch.from_numpy(over).to(action.device)] = 0.0
+            action[sent(over, action.device)] = 0.0
         endings, observation = self.worlds.step(action, self._buffer)
         stepped = None
         if restarting:
@@ -174,12 +178,17 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
         # What a restart overwrites is copied first, whatever the caller wants of the rest.
         numbers, flags, infos = self._report(stepped, copy=self._copy or final)
         if final:
-            which, final_observation = self._mask(ended), observation.clone()
-            final_infos = self._ending_infos(infos, endings, ended)
+            which = self._mask(ended)
+            final_infos = self._ending_infos(infos, endings, which)
+            final_observation = observation
+            if self._copy and ended.all():
+                observation = torch.empty_like(observation)
+            else:
+                final_observation = observation.clone()
             self.worlds.restart(np.flatnonzero(ended), observation)
             _, _, infos = self._report(~ended, copy=self._copy)
             infos |= {"final_obs": self._out(final_observation), "_final_obs": which}
-            infos |= {"final_info": final_infos, "_final_info": self._mask(ended)}
+            infos |= {"final_info": final_infos, "_final_info": which}
         else:
             self._ended = ended
         self._show()
@@ -222,19 +231,10 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
         count, physics = self.config.particle_count, self.worlds.physics
         start = checked_particles(x, s, len(chosen), count, physics, device)
         with self.worlds.here():
-            observation = self._collected(self.worlds.place(chosen, start))
+            self.worlds.place(chosen, start)
+            observation = self.worlds.perceive(self._buffer)
         self._show()
         return self._out(observation)
-
-    def _collected(self, observation: Tensor) -> Tensor:
-        """Return the observations of all worlds, given those of worlds that have just changed."""
-        if len(observation) < self.num_envs:
-            observation = self.worlds.perceive()
-        if self._copy:
-            return observation
-        if self._buffer is None:
-            self._buffer = observation
-        return self._buffer.copy_(observation)
 
     def _report(
         self, stepped: NDArray[np.bool_] | None, *, copy: bool
@@ -246,19 +246,18 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
             copy: Make new arrays, which later steps and restarts leave alone.
         """
         worlds = self.worlds
-        buffers = [worlds.numbers, worlds.flags]
-        if worlds.particle_reward is not None:
-            buffers.append(worlds.particle_reward)
-        numbers, flags, *shares = [self._out(b.clone() if copy else b) for b in buffers]
+        report = worlds.report.copy() if copy else worlds.report
         # One view for each quantity, made at once.
-        numbers, flags = list(numbers), list(flags)
-        everyone = self._mask(None)
+        numbers, flags = list(self._out(report.numbers)), list(self._out(report.endings))
+        everyone = self._out(report.everyone)
         which = everyone if stepped is None else self._mask(stepped)
         infos = self._losses(numbers, everyone)
         improvements = numbers[2 + len(worlds.part_names) :]
         own = {f"reward_{n}": v for n, v in zip(worlds.part_names, improvements, strict=True)}
         own |= dict(zip(FLAGS, flags[2:], strict=True))
-        own |= dict(zip(("particle_reward",), shares, strict=False))
+        if worlds.particle_reward is not None:
+            shares = worlds.particle_reward
+            own["particle_reward"] = self._out(shares.clone() if copy else shares)
         for name, value in own.items():
             infos[name], infos[f"_{name}"] = value, which
         return numbers, flags, infos
@@ -270,27 +269,22 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
         return infos
 
     def _ending_infos(
-        self, infos: dict[str, Any], endings: NDArray[np.uint8], ended: NDArray[np.bool_]
+        self, infos: dict[str, Any], endings: NDArray[np.uint8], which: Any
     ) -> dict[str, Any]:
         """Return the last infos of the worlds whose episodes are over, with the reasons."""
-        which = self._mask(ended)
         final = {name: which if name.startswith("_") else value for name, value in infos.items()}
         reasons = np.full(self.num_envs, None, dtype=object)
-        for k in np.flatnonzero(ended):
+        for k in np.flatnonzero(endings):
             reasons[k] = reason(int(endings[k]))
         return final | {"reason": reasons, "_reason": which}
 
     def _out(self, tensor: Tensor) -> Any:
         return to_output(tensor, self.config.output)
 
-    def _mask(self, mask: NDArray[np.bool_] | None) -> Any:
-        """Return a mask of worlds, None for all of them, as a new array to hand out."""
-        if self.config.output == "torch" and mask is None:
-            return torch.ones(self.num_envs, dtype=torch.bool, device=self.task.device)
-        given = np.ones(self.num_envs, dtype=bool) if mask is None else mask.copy()
-        if self.config.output == "numpy":
-            return given
-        return torch.from_numpy(given).to(self.task.device)
+    def _mask(self, mask: NDArray[np.bool_]) -> Any:
+        """Return a mask of worlds as a new array to hand out."""
+        given = mask.copy()
+        return given if self.config.output == "numpy" else sent(given, self.task.device)
 
     def _show(self) -> None:
         self._screen.show(self.spec.id if self.spec is not None else type(self).__name__)

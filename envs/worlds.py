@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import contextlib
 import os
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.control import Physics, act, observe, perceive_worlds, place_perception
+from npa_envs.control import CheckedCopy, Physics, SurveyedWorlds, act, survey_worlds
 from npa_envs.envs.config import EnvConfig
 from npa_envs.envs.memory import check_memory
 from npa_envs.envs.restarts import Restarts
@@ -34,6 +34,41 @@ SUCCESS, DIVERGED, TIME_LIMIT = 1, 2, 4
 
 FLAGS = ("success", "diverged")
 """Names of the first two endings in `info`."""
+
+
+class Report(NamedTuple):
+    """What a step says of each world, in one buffer: it is handed out by one copy, not twenty."""
+
+    buffer: Tensor
+    """All that follows, uint8."""
+    numbers: Tensor
+    """Reward; loss; its parts; their improvements in the last step; shape [2 + 2 K, B]."""
+    endings: Tensor
+    """Terminated; truncated; success; diverged; bool, shape [4, B]."""
+    everyone: Tensor
+    """True for every world, bool, shape [B]."""
+
+    @classmethod
+    def empty(cls, world_count: int, part_count: int, device: torch.device) -> Report:
+        """Return the report of B worlds whose loss has K parts: zeros."""
+        rows = 4 * (2 + 2 * part_count) + 3 + len(FLAGS)
+        buffer = torch.zeros(rows * world_count, dtype=torch.uint8, device=device)
+        report = cls.over(buffer, world_count)
+        report.everyone.fill_(True)
+        return report
+
+    @classmethod
+    def over(cls, buffer: Tensor, world_count: int) -> Report:
+        """Return the report that a buffer holds."""
+        flag_rows = 3 + len(FLAGS)
+        rows = buffer.view(-1, world_count)
+        numbers = buffer[: -flag_rows * world_count].view(torch.float32).view(-1, world_count)
+        flags = rows[-flag_rows:].view(torch.bool)
+        return cls(buffer, numbers, flags[:-1], flags[-1])
+
+    def copy(self) -> Report:
+        """Return a copy that later steps leave alone."""
+        return self.over(self.buffer.clone(), len(self.everyone))
 
 
 def reason(ending: int) -> str | None:
@@ -120,24 +155,24 @@ class Worlds:
         self._action = zeros(count, physics.action_dim)
         self._diverged = zeros(dtype=torch.uint8)
         self._enabled = torch.ones(1, dtype=torch.uint8, device=device)
-        # One buffer for all numbers of a step and one for its endings, so that a step hands out two
-        # copies and not twenty.
         self.part_names: tuple[str, ...] = ()
-        """Names of the parts of the loss."""
-        self.numbers = zeros()[None]
-        """Reward; loss; its parts; their improvements in the last step; shape [2 + 2 K, B]."""
-        self.flags = torch.zeros(2 + len(FLAGS), world_count, dtype=torch.bool, device=device)
-        """Terminated; truncated; success; diverged; shape [4, B]."""
+        """Names of the parts of the loss, known once worlds have been placed."""
+        self.report = Report.empty(world_count, 0, device)
+        """What a step hands out besides the observation."""
         # Each world's ending, then whether the actions were finite: all that the host reads.
         self._host_endings = torch.zeros(
             world_count + 1, dtype=torch.uint8, pin_memory=device.type == "cuda"
         )
-        self._act = Replayed(self._move, device)
-        self._measure = Replayed(self._judge, device)
-        self._survey = Replayed(self._sort, device)
-        self.restart = Restarts(self.start, world_count, device, recorded=self.task.start_is_short)
+        self._take = CheckedCopy(self._action, self._enabled)
+        self._advance = Replayed(self._move_and_judge, device)
+        self.restart = Restarts(
+            self._start_and_survey, world_count, device, recorded=self.task.start_is_short
+        )
         """Starts the next episodes of some worlds: restart(indices, observation)."""
-        self._beside = Beside(device) if device.type == "cuda" else None
+        self._beside = self._judged = None
+        if device.type == "cuda":
+            self._beside = Beside(device)
+            self._judged = torch.cuda.Event()  # type: ignore[no-untyped-call]
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what only the next step needs, and which cannot be pickled."""
@@ -146,16 +181,16 @@ class Worlds:
     @property
     def reward(self) -> Tensor:
         """Rewards of the last step, shape [B]."""
-        return self.numbers[0]
+        return self.report.numbers[0]
 
     @property
     def loss(self) -> Tensor:
         """Losses as they are, shape [B]."""
-        return self.numbers[1]
+        return self.report.numbers[1]
 
     @torch.no_grad()
-    def start(self, worlds: Tensor, keys: Tensor | None = None) -> Tensor:
-        """Start episodes in some worlds and return what is perceived there, [M, N, P].
+    def start(self, worlds: Tensor, keys: Tensor | None = None) -> Start:
+        """Start episodes in some worlds and return their particles.
 
         Args:
             worlds: Which, int64, shape [M].
@@ -170,17 +205,21 @@ class Worlds:
         start = self.task.start(random)
         self.random.put(worlds, random)
         self.elapsed.index_fill_(0, worlds, 0)
-        observation = self.place(worlds, start)
+        self.place(worlds, start)
         self._start_loss[worlds] = self.loss[worlds]
         if start.success_loss is None:
             self._success_loss.index_fill_(0, worlds, -torch.inf)
         else:
             self._success_loss[worlds] = start.success_loss
-        return observation
+        return start
+
+    def _start_and_survey(self, worlds: Tensor) -> SurveyedWorlds:
+        start = self.start(worlds)
+        return survey_worlds(start.x, start.s, self.physics, places=worlds)
 
     @torch.no_grad()
-    def place(self, worlds: Tensor, start: Start) -> Tensor:
-        """Put particles into some worlds, at no reward, and return what is perceived, [M, N, P].
+    def place(self, worlds: Tensor, start: Start) -> None:
+        """Put particles into some worlds, at no reward.
 
         Args:
             worlds: Which, int64, shape [M].
@@ -190,21 +229,26 @@ class Worlds:
         parts = self.task.losses(x, s)
         if not self.part_names:
             self.part_names = tuple(parts)
-            self.numbers = self.numbers.new_zeros(2 + 2 * len(parts), self.world_count)
-        self.x[worlds], self.s[worlds] = x, s
-        self.numbers.index_fill_(1, worlds, 0.0)
+            self.report = Report.empty(self.world_count, len(parts), x.device)
+        self.x.index_copy_(0, worlds, x)
+        self.s.index_copy_(0, worlds, s)
         values = torch.stack(list(parts.values()))
-        self.numbers[1, worlds] = total(values)
-        self.numbers[2 : 2 + len(values), worlds] = values
+        still = torch.zeros_like(values)
+        numbers = torch.cat((still[:1], total(values)[None], values, still))
+        self.report.numbers.index_copy_(1, worlds, numbers)
         if self.particle_loss is not None and self.particle_reward is not None:
             self.particle_loss[worlds] = self.task.particle_losses(x, s)
             self.particle_reward.index_fill_(0, worlds, 0.0)
-        self.flags.index_fill_(1, worlds, False)
-        return observe(x, s, self.physics)
+        self.report.endings.index_fill_(1, worlds, False)
 
-    def perceive(self) -> Tensor:
-        """Return what is perceived in all worlds as they are, shape [B, N, P]."""
-        return observe(self.x, self.s, self.physics)
+    @torch.no_grad()
+    def perceive(self, out: Tensor | None = None) -> Tensor:
+        """Return what is perceived in all worlds as they are, shape [B, N, P].
+
+        Args:
+            out: Where to write it; a new tensor otherwise.
+        """
+        return survey_worlds(self.x, self.s, self.physics).perceive(out)
 
     def here(self) -> contextlib.AbstractContextManager[Any]:
         """Return a context in which the worlds' device is the current one."""
@@ -226,26 +270,34 @@ class Worlds:
         Raises:
             NPAError: An action is not finite; the worlds are then as they were.
         """
-        if self._beside is None and not bool(torch.isfinite(action).all()):
+        self._take(action)
+        if self._judged is None and not self._enabled[0]:
+            self._enabled.fill_(1)
             raise self._not_finite(action)
-        self._action.copy_(action)
-        self._act()
-        if self._beside is None:
-            self._measure()
-            self._survey()
-        else:
-            self._beside.run(self._measure)
-            self._survey()
-            # The long perception comes last: the host knows the endings while it still runs.
-            self._beside.join()
-        observation = place_perception(self._surveyed, self.physics, out)
-        if self._beside is not None:
-            self._beside.wait()
+        self._advance()
+        if self._judged is None:
+            return self._endings(), self._surveyed.perceive(out)
+        self._judged.record()
+        # The host learns the endings while the device perceives.
+        observation = self._surveyed.perceive(out)
+        self._judged.synchronize()
         if not self._host_endings[-1]:
             self.random.steps -= 1
             self.elapsed -= 1
             raise self._not_finite(action)
-        return self._host_endings[:-1].numpy().copy(), observation
+        return self._endings(), observation
+
+    def _endings(self) -> NDArray[np.uint8]:
+        return self._host_endings[:-1].numpy().copy()
+
+    def _move_and_judge(self) -> None:
+        """Apply the actions; then judge the worlds and, beside that, sort them."""
+        self._move()
+        with contextlib.nullcontext() if self._beside is None else self._beside.aside():
+            self._judge()
+        self._surveyed = survey_worlds(self.x, self.s, self.physics)
+        if self._beside is not None:
+            self._beside.join()
 
     def _move(self) -> None:
         """Apply the actions."""
@@ -273,7 +325,7 @@ class Worlds:
         late = torch.zeros_like(success)
         if self.episode_steps is not None:
             late = self.elapsed >= self.episode_steps
-        self.flags.copy_(torch.stack((success | diverged, late, success, diverged)))
+        self.report.endings.copy_(torch.stack((success | diverged, late, success, diverged)))
         improvement = self.loss - loss
         if self.particle_loss is not None and self.particle_reward is not None:
             shares = task.particle_losses(self.x, self.s)
@@ -285,13 +337,12 @@ class Worlds:
             limit = self.episode_steps or config.episode_steps
             over = success | diverged | (self.elapsed == limit)
             reward = torch.where(over, -loss, torch.zeros_like(loss))
-        before = self.numbers[2 : 2 + len(parts)]
-        self.numbers.copy_(torch.cat((reward[None], loss[None], parts, before - parts)))
+        numbers = self.report.numbers
+        before = numbers[2 : 2 + len(parts)]
+        numbers.copy_(torch.cat((reward[None], loss[None], parts, before - parts)))
         ending = SUCCESS * success.byte() + DIVERGED * diverged.byte() + TIME_LIMIT * late.byte()
         self._host_endings.copy_(torch.cat((ending, self._enabled)), non_blocking=True)
-
-    def _sort(self) -> None:
-        self._surveyed = perceive_worlds(self.x, self.s, self.physics)
+        self._enabled.fill_(1)
 
     def _not_finite(self, action: Tensor) -> NPAError:
         bad = ~torch.isfinite(action)

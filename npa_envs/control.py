@@ -14,9 +14,11 @@ from torch import Tensor
 
 from npa_envs.randomness import WorldRandom
 from npa_envs.sph.actions import apply_actions
-from npa_envs.sph.finite import mark_finite
+from npa_envs.sph.finite import CheckedCopy
 from npa_envs.sph.passes import Terms
-from npa_envs.sph.rows import Surveyed, survey, write_observation
+from npa_envs.sph.rows import SurveyedWorlds, survey
+
+__all__ = ["CheckedCopy", "Physics", "SurveyedWorlds", "act", "observe", "survey_worlds"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,30 +78,28 @@ class Physics:
         return self.state_dim + (self.space_dim if self.moving else 0)
 
 
-def perceive_worlds(x: Tensor, s: Tensor, physics: Physics) -> Surveyed:
-    """Return what `place_perception` needs: the worlds sorted, their densities known.
+def survey_worlds(
+    x: Tensor, s: Tensor, physics: Physics, places: Tensor | None = None
+) -> SurveyedWorlds:
+    """Return worlds made ready for perception: sorted, their densities known.
 
     Args:
         x: Positions [length units], shape [B, N, D], finite.
-        s: States, dimensionless, shape [B, N, C], finite; they may be read again later.
+        s: States, dimensionless, shape [B, N, C], finite; they may be read again later, where they
+            are.
         physics: The worlds' constants.
+        places: Which worlds of a larger batch these are, int64, shape [B]; default: their own one.
     """
-    return survey(x, s, eps=physics.eps, eps0=physics.eps0, box=physics.box, terms=Terms())
-
-
-def place_perception(surveyed: Surveyed, physics: Physics, out: Tensor | None = None) -> Tensor:
-    """Return what every particle perceives, clipped, in the particles' order, shape [B, N, P].
-
-    Args:
-        surveyed: What `perceive_worlds` returned, before states change.
-        physics: The worlds' constants.
-        out: Where to write it, contiguous; a new tensor otherwise.
-    """
-    if out is None:
-        shape = (surveyed.plan.world_count, surveyed.plan.particle_count, physics.perception_dim)
-        out = surveyed.ordered.positions.new_empty(shape)
-    write_observation(surveyed, physics.perception_limit, out.view(-1, physics.perception_dim))
-    return out
+    return survey(
+        x,
+        s,
+        eps=physics.eps,
+        eps0=physics.eps0,
+        box=physics.box,
+        terms=Terms(),
+        limit=physics.perception_limit,
+        places=places,
+    )
 
 
 @torch.no_grad()
@@ -111,7 +111,7 @@ def observe(x: Tensor, s: Tensor, physics: Physics) -> Tensor:
         s: States, dimensionless, shape [B, N, C], finite.
         physics: The worlds' constants.
     """
-    return place_perception(perceive_worlds(x, s, physics), physics)
+    return survey_worlds(x, s, physics).perceive()
 
 
 @torch.no_grad()
@@ -134,11 +134,10 @@ def act(
             fraction of `state_scale` (C, clipped to [-1, 1]); shape [B, N, A].
         physics: The worlds' constants.
         random: Where masks and noise come from; advanced by one step.
-        enabled: Set to whether all actions are finite; where not, no world changes; uint8, [1].
+        enabled: Whether all actions are finite; where not, no world changes; uint8, shape [1].
         diverged: Set to 1 for worlds in which a number left its bounds or is not finite, uint8,
             shape [B]; such numbers are moved back to the bounds, NaN to 0.
     """
-    mark_finite(action, enabled)
     random.advance()
     mask = noise = None
     if physics.update_prob < 1.0:

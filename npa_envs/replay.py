@@ -5,8 +5,11 @@ from __future__ import annotations
 import contextlib
 import gc
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import torch
+from numpy.typing import NDArray
+from torch import Tensor
 
 
 @contextlib.contextmanager
@@ -20,6 +23,18 @@ def no_garbage_collection() -> Iterator[None]:
     finally:
         if enabled:
             gc.enable()
+
+
+def sent(values: NDArray[Any], device: torch.device) -> Tensor:
+    """Return an array as a tensor on a device; the host does not wait for what the device does.
+
+    Args:
+        values: An array that nobody changes until the device has read it.
+        device: Where it is to go.
+    """
+    tensor = torch.from_numpy(values)
+    # Unpinned memory would be copied once the stream is idle, and the host would wait for that.
+    return tensor.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else tensor
 
 
 class Replayed:
@@ -62,25 +77,15 @@ class Beside:
 
     def __init__(self, device: torch.device) -> None:
         self._device = device
-        # First in line, so that the host can read its results soon.
-        self._stream = torch.cuda.Stream(device, priority=-1)  # type: ignore[no-untyped-call]
-        self._done = torch.cuda.Event()  # type: ignore[no-untyped-call]
+        self._stream = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
 
-    def run(self, work: Callable[[], None]) -> None:
-        """Start work once the current stream has done what it was given so far.
-
-        Args:
-            work: Launches kernels; never waits for the device.
-        """
+    @contextlib.contextmanager
+    def aside(self) -> Iterator[None]:
+        """What is launched inside begins once the current stream has done its work so far."""
         self._stream.wait_stream(torch.cuda.current_stream(self._device))
         with torch.cuda.stream(self._stream):
-            work()
-            self._done.record()
+            yield
 
     def join(self) -> None:
         """Let what the current stream is given from now on wait until the work is done."""
-        torch.cuda.current_stream(self._device).wait_event(self._done)
-
-    def wait(self) -> None:
-        """Wait on the host until the work is done."""
-        self._done.synchronize()
+        torch.cuda.current_stream(self._device).wait_stream(self._stream)

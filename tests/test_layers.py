@@ -40,7 +40,7 @@ LADDER = {
     "npa_envs.files": rung(1),
     "npa_envs.kernels": rung(1, "warp"),
     "npa_envs.reference": rung(1, "torch"),
-    "npa_envs.replay": rung(1, "torch"),
+    "npa_envs.replay": rung(1, "torch numpy"),
     "npa_envs.warp_report": rung(1, "warp"),
     "npa_envs.sph": rung(2, "warp torch", never=("npa_envs.reference",)),
     "npa_envs.randomness": rung(3, "torch numpy", never=("npa_envs.kernels", "npa_envs.reference")),

@@ -139,7 +139,7 @@ class DamageEvents(AnyWrapper, RecordConstructorArgs):
         before = float(worlds.loss[0])
         x, s = damaged_particles(self._base, self.schedule.events, due, self._first)
         observation = self._base.place_particles(x[0], s[0])
-        loss, *parts = worlds.numbers[1 : 2 + len(worlds.part_names), 0].tolist()
+        loss, *parts = worlds.report.numbers[1 : 2 + len(worlds.part_names), 0].tolist()
         damage = info.get("loss_damage", 0.0) + loss - before
         info = info | {"loss": loss, "loss_damage": damage}
         info |= {f"loss_{n}": value for n, value in zip(worlds.part_names, parts, strict=True)}
@@ -208,7 +208,7 @@ class VectorDamageEvents(AnyVectorWrapper, RecordConstructorArgs):
         output = base.config.output
         now = {"loss": worlds.loss.clone(), "loss_damage": worlds.loss - before}
         for k, name in enumerate(worlds.part_names):
-            now[f"loss_{name}"] = worlds.numbers[2 + k].clone()
+            now[f"loss_{name}"] = worlds.report.numbers[2 + k].clone()
         mask = torch.from_numpy(hurt).to(base.task.device)
         now |= {"_loss_damage": mask}
         told = {name: to_output(value, output) for name, value in now.items()}

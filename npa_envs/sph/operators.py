@@ -12,8 +12,9 @@ import torch
 from torch import Tensor
 
 from npa_envs.sph.adjoint import perceive_rows_backward
+from npa_envs.sph.bridge import launch
 from npa_envs.sph.cells import make_plan, sort_worlds
-from npa_envs.sph.passes import Terms, compute_density, write_perception
+from npa_envs.sph.passes import Terms, compute_density, perception_launch
 
 __all__ = ["Rows", "Terms", "perceive_rows"]
 
@@ -50,8 +51,10 @@ def _perceive_rows(
     densities = compute_density(plan, ordered, terms)
     perception = x.new_empty(row_capacity, row_width)
     row_kernel_sum = x.new_empty(row_capacity, plan.space_dim)
-    write_perception(
-        plan, ordered, densities, terms, scale, perception, row_kernel_sum=row_kernel_sum
+    launch(
+        *perception_launch(
+            plan, ordered, densities, terms, scale, perception, row_kernel_sum=row_kernel_sum
+        )
     )
     return (
         perception,

@@ -170,7 +170,7 @@ def compute_density_gradients(plan: Plan, ordered: SortedWorlds, terms: Terms) -
     return Densities(particles, row_density_gradient)
 
 
-def write_perception(
+def perception_launch(
     plan: Plan,
     ordered: SortedWorlds,
     densities: Densities,
@@ -182,8 +182,8 @@ def write_perception(
     destination: Tensor | None = None,
     limit: float = 0.0,
     row_kernel_sum: Tensor | None = None,
-) -> None:
-    """Write the perception of each row.
+) -> tuple[Any, ...]:
+    """Return what to give to `launch` so that it writes the perception of each row.
 
     Args:
         plan: Plan of the call.
@@ -221,7 +221,7 @@ def write_perception(
         )
         rows = -(-plan.row_capacity // WARP_ROWS) * WARP_ROWS
         source = ordered.states if states is None else states
-        launch(
+        return (
             kernel,
             rows * plan.group_count * plan.lanes,
             out.device,
@@ -243,8 +243,7 @@ def write_perception(
             out,
             row_kernel_sum,
         )
-        return
-    launch(
+    return (
         plain_kernels(plan, terms).perceive,
         (plan.row_capacity, plan.group_count, plan.lanes),
         out.device,

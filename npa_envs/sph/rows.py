@@ -2,34 +2,59 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any
 
+import torch
 from torch import Tensor
 
-from npa_envs.sph.cells import Plan, SortedWorlds, make_plan, sort_worlds
+from npa_envs.sph.bridge import Repeated
+from npa_envs.sph.cells import make_plan, sort_worlds
 from npa_envs.sph.passes import (
-    Densities,
     Terms,
     compute_density,
     list_capacity,
     list_neighbours,
-    write_perception,
+    perception_launch,
 )
 
 DENSITY_LANES = 1
 """Threads of a particle in the density pass: whole batches fill the device without more."""
 
 
-class Surveyed(NamedTuple):
-    """Worlds made ready for perception: sorted, their densities known."""
+class SurveyedWorlds:
+    """Worlds made ready for perception: sorted, their densities known; `survey` makes it.
 
-    plan: Plan
-    ordered: SortedWorlds
-    densities: Densities
-    states: Tensor | None
-    """States in the caller's order, where they are read in place."""
-    terms: Terms
-    scale: float
+    Args:
+        launch_of: Returns what to give to a launch that writes rows into a tensor, [B N, P].
+        shape: Shape of what is perceived, [B, N, P].
+        like: A tensor of its dtype and on its device.
+    """
+
+    def __init__(
+        self, launch_of: Callable[[Tensor], tuple[Any, ...]], shape: tuple[int, ...], like: Tensor
+    ) -> None:
+        self._launch_of = launch_of
+        self._shape = shape
+        self._like = like
+        self._repeated: Repeated | None = None
+
+    def perceive(self, out: Tensor | None = None) -> Tensor:
+        """Return what every particle perceives, clipped, in the caller's order, shape [B, N, P].
+
+        Later calls, after the tensors read have got other numbers, take less of the host's time.
+
+        Args:
+            out: Where to write it, contiguous; a new tensor otherwise. Where the worlds have places
+                in a larger batch it must be given, of that batch's shape.
+        """
+        if out is None:
+            out = self._like.new_empty(self._shape)
+        rows = out.view(-1, self._shape[-1])
+        if self._repeated is None:
+            self._repeated = Repeated(*self._launch_of(rows), changing=rows)
+        self._repeated(rows)
+        return out
 
 
 def survey(
@@ -40,7 +65,9 @@ def survey(
     eps0: float,
     box: tuple[float, ...] | None,
     terms: Terms,
-) -> Surveyed:
+    limit: float,
+    places: Tensor | None = None,
+) -> SurveyedWorlds:
     """Sort checked worlds and compute their densities.
 
     The result may read `s` where it is: it serves until the states change.
@@ -52,6 +79,9 @@ def survey(
         eps0: Radius at which the rule was trained [length units].
         box: Sides of the periodic box [length units], or None in open space.
         terms: Groups of the perception vector.
+        limit: Entries are clipped to plus and minus this, positive.
+        places: Which worlds of a larger batch these are, in whose rows their perception is written,
+            int64, shape [B]; default: a batch of their own.
     """
     x, s = x.contiguous(), s.contiguous()
     plan = make_plan(x, x.shape, s.shape[2], x.shape[0] * x.shape[1], False, eps, box)
@@ -61,26 +91,24 @@ def survey(
         densities = list_neighbours(plan, ordered, ordered.source if in_place else None)
     else:
         densities = compute_density(plan, ordered, terms, lanes=DENSITY_LANES)
-    return Surveyed(plan, ordered, densities, s if in_place else None, terms, eps / eps0)
 
+    destination = ordered.source
+    if places is not None:
+        shift = (places - torch.arange(len(places), device=x.device)) * plan.particle_count
+        destination = (destination.view(plan.world_count, -1) + shift.int()[:, None]).view(-1)
 
-def write_observation(surveyed: Surveyed, limit: float, out: Tensor) -> None:
-    """Write what every particle perceives, clipped; not differentiable.
+    def launch_of(rows: Tensor) -> tuple[Any, ...]:
+        return perception_launch(
+            plan,
+            ordered,
+            densities,
+            terms,
+            eps / eps0,
+            rows,
+            states=s if in_place else None,
+            destination=destination,
+            limit=limit,
+        )
 
-    Args:
-        surveyed: Worlds made ready by `survey`.
-        limit: Entries are clipped to plus and minus this, positive.
-        out: Where to write, shape [B N, P], contiguous.
-    """
-    plan, ordered, densities, states, terms, scale = surveyed
-    write_perception(
-        plan,
-        ordered,
-        densities,
-        terms,
-        scale,
-        out,
-        states=states,
-        destination=ordered.source,
-        limit=limit,
-    )
+    perception_dim = terms.perception_dim(plan.space_dim, plan.state_dim)
+    return SurveyedWorlds(launch_of, (*x.shape[:2], perception_dim), x)

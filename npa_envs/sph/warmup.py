@@ -9,11 +9,11 @@ import torch
 from npa_envs.sph.actions import apply_actions
 from npa_envs.sph.draws import bernoulli_draw, integer_draw, normal_draw, uniform_draw
 from npa_envs.sph.fields import perceive
-from npa_envs.sph.finite import mark_finite
+from npa_envs.sph.finite import CheckedCopy
 from npa_envs.sph.operators import Rows
 from npa_envs.sph.passes import Terms
 from npa_envs.sph.picture_losses import picture_losses
-from npa_envs.sph.rows import survey, write_observation
+from npa_envs.sph.rows import survey
 from npa_envs.sph.splat import splat
 from npa_envs.sph.update import update_particles
 from npa_envs.sph.worlds import world_mean
@@ -42,10 +42,11 @@ def warmup(
         uniform_draw(keys, counts, counts, 0, 1, dtype)
         normal_draw(keys, counts, counts, 0, 1, dtype)
         world_mean(torch.zeros(1, 1, 1, dtype=dtype, device=device))
-        mark_finite(
+        copy = CheckedCopy(
             torch.zeros(1, dtype=dtype, device=device),
             torch.zeros(1, dtype=torch.uint8, device=device),
         )
+        copy(torch.zeros(1, dtype=dtype, device=device))
         for space_dim in space_dims:
             x = torch.zeros(1, 2, space_dim, dtype=dtype, device=device, requires_grad=True)
             s = torch.zeros(1, 2, state_dim, dtype=dtype, device=device, requires_grad=True)
@@ -70,9 +71,7 @@ def _warm_observation(x: torch.Tensor, s: torch.Tensor) -> None:
     for particle_count in (x.shape[1], 4096):
         places = x.detach()[:, :1].expand(-1, particle_count, -1)
         states = s.detach()[:, :1].expand(-1, particle_count, -1)
-        surveyed = survey(places, states, eps=0.1, eps0=0.1, box=None, terms=Terms())
-        width = Terms().perception_dim(x.shape[2], s.shape[2])
-        write_observation(surveyed, 1.0, x.new_empty(particle_count, width))
+        survey(places, states, eps=0.1, eps0=0.1, box=None, terms=Terms(), limit=1.0).perceive()
 
 
 def _warm_update(x: torch.Tensor, s: torch.Tensor) -> None:
