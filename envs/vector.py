@@ -20,9 +20,12 @@ from npa_envs.envs.spaces import action_space, observation_space
 from npa_envs.envs.task import EnvTask
 from npa_envs.envs.vector_options import autoreset_mode as checked_mode
 from npa_envs.envs.vector_options import checked_count, world_keys, worlds_to_reset
-from npa_envs.envs.worlds import FLAGS, Worlds, reason
+from npa_envs.envs.worlds import FLAGS, TIME_LIMIT, Worlds, reason
 from npa_envs.errors import NPAError
 from npa_envs.replay import sent
+
+REASONS = np.array([reason(ending) for ending in range(2 * TIME_LIMIT)], dtype=object)
+"""Why an episode ended, in words, for each combination of endings."""
 
 
 class NPAVectorEnv(VectorEnv[Any, Any, Any]):
@@ -273,10 +276,7 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
     ) -> dict[str, Any]:
         """Return the last infos of the worlds whose episodes are over, with the reasons."""
         final = {name: which if name.startswith("_") else value for name, value in infos.items()}
-        reasons = np.full(self.num_envs, None, dtype=object)
-        for k in np.flatnonzero(endings):
-            reasons[k] = reason(int(endings[k]))
-        return final | {"reason": reasons, "_reason": which}
+        return final | {"reason": REASONS[endings], "_reason": which}
 
     def _out(self, tensor: Tensor) -> Any:
         return to_output(tensor, self.config.output)

@@ -22,6 +22,7 @@ from npa_envs.kernels.slots import (
     inverse_root,
     largest_in_warp,
     log_scale_of_square,
+    make_lists,
     make_slots,
     make_stage,
     meet_warp,
@@ -32,6 +33,9 @@ from npa_envs.kernels.slots import (
 
 CUDA_REGISTERS = 80
 """Registers of a thread of the perception pass."""
+
+AHEAD = 2
+"""Listed neighbours that a lane asks for together."""
 
 load_record = make_wide_load(RECORD, wp.float32)
 load_scalar = make_wide_load(wp.float32, wp.float32)
@@ -48,11 +52,13 @@ def listed_perception(
     periodic: bool,
     grouped: bool,
     capacity: int = 0,
+    for_adjoint: bool = True,
 ) -> wp.Kernel:
     """Return the perception kernel of one variant, as `perception_kernels` does.
 
     A variant is also made for a box or open space, for channels that come in several groups, and
-    for lists and records that the density pass left; only overlong lists are then searched anew.
+    for lists and records that the density pass left (only overlong lists are then searched anew),
+    and with or without what the adjoint reads.
     """
     scalar = wp.float32
     flat = space_dim == 2
@@ -75,7 +81,7 @@ def listed_perception(
     if state_gradient:
         topic = "listed_perception" if moment_correction else "listed_uncorrected_perception"
     topic += "_in_box" * periodic + "_grouped" * grouped
-    topic += f"_from_lists_{capacity}" * (capacity > 0)
+    topic += f"_from_lists_{capacity}" * (capacity > 0) + "_for_adjoint" * for_adjoint
     module = kernel_module(topic, space_dim, scalar, width, lanes)
     load_share = make_wide_load(share, scalar)
     load_vector = make_wide_load(vector, scalar)
@@ -88,9 +94,24 @@ def listed_perception(
         slots.append_number,
         slots.number_at,
     )
-    put_entry, entry_at, fetch_numbers = slots.put_entry, slots.entry_at, slots.fetch_numbers
+    put_entry, entry_at = slots.put_entry, slots.entry_at
+    step_at = make_lists(capacity).step_at
+    places_ahead = wp.types.vector(AHEAD, wp.int32)
+    records_ahead = wp.types.matrix((AHEAD, 4), scalar)
     write_rows = slots.write_rows
     stage_share, stage_rows = make_stage(share), make_stage(share_rows)
+
+    @wp.func
+    def padded(count: wp.int32):
+        """A number of neighbours rounded up to a multiple of the lanes."""
+        return (count + wp.static(lanes - 1)) & ~wp.int32(wp.static(lanes - 1))
+
+    @wp.func
+    def place_and_volume(record: RECORD):
+        place = vector()
+        for d in range(wp.static(space_dim)):
+            place[d] = record[d]
+        return place, record[wp.static(space_dim)]
 
     @wp.func
     def spiky_wide(domain: Domain, centre: vector, neighbour: vector, squared: scalar):
@@ -112,14 +133,49 @@ def listed_perception(
         return wp.float64(domain.spiky_norm) * falloff * falloff * inverse, r
 
     @wp.func
-    def add_listed(
+    def weigh(
+        domain: Domain,
+        slot: wp.uint32,
+        entry: wp.int32,
+        number: wp.int32,
+        position: vector,
+        neighbour: vector,
+        volume: scalar,
+        kernel_sum: vector,
+        moment: square,
+        density_gradient: wide,
+    ):
+        """Weigh a neighbour for all lanes, and add it to this lane's share of the short sums.
+
+        What fills up a list has no volume and lies at the centre: it adds nothing.
+        """
+        offset = neighbour - position
+        if wp.static(periodic):
+            offset = periodic_image(domain, offset)
+        squared = wp.dot(offset, offset)
+        falloff = scalar(1.0) - squared * domain.inverse_squared_eps
+        weight = volume * domain.smoothing_norm * falloff * falloff * falloff
+        factor, r = spiky_wide(domain, position, neighbour, squared)
+        density_gradient += factor * r
+        weighted = vector()
+        if wp.static(state_gradient):
+            weighted = (volume * scalar(factor)) * offset
+            if wp.static(for_adjoint):
+                kernel_sum += weighted
+            if wp.static(moment_correction):
+                for row in range(wp.static(space_dim)):
+                    for column in range(row, wp.static(space_dim)):
+                        moment[row, column] += offset[row] * weighted[column]
+        put_entry(slot, entry, weight, weighted, number)
+        return kernel_sum, moment, density_gradient
+
+    @wp.func
+    def weigh_found(
         domain: Domain,
         sorted_positions: wp.array(dtype=vector),
         volumes: wp.array(dtype=scalar),
         records: wp.array(dtype=RECORD),
-        states: wp.array(dtype=share),
         state_place: wp.array(dtype=wp.int32),
-        part: wp.int32,
         part_count: wp.int32,
         lane: wp.int32,
         slot: wp.uint32,
@@ -127,26 +183,19 @@ def listed_perception(
         count: wp.int32,
         k: wp.int32,
         position: vector,
-        own: share,
-        blur: share,
-        gradient: share_gradient,
         kernel_sum: vector,
         moment: square,
         density_gradient: wide,
     ):
-        """Add what the listed neighbours contribute to this lane's share of all sums."""
+        """Weigh the neighbours whose numbers are in the slot, from `begin` to `count`."""
         meet_warp()
-        padded = (count + wp.int32(3)) & ~wp.int32(3)
-        for entry in range(lane, padded, wp.static(lanes)):
+        for entry in range(lane, padded(count), wp.static(lanes)):
             listed = entry >= begin and entry < count
             j = wp.where(listed, number_at(slot, entry), k)
             number = j
             if wp.static(capacity > 0):
                 record = load_record(records, j)
-                neighbour = vector()
-                for d in range(wp.static(space_dim)):
-                    neighbour[d] = record[d]
-                volume = record[wp.static(space_dim)]
+                neighbour, volume = place_and_volume(record)
                 if wp.static(flat):
                     number = as_number(record[3])
             else:
@@ -154,26 +203,89 @@ def listed_perception(
                 volume = load_scalar(volumes, j * wp.static(space_dim + 1) + wp.static(space_dim))
             if wp.static(not flat or capacity == 0) and state_place.shape[0] > 0:
                 number = load_integer(state_place, j)
-            volume = wp.where(listed, volume, scalar(0.0))
-            offset = neighbour - position
-            if wp.static(periodic):
-                offset = periodic_image(domain, offset)
-            squared = wp.dot(offset, offset)
-            falloff = scalar(1.0) - squared * domain.inverse_squared_eps
-            weight = volume * domain.smoothing_norm * falloff * falloff * falloff
-            factor, r = spiky_wide(domain, position, neighbour, squared)
-            density_gradient += factor * r
-            weighted = vector()
-            if wp.static(state_gradient):
-                weighted = (volume * scalar(factor)) * offset
-                kernel_sum += weighted
-                if wp.static(moment_correction):
-                    for row in range(wp.static(space_dim)):
-                        for column in range(row, wp.static(space_dim)):
-                            moment[row, column] += offset[row] * weighted[column]
-            put_entry(slot, entry, weight, weighted, number * part_count)
+            kernel_sum, moment, density_gradient = weigh(
+                domain,
+                slot,
+                entry,
+                number * part_count,
+                position,
+                neighbour,
+                wp.where(listed, volume, scalar(0.0)),
+                kernel_sum,
+                moment,
+                density_gradient,
+            )
         meet_warp()
-        for entry in range(padded):
+        return kernel_sum, moment, density_gradient
+
+    @wp.func
+    def weigh_listed(
+        domain: Domain,
+        records: wp.array(dtype=RECORD),
+        lists: wp.array(dtype=wp.int16),
+        state_place: wp.array(dtype=wp.int32),
+        part_count: wp.int32,
+        lane: wp.int32,
+        slot: wp.uint32,
+        row: wp.int32,
+        begin: wp.int32,
+        count: wp.int32,
+        k: wp.int32,
+        position: vector,
+        kernel_sum: vector,
+        moment: square,
+        density_gradient: wide,
+    ):
+        """Weigh `count` neighbours of a list from its entry `begin` on.
+
+        Several are asked for before the first is used.
+        """
+        for first in range(lane, padded(count), wp.static(lanes * AHEAD)):
+            places = places_ahead()
+            ahead = records_ahead()
+            for a in range(wp.static(AHEAD)):
+                entry = first + wp.static(lanes) * a
+                places[a] = k
+                if entry < count:
+                    places[a] = k + step_at(lists, row, begin + entry)
+            for a in range(wp.static(AHEAD)):
+                ahead[a] = load_record(records, places[a])
+            for a in range(wp.static(AHEAD)):
+                entry = first + wp.static(lanes) * a
+                if entry < padded(count):
+                    neighbour, volume = place_and_volume(ahead[a])
+                    number = places[a]
+                    if wp.static(flat):
+                        number = as_number(ahead[a][3])
+                    elif state_place.shape[0] > 0:
+                        number = load_integer(state_place, places[a])
+                    kernel_sum, moment, density_gradient = weigh(
+                        domain,
+                        slot,
+                        entry,
+                        number * part_count,
+                        position,
+                        neighbour,
+                        wp.where(entry < count, volume, scalar(0.0)),
+                        kernel_sum,
+                        moment,
+                        density_gradient,
+                    )
+        meet_warp()
+        return kernel_sum, moment, density_gradient
+
+    @wp.func
+    def add_states(
+        states: wp.array(dtype=share),
+        part: wp.int32,
+        slot: wp.uint32,
+        count: wp.int32,
+        own: share,
+        blur: share,
+        gradient: share_gradient,
+    ):
+        """Add the states of weighed neighbours to this lane's share of the long sums."""
+        for entry in range(padded(count)):
             packed = entry_at(slot, entry)
             place = as_number(packed[wp.static(space_dim + 1)])
             state = load_share(states, place + part)
@@ -184,7 +296,7 @@ def listed_perception(
                     for c in range(wp.static(width // lanes)):
                         gradient[d, c] += packed[d + 1] * difference[c]
         meet_warp()
-        return blur, gradient, kernel_sum, moment, density_gradient
+        return blur, gradient
 
     @wp.kernel(enable_backward=False, module=module, cuda_max_registers=CUDA_REGISTERS)
     def perceive(
@@ -228,8 +340,11 @@ def listed_perception(
             g = row % group_count
             row = row / group_count
         slot = slot_address()
-        part = g * wp.static(lanes) + lane
-        part_count = group_count * wp.static(lanes)
+        part = lane
+        part_count = wp.int32(wp.static(lanes))
+        if wp.static(grouped):
+            part = g * wp.static(lanes) + lane
+            part_count = group_count * wp.static(lanes)
         row_count = load_integer(starts, starts.shape[0] - 1) - row_base
         present = row < wp.min(row_count, row_capacity)
         blur = share()
@@ -252,35 +367,30 @@ def listed_perception(
         position = load_vector(sorted_positions, k)
         searching = wp.bool(present)
         if wp.static(capacity > 0):
-            length = wp.where(present, load_integer(list_lengths, k), wp.int32(0))
+            length = wp.where(present, load_integer(list_lengths, safe_row), wp.int32(0))
             searching = length > wp.static(capacity)
             length = wp.where(searching, wp.int32(0), length)
             longest = largest_in_warp(length)
             for first_entry in range(0, longest, wp.static(SLOT_ENTRIES)):
                 fetched = wp.clamp(length - first_entry, 0, wp.static(SLOT_ENTRIES))
-                fetch_numbers(slot, lists, k, first_entry, fetched, lane)
-                blur, gradient, kernel_sum, moment, wide_sum = add_listed(
+                kernel_sum, moment, wide_sum = weigh_listed(
                     domain,
-                    sorted_positions,
-                    volumes,
                     records,
-                    states,
+                    lists,
                     state_place,
-                    part,
                     part_count,
                     lane,
                     slot,
-                    0,
+                    safe_row,
+                    first_entry,
                     fetched,
                     k,
                     position,
-                    own,
-                    blur,
-                    gradient,
                     kernel_sum,
                     moment,
                     wide_sum,
                 )
+                blur, gradient = add_states(states, part, slot, fetched, own, blur, gradient)
         base = wp.int32(0)
         cell = cell_vector()
         segments = wp.int32(0)
@@ -326,14 +436,12 @@ def listed_perception(
                 j += wp.static(lanes)
                 working = run < run_count or any_in_warp(j - lane < end)
                 filling = working and not any_in_warp(count > wp.static(SLOT_ENTRIES - lanes))
-            blur, gradient, kernel_sum, moment, wide_sum = add_listed(
+            kernel_sum, moment, wide_sum = weigh_found(
                 domain,
                 sorted_positions,
                 volumes,
                 records,
-                states,
                 state_place,
-                part,
                 part_count,
                 lane,
                 slot,
@@ -341,13 +449,11 @@ def listed_perception(
                 count,
                 k,
                 position,
-                own,
-                blur,
-                gradient,
                 kernel_sum,
                 moment,
                 wide_sum,
             )
+            blur, gradient = add_states(states, part, slot, count, own, blur, gradient)
             begin = count & wp.static(lanes - 1)
         wide_sum = add_wide(wide_sum)
         if wp.static(state_gradient and moment_correction):
@@ -372,7 +478,7 @@ def listed_perception(
             stage_rows(slot, wp.static(2 * width) + mine * wp.static(space_dim), scaled)
         bound = wp.where(limit > scalar(0.0), limit, scalar(wp.static(math.nan)))
         write_rows(slot, destination, g, state_dim, bound, perception)
-        if row_kernel_sum.shape[0] > 0:
+        if wp.static(for_adjoint):
             kernel_sum = add_vector(kernel_sum)
             if destination >= 0 and part == 0:
                 row_kernel_sum[row] = kernel_sum

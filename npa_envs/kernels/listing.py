@@ -11,7 +11,8 @@ import warp as wp
 
 from npa_envs.kernels.domain import domain_types, kernel_module
 from npa_envs.kernels.lanes import make_lane_sum, make_wide_load
-from npa_envs.kernels.slots import as_word, make_lists
+from npa_envs.kernels.slots import CUDA_BLOCK, as_word, make_lists
+from npa_envs.kernels.wide import make_wide_store
 
 AHEAD = 3
 """Candidates that a thread with lists to make looks at together."""
@@ -19,22 +20,29 @@ AHEAD = 3
 RECORD = wp.types.vector(4, wp.float32)
 """What perception reads of a neighbour: position, volume, and in 2D where its state is."""
 
+LONGEST_STEP = wp.constant(2**15 - 1)
+"""Steps of a list's entry have 16 bits."""
+
+LIST_BYTES = 2 * CUDA_BLOCK
+"""Bytes from one entry of a list to the next while it is made."""
+
 load_integer = make_wide_load(wp.int32, wp.int32)
+store_record = make_wide_store(RECORD, wp.float32)
 
 
 @functools.cache
-def listed_density(space_dim: int, lanes: int, periodic: bool, capacity: int = 0) -> wp.Kernel:
+def listed_density(
+    space_dim: int, lanes: int, periodic: bool, capacity: int = 0, masked: bool = False
+) -> wp.Kernel:
     """Return the density kernel with `lanes` to a particle, of a box or of open space.
 
-    With a capacity it also leaves lists of that many neighbours, and records of 16 bytes in place
-    of particles; it then has one lane.
+    With a capacity it also leaves lists of that many neighbours, if `masked` of the particles that
+    have a row, and records of 16 bytes. Several lanes then need launches of whole warps.
     """
     scalar = wp.float32
     flat = space_dim == 2
     types = domain_types(space_dim, scalar)
     vector, particle, Domain = types.vector, types.particle, types.Domain
-    if capacity:
-        particle = RECORD
     cell_place, segment_count, segment_cells = (
         types.cell_place,
         types.segment_count,
@@ -44,7 +52,7 @@ def listed_density(space_dim: int, lanes: int, periodic: bool, capacity: int = 0
     load_vector = make_wide_load(vector, scalar)
     add_scalar = make_lane_sum(scalar, scalar, lanes)
     positions_ahead = wp.types.matrix((AHEAD, space_dim), scalar)
-    keep = make_lists(capacity)
+    keep = make_lists(capacity, lanes)
     list_address, append_step, leave_list = keep.list_address, keep.append_step, keep.leave_list
 
     @wp.func
@@ -57,7 +65,7 @@ def listed_density(space_dim: int, lanes: int, periodic: bool, capacity: int = 0
         return wp.max(scalar(1.0) - squared * domain.inverse_squared_eps, scalar(0.0))
 
     topic = "listed_density_in_box" if periodic else "listed_density"
-    topic += f"_listing_{capacity}" * (capacity > 0)
+    topic += f"_listing_{capacity}" * (capacity > 0) + "_rows" * masked
 
     @wp.kernel(enable_backward=False, module=kernel_module(topic, space_dim, scalar, 0, lanes))
     def compute_density(
@@ -66,15 +74,23 @@ def listed_density(space_dim: int, lanes: int, periodic: bool, capacity: int = 0
         sorted_cell: wp.array(dtype=wp.int32),
         sorted_positions: wp.array(dtype=vector),
         state_place: wp.array(dtype=wp.int32),
+        source: wp.array(dtype=wp.int32),
+        row_of: wp.array(dtype=wp.int32),
         # outputs
         particles: wp.array(dtype=particle),
+        records: wp.array(dtype=RECORD),
         lists: wp.array(dtype=wp.int16),
         list_lengths: wp.array(dtype=wp.int32),
     ):
-        """Write every particle's position and volume 1 / rho."""
+        """Write every particle's position and volume 1 / rho, where `particles` is not empty.
+
+        A list lies at its row. Its length is larger than the capacity where not all fits in.
+        """
         thread = wp.tid()
         k = thread >> wp.static(lanes.bit_length() - 1)
         lane = thread & wp.static(lanes - 1)
+        inside = k < sorted_positions.shape[0]
+        k = wp.where(inside, k, wp.int32(0))
         position = load_vector(sorted_positions, k)
         index = load_integer(sorted_cell, k)
         local = wp.int32(wp.uint32(index) % wp.uint32(domain.cell_count))
@@ -82,31 +98,43 @@ def listed_density(space_dim: int, lanes: int, periodic: bool, capacity: int = 0
         cell = cell_place(domain, local)
         total = scalar(0.0)
         if wp.static(capacity > 0):
+            row = k
+            if wp.static(masked):
+                row = load_integer(row_of, load_integer(source, k))
+            row = wp.where(inside, row, wp.int32(-1))
             list_begin = list_address()
             list_end = list_begin
+            if row < 0:
+                list_end = list_begin + wp.uint32(wp.static(LIST_BYTES * capacity))
+            far = wp.bool(False)
         for segment in range(segment_count(domain, cell)):
             first, last = segment_cells(domain, cell, segment)
             end = load_integer(starts, base + last)
             j = load_integer(starts, base + first) + lane
             if wp.static(capacity > 0):
+                begin = j - lane
+                far = far or (begin < end and wp.max(k - begin, end - k) > LONGEST_STEP)
                 # Several positions are asked for before the first is used.
-                while j + wp.static(AHEAD - 1) < end:
+                while j + wp.static((AHEAD - 1) * lanes) < end:
                     ahead = positions_ahead()
-                    for step in range(wp.static(AHEAD)):
-                        ahead[step] = load_vector(sorted_positions, j + step)
-                    for step in range(wp.static(AHEAD)):
-                        falloff = falloff_at(domain, ahead[step] - position)
-                        list_end = append_step(list_begin, list_end, falloff, j + step - k)
+                    for a in range(wp.static(AHEAD)):
+                        ahead[a] = load_vector(sorted_positions, j + a * wp.static(lanes))
+                    for a in range(wp.static(AHEAD)):
+                        step = j + a * wp.static(lanes) - k
+                        falloff = falloff_at(domain, ahead[a] - position)
+                        list_end = append_step(list_begin, list_end, falloff, step)
                         total += falloff * falloff * falloff
-                    j += wp.static(AHEAD)
+                    j += wp.static(AHEAD * lanes)
                 if j < end:
                     ahead = positions_ahead()
-                    for step in range(wp.static(AHEAD - 1)):
-                        ahead[step] = load_vector(sorted_positions, wp.min(j + step, end - 1))
-                    for step in range(wp.static(AHEAD - 1)):
-                        falloff = falloff_at(domain, ahead[step] - position)
-                        falloff = wp.where(j + step < end, falloff, scalar(0.0))
-                        list_end = append_step(list_begin, list_end, falloff, j + step - k)
+                    for a in range(wp.static(AHEAD - 1)):
+                        place = wp.min(j + a * wp.static(lanes), end - 1)
+                        ahead[a] = load_vector(sorted_positions, place)
+                    for a in range(wp.static(AHEAD - 1)):
+                        candidate = j + a * wp.static(lanes)
+                        falloff = falloff_at(domain, ahead[a] - position)
+                        falloff = wp.where(candidate < end, falloff, scalar(0.0))
+                        list_end = append_step(list_begin, list_end, falloff, candidate - k)
                         total += falloff * falloff * falloff
             else:
                 for candidate in range(j, end, wp.static(lanes)):
@@ -115,18 +143,26 @@ def listed_density(space_dim: int, lanes: int, periodic: bool, capacity: int = 0
                     total += falloff * falloff * falloff
         # A particle always sees itself: a position that is not finite would otherwise have rho 0.
         total = wp.max(add_scalar(total), scalar(1.0))
-        if lane == 0:
+        if wp.static(capacity > 0):
+            length = leave_list(list_begin, list_end, row, lists)
+            if lane == 0 and row >= 0:
+                list_lengths[row] = wp.where(far, wp.static(capacity + 1), length)
+        if lane == 0 and inside:
             entry = particle()
             for d in range(wp.static(space_dim)):
                 entry[d] = position[d]
             entry[wp.static(space_dim)] = scalar(1.0) / (domain.smoothing_norm * total)
-            if wp.static(capacity > 0 and flat):
-                number = k
-                if state_place.shape[0] > 0:
-                    number = load_integer(state_place, k)
-                entry[3] = as_word(number)
-            particles[k] = entry
+            if particles.shape[0] > 0:
+                particles[k] = entry
             if wp.static(capacity > 0):
-                list_lengths[k] = leave_list(list_begin, list_end, k, lists)
+                record = RECORD()
+                for d in range(wp.static(space_dim + 1)):
+                    record[d] = entry[d]
+                if wp.static(flat):
+                    number = k
+                    if state_place.shape[0] > 0:
+                        number = load_integer(state_place, k)
+                    record[3] = as_word(number)
+                store_record(records, k, record)
 
     return compute_density

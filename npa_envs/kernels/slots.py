@@ -81,26 +81,30 @@ _LIST_APPEND = """
     return place;
 """
 
+# Each lane's entries follow those of the lanes before it.
 _LIST_LEAVE = """
     const int length = (place - first) / (2 * {block});
-    short* to = lists.data + (size_t)(particle / 32) * (32 * {capacity}) + particle % 32;
-    const int held = length < {capacity} ? length : {capacity};
+    int end = length;
+    #pragma unroll
+    for (int offset = 1; offset < {lanes}; offset *= 2) {{
+        const int before = __shfl_up_sync(~0u, end, offset, {lanes});
+        if (threadIdx.x % {lanes} >= offset) end += before;
+    }}
+    const int total = {lanes} > 1 ? __shfl_sync(~0u, end, {lanes} - 1, {lanes}) : length;
+    if (row < 0) return total;
+    const int begin = end - length;
+    short* to = lists.data + (size_t)(row / 32) * (32 * {capacity}) + row % 32;
+    const int held = length < {capacity} - begin ? length : {capacity} - begin;
     for (int entry = 0; entry < held; ++entry) {{
         short step;
         asm volatile("ld.shared.u16 %0, [%1];" : "=h"(step) : "r"(first + 2 * {block} * entry));
-        to[32 * entry] = step;
+        to[32 * (begin + entry)] = step;
     }}
-    return length;
+    return total;
 """
 
-_LIST_FETCH = """
-    const short* from = lists.data + (size_t)(particle / 32) * (32 * {capacity}) + particle % 32;
-    #pragma unroll 4
-    for (int entry = lane; entry < count; entry += {lanes}) {{
-        const int number = particle + from[32 * (begin + entry)];
-        const unsigned place = slot + {first_number} + {number_stride} * entry;
-        *reinterpret_cast<int*>(__cvta_shared_to_generic(place)) = number;
-    }}
+_LIST_STEP = """
+    return lists.data[(size_t)(row / 32) * (32 * {capacity}) + row % 32 + 32 * entry];
 """
 
 _STAGE = """
@@ -228,16 +232,6 @@ def make_slots(
     @wp.func_native(_NUMBER.format(**names))
     def number_at(slot: wp.uint32, entry: wp.int32) -> wp.int32: ...
 
-    @wp.func_native(_LIST_FETCH.format(**names))
-    def fetch_numbers(
-        slot: wp.uint32,
-        lists: wp.array(dtype=wp.int16),
-        particle: wp.int32,
-        begin: wp.int32,
-        count: wp.int32,
-        lane: wp.int32,
-    ): ...
-
     @wp.func_native(_PUT.format(**names))
     def put_entry(
         slot: wp.uint32, entry: wp.int32, smooth: wp.float32, kernel: vector, number: wp.int32
@@ -259,7 +253,6 @@ def make_slots(
     return SimpleNamespace(
         slot_address=slot_address,
         append_number=append_number,
-        fetch_numbers=fetch_numbers,
         number_at=number_at,
         put_entry=put_entry,
         entry_at=entry_at,
@@ -268,16 +261,17 @@ def make_slots(
 
 
 @functools.cache
-def make_lists(capacity: int) -> SimpleNamespace:
-    """Return the Warp functions on lists of neighbours, which a thread of a particle each makes.
+def make_lists(capacity: int, lanes: int = 1) -> SimpleNamespace:
+    """Return the Warp functions on lists of neighbours, which the lanes of a particle make.
 
     A list holds the steps to neighbours in the sorted order, in 16 bits. It is gathered in fast
     memory and left in an array: 32 particles together, first entries first.
 
     Args:
         capacity: Neighbours that a list has room for; more are counted but not kept.
+        lanes: Lanes of a particle; whole warps must leave their lists together.
     """
-    names = {"capacity": capacity, "block": CUDA_BLOCK}
+    names = {"capacity": capacity, "block": CUDA_BLOCK, "lanes": lanes}
 
     @wp.func_native(_LIST_ADDRESS.format(**names))
     def list_address() -> wp.uint32: ...
@@ -289,11 +283,17 @@ def make_lists(capacity: int) -> SimpleNamespace:
 
     @wp.func_native(_LIST_LEAVE.format(**names))
     def leave_list(
-        first: wp.uint32, place: wp.uint32, particle: wp.int32, lists: wp.array(dtype=wp.int16)
+        first: wp.uint32, place: wp.uint32, row: wp.int32, lists: wp.array(dtype=wp.int16)
     ) -> wp.int32: ...
 
+    @wp.func_native(_LIST_STEP.format(**names))
+    def step_at(lists: wp.array(dtype=wp.int16), row: wp.int32, entry: wp.int32) -> wp.int32: ...
+
     return SimpleNamespace(
-        list_address=list_address, append_step=append_step, leave_list=leave_list
+        list_address=list_address,
+        append_step=append_step,
+        leave_list=leave_list,
+        step_at=step_at,
     )
 
 

@@ -14,7 +14,14 @@ from torch import Tensor
 from npa_envs.sph.adjoint import perceive_rows_backward
 from npa_envs.sph.bridge import launch
 from npa_envs.sph.cells import make_plan, sort_worlds
-from npa_envs.sph.passes import Terms, compute_density, perception_launch
+from npa_envs.sph.passes import (
+    Terms,
+    compute_density,
+    list_capacity,
+    list_lanes,
+    list_neighbours,
+    perception_launch,
+)
 
 __all__ = ["Rows", "Terms", "perceive_rows"]
 
@@ -44,16 +51,27 @@ def _perceive_rows(
     state_gradient: bool,
     moment_correction: bool,
     density_gradient: bool,
+    for_adjoint: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     plan = make_plan(x, x.shape, s.shape[2], row_capacity, mask is not None, eps, box)
     terms = Terms(state_gradient, moment_correction, density_gradient)
     ordered = sort_worlds(plan, x, s, mask)
-    densities = compute_density(plan, ordered, terms)
+    if list_capacity(plan):
+        lanes = list_lanes(plan)
+        densities = list_neighbours(plan, ordered, None, with_particles=for_adjoint, lanes=lanes)
+    else:
+        densities = compute_density(plan, ordered, terms)
     perception = x.new_empty(row_capacity, row_width)
-    row_kernel_sum = x.new_empty(row_capacity, plan.space_dim)
+    row_kernel_sum = x.new_empty(row_capacity if for_adjoint else 0, plan.space_dim)
     launch(
         *perception_launch(
-            plan, ordered, densities, terms, scale, perception, row_kernel_sum=row_kernel_sum
+            plan,
+            ordered,
+            densities,
+            terms,
+            scale,
+            perception,
+            row_kernel_sum=row_kernel_sum if for_adjoint else None,
         )
     )
     return (
@@ -79,9 +97,11 @@ def _(
     eps: float,
     scale: float,
     box: list[float] | None,
-    *terms: bool,
+    *options: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     plan = make_plan(x, x.shape, s.shape[2], row_capacity, mask is not None, eps, box)
+    for_adjoint = options[-1]
+    particle_count = plan.total if for_adjoint or not list_capacity(plan) else 0
     integers = torch.int32
     return (
         x.new_empty(row_capacity, row_width),
@@ -89,9 +109,9 @@ def _(
         x.new_empty(row_capacity, dtype=integers),
         x.new_empty(plan.start_count, dtype=integers),
         x.new_empty(plan.total, dtype=integers),
-        x.new_empty(plan.total, plan.space_dim + 1),
+        x.new_empty(particle_count, plan.space_dim + 1),
         x.new_empty(row_capacity, plan.space_dim),
-        x.new_empty(row_capacity, plan.space_dim),
+        x.new_empty(row_capacity if for_adjoint else 0, plan.space_dim),
         s.new_empty(plan.total * plan.group_count, plan.width),
     )
 
@@ -122,7 +142,18 @@ class _PerceiveRows(torch.autograd.Function):
             row_positions,
             row_kernel_sum,
             states,
-        ) = _perceive_rows(x, s, mask, row_capacity, row_width, eps, scale, box, *terms)
+        ) = _perceive_rows(
+            x,
+            s,
+            mask,
+            row_capacity,
+            row_width,
+            eps,
+            scale,
+            box,
+            *terms,
+            for_adjoint=any(ctx.needs_input_grad),
+        )
         ctx.mark_non_differentiable(row_of, row_source, starts)
         ctx.set_materialize_grads(False)
         if any(ctx.needs_input_grad):

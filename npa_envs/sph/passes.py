@@ -22,11 +22,11 @@ CAPACITY, LARGE_CAPACITY = 64, 128
 SMALL_WORLD = 2048
 """Particles of a small world."""
 
-LARGEST_LISTED_WORLD = 2**15
-"""Steps within larger worlds do not fit into the 16 bits of a list's entry."""
-
 LIST_BLOCK = 32
 """Particles whose lists lie together."""
+
+FULL_DEVICE = 2**16
+"""Particles that fill a device with one thread each."""
 
 
 class Terms(NamedTuple):
@@ -43,25 +43,27 @@ class Terms(NamedTuple):
 
 
 class NeighbourLists(NamedTuple):
-    """The neighbours of each sorted particle, itself included."""
+    """The neighbours of each row's particle, itself included."""
 
     capacity: int
     """Neighbours that a list has room for: what is longer, perception searches for again."""
     steps: Tensor
     """Steps to neighbours in the sorted order, int16; 32 particles together."""
     lengths: Tensor
-    """Neighbours of each particle, int32, [B N]."""
+    """Neighbours of each row's particle, int32, [K]."""
+    records: Tensor
+    """Sorted positions with volumes, and in 2D places of states, shape [B N, 4]."""
 
 
 class Densities(NamedTuple):
     """What the density pass leaves for perception."""
 
     particles: Tensor
-    """Sorted positions with volumes 1 / rho, shape [B N, D + 1]."""
+    """Sorted positions with volumes 1 / rho, shape [B N, D + 1]; empty where nobody asked."""
     row_density_gradient: Tensor
     """Density gradients of the rows, float64, [K, D]; empty where perception computes them."""
     lists: NeighbourLists | None = None
-    """What the density pass found of neighbours; `particles` are then records, [B N, 4]."""
+    """What the density pass found of neighbours."""
 
 
 def plain_kernels(plan: Plan, terms: Terms) -> Any:
@@ -78,40 +80,58 @@ def plain_kernels(plan: Plan, terms: Terms) -> Any:
 
 def list_capacity(plan: Plan) -> int:
     """Return how many neighbours a list has room for, 0 where there are no lists."""
-    if not plan.listed or plan.particle_count > LARGEST_LISTED_WORLD:
+    if not plan.listed:
         return 0
     return CAPACITY if plan.particle_count <= SMALL_WORLD else LARGE_CAPACITY
 
 
-def list_neighbours(plan: Plan, ordered: SortedWorlds, state_place: Tensor | None) -> Densities:
-    """Compute densities and list neighbours, for a perception of all particles.
+def list_lanes(plan: Plan) -> int:
+    """Return how many threads of a particle list neighbours fastest, be it one world or many."""
+    return plan.lanes if plan.total < FULL_DEVICE else 1
+
+
+def list_neighbours(
+    plan: Plan,
+    ordered: SortedWorlds,
+    state_place: Tensor | None,
+    *,
+    with_particles: bool,
+    lanes: int = 1,
+) -> Densities:
+    """Compute densities, and list the neighbours of the rows.
 
     Args:
         plan: Plan of the call, of a positive `list_capacity`.
         ordered: The sorted worlds.
         state_place: Where the states of sorted particles are, int32, shape [B N]; None: in order.
+        with_particles: Also leave `particles`, which the adjoint reads.
+        lanes: Threads of a particle.
     """
     capacity = list_capacity(plan)
     positions = ordered.positions
     records = positions.new_empty(plan.total, 4)
-    blocks = -(-plan.total // LIST_BLOCK)
+    particles = positions.new_empty(plan.total if with_particles else 0, plan.space_dim + 1)
+    blocks = -(-plan.row_capacity // LIST_BLOCK)
     steps = positions.new_empty(blocks, capacity, LIST_BLOCK, dtype=torch.int16)
-    lengths = positions.new_empty(plan.total, dtype=torch.int32)
+    lengths = positions.new_empty(plan.row_capacity, dtype=torch.int32)
     launch(
-        listed_density(plan.space_dim, 1, plan.periodic, capacity),
-        plan.total,
+        listed_density(plan.space_dim, lanes, plan.periodic, capacity, plan.masked),
+        -(-plan.total * lanes // LIST_BLOCK) * LIST_BLOCK,
         positions.device,
         plan.domain,
         ordered.starts,
         ordered.cell,
         positions,
         state_place,
+        ordered.source,
+        ordered.row_of,
+        particles,
         records,
         steps.view(-1),
         lengths,
     )
     no_gradient = positions.new_empty(0, plan.space_dim, dtype=torch.float64)
-    return Densities(records, no_gradient, NeighbourLists(capacity, steps, lengths))
+    return Densities(particles, no_gradient, NeighbourLists(capacity, steps, lengths, records))
 
 
 def compute_density(
@@ -139,7 +159,10 @@ def compute_density(
         ordered.cell,
         positions,
         None,
+        None,
+        None,
         particles,
+        None,
         None,
         None,
     )
@@ -218,6 +241,7 @@ def perception_launch(
             plan.periodic,
             plan.group_count > 1,
             0 if lists is None else lists.capacity,
+            row_kernel_sum is not None,
         )
         rows = -(-plan.row_capacity // WARP_ROWS) * WARP_ROWS
         source = ordered.states if states is None else states
@@ -233,7 +257,7 @@ def perception_launch(
             ordered.cell,
             ordered.positions,
             densities.particles.view(-1) if lists is None else None,
-            densities.particles if lists is not None else None,
+            None if lists is None else lists.records,
             source.view(-1, plan.width // plan.lanes),
             None if states is None else ordered.source,
             row_place,

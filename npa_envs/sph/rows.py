@@ -88,7 +88,8 @@ def survey(
     in_place = plan.listed and plan.state_dim % plan.width == 0 and s.data_ptr() % 16 == 0
     ordered = sort_worlds(plan, x, None if in_place else s, None, with_rows=not plan.listed)
     if list_capacity(plan):
-        densities = list_neighbours(plan, ordered, ordered.source if in_place else None)
+        place = ordered.source if in_place else None
+        densities = list_neighbours(plan, ordered, place, with_particles=False)
     else:
         densities = compute_density(plan, ordered, terms, lanes=DENSITY_LANES)
 
