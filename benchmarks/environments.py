@@ -104,8 +104,9 @@ def python_times(env: Any, actions: list[Any], device: torch.device) -> tuple[fl
     out = worlds.perceive()
 
     def queue(action: Any) -> None:
-        worlds._take(action)
-        worlds._advance()
+        worlds._draw()
+        worlds._actions.apply(action)
+        worlds._judge_and_survey()
         worlds._surveyed.perceive(out)
 
     times: dict[Callable[[Any], Any], list[float]] = {env.step: [], queue: []}

@@ -122,8 +122,11 @@ class RegenerationTask(PictureTask[Regeneration2DEnvConfig]):
         for k, kind in enumerate(kinds):
             size = SIZES[kind] if self.config.damage_size is None else self.config.damage_size
             new_x, new_s = damage_worlds(x, s, kind=kind, size=size, generator=random)
-            hurt_x = torch.where(chosen == k, new_x, hurt_x)
-            hurt_s = torch.where(chosen == k, new_s, hurt_s)
+            # A damage leaves either positions or states as they are.
+            if new_x is not x:
+                hurt_x = torch.where(chosen == k, new_x, hurt_x)
+            if new_s is not s:
+                hurt_s = torch.where(chosen == k, new_s, hurt_s)
         if threshold is None:
             whole, hurt = self._loss(x, s), self._loss(hurt_x, hurt_s)
             healed = whole + (1.0 - self.config.healed_share) * (hurt - whole)

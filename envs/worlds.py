@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.control import CheckedCopy, Physics, SurveyedWorlds, act, survey_worlds
+from npa_envs.control import Actions, Physics, SurveyedWorlds, survey_worlds
 from npa_envs.envs.config import EnvConfig
 from npa_envs.envs.memory import check_memory
 from npa_envs.envs.restarts import Restarts
@@ -152,7 +152,6 @@ class Worlds:
         """Each particle's own reward of the last step, shape [B, N], likewise."""
         self._start_loss = zeros()
         self._success_loss = zeros()
-        self._action = zeros(count, physics.action_dim)
         self._diverged = zeros(dtype=torch.uint8)
         self._enabled = torch.ones(1, dtype=torch.uint8, device=device)
         self.part_names: tuple[str, ...] = ()
@@ -163,8 +162,16 @@ class Worlds:
         self._host_endings = torch.zeros(
             world_count + 1, dtype=torch.uint8, pin_memory=device.type == "cuda"
         )
-        self._take = CheckedCopy(self._action, self._enabled)
-        self._advance = Replayed(self._move_and_judge, device)
+        self._actions = Actions(
+            self.x,
+            self.s,
+            physics,
+            self.random,
+            enabled=self._enabled,
+            diverged=self._diverged,
+        )
+        self._draw = Replayed(self._actions.draw, device)
+        self._judge_and_survey = Replayed(self._look, device)
         self.restart = Restarts(
             self._start_and_survey, world_count, device, recorded=self.task.start_is_short
         )
@@ -270,11 +277,11 @@ class Worlds:
         Raises:
             NPAError: An action is not finite; the worlds are then as they were.
         """
-        self._take(action)
-        if self._judged is None and not self._enabled[0]:
-            self._enabled.fill_(1)
+        if self._judged is None and not bool(torch.isfinite(action).all()):
             raise self._not_finite(action)
-        self._advance()
+        self._draw()
+        self._actions.apply(action)
+        self._judge_and_survey()
         if self._judged is None:
             return self._endings(), self._surveyed.perceive(out)
         self._judged.record()
@@ -290,28 +297,14 @@ class Worlds:
     def _endings(self) -> NDArray[np.uint8]:
         return self._host_endings[:-1].numpy().copy()
 
-    def _move_and_judge(self) -> None:
-        """Apply the actions; then judge the worlds and, beside that, sort them."""
-        self._move()
+    def _look(self) -> None:
+        """Judge the worlds and, beside that, sort them."""
+        self.elapsed += 1
         with contextlib.nullcontext() if self._beside is None else self._beside.aside():
             self._judge()
         self._surveyed = survey_worlds(self.x, self.s, self.physics)
         if self._beside is not None:
             self._beside.join()
-
-    def _move(self) -> None:
-        """Apply the actions."""
-        self._diverged.zero_()
-        act(
-            self.x,
-            self.s,
-            self._action,
-            self.physics,
-            self.random,
-            enabled=self._enabled,
-            diverged=self._diverged,
-        )
-        self.elapsed += 1
 
     def _judge(self) -> None:
         """Write rewards, losses and endings of the worlds as they now are."""

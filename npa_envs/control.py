@@ -1,8 +1,7 @@
 """Worlds whose updates come from outside: what particles perceive, and what an action does.
 
 The same dynamics as `npa_envs.rollout`, with the rule taken out: an action stands where a rule's
-bounded output stands. Nothing here waits for the device, so all of it may be captured in a CUDA
-graph.
+bounded output stands. Nothing here waits for the device.
 """
 
 from __future__ import annotations
@@ -13,12 +12,11 @@ import torch
 from torch import Tensor
 
 from npa_envs.randomness import WorldRandom
-from npa_envs.sph.actions import apply_actions
-from npa_envs.sph.finite import CheckedCopy
+from npa_envs.sph.actions import RepeatedActions
 from npa_envs.sph.passes import Terms
 from npa_envs.sph.rows import SurveyedWorlds, survey
 
-__all__ = ["CheckedCopy", "Physics", "SurveyedWorlds", "act", "observe", "survey_worlds"]
+__all__ = ["Actions", "Physics", "SurveyedWorlds", "observe", "survey_worlds"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,49 +112,71 @@ def observe(x: Tensor, s: Tensor, physics: Physics) -> Tensor:
     return survey_worlds(x, s, physics).perceive()
 
 
-@torch.no_grad()
-def act(
-    x: Tensor,
-    s: Tensor,
-    action: Tensor,
-    physics: Physics,
-    random: WorldRandom,
-    *,
-    enabled: Tensor,
-    diverged: Tensor,
-) -> None:
-    """Apply one step's actions in place: draws the masks and the noise as `rollout` does.
+class Actions:
+    """What actions do to some worlds, in place, with the masks and the noise of `rollout`.
 
     Args:
         x: Positions [length units], shape [B, N, D], finite.
         s: States, dimensionless, shape [B, N, C], finite.
-        action: Displacement as a fraction of α ε (D, norm clipped to 1), then state step as a
-            fraction of `state_scale` (C, clipped to [-1, 1]); shape [B, N, A].
         physics: The worlds' constants.
-        random: Where masks and noise come from; advanced by one step.
-        enabled: Whether all actions are finite; where not, no world changes; uint8, shape [1].
-        diverged: Set to 1 for worlds in which a number left its bounds or is not finite, uint8,
-            shape [B]; such numbers are moved back to the bounds, NaN to 0.
+        random: Where masks and noise come from; advanced by one step in each `draw`.
+        enabled: Whether actions are applied, uint8, shape [1]: set to 0 where one is not finite,
+            and no world changes; the caller sets it to 1 again.
+        diverged: Set to 1 for worlds in which a number left its bounds or is not finite, to 0 for
+            the others, uint8, shape [B]; such numbers are moved back to the bounds, NaN to 0.
     """
-    random.advance()
-    mask = noise = None
-    if physics.update_prob < 1.0:
-        mask = random.bernoulli(physics.update_prob, x.shape[1])
-    if physics.position_noise > 0.0:
-        noise = random.normal(*x.shape[1:], dtype=x.dtype) * physics.position_noise
-    apply_actions(
-        action,
-        x,
-        s,
-        mask=mask,
-        noise=noise,
-        reach=physics.reach,
-        dt=physics.dt,
-        state_scale=physics.state_scale,
-        moving=physics.moving,
-        box=physics.box,
-        position_limit=physics.position_limit,
-        state_limit=physics.state_limit,
-        enabled=enabled,
-        diverged=diverged,
-    )
+
+    def __init__(
+        self,
+        x: Tensor,
+        s: Tensor,
+        physics: Physics,
+        random: WorldRandom,
+        *,
+        enabled: Tensor,
+        diverged: Tensor,
+    ) -> None:
+        self._physics = physics
+        self._random = random
+        self._diverged = diverged
+        self._mask = self._noise = None
+        if physics.update_prob < 1.0:
+            self._mask = torch.zeros(x.shape[:2], dtype=torch.uint8, device=x.device)
+        if physics.position_noise > 0.0:
+            self._noise = torch.zeros_like(x)
+        self._apply = RepeatedActions(
+            x,
+            s,
+            mask=self._mask,
+            noise=self._noise,
+            reach=physics.reach,
+            dt=physics.dt,
+            state_scale=physics.state_scale,
+            moving=physics.moving,
+            box=physics.box,
+            position_limit=physics.position_limit,
+            state_limit=physics.state_limit,
+            enabled=enabled,
+            diverged=diverged,
+        )
+
+    @torch.no_grad()
+    def draw(self) -> None:
+        """Draw the next step's masks and noise; may be captured in a CUDA graph."""
+        physics, random = self._physics, self._random
+        self._diverged.zero_()
+        random.advance()
+        if self._mask is not None:
+            self._mask.copy_(random.bernoulli(physics.update_prob, self._mask.shape[1]))
+        if self._noise is not None:
+            noise = random.normal(*self._noise.shape[1:], dtype=self._noise.dtype)
+            self._noise.copy_(noise * physics.position_noise)
+
+    def apply(self, action: Tensor) -> None:
+        """Apply actions with what was drawn last.
+
+        Args:
+            action: Displacement as a fraction of α ε (D, norm clipped to 1), then state step as a
+                fraction of `state_scale` (C, clipped to [-1, 1]); shape [B, N, A], any device.
+        """
+        self._apply(action)

@@ -1,12 +1,14 @@
 """Applying actions: the formula, a rule as a policy, masks, noise, boxes, limits, errors."""
 
 import math
+import pickle
 
 import pytest
 import torch
 
 from npa_envs.errors import NPAError
 from npa_envs.sph import apply_actions
+from npa_envs.sph.actions import RepeatedActions
 from npa_envs.sph.operators import Rows
 from npa_envs.sph.update import update_particles
 
@@ -300,3 +302,80 @@ def test_tensors_that_do_not_fit_are_clear_errors(change, message):
                 **given,
             },
         )
+
+
+def repeated(x, s, **options):
+    """Return the actions on copies of a world, with these copies, and what switches them off."""
+    x, s = x.clone(), s.clone()
+    enabled = torch.ones(1, dtype=torch.uint8, device=x.device)
+    given = {
+        "mask": None,
+        "noise": None,
+        "reach": REACH,
+        "dt": DT,
+        "state_scale": STATE_SCALE,
+        "moving": True,
+        "box": None,
+        "diverged": torch.zeros(x.shape[0], dtype=torch.uint8, device=x.device),
+        **LIMITS,
+        **options,
+    }
+    return RepeatedActions(x, s, enabled=enabled, **given), (x, s), enabled
+
+
+@pytest.mark.parametrize("how", ["plain", "strided", "misaligned", "other dtype", "on the host"])
+def test_repeated_actions_are_the_same_wherever_they_lie(how, world, device):
+    action, x, s = world
+    act, (moved, changed), enabled = repeated(x, s)
+    expected = world[1:]
+    for sign in (1.0, -1.0, 0.5):
+        given = {
+            "plain": lambda a: a,
+            "strided": lambda a: a.mT.contiguous().mT,
+            "misaligned": lambda a: torch.cat((a.new_zeros(1), a.flatten()))[1:].view(a.shape),
+            "other dtype": lambda a: a.to(torch.float64 if a.dtype == torch.float32 else a.dtype),
+            "on the host": lambda a: a.cpu(),
+        }[how](sign * action)
+        act(given)
+        expected = applied(sign * action, *expected)[:2]
+    assert torch.equal(moved, expected[0])
+    assert torch.equal(changed, expected[1])
+    assert enabled.item() == 1
+
+
+def test_one_number_that_is_not_finite_is_found_wherever_it_lies(world, device):
+    action, x, s = (tensor[:1, :7] for tensor in world)
+    act, (moved, changed), enabled = repeated(x, s)
+    for place in range(action.numel()):
+        for wild in (math.nan, math.inf, -math.inf):
+            bad = action.contiguous().clone()
+            bad.view(-1)[place] = wild
+            act(bad)
+            assert enabled.item() == 0
+            assert torch.equal(moved, x)
+            assert torch.equal(changed, s)
+            # Nothing but the caller switches them on again.
+            act(action)
+            assert enabled.item() == 0
+            assert torch.equal(moved, x)
+            enabled.fill_(1)
+    act(torch.full_like(action, torch.finfo(action.dtype).max))
+    assert enabled.item() == 1
+
+
+def test_repeated_actions_can_be_pickled_after_use(world):
+    action, x, s = (tensor.cpu() for tensor in world)
+    act, _, _ = repeated(x, s)
+    act(action)
+    again = pickle.loads(pickle.dumps(act))
+    again(action)
+    twice = applied(action, *applied(action, x, s)[:2])
+    assert torch.equal(again._worlds[0], twice[0])
+
+
+def test_repeated_actions_of_another_shape_are_clear_errors(world):
+    action, x, s = world
+    with pytest.raises(NPAError, match="action must have shape"):
+        repeated(x, s)[0](action[:, :-1])
+    with pytest.raises(NPAError, match=r"mask must be torch\.uint8"):
+        repeated(x, s, mask=torch.zeros(x.shape[:2], device=x.device))

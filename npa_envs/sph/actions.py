@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
+from npa_envs.kernels.finite import VALUES_PER_THREAD, find_not_finite
 from npa_envs.kernels.update import CHANNEL_SHARE, update_kernels
-from npa_envs.sph.bridge import launch, scalar_type
+from npa_envs.sph.bridge import Repeated, launch, scalar_type
 from npa_envs.sph.cells import LARGEST_INDEX
 from npa_envs.sph.checks import check_world
 
@@ -59,6 +61,160 @@ def apply_actions(
         NPAError: A shape, dtype or device does not fit, or a tensor to be changed or read is not
             contiguous.
     """
+    _check_worlds(action, x, s, mask, noise, enabled, diverged, moving)
+    aligned = s.data_ptr() % 16 == 0 and action.data_ptr() % 16 == 0
+    launch(
+        *_launch_of(
+            action.view(-1),
+            x,
+            s,
+            mask=mask,
+            noise=noise,
+            reach=reach,
+            dt=dt,
+            state_scale=state_scale,
+            moving=moving,
+            box=box,
+            position_limit=position_limit,
+            state_limit=state_limit,
+            enabled=enabled,
+            diverged=diverged,
+            aligned=aligned,
+        )
+    )
+
+
+class RepeatedActions:
+    """`apply_actions` on the same worlds again and again, checked first: less of the host's time.
+
+    Args:
+        x: As for `apply_actions`.
+        s: As for `apply_actions`.
+        enabled: Whether all actions were finite; where not, nothing happens; uint8, shape [1]. Set
+            to 0 where one is not, and never to 1.
+        options: The other keywords of `apply_actions`.
+
+    Raises:
+        NPAError: As `apply_actions`.
+    """
+
+    def __init__(self, x: Tensor, s: Tensor, *, enabled: Tensor, **options: Any) -> None:
+        action_dim = s.shape[2] + (x.shape[2] if options["moving"] else 0)
+        self._buffer = s.new_zeros(*s.shape[:2], action_dim)
+        self._worlds = (x, s)
+        self._options = {"enabled": enabled, **options}
+        self._check: Repeated | None = None
+        self._apply: Repeated | None = None
+        names = ("mask", "noise", "diverged", "moving")
+        given = {name: options[name] for name in names}
+        _check_worlds(self._buffer, x, s, enabled=enabled, **given)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out the recorded launches, which cannot be pickled."""
+        return self.__dict__ | {"_check": None, "_apply": None}
+
+    def __call__(self, action: Tensor) -> None:
+        """Apply actions.
+
+        Args:
+            action: Shape [B, N, A], of any dtype, on any device.
+
+        Raises:
+            NPAError: It has another shape.
+        """
+        buffer = self._buffer
+        if action.shape != buffer.shape:
+            raise NPAError(
+                f"action must have shape {tuple(buffer.shape)}, got {tuple(action.shape)}"
+            )
+        fits = action.dtype == buffer.dtype and action.device == buffer.device
+        if not fits or not action.is_contiguous() or action.data_ptr() % 16:
+            buffer.copy_(action)
+            action = buffer
+        flat = action.detach().view(-1)
+        if self._check is None or self._apply is None:
+            self._check, self._apply = self._record(flat)
+        self._check(flat)
+        self._apply(flat)
+
+    def _record(self, flat: Tensor) -> tuple[Repeated, Repeated]:
+        """Return the launches that check and that apply, both of actions that are aligned."""
+        x, s = self._worlds
+        thread_count = -(-flat.numel() // VALUES_PER_THREAD)
+        check = Repeated(
+            find_not_finite(scalar_type(x.dtype)),
+            thread_count,
+            x.device,
+            thread_count,
+            flat,
+            self._options["enabled"],
+            changing=flat,
+        )
+        aligned = s.data_ptr() % 16 == 0
+        apply = Repeated(*_launch_of(flat, x, s, aligned=aligned, **self._options), changing=flat)
+        return check, apply
+
+
+def _launch_of(
+    action: Tensor,
+    x: Tensor,
+    s: Tensor,
+    *,
+    mask: Tensor | None,
+    noise: Tensor | None,
+    reach: float,
+    dt: float,
+    state_scale: float,
+    moving: bool,
+    box: Sequence[float] | None,
+    position_limit: float,
+    state_limit: float,
+    enabled: Tensor | None,
+    diverged: Tensor,
+    aligned: bool,
+) -> tuple[Any, ...]:
+    """Return what to give to `launch`; `aligned` says where actions and states lie in memory."""
+    world_count, particle_count, space_dim = x.shape
+    state_dim = s.shape[2]
+    # Adjacent channels are then read and written at once.
+    aligned = aligned and state_dim % CHANNEL_SHARE == 0 and (space_dim % 2 == 0 or not moving)
+    return (
+        update_kernels(space_dim, scalar_type(x.dtype)).apply_actions,
+        world_count * particle_count * -(-state_dim // CHANNEL_SHARE),
+        x.device,
+        particle_count,
+        reach * dt,
+        state_scale * dt,
+        int(box is not None),
+        tuple(box) if box is not None else (1.0,) * space_dim,
+        int(moving),
+        position_limit,
+        state_limit,
+        int(mask is not None),
+        None if mask is None else mask.view(-1),
+        int(noise is not None),
+        None if noise is None else noise.view(-1, space_dim),
+        int(enabled is not None),
+        enabled,
+        state_dim,
+        int(aligned),
+        action,
+        x.view(-1, space_dim),
+        s.view(-1),
+        diverged,
+    )
+
+
+def _check_worlds(
+    action: Tensor,
+    x: Tensor,
+    s: Tensor,
+    mask: Tensor | None,
+    noise: Tensor | None,
+    enabled: Tensor | None,
+    diverged: Tensor,
+    moving: bool,
+) -> None:
     check_world(x, s)
     world_count, particle_count, space_dim = x.shape
     state_dim = s.shape[2]
@@ -80,34 +236,6 @@ def apply_actions(
             f"actions must stay below {LARGEST_INDEX} numbers in one batch, got {action.numel()}: "
             f"split the batch"
         )
-    # Adjacent channels are then read and written at once: their places are aligned in memory.
-    aligned = state_dim % CHANNEL_SHARE == 0 and (space_dim % 2 == 0 or not moving)
-    aligned = aligned and s.data_ptr() % 16 == 0 and action.data_ptr() % 16 == 0
-    launch(
-        update_kernels(space_dim, scalar_type(x.dtype)).apply_actions,
-        world_count * particle_count * -(-state_dim // CHANNEL_SHARE),
-        x.device,
-        particle_count,
-        reach * dt,
-        state_scale * dt,
-        int(box is not None),
-        tuple(box) if box is not None else (1.0,) * space_dim,
-        int(moving),
-        position_limit,
-        state_limit,
-        int(mask is not None),
-        None if mask is None else mask.view(-1),
-        int(noise is not None),
-        None if noise is None else noise.view(-1, space_dim),
-        int(enabled is not None),
-        enabled,
-        state_dim,
-        int(aligned),
-        action.view(-1),
-        x.view(-1, space_dim),
-        s.view(-1),
-        diverged,
-    )
 
 
 def _check_fit(

@@ -6,10 +6,9 @@ from collections.abc import Iterable
 
 import torch
 
-from npa_envs.sph.actions import apply_actions
+from npa_envs.sph.actions import RepeatedActions
 from npa_envs.sph.draws import bernoulli_draw, integer_draw, normal_draw, uniform_draw
 from npa_envs.sph.fields import perceive
-from npa_envs.sph.finite import CheckedCopy
 from npa_envs.sph.operators import Rows
 from npa_envs.sph.passes import Terms
 from npa_envs.sph.picture_losses import picture_losses
@@ -42,11 +41,6 @@ def warmup(
         uniform_draw(keys, counts, counts, 0, 1, dtype)
         normal_draw(keys, counts, counts, 0, 1, dtype)
         world_mean(torch.zeros(1, 1, 1, dtype=dtype, device=device))
-        copy = CheckedCopy(
-            torch.zeros(1, dtype=dtype, device=device),
-            torch.zeros(1, dtype=torch.uint8, device=device),
-        )
-        copy(torch.zeros(1, dtype=dtype, device=device))
         for space_dim in space_dims:
             x = torch.zeros(1, 2, space_dim, dtype=dtype, device=device, requires_grad=True)
             s = torch.zeros(1, 2, state_dim, dtype=dtype, device=device, requires_grad=True)
@@ -87,8 +81,7 @@ def _warm_update(x: torch.Tensor, s: torch.Tensor) -> None:
 
 
 def _warm_actions(x: torch.Tensor, s: torch.Tensor) -> None:
-    apply_actions(
-        x.new_zeros(*x.shape[:2], x.shape[2] + s.shape[2]),
+    actions = RepeatedActions(
         x.detach().clone(),
         s.detach().clone(),
         mask=None,
@@ -100,9 +93,10 @@ def _warm_actions(x: torch.Tensor, s: torch.Tensor) -> None:
         box=None,
         position_limit=1.0,
         state_limit=1.0,
-        enabled=None,
+        enabled=torch.ones(1, dtype=torch.uint8, device=x.device),
         diverged=torch.zeros(x.shape[0], dtype=torch.uint8, device=x.device),
     )
+    actions(x.new_zeros(*x.shape[:2], x.shape[2] + s.shape[2]))
 
 
 def _pull_back(value: torch.Tensor) -> None:
