@@ -120,7 +120,8 @@ def make_read_at(value_type: type, scalar: type, alignment: int) -> Any:
     Args:
         value_type: A vector type of a multiple of `alignment` bytes.
         scalar: The scalar type that it is made of.
-        alignment: Bytes that the place is a multiple of in memory, and that a load takes: 8 or 16.
+        alignment: Bytes that the place is a multiple of in memory, and that a load takes: 4, 8
+            or 16.
     """
     count = value_type._length_
     name = {"f32": "wp::float32", "f64": "wp::float64"}[scalar_name(scalar)]
