@@ -1,6 +1,6 @@
 """Native snippets beside those of `lanes`: what plain Warp cannot say on CUDA.
 
-Stores of 16 bytes at a time, sums over a warp, the hardware's own exponential.
+Stores of up to 16 bytes at a time, sums over a warp, the hardware's own exponential.
 """
 
 import functools
@@ -12,14 +12,16 @@ from npa_envs.kernels.domain import scalar_name
 
 _STORE = """
 #if defined(__CUDA_ARCH__)
-    struct alignas(16) Chunk { unsigned part[4]; };
+    constexpr unsigned size = sizeof(value);
+    constexpr unsigned bytes = size % 16 == 0 ? 16 : size % 8 == 0 ? 8 : 4;
+    struct alignas(bytes) Chunk { unsigned part[bytes / 4]; };
     Chunk* to = reinterpret_cast<Chunk*>(entries.data + index);
     const unsigned* from = reinterpret_cast<const unsigned*>(&value);
     #pragma unroll
-    for (unsigned i = 0; i < sizeof(value) / 16; ++i) {
+    for (unsigned i = 0; i < size / bytes; ++i) {
         Chunk chunk;
         #pragma unroll
-        for (unsigned k = 0; k < 4; ++k) chunk.part[k] = from[4 * i + k];
+        for (unsigned k = 0; k < bytes / 4; ++k) chunk.part[k] = from[bytes / 4 * i + k];
         to[i] = chunk;
     }
 #else
@@ -100,10 +102,13 @@ _FAST_EXP2 = """
 
 @functools.cache
 def make_wide_store(value_type: type, scalar: type) -> Any:
-    """Return a Warp function that writes an entry of a flat array 16 bytes at a time on CUDA.
+    """Return a Warp function that writes an entry of a flat array, on CUDA in few, wide stores.
+
+    The array must be dense and its memory aligned to an entry, or to 16 bytes; the index must not
+    be negative.
 
     Args:
-        value_type: A vector or matrix type of a multiple of 16 bytes.
+        value_type: A scalar, vector or matrix type.
         scalar: The scalar type that it is made of.
     """
 

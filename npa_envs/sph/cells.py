@@ -146,13 +146,12 @@ def sort_worlds(
     small = plan.particle_count <= LARGEST_WORLD and plan.domain.cell_count <= LARGEST_GRID
     if plan.listed and small and not plan.masked and s is None and not with_rows:
         return _sort_by_blocks(plan, x)
-    share = plan.width // plan.lanes
-    kernels = cell_kernels(plan.space_dim, plan.scalar, share)
+    kernels = cell_kernels(plan.space_dim, plan.scalar, plan.width, plan.lanes)
     device, total = x.device, plan.total
-    cell, arrival, arrived = torch.empty(3, total, dtype=torch.int32, device=device).unbind()
+    cell, arrival = torch.empty(2, total, dtype=torch.int32, device=device).unbind()
+    arrived = torch.empty(total, 2, dtype=torch.int32, device=device)
     counts = torch.zeros(plan.start_count, dtype=torch.int32, device=device)
     positions = x.view(total, plan.space_dim)
-    states = None if s is None else s.view(total, plan.state_dim)
     flat_mask = None if mask is None else mask.view(total)
     launch(
         kernels.count_cells,
@@ -169,7 +168,17 @@ def sort_worlds(
         counts,
     )
     starts = torch.cumsum(counts, 0, dtype=torch.int32)
-    launch(kernels.place_by_arrival, total, device, cell, arrival, starts, arrived)
+    launch(
+        kernels.place_by_arrival,
+        total,
+        device,
+        flat_mask,
+        int(plan.masked),
+        cell,
+        arrival,
+        starts,
+        arrived,
+    )
 
     source, sorted_cell = torch.empty(2, total, dtype=torch.int32, device=device).unbind()
     row_capacity = plan.row_capacity if with_rows else 0
@@ -178,19 +187,24 @@ def sort_worlds(
     row_place = torch.empty_like(row_source)
     sorted_positions = torch.empty_like(positions)
     row_positions = x.new_empty(row_capacity, plan.space_dim)
-    sorted_states = x.new_empty(0 if s is None else total, plan.group_count * plan.width)
+    # A thread reads and writes its share of a particle's channels at once where it is aligned.
+    share = plan.width // plan.lanes
+    groups = 0 if s is None else plan.group_count
+    aligned = s is not None and plan.state_dim % share == 0 and s.data_ptr() % 16 == 0
+    sorted_states = x.new_empty(total * groups * plan.lanes, share)
+    parts = max(groups, 1) * plan.lanes
     launch(
         kernels.order_particles,
-        (total, 1 if s is None else plan.group_count * plan.lanes),
+        total * parts,
         device,
+        parts,
         positions,
-        states,
-        flat_mask,
-        int(plan.masked),
+        plan.state_dim,
+        int(aligned),
+        None if s is None else s.view(-1),
         plan.active_offset,
         plan.row_base,
         plan.row_capacity,
-        cell,
         arrived,
         starts,
         source,
