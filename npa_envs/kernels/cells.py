@@ -13,8 +13,8 @@ from types import SimpleNamespace
 import warp as wp
 
 from npa_envs.kernels.domain import domain_types, kernel_module
-from npa_envs.kernels.lanes import make_lane_sum, make_wide_load
-from npa_envs.kernels.wide import make_read_at, make_wide_store
+from npa_envs.kernels.lanes import make_wide_load
+from npa_envs.kernels.wide import make_read_channels, make_wide_store, of_warp
 
 load_integer = make_wide_load(wp.int32, wp.int32)
 store_integer = make_wide_store(wp.int32, wp.int32)
@@ -26,23 +26,21 @@ store_pair = make_wide_store(wp.vec2i, wp.int32)
 def cell_kernels(space_dim: int, scalar: type, width: int, lanes: int) -> SimpleNamespace:
     """Return the kernels of one variant.
 
-    Some threads share a particle, of which each moves `width // lanes` channels.
-
     Args:
         space_dim: Space dimension D, 2 or 3.
         scalar: `wp.float32` or `wp.float64`.
         width: Channels of a group: 4, 8 or 16.
-        lanes: Threads that share a group.
+        lanes: Threads that share a group, 1 on the CPU.
     """
     types = domain_types(space_dim, scalar)
     vector, Domain = types.vector, types.Domain
     cell_of, cell_index = types.cell_of, types.cell_index
     share = wp.types.vector(width // lanes, scalar)
-    alignment = min(wp.types.type_size_in_bytes(share), 16)
-    read_share = make_read_at(share, scalar, alignment)
+    shares = wp.types.matrix((lanes, width // lanes), scalar)
+    warp_size = 32 if lanes > 1 else 1
+    read_channels = make_read_channels(share, scalar)
     store_vector = make_wide_store(vector, scalar)
     store_share = make_wide_store(share, scalar)
-    add_integer = make_lane_sum(wp.int32, wp.int32, lanes, whole_warps=True)
     module = kernel_module("cells", space_dim, scalar, width, lanes)
 
     @wp.kernel(enable_backward=False, module=module)
@@ -91,9 +89,9 @@ def cell_kernels(space_dim: int, scalar: type, width: int, lanes: int) -> Simple
 
     @wp.kernel(enable_backward=False, module=module)
     def order_particles(
-        parts: wp.int32,
         positions: wp.array(dtype=vector),
         state_dim: wp.int32,
+        group_count: wp.int32,
         aligned: wp.int32,
         states: wp.array(dtype=scalar),
         active_offset: wp.int32,
@@ -113,40 +111,26 @@ def cell_kernels(space_dim: int, scalar: type, width: int, lanes: int) -> Simple
     ):
         """Move every particle to its rank by index within its cell; give active ones rows.
 
-        States and rows are left out where their arrays are empty. All that is known where to read
-        is asked for before the ranks are counted.
+        States and rows are left out where their arrays are empty. Threads come in whole warps on
+        CUDA, some of them beyond the last particle.
         """
-        t = wp.tid()
-        k = t / parts
-        part = t - k * parts
-        own = load_pair(arrived, k)
+        k = wp.tid()
+        total = arrived.shape[0]
+        own = load_pair(arrived, wp.min(k, total - 1))
         i = own[0] / 2
         c = own[1]
         begin = load_integer(starts, c)
-        end = load_integer(starts, c + 1)
         first_row = load_integer(starts, active_offset + c) - row_base
         position = positions[i]
-        state = share()
-        if sorted_states.shape[0] > 0:
-            first = part * wp.static(width // lanes)
-            if aligned == 0:
-                for n in range(wp.static(width // lanes)):
-                    if first + n < state_dim:
-                        state[n] = states[i * state_dim + first + n]
-            elif first < state_dim:
-                state = read_share(states, i * state_dim + first)
         rank = wp.int32(0)
         active_rank = wp.int32(0)
-        for other in range(begin + part % wp.static(lanes), end, wp.static(lanes)):
+        for other in range(begin, load_integer(starts, c + 1)):
             entry = load_pair(arrived, other)[0]
             if entry < own[0]:
                 rank += 1
                 active_rank += entry & 1
-        place = begin + add_integer(rank)
-        active_rank = add_integer(active_rank)
-        if sorted_states.shape[0] > 0:
-            store_share(sorted_states, place * parts + part, state)
-        if part == 0:
+        place = begin + rank
+        if k < total:
             store_integer(source, place, i)
             store_integer(sorted_cell, place, c)
             store_vector(sorted_positions, place, position)
@@ -159,6 +143,31 @@ def cell_kernels(space_dim: int, scalar: type, width: int, lanes: int) -> Simple
                     store_integer(row_source, row, i)
                     store_integer(row_place, row, place)
                     store_vector(row_positions, row, position)
+
+        # A warp moves the states of its particles together: neighbouring threads, neighbouring
+        # shares. All that is read is asked for before any of it is written.
+        if sorted_states.shape[0] > 0:
+            lane = k % wp.static(warp_size)
+            parts = group_count * wp.static(lanes)
+            for first_turn in range(0, parts, wp.static(lanes)):
+                held = shares()
+                for turn in range(wp.static(lanes)):
+                    chunk = lane + (first_turn + turn) * wp.static(warp_size)
+                    owner = chunk / parts
+                    first = (chunk - owner * parts) * wp.static(width // lanes)
+                    state = read_channels(states, state_dim, aligned, of_warp(i, owner), first)
+                    for n in range(wp.static(width // lanes)):
+                        held[turn, n] = state[n]
+                for turn in range(wp.static(lanes)):
+                    chunk = lane + (first_turn + turn) * wp.static(warp_size)
+                    owner = chunk / parts
+                    part = chunk - owner * parts
+                    to = of_warp(place, owner) * parts + part
+                    state = share()
+                    for n in range(wp.static(width // lanes)):
+                        state[n] = held[turn, n]
+                    if k - lane + owner < total:
+                        store_share(sorted_states, to, state)
 
     return SimpleNamespace(
         count_cells=count_cells,

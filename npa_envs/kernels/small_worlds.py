@@ -12,7 +12,7 @@ import warp as wp
 
 from npa_envs.kernels.domain import domain_types, kernel_module
 from npa_envs.kernels.lanes import make_wide_load
-from npa_envs.kernels.wide import make_read_at, make_wide_store
+from npa_envs.kernels.wide import make_read_channels, make_wide_store
 
 BLOCKS = {1024: 256, 4096: 1024}
 """Threads of a block by the particles that it has room for."""
@@ -251,7 +251,7 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
     positions_ahead = wp.types.matrix((turns, space_dim), scalar)
     flags_ahead = wp.types.vector(turns, wp.int32)
     load_vector = make_wide_load(vector, scalar)
-    read_share = make_read_at(share, scalar, 16)
+    read_channels = make_read_channels(share, scalar)
     store_vector = make_wide_store(vector, scalar)
     store_share = make_wide_store(share, scalar)
     sort = make_block_sort(capacity)
@@ -265,20 +265,28 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
     member_at = sort.member_at
 
     @wp.func
-    def state_share(
-        states: wp.array(dtype=scalar), state_dim: wp.int32, i: wp.int32, part: wp.int32
+    def write_starts(
+        memory: wp.uint64,
+        cell_count: wp.int32,
+        slice: wp.int32,
+        slices: wp.int32,
+        world: wp.int32,
+        particle_count: wp.int32,
+        masked: wp.int32,
+        active_offset: wp.int32,
+        row_base: wp.int32,
+        starts: wp.array(dtype=wp.int32),
     ):
-        """Some adjacent channels of a particle, zeros beyond its last one."""
-        result = share()
-        first = part * wp.static(STATE_SHARE)
-        if state_dim % wp.static(STATE_SHARE) == 0:
-            if first < state_dim:
-                result = read_share(states, i * state_dim + first)
-        else:
-            for k in range(wp.static(STATE_SHARE)):
-                if first + k < state_dim:
-                    result[k] = states[i * state_dim + first + k]
-        return result
+        """Write the first place, and the first row, of each of the slice's cells."""
+        share_of_cells = (cell_count + slices - 1) / slices
+        begin = slice * share_of_cells
+        end = wp.min(begin + share_of_cells, cell_count)
+        for cell in range(begin + thread_of_block(), end, wp.static(block)):
+            start = start_of(memory, cell)
+            written = world * cell_count + cell
+            store_integer(starts, written, world * particle_count + start[0])
+            if masked != 0:
+                store_integer(starts, active_offset + written, row_base + start[1])
 
     @wp.kernel(
         enable_backward=False,
@@ -292,6 +300,7 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
         positions: wp.array(dtype=vector),
         state_dim: wp.int32,
         parts: wp.int32,
+        aligned: wp.int32,
         states: wp.array(dtype=scalar),
         masked: wp.int32,
         mask: wp.array(dtype=wp.uint8),
@@ -345,14 +354,19 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
                 arrive(memory, i, cell, acting[turn] != 0)
         add_up_counts(memory, domain.cell_count)
 
-        share_of_cells = (domain.cell_count + slices - 1) / slices
-        last_cell = wp.min((slice + 1) * share_of_cells, domain.cell_count)
-        for cell in range(slice * share_of_cells + lane, last_cell, wp.static(block)):
-            start = start_of(memory, cell)
-            starts[first_cell + cell] = first_particle + start[0]
-            if masked != 0:
-                starts[active_offset + first_cell + cell] = row_base + start[1]
-        if slice == 0 and lane == 0 and first_particle + particle_count == positions.shape[0]:
+        write_starts(
+            memory,
+            domain.cell_count,
+            slice,
+            slices,
+            world,
+            particle_count,
+            masked,
+            active_offset,
+            row_base,
+            starts,
+        )
+        if lane == 0 and slice == 0 and first_particle + particle_count == positions.shape[0]:
             end_of_all = start_of(memory, domain.cell_count)
             starts[starts.shape[0] - 1] = row_base + end_of_all[1]
         for i in range(lane, particle_count, wp.static(block)):
@@ -371,7 +385,8 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
                 position = load_vector(positions, i)
                 state = share()
                 if sorted_states.shape[0] > 0:
-                    state = state_share(states, state_dim, i, part)
+                    first = part * wp.static(STATE_SHARE)
+                    state = read_channels(states, state_dim, aligned, i, first)
                 ranked = ranked_at(memory, k)
                 inside = ranked[0] >= begin and ranked[0] < end
                 place = first_particle + ranked[0]

@@ -81,6 +81,14 @@ _WARP_SUM = """
 #endif
 """
 
+_OF_WARP = """
+#if defined(__CUDA_ARCH__)
+    return __shfl_sync(0xffffffffu, value, lane);
+#else
+    return value;
+#endif
+"""
+
 _EXP2 = """
 #if defined(__CUDA_ARCH__)
     return ::exp2(value);
@@ -98,6 +106,12 @@ _FAST_EXP2 = """
     return wp::exp(value * 0.69314718f);
 #endif
 """
+
+
+@wp.func_native(_OF_WARP)
+def of_warp(value: wp.int32, lane: wp.int32) -> wp.int32:
+    """What a thread of the warp has, all 32 of which must ask; on the CPU, the argument."""
+    ...
 
 
 @functools.cache
@@ -136,6 +150,39 @@ def make_read_at(value_type: type, scalar: type, alignment: int) -> Any:
     def read_at(values: wp.array(dtype=scalar), place: wp.int32) -> value_type: ...
 
     return read_at
+
+
+@functools.cache
+def make_read_channels(value_type: type, scalar: type) -> Any:
+    """Return a Warp function that reads adjacent channels of a particle, zeros beyond its last one.
+
+    Args:
+        value_type: A vector type.
+        scalar: The scalar type that it is made of.
+    """
+    count = value_type._length_
+    alignment = min(wp.types.type_size_in_bytes(value_type), 16)
+    read_at = make_read_at(value_type, scalar, alignment)
+
+    @wp.func
+    def read_channels(
+        states: wp.array(dtype=scalar),
+        state_dim: wp.int32,
+        aligned: wp.int32,
+        particle: wp.int32,
+        first: wp.int32,
+    ):
+        result = value_type()
+        place = particle * state_dim + first
+        if aligned == 0:
+            for k in range(wp.static(count)):
+                if first + k < state_dim:
+                    result[k] = states[place + k]
+        elif first < state_dim:
+            result = read_at(states, place)
+        return result
+
+    return read_channels
 
 
 @functools.cache

@@ -17,6 +17,9 @@ from npa_envs.sph.bridge import channel_width, lane_count, launch, scalar_type
 LARGEST_INDEX = 2**31 - 1
 """Kernels index with 32 bits."""
 
+CUDA_WARP = 32
+"""Threads of a CUDA warp, which move the states of as many particles together."""
+
 LARGEST_MASK = 2**20
 """Particles of masked worlds that blocks sort: each block counts the active ones before it."""
 
@@ -192,14 +195,14 @@ def sort_worlds(
     # A thread reads and writes its share of a particle's channels at once where it is aligned.
     share = plan.width // plan.lanes
     aligned = s is not None and plan.state_dim % share == 0 and s.data_ptr() % 16 == 0
-    parts = plan.lanes if s is None else plan.group_count * plan.lanes
+    warps = CUDA_WARP if plan.lanes > 1 else 1
     launch(
         kernels.order_particles,
-        total * parts,
+        -(-total // warps) * warps,
         device,
-        parts,
         positions,
         plan.state_dim,
+        plan.group_count,
         int(aligned),
         None if s is None else s.view(-1),
         plan.active_offset,
@@ -256,6 +259,7 @@ def _sort_by_blocks(
         x.view(plan.total, plan.space_dim),
         plan.state_dim,
         1 if s is None else plan.group_count * plan.width // STATE_SHARE,
+        int(plan.state_dim % STATE_SHARE == 0),
         None if s is None else s.view(-1),
         int(plan.masked),
         None if mask is None else mask.view(-1),
