@@ -17,9 +17,6 @@ from npa_envs.kernels.wide import make_read_channels, make_wide_store
 BLOCKS = {1024: 256, 4096: 1024}
 """Threads of a block by the particles that it has room for."""
 
-LARGEST_WORLD = max(BLOCKS)
-"""Particles of the largest world that a block has room for."""
-
 RESIDENT_THREADS = 1024
 """Threads that a multiprocessor has registers for, at least."""
 
@@ -30,8 +27,8 @@ STATE_SHARE = 4
 """Adjacent channels that a thread moves."""
 
 # Counts, later starts, of cells: of all particles, and from bit 16 on of the active ones. Then of
-# each particle its cell and its arrival there, and of each provisional place its entry: twice a
-# particle's number, plus one if it is active.
+# each particle its cell and its arrival there, and of each provisional place its particle: arrivals
+# and members are doubled, plus one if the particle is active.
 _MEMORY = """
     struct Memory {{
         int starts[{grid} + 1];
