@@ -61,8 +61,8 @@ def _warm_pictures(x: torch.Tensor) -> None:
 
 
 def _warm_observation(x: torch.Tensor, s: torch.Tensor) -> None:
-    """Small and large worlds have kernels of their own."""
-    for particle_count in (x.shape[1], 4096):
+    """Small, middling and large worlds have kernels of their own."""
+    for particle_count in (x.shape[1], 4096, 4097):
         places = x.detach()[:, :1].expand(-1, particle_count, -1)
         states = s.detach()[:, :1].expand(-1, particle_count, -1)
         survey(places, states, eps=0.1, eps0=0.1, box=None, terms=Terms(), limit=1.0).perceive()
