@@ -53,12 +53,14 @@ def listed_perception(
     grouped: bool,
     capacity: int = 0,
     for_adjoint: bool = True,
+    teams: int = 1,
 ) -> wp.Kernel:
     """Return the perception kernel of one variant, as `perception_kernels` does.
 
     A variant is also made for a box or open space, for channels that come in several groups, and
     for lists and records that the density pass left (only overlong lists are then searched anew),
-    and with or without what the adjoint reads.
+    and with or without what the adjoint reads. Several teams of lanes share a particle where few
+    particles fill the device: each runs through its own part of the list, all channels of it.
     """
     scalar = wp.float32
     flat = space_dim == 2
@@ -74,7 +76,10 @@ def listed_perception(
     group = wp.types.vector(width, scalar)
     share = share_type(group, scalar, lanes)
     share_gradient = share_type(wp.types.matrix((space_dim, width), scalar), scalar, lanes)
-    share_rows = wp.types.vector(width // lanes * space_dim, scalar)
+    share_width = width // lanes
+    share_rows = wp.types.vector(share_width * space_dim, scalar)
+    team = lanes
+    lanes *= teams
     square = wp.types.matrix((space_dim, space_dim), scalar)
     cell_vector = wp.types.vector(space_dim, wp.int32)
     topic = "listed_smoothing"
@@ -88,6 +93,8 @@ def listed_perception(
     add_vector = make_lane_sum(vector, scalar, lanes, whole_warps=True)
     add_square = make_lane_sum(square, scalar, lanes, whole_warps=True)
     add_wide = make_lane_sum(wide, wp.float64, lanes, whole_warps=True)
+    add_share = make_lane_sum(share, scalar, lanes, whole_warps=True, stride=team)
+    add_gradient = make_lane_sum(share_gradient, scalar, lanes, whole_warps=True, stride=team)
     slots = make_slots(space_dim, width, lanes, state_gradient, grouped, capacity)
     slot_address, append_number, number_at = (
         slots.slot_address,
@@ -278,14 +285,15 @@ def listed_perception(
     def add_states(
         states: wp.array(dtype=share),
         part: wp.int32,
+        first: wp.int32,
         slot: wp.uint32,
         count: wp.int32,
         own: share,
         blur: share,
         gradient: share_gradient,
     ):
-        """Add the states of weighed neighbours to this lane's share of the long sums."""
-        for entry in range(padded(count)):
+        """Add states of weighed neighbours, this team's from `first` on, to the long sums."""
+        for entry in range(first, padded(count), wp.static(teams)):
             packed = entry_at(slot, entry)
             place = as_number(packed[wp.static(space_dim + 1)])
             state = load_share(states, place + part)
@@ -293,7 +301,7 @@ def listed_perception(
             if wp.static(state_gradient):
                 difference = state - own
                 for d in range(wp.static(space_dim)):
-                    for c in range(wp.static(width // lanes)):
+                    for c in range(wp.static(share_width)):
                         gradient[d, c] += packed[d + 1] * difference[c]
         meet_warp()
         return blur, gradient
@@ -340,11 +348,13 @@ def listed_perception(
             g = row % group_count
             row = row / group_count
         slot = slot_address()
-        part = lane
-        part_count = wp.int32(wp.static(lanes))
+        # Which channels this lane sums, and which neighbours: every so-manyth from the first on.
+        part = lane & wp.static(team - 1)
+        first = lane >> wp.static(team.bit_length() - 1)
+        part_count = wp.int32(wp.static(team))
         if wp.static(grouped):
-            part = g * wp.static(lanes) + lane
-            part_count = group_count * wp.static(lanes)
+            part += g * wp.static(team)
+            part_count = group_count * wp.static(team)
         row_count = load_integer(starts, starts.shape[0] - 1) - row_base
         present = row < wp.min(row_count, row_capacity)
         blur = share()
@@ -390,7 +400,7 @@ def listed_perception(
                     moment,
                     wide_sum,
                 )
-                blur, gradient = add_states(states, part, slot, fetched, own, blur, gradient)
+                blur, gradient = add_states(states, part, first, slot, fetched, own, blur, gradient)
         base = wp.int32(0)
         cell = cell_vector()
         segments = wp.int32(0)
@@ -418,9 +428,9 @@ def listed_perception(
                 while run < run_count and not any_in_warp(j - lane < end):
                     if run % wp.static(lanes) == 0:
                         mine = wp.min(run + lane, wp.max(segments - 1, wp.int32(0)))
-                        first, last = segment_cells(domain, cell, mine)
-                        run_begin = load_integer(starts, base + first)
-                        run_end = load_integer(starts, base + last)
+                        first_cell, last_cell = segment_cells(domain, cell, mine)
+                        run_begin = load_integer(starts, base + first_cell)
+                        run_end = load_integer(starts, base + last_cell)
                         run_end = wp.where(run + lane < segments, run_end, wp.int32(0))
                     turn = run % wp.static(lanes)
                     j = of_lane(run_begin, turn, wp.uint32(lanes)) + lane
@@ -453,9 +463,12 @@ def listed_perception(
                 moment,
                 wide_sum,
             )
-            blur, gradient = add_states(states, part, slot, count, own, blur, gradient)
+            blur, gradient = add_states(states, part, first, slot, count, own, blur, gradient)
             begin = count & wp.static(lanes - 1)
         wide_sum = add_wide(wide_sum)
+        if wp.static(teams > 1):
+            blur = add_share(blur)
+            gradient = add_gradient(gradient)
         if wp.static(state_gradient and moment_correction):
             moment = add_square(moment)
             for r in range(1, wp.static(space_dim)):
@@ -463,12 +476,12 @@ def listed_perception(
                     moment[r, c] = moment[c, r]
             if wp.abs(wp.determinant(moment)) >= scalar(wp.static(MOMENT_THRESHOLD)):
                 gradient = wp.inverse(moment) * gradient
-        mine = lane * wp.static(width // lanes)
+        mine = (lane & wp.static(team - 1)) * wp.static(share_width)
         stage_share(slot, mine, wp.where(present, own, share()))
         stage_share(slot, wp.static(width) + mine, blur)
         if wp.static(state_gradient):
             scaled = share_rows()
-            for c in range(wp.static(width // lanes)):
+            for c in range(wp.static(share_width)):
                 along = vector()
                 for d in range(wp.static(space_dim)):
                     along[d] = gradient_scale * gradient[d, c]
@@ -480,7 +493,7 @@ def listed_perception(
         write_rows(slot, destination, g, state_dim, bound, perception)
         if wp.static(for_adjoint):
             kernel_sum = add_vector(kernel_sum)
-            if destination >= 0 and part == 0:
+            if destination >= 0 and lane == 0 and g == 0:
                 row_kernel_sum[row] = kernel_sum
         column = 2 * state_dim
         if wp.static(state_gradient):
@@ -490,7 +503,7 @@ def listed_perception(
             for d in range(wp.static(space_dim)):
                 along[d] = scalar(wide_sum[d]) * density_scale
             along *= log_scale_of_square(wp.dot(along, along))
-            if destination >= 0 and part == 0:
+            if destination >= 0 and lane == 0 and g == 0:
                 for d in range(wp.static(space_dim)):
                     perception[destination, column + d] = within(along[d], bound)
             column += wp.static(space_dim)

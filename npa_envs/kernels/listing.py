@@ -105,6 +105,7 @@ def listed_density(
             list_begin = list_address()
             list_end = list_begin
             if row < 0:
+                # As if it were full.
                 list_end = list_begin + wp.uint32(wp.static(LIST_BYTES * capacity))
             far = wp.bool(False)
         for segment in range(segment_count(domain, cell)):

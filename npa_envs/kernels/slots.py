@@ -18,6 +18,9 @@ CUDA_BLOCK = 128
 SLOT_ENTRIES = 32
 """Neighbours that a slot has room for; longer neighbourhoods are summed in several rounds."""
 
+SHARE_OF_LIST = 2
+"""A lane of several has room for so many times its share of a list."""
+
 _ADDRESS = """
     __shared__ __align__(16) unsigned char slots[{slots} * {bytes}];
     return (unsigned)__cvta_generic_to_shared(slots + threadIdx.x / {lanes} * {bytes});
@@ -64,7 +67,7 @@ _GET = """
 """
 
 _LIST_ADDRESS = """
-    __shared__ unsigned short lists[{capacity} * {block}];
+    __shared__ unsigned short lists[{room} * {block}];
     return (unsigned)__cvta_generic_to_shared(lists + threadIdx.x);
 """
 
@@ -77,13 +80,14 @@ _LIST_APPEND = """
         "@kept st.shared.u16 [%0], %3;\\n"
         "@near add.u32 %0, %0, %4; }}"
         : "+r"(place)
-        : "f"(weight), "r"(first + 2 * {block} * {capacity}), "h"((short)step), "n"(2 * {block}));
+        : "f"(weight), "r"(first + 2 * {block} * {room}), "h"((short)step), "n"(2 * {block}));
     return place;
 """
 
 # Each lane's entries follow those of the lanes before it.
 _LIST_LEAVE = """
-    const int length = (place - first) / (2 * {block});
+    int length = (place - first) / (2 * {block});
+    if (length > {room}) length = {capacity} + 1;
     int end = length;
     #pragma unroll
     for (int offset = 1; offset < {lanes}; offset *= 2) {{
@@ -268,10 +272,11 @@ def make_lists(capacity: int, lanes: int = 1) -> SimpleNamespace:
     memory and left in an array: 32 particles together, first entries first.
 
     Args:
-        capacity: Neighbours that a list has room for; more are counted but not kept.
+        capacity: Neighbours that a list has room for; more are counted, but not all are kept.
         lanes: Lanes of a particle; whole warps must leave their lists together.
     """
-    names = {"capacity": capacity, "block": CUDA_BLOCK, "lanes": lanes}
+    room = min(capacity, SHARE_OF_LIST * capacity // lanes)
+    names = {"capacity": capacity, "block": CUDA_BLOCK, "lanes": lanes, "room": room}
 
     @wp.func_native(_LIST_ADDRESS.format(**names))
     def list_address() -> wp.uint32: ...

@@ -21,6 +21,7 @@ from npa_envs.sph.passes import (
     list_lanes,
     list_neighbours,
     perception_launch,
+    row_teams,
 )
 
 __all__ = ["Rows", "Terms", "perceive_rows"]
@@ -72,6 +73,7 @@ def _perceive_rows(
             scale,
             perception,
             row_kernel_sum=row_kernel_sum if for_adjoint else None,
+            teams=row_teams(plan),
         )
     )
     return (

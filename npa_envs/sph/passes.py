@@ -90,6 +90,12 @@ def list_lanes(plan: Plan) -> int:
     return plan.lanes if plan.total < FULL_DEVICE else 1
 
 
+def row_teams(plan: Plan) -> int:
+    """Return how many teams of lanes share a row so that few rows fill a device."""
+    rows = plan.row_capacity * plan.group_count
+    return next((teams for teams in (1, 2) if rows * teams >= FULL_DEVICE // 4), 4)
+
+
 def list_neighbours(
     plan: Plan,
     ordered: SortedWorlds,
@@ -205,6 +211,7 @@ def perception_launch(
     destination: Tensor | None = None,
     limit: float = 0.0,
     row_kernel_sum: Tensor | None = None,
+    teams: int = 1,
 ) -> tuple[Any, ...]:
     """Return what to give to `launch` so that it writes the perception of each row.
 
@@ -219,6 +226,7 @@ def perception_launch(
         destination: Row of `out` for each row, int32, shape [K]; default: its own.
         limit: Entries are clipped to plus and minus this; 0: they are not.
         row_kernel_sum: Where to write the rows' sums of v K, shape [K, D], for the adjoint.
+        teams: Teams of lanes that share a row where neighbours are listed, 1, 2 or 4.
     """
     common = (
         plan.domain,
@@ -242,12 +250,13 @@ def perception_launch(
             plan.group_count > 1,
             0 if lists is None else lists.capacity,
             row_kernel_sum is not None,
+            teams,
         )
         rows = -(-plan.row_capacity // WARP_ROWS) * WARP_ROWS
         source = ordered.states if states is None else states
         return (
             kernel,
-            rows * plan.group_count * plan.lanes,
+            rows * plan.group_count * plan.lanes * teams,
             out.device,
             *common,
             plan.row_capacity,
