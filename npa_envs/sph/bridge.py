@@ -21,7 +21,7 @@ GROUP_WIDTHS = (4, 8, 16)
 
 
 CUDA_BLOCK = 128
-"""Threads of a CUDA block."""
+"""Threads of a CUDA block, where a launch does not say otherwise."""
 
 
 def scalar_type(dtype: torch.dtype) -> Any:
@@ -69,7 +69,13 @@ def _warp_stream(device: torch.device, handle: int) -> Any:
 _launched: set[tuple[Any, torch.device]] = set()
 
 
-def launch(kernel: Any, size: int | tuple[int, ...], device: torch.device, *arguments: Any) -> None:
+def launch(
+    kernel: Any,
+    size: int | tuple[int, ...],
+    device: torch.device,
+    *arguments: Any,
+    block: int = CUDA_BLOCK,
+) -> None:
     """Launch a kernel on torch's current stream of a device.
 
     Args:
@@ -77,6 +83,7 @@ def launch(kernel: Any, size: int | tuple[int, ...], device: torch.device, *argu
         size: Number of threads along each dimension.
         device: Device of every tensor among the arguments.
         arguments: Kernel arguments in order: tensors (None for an absent one), structs and numbers.
+        block: Threads of a CUDA block.
     """
     types = _array_types(kernel)
     converted = [
@@ -98,5 +105,5 @@ def launch(kernel: Any, size: int | tuple[int, ...], device: torch.device, *argu
             device=where,
             stream=stream,
             record_tape=False,
-            block_dim=CUDA_BLOCK if where.is_cuda else None,
+            block_dim=block if where.is_cuda else None,
         )
