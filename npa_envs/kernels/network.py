@@ -8,11 +8,10 @@ import warp as wp
 from npa_envs.kernels.products import (
     OUTPUT_TARGET,
     UNIT_TARGET,
-    add_partial_sums,
     make_two_layers,
-    make_weight_sums,
     scale_to,
 )
+from npa_envs.kernels.weight_sums import add_partial_sums, make_weight_sums
 
 LANES = 32
 """Threads of a warp: each holds its part of every fragment."""
@@ -109,10 +108,10 @@ def arrangement_kernels() -> SimpleNamespace:
 
 
 @functools.cache
-def two_layer_kernel(steps: int, tiles: int, groups: int, mode: str) -> wp.Kernel:
+def two_layer_kernel(steps: int, tiles: int, mode: str) -> wp.Kernel:
     """Return the kernel of two products, row by row: `make_two_layers` names the variants."""
-    name = f"npa_envs.kernels.network_{mode}_{steps}_{tiles}_{groups}"
-    two_layers = make_two_layers(steps, tiles, groups, mode)
+    name = f"npa_envs.kernels.network_{mode}_{steps}_{tiles}"
+    two_layers = make_two_layers(steps, tiles, mode)
 
     @wp.kernel(
         enable_backward=False, module=wp.get_module(name), cuda_max_registers=LAYER_REGISTERS

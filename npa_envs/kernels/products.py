@@ -23,13 +23,7 @@ ROW_TARGET, UNIT_TARGET, OUTPUT_TARGET = 8, 4, 7
 
 A hidden unit then lies below 2^(8 + 1 + 4 + 1), within float16, and its error far below."""
 
-ROW_TILE = 32
-"""Rows that a block sums weight gradients of between two barriers."""
-
-WARP_UNITS = 32
-"""Hidden units whose weight gradients a warp sums."""
-
-_HALF_PAIRS = """
+HALF_PAIRS = """
     // The first of two numbers lies in the lower half of a word.
     const auto split = [](float a, float b, unsigned& high, unsigned& low) {
         float upper, lower;
@@ -40,7 +34,7 @@ _HALF_PAIRS = """
     };
 """
 
-_BFLOAT_PAIRS = """
+BFLOAT_PAIRS = """
     // The first of two numbers lies in the lower half of a word.
     const auto split = [](float a, float b, unsigned& high, unsigned& low) {
         asm("cvt.rn.bf16x2.f32 %0, %1, %2;" : "=r"(high) : "f"(b), "f"(a));
@@ -50,7 +44,7 @@ _BFLOAT_PAIRS = """
     };
 """
 
-_MULTIPLY = """
+MULTIPLY = """
     using Four = float[4];  // Warp defines away what reads like a cast
     const auto multiply = [](Four& sum, const unsigned (&a)[4], unsigned b0, unsigned b1) {
         asm volatile("mma.sync.aligned.m16n8k16.row.col.f32.$type.$type.f32 "
@@ -61,111 +55,95 @@ _MULTIPLY = """
 """
 
 _TWO_LAYERS = """
-    constexpr int groups = $groups;  // of 16 rows
     constexpr int steps = $steps;    // of 16 input columns
     constexpr int tiles = $tiles;    // of 8 output columns
     const unsigned lane = threadIdx.x & 31u, t = lane & 3u;
     const int count = input.shape[0], width = input.shape[1], out_width = output.shape[1];
-    const int warp = (blockIdx.x * blockDim.x + threadIdx.x) / 32;
-    const int first = warp * (16 * groups) + lane / 4;
+    const int first = (blockIdx.x * blockDim.x + threadIdx.x) / 32 * 16 + lane / 4;
     const int units = unit_count / 16, words = (units + 7) / 8 * 4;
 
-    unsigned high[groups][steps][4], low[groups][steps][4];
-    float unscale[groups][2];
+    unsigned high[steps][4], low[steps][4];
+    float unscale[2];
     #pragma unroll
-    for (int group = 0; group < groups; ++group) {
+    for (int half = 0; half < 2; ++half) {
+        const int row = first + 8 * half;
+        const float* from = input.data + (size_t)row * width + 4 * t;
+        float part[steps][4];
+        float largest = 0.0f;
         #pragma unroll
-        for (int half = 0; half < 2; ++half) {
-            const int row = first + 16 * group + 8 * half;
-            const float* from = input.data + (size_t)row * width + 4 * t;
-            float part[steps][4];
-            float largest = 0.0f;
+        for (int k = 0; k < steps; ++k) {
             #pragma unroll
-            for (int k = 0; k < steps; ++k) {
-                #pragma unroll
-                for (int i = 0; i < 4; ++i) part[k][i] = 0.0f;
-                if (row < count && 16 * k + 4 * t < width) {
-                    asm volatile("ld.global.nc.L1::no_allocate.v4.f32 {%0, %1, %2, %3}, [%4];"
-                        : "=f"(part[k][0]), "=f"(part[k][1]), "=f"(part[k][2]), "=f"(part[k][3])
-                        : "l"(from + 16 * k));
-                }
-                #pragma unroll
-                for (int i = 0; i < 4; ++i) largest = fmaxf(largest, fabsf(part[k][i]));
+            for (int i = 0; i < 4; ++i) part[k][i] = 0.0f;
+            if (row < count && 16 * k + 4 * t < width) {
+                asm volatile("ld.global.nc.L1::no_allocate.v4.f32 {%0, %1, %2, %3}, [%4];"
+                    : "=f"(part[k][0]), "=f"(part[k][1]), "=f"(part[k][2]), "=f"(part[k][3])
+                    : "l"(from + 16 * k));
             }
-            largest = fmaxf(largest, __shfl_xor_sync(~0u, largest, 1));
-            largest = fmaxf(largest, __shfl_xor_sync(~0u, largest, 2));
-            const unsigned exponent =
-                min(max(__float_as_uint(largest) >> 23, $target + 1u), 254u);
-            const float scale = __uint_as_float((254u + $target - exponent) << 23);
-            unscale[group][half] = __uint_as_float((exponent - $target) << 23);
             #pragma unroll
-            for (int k = 0; k < steps; ++k) {
-                #pragma unroll
-                for (int i = 0; i < 2; ++i) {
-                    split(part[k][2 * i] * scale, part[k][2 * i + 1] * scale,
-                        high[group][k][2 * i + half], low[group][k][2 * i + half]);
-                }
+            for (int i = 0; i < 4; ++i) largest = fmaxf(largest, fabsf(part[k][i]));
+        }
+        largest = fmaxf(largest, __shfl_xor_sync(~0u, largest, 1));
+        largest = fmaxf(largest, __shfl_xor_sync(~0u, largest, 2));
+        const unsigned exponent = min(max(__float_as_uint(largest) >> 23, $target + 1u), 254u);
+        const float scale = __uint_as_float((254u + $target - exponent) << 23);
+        unscale[half] = __uint_as_float((exponent - $target) << 23);
+        #pragma unroll
+        for (int k = 0; k < steps; ++k) {
+            #pragma unroll
+            for (int i = 0; i < 2; ++i) {
+                split(part[k][2 * i] * scale, part[k][2 * i + 1] * scale,
+                    high[k][2 * i + half], low[k][2 * i + half]);
             }
         }
     }
 
-    float total[groups][tiles][4] = {};
-    unsigned signs[groups][2] = {};
+    float total[tiles][4] = {};
+    unsigned signs[2] = {};
     const uint4* hidden = reinterpret_cast<const uint4*>(hidden_weights.data) + lane;
     const uint4* outer = reinterpret_cast<const uint4*>(output_weights.data) + lane;
     #pragma unroll 1
     for (int unit = 0; unit < units; ++unit) {
-        float sum[groups][2][4] = {}, rest[groups][2][4] = {};
+        float sum[2][4] = {}, rest[2][4] = {};
         #pragma unroll
         for (int k = 0; k < steps; ++k) {
             #pragma unroll
             for (int tile = 0; tile < 2; ++tile) {
                 const uint4 weight = __ldg(hidden + (tile * steps + k) * 32);
-                #pragma unroll
-                for (int group = 0; group < groups; ++group) {
-                    multiply(rest[group][tile], low[group][k], weight.x, weight.y);
-                    multiply(rest[group][tile], high[group][k], weight.z, weight.w);
-                    multiply(sum[group][tile], high[group][k], weight.x, weight.y);
-                }
+                multiply(rest[tile], low[k], weight.x, weight.y);
+                multiply(rest[tile], high[k], weight.z, weight.w);
+                multiply(sum[tile], high[k], weight.x, weight.y);
             }
         }
         hidden += 2 * steps * 32;
-        unsigned left[groups][4], left_rest[groups][4];
+        unsigned left[4], left_rest[4];
         #pragma unroll
-        for (int group = 0; group < groups; ++group) {
+        for (int half = 0; half < 2; ++half) {
+            const int row = first + 8 * half;
+            int* word = signs_of.data + (size_t)row * words + (unit / 8) * 4 + t;
+            unsigned& kept = signs[half];
+            $before
             #pragma unroll
-            for (int half = 0; half < 2; ++half) {
-                const int row = first + 16 * group + 8 * half;
-                int* word = signs_of.data + (size_t)row * words + (unit / 8) * 4 + t;
-                unsigned& kept = signs[group][half];
-                $before
+            for (int tile = 0; tile < 2; ++tile) {
+                float value[2];
                 #pragma unroll
-                for (int tile = 0; tile < 2; ++tile) {
-                    float value[2];
-                    #pragma unroll
-                    for (int i = 0; i < 2; ++i) {
-                        value[i] = sum[group][tile][2 * half + i] + rest[group][tile][2 * half + i];
-                        const unsigned bit = 1u << (2 * tile + i);
-                        $choose
-                    }
-                    split(value[0], value[1],
-                        left[group][2 * tile + half], left_rest[group][2 * tile + half]);
+                for (int i = 0; i < 2; ++i) {
+                    value[i] = sum[tile][2 * half + i] + rest[tile][2 * half + i];
+                    const unsigned bit = 1u << (2 * tile + i);
+                    $choose
                 }
-                $after
+                split(value[0], value[1], left[2 * tile + half], left_rest[2 * tile + half]);
             }
+            $after
         }
         #pragma unroll
         for (int tile = 0; tile < tiles; ++tile) {
             const uint4 weight = __ldg(outer + tile * 32);
+            float part[4] = {};
+            multiply(part, left_rest, weight.x, weight.y);
+            multiply(part, left, weight.z, weight.w);
+            multiply(part, left, weight.x, weight.y);
             #pragma unroll
-            for (int group = 0; group < groups; ++group) {
-                float part[4] = {};
-                multiply(part, left_rest[group], weight.x, weight.y);
-                multiply(part, left[group], weight.z, weight.w);
-                multiply(part, left[group], weight.x, weight.y);
-                #pragma unroll
-                for (int i = 0; i < 4; ++i) total[group][tile][i] += part[i];
-            }
+            for (int i = 0; i < 4; ++i) total[tile][i] += part[i];
         }
         outer += tiles * 32;
     }
@@ -176,16 +154,13 @@ _TWO_LAYERS = """
         if (column >= out_width) continue;
         const float2 factor = *reinterpret_cast<const float2*>(output_unscale.data + column);
         #pragma unroll
-        for (int group = 0; group < groups; ++group) {
-            #pragma unroll
-            for (int half = 0; half < 2; ++half) {
-                const int row = first + 16 * group + 8 * half;
-                if (row >= count) continue;
-                float2 pair;
-                pair.x = total[group][tile][2 * half] * factor.x * unscale[group][half];
-                pair.y = total[group][tile][2 * half + 1] * factor.y * unscale[group][half];
-                *reinterpret_cast<float2*>(output.data + (size_t)row * out_width + column) = pair;
-            }
+        for (int half = 0; half < 2; ++half) {
+            const int row = first + 8 * half;
+            if (row >= count) continue;
+            float2 pair;
+            pair.x = total[tile][2 * half] * factor.x * unscale[half];
+            pair.y = total[tile][2 * half + 1] * factor.y * unscale[half];
+            *reinterpret_cast<float2*>(output.data + (size_t)row * out_width + column) = pair;
         }
     }
 """
@@ -217,223 +192,6 @@ _MASK = {
     "after": "kept >>= 4;",
 }
 
-_WEIGHT_SUMS = """
-    constexpr int steps = $steps;            // of 16 columns of a row
-    constexpr int tiles = $tiles;            // of 8
-    constexpr int out_steps = $out_steps;    // of 16 columns of a cotangent
-    constexpr int out_tiles = $out_tiles;    // of 8
-    constexpr int warps = $warps;
-    constexpr int pitch = 16 * steps + 8, out_pitch = 16 * out_steps + 8;
-    constexpr int words = $words;
-    __shared__ __align__(16) unsigned short inputs[2][$rows * pitch];
-    __shared__ __align__(16) unsigned short bars[2][$rows * out_pitch];
-    __shared__ int signs[$rows * words];
-
-    const unsigned lane = threadIdx.x & 31u, t = lane & 3u, g = lane >> 2;
-    const int width = input.shape[1], out_width = output_bar.shape[1];
-    const int share = blockIdx.x / $unit_blocks;
-    const int base = ((blockIdx.x % $unit_blocks) * warps + threadIdx.x / 32) * 32;
-    const int begin = share * share_rows, end = min(begin + share_rows, input.shape[0]);
-
-    const auto stage = [&](const float* from, int columns, int row, int column,
-                           unsigned short* high, unsigned short* low) {
-        float4 part = {0.0f, 0.0f, 0.0f, 0.0f};
-        if (row < end && column < columns) {
-            part = __ldg(reinterpret_cast<const float4*>(from + (size_t)row * columns + column));
-        }
-        uint2 upper, lower;
-        split(part.x, part.y, upper.x, lower.x);
-        split(part.z, part.w, upper.y, lower.y);
-        *reinterpret_cast<uint2*>(high) = upper;
-        *reinterpret_cast<uint2*>(low) = lower;
-    };
-    const auto fetch = [](unsigned (&to)[4], const unsigned short* from) {
-        asm volatile("ldmatrix.sync.aligned.m8n8.x4.shared.b16 {%0, %1, %2, %3}, [%4];"
-            : "=r"(to[0]), "=r"(to[1]), "=r"(to[2]), "=r"(to[3])
-            : "r"((unsigned)__cvta_generic_to_shared(from)) : "memory");
-    };
-    const auto fetch_turned = [](unsigned (&to)[4], const unsigned short* from) {
-        asm volatile("ldmatrix.sync.aligned.m8n8.x4.trans.shared.b16 {%0, %1, %2, %3}, [%4];"
-            : "=r"(to[0]), "=r"(to[1]), "=r"(to[2]), "=r"(to[3])
-            : "r"((unsigned)__cvta_generic_to_shared(from)) : "memory");
-    };
-    // Where this lane's part of 16 rows and 16 columns begins, as it is and turned.
-    const int straight = (lane & 7) + (lane >> 4) * 8, straight_column = (lane >> 3 & 1) * 8;
-    const int turned = lane & 15, turned_column = (lane >> 4) * 8;
-
-    // Adds the transposed product of two groups of 16 units and of a fragment's rows and columns.
-    using Units = Four[2][2];
-    const auto multiply_units = [&](Units& sum, const uint4* weights, int count, int k,
-                                    const unsigned (&high)[4], const unsigned (&low)[4]) {
-        #pragma unroll
-        for (int group = 0; group < 2; ++group) {
-            const uint4* from = weights + ((group * count + k) * 2) * 32;
-            const uint4 upper = __ldg(from), lower = __ldg(from + 32);
-            const unsigned a[4] = {upper.x, upper.y, upper.z, upper.w};
-            const unsigned rest[4] = {lower.x, lower.y, lower.z, lower.w};
-            #pragma unroll
-            for (int tile = 0; tile < 2; ++tile) {
-                multiply(sum[group][tile], rest, high[2 * tile], high[2 * tile + 1]);
-                multiply(sum[group][tile], a, low[2 * tile], low[2 * tile + 1]);
-                multiply(sum[group][tile], a, high[2 * tile], high[2 * tile + 1]);
-            }
-        }
-    };
-    const auto add_product = [&](Four& total, const unsigned (&a)[4],
-                                 const unsigned (&rest)[4], const unsigned (&high)[4],
-                                 const unsigned (&low)[4], int tile) {
-        float part[4] = {};
-        multiply(part, rest, high[2 * tile], high[2 * tile + 1]);
-        multiply(part, a, low[2 * tile], low[2 * tile + 1]);
-        multiply(part, a, high[2 * tile], high[2 * tile + 1]);
-        #pragma unroll
-        for (int i = 0; i < 4; ++i) total[i] += part[i];
-    };
-
-    float hidden_total[2][tiles][4] = {}, output_total[2][out_tiles][4] = {};
-    const uint4* hidden =
-        reinterpret_cast<const uint4*>(hidden_weights.data) + base / 16 * steps * 64 + lane;
-    const uint4* outer =
-        reinterpret_cast<const uint4*>(output_weights.data) + base / 16 * out_steps * 64 + lane;
-    #pragma unroll 1
-    for (int first = begin; first < end; first += $rows) {
-        __syncthreads();
-        for (int i = threadIdx.x; i < $rows * 4 * steps; i += 32 * warps) {
-            const int row = i / (4 * steps), column = i % (4 * steps) * 4;
-            const int to = row * pitch + column;
-            stage(input.data, width, first + row, column, inputs[0] + to, inputs[1] + to);
-        }
-        for (int i = threadIdx.x; i < $rows * 4 * out_steps; i += 32 * warps) {
-            const int row = i / (4 * out_steps), column = i % (4 * out_steps) * 4;
-            const int to = row * out_pitch + column;
-            stage(output_bar.data, out_width, first + row, column, bars[0] + to, bars[1] + to);
-        }
-        for (int i = threadIdx.x; i < $rows * words; i += 32 * warps) {
-            const bool inside = first + i / words < end;
-            signs[i] = inside ? __ldg(signs_of.data + (size_t)first * words + i) : 0;
-        }
-        __syncthreads();
-        #pragma unroll 1
-        for (int row = 0; row < $rows && first + row < end; row += 16) {
-            float sum[2][2][4] = {}, bar[2][2][4] = {};
-            #pragma unroll
-            for (int k = 0; k < steps; ++k) {
-                unsigned high[4], low[4];
-                const int from = (row + straight) * pitch + 16 * k + straight_column;
-                fetch(high, inputs[0] + from);
-                fetch(low, inputs[1] + from);
-                multiply_units(sum, hidden, steps, k, high, low);
-            }
-            #pragma unroll
-            for (int k = 0; k < out_steps; ++k) {
-                unsigned high[4], low[4];
-                const int from = (row + straight) * out_pitch + 16 * k + straight_column;
-                fetch(high, bars[0] + from);
-                fetch(low, bars[1] + from);
-                multiply_units(bar, outer, out_steps, k, high, low);
-            }
-            unsigned units[2][4], units_rest[2][4], unit_bars[2][4], unit_bars_rest[2][4];
-            #pragma unroll
-            for (int tile = 0; tile < 2; ++tile) {
-                unsigned kept[2];
-                #pragma unroll
-                for (int i = 0; i < 2; ++i) {
-                    const int at = (row + 8 * tile + 2 * t + i) * words + base / 128 * 4 + g / 2;
-                    kept[i] = (unsigned)signs[at] >> (base % 128 / 4 + (g & 1u));
-                }
-                #pragma unroll
-                for (int group = 0; group < 2; ++group) {
-                    #pragma unroll
-                    for (int half = 0; half < 2; ++half) {
-                        float unit[2], unit_bar[2];
-                        #pragma unroll
-                        for (int i = 0; i < 2; ++i) {
-                            const bool on = kept[i] >> (4 * group + 2 * half) & 1u;
-                            unit[i] = on ? sum[group][tile][2 * half + i] : 0.0f;
-                            unit_bar[i] = on ? bar[group][tile][2 * half + i] : 0.0f;
-                        }
-                        const int word = 2 * tile + half;
-                        split(unit[0], unit[1], units[group][word], units_rest[group][word]);
-                        split(unit_bar[0], unit_bar[1],
-                            unit_bars[group][word], unit_bars_rest[group][word]);
-                    }
-                }
-            }
-            #pragma unroll
-            for (int tile = 0; tile < tiles; ++tile) {
-                unsigned high[4], low[4];
-                if (tile % 2 == 0) {
-                    const int from = (row + turned) * pitch + 8 * tile + turned_column;
-                    fetch_turned(high, inputs[0] + from);
-                    fetch_turned(low, inputs[1] + from);
-                    #pragma unroll
-                    for (int other = 0; other < 2 && tile + other < tiles; ++other) {
-                        #pragma unroll
-                        for (int group = 0; group < 2; ++group) {
-                            add_product(hidden_total[group][tile + other], unit_bars[group],
-                                unit_bars_rest[group], high, low, other);
-                        }
-                    }
-                }
-            }
-            #pragma unroll
-            for (int tile = 0; tile < out_tiles; tile += 2) {
-                unsigned high[4], low[4];
-                const int from = (row + turned) * out_pitch + 8 * tile + turned_column;
-                fetch_turned(high, bars[0] + from);
-                fetch_turned(low, bars[1] + from);
-                #pragma unroll
-                for (int other = 0; other < 2 && tile + other < out_tiles; ++other) {
-                    #pragma unroll
-                    for (int group = 0; group < 2; ++group) {
-                        add_product(output_total[group][tile + other], units[group],
-                            units_rest[group], high, low, other);
-                    }
-                }
-            }
-        }
-    }
-
-    float* to = partial_sums.data + (size_t)share * partial_sums.shape[1];
-    #pragma unroll
-    for (int group = 0; group < 2; ++group) {
-        #pragma unroll
-        for (int i = 0; i < 4; ++i) {
-            const int unit = base + 16 * group + g + i / 2 * 8, place = 2 * t + i % 2;
-            #pragma unroll
-            for (int tile = 0; tile < tiles; ++tile) {
-                const int column = 8 * tile + place;
-                if (column < width) to[unit * width + column] = hidden_total[group][tile][i];
-            }
-            float* output_to = to + unit_count * width + unit;
-            #pragma unroll
-            for (int tile = 0; tile < out_tiles; ++tile) {
-                const int column = 8 * tile + place;
-                if (column >= out_width) continue;
-                output_to[column * unit_count] = output_total[group][tile][i];
-            }
-        }
-    }
-"""
-
-_ADD_SHARES = """
-    __shared__ float sums[4][32];
-    const int column = blockIdx.x * 32 + threadIdx.x % 32, warp = threadIdx.x / 32;
-    const int count = partial_sums.shape[0], width = partial_sums.shape[1];
-    float sum = 0.0f;
-    if (column < width) {
-        const float* from = partial_sums.data + column;
-        #pragma unroll 8
-        for (int share = warp; share < count; share += 4) sum += from[(size_t)share * width];
-    }
-    sums[warp][threadIdx.x % 32] = sum;
-    __syncthreads();
-    if (warp == 0 && column < width) {
-        const int i = threadIdx.x;
-        total.data[column] = (sums[0][i] + sums[1][i]) + (sums[2][i] + sums[3][i]);
-    }
-"""
-
 
 @wp.func_native("""
     const unsigned exponent = min(max(__float_as_uint(size) >> 23, target + 1u), 254u);
@@ -445,19 +203,18 @@ def scale_to(size: wp.float32, target: wp.uint32) -> wp.float32:
 
 
 @functools.cache
-def make_two_layers(steps: int, tiles: int, groups: int, mode: str) -> wp.Function:
-    """Return the Warp function of two products, row by row, for `groups` of 16 rows a warp.
+def make_two_layers(steps: int, tiles: int, mode: str) -> wp.Function:
+    """Return the Warp function of two products, row by row, for 16 rows a warp.
 
     Args:
         steps: Groups of 16 input columns.
         tiles: Groups of 8 output columns.
-        groups: Groups of 16 rows of a warp.
         mode: Between the products, "rectify" hidden units, "note" which are positive too, or
             "mask" by what was noted.
     """
     between = {"rectify": _RECTIFY, "note": _RECTIFY_AND_NOTE, "mask": _MASK}[mode]
-    body = Template(_HALF_PAIRS + _MULTIPLY + _TWO_LAYERS).substitute(
-        between, type="f16", steps=steps, tiles=tiles, groups=groups, target=ROW_TARGET
+    body = Template(HALF_PAIRS + MULTIPLY + _TWO_LAYERS).substitute(
+        between, type="f16", steps=steps, tiles=tiles, target=ROW_TARGET
     )
 
     @wp.func_native(body)
@@ -472,52 +229,3 @@ def make_two_layers(steps: int, tiles: int, groups: int, mode: str) -> wp.Functi
     ): ...
 
     return two_layers
-
-
-@functools.cache
-def make_weight_sums(
-    steps: int, tiles: int, out_tiles: int, warps: int, unit_blocks: int, words: int
-) -> wp.Function:
-    """Return the Warp function that sums the weights' gradients over a share of the rows.
-
-    Args:
-        steps: Groups of 16 columns of a row.
-        tiles: Groups of 8 columns of a row.
-        out_tiles: Groups of 8 columns of an update.
-        warps: Warps of a block, each for `WARP_UNITS` hidden units.
-        unit_blocks: Blocks that serve the hidden units of one share of rows.
-        words: Words of a row's signs.
-    """
-    body = Template(_BFLOAT_PAIRS + _MULTIPLY + _WEIGHT_SUMS).substitute(
-        type="bf16",
-        rows=ROW_TILE,
-        steps=steps,
-        tiles=tiles,
-        out_steps=-(-out_tiles // 2),
-        out_tiles=out_tiles,
-        warps=warps,
-        unit_blocks=unit_blocks,
-        words=words,
-    )
-
-    @wp.func_native(body)
-    def weight_sums(
-        unit_count: wp.int32,
-        share_rows: wp.int32,
-        input: wp.array(dtype=wp.float32, ndim=2),
-        output_bar: wp.array(dtype=wp.float32, ndim=2),
-        signs_of: wp.array(dtype=wp.int32, ndim=2),
-        hidden_weights: wp.array(dtype=wp.bfloat16),
-        output_weights: wp.array(dtype=wp.bfloat16),
-        partial_sums: wp.array(dtype=wp.float32, ndim=2),
-    ): ...
-
-    return weight_sums
-
-
-@wp.func_native(_ADD_SHARES)
-def add_partial_sums(
-    partial_sums: wp.array(dtype=wp.float32, ndim=2), total: wp.array(dtype=wp.float32)
-):
-    """Add what the shares of rows summed, in a fixed order; blocks of 128 threads, 32 columns."""
-    ...

@@ -14,7 +14,8 @@ from npa_envs.kernels.network import (
     two_layer_kernel,
     weight_gradient_kernels,
 )
-from npa_envs.kernels.products import UNIT_GROUP, WARP_UNITS
+from npa_envs.kernels.products import UNIT_GROUP
+from npa_envs.kernels.weight_sums import WARP_UNITS
 from npa_envs.sph.bridge import launch
 
 LARGEST_ROW, LARGEST_UPDATE, LARGEST_HIDDEN = 128, 32, 512
@@ -25,12 +26,6 @@ SMALLEST_CAPABILITY = (8, 0)
 
 ROW_GROUP = 16
 """Rows of a fragment."""
-
-WIDE_TILES = 12
-"""Fragments of a row that fit into a thread's registers twice."""
-
-MANY_ROWS = 2**15
-"""From here on a warp maps two groups of rows, which halves how often it reads the weights."""
 
 LAYER_BLOCK = 64
 """Threads of a block that maps rows: small, so that few rows still fill the device."""
@@ -172,12 +167,10 @@ def _map_rows(
 ) -> Tensor:
     """Run two layers on rows [K, width], as `make_two_layers` says; returns [K, out_width]."""
     steps, tiles = -(-rows.shape[1] // 16), -(-out_width // 8)
-    wide = max(2 * steps, tiles) > WIDE_TILES
-    groups = 1 if wide or rows.shape[0] < MANY_ROWS else 2
     output = rows.new_empty(rows.shape[0], out_width)
-    warps = -(-rows.shape[0] // (ROW_GROUP * groups))
+    warps = -(-rows.shape[0] // ROW_GROUP)
     launch(
-        two_layer_kernel(steps, tiles, groups, mode),
+        two_layer_kernel(steps, tiles, mode),
         -(-warps * LANES // LAYER_BLOCK) * LAYER_BLOCK,
         rows.device,
         unit_count,
