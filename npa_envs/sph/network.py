@@ -43,7 +43,7 @@ class ArrangedWeights(NamedTuple):
     forward: list[Tensor]
     """Fragments of W1 and of W2, float16, and the scales of updates, float32."""
     backward: list[Tensor]
-    """The same of W2 and W1 transposed, then fragments of both, bfloat16; empty if not needed."""
+    """The same of both transposed, then fragments of both, bfloat16; empty without gradients."""
 
 
 def fits_network(hidden_weight: Tensor, output_weight: Tensor) -> bool:
@@ -147,8 +147,11 @@ def arrange_weights(hidden_weight: Tensor, output_weight: Tensor) -> ArrangedWei
         hidden_weight: Weights of the hidden units, shape [H, row_width].
         output_weight: Weights of the updates, shape [A', H].
     """
-    if not fits_network(hidden_weight, output_weight):
-        return None
+    fits = fits_network(hidden_weight, output_weight)
+    return _arrange(hidden_weight, output_weight) if fits else None
+
+
+def _arrange(hidden_weight: Tensor, output_weight: Tensor) -> ArrangedWeights:
     arranged = _arrange_weights(
         hidden_weight.detach().contiguous(),
         output_weight.detach().contiguous(),
@@ -315,13 +318,16 @@ def run_network(
         rows: Rows of perception, dimensionless, shape [K, row_width].
         hidden_weight: Weights W1 of the hidden units, shape [H, row_width].
         output_weight: Weights W2 of the updates, shape [A', H].
-        arranged: The same weights as `arrange_weights` laid them out, with gradients enabled if
-            they are here.
+        arranged: The same weights as `arrange_weights` laid them out; again where gradients were
+            not enabled then and are now.
 
     Returns:
         Raw updates, dimensionless, shape [K, A'].
     """
+    noting = torch.is_grad_enabled()
+    if noting and not arranged.backward:
+        arranged = _arrange(hidden_weight, output_weight)
     update: Tensor = _Network.apply(  # type: ignore[no-untyped-call]
-        rows.contiguous(), hidden_weight, output_weight, arranged, torch.is_grad_enabled()
+        rows.contiguous(), hidden_weight, output_weight, arranged, noting
     )
     return update
