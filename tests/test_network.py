@@ -48,7 +48,8 @@ def random_rows(rule, folded, row_count):
 def pulled_back(function, inputs, cotangent):
     inputs = [value.detach().requires_grad_() for value in inputs]
     update = function(*inputs)
-    return update.detach(), torch.autograd.grad(update, inputs, cotangent)
+    bars = torch.autograd.grad(update, inputs, cotangent.expand_as(update))
+    return update.detach(), bars
 
 
 def error(value, answer):
@@ -132,6 +133,19 @@ def test_network_without_gradients_is_the_same(device):
     with torch.no_grad():
         quiet = rule.folded()(rows)
     assert torch.equal(quiet, rule.folded()(rows).detach())
+
+
+def test_rows_may_lie_anywhere(device):
+    rule = trained_like_rule(device)
+    folded = rule.folded()
+    rows = random_rows(rule, folded, 50)
+    shifted = torch.zeros(rows.numel() + 1, device=device)[1:].view_as(rows).copy_(rows)
+    strided = rows.repeat_interleave(2, dim=1)[:, ::2]
+    expected, (expected_bar,) = pulled_back(folded, [rows], torch.ones(50, 1, device=device))
+    for same in (shifted, strided):
+        update, (rows_bar,) = pulled_back(folded, [same], torch.ones(50, 1, device=device))
+        assert torch.equal(update, expected)
+        assert torch.equal(rows_bar, expected_bar)
 
 
 def test_weights_folded_without_gradients_still_have_them(device):

@@ -103,15 +103,16 @@ _TWO_LAYERS = """
     const uint4* outer = reinterpret_cast<const uint4*>(output_weights.data) + lane;
     #pragma unroll 1
     for (int unit = 0; unit < units; ++unit) {
-        float sum[2][4] = {}, rest[2][4] = {};
+        // Three sums of products: none waits for another.
+        float sum[2][4] = {}, rest[2][2][4] = {};
         #pragma unroll
         for (int k = 0; k < steps; ++k) {
             #pragma unroll
             for (int tile = 0; tile < 2; ++tile) {
                 const uint4 weight = __ldg(hidden + (tile * steps + k) * 32);
-                multiply(rest[tile], low[k], weight.x, weight.y);
-                multiply(rest[tile], high[k], weight.z, weight.w);
                 multiply(sum[tile], high[k], weight.x, weight.y);
+                multiply(rest[0][tile], low[k], weight.x, weight.y);
+                multiply(rest[1][tile], high[k], weight.z, weight.w);
             }
         }
         hidden += 2 * steps * 32;
@@ -127,7 +128,8 @@ _TWO_LAYERS = """
                 float value[2];
                 #pragma unroll
                 for (int i = 0; i < 2; ++i) {
-                    value[i] = sum[tile][2 * half + i] + rest[tile][2 * half + i];
+                    const int place = 2 * half + i;
+                    value[i] = rest[0][tile][place] + rest[1][tile][place] + sum[tile][place];
                     const unsigned bit = 1u << (2 * tile + i);
                     $choose
                 }

@@ -152,12 +152,19 @@ def arrange_weights(hidden_weight: Tensor, output_weight: Tensor) -> ArrangedWei
 
 
 def _arrange(hidden_weight: Tensor, output_weight: Tensor) -> ArrangedWeights:
+    """Lay out weights that fit, for the backward pass too where gradients are enabled."""
     arranged = _arrange_weights(
         hidden_weight.detach().contiguous(),
         output_weight.detach().contiguous(),
         torch.is_grad_enabled(),
     )
     return ArrangedWeights(arranged[:3], arranged[3:])
+
+
+def _aligned(rows: Tensor) -> Tensor:
+    """Return contiguous rows, which are read 16 bytes at a time, moved if they begin elsewhere."""
+    rows = rows.contiguous()
+    return rows if rows.data_ptr() % 16 == 0 else rows.clone()
 
 
 def _map_rows(
@@ -177,7 +184,7 @@ def _map_rows(
         -(-warps * LANES // LAYER_BLOCK) * LAYER_BLOCK,
         rows.device,
         unit_count,
-        rows,
+        _aligned(rows),
         *arranged[:3],
         signs,
         output,
@@ -237,7 +244,7 @@ def _weight_gradients(
     )
     processors = torch.cuda.get_device_properties(rows.device).multi_processor_count
     most = max(SHARES_PER_PROCESSOR * processors // unit_blocks, 1)
-    share_rows = -(-count // (most * ROW_GROUP)) * ROW_GROUP
+    share_rows = max(-(-count // (most * ROW_GROUP)), 1) * ROW_GROUP
     shares = -(-count // share_rows)
     partial_sums = rows.new_empty(shares, unit_count * (width + out_width))
     launch(
@@ -246,8 +253,8 @@ def _weight_gradients(
         rows.device,
         unit_count,
         share_rows,
-        rows,
-        update_bar,
+        _aligned(rows),
+        _aligned(update_bar),
         signs,
         *arranged[3:],
         partial_sums,
@@ -296,12 +303,11 @@ class _Network(torch.autograd.Function):
     def backward(ctx: Any, update_bar: Tensor) -> tuple[Tensor | None, ...]:
         rows, signs, *arranged = ctx.saved_tensors
         unit_count, width = ctx.unit_count, rows.shape[1]
-        bar = update_bar.contiguous()
         rows_bar = hidden_bar = output_bar = None
         if ctx.needs_input_grad[0]:
-            rows_bar = _run_network_backward(bar, arranged, signs, width, unit_count)
+            rows_bar = _run_network_backward(update_bar, arranged, signs, width, unit_count)
         if any(ctx.needs_input_grad[1:3]):
-            total = _weight_gradients(rows, bar, signs, arranged, unit_count)
+            total = _weight_gradients(rows, update_bar, signs, arranged, unit_count)
             hidden_bar = total[: unit_count * width].view(unit_count, width)
             output_bar = total[unit_count * width :].view(-1, unit_count)
         return rows_bar, hidden_bar, output_bar, None, None
@@ -328,6 +334,6 @@ def run_network(
     if noting and not arranged.backward:
         arranged = _arrange(hidden_weight, output_weight)
     update: Tensor = _Network.apply(  # type: ignore[no-untyped-call]
-        rows.contiguous(), hidden_weight, output_weight, arranged, noting
+        rows, hidden_weight, output_weight, arranged, noting
     )
     return update
