@@ -21,7 +21,7 @@ GROUP_WIDTHS = (4, 8, 16)
 
 
 CUDA_BLOCK = 128
-"""Threads of a CUDA block."""
+"""Threads of a CUDA block, where a launch does not say otherwise."""
 
 
 def scalar_type(dtype: torch.dtype) -> Any:
