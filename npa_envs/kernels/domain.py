@@ -17,6 +17,9 @@ import warp as wp
 CELL_SLACK = 1.0 + 2.0**-20
 """Cells are this much larger than eps / reach: rounding a cell index cannot lose a neighbour."""
 
+LARGEST_PLACE = 2.0**62
+"""Cells from the origin to which places are counted; what is farther lies in cell 0."""
+
 MOMENT_THRESHOLD = 1e-3
 """Smallest |det M| that is inverted, dimensionless; below it the gradient stays uncorrected."""
 
@@ -158,9 +161,14 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
             count = wp.float64(domain.cell_shape[d])
             place = wp.float64(position[d]) * domain.cell_scale[d]
             if domain.periodic != 0:
-                place = (place - wp.floor(place)) * count
-            place = wp.floor(place)
-            place -= count * wp.floor(place / count)
+                place = wp.floor((place - wp.floor(place)) * count)
+            else:
+                # A grid of open space has a power of two of cells along each dimension.
+                place = wp.floor(place)
+                if wp.abs(place) < wp.float64(LARGEST_PLACE):
+                    place = wp.float64(wp.int64(place) & wp.int64(domain.cell_shape[d] - 1))
+            if place == count:
+                place = wp.float64(0.0)
             # False for NaN too: a world that blew up must still index inside its grid.
             if place >= wp.float64(0.0) and place < count:
                 cell[d] = wp.int32(place)
