@@ -95,14 +95,12 @@ _LIST_LEAVE = """
         if (threadIdx.x % {lanes} >= offset) end += before;
     }}
     const int total = {lanes} > 1 ? __shfl_sync(~0u, end, {lanes} - 1, {lanes}) : length;
-    if (row < 0) return total;
-    const int begin = end - length;
+    if (row < 0 || total > {capacity}) return total;
     short* to = lists.data + (size_t)(row / 32) * (32 * {capacity}) + row % 32;
-    const int held = length < {capacity} - begin ? length : {capacity} - begin;
-    for (int entry = 0; entry < held; ++entry) {{
+    for (int entry = 0; entry < length; ++entry) {{
         short step;
         asm volatile("ld.shared.u16 %0, [%1];" : "=h"(step) : "r"(first + 2 * {block} * entry));
-        to[32 * (begin + entry)] = step;
+        to[32 * (end - length + entry)] = step;
     }}
     return total;
 """

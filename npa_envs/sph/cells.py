@@ -125,6 +125,8 @@ def make_plan(
     world_count, particle_count, space_dim = (int(size) for size in shape)
     scalar = scalar_type(like.dtype)
     sides = None if box is None else tuple(box)
+    # In 3D, more and smaller cells mean many short runs, which lanes share badly.
+    reach = 1 if space_dim == 3 and like.device.type == "cuda" else 2
     plan = Plan(
         scalar=scalar,
         width=channel_width(int(state_dim)),
@@ -135,7 +137,7 @@ def make_plan(
         state_dim=int(state_dim),
         row_capacity=row_capacity,
         masked=masked,
-        domain=make_domain(space_dim, scalar, eps, sides, particle_count),
+        domain=make_domain(space_dim, scalar, eps, sides, particle_count, reach),
     )
     largest = max(2 * plan.cell_total, plan.total * (1 + plan.state_dim))
     if largest >= LARGEST_INDEX:
