@@ -149,6 +149,34 @@ def test_observation_of_a_world_does_not_depend_on_its_batch(device):
         assert torch.equal(together[k], run(x[k : k + 1], s[k : k + 1])[0])
 
 
+@pytest.mark.parametrize("masked", [False, True], ids=("all", "active"))
+@pytest.mark.parametrize("count", [40, 130, 300, 900])
+def test_rows_of_crowded_worlds_are_right(count, masked, device):
+    """Everybody sees everybody: on CUDA, lists overflow, and before that a lane's share of one."""
+    x, s = random_world(2, count, 2, 16, dtype=torch.float32, device=device)
+    x *= 0.05
+    generator = torch.Generator().manual_seed(2)
+    mask = (torch.rand(2, count, generator=generator) < 0.5).to(torch.uint8) if masked else None
+    rows, places = perceive_rows(
+        x,
+        s,
+        mask=None if mask is None else mask.to(device),
+        row_capacity=2 * count,
+        row_width=68,
+        eps=0.2,
+        eps0=0.2,
+        box=None,
+        terms=Terms(),
+    )
+    expected = oracle.perceive(x.cpu().double(), s.cpu().double(), 0.2, 0.2).view(-1, 66)
+    active = torch.ones(2 * count, dtype=torch.bool) if mask is None else mask.view(-1).bool()
+    row_of = places.row_of.cpu().long()
+    assert torch.equal(row_of >= 0, active)
+    assert (
+        relative_error(rows.cpu()[row_of[active], :66], expected[active]) < FORWARD[torch.float32]
+    )
+
+
 def test_neighbourhoods_may_be_longer_than_lists(device):
     """On CUDA lists are for 64 neighbours here: some of these particles have more, others fewer."""
     x, s = random_world(3, 333, 2, 16, dtype=torch.float32, device=device)
