@@ -183,7 +183,7 @@ _WRITE = """
 
 @functools.cache
 def make_slots(
-    space_dim: int, width: int, lanes: int, state_gradient: bool, grouped: bool, capacity: int
+    space_dim: int, width: int, lanes: int, state_gradient: bool, grouped: bool
 ) -> SimpleNamespace:
     """Return the Warp functions on slots of one variant.
 
@@ -193,7 +193,6 @@ def make_slots(
         lanes: Lanes of a particle.
         state_gradient: Whether a row holds the state gradient.
         grouped: Whether channels come in several groups.
-        capacity: Neighbours that a particle's list has room for.
     """
     vector = wp.types.vector(space_dim, wp.float32)
     entry_type = wp.types.vector(space_dim + 2, wp.float32)
@@ -212,7 +211,6 @@ def make_slots(
         "row_words": row_words,
         "grouped": int(grouped),
         "dims": space_dim,
-        "capacity": capacity,
         "last": "__int_as_float(number)" if flat else "kernel[2]",
         "put_number": "",
         "get_number": "",
