@@ -6,8 +6,9 @@ dense disk (Morphogenesis2D), or as grown and damaged pictures (Regeneration2D).
 observations stay on the device and the host reads one byte a world; on a CPU they are NumPy's.
 
 Of a step's wall time, `wait` is what the host spent waiting for the device; the rest of it the host
-was busy. `calm_step` is a step without resets, `queued` the same steps of the same worlds with the
-work queued on the device and nothing of Python's between: the difference is what Python costs.
+was busy. Where resets come together, `calm_step` is a step without any, and `queued` the same steps
+of the same worlds with the work queued on the device and nothing of Python's between: the
+difference is what Python costs.
 `device` is the sum of the kernels' times, `idle` the share of a step without any.
 """
 
@@ -99,10 +100,7 @@ def python_times(env: Any, actions: list[Any], device: torch.device) -> tuple[fl
     out = worlds.perceive()
 
     def queue(action: Any) -> None:
-        worlds._draw()
-        worlds._actions.apply(action)
-        worlds._judge_and_survey()
-        worlds._surveyed.perceive(out)
+        worlds.queue(action, out)
 
     times: dict[Callable[[Any], Any], list[float]] = {env.step: [], queue: []}
     for _ in range(COMPARISONS):
@@ -235,7 +233,7 @@ def measure(
     # Half-way through an episode worlds are as they typically are.
     run(EPISODE_STEPS // 2)
     row["neighbours"] = neighbour_count(env)
-    if wait is not None:
+    if wait is not None and not staggered:
         calm, queued = python_times(env, random_actions(env, device), device)
         row["calm_step_us"], row["queued_us"] = calm * 1e6, queued * 1e6
     env.close()

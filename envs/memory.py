@@ -17,12 +17,23 @@ LARGEST_INDEX = 2**31 - 1
 """Kernels index the particles' states with 32 bits."""
 
 
-def needed_bytes(world_count: int, particle_count: int, physics: Physics) -> int:
+LISTED_BYTES = 320
+"""What CUDA keeps of a particle's neighbours, at most: a list of 128, and what is sorted."""
+
+RECORDED_STARTS = 4 / 3
+"""Particles of all recorded restarts together, which have lists of their own, to those of a batch:
+1 + 1/4 + 1/16 + ..."""
+
+
+def needed_bytes(
+    world_count: int, particle_count: int, physics: Physics, device: torch.device
+) -> int:
     """Return about how much memory worlds take while they are stepped [bytes]."""
     particles = world_count * particle_count
     worlds = 6 * (physics.space_dim + physics.state_dim)
     numbers = OBSERVATION_COPIES * physics.perception_dim + 2 * physics.action_dim + worlds + 16
-    return 4 * particles * numbers
+    listed = LISTED_BYTES * (1.0 + RECORDED_STARTS) if device.type == "cuda" else 0.0
+    return int(particles * (4 * numbers + listed))
 
 
 def free_bytes(device: torch.device) -> int | None:
@@ -66,7 +77,7 @@ def check_memory(
     cure = "choose a smaller particle_count or fewer worlds"
     if world_count * particle_count * (1 + physics.state_dim) > LARGEST_INDEX:
         raise NPAError(f"particle_count is too large: {what} exceed 32-bit indices: {cure}")
-    needed = needed_bytes(world_count, particle_count, physics) + extra_bytes
+    needed = needed_bytes(world_count, particle_count, physics, device) + extra_bytes
     free = free_bytes(device)
     if free is not None and needed > free:
         raise NPAError(

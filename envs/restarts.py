@@ -18,7 +18,7 @@ GROWTH = 4
 
 
 class Restarts:
-    """Starts of next episodes, as one launch on CUDA instead of some hundred.
+    """Starts of next episodes, on CUDA as one graph and one launch instead of some hundred.
 
     A recorded start serves a fixed number of worlds. Fewer are filled up by repeating the last one:
     it is then started twice in the same way, which is the same as once.

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.envs.arrays import checked_action, checked_particles, to_output
+from npa_envs.envs.report import DIVERGED, SUCCESS, reason
 from npa_envs.envs.screen import Screen
 from npa_envs.envs.spaces import action_space, observation_space
 from npa_envs.envs.task import EnvTask
 from npa_envs.envs.vector_options import world_keys
-from npa_envs.envs.worlds import DIVERGED, SUCCESS, Worlds, reason
+from npa_envs.envs.worlds import Worlds
 from npa_envs.errors import NPAError
 
 

@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.envs.arrays import checked_action, checked_particles, to_output
+from npa_envs.envs.report import FLAGS, TIME_LIMIT, reason
 from npa_envs.envs.screen import Screen
 from npa_envs.envs.spaces import action_space, observation_space
 from npa_envs.envs.task import EnvTask
 from npa_envs.envs.vector_options import autoreset_mode as checked_mode
 from npa_envs.envs.vector_options import checked_count, world_keys, worlds_to_reset
-from npa_envs.envs.worlds import FLAGS, TIME_LIMIT, Worlds, reason
+from npa_envs.envs.worlds import Worlds
 from npa_envs.errors import NPAError
 from npa_envs.replay import sent
 
@@ -191,7 +192,7 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
             self.worlds.restart(np.flatnonzero(ended), observation)
             _, _, infos = self._report(~ended, copy=self._copy)
             infos |= {"final_obs": self._out(final_observation), "_final_obs": which}
-            infos |= {"final_info": final_infos, "_final_info": which}
+            infos |= {"final_info": final_infos, "_final_info": self._mask(ended)}
         else:
             self._ended = ended
         self._show()
@@ -252,7 +253,7 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
         report = worlds.report.copy() if copy else worlds.report
         # One view for each quantity, made at once.
         numbers, flags = list(self._out(report.numbers)), list(self._out(report.endings))
-        everyone = self._out(report.everyone)
+        everyone = self._out(report.everyone if copy else report.everyone.clone())
         which = everyone if stepped is None else self._mask(stepped)
         infos = self._losses(numbers, everyone)
         improvements = numbers[2 + len(worlds.part_names) :]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,6 +18,7 @@ from torch import Tensor
 from npa_envs.control import Actions, Physics, SurveyedWorlds, survey_worlds
 from npa_envs.envs.config import EnvConfig
 from npa_envs.envs.memory import check_memory
+from npa_envs.envs.report import DIVERGED, SUCCESS, TIME_LIMIT, Report
 from npa_envs.envs.restarts import Restarts
 from npa_envs.envs.task import EnvTask, Start
 from npa_envs.errors import NPAError
@@ -28,53 +29,6 @@ from npa_envs.replay import Beside, Replayed
 # starts them, would wait for it for ever.
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
-
-SUCCESS, DIVERGED, TIME_LIMIT = 1, 2, 4
-"""Bits of an ending: why an episode is over; none is set while it runs."""
-
-FLAGS = ("success", "diverged")
-"""Names of the first two endings in `info`."""
-
-
-class Report(NamedTuple):
-    """What a step says of each world, in one buffer: it is handed out by one copy, not twenty."""
-
-    buffer: Tensor
-    """All that follows, uint8."""
-    numbers: Tensor
-    """Reward; loss; its parts; their improvements in the last step; shape [2 + 2 K, B]."""
-    endings: Tensor
-    """Terminated; truncated; success; diverged; bool, shape [4, B]."""
-    everyone: Tensor
-    """True for every world, bool, shape [B]."""
-
-    @classmethod
-    def empty(cls, world_count: int, part_count: int, device: torch.device) -> Report:
-        """Return the report of B worlds whose loss has K parts: zeros."""
-        rows = 4 * (2 + 2 * part_count) + 3 + len(FLAGS)
-        buffer = torch.zeros(rows * world_count, dtype=torch.uint8, device=device)
-        report = cls.over(buffer, world_count)
-        report.everyone.fill_(True)
-        return report
-
-    @classmethod
-    def over(cls, buffer: Tensor, world_count: int) -> Report:
-        """Return the report that a buffer holds."""
-        flag_rows = 3 + len(FLAGS)
-        rows = buffer.view(-1, world_count)
-        numbers = buffer[: -flag_rows * world_count].view(torch.float32).view(-1, world_count)
-        flags = rows[-flag_rows:].view(torch.bool)
-        return cls(buffer, numbers, flags[:-1], flags[-1])
-
-    def copy(self) -> Report:
-        """Return a copy that later steps leave alone."""
-        return self.over(self.buffer.clone(), len(self.everyone))
-
-
-def reason(ending: int) -> str | None:
-    """Return why an episode ended, in words, or None where it has not."""
-    words = {DIVERGED: "diverged", SUCCESS: "success", TIME_LIMIT: "time limit"}
-    return next((word for bit, word in words.items() if ending & bit), None)
 
 
 def make_physics(config: EnvConfig, task_type: type[EnvTask[Any]]) -> Physics:
@@ -170,6 +124,7 @@ class Worlds:
             enabled=self._enabled,
             diverged=self._diverged,
         )
+        self._surveyed: SurveyedWorlds | None = None
         self._draw = Replayed(self._actions.draw, device)
         self._judge_and_survey = Replayed(self._look, device)
         self.restart = Restarts(
@@ -278,27 +233,29 @@ class Worlds:
             out: Where to write what is perceived; a new tensor otherwise.
 
         Raises:
-            NPAError: An action is not finite; the worlds are then as they were.
+            NPAError: An action is not finite; the worlds, and what is reported of them, are then as
+                they were.
         """
-        if self._beside is None and not bool(torch.isfinite(action).all()):
-            raise self._not_finite(action)
-        self._draw()
-        self._actions.apply(action)
-        self._judge_and_survey()
-        if self._beside is not None:
-            self._beside.mark()
-        # The host learns the endings while the device perceives.
-        observation = self._surveyed.perceive(out)
+        observation = self.queue(action, out)
         if self._beside is not None:
             self._beside.wait()
         if not self._host_endings[-1]:
             self.random.steps -= 1
             self.elapsed -= 1
             raise self._not_finite(action)
-        return self._endings(), observation
+        return self._host_endings[:-1].numpy().copy(), observation
 
-    def _endings(self) -> NDArray[np.uint8]:
-        return self._host_endings[:-1].numpy().copy()
+    @torch.no_grad()
+    def queue(self, action: Tensor, out: Tensor | None = None) -> Tensor:
+        """Do what `step` does but wait for the device, and return what is perceived there then."""
+        self._draw()
+        self._actions.apply(action)
+        self._judge_and_survey()
+        if self._beside is not None:
+            # The host learns the endings while the device perceives.
+            self._beside.mark()
+        assert self._surveyed is not None, "the worlds were sorted just now"
+        return self._surveyed.perceive(out)
 
     def _look(self) -> None:
         """Judge the worlds and, beside that, sort them."""
@@ -321,12 +278,14 @@ class Worlds:
         late = torch.zeros_like(success)
         if self.episode_steps is not None:
             late = self.elapsed >= self.episode_steps
-        self.report.endings.copy_(torch.stack((success | diverged, late, success, diverged)))
+        enabled = self._enabled.bool()
+        endings = torch.stack((success | diverged, late, success, diverged))
+        self.report.endings.copy_(torch.where(enabled, endings, self.report.endings))
         improvement = self.loss - loss
         if self.particle_loss is not None and self.particle_reward is not None:
             shares = task.particle_losses(self.x, self.s)
             own = torch.where(diverged[:, None], improvement[:, None], self.particle_loss - shares)
-            self.particle_reward.copy_(own)
+            self.particle_reward.copy_(torch.where(enabled, own, self.particle_reward))
             self.particle_loss.copy_(shares)
         reward = improvement
         if config.reward == "sparse":
@@ -335,7 +294,8 @@ class Worlds:
             reward = torch.where(over, -loss, torch.zeros_like(loss))
         numbers = self.report.numbers
         before = numbers[2 : 2 + len(parts)]
-        numbers.copy_(torch.cat((reward[None], loss[None], parts, before - parts)))
+        now = torch.cat((reward[None], loss[None], parts, before - parts))
+        numbers.copy_(torch.where(enabled, now, numbers))
         ending = SUCCESS * success.byte() + DIVERGED * diverged.byte() + TIME_LIMIT * late.byte()
         self._host_endings.copy_(torch.cat((ending, self._enabled)), non_blocking=True)
         self._enabled.fill_(1)

@@ -16,7 +16,7 @@ from npa_envs.sph.actions import RepeatedActions
 from npa_envs.sph.passes import Terms
 from npa_envs.sph.rows import SurveyedWorlds, survey
 
-__all__ = ["Actions", "Physics", "SurveyedWorlds", "observe", "survey_worlds"]
+__all__ = ["Actions", "Physics", "SurveyedWorlds", "survey_worlds"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,18 +98,6 @@ def survey_worlds(
         limit=physics.perception_limit,
         places=places,
     )
-
-
-@torch.no_grad()
-def observe(x: Tensor, s: Tensor, physics: Physics) -> Tensor:
-    """Return what every particle perceives, clipped: z of `npa_envs.perceive`, [B, N, P].
-
-    Args:
-        x: Positions [length units], shape [B, N, D], finite.
-        s: States, dimensionless, shape [B, N, C], finite.
-        physics: The worlds' constants.
-    """
-    return survey_worlds(x, s, physics).perceive()
 
 
 class Actions:

@@ -29,7 +29,7 @@ def sent(values: NDArray[Any], device: torch.device) -> Tensor:
     """Return an array as a tensor on a device; the host does not wait for what the device does.
 
     Args:
-        values: An array that nobody changes until the device has read it.
+        values: An array; on a CPU the tensor shares its memory.
         device: Where it is to go.
     """
     tensor = torch.from_numpy(values)

@@ -90,8 +90,8 @@ class RepeatedActions:
     Args:
         x: As for `apply_actions`.
         s: As for `apply_actions`.
-        enabled: Whether all actions were finite; where not, nothing happens; uint8, shape [1]. Set
-            to 0 where one is not, and never to 1.
+        enabled: Whether anything happens, uint8, shape [1]: set to 0 where an action is not finite,
+            and never to 1.
         options: The other keywords of `apply_actions`.
 
     Raises:

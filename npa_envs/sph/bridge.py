@@ -119,6 +119,10 @@ def launch(
         wp.launch(kernel, size, inputs=converted, record_tape=False, **placement)
 
 
+def _form(tensor: Tensor) -> tuple[Any, ...]:
+    return tensor.shape, tensor.dtype, tensor.device, tensor.is_contiguous()
+
+
 class Repeated:
     """A launch that is made again and again with one tensor changed: a tenth of the host's time.
 
@@ -147,6 +151,7 @@ class Repeated:
             self._recorded = wp.launch(
                 kernel, size, inputs=converted, record_tape=False, record_cmd=True, **placement
             )
+        self._form = _form(changing)
         place = next(k for k, value in enumerate(arguments) if value is changing)
         self._argument = converted[place]
         self._recorded.set_param_at_index_from_ctype(place, self._argument)
@@ -155,7 +160,9 @@ class Repeated:
         """Launch on torch's current stream.
 
         Args:
-            tensor: The changing argument, of the same shape and strides as the first one.
+            tensor: The changing argument, contiguous like the first one, of its shape, dtype and
+                device.
         """
+        assert _form(tensor) == self._form, "only an address is replaced"
         self._argument.data = tensor.data_ptr()
         self._recorded.launch(_current_stream(self._device))

@@ -10,8 +10,8 @@ from npa_envs.sph.actions import RepeatedActions
 from npa_envs.sph.draws import bernoulli_draw, integer_draw, normal_draw, uniform_draw
 from npa_envs.sph.fields import perceive
 from npa_envs.sph.network import arrange_weights, run_network
-from npa_envs.sph.operators import Rows
-from npa_envs.sph.passes import Terms
+from npa_envs.sph.operators import Rows, perceive_rows
+from npa_envs.sph.passes import SHARED_WORLD, Terms
 from npa_envs.sph.picture_losses import picture_losses
 from npa_envs.sph.rows import survey
 from npa_envs.sph.splat import splat
@@ -45,8 +45,8 @@ def warmup(
         for space_dim in space_dims:
             x = torch.zeros(1, 2, space_dim, dtype=dtype, device=device, requires_grad=True)
             s = torch.zeros(1, 2, state_dim, dtype=dtype, device=device, requires_grad=True)
-            for detached in (False, True):
-                _pull_back(perceive(x, s, 0.1, detach_positions=detached))
+            _pull_back(perceive(x, s, 0.1, detach_positions=False))
+            _warm_rows(x, s)
             _warm_network(x, s)
             _warm_update(x, s)
             _warm_actions(x, s)
@@ -55,12 +55,37 @@ def warmup(
                 _warm_pictures(x)
 
 
+def _warm_rows(x: torch.Tensor, s: torch.Tensor) -> None:
+    """Rollouts of small and of large worlds, of all particles and of some, with gradients or none."""
+    for particle_count in (x.shape[1], SHARED_WORLD, SHARED_WORLD + 1):
+        places = x.detach()[:, :1].expand(-1, particle_count, -1)
+        mask = torch.ones(1, particle_count, dtype=torch.uint8, device=x.device)
+        for chosen in (None, mask):
+            for gradients in (False, True):
+                states = s.detach()[:, :1].expand(-1, particle_count, -1).clone()
+                rows, _ = perceive_rows(
+                    places,
+                    states.requires_grad_(gradients),
+                    mask=chosen,
+                    row_capacity=particle_count,
+                    row_width=Terms().perception_dim(x.shape[2], s.shape[2]) + 1,
+                    eps=0.1,
+                    eps0=0.1,
+                    box=None,
+                    terms=Terms(),
+                )
+                if gradients:
+                    _pull_back(rows)
+
+
 def _warm_network(x: torch.Tensor, s: torch.Tensor) -> None:
     """A rule's products, where they have kernels of their own."""
     width = Terms().perception_dim(x.shape[2], s.shape[2]) + 1
+    out = x.shape[2] + s.shape[2]
+    width, out = width + -width % 4, out + -out % 4
     rows, hidden, update = (
         torch.zeros(*shape, dtype=x.dtype, device=x.device, requires_grad=True)
-        for shape in ((1, width + -width % 4), (128, width + -width % 4), (20, 128))
+        for shape in ((1, width), (128, width), (out, 128))
     )
     for gradients in (False, True):
         with torch.set_grad_enabled(gradients):
