@@ -56,7 +56,7 @@ def warmup(
 
 
 def _warm_rows(x: torch.Tensor, s: torch.Tensor) -> None:
-    """Rollouts of small and of large worlds, of all particles and of some, with gradients or none."""
+    """Perception in rollouts: small and large worlds, all particles and some, gradients or none."""
     for particle_count in (x.shape[1], SHARED_WORLD, SHARED_WORLD + 1):
         places = x.detach()[:, :1].expand(-1, particle_count, -1)
         mask = torch.ones(1, particle_count, dtype=torch.uint8, device=x.device)
