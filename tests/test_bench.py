@@ -94,7 +94,7 @@ def test_the_hash_grid_keeps_worlds_apart():
         torch.testing.assert_close(together[1:], single)
 
 
-def test_a_step_composed_in_torch_is_the_librarys_step():
+def test_a_step_composed_in_torch_is_that_of_the_library():
     start = gecko(1, 300, torch.device("cpu")).grown(3)
     rule, x, s = start.rule.double(), start.x.double(), start.s.double()
     composed = composed_step(STRATEGIES["dense"], rule, x, s, 0.5, mask_source(x))
@@ -120,6 +120,16 @@ def test_bfloat16_storage_rounds_states_and_nothing_else():
     kept = PRECISIONS["bf16_storage"].kept(s)
     assert torch.equal(kept, s.bfloat16().float())
     assert torch.equal(PRECISIONS["float32"].kept(s), s)
+
+
+def test_a_rule_in_another_precision_has_the_same_weights():
+    rule = gecko(1, 64, torch.device("cpu")).rule
+    for precision in PRECISIONS.values():
+        own = precision.rule(rule)
+        assert own.hidden.weight.dtype == precision.dtype
+        assert torch.equal(own.output.weight.float(), rule.output.weight)
+    # The fused path does not see torch's switch.
+    assert not PRECISIONS["tf32"].rule(rule).is_plain()
 
 
 def test_the_switch_for_tf32_is_put_back():
@@ -259,9 +269,7 @@ def test_peers_that_are_there_are_right_and_others_are_left_out_with_a_reason(mo
 
 
 def test_the_suites_measure_all_their_tables():
-    here = session(
-        strategies=[STRATEGIES["library"]], precisions=[PRECISIONS["float32"]]
-    )
+    here = session(strategies=[STRATEGIES["library"]], precisions=[PRECISIONS["float32"]])
     tables = suites.quick(here)
     assert list(tables) == ["perception", "rollouts", "peers", "throughput"]
     assert all(tables.values())
@@ -409,7 +417,8 @@ def test_the_command_prints_tables_and_writes_what_it_says(tmp_path, monkeypatch
     loaded = json.loads(path.read_text())
     assert (path.name, loaded["commit"]) == ("quick_cpu.json", "abc")
     assert loaded["command"].startswith("npa-envs bench --no-progress")
-    assert {row["strategy"] for row in loaded["tables"]["perception"]} == set(STRATEGIES) - {"plain"}
+    strategies = {row["strategy"] for row in loaded["tables"]["perception"]}
+    assert strategies == set(STRATEGIES) - {"plain"}
 
 
 def test_the_command_writes_nothing_unless_asked(tmp_path, monkeypatch):
@@ -423,7 +432,7 @@ def test_the_command_writes_nothing_unless_asked(tmp_path, monkeypatch):
     ("words", "message"),
     [
         (["--suite", "papper"], "did you mean 'paper'?"),
-        (["--strategies", "libary"], "did you mean 'library'?"),
+        (["--strategies", "libraries"], "did you mean 'library'?"),
         (["--precisions", "float16"], "unknown precision 'float16'"),
         (["--device", "cuda:99"], "device must"),
         (["--repeats", "0"], "repeats must be at least 1"),
@@ -454,7 +463,7 @@ def test_explain_prints_and_measures_nothing(capsys):
     assert "One step of 1 x 64 particles in 2D" in capsys.readouterr().out
 
 
-def test_the_masks_of_a_composed_rollout_are_the_librarys():
+def test_the_masks_of_a_composed_rollout_are_those_of_the_library():
     start = gecko(1, 100, torch.device("cpu"))
     own = rollout(start.rule, start.x, start.s, 3, update_prob=0.5, generator=mask_source(start.x))
     x, s, generator = start.x, start.s, mask_source(start.x)

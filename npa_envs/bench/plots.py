@@ -6,12 +6,20 @@ import io
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
+from npa_envs.bench.precisions import PRECISIONS
 from npa_envs.bench.report import Report
 from npa_envs.bench.scaling import AXES, ScalingRow
+from npa_envs.bench.strategies import STRATEGIES
 from npa_envs.errors import MissingDependencyError
 
 FLOOR = 1e-16
 """Errors below this, as that of the float64 reference itself, are drawn here."""
+
+COLOURS = dict(zip(STRATEGIES, ("C0", "C4", "C1", "C2", "C3"), strict=True))
+"""Colour of each strategy."""
+
+MARKERS = dict(zip(PRECISIONS, ("s", "o", "^", "D", "v"), strict=True))
+"""Shape of each precision."""
 
 AXIS_LABELS = {
     "particles": "particles N, same density",
@@ -19,6 +27,7 @@ AXIS_LABELS = {
     "worlds": "worlds B",
     "channels": "state channels C",
 }
+"""What the axes of the suite `scaling` are called."""
 
 
 class Point(NamedTuple):
@@ -107,8 +116,7 @@ def _draw_fronts(report: Report) -> Any:
     axes[0].set_title(f"one perception, N {largest}")
     _draw_front(axes[1], steps, "relative error of states after 8 steps", "time of a step [µs]")
     axes[1].set_title(f"gecko, p 0.5, N {most}")
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=8)
+    _add_legend(figure, [*perception, *steps])
     return figure
 
 
@@ -123,25 +131,61 @@ def _largest_common(rows: Sequence[Any]) -> int:
 
 
 def _draw_front(axis: Any, points: Sequence[Point], across: str, up: str) -> None:
+    """Draw points, coloured by strategy and shaped by precision, over the front of the best."""
     drawn = [point._replace(error=max(point.error, FLOOR)) for point in points]
     best = front(drawn)
-    axis.step(
-        [point.error for point in best], [point.time for point in best], where="post", color="0.8"
-    )
-    for strategy in dict.fromkeys(point.strategy for point in drawn):
-        own = [point for point in drawn if point.strategy == strategy]
-        axis.scatter([p.error for p in own], [p.time for p in own], label=strategy, s=28, zorder=2)
-    for point in best:
-        axis.annotate(
-            point.precision,
-            (point.error, point.time),
-            xytext=(3, -10),
-            textcoords="offset points",
-            fontsize=7,
+    line = [point.error for point in best], [point.time for point in best]
+    axis.step(*line, where="post", color="0.8", zorder=1)
+    for point in drawn:
+        axis.scatter(
+            point.error,
+            point.time,
+            color=COLOURS[point.strategy],
+            marker=MARKERS[point.precision],
+            s=36,
+            zorder=2,
         )
     axis.set(xscale="log", yscale="log", xlabel=across, ylabel=up)
-    axis.margins(0.12)
+    axis.margins(0.08)
+    _number_plainly(axis.yaxis)
     axis.grid(alpha=0.3)
+
+
+def _add_legend(figure: Any, points: Sequence[Point]) -> None:
+    """Say which colours and shapes stand for what."""
+    from matplotlib.lines import Line2D
+
+    strategies = dict.fromkeys(point.strategy for point in points)
+    precisions = dict.fromkeys(point.precision for point in points)
+    marks = [
+        *(
+            Line2D([], [], ls="", marker="o", color=COLOURS[name], label=name)
+            for name in strategies
+        ),
+        *(
+            Line2D([], [], ls="", marker=MARKERS[name], color="0.4", label=name)
+            for name in precisions
+        ),
+        Line2D([], [], color="0.8", label="front"),
+    ]
+    figure.legend(handles=marks, loc="outside lower center", ncols=5, fontsize=8)
+
+
+def _number_plainly(axis: Any, values: Sequence[float] | None = None) -> None:
+    """Label a logarithmic axis at 1, 2, 5, 10 ... or at some values, without powers of ten."""
+    from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocator
+
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5)) if values is None else FixedLocator(values, nbins=9))
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter(FuncFormatter(lambda value, _: _short(value)))
+
+
+def _short(value: float) -> str:
+    """Return a number with k or M for thousands and millions."""
+    for unit, letter in ((1e6, "M"), (1e3, "k")):
+        if value >= unit:
+            return f"{value / unit:.3g}{letter}"
+    return f"{value:.3g}"
 
 
 def _draw_scaling(report: Report, what: str) -> Any:
@@ -152,6 +196,9 @@ def _draw_scaling(report: Report, what: str) -> Any:
             panel.plot([row.value for row in rows], values, marker="o", ms=4, label=label)
         panel.set(xscale="log", yscale="log", xlabel=AXIS_LABELS[name])
         panel.set_ylabel("time of a step [µs]" if what == "time" else "peak memory [MiB]")
+        _number_plainly(panel.xaxis, [row.value for row in rows])
+        _number_plainly(panel.yaxis)
+        panel.tick_params(axis="x", labelsize=8)
         panel.grid(alpha=0.3)
     panels[0].legend(fontsize=8)
     return figure

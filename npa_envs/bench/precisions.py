@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import copy
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -13,6 +12,14 @@ from torch.nn import functional
 
 from npa_envs.errors import NPAError, suggest
 from npa_envs.rule import NPARule
+
+
+class TorchRule(NPARule):
+    """A rule whose products torch takes, so that torch's switch for TF32 reaches them."""
+
+    def forward(self, perception: Tensor) -> Tensor:
+        """Map perception vectors, shape [..., P], to raw updates, shape [..., A]."""
+        return super().forward(perception)
 
 
 class MixedRule(NPARule):
@@ -56,11 +63,10 @@ class Precision:
 
     def rule(self, rule: NPARule) -> NPARule:
         """Return a copy of a rule that computes in this precision."""
-        if not self.short_products:
-            return copy.deepcopy(rule).to(self.dtype)
-        mixed = MixedRule(**rule.hyper_parameters()).to(rule.hidden.weight)
-        mixed.load_state_dict(rule.state_dict())
-        return mixed
+        kind = MixedRule if self.short_products else TorchRule if self.tensor_float else NPARule
+        own = kind(**rule.hyper_parameters()).to(rule.hidden.weight)
+        own.load_state_dict(rule.state_dict())
+        return own.to(self.dtype)
 
     def kept(self, states: Tensor) -> Tensor:
         """Return states as they are kept from one step to the next, in their own dtype."""
