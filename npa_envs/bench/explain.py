@@ -77,6 +77,7 @@ def _launches(question: Question) -> tuple[list[Launch], list[Launch]]:
             box=question.box,
             update_prob=workload.update_prob,
             detach_positions=question.gradients != "positions",
+            generator=torch.Generator(question.device).manual_seed(0),
         )
     with recorded_launches() as backward:
         if needed:
@@ -139,7 +140,7 @@ def _neighbours(plan: Plan, question: Question) -> str:
         return f"searched for in each pass: lists are kept in float32 on CUDA, this is {why}"
     room = list_capacity(plan)
     if not room:
-        return f"listed within each pass: worlds of {plan.particle_count} outgrow 16-bit steps"
+        return f"searched for in each pass: worlds of {plan.particle_count} keep no lists"
     return f"listed by the density pass for the perception pass, with room for {room} each"
 
 

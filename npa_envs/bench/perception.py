@@ -7,6 +7,7 @@ implementation and shows how far that can be trusted.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -62,17 +63,18 @@ def perception_rows(session: Session, workload: Workload) -> list[PerceptionRow]
     """Return a row for each strategy and for each precision that perception knows of."""
     x, s = workload.worlds(session.device)
     exact = perceived(STRATEGIES["library"], x.double(), s.double(), workload.eps)
-    rows = []
+    rows: list[PerceptionRow] = []
     for precision in session.usable_precisions():
         if not precision.reaches_perception:
             session.leave_out(f"perception in {precision.name}", "only the rule's products differ")
             continue
         places, states = x.to(precision.dtype), precision.kept(s.to(precision.dtype))
         for strategy in session.usable_strategies(places):
-            rows.append(
-                _row(session, workload, strategy, precision.name, places, states, exact=exact)
+            name = precision.name
+            rows += session.attempt(
+                f"{strategy.name} in {name}, {workload.name}",
+                partial(_row, session, workload, strategy, name, places, states, exact=exact),
             )
-            session.progress(1)
     return rows
 
 

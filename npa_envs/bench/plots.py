@@ -175,7 +175,9 @@ def _number_plainly(axis: Any, values: Sequence[float] | None = None) -> None:
     """Label a logarithmic axis at 1, 2, 5, 10 ... or at some values, without powers of ten."""
     from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocator
 
-    axis.set_major_locator(LogLocator(subs=(1, 2, 5)) if values is None else FixedLocator(values, nbins=9))
+    axis.set_major_locator(
+        LogLocator(subs=(1, 2, 5)) if values is None else FixedLocator(values, nbins=9)
+    )
     axis.set_minor_locator(NullLocator())
     axis.set_major_formatter(FuncFormatter(lambda value, _: _short(value)))
 

@@ -52,9 +52,15 @@ class Report:
             lines = [f"  {name}: {value:.3g}" for name, value in self.ratios.items()]
             parts.append("\n".join(["times faster:", *lines]))
         if self.left_out:
-            lines = [f"  {entry.what}: {entry.why}" for entry in self.left_out]
-            parts.append("\n".join(["left out:", *lines]))
+            parts.append("\n".join(["left out:", *self._reasons()]))
         return "\n\n".join(parts)
+
+    def _reasons(self) -> list[str]:
+        """Return a line for each reason to leave something out."""
+        by_reason: dict[str, list[str]] = {}
+        for entry in self.left_out:
+            by_reason.setdefault(entry.why, []).append(entry.what)
+        return [f"  {why}: {'; '.join(names)}" for why, names in by_reason.items()]
 
     def json(self) -> str:
         """Return everything as JSON; a number that is not finite becomes null."""

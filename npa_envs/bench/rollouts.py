@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -193,7 +194,7 @@ def rollout_rows(session: Session, particle_count: int) -> list[RolloutRow]:
     grown = seed.grown(GROWN_STEPS)
     exact = Runner(STRATEGIES["library"], PRECISIONS["float64"], grown)
     expected = list(exact.marks(MARKS)), exact.weight_gradient(mask_source(grown.x))
-    rows = []
+    rows: list[RolloutRow] = []
     for precision in session.usable_precisions():
         for strategy in session.usable_strategies(grown.x.to(precision.dtype)):
             if session.small and strategy.name in SLOW:
@@ -201,8 +202,10 @@ def rollout_rows(session: Session, particle_count: int) -> list[RolloutRow]:
                 continue
             runner = Runner(strategy, precision, grown)
             task = _task_runner(session, strategy, precision, seed)
-            rows.append(_row(session, runner, expected, task))
-            session.progress(1)
+            rows += session.attempt(
+                f"rollouts of {strategy.name} in {precision.name}, {particle_count} particles",
+                partial(_row, session, runner, expected, task),
+            )
     return rows
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -55,11 +56,10 @@ class SlopeRow:
 
 def scaling_rows(session: Session) -> list[ScalingRow]:
     """Return the rows of all axes, increasing along each."""
-    rows = []
+    rows: list[ScalingRow] = []
     for axis, values in zip(AXES, _values(session), strict=True):
         for value in values:
-            rows.append(_row(session, axis, value))
-            session.progress(1)
+            rows += session.attempt(f"{value} {axis}", partial(_row, session, axis, value))
     return rows
 
 

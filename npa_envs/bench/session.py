@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -12,6 +12,8 @@ from torch import Tensor
 from npa_envs.bench.precisions import PRECISIONS, Precision
 from npa_envs.bench.strategies import STRATEGIES, Strategy
 from npa_envs.bench.timing import Cost, measure
+
+Row = TypeVar("Row")
 
 Tables = dict[str, list[Any]]
 """Rows of a suite, instances of one dataclass each, by the table's name."""
@@ -60,6 +62,21 @@ class Session:
     ) -> Cost:
         """Return what a call costs; arguments as `measure`."""
         return measure(run, self.device, repeats=self.repeats, graph=graph, generator=generator)
+
+    def attempt(self, what: str, make: Callable[[], Row]) -> list[Row]:
+        """Return the row that a call makes, none where the device's memory does not suffice.
+
+        Args:
+            what: What is measured, for the note on what was left out.
+            make: Measures it.
+        """
+        try:
+            return [make()]
+        except torch.OutOfMemoryError:
+            self.leave_out(what, "not enough memory")
+            return []
+        finally:
+            self.progress(1)
 
     def leave_out(self, what: str, why: str) -> None:
         """Note that something is not measured."""

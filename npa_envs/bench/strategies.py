@@ -16,8 +16,11 @@ from npa_envs.sph import perceive, perception_fields
 NEIGHBOUR_CAP = 32
 """Neighbours, the particle included, that the capped strategy sums over."""
 
-DENSE_PAIRS = {"cpu": 2**22, "cuda": 2**24}
-"""Pairs B N² that dense torch is given: each takes about a kilobyte."""
+MOST_PAIRS = {
+    "dense": {"cpu": 2**22, "cuda": 2**24},
+    "neighbour_cap": {"cpu": 2**26, "cuda": 2**34},
+}
+"""Pairs B N² that quadratic strategies are given; one takes dense torch about a kilobyte."""
 
 SEARCH_BLOCK = 1024
 """Particles whose distances to all others are held at a time."""
@@ -47,8 +50,8 @@ class Strategy:
             return "on a CPU the library runs these very kernels"
         if self.name == "plain" and x.dtype == torch.float64:
             return "in float64 the library runs these very kernels"
-        if self.name == "dense" and pairs > DENSE_PAIRS[x.device.type]:
-            return f"{pairs} pairs take too much memory and time"
+        if self.name in MOST_PAIRS and pairs > MOST_PAIRS[self.name][x.device.type]:
+            return f"{pairs} pairs take too much memory or time"
         return None
 
 

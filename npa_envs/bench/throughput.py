@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal, NamedTuple
 
 import torch
@@ -101,15 +102,17 @@ class AimRow:
 
 def throughput_rows(session: Session, workloads: Sequence[Workload]) -> list[ThroughputRow]:
     """Return two rows for each workload: storing and recomputing."""
-    rows = []
+    rows: list[ThroughputRow] = []
     for workload in workloads:
         train = workload not in INFERENCE_ONLY
         if not train:
             session.leave_out(f"training of {workload.name}", "a workload of inference only")
         modes: tuple[Memory, ...] = ("store", "recompute") if train else ("store",)
         for memory in modes:
-            rows.append(throughput_row(session, workload, memory, train=train))
-            session.progress(1)
+            rows += session.attempt(
+                f"{workload.name}, {memory}",
+                partial(throughput_row, session, workload, memory, train=train),
+            )
     return rows
 
 

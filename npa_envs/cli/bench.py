@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 
 CHECK_FAILED = 1
 
+QUICK = "quick"
+"""The suite that is run unless another one is asked for, and whose ratios are checked."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class BenchOptions:
@@ -116,17 +119,20 @@ def run(options: BenchOptions, command: str = "npa-envs bench") -> int:
         NPAError: As for `main`.
     """
     from npa_envs.bench.ratios import missed_ratios, stored_ratios
+    from npa_envs.bench.suites import suite_of
     from npa_envs.devices import check_device
 
     _check(options)
     device = check_device(options.device)
+    suite_of(options.suite or QUICK)
     if options.explain:
         print(_explanation(options, device))
         return 0
     if options.output is not None:
+        from npa_envs.cli.rollout import check_writable
         from npa_envs.cli.worlds import make_folder
 
-        make_folder(options.output)
+        check_writable(make_folder(options.output))
     if options.plots:
         from npa_envs.bench.plots import check_matplotlib
 
@@ -139,7 +145,7 @@ def run(options: BenchOptions, command: str = "npa-envs bench") -> int:
     if options.check is None:
         return 0
     missed = missed_ratios(report.ratios, stored)
-    print("\n".join(["", *(f"missed: {line}" for line in missed or ["none, ratios are held"])]))
+    print("\n".join(f"missed: {line}" for line in missed) or "ratios are held")
     return CHECK_FAILED if missed else 0
 
 
@@ -150,7 +156,7 @@ def _check(options: BenchOptions) -> None:
             raise NPAError(f"{name} must be at least 1, got {getattr(options, name)}")
     if options.plots and options.output is None:
         raise NPAError("plots need a folder to be written to: give --output DIR as well")
-    if options.check is not None and options.suite not in (None, "quick"):
+    if options.check is not None and options.suite not in (None, QUICK):
         raise NPAError(
             f"check compares ratios of the suite quick, got suite {options.suite!r}: "
             "leave --suite out"
@@ -175,7 +181,7 @@ def measured_report(options: BenchOptions, device: torch.device, command: str) -
     from npa_envs.bench.suites import suite_of
     from npa_envs.cli.progress import StepBar
 
-    name = options.suite or "quick"
+    name = options.suite or QUICK
     suite = suite_of(name)
     with StepBar(None, show=options.progress, unit="row") as bar, _torch_threads(options.threads):
         session = Session(
