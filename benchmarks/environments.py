@@ -73,22 +73,17 @@ class TimedWait:
     """Adds up how long the host waits for the device in the steps of some worlds.
 
     Args:
-        worlds: The worlds of an environment on CUDA, whose event it replaces.
+        worlds: The worlds of an environment on CUDA.
     """
 
     def __init__(self, worlds: Any) -> None:
         self.waited = 0.0
-        self._event = worlds._judged
-        worlds._judged = self
+        self._wait = worlds._beside.wait
+        worlds._beside.wait = self._timed
 
-    def record(self) -> None:
-        """Record the event."""
-        self._event.record()
-
-    def synchronize(self) -> None:
-        """Wait for the event."""
+    def _timed(self) -> None:
         start = time.perf_counter()
-        self._event.synchronize()
+        self._wait()
         self.waited += time.perf_counter() - start
 
 

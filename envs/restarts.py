@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
@@ -43,6 +44,10 @@ class Restarts:
         self._device = device
         self._recorded = recorded and device.type == "cuda"
         self._chunks: dict[int, _Chunk] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out recorded starts, which cannot be pickled."""
+        return self.__dict__ | {"_chunks": {}}
 
     def __call__(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
         """Start the next episodes of some worlds.

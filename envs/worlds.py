@@ -176,14 +176,17 @@ class Worlds:
             self._start_and_survey, world_count, device, recorded=self.task.start_is_short
         )
         """Starts the next episodes of some worlds: restart(indices, observation)."""
-        self._beside = self._judged = None
-        if device.type == "cuda":
-            self._beside = Beside(device)
-            self._judged = torch.cuda.Event()  # type: ignore[no-untyped-call]
+        self._beside = Beside(device) if device.type == "cuda" else None
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what only the next step needs, and which cannot be pickled."""
         return self.__dict__ | {"_surveyed": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Pin memory again that the device writes to."""
+        self.__dict__.update(state)
+        if self._beside is not None:
+            self._host_endings = self._host_endings.pin_memory()
 
     @property
     def reward(self) -> Tensor:
@@ -277,17 +280,17 @@ class Worlds:
         Raises:
             NPAError: An action is not finite; the worlds are then as they were.
         """
-        if self._judged is None and not bool(torch.isfinite(action).all()):
+        if self._beside is None and not bool(torch.isfinite(action).all()):
             raise self._not_finite(action)
         self._draw()
         self._actions.apply(action)
         self._judge_and_survey()
-        if self._judged is None:
-            return self._endings(), self._surveyed.perceive(out)
-        self._judged.record()
+        if self._beside is not None:
+            self._beside.mark()
         # The host learns the endings while the device perceives.
         observation = self._surveyed.perceive(out)
-        self._judged.synchronize()
+        if self._beside is not None:
+            self._beside.wait()
         if not self._host_endings[-1]:
             self.random.steps -= 1
             self.elapsed -= 1

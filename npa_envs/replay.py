@@ -54,6 +54,10 @@ class Replayed:
         self._warm = False
         self._graph: torch.cuda.CUDAGraph | None = None
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out the graph, which cannot be pickled: it is captured anew."""
+        return self.__dict__ | {"_warm": False, "_graph": None}
+
     def __call__(self) -> None:
         """Run the function."""
         if self._device.type == "cpu" or not self._warm:
@@ -78,6 +82,11 @@ class Beside:
     def __init__(self, device: torch.device) -> None:
         self._device = device
         self._stream = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
+        self._mark = torch.cuda.Event()  # type: ignore[no-untyped-call]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the device alone: streams and events are a process's own."""
+        return Beside, (self._device,)
 
     @contextlib.contextmanager
     def aside(self) -> Iterator[None]:
@@ -89,3 +98,11 @@ class Beside:
     def join(self) -> None:
         """Let what the current stream is given from now on wait until the work is done."""
         torch.cuda.current_stream(self._device).wait_stream(self._stream)
+
+    def mark(self) -> None:
+        """Remember what the current stream has been given so far."""
+        self._mark.record()
+
+    def wait(self) -> None:
+        """Wait on the host until what was remembered is done."""
+        self._mark.synchronize()

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from npa_envs.errors import NPAError
+from npa_envs.sph.network import ArrangedWeights, arrange_weights, run_network
 
 COLOUR_OFFSET = 0.5
 """A particle's colour is its last three outputs plus this, dimensionless."""
@@ -74,6 +75,8 @@ class FoldedRule(NamedTuple):
     """[W1 | b1 | 0], shape [H, row_width]."""
     output_weight: Tensor
     """W2 and rows of zeros up to a multiple of `FOLD`, shape [A', H]."""
+    arranged: ArrangedWeights | None = None
+    """Both as the fused kernels read them, where there are such for their device and sizes."""
 
     @property
     def row_width(self) -> int:
@@ -82,6 +85,8 @@ class FoldedRule(NamedTuple):
 
     def __call__(self, rows: Tensor) -> Tensor:
         """Map rows [z | 1 | 0], shape [K, row_width], to raw updates [y | 0], shape [K, A']."""
+        if self.arranged is not None:
+            return run_network(rows, self.hidden_weight, self.output_weight, self.arranged)
         hidden = torch.relu(rows @ self.hidden_weight.T)
         return _BlockedProduct.product(hidden, self.output_weight)
 
@@ -219,7 +224,9 @@ class NPARule(nn.Module):
         padding = -(self.perception_dim + 1) % FOLD
         weight = torch.cat((self.hidden.weight, self.hidden.bias[:, None]), dim=1)
         output_weight = nn.functional.pad(self.output.weight, (0, 0, 0, -self.update_dim % FOLD))
-        return FoldedRule(nn.functional.pad(weight, (0, padding)), output_weight)
+        hidden_weight = nn.functional.pad(weight, (0, padding))
+        arranged = arrange_weights(hidden_weight, output_weight)
+        return FoldedRule(hidden_weight, output_weight, arranged)
 
     def read_out(self, states: Tensor) -> Tensor:
         """Return the rule's outputs: the read-out network's, or the states where it has none.

@@ -280,6 +280,45 @@ def test_rows_beyond_the_last_active_one_pull_nothing_back(device):
     assert (gradient[:2] != 0).all()
 
 
+@pytest.mark.parametrize("box", [None, 1.4])
+@pytest.mark.parametrize("moving", [True, False])
+@pytest.mark.parametrize("state_dim", [5, 16])
+@pytest.mark.parametrize("space_dim", [2, 3])
+def test_columns_that_nothing_reads_change_nothing(space_dim, state_dim, moving, box, device):
+    """How wide a row is decides how many numbers are read and written at once."""
+    x, s = random_world(3, 85, space_dim, state_dim, dtype=torch.float32, device=device)
+    generator = torch.Generator().manual_seed(1)
+    row_source = torch.randperm(255, generator=generator)[:120].to(device, torch.int32)
+    row_of = torch.full((255,), -1, dtype=torch.int32, device=device)
+    row_of[row_source.long()] = torch.arange(120, dtype=torch.int32, device=device)
+    starts = torch.tensor([0, 255 + 120], dtype=torch.int32, device=device)
+    rows = Rows(row_of, row_source, starts, row_base=255)
+    width = state_dim + space_dim * moving
+    update = torch.randn(120, width, generator=generator).to(device)
+    cotangents = [torch.randn(shape, generator=generator) for shape in (x.shape, s.shape, (3, 85))]
+
+    def run(padding):
+        padded = torch.nn.functional.pad(update, (0, padding), value=7.0).requires_grad_()
+        sides = None if box is None else (box,) * space_dim
+        path = x.new_ones(3, 85)
+        moved = update_particles(
+            padded, x, s, path, rows=rows, reach=0.1, dt=0.7, moving=moving, box=sides
+        )
+        (bar,) = torch.autograd.grad(moved, padded, [value.to(device) for value in cotangents])
+        assert (bar[:, width:] == 0).all()
+        return *moved, bar[:, :width]
+
+    plain = run(0)
+    for padding in range(1, 5):
+        for value, expected in zip(run(padding), plain, strict=True):
+            assert torch.equal(value, expected)
+    changed = row_of.view(3, 85) >= 0
+    change = update.new_zeros(255, state_dim)
+    change[row_source.long()] = 0.7 * update[:, width - state_dim :]
+    assert relative_error(plain[1], s.double() + change.view_as(s)) < 1e-7
+    assert torch.equal(plain[1][~changed], s[~changed])
+
+
 def test_a_rule_with_a_hook_is_run_as_a_module(device):
     rule = small_rule(device)
     x, s = random_world(1, 50, 2, 5, dtype=torch.float64, device=device)

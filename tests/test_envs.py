@@ -103,8 +103,11 @@ def test_same_seed_gives_the_same_episode_and_another_seed_another(name):
 
 
 @every_id
-def test_an_environment_survives_pickling_in_the_midst_of_an_episode(name):
-    env, batch = make(name).unwrapped, make_vec(name, 2)
+def test_an_environment_survives_pickling_in_the_midst_of_an_episode(name, device):
+    env, batch = (
+        make(name, device=str(device)).unwrapped,
+        make_vec(name, 2, device=str(device)),
+    )
     env.reset(seed=0)
     batch.reset(seed=0)
     for action in actions(env, 3):

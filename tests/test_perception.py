@@ -149,6 +149,34 @@ def test_observation_of_a_world_does_not_depend_on_its_batch(device):
         assert torch.equal(together[k], run(x[k : k + 1], s[k : k + 1])[0])
 
 
+@pytest.mark.parametrize("masked", [False, True], ids=("all", "active"))
+@pytest.mark.parametrize("count", [40, 130, 300, 900])
+def test_rows_of_crowded_worlds_are_right(count, masked, device):
+    """Everybody sees everybody: on CUDA, lists overflow, and before that a lane's share of one."""
+    x, s = random_world(2, count, 2, 16, dtype=torch.float32, device=device)
+    x *= 0.05
+    generator = torch.Generator().manual_seed(2)
+    mask = (torch.rand(2, count, generator=generator) < 0.5).to(torch.uint8) if masked else None
+    rows, places = perceive_rows(
+        x,
+        s,
+        mask=None if mask is None else mask.to(device),
+        row_capacity=2 * count,
+        row_width=68,
+        eps=0.2,
+        eps0=0.2,
+        box=None,
+        terms=Terms(),
+    )
+    expected = oracle.perceive(x.cpu().double(), s.cpu().double(), 0.2, 0.2).view(-1, 66)
+    active = torch.ones(2 * count, dtype=torch.bool) if mask is None else mask.view(-1).bool()
+    row_of = places.row_of.cpu().long()
+    assert torch.equal(row_of >= 0, active)
+    assert (
+        relative_error(rows.cpu()[row_of[active], :66], expected[active]) < FORWARD[torch.float32]
+    )
+
+
 def test_neighbourhoods_may_be_longer_than_lists(device):
     """On CUDA lists are for 64 neighbours here: some of these particles have more, others fewer."""
     x, s = random_world(3, 333, 2, 16, dtype=torch.float32, device=device)
@@ -166,22 +194,85 @@ def test_neighbourhoods_may_be_longer_than_lists(device):
     assert torch.equal(together[1], run(x[1:2], s[1:2])[0])
 
 
+MASKS = {"all": None, "some": 0.5, "none": 0.0, "full": 1.0}
+
+
+def sorted_twice(x, s, mask, row_capacity, box, monkeypatch, **options):
+    """Sort worlds as they come, and as if no block had room for them."""
+    plan = make_plan(x, x.shape, s.shape[2], row_capacity, mask is not None, 0.1, box)
+    given = options.pop("with_states", True)
+    found = sort_worlds(plan, x, s if given else None, mask, **options)
+    monkeypatch.setattr(cells, "LARGEST_GRID", 0)
+    expected = sort_worlds(plan, x, s if given else None, mask, **options)
+    return found, expected
+
+
+@pytest.mark.parametrize("masked", MASKS)
+@pytest.mark.parametrize("state_dim", [5, 16, 20])
 @pytest.mark.parametrize(
-    ("particle_count", "space_dim", "box"),
-    [(1, 2, None), (83, 3, None), (1000, 2, (1.3, 0.9)), (1024, 2, None)],
+    ("world_count", "particle_count", "space_dim", "box"),
+    [
+        (1, 1, 2, None),
+        (3, 83, 3, None),
+        (2, 1000, 2, (1.3, 0.9)),
+        (3, 1024, 2, None),
+        (150, 129, 2, None),
+        (2, 1500, 3, (1.4, 1.5, 0.9)),
+        (5, 4096, 2, None),
+    ],
 )
-def test_small_worlds_are_sorted_as_others_are(particle_count, space_dim, box, device, monkeypatch):
+def test_small_worlds_are_sorted_as_others_are(
+    world_count, particle_count, space_dim, box, state_dim, masked, device, monkeypatch
+):
     """On CUDA a block sorts a small world by itself; elsewhere the two are the same kernels."""
-    x, _ = random_world(3, particle_count, space_dim, 1, dtype=torch.float32, device=device)
+    x, s = random_world(
+        world_count, particle_count, space_dim, state_dim, dtype=torch.float32, device=device
+    )
     x[0, : particle_count // 4] = 0.25
-    x[1, 0] = 1e6
-    plan = make_plan(x, x.shape, 16, 3 * particle_count, False, 0.1, box)
-    by_blocks = sort_worlds(plan, x, None, None, with_rows=False)
-    monkeypatch.setattr(cells, "LARGEST_WORLD", 0)
-    for found, expected in zip(
-        by_blocks, sort_worlds(plan, x, None, None, with_rows=False), strict=True
-    ):
-        assert torch.equal(found, expected)
+    x[-1, 0] = 1e6
+    mask = None
+    if MASKS[masked] is not None:
+        generator = torch.Generator().manual_seed(2)
+        mask = torch.rand(x.shape[:2], generator=generator) < MASKS[masked]
+        mask = mask.to(device, torch.uint8)
+    total = world_count * particle_count
+    active = total if mask is None else int(mask.sum())
+    found, expected = sorted_twice(x, s, mask, max(active, 1), box, monkeypatch)
+    names = ("row_source", "row_place", "row_positions")
+    for name, value in found._asdict().items():
+        count = active if name in names else None
+        assert torch.equal(value[:count], getattr(expected, name)[:count]), name
+
+
+@pytest.mark.parametrize("particle_count", [300, 1500])
+@pytest.mark.parametrize(
+    ("with_states", "with_rows"), [(False, False), (True, False), (False, True)]
+)
+def test_small_worlds_are_sorted_without_states_or_rows(
+    with_states, with_rows, particle_count, device, monkeypatch
+):
+    x, s = random_world(3, particle_count, 2, 16, dtype=torch.float32, device=device)
+    options = {"with_states": with_states, "with_rows": with_rows}
+    found, expected = sorted_twice(x, s, None, 3 * particle_count, None, monkeypatch, **options)
+    for value, wanted in zip(found, expected, strict=True):
+        assert torch.equal(value, wanted)
+
+
+def test_small_worlds_leave_out_what_no_row_is_left_for(device, monkeypatch):
+    x, s = random_world(3, 500, 2, 16, dtype=torch.float32, device=device)
+    mask = torch.ones(3, 500, dtype=torch.uint8, device=device)
+    found, expected = sorted_twice(x, s, mask, 700, None, monkeypatch)
+    for value, wanted in zip(found, expected, strict=True):
+        assert torch.equal(value, wanted)
+
+
+def test_particles_in_one_cell_are_sorted_by_index(device, monkeypatch):
+    x, s = random_world(2, 1100, 2, 16, dtype=torch.float32, device=device)
+    x[:] = 0.3
+    found, expected = sorted_twice(x, s, None, 2200, None, monkeypatch)
+    assert torch.equal(found.source.cpu(), torch.arange(2200, dtype=torch.int32))
+    for value, wanted in zip(found, expected, strict=True):
+        assert torch.equal(value, wanted)
 
 
 def test_slots_fit_the_blocks_that_are_launched():

@@ -11,7 +11,7 @@ from npa_envs.bench.workloads import Workload
 from npa_envs.dynamics import row_capacity, step
 from npa_envs.errors import NPAError, suggest
 from npa_envs.sph.cells import Plan, make_plan
-from npa_envs.sph.passes import list_capacity
+from npa_envs.sph.passes import rollout_listing
 
 GRADIENTS = ("none", "weights", "positions")
 """What is differentiated: nothing; by weights and states; by positions as well."""
@@ -131,17 +131,24 @@ def _boundary(question: Question) -> str:
 def _threads(plan: Plan) -> str:
     if plan.lanes == 1:
         return "one a particle: a CPU runs them one after the other"
-    return f"{plan.lanes} share a particle and split its candidates"
+    if not plan.listed:
+        return f"{plan.lanes} share a particle and split its candidates"
+    listing = rollout_listing(plan)
+    return (
+        f"{listing.lanes} list a particle's neighbours, {listing.teams} x {plan.lanes} sum a row: "
+        "small worlds fill a device with more for each"
+    )
 
 
 def _neighbours(plan: Plan, question: Question) -> str:
     if not plan.listed:
         why = "on a CPU" if question.device.type == "cpu" else "in float64"
         return f"searched for in each pass: lists are kept in float32 on CUDA, this is {why}"
-    room = list_capacity(plan)
-    if not room:
-        return f"searched for in each pass: worlds of {plan.particle_count} keep no lists"
-    return f"listed by the density pass for the perception pass, with room for {room} each"
+    room = rollout_listing(plan).capacity
+    return (
+        f"listed by the density pass for the perception pass, with room for {room} each: longer "
+        "lists are searched for again"
+    )
 
 
 def _rows(plan: Plan, question: Question) -> str:

@@ -17,6 +17,9 @@ import warp as wp
 CELL_SLACK = 1.0 + 2.0**-20
 """Cells are this much larger than eps / reach: rounding a cell index cannot lose a neighbour."""
 
+FAR = 2.0**62
+"""Cells from the origin beyond which all are one: positions there are equal or far apart."""
+
 MOMENT_THRESHOLD = 1e-3
 """Smallest |det M| that is inverted, dimensionless; below it the gradient stays uncorrected."""
 
@@ -155,15 +158,16 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
         """Cell of a position; open space wraps around the grid, so that any position has one."""
         cell = cell_vector()
         for d in range(wp.static(space_dim)):
-            count = wp.float64(domain.cell_shape[d])
+            count = domain.cell_shape[d]
             place = wp.float64(position[d]) * domain.cell_scale[d]
+            # Comparisons are false for NaN: a world that blew up must still index inside its grid.
             if domain.periodic != 0:
-                place = (place - wp.floor(place)) * count
-            place = wp.floor(place)
-            place -= count * wp.floor(place / count)
-            # False for NaN too: a world that blew up must still index inside its grid.
-            if place >= wp.float64(0.0) and place < count:
-                cell[d] = wp.int32(place)
+                place = wp.floor((place - wp.floor(place)) * wp.float64(count))
+                if place < wp.float64(count):
+                    cell[d] = wp.int32(place)
+            elif wp.abs(place) < wp.float64(wp.static(FAR)):
+                # The count is a power of two, and float64 divides slowly.
+                cell[d] = wp.int32(wp.int64(wp.floor(place)) & wp.int64(count - 1))
         return cell
 
     @wp.func

@@ -30,7 +30,7 @@ _ADD = """
     #pragma unroll
     for (unsigned i = 0; i < sizeof(parts) / sizeof({part}); ++i) {{
         #pragma unroll
-        for (unsigned offset = {lanes} / 2; offset > 0; offset >>= 1) {{
+        for (unsigned offset = {lanes} / 2; offset >= {stride}; offset >>= 1) {{
             sums[i] += __shfl_xor_sync(mask, sums[i], offset);
         }}
     }}
@@ -120,7 +120,9 @@ def share_type(value_type: type, scalar: type, lanes: int) -> type:
 
 
 @functools.cache
-def make_lane_sum(value_type: type, scalar: type, lanes: int, whole_warps: bool = False) -> Any:
+def make_lane_sum(
+    value_type: type, scalar: type, lanes: int, whole_warps: bool = False, stride: int = 1
+) -> Any:
     """Return a Warp function that adds a value over the lanes of a particle; each gets the sum.
 
     Args:
@@ -128,11 +130,12 @@ def make_lane_sum(value_type: type, scalar: type, lanes: int, whole_warps: bool 
         scalar: The scalar type that it is made of.
         lanes: Lanes of a particle, 1 on the CPU.
         whole_warps: All threads of a warp call it together, which takes fewer instructions.
+        stride: Every so-manyth lane is added, a power of two.
     """
     part = _c_scalar(scalar)
     shuffles = _SHUFFLES.format(part=part, lanes=lanes, whole=int(whole_warps))
 
-    @wp.func_native(_ADD.format(part=part, lanes=lanes, shuffles=shuffles))
+    @wp.func_native(_ADD.format(part=part, lanes=lanes, stride=stride, shuffles=shuffles))
     def lane_sum(value: value_type) -> value_type: ...
 
     return lane_sum

@@ -1,10 +1,10 @@
-"""Perception on CUDA in float32, by lists of neighbours in fast memory.
+"""Perception on CUDA in float32, by the lists of neighbours that the density pass left.
 
-The same sums as `perception`, in another order of work. The lanes of a particle first list who is
-within eps, then weigh the listed ones, a neighbour for each lane, and then run through the list
+The same sums as `perception`, in another order of work. The lanes of a particle weigh the listed
+neighbours, one for each lane, and put the weights into fast memory; then they run through these
 together, a few channels for each lane: weights are computed once, and only for neighbours; a
 neighbour's state is read once, by adjacent lanes. Rows leave through fast memory too, in whole
-transactions. Where the density pass has left lists, nobody is searched for again.
+transactions. A list that is too long was not kept: its neighbours are searched for again.
 """
 
 import functools
@@ -19,7 +19,6 @@ from npa_envs.kernels.slots import (
     SLOT_ENTRIES,
     any_in_warp,
     as_number,
-    inverse_root,
     largest_in_warp,
     log_scale_of_square,
     make_lists,
@@ -30,6 +29,7 @@ from npa_envs.kernels.slots import (
     thread_number,
     within,
 )
+from npa_envs.kernels.spiky import make_spiky_wide
 
 CUDA_REGISTERS = 80
 """Registers of a thread of the perception pass."""
@@ -38,7 +38,6 @@ AHEAD = 2
 """Listed neighbours that a lane asks for together."""
 
 load_record = make_wide_load(RECORD, wp.float32)
-load_scalar = make_wide_load(wp.float32, wp.float32)
 load_integer = make_wide_load(wp.int32, wp.int32)
 
 
@@ -51,14 +50,24 @@ def listed_perception(
     moment_correction: bool,
     periodic: bool,
     grouped: bool,
-    capacity: int = 0,
-    for_adjoint: bool = True,
+    capacity: int,
+    for_adjoint: bool,
+    teams: int,
 ) -> wp.Kernel:
-    """Return the perception kernel of one variant, as `perception_kernels` does.
+    """Return the perception kernel of one variant.
 
-    A variant is also made for a box or open space, for channels that come in several groups, and
-    for lists and records that the density pass left (only overlong lists are then searched anew),
-    and with or without what the adjoint reads.
+    Args:
+        space_dim: Space dimension D.
+        width: Channels of a group.
+        lanes: Lanes of a team, which share the channels of a group.
+        state_gradient: Whether the state gradient is perceived.
+        moment_correction: Whether it is corrected by the moment matrix.
+        periodic: Whether space is a periodic box.
+        grouped: Whether channels come in several groups.
+        capacity: Neighbours that lists have room for.
+        for_adjoint: Whether what the adjoint reads is written, too.
+        teams: Teams that share a particle where few particles fill the device: each runs through
+            its own part of the list, all channels of it.
     """
     scalar = wp.float32
     flat = space_dim == 2
@@ -70,25 +79,31 @@ def listed_perception(
         types.segment_cells,
     )
     periodic_image = types.periodic_image
+    spiky_wide = make_spiky_wide(space_dim, periodic)
     wide = wp.types.vector(space_dim, wp.float64)
     group = wp.types.vector(width, scalar)
     share = share_type(group, scalar, lanes)
     share_gradient = share_type(wp.types.matrix((space_dim, width), scalar), scalar, lanes)
-    share_rows = wp.types.vector(width // lanes * space_dim, scalar)
+    share_width = width // lanes
+    share_rows = wp.types.vector(share_width * space_dim, scalar)
+    team = lanes
+    lanes *= teams
     square = wp.types.matrix((space_dim, space_dim), scalar)
     cell_vector = wp.types.vector(space_dim, wp.int32)
     topic = "listed_smoothing"
     if state_gradient:
         topic = "listed_perception" if moment_correction else "listed_uncorrected_perception"
     topic += "_in_box" * periodic + "_grouped" * grouped
-    topic += f"_from_lists_{capacity}" * (capacity > 0) + "_for_adjoint" * for_adjoint
+    topic += f"_{capacity}" + "_for_adjoint" * for_adjoint
     module = kernel_module(topic, space_dim, scalar, width, lanes)
     load_share = make_wide_load(share, scalar)
     load_vector = make_wide_load(vector, scalar)
     add_vector = make_lane_sum(vector, scalar, lanes, whole_warps=True)
     add_square = make_lane_sum(square, scalar, lanes, whole_warps=True)
     add_wide = make_lane_sum(wide, wp.float64, lanes, whole_warps=True)
-    slots = make_slots(space_dim, width, lanes, state_gradient, grouped, capacity)
+    add_share = make_lane_sum(share, scalar, lanes, whole_warps=True, stride=team)
+    add_gradient = make_lane_sum(share_gradient, scalar, lanes, whole_warps=True, stride=team)
+    slots = make_slots(space_dim, width, lanes, state_gradient, grouped)
     slot_address, append_number, number_at = (
         slots.slot_address,
         slots.append_number,
@@ -107,48 +122,26 @@ def listed_perception(
         return (count + wp.static(lanes - 1)) & ~wp.int32(wp.static(lanes - 1))
 
     @wp.func
-    def place_and_volume(record: RECORD):
-        place = vector()
-        for d in range(wp.static(space_dim)):
-            place[d] = record[d]
-        return place, record[wp.static(space_dim)]
-
-    @wp.func
-    def spiky_wide(domain: Domain, centre: vector, neighbour: vector, squared: scalar):
-        """Spiky factor and distance vector of a pair in float64, as in `perception`."""
-        r = wide()
-        start = squared
-        for d in range(wp.static(space_dim)):
-            r[d] = wp.float64(neighbour[d]) - wp.float64(centre[d])
-        if wp.static(periodic):
-            for d in range(wp.static(space_dim)):
-                images = wp.round((neighbour[d] - centre[d]) * domain.inverse_box[d])
-                r[d] -= wp.float64(images) * wp.float64(domain.box[d])
-            start = scalar(wp.dot(r, r))
-        exact = wp.dot(r, r)
-        apart = wp.where(start > scalar(0.0), inverse_root(start), scalar(0.0))
-        inverse = wp.float64(apart)
-        inverse *= wp.float64(1.5) - wp.float64(0.5) * exact * inverse * inverse
-        falloff = wp.float64(1.0) - exact * inverse * wp.float64(domain.inverse_eps)
-        return wp.float64(domain.spiky_norm) * falloff * falloff * inverse, r
-
-    @wp.func
     def weigh(
         domain: Domain,
         slot: wp.uint32,
         entry: wp.int32,
         number: wp.int32,
         position: vector,
-        neighbour: vector,
-        volume: scalar,
+        record: RECORD,
+        counts: wp.bool,
         kernel_sum: vector,
         moment: square,
         density_gradient: wide,
     ):
         """Weigh a neighbour for all lanes, and add it to this lane's share of the short sums.
 
-        What fills up a list has no volume and lies at the centre: it adds nothing.
+        What fills up a list does not count and lies at the centre: it adds nothing.
         """
+        neighbour = vector()
+        for d in range(wp.static(space_dim)):
+            neighbour[d] = record[d]
+        volume = wp.where(counts, record[wp.static(space_dim)], scalar(0.0))
         offset = neighbour - position
         if wp.static(periodic):
             offset = periodic_image(domain, offset)
@@ -172,8 +165,6 @@ def listed_perception(
     @wp.func
     def weigh_found(
         domain: Domain,
-        sorted_positions: wp.array(dtype=vector),
-        volumes: wp.array(dtype=scalar),
         records: wp.array(dtype=RECORD),
         state_place: wp.array(dtype=wp.int32),
         part_count: wp.int32,
@@ -192,16 +183,11 @@ def listed_perception(
         for entry in range(lane, padded(count), wp.static(lanes)):
             listed = entry >= begin and entry < count
             j = wp.where(listed, number_at(slot, entry), k)
+            record = load_record(records, j)
             number = j
-            if wp.static(capacity > 0):
-                record = load_record(records, j)
-                neighbour, volume = place_and_volume(record)
-                if wp.static(flat):
-                    number = as_number(record[3])
-            else:
-                neighbour = load_vector(sorted_positions, j)
-                volume = load_scalar(volumes, j * wp.static(space_dim + 1) + wp.static(space_dim))
-            if wp.static(not flat or capacity == 0) and state_place.shape[0] > 0:
+            if wp.static(flat):
+                number = as_number(record[3])
+            elif state_place.shape[0] > 0:
                 number = load_integer(state_place, j)
             kernel_sum, moment, density_gradient = weigh(
                 domain,
@@ -209,8 +195,8 @@ def listed_perception(
                 entry,
                 number * part_count,
                 position,
-                neighbour,
-                wp.where(listed, volume, scalar(0.0)),
+                record,
+                listed,
                 kernel_sum,
                 moment,
                 density_gradient,
@@ -253,7 +239,6 @@ def listed_perception(
             for a in range(wp.static(AHEAD)):
                 entry = first + wp.static(lanes) * a
                 if entry < padded(count):
-                    neighbour, volume = place_and_volume(ahead[a])
                     number = places[a]
                     if wp.static(flat):
                         number = as_number(ahead[a][3])
@@ -265,8 +250,8 @@ def listed_perception(
                         entry,
                         number * part_count,
                         position,
-                        neighbour,
-                        wp.where(entry < count, volume, scalar(0.0)),
+                        ahead[a],
+                        entry < count,
                         kernel_sum,
                         moment,
                         density_gradient,
@@ -278,14 +263,15 @@ def listed_perception(
     def add_states(
         states: wp.array(dtype=share),
         part: wp.int32,
+        first: wp.int32,
         slot: wp.uint32,
         count: wp.int32,
         own: share,
         blur: share,
         gradient: share_gradient,
     ):
-        """Add the states of weighed neighbours to this lane's share of the long sums."""
-        for entry in range(padded(count)):
+        """Add states of weighed neighbours, this team's from `first` on, to the long sums."""
+        for entry in range(first, padded(count), wp.static(teams)):
             packed = entry_at(slot, entry)
             place = as_number(packed[wp.static(space_dim + 1)])
             state = load_share(states, place + part)
@@ -293,7 +279,7 @@ def listed_perception(
             if wp.static(state_gradient):
                 difference = state - own
                 for d in range(wp.static(space_dim)):
-                    for c in range(wp.static(width // lanes)):
+                    for c in range(wp.static(share_width)):
                         gradient[d, c] += packed[d + 1] * difference[c]
         meet_warp()
         return blur, gradient
@@ -312,7 +298,6 @@ def listed_perception(
         starts: wp.array(dtype=wp.int32),
         sorted_cell: wp.array(dtype=wp.int32),
         sorted_positions: wp.array(dtype=vector),
-        volumes: wp.array(dtype=scalar),
         records: wp.array(dtype=RECORD),
         states: wp.array(dtype=share),
         state_place: wp.array(dtype=wp.int32),
@@ -326,11 +311,10 @@ def listed_perception(
     ):
         """Write the perception vector of each row, as `perception_kernels` does.
 
-        Threads come in whole warps: lanes, groups, rows, some of them beyond the last row. Volumes
-        are the last entries of particles, or lie in records beside the lists. States are read
-        where `state_place` says, or in sorted order if it is empty; rows are written where
-        `row_destination` says, or in their own order; clipped to plus and minus `limit` unless
-        that is zero.
+        Threads come in whole warps: lanes, teams, groups, rows, some of them beyond the last row.
+        States are read where `state_place` says, or in sorted order if it is empty (in 2D the
+        records say where); rows are written where `row_destination` says, or in their own order;
+        clipped to plus and minus `limit` unless that is zero.
         """
         thread = thread_number()
         lane = thread & wp.static(lanes - 1)
@@ -340,11 +324,13 @@ def listed_perception(
             g = row % group_count
             row = row / group_count
         slot = slot_address()
-        part = lane
-        part_count = wp.int32(wp.static(lanes))
+        # Which channels this lane sums, and which neighbours: every so-manyth from the first on.
+        part = lane & wp.static(team - 1)
+        first = lane >> wp.static(team.bit_length() - 1)
+        part_count = wp.int32(wp.static(team))
         if wp.static(grouped):
-            part = g * wp.static(lanes) + lane
-            part_count = group_count * wp.static(lanes)
+            part += g * wp.static(team)
+            part_count = group_count * wp.static(team)
         row_count = load_integer(starts, starts.shape[0] - 1) - row_base
         present = row < wp.min(row_count, row_capacity)
         blur = share()
@@ -365,32 +351,30 @@ def listed_perception(
             own_place = load_integer(state_place, k)
         own = load_share(states, own_place * part_count + part)
         position = load_vector(sorted_positions, k)
-        searching = wp.bool(present)
-        if wp.static(capacity > 0):
-            length = wp.where(present, load_integer(list_lengths, safe_row), wp.int32(0))
-            searching = length > wp.static(capacity)
-            length = wp.where(searching, wp.int32(0), length)
-            longest = largest_in_warp(length)
-            for first_entry in range(0, longest, wp.static(SLOT_ENTRIES)):
-                fetched = wp.clamp(length - first_entry, 0, wp.static(SLOT_ENTRIES))
-                kernel_sum, moment, wide_sum = weigh_listed(
-                    domain,
-                    records,
-                    lists,
-                    state_place,
-                    part_count,
-                    lane,
-                    slot,
-                    safe_row,
-                    first_entry,
-                    fetched,
-                    k,
-                    position,
-                    kernel_sum,
-                    moment,
-                    wide_sum,
-                )
-                blur, gradient = add_states(states, part, slot, fetched, own, blur, gradient)
+        length = wp.where(present, load_integer(list_lengths, safe_row), wp.int32(0))
+        searching = length > wp.static(capacity)
+        length = wp.where(searching, wp.int32(0), length)
+        longest = largest_in_warp(length)
+        for first_entry in range(0, longest, wp.static(SLOT_ENTRIES)):
+            fetched = wp.clamp(length - first_entry, 0, wp.static(SLOT_ENTRIES))
+            kernel_sum, moment, wide_sum = weigh_listed(
+                domain,
+                records,
+                lists,
+                state_place,
+                part_count,
+                lane,
+                slot,
+                safe_row,
+                first_entry,
+                fetched,
+                k,
+                position,
+                kernel_sum,
+                moment,
+                wide_sum,
+            )
+            blur, gradient = add_states(states, part, first, slot, fetched, own, blur, gradient)
         base = wp.int32(0)
         cell = cell_vector()
         segments = wp.int32(0)
@@ -418,9 +402,9 @@ def listed_perception(
                 while run < run_count and not any_in_warp(j - lane < end):
                     if run % wp.static(lanes) == 0:
                         mine = wp.min(run + lane, wp.max(segments - 1, wp.int32(0)))
-                        first, last = segment_cells(domain, cell, mine)
-                        run_begin = load_integer(starts, base + first)
-                        run_end = load_integer(starts, base + last)
+                        first_cell, last_cell = segment_cells(domain, cell, mine)
+                        run_begin = load_integer(starts, base + first_cell)
+                        run_end = load_integer(starts, base + last_cell)
                         run_end = wp.where(run + lane < segments, run_end, wp.int32(0))
                     turn = run % wp.static(lanes)
                     j = of_lane(run_begin, turn, wp.uint32(lanes)) + lane
@@ -438,8 +422,6 @@ def listed_perception(
                 filling = working and not any_in_warp(count > wp.static(SLOT_ENTRIES - lanes))
             kernel_sum, moment, wide_sum = weigh_found(
                 domain,
-                sorted_positions,
-                volumes,
                 records,
                 state_place,
                 part_count,
@@ -453,9 +435,12 @@ def listed_perception(
                 moment,
                 wide_sum,
             )
-            blur, gradient = add_states(states, part, slot, count, own, blur, gradient)
+            blur, gradient = add_states(states, part, first, slot, count, own, blur, gradient)
             begin = count & wp.static(lanes - 1)
         wide_sum = add_wide(wide_sum)
+        if wp.static(teams > 1):
+            blur = add_share(blur)
+            gradient = add_gradient(gradient)
         if wp.static(state_gradient and moment_correction):
             moment = add_square(moment)
             for r in range(1, wp.static(space_dim)):
@@ -463,12 +448,12 @@ def listed_perception(
                     moment[r, c] = moment[c, r]
             if wp.abs(wp.determinant(moment)) >= scalar(wp.static(MOMENT_THRESHOLD)):
                 gradient = wp.inverse(moment) * gradient
-        mine = lane * wp.static(width // lanes)
+        mine = (lane & wp.static(team - 1)) * wp.static(share_width)
         stage_share(slot, mine, wp.where(present, own, share()))
         stage_share(slot, wp.static(width) + mine, blur)
         if wp.static(state_gradient):
             scaled = share_rows()
-            for c in range(wp.static(width // lanes)):
+            for c in range(wp.static(share_width)):
                 along = vector()
                 for d in range(wp.static(space_dim)):
                     along[d] = gradient_scale * gradient[d, c]
@@ -480,7 +465,7 @@ def listed_perception(
         write_rows(slot, destination, g, state_dim, bound, perception)
         if wp.static(for_adjoint):
             kernel_sum = add_vector(kernel_sum)
-            if destination >= 0 and part == 0:
+            if destination >= 0 and lane == 0 and g == 0:
                 row_kernel_sum[row] = kernel_sum
         column = 2 * state_dim
         if wp.static(state_gradient):
@@ -490,7 +475,7 @@ def listed_perception(
             for d in range(wp.static(space_dim)):
                 along[d] = scalar(wide_sum[d]) * density_scale
             along *= log_scale_of_square(wp.dot(along, along))
-            if destination >= 0 and part == 0:
+            if destination >= 0 and lane == 0 and g == 0:
                 for d in range(wp.static(space_dim)):
                     perception[destination, column + d] = within(along[d], bound)
             column += wp.static(space_dim)

@@ -32,12 +32,16 @@ store_record = make_wide_store(RECORD, wp.float32)
 
 @functools.cache
 def listed_density(
-    space_dim: int, lanes: int, periodic: bool, capacity: int = 0, masked: bool = False
+    space_dim: int, lanes: int, periodic: bool, capacity: int, masked: bool
 ) -> wp.Kernel:
-    """Return the density kernel with `lanes` to a particle, of a box or of open space.
+    """Return the density kernel of one variant.
 
-    With a capacity it also leaves lists of that many neighbours, if `masked` of the particles that
-    have a row, and records of 16 bytes. Several lanes then need launches of whole warps.
+    Args:
+        space_dim: Space dimension D.
+        lanes: Threads of a particle; launches of several come in whole warps.
+        periodic: Whether space is a periodic box.
+        capacity: Neighbours that a list has room for.
+        masked: Whether only some particles have rows, and lists.
     """
     scalar = wp.float32
     flat = space_dim == 2
@@ -64,8 +68,7 @@ def listed_density(
         squared = wp.dot(nearest, nearest)
         return wp.max(scalar(1.0) - squared * domain.inverse_squared_eps, scalar(0.0))
 
-    topic = "listed_density_in_box" if periodic else "listed_density"
-    topic += f"_listing_{capacity}" * (capacity > 0) + "_rows" * masked
+    topic = "listed_density" + "_in_box" * periodic + f"_{capacity}" + "_of_rows" * masked
 
     @wp.kernel(enable_backward=False, module=kernel_module(topic, space_dim, scalar, 0, lanes))
     def compute_density(
@@ -82,9 +85,10 @@ def listed_density(
         lists: wp.array(dtype=wp.int16),
         list_lengths: wp.array(dtype=wp.int32),
     ):
-        """Write every particle's position and volume 1 / rho, where `particles` is not empty.
+        """Write every particle's record, and the list of each row's neighbours.
 
-        A list lies at its row. Its length is larger than the capacity where not all fits in.
+        Positions with volumes 1 / rho also go to `particles`, unless that is empty. A list's length
+        is larger than the capacity where not all fits in.
         """
         thread = wp.tid()
         k = thread >> wp.static(lanes.bit_length() - 1)
@@ -96,73 +100,65 @@ def listed_density(
         local = wp.int32(wp.uint32(index) % wp.uint32(domain.cell_count))
         base = index - local
         cell = cell_place(domain, local)
+        row = k
+        if wp.static(masked):
+            row = load_integer(row_of, load_integer(source, k))
+        row = wp.where(inside and row < list_lengths.shape[0], row, wp.int32(-1))
+        list_begin = list_address()
+        list_end = list_begin
+        if row < 0:
+            # As if it were full.
+            list_end = list_begin + wp.uint32(wp.static(LIST_BYTES * capacity))
+        far = wp.bool(False)
         total = scalar(0.0)
-        if wp.static(capacity > 0):
-            row = k
-            if wp.static(masked):
-                row = load_integer(row_of, load_integer(source, k))
-            row = wp.where(inside, row, wp.int32(-1))
-            list_begin = list_address()
-            list_end = list_begin
-            if row < 0:
-                list_end = list_begin + wp.uint32(wp.static(LIST_BYTES * capacity))
-            far = wp.bool(False)
         for segment in range(segment_count(domain, cell)):
             first, last = segment_cells(domain, cell, segment)
+            begin = load_integer(starts, base + first)
             end = load_integer(starts, base + last)
-            j = load_integer(starts, base + first) + lane
-            if wp.static(capacity > 0):
-                begin = j - lane
-                far = far or (begin < end and wp.max(k - begin, end - k) > LONGEST_STEP)
-                # Several positions are asked for before the first is used.
-                while j + wp.static((AHEAD - 1) * lanes) < end:
-                    ahead = positions_ahead()
-                    for a in range(wp.static(AHEAD)):
-                        ahead[a] = load_vector(sorted_positions, j + a * wp.static(lanes))
-                    for a in range(wp.static(AHEAD)):
-                        step = j + a * wp.static(lanes) - k
-                        falloff = falloff_at(domain, ahead[a] - position)
-                        list_end = append_step(list_begin, list_end, falloff, step)
-                        total += falloff * falloff * falloff
-                    j += wp.static(AHEAD * lanes)
-                if j < end:
-                    ahead = positions_ahead()
-                    for a in range(wp.static(AHEAD - 1)):
-                        place = wp.min(j + a * wp.static(lanes), end - 1)
-                        ahead[a] = load_vector(sorted_positions, place)
-                    for a in range(wp.static(AHEAD - 1)):
-                        candidate = j + a * wp.static(lanes)
-                        falloff = falloff_at(domain, ahead[a] - position)
-                        falloff = wp.where(candidate < end, falloff, scalar(0.0))
-                        list_end = append_step(list_begin, list_end, falloff, candidate - k)
-                        total += falloff * falloff * falloff
-            else:
-                for candidate in range(j, end, wp.static(lanes)):
-                    offset = load_vector(sorted_positions, candidate) - position
-                    falloff = falloff_at(domain, offset)
+            far = far or (begin < end and wp.max(k - begin, end - k) > LONGEST_STEP)
+            j = begin + lane
+            # Several positions are asked for before the first is used.
+            while j + wp.static((AHEAD - 1) * lanes) < end:
+                ahead = positions_ahead()
+                for a in range(wp.static(AHEAD)):
+                    ahead[a] = load_vector(sorted_positions, j + a * wp.static(lanes))
+                for a in range(wp.static(AHEAD)):
+                    step = j + a * wp.static(lanes) - k
+                    falloff = falloff_at(domain, ahead[a] - position)
+                    list_end = append_step(list_begin, list_end, falloff, step)
+                    total += falloff * falloff * falloff
+                j += wp.static(AHEAD * lanes)
+            if j < end:
+                ahead = positions_ahead()
+                for a in range(wp.static(AHEAD - 1)):
+                    place = wp.min(j + a * wp.static(lanes), end - 1)
+                    ahead[a] = load_vector(sorted_positions, place)
+                for a in range(wp.static(AHEAD - 1)):
+                    candidate = j + a * wp.static(lanes)
+                    falloff = falloff_at(domain, ahead[a] - position)
+                    falloff = wp.where(candidate < end, falloff, scalar(0.0))
+                    list_end = append_step(list_begin, list_end, falloff, candidate - k)
                     total += falloff * falloff * falloff
         # A particle always sees itself: a position that is not finite would otherwise have rho 0.
         total = wp.max(add_scalar(total), scalar(1.0))
-        if wp.static(capacity > 0):
-            length = leave_list(list_begin, list_end, row, lists)
-            if lane == 0 and row >= 0:
-                list_lengths[row] = wp.where(far, wp.static(capacity + 1), length)
+        length = leave_list(list_begin, list_end, row, lists)
+        if lane == 0 and row >= 0:
+            list_lengths[row] = wp.where(far, wp.static(capacity + 1), length)
         if lane == 0 and inside:
             entry = particle()
+            record = RECORD()
             for d in range(wp.static(space_dim)):
                 entry[d] = position[d]
             entry[wp.static(space_dim)] = scalar(1.0) / (domain.smoothing_norm * total)
             if particles.shape[0] > 0:
                 particles[k] = entry
-            if wp.static(capacity > 0):
-                record = RECORD()
-                for d in range(wp.static(space_dim + 1)):
-                    record[d] = entry[d]
-                if wp.static(flat):
-                    number = k
-                    if state_place.shape[0] > 0:
-                        number = load_integer(state_place, k)
-                    record[3] = as_word(number)
-                store_record(records, k, record)
+            for d in range(wp.static(space_dim + 1)):
+                record[d] = entry[d]
+            if wp.static(flat):
+                number = k
+                if state_place.shape[0] > 0:
+                    number = load_integer(state_place, k)
+                record[3] = as_word(number)
+            store_record(records, k, record)
 
     return compute_density

@@ -18,6 +18,9 @@ CUDA_BLOCK = 128
 SLOT_ENTRIES = 32
 """Neighbours that a slot has room for; longer neighbourhoods are summed in several rounds."""
 
+SHARE_OF_LIST = 2
+"""A lane of several has room for so many times its share of a list."""
+
 _ADDRESS = """
     __shared__ __align__(16) unsigned char slots[{slots} * {bytes}];
     return (unsigned)__cvta_generic_to_shared(slots + threadIdx.x / {lanes} * {bytes});
@@ -64,7 +67,7 @@ _GET = """
 """
 
 _LIST_ADDRESS = """
-    __shared__ unsigned short lists[{capacity} * {block}];
+    __shared__ unsigned short lists[{room} * {block}];
     return (unsigned)__cvta_generic_to_shared(lists + threadIdx.x);
 """
 
@@ -77,13 +80,14 @@ _LIST_APPEND = """
         "@kept st.shared.u16 [%0], %3;\\n"
         "@near add.u32 %0, %0, %4; }}"
         : "+r"(place)
-        : "f"(weight), "r"(first + 2 * {block} * {capacity}), "h"((short)step), "n"(2 * {block}));
+        : "f"(weight), "r"(first + 2 * {block} * {room}), "h"((short)step), "n"(2 * {block}));
     return place;
 """
 
 # Each lane's entries follow those of the lanes before it.
 _LIST_LEAVE = """
-    const int length = (place - first) / (2 * {block});
+    int length = (place - first) / (2 * {block});
+    if (length > {room}) length = {capacity} + 1;
     int end = length;
     #pragma unroll
     for (int offset = 1; offset < {lanes}; offset *= 2) {{
@@ -91,14 +95,12 @@ _LIST_LEAVE = """
         if (threadIdx.x % {lanes} >= offset) end += before;
     }}
     const int total = {lanes} > 1 ? __shfl_sync(~0u, end, {lanes} - 1, {lanes}) : length;
-    if (row < 0) return total;
-    const int begin = end - length;
+    if (row < 0 || total > {capacity}) return total;
     short* to = lists.data + (size_t)(row / 32) * (32 * {capacity}) + row % 32;
-    const int held = length < {capacity} - begin ? length : {capacity} - begin;
-    for (int entry = 0; entry < held; ++entry) {{
+    for (int entry = 0; entry < length; ++entry) {{
         short step;
         asm volatile("ld.shared.u16 %0, [%1];" : "=h"(step) : "r"(first + 2 * {block} * entry));
-        to[32 * (begin + entry)] = step;
+        to[32 * (end - length + entry)] = step;
     }}
     return total;
 """
@@ -181,7 +183,7 @@ _WRITE = """
 
 @functools.cache
 def make_slots(
-    space_dim: int, width: int, lanes: int, state_gradient: bool, grouped: bool, capacity: int
+    space_dim: int, width: int, lanes: int, state_gradient: bool, grouped: bool
 ) -> SimpleNamespace:
     """Return the Warp functions on slots of one variant.
 
@@ -191,7 +193,6 @@ def make_slots(
         lanes: Lanes of a particle.
         state_gradient: Whether a row holds the state gradient.
         grouped: Whether channels come in several groups.
-        capacity: Neighbours that a particle's list has room for.
     """
     vector = wp.types.vector(space_dim, wp.float32)
     entry_type = wp.types.vector(space_dim + 2, wp.float32)
@@ -210,7 +211,6 @@ def make_slots(
         "row_words": row_words,
         "grouped": int(grouped),
         "dims": space_dim,
-        "capacity": capacity,
         "last": "__int_as_float(number)" if flat else "kernel[2]",
         "put_number": "",
         "get_number": "",
@@ -268,10 +268,11 @@ def make_lists(capacity: int, lanes: int = 1) -> SimpleNamespace:
     memory and left in an array: 32 particles together, first entries first.
 
     Args:
-        capacity: Neighbours that a list has room for; more are counted but not kept.
+        capacity: Neighbours that a list has room for; more are counted, but not all are kept.
         lanes: Lanes of a particle; whole warps must leave their lists together.
     """
-    names = {"capacity": capacity, "block": CUDA_BLOCK, "lanes": lanes}
+    room = min(capacity, SHARE_OF_LIST * capacity // lanes)
+    names = {"capacity": capacity, "block": CUDA_BLOCK, "lanes": lanes, "room": room}
 
     @wp.func_native(_LIST_ADDRESS.format(**names))
     def list_address() -> wp.uint32: ...

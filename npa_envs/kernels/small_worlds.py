@@ -2,55 +2,78 @@
 
 The same order as that of `cells`, in one launch in place of six: particles are counted by cell,
 the counts are added up, particles take provisional places by arrival, and ranks among indices
-replace those.
+replace those. Where worlds are few, several blocks sort the same world, and each writes a slice.
 """
 
 import functools
+from types import SimpleNamespace
 
 import warp as wp
 
 from npa_envs.kernels.domain import domain_types, kernel_module
 from npa_envs.kernels.lanes import make_wide_load
-from npa_envs.kernels.slots import CUDA_BLOCK, thread_number
+from npa_envs.kernels.wide import make_read_channels, make_wide_store
 
-LARGEST_WORLD = 1024
-"""Particles that a block has room for."""
+BLOCKS = {1024: 256, 4096: 1024}
+"""Threads of a block by the particles that it has room for."""
+
+RESIDENT_THREADS = 1024
+"""Threads that a multiprocessor has registers for, at least."""
 
 LARGEST_GRID = 4096
 """Cells that a block has room for."""
 
-# Counts, later starts, of cells; then of each particle its cell, its arrival there, and the
-# particle of each provisional place.
-_MEMORY = f"""
-    __shared__ struct {{
-        int starts[{LARGEST_GRID} + 1];
-        int sums[{CUDA_BLOCK} / 32];
-        unsigned short cells[{LARGEST_WORLD}];
-        unsigned short arrivals[{LARGEST_WORLD}];
-        unsigned short members[{LARGEST_WORLD}];
-    }} memory;
+STATE_SHARE = 4
+"""Adjacent channels that a thread moves."""
+
+# Counts, later starts, of cells: of all particles, and from bit 16 on of the active ones. Then of
+# each particle its cell and its arrival there, and of each provisional place its particle: arrivals
+# and members are doubled, plus one if the particle is active.
+_MEMORY = """
+    struct Memory {{
+        int starts[{grid} + 1];
+        int sums[{block} / 32];
+        int earlier;
+        unsigned short cells[{capacity}];
+        unsigned short arrivals[{capacity}];
+        unsigned short members[{capacity}];
+    }};
+"""
+
+_ALLOCATE = """
+    __shared__ Memory memory;
     return (unsigned long long)&memory;
 """
 
-_VIEW = f"""
-    struct Memory {{
-        int starts[{LARGEST_GRID} + 1];
-        int sums[{CUDA_BLOCK} / 32];
-        unsigned short cells[{LARGEST_WORLD}];
-        unsigned short arrivals[{LARGEST_WORLD}];
-        unsigned short members[{LARGEST_WORLD}];
-    }};
+_VIEW = """
     Memory& memory = *reinterpret_cast<Memory*>(address);
+"""
+
+_COUNT_ACTIVE = """
+    int sum = 0;
+    const uint4* chunks = reinterpret_cast<const uint4*>(mask.data);
+    for (int chunk = threadIdx.x; chunk < count / 16; chunk += blockDim.x) {
+        const uint4 flags = chunks[chunk];
+        sum += __popc(__vsetne4(flags.x, 0)) + __popc(__vsetne4(flags.y, 0));
+        sum += __popc(__vsetne4(flags.z, 0)) + __popc(__vsetne4(flags.w, 0));
+    }
+    const int rest = count / 16 * 16 + threadIdx.x;
+    if (rest < count) sum += mask.data[rest] != 0;
+    return sum;
 """
 
 _CLEAR = """
     for (int cell = threadIdx.x; cell < cell_count; cell += blockDim.x) memory.starts[cell] = 0;
+    if (threadIdx.x == 0) memory.earlier = 0;
     __syncthreads();
+    const int sum = __reduce_add_sync(~0u, earlier);
+    if ((threadIdx.x & 31u) == 0) atomicAdd(&memory.earlier, sum);
 """
 
 _ARRIVE = """
+    const int before = atomicAdd(&memory.starts[cell], active ? 1 << 16 | 1 : 1);
     memory.cells[particle] = cell;
-    memory.arrivals[particle] = atomicAdd(&memory.starts[cell], 1);
+    memory.arrivals[particle] = (before & 0xffff) << 1 | active;
 """
 
 # A thread adds up some adjacent cells, a warp its threads, and every thread the warps before it.
@@ -70,66 +93,58 @@ _ADD_UP = """
     if ((threadIdx.x & 31u) == 31u) memory.sums[threadIdx.x / 32] = before;
     before -= sum;
     __syncthreads();
-    for (unsigned warp = 0; warp < threadIdx.x / 32; ++warp) before += memory.sums[warp];
+    const unsigned lane = threadIdx.x & 31u;
+    before += __reduce_add_sync(~0u, lane < threadIdx.x / 32 ? memory.sums[lane] : 0);
     for (int cell = begin; cell < end; ++cell) {
         const int count = memory.starts[cell];
         memory.starts[cell] = before;
-        starts.data[first_cell + cell] = first_particle + before;
         before += count;
     }
     if (threadIdx.x == blockDim.x - 1) memory.starts[cell_count] = before;
     __syncthreads();
 """
 
+_START = """
+    const int start = memory.starts[cell];
+    return wp::vec_t<2, int>(start & 0xffff, memory.earlier + (start >> 16));
+"""
+
 _PLACE = """
-    memory.members[memory.starts[memory.cells[particle]] + memory.arrivals[particle]] = particle;
+    const int arrival = memory.arrivals[particle];
+    const int place = (memory.starts[memory.cells[particle]] & 0xffff) + (arrival >> 1);
+    memory.members[place] = particle << 1 | arrival & 1;
+"""
+
+# From the start of the cell of the slice's first place to the end of the cell of its last one.
+_SPAN = """
+    const int first_cell = memory.cells[memory.members[begin] >> 1];
+    const int last_cell = memory.cells[memory.members[end - 1] >> 1];
+    return wp::vec_t<2, int>(
+        memory.starts[first_cell] & 0xffff, memory.starts[last_cell + 1] & 0xffff
+    );
 """
 
 _RANKED = """
-    const int particle = memory.members[place];
-    const int cell = memory.cells[particle];
-    const int begin = memory.starts[cell];
-    const int end = memory.starts[cell + 1];
-    int ranked = begin;
-    for (int other = begin; other < end; ++other) ranked += memory.members[other] < particle;
-    return wp::vec_t<3, int>(ranked, particle, cell);
+    const int entry = memory.members[place];
+    const int cell = memory.cells[entry >> 1];
+    const int start = memory.starts[cell];
+    const int end = memory.starts[cell + 1] & 0xffff;
+    int ranked = start & 0xffff;
+    int row = start >> 16;
+    for (int other = start & 0xffff; other < end; ++other) {
+        const int member = memory.members[other];
+        ranked += member < entry;
+        row += member < entry & member;
+    }
+    row = entry & 1 ? memory.earlier + row : -1;
+    return wp::vec_t<3, int>(ranked, cell, row);
 """
 
+_MEMBER = """
+    return memory.members[place] >> 1;
+"""
 
-@wp.func_native(_MEMORY)
-def block_memory() -> wp.uint64:
-    """The block's memory."""
-    ...
-
-
-@wp.func_native(_VIEW + _CLEAR)
-def clear_counts(address: wp.uint64, cell_count: wp.int32):
-    """Set the counts of all cells to zero."""
-    ...
-
-
-@wp.func_native(_VIEW + _ARRIVE)
-def arrive(address: wp.uint64, particle: wp.int32, cell: wp.int32):
-    """Count a particle in its cell."""
-    ...
-
-
-@wp.func_native(_VIEW + _ADD_UP)
-def add_up_counts(
-    address: wp.uint64,
-    cell_count: wp.int32,
-    first_cell: wp.int32,
-    first_particle: wp.int32,
-    starts: wp.array(dtype=wp.int32),
-):
-    """Turn counts into starts, and write them from `first_cell` on."""
-    ...
-
-
-@wp.func_native(_VIEW + _PLACE)
-def place_arrived(address: wp.uint64, particle: wp.int32):
-    """Give a particle its provisional place."""
-    ...
+store_integer = make_wide_store(wp.int32, wp.int32)
 
 
 @wp.func_native("__syncthreads();")
@@ -138,55 +153,252 @@ def meet_block():
     ...
 
 
-@wp.func_native(_VIEW + _RANKED)
-def ranked_at(address: wp.uint64, place: wp.int32) -> wp.vec3i:
-    """Final place, number and cell of the particle at a provisional place."""
+@wp.func_native(_COUNT_ACTIVE)
+def count_active(mask: wp.array(dtype=wp.uint8), count: wp.int32) -> wp.int32:
+    """A thread's part in counting the active ones of the first `count` particles of all worlds."""
+    ...
+
+
+@wp.func_native("return blockIdx.x;")
+def block_number() -> wp.int32:
+    """Number of this block in its launch."""
+    ...
+
+
+@wp.func_native("return threadIdx.x;")
+def thread_of_block() -> wp.int32:
+    """Number of this thread in its block."""
     ...
 
 
 @functools.cache
-def sort_small_worlds(space_dim: int) -> wp.Kernel:
-    """Return the kernel that sorts worlds of float32, a block of threads for each."""
+def make_block_sort(capacity: int) -> SimpleNamespace:
+    """Return the Warp functions by which a block sorts a world of up to `capacity` particles."""
+    memory = _MEMORY.format(grid=LARGEST_GRID, block=BLOCKS[capacity], capacity=capacity)
+    view = memory + _VIEW
+
+    @wp.func_native(memory + _ALLOCATE)
+    def block_memory() -> wp.uint64:
+        """The block's memory."""
+        ...
+
+    @wp.func_native(view + _CLEAR)
+    def clear_counts(address: wp.uint64, cell_count: wp.int32, earlier: wp.int32):
+        """Set the counts of all cells to zero, and add up every thread's count of earlier rows."""
+        ...
+
+    @wp.func_native(view + _ARRIVE)
+    def arrive(address: wp.uint64, particle: wp.int32, cell: wp.int32, active: wp.bool):
+        """Count a particle in its cell."""
+        ...
+
+    @wp.func_native(view + _ADD_UP)
+    def add_up_counts(address: wp.uint64, cell_count: wp.int32):
+        """Turn counts into starts."""
+        ...
+
+    @wp.func_native(view + _START)
+    def start_of(address: wp.uint64, cell: wp.int32) -> wp.vec2i:
+        """First place in the world, and first row of all worlds, of a cell."""
+        ...
+
+    @wp.func_native(view + _PLACE)
+    def place_arrived(address: wp.uint64, particle: wp.int32):
+        """Give a particle its provisional place."""
+        ...
+
+    @wp.func_native(view + _SPAN)
+    def span_of_slice(address: wp.uint64, begin: wp.int32, end: wp.int32) -> wp.vec2i:
+        """Provisional places, from and up to, of all that may belong into a slice of places."""
+        ...
+
+    @wp.func_native(view + _RANKED)
+    def ranked_at(address: wp.uint64, place: wp.int32) -> wp.vec3i:
+        """Final place, cell and row (-1: none) of the particle at a provisional place."""
+        ...
+
+    @wp.func_native(view + _MEMBER)
+    def member_at(address: wp.uint64, place: wp.int32) -> wp.int32:
+        """Number of the particle at a provisional place."""
+        ...
+
+    return SimpleNamespace(
+        block_memory=block_memory,
+        clear_counts=clear_counts,
+        arrive=arrive,
+        add_up_counts=add_up_counts,
+        start_of=start_of,
+        place_arrived=place_arrived,
+        span_of_slice=span_of_slice,
+        ranked_at=ranked_at,
+        member_at=member_at,
+    )
+
+
+@functools.cache
+def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
+    """Return the kernel that sorts worlds of float32 and of up to `capacity` particles."""
     scalar = wp.float32
+    block = BLOCKS[capacity]
+    turns = capacity // block
     types = domain_types(space_dim, scalar)
     vector, Domain = types.vector, types.Domain
     cell_of, cell_index = types.cell_of, types.cell_index
+    share = wp.types.vector(STATE_SHARE, scalar)
+    positions_ahead = wp.types.matrix((turns, space_dim), scalar)
+    flags_ahead = wp.types.vector(turns, wp.int32)
     load_vector = make_wide_load(vector, scalar)
+    read_channels = make_read_channels(share, scalar)
+    store_vector = make_wide_store(vector, scalar)
+    store_share = make_wide_store(share, scalar)
+    sort = make_block_sort(capacity)
+    block_memory, clear_counts = sort.block_memory, sort.clear_counts
+    arrive, add_up_counts, start_of = sort.arrive, sort.add_up_counts, sort.start_of
+    place_arrived, span_of_slice, ranked_at = (
+        sort.place_arrived,
+        sort.span_of_slice,
+        sort.ranked_at,
+    )
+    member_at = sort.member_at
 
-    @wp.kernel(enable_backward=False, module=kernel_module("small_worlds", space_dim, scalar))
+    @wp.func
+    def write_starts(
+        memory: wp.uint64,
+        cell_count: wp.int32,
+        slice: wp.int32,
+        slices: wp.int32,
+        world: wp.int32,
+        particle_count: wp.int32,
+        masked: wp.int32,
+        active_offset: wp.int32,
+        row_base: wp.int32,
+        starts: wp.array(dtype=wp.int32),
+    ):
+        """Write the first place, and the first row, of each of the slice's cells."""
+        share_of_cells = (cell_count + slices - 1) / slices
+        begin = slice * share_of_cells
+        end = wp.min(begin + share_of_cells, cell_count)
+        for cell in range(begin + thread_of_block(), end, wp.static(block)):
+            start = start_of(memory, cell)
+            written = world * cell_count + cell
+            store_integer(starts, written, world * particle_count + start[0])
+            if masked != 0:
+                store_integer(starts, active_offset + written, row_base + start[1])
+
+    @wp.kernel(
+        enable_backward=False,
+        launch_bounds=(block, RESIDENT_THREADS // block),
+        module=kernel_module(f"small_worlds_{capacity}", space_dim, scalar),
+    )
     def sort_worlds(
         domain: Domain,
         particle_count: wp.int32,
+        slices: wp.int32,
         positions: wp.array(dtype=vector),
+        state_dim: wp.int32,
+        parts: wp.int32,
+        aligned: wp.int32,
+        states: wp.array(dtype=scalar),
+        masked: wp.int32,
+        mask: wp.array(dtype=wp.uint8),
+        active_offset: wp.int32,
+        row_base: wp.int32,
+        row_capacity: wp.int32,
         # outputs
         starts: wp.array(dtype=wp.int32),
         source: wp.array(dtype=wp.int32),
         sorted_cell: wp.array(dtype=wp.int32),
+        row_of: wp.array(dtype=wp.int32),
+        row_source: wp.array(dtype=wp.int32),
+        row_place: wp.array(dtype=wp.int32),
         sorted_positions: wp.array(dtype=vector),
+        row_positions: wp.array(dtype=vector),
+        sorted_states: wp.array(dtype=share),
     ):
-        """Sort every world by cell, then index; write where every cell starts."""
-        thread = thread_number()
-        world = thread / wp.static(CUDA_BLOCK)
-        lane = thread - world * wp.static(CUDA_BLOCK)
+        """Sort every world by cell, then index; write one slice of it.
+
+        States and rows are left out where their arrays are empty.
+        """
+        world = block_number() / slices
+        slice = block_number() - world * slices
+        lane = thread_of_block()
         first_particle = world * particle_count
         first_cell = world * domain.cell_count
-        memory = block_memory()
-        clear_counts(memory, domain.cell_count)
-        for i in range(lane, particle_count, wp.static(CUDA_BLOCK)):
+        ahead = positions_ahead()
+        acting = flags_ahead()
+        for turn in range(wp.static(turns)):
+            i = wp.min(lane + turn * wp.static(block), particle_count - 1)
             position = load_vector(positions, first_particle + i)
-            arrive(memory, i, cell_index(domain, cell_of(domain, position)))
-        add_up_counts(memory, domain.cell_count, first_cell, first_particle, starts)
-        for i in range(lane, particle_count, wp.static(CUDA_BLOCK)):
+            for d in range(wp.static(space_dim)):
+                ahead[turn, d] = position[d]
+            acting[turn] = wp.int32(1)
+            if masked != 0:
+                acting[turn] = wp.int32(mask[first_particle + i])
+        earlier = wp.int32(0)
+        if masked != 0:
+            earlier = count_active(mask, first_particle)
+        elif lane == 0:
+            earlier = first_particle
+        memory = block_memory()
+        clear_counts(memory, domain.cell_count, earlier)
+        for turn in range(wp.static(turns)):
+            i = lane + turn * wp.static(block)
+            if i < particle_count:
+                position = vector()
+                for d in range(wp.static(space_dim)):
+                    position[d] = ahead[turn, d]
+                cell = cell_index(domain, cell_of(domain, position))
+                arrive(memory, i, cell, acting[turn] != 0)
+        add_up_counts(memory, domain.cell_count)
+
+        write_starts(
+            memory,
+            domain.cell_count,
+            slice,
+            slices,
+            world,
+            particle_count,
+            masked,
+            active_offset,
+            row_base,
+            starts,
+        )
+        if lane == 0 and slice == 0 and first_particle + particle_count == positions.shape[0]:
+            end_of_all = start_of(memory, domain.cell_count)
+            starts[starts.shape[0] - 1] = row_base + end_of_all[1]
+        for i in range(lane, particle_count, wp.static(block)):
             place_arrived(memory, i)
         meet_block()
-        for k in range(lane, particle_count, wp.static(CUDA_BLOCK)):
-            ranked = ranked_at(memory, k)
-            place = first_particle + ranked[0]
-            i = first_particle + ranked[1]
-            source[place] = i
-            sorted_cell[place] = first_cell + ranked[2]
-            sorted_positions[place] = load_vector(positions, i)
-        if thread == 0:
-            starts[starts.shape[0] - 1] = positions.shape[0]
+
+        share_of_places = (particle_count + slices - 1) / slices
+        begin = slice * share_of_places
+        end = wp.min(begin + share_of_places, particle_count)
+        if begin < end:
+            span = span_of_slice(memory, begin, end)
+            for chunk in range(span[0] * parts + lane, span[1] * parts, wp.static(block)):
+                k = chunk / parts
+                part = chunk - k * parts
+                i = first_particle + member_at(memory, k)
+                position = load_vector(positions, i)
+                state = share()
+                if sorted_states.shape[0] > 0:
+                    first = part * wp.static(STATE_SHARE)
+                    state = read_channels(states, state_dim, aligned, i, first)
+                ranked = ranked_at(memory, k)
+                inside = ranked[0] >= begin and ranked[0] < end
+                place = first_particle + ranked[0]
+                if inside and sorted_states.shape[0] > 0:
+                    store_share(sorted_states, place * parts + part, state)
+                if inside and part == 0:
+                    store_integer(source, place, i)
+                    store_integer(sorted_cell, place, first_cell + ranked[1])
+                    store_vector(sorted_positions, place, position)
+                    if row_of.shape[0] > 0:
+                        row = wp.where(ranked[2] < row_capacity, ranked[2], wp.int32(-1))
+                        store_integer(row_of, i, row)
+                        if row >= 0:
+                            store_integer(row_source, row, i)
+                            store_integer(row_place, row, place)
+                            store_vector(row_positions, row, position)
 
     return sort_worlds

@@ -11,10 +11,19 @@ from types import SimpleNamespace
 import warp as wp
 
 from npa_envs.kernels.domain import domain_types, kernel_module
+from npa_envs.kernels.lanes import make_wide_load
 from npa_envs.kernels.wide import make_read_at, make_write_at
 
 CHANNEL_SHARE = 4
-"""Channels of a particle that one thread of `apply_actions` changes."""
+"""Adjacent channels of a particle, or columns of a row, that one thread changes."""
+
+UPDATE_ALIGNMENT = {2: 8, 3: 4}
+"""Bytes of float32 that the state part of an update's aligned row begins at a multiple of."""
+
+TEAM = 32
+"""Particles that a warp moves; the next warps change their states."""
+
+load_integer = make_wide_load(wp.int32, wp.int32)
 
 
 @functools.cache
@@ -24,9 +33,11 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
     vector = types.vector
     wide = wp.types.vector(space_dim, wp.float64)
     share = wp.types.vector(CHANNEL_SHARE, scalar)
+    load_scalar = make_wide_load(scalar, scalar)
     read_states = make_read_at(share, scalar, 16)
     read_actions = make_read_at(share, scalar, 8)
-    write_states = make_write_at(share, scalar)
+    read_change = make_read_at(share, scalar, UPDATE_ALIGNMENT[space_dim])
+    write_share = make_write_at(share, scalar)
     module = kernel_module("update", space_dim, scalar)
 
     @wp.func
@@ -71,47 +82,68 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         periodic: wp.int32,
         box: vector,
         moving: wp.int32,
+        state_dim: wp.int32,
+        update_width: wp.int32,
+        aligned: wp.int32,
         row_of: wp.array(dtype=wp.int32),
-        update: wp.array(dtype=scalar, ndim=2),
+        update: wp.array(dtype=scalar),
         positions: wp.array(dtype=vector),
-        states: wp.array(dtype=scalar, ndim=2),
+        states: wp.array(dtype=scalar),
         path_length: wp.array(dtype=scalar),
         # outputs
         new_positions: wp.array(dtype=vector),
-        new_states: wp.array(dtype=scalar, ndim=2),
+        new_states: wp.array(dtype=scalar),
         new_path_length: wp.array(dtype=scalar),
     ):
         """Move and change the particles that have a row; copy the others."""
+        # The first threads of a team move a particle each, the others change some channels each.
+        sharers = (state_dim + wp.static(CHANNEL_SHARE - 1)) / wp.static(CHANNEL_SHARE)
         t = wp.tid()
-        total = positions.shape[0]
-        if t >= total:
-            # The threads after the first B N: one for each state channel.
-            i = (t - total) / states.shape[1]
-            c = (t - total) % states.shape[1]
-            row = row_of[i]
-            state = states[i, c]
-            if row >= 0:
-                offset = wp.int32(0)
-                if moving != 0:
-                    offset = wp.int32(wp.static(space_dim))
-                state += dt * update[row, offset + c]
-            new_states[i, c] = state
-        else:
-            row = row_of[t]
-            position = positions[t]
-            path = path_length[t]
+        team = t / (wp.static(TEAM) * (1 + sharers))
+        turn = t - team * (wp.static(TEAM) * (1 + sharers))
+        i = team * wp.static(TEAM) + turn
+        first = wp.int32(-1)
+        if turn >= wp.static(TEAM):
+            member = (turn - wp.static(TEAM)) / sharers
+            i = team * wp.static(TEAM) + member
+            first = (turn - wp.static(TEAM) - member * sharers) * wp.static(CHANNEL_SHARE)
+        if i >= positions.shape[0]:
+            return
+        row = load_integer(row_of, i)
+        row_begin = row * update_width
+        if first < 0:
+            position = positions[i]
+            path = path_length[i]
             if row >= 0 and moving != 0:
                 delta = wide()
                 for d in range(wp.static(space_dim)):
-                    delta[d] = wp.float64(update[row, d])
+                    delta[d] = wp.float64(load_scalar(update, row_begin + d))
                 length = wp.length(delta)
                 step = largest_step / (wp.float64(1.0) + length)
                 position = displaced(position, step, delta)
                 path += scalar(step * length)
             if periodic != 0:
                 position = wrapped(position, box)
-            new_positions[t] = position
-            new_path_length[t] = path
+            new_positions[i] = position
+            new_path_length[i] = path
+        else:
+            states_begin = i * state_dim + first
+            change_begin = row_begin + first
+            if moving != 0:
+                change_begin += wp.static(space_dim)
+            if aligned != 0:
+                state = read_states(states, states_begin)
+                if row >= 0:
+                    change = read_change(update, change_begin)
+                    for k in range(wp.static(CHANNEL_SHARE)):
+                        state[k] += dt * change[k]
+                write_share(new_states, states_begin, state)
+            else:
+                for k in range(wp.min(wp.static(CHANNEL_SHARE), state_dim - first)):
+                    value = states[states_begin + k]
+                    if row >= 0:
+                        value += dt * update[change_begin + k]
+                    new_states[states_begin + k] = value
 
     @wp.kernel(enable_backward=False, module=module)
     def pull_back_update(
@@ -119,39 +151,56 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         dt: scalar,
         moving: wp.int32,
         row_base: wp.int32,
+        state_dim: wp.int32,
+        update_width: wp.int32,
+        aligned: wp.int32,
         starts: wp.array(dtype=wp.int32),
         row_source: wp.array(dtype=wp.int32),
-        update: wp.array(dtype=scalar, ndim=2),
+        update: wp.array(dtype=scalar),
         new_positions_bar: wp.array(dtype=vector),
-        new_states_bar: wp.array(dtype=scalar, ndim=2),
+        new_states_bar: wp.array(dtype=scalar),
         new_path_bar: wp.array(dtype=scalar),
         # outputs
-        update_bar: wp.array(dtype=scalar, ndim=2),
+        update_bar: wp.array(dtype=scalar),
     ):
         """Write the cotangent of every row's update, zero beyond the last active row."""
-        row, a = wp.tid()
-        bar = scalar(0.0)
-        if row < starts[starts.shape[0] - 1] - row_base:
-            i = row_source[row]
+        # A thread has some adjacent columns of a row.
+        sharers = (update_width + wp.static(CHANNEL_SHARE - 1)) / wp.static(CHANNEL_SHARE)
+        t = wp.tid()
+        row = t / sharers
+        first = (t - row * sharers) * wp.static(CHANNEL_SHARE)
+        row_begin = row * update_width
+        i = load_integer(row_source, row)
+        bar = share()
+        if row < load_integer(starts, starts.shape[0] - 1) - row_base:
             offset = wp.int32(0)
             if moving != 0:
                 offset = wp.int32(wp.static(space_dim))
-            if a >= offset:
+            for k in range(wp.static(CHANNEL_SHARE)):
                 # Updates may be padded with columns that nothing reads.
-                if a - offset < new_states_bar.shape[1]:
-                    bar = dt * new_states_bar[i, a - offset]
-            else:
+                c = first + k - offset
+                place = i * state_dim + wp.clamp(c, 0, state_dim - 1)
+                state_bar = load_scalar(new_states_bar, place)
+                if c >= 0 and c < state_dim:
+                    bar[k] = dt * state_bar
+            if first < offset:
                 delta = vector()
                 for d in range(wp.static(space_dim)):
-                    delta[d] = update[row, d]
+                    delta[d] = load_scalar(update, row_begin + d)
                 length = wp.length(delta)
                 shrink = scalar(1.0) / (scalar(1.0) + length)
                 pull = new_positions_bar[i]
                 radial = scalar(0.0)
                 if length > scalar(0.0):
                     radial = (new_path_bar[i] - wp.dot(pull, delta)) * shrink * shrink / length
-                bar = largest_step * (shrink * pull[a] + radial * delta[a])
-        update_bar[row, a] = bar
+                for d in range(wp.static(space_dim)):
+                    bar[d] = largest_step * (shrink * pull[d] + radial * delta[d])
+        if aligned != 0:
+            write_share(update_bar, row_begin + first, bar)
+        else:
+            for k in range(wp.static(CHANNEL_SHARE)):
+                if first + k < update_width:
+                    update_bar[row_begin + first + k] = bar[k]
 
     @wp.kernel(enable_backward=False, module=module)
     def apply_actions(
@@ -245,7 +294,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
             held_back += changed
             if acting != wp.uint8(0) or changed != 0:
                 if aligned != 0:
-                    write_states(states, states_begin + first, after)
+                    write_share(states, states_begin + first, after)
                 else:
                     for k in range(wp.static(CHANNEL_SHARE)):
                         c = first + k * stride

@@ -1,6 +1,6 @@
 """Native snippets beside those of `lanes`: what plain Warp cannot say on CUDA.
 
-Stores of 16 bytes at a time, sums over a warp, the hardware's own exponential.
+Stores of up to 16 bytes at a time, sums over a warp, the hardware's own exponential.
 """
 
 import functools
@@ -12,14 +12,16 @@ from npa_envs.kernels.domain import scalar_name
 
 _STORE = """
 #if defined(__CUDA_ARCH__)
-    struct alignas(16) Chunk { unsigned part[4]; };
+    constexpr unsigned size = sizeof(value);
+    constexpr unsigned bytes = size % 16 == 0 ? 16 : size % 8 == 0 ? 8 : 4;
+    struct alignas(bytes) Chunk { unsigned part[bytes / 4]; };
     Chunk* to = reinterpret_cast<Chunk*>(entries.data + index);
     const unsigned* from = reinterpret_cast<const unsigned*>(&value);
     #pragma unroll
-    for (unsigned i = 0; i < sizeof(value) / 16; ++i) {
+    for (unsigned i = 0; i < size / bytes; ++i) {
         Chunk chunk;
         #pragma unroll
-        for (unsigned k = 0; k < 4; ++k) chunk.part[k] = from[4 * i + k];
+        for (unsigned k = 0; k < bytes / 4; ++k) chunk.part[k] = from[bytes / 4 * i + k];
         to[i] = chunk;
     }
 #else
@@ -79,6 +81,14 @@ _WARP_SUM = """
 #endif
 """
 
+_OF_WARP = """
+#if defined(__CUDA_ARCH__)
+    return __shfl_sync(0xffffffffu, value, lane);
+#else
+    return value;
+#endif
+"""
+
 _EXP2 = """
 #if defined(__CUDA_ARCH__)
     return ::exp2(value);
@@ -98,12 +108,21 @@ _FAST_EXP2 = """
 """
 
 
+@wp.func_native(_OF_WARP)
+def of_warp(value: wp.int32, lane: wp.int32) -> wp.int32:
+    """What a thread of the warp has, all 32 of which must ask; on the CPU, the argument."""
+    ...
+
+
 @functools.cache
 def make_wide_store(value_type: type, scalar: type) -> Any:
-    """Return a Warp function that writes an entry of a flat array 16 bytes at a time on CUDA.
+    """Return a Warp function that writes an entry of a flat array, on CUDA in few, wide stores.
+
+    The array must be dense and its memory aligned to an entry, or to 16 bytes; the index must not
+    be negative.
 
     Args:
-        value_type: A vector or matrix type of a multiple of 16 bytes.
+        value_type: A scalar, vector or matrix type.
         scalar: The scalar type that it is made of.
     """
 
@@ -120,7 +139,8 @@ def make_read_at(value_type: type, scalar: type, alignment: int) -> Any:
     Args:
         value_type: A vector type of a multiple of `alignment` bytes.
         scalar: The scalar type that it is made of.
-        alignment: Bytes that the place is a multiple of in memory, and that a load takes: 8 or 16.
+        alignment: Bytes that the place is a multiple of in memory, and that a load takes: 4, 8
+            or 16.
     """
     count = value_type._length_
     name = {"f32": "wp::float32", "f64": "wp::float64"}[scalar_name(scalar)]
@@ -130,6 +150,39 @@ def make_read_at(value_type: type, scalar: type, alignment: int) -> Any:
     def read_at(values: wp.array(dtype=scalar), place: wp.int32) -> value_type: ...
 
     return read_at
+
+
+@functools.cache
+def make_read_channels(value_type: type, scalar: type) -> Any:
+    """Return a Warp function that reads adjacent channels of a particle, zeros beyond its last one.
+
+    Args:
+        value_type: A vector type.
+        scalar: The scalar type that it is made of.
+    """
+    count = value_type._length_
+    alignment = min(wp.types.type_size_in_bytes(value_type), 16)
+    read_at = make_read_at(value_type, scalar, alignment)
+
+    @wp.func
+    def read_channels(
+        states: wp.array(dtype=scalar),
+        state_dim: wp.int32,
+        aligned: wp.int32,
+        particle: wp.int32,
+        first: wp.int32,
+    ):
+        result = value_type()
+        place = particle * state_dim + first
+        if aligned == 0:
+            for k in range(wp.static(count)):
+                if first + k < state_dim:
+                    result[k] = states[place + k]
+        elif first < state_dim:
+            result = read_at(states, place)
+        return result
+
+    return read_channels
 
 
 @functools.cache

@@ -8,8 +8,10 @@ import torch
 from torch import Tensor
 
 from npa_envs.kernels.adjoint import adjoint_kernels
+from npa_envs.kernels.listed_adjoint import SHARE, listed_adjoint
+from npa_envs.kernels.tiles import TILE, WARP
 from npa_envs.sph.bridge import launch
-from npa_envs.sph.cells import density_scale, make_plan
+from npa_envs.sph.cells import Plan, density_scale, make_plan
 
 
 @torch.library.custom_op("npa::perceive_rows_backward", mutates_args=())
@@ -47,6 +49,21 @@ def perceive_rows_backward(
         eps,
         box,
     )
+    if plan.listed and states is None:
+        states_bar = _gather_by_tiles(
+            plan,
+            perception_bar,
+            perception,
+            row_of,
+            starts,
+            source,
+            particles,
+            row_positions,
+            row_kernel_sum,
+            scale,
+            state_gradient,
+        )
+        return states_bar, states_bar.new_empty(0)
     width = plan.width
     kernels = adjoint_kernels(space_dim, plan.scalar, width, plan.lanes, state_gradient)
     device = particles.device
@@ -134,6 +151,74 @@ def perceive_rows_backward(
         positions_bar,
     )
     return states_bar, positions_bar
+
+
+def _gather_by_tiles(
+    plan: Plan,
+    perception_bar: Tensor,
+    perception: Tensor,
+    row_of: Tensor,
+    starts: Tensor,
+    source: Tensor,
+    particles: Tensor,
+    row_positions: Tensor,
+    row_kernel_sum: Tensor,
+    scale: float,
+    state_gradient: bool,
+) -> Tensor:
+    """Return the cotangent of states, [B N, C], on CUDA in float32."""
+    kernels = listed_adjoint(
+        plan.space_dim, plan.width, state_gradient, plan.periodic, plan.group_count > 1
+    )
+    device = particles.device
+    bar = perception_bar.contiguous()
+    # All cotangents are multiplied by one kernel's norm, those of the smoothed state before.
+    norm = plan.domain.spiky_norm if state_gradient else plan.domain.smoothing_norm
+    kinds = 1 + plan.space_dim * state_gradient
+    entries = plan.row_capacity * plan.group_count + 1
+    cotangents = bar.new_empty(entries * kinds * plan.width // SHARE, SHARE)
+    launch(
+        kernels.unscale_cotangents,
+        entries * plan.width // SHARE,
+        device,
+        plan.state_dim,
+        scale,
+        plan.domain.smoothing_norm / norm,
+        plan.row_base,
+        plan.row_capacity,
+        plan.group_count,
+        starts,
+        perception,
+        bar,
+        cotangents,
+    )
+    states_bar = bar.new_empty(plan.total, plan.state_dim)
+    tile_count = -(-plan.particle_count // TILE)
+    launch(
+        kernels.gather_state_cotangents,
+        plan.world_count * tile_count * plan.group_count * WARP,
+        device,
+        plan.domain,
+        norm,
+        plan.particle_count,
+        tile_count,
+        plan.state_dim,
+        plan.active_offset,
+        plan.row_base,
+        plan.row_capacity,
+        plan.group_count,
+        starts,
+        particles.view(-1),
+        source,
+        row_of,
+        row_positions,
+        row_kernel_sum,
+        bar,
+        cotangents,
+        cotangents.view(-1),
+        states_bar,
+    )
+    return states_bar
 
 
 @perceive_rows_backward.register_fake

@@ -21,7 +21,7 @@ GROUP_WIDTHS = (4, 8, 16)
 
 
 CUDA_BLOCK = 128
-"""Threads of a CUDA block."""
+"""Threads of a CUDA block, where a launch does not say otherwise."""
 
 
 def scalar_type(dtype: torch.dtype) -> Any:
@@ -83,11 +83,11 @@ def _current_stream(device: torch.device) -> Any:
     return _warp_stream(device, torch.cuda.current_stream(device).cuda_stream)
 
 
-def _placement(device: torch.device) -> dict[str, Any]:
+def _placement(device: torch.device, block_dim: int = CUDA_BLOCK) -> dict[str, Any]:
     """Return where `wp.launch` shall put a kernel."""
     where = warp_device(device)
-    block_dim = CUDA_BLOCK if where.is_cuda else None
-    return {"device": where, "stream": _current_stream(device), "block_dim": block_dim}
+    threads = block_dim if where.is_cuda else None
+    return {"device": where, "stream": _current_stream(device), "block_dim": threads}
 
 
 def _quiet_at_first(kernel: Any, device: torch.device) -> contextlib.AbstractContextManager[Any]:
@@ -97,7 +97,13 @@ def _quiet_at_first(kernel: Any, device: torch.device) -> contextlib.AbstractCon
     return quiet_warp() if first else contextlib.nullcontext()
 
 
-def launch(kernel: Any, size: int | tuple[int, ...], device: torch.device, *arguments: Any) -> None:
+def launch(
+    kernel: Any,
+    size: int | tuple[int, ...],
+    device: torch.device,
+    *arguments: Any,
+    block_dim: int = CUDA_BLOCK,
+) -> None:
     """Launch a kernel on torch's current stream of a device.
 
     Args:
@@ -105,9 +111,10 @@ def launch(kernel: Any, size: int | tuple[int, ...], device: torch.device, *argu
         size: Number of threads along each dimension.
         device: Device of every tensor among the arguments.
         arguments: Kernel arguments in order: tensors (None for an absent one), structs and numbers.
+        block_dim: Threads of a CUDA block.
     """
     converted = _converted(kernel, arguments)
-    placement = _placement(device)
+    placement = _placement(device, block_dim)
     with _quiet_at_first(kernel, device):
         wp.launch(kernel, size, inputs=converted, record_tape=False, **placement)
 

@@ -11,12 +11,23 @@ from torch import Tensor
 from npa_envs.errors import NPAError
 from npa_envs.kernels.cells import cell_kernels
 from npa_envs.kernels.domain import make_domain
-from npa_envs.kernels.slots import CUDA_BLOCK
-from npa_envs.kernels.small_worlds import LARGEST_GRID, LARGEST_WORLD, sort_small_worlds
+from npa_envs.kernels.small_worlds import BLOCKS, LARGEST_GRID, STATE_SHARE, sort_small_worlds
 from npa_envs.sph.bridge import channel_width, lane_count, launch, scalar_type
 
 LARGEST_INDEX = 2**31 - 1
 """Kernels index with 32 bits."""
+
+CUDA_WARP = 32
+"""Threads of a CUDA warp, which move the states of as many particles together."""
+
+LARGEST_MASK = 2**20
+"""Particles of masked worlds that blocks sort: each block counts the active ones before it."""
+
+BUSY_BLOCKS = 128
+"""Blocks that occupy a device: fewer worlds are cut into slices."""
+
+SMALLEST_SLICE = 128
+"""Particles of a slice, at least."""
 
 
 class Plan(NamedTuple):
@@ -114,6 +125,8 @@ def make_plan(
     world_count, particle_count, space_dim = (int(size) for size in shape)
     scalar = scalar_type(like.dtype)
     sides = None if box is None else tuple(box)
+    # In 3D, more and smaller cells mean many short runs, which lanes share badly.
+    reach = 1 if space_dim == 3 and like.device.type == "cuda" else 2
     plan = Plan(
         scalar=scalar,
         width=channel_width(int(state_dim)),
@@ -124,7 +137,7 @@ def make_plan(
         state_dim=int(state_dim),
         row_capacity=row_capacity,
         masked=masked,
-        domain=make_domain(space_dim, scalar, eps, sides, particle_count),
+        domain=make_domain(space_dim, scalar, eps, sides, particle_count, reach),
     )
     largest = max(2 * plan.cell_total, plan.total * (1 + plan.state_dim))
     if largest >= LARGEST_INDEX:
@@ -143,16 +156,15 @@ def sort_worlds(
 
     What is left out is empty: states without `s`, everything about rows without `with_rows`.
     """
-    small = plan.particle_count <= LARGEST_WORLD and plan.domain.cell_count <= LARGEST_GRID
-    if plan.listed and small and not plan.masked and s is None and not with_rows:
-        return _sort_by_blocks(plan, x)
-    share = plan.width // plan.lanes
-    kernels = cell_kernels(plan.space_dim, plan.scalar, share)
+    capacity = _block_capacity(plan, x, s, mask)
+    if capacity:
+        return _sort_by_blocks(plan, capacity, x, s, mask, with_rows)
+    kernels = cell_kernels(plan.space_dim, plan.scalar, plan.width, plan.lanes)
     device, total = x.device, plan.total
-    cell, arrival, arrived = torch.empty(3, total, dtype=torch.int32, device=device).unbind()
+    cell, arrival = torch.empty(2, total, dtype=torch.int32, device=device).unbind()
+    arrived = torch.empty(total, 2, dtype=torch.int32, device=device)
     counts = torch.zeros(plan.start_count, dtype=torch.int32, device=device)
     positions = x.view(total, plan.space_dim)
-    states = None if s is None else s.view(total, plan.state_dim)
     flat_mask = None if mask is None else mask.view(total)
     launch(
         kernels.count_cells,
@@ -169,82 +181,99 @@ def sort_worlds(
         counts,
     )
     starts = torch.cumsum(counts, 0, dtype=torch.int32)
-    launch(kernels.place_by_arrival, total, device, cell, arrival, starts, arrived)
+    launch(
+        kernels.place_by_arrival,
+        total,
+        device,
+        flat_mask,
+        int(plan.masked),
+        cell,
+        arrival,
+        starts,
+        arrived,
+    )
 
+    ordered = _empty_worlds(plan, x, s, with_rows)
+    # A thread reads and writes its share of a particle's channels at once where it is aligned.
+    share = plan.width // plan.lanes
+    aligned = s is not None and plan.state_dim % share == 0 and s.data_ptr() % 16 == 0
+    warps = CUDA_WARP if plan.lanes > 1 else 1
+    launch(
+        kernels.order_particles,
+        -(-total // warps) * warps,
+        device,
+        positions,
+        plan.state_dim,
+        plan.group_count,
+        int(aligned),
+        None if s is None else s.view(-1),
+        plan.active_offset,
+        plan.row_base,
+        plan.row_capacity,
+        arrived,
+        starts,
+        *ordered[:-1],
+        ordered[-1].view(-1, share),
+    )
+    return SortedWorlds(starts, *ordered)
+
+
+def _empty_worlds(plan: Plan, x: Tensor, s: Tensor | None, with_rows: bool) -> list[Tensor]:
+    """Return what sorting fills in: all of `SortedWorlds` but the starts."""
+    total, device = plan.total, x.device
     source, sorted_cell = torch.empty(2, total, dtype=torch.int32, device=device).unbind()
     row_capacity = plan.row_capacity if with_rows else 0
     row_of = source.new_empty(total if with_rows else 0)
     row_source = source.new_empty(row_capacity)
     row_place = torch.empty_like(row_source)
-    sorted_positions = torch.empty_like(positions)
+    sorted_positions = x.new_empty(total, plan.space_dim)
     row_positions = x.new_empty(row_capacity, plan.space_dim)
-    sorted_states = x.new_empty(0 if s is None else total, plan.group_count * plan.width)
-    launch(
-        kernels.order_particles,
-        (total, 1 if s is None else plan.group_count * plan.lanes),
-        device,
-        positions,
-        states,
-        flat_mask,
-        int(plan.masked),
-        plan.active_offset,
-        plan.row_base,
-        plan.row_capacity,
-        cell,
-        arrived,
-        starts,
-        source,
-        sorted_cell,
-        row_of,
-        row_source,
-        row_place,
-        sorted_positions,
-        row_positions,
-        sorted_states,
-    )
-    return SortedWorlds(
-        starts,
-        source,
-        sorted_cell,
-        row_of,
-        row_source,
-        row_place,
-        sorted_positions,
-        row_positions,
-        sorted_states.view(-1, plan.width),
-    )
+    sorted_states = x.new_empty(0 if s is None else total * plan.group_count, plan.width)
+    integers = [source, sorted_cell, row_of, row_source, row_place]
+    return [*integers, sorted_positions, row_positions, sorted_states]
 
 
-def _sort_by_blocks(plan: Plan, x: Tensor) -> SortedWorlds:
-    """Sort small worlds, without states and rows, in one launch."""
+def _block_capacity(plan: Plan, *tensors: Tensor | None) -> int:
+    """Return how many particles a block that sorts these worlds has room for, 0 if none has."""
+    earlier = plan.total if plan.masked else 0
+    if not plan.listed or plan.domain.cell_count > LARGEST_GRID or earlier > LARGEST_MASK:
+        return 0
+    if any(tensor is not None and tensor.data_ptr() % 16 for tensor in tensors):
+        return 0
+    return next((size for size in sorted(BLOCKS) if size >= plan.particle_count), 0)
+
+
+def _sort_by_blocks(
+    plan: Plan, capacity: int, x: Tensor, s: Tensor | None, mask: Tensor | None, with_rows: bool
+) -> SortedWorlds:
+    """Sort small worlds in one launch."""
+    ordered = _empty_worlds(plan, x, s, with_rows)
     starts = torch.empty(plan.start_count, dtype=torch.int32, device=x.device)
-    source, sorted_cell = torch.empty(2, plan.total, dtype=torch.int32, device=x.device).unbind()
-    positions = x.view(plan.total, plan.space_dim)
-    sorted_positions = torch.empty_like(positions)
+    slices = max(min(BUSY_BLOCKS // plan.world_count, plan.particle_count // SMALLEST_SLICE), 1)
+    block = BLOCKS[capacity]
     launch(
-        sort_small_worlds(plan.space_dim),
-        plan.world_count * CUDA_BLOCK,
+        sort_small_worlds(plan.space_dim, capacity),
+        plan.world_count * slices * block,
         x.device,
         plan.domain,
         plan.particle_count,
-        positions,
+        slices,
+        x.view(plan.total, plan.space_dim),
+        plan.state_dim,
+        1 if s is None else plan.group_count * plan.width // STATE_SHARE,
+        int(plan.state_dim % STATE_SHARE == 0),
+        None if s is None else s.view(-1),
+        int(plan.masked),
+        None if mask is None else mask.view(-1),
+        plan.active_offset,
+        plan.row_base,
+        plan.row_capacity,
         starts,
-        source,
-        sorted_cell,
-        sorted_positions,
+        *ordered[:-1],
+        ordered[-1].view(-1, STATE_SHARE),
+        block_dim=block,
     )
-    none = source.new_empty(0)
-    return SortedWorlds(
-        starts,
-        source,
-        sorted_cell,
-        none,
-        none,
-        none,
-        sorted_positions,
-        x.new_empty(0, plan.space_dim),
-        x.new_empty(0, plan.width),
-    )
+    return SortedWorlds(starts, *ordered)
 
 
 def density_scale(scale: float, space_dim: int, particle_count: int) -> float:

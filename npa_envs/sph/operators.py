@@ -14,14 +14,7 @@ from torch import Tensor
 from npa_envs.sph.adjoint import perceive_rows_backward
 from npa_envs.sph.bridge import launch
 from npa_envs.sph.cells import make_plan, sort_worlds
-from npa_envs.sph.passes import (
-    Terms,
-    compute_density,
-    list_capacity,
-    list_lanes,
-    list_neighbours,
-    perception_launch,
-)
+from npa_envs.sph.passes import Terms, compute_densities, perception_launch, rollout_listing
 
 __all__ = ["Rows", "Terms", "perceive_rows"]
 
@@ -56,11 +49,9 @@ def _perceive_rows(
     plan = make_plan(x, x.shape, s.shape[2], row_capacity, mask is not None, eps, box)
     terms = Terms(state_gradient, moment_correction, density_gradient)
     ordered = sort_worlds(plan, x, s, mask)
-    if list_capacity(plan):
-        lanes = list_lanes(plan)
-        densities = list_neighbours(plan, ordered, None, with_particles=for_adjoint, lanes=lanes)
-    else:
-        densities = compute_density(plan, ordered, terms)
+    densities = compute_densities(
+        plan, ordered, terms, rollout_listing(plan), with_particles=for_adjoint
+    )
     perception = x.new_empty(row_capacity, row_width)
     row_kernel_sum = x.new_empty(row_capacity if for_adjoint else 0, plan.space_dim)
     launch(
@@ -101,7 +92,7 @@ def _(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     plan = make_plan(x, x.shape, s.shape[2], row_capacity, mask is not None, eps, box)
     for_adjoint = options[-1]
-    particle_count = plan.total if for_adjoint or not list_capacity(plan) else 0
+    particle_count = plan.total if for_adjoint or not plan.listed else 0
     integers = torch.int32
     return (
         x.new_empty(row_capacity, row_width),

@@ -13,20 +13,17 @@ from npa_envs.kernels.perception import perception_kernels
 from npa_envs.sph.bridge import launch
 from npa_envs.sph.cells import Plan, SortedWorlds, density_scale
 
-WARP_ROWS = 8
-"""Rows that a CUDA warp serves, and writes together."""
+WARP = 32
+"""Threads of a CUDA warp: rows come in whole warps, and the lists of so many rows lie together."""
 
 CAPACITY, LARGE_CAPACITY = 64, 128
-"""Neighbours that lists have room for, in small worlds and in larger ones."""
+"""Neighbours that lists have room for, in small worlds of a batch and elsewhere."""
 
 SMALL_WORLD = 2048
 """Particles of a small world."""
 
-LIST_BLOCK = 32
-"""Particles whose lists lie together."""
-
-FULL_DEVICE = 2**16
-"""Particles that fill a device with one thread each."""
+SHARED_WORLD = 4096
+"""Particles of worlds that are often rolled out few at a time: several threads share a particle."""
 
 
 class Terms(NamedTuple):
@@ -42,11 +39,26 @@ class Terms(NamedTuple):
         return 2 * state_dim + gradients + space_dim * self.density_gradient
 
 
-class NeighbourLists(NamedTuple):
-    """The neighbours of each row's particle, itself included."""
+class Listing(NamedTuple):
+    """How neighbours are listed, and how threads share particles, on CUDA.
+
+    It follows from the size of a world alone: the sums of a world, taken in the order that this
+    gives, are the same in every batch.
+    """
 
     capacity: int
     """Neighbours that a list has room for: what is longer, perception searches for again."""
+    lanes: int
+    """Threads of a particle in the density pass."""
+    teams: int
+    """Teams of lanes of a row in the perception pass."""
+
+
+class NeighbourLists(NamedTuple):
+    """The neighbours of each row's particle, itself included."""
+
+    listing: Listing
+    """How they were listed."""
     steps: Tensor
     """Steps to neighbours in the sorted order, int16; 32 particles together."""
     lengths: Tensor
@@ -78,45 +90,61 @@ def plain_kernels(plan: Plan, terms: Terms) -> Any:
     )
 
 
-def list_capacity(plan: Plan) -> int:
-    """Return how many neighbours a list has room for, 0 where there are no lists."""
+def rollout_listing(plan: Plan) -> Listing:
+    """Return how rollouts list neighbours: few worlds shall fill a device, too."""
+    if plan.particle_count <= SHARED_WORLD:
+        return Listing(LARGE_CAPACITY, lanes=plan.lanes, teams=2)
+    return Listing(LARGE_CAPACITY, lanes=1, teams=1)
+
+
+def batch_listing(plan: Plan) -> Listing:
+    """Return how environments list neighbours: whole batches fill a device with less."""
+    small = plan.particle_count <= SMALL_WORLD
+    return Listing(CAPACITY if small else LARGE_CAPACITY, lanes=1, teams=1)
+
+
+def compute_densities(
+    plan: Plan,
+    ordered: SortedWorlds,
+    terms: Terms,
+    listing: Listing,
+    *,
+    state_place: Tensor | None = None,
+    with_particles: bool = True,
+) -> Densities:
+    """Compute densities, and what perception wants besides: lists or the rows' density gradients.
+
+    Args:
+        plan: Plan of the call.
+        ordered: The sorted worlds.
+        terms: Groups of the perception that follows.
+        listing: How to list neighbours, where the plan says so.
+        state_place: Where the states of sorted particles are, int32, shape [B N]; None: in order.
+        with_particles: Also leave `particles` where neighbours are listed: the adjoint reads them.
+    """
     if not plan.listed:
-        return 0
-    return CAPACITY if plan.particle_count <= SMALL_WORLD else LARGE_CAPACITY
-
-
-def list_lanes(plan: Plan) -> int:
-    """Return how many threads of a particle list neighbours fastest, be it one world or many."""
-    return plan.lanes if plan.total < FULL_DEVICE else 1
+        return compute_density_gradients(plan, ordered, terms)
+    return list_neighbours(plan, ordered, listing, state_place, with_particles)
 
 
 def list_neighbours(
     plan: Plan,
     ordered: SortedWorlds,
+    listing: Listing,
     state_place: Tensor | None,
-    *,
     with_particles: bool,
-    lanes: int = 1,
 ) -> Densities:
-    """Compute densities, and list the neighbours of the rows.
-
-    Args:
-        plan: Plan of the call, of a positive `list_capacity`.
-        ordered: The sorted worlds.
-        state_place: Where the states of sorted particles are, int32, shape [B N]; None: in order.
-        with_particles: Also leave `particles`, which the adjoint reads.
-        lanes: Threads of a particle.
-    """
-    capacity = list_capacity(plan)
+    """Compute densities, and list the neighbours of the rows: `compute_densities` on CUDA."""
+    capacity, lanes, _ = listing
     positions = ordered.positions
     records = positions.new_empty(plan.total, 4)
     particles = positions.new_empty(plan.total if with_particles else 0, plan.space_dim + 1)
-    blocks = -(-plan.row_capacity // LIST_BLOCK)
-    steps = positions.new_empty(blocks, capacity, LIST_BLOCK, dtype=torch.int16)
+    blocks = -(-plan.row_capacity // WARP)
+    steps = positions.new_empty(blocks, capacity, WARP, dtype=torch.int16)
     lengths = positions.new_empty(plan.row_capacity, dtype=torch.int32)
     launch(
         listed_density(plan.space_dim, lanes, plan.periodic, capacity, plan.masked),
-        -(-plan.total * lanes // LIST_BLOCK) * LIST_BLOCK,
+        -(-plan.total * lanes // WARP) * WARP,
         positions.device,
         plan.domain,
         ordered.starts,
@@ -131,42 +159,7 @@ def list_neighbours(
         lengths,
     )
     no_gradient = positions.new_empty(0, plan.space_dim, dtype=torch.float64)
-    return Densities(particles, no_gradient, NeighbourLists(capacity, steps, lengths, records))
-
-
-def compute_density(
-    plan: Plan, ordered: SortedWorlds, terms: Terms, *, lanes: int | None = None
-) -> Densities:
-    """Compute densities, and the rows' density gradients unless perception does.
-
-    Args:
-        plan: Plan of the call.
-        ordered: The sorted worlds.
-        terms: Groups of the perception that follows.
-        lanes: Threads of a particle where neighbours are listed; default: the plan's.
-    """
-    if not plan.listed:
-        return compute_density_gradients(plan, ordered, terms)
-    positions = ordered.positions
-    particles = positions.new_empty(plan.total, plan.space_dim + 1)
-    lanes = lanes or plan.lanes
-    launch(
-        listed_density(plan.space_dim, lanes, plan.periodic),
-        plan.total * lanes,
-        positions.device,
-        plan.domain,
-        ordered.starts,
-        ordered.cell,
-        positions,
-        None,
-        None,
-        None,
-        particles,
-        None,
-        None,
-        None,
-    )
-    return Densities(particles, positions.new_empty(0, plan.space_dim, dtype=torch.float64))
+    return Densities(particles, no_gradient, NeighbourLists(listing, steps, lengths, records))
 
 
 def compute_density_gradients(plan: Plan, ordered: SortedWorlds, terms: Terms) -> Densities:
@@ -231,7 +224,8 @@ def perception_launch(
     )
     row_place = ordered.row_place if plan.masked else None
     lists = densities.lists
-    if plan.listed:
+    if lists is not None:
+        capacity, _, teams = lists.listing
         kernel = listed_perception(
             plan.space_dim,
             plan.width,
@@ -240,14 +234,15 @@ def perception_launch(
             terms.moment_correction,
             plan.periodic,
             plan.group_count > 1,
-            0 if lists is None else lists.capacity,
+            capacity,
             row_kernel_sum is not None,
+            teams,
         )
-        rows = -(-plan.row_capacity // WARP_ROWS) * WARP_ROWS
+        threads = plan.row_capacity * plan.group_count * plan.lanes * teams
         source = ordered.states if states is None else states
         return (
             kernel,
-            rows * plan.group_count * plan.lanes,
+            -(-threads // WARP) * WARP,
             out.device,
             *common,
             plan.row_capacity,
@@ -256,14 +251,13 @@ def perception_launch(
             ordered.starts,
             ordered.cell,
             ordered.positions,
-            densities.particles.view(-1) if lists is None else None,
-            None if lists is None else lists.records,
+            lists.records,
             source.view(-1, plan.width // plan.lanes),
             None if states is None else ordered.source,
             row_place,
             destination,
-            None if lists is None else lists.steps.view(-1),
-            None if lists is None else lists.lengths,
+            lists.steps.view(-1),
+            lists.lengths,
             out,
             row_kernel_sum,
         )

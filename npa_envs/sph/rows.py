@@ -10,16 +10,7 @@ from torch import Tensor
 
 from npa_envs.sph.bridge import Repeated
 from npa_envs.sph.cells import make_plan, sort_worlds
-from npa_envs.sph.passes import (
-    Terms,
-    compute_density,
-    list_capacity,
-    list_neighbours,
-    perception_launch,
-)
-
-DENSITY_LANES = 1
-"""Threads of a particle in the density pass: whole batches fill the device without more."""
+from npa_envs.sph.passes import Terms, batch_listing, compute_densities, perception_launch
 
 
 class SurveyedWorlds:
@@ -87,12 +78,16 @@ def survey(
     plan = make_plan(x, x.shape, s.shape[2], x.shape[0] * x.shape[1], False, eps, box)
     in_place = plan.listed and plan.state_dim % plan.width == 0 and s.data_ptr() % 16 == 0
     ordered = sort_worlds(plan, x, None if in_place else s, None, with_rows=not plan.listed)
-    if list_capacity(plan):
-        place = ordered.source if in_place else None
-        densities = list_neighbours(plan, ordered, place, with_particles=False)
-    else:
-        densities = compute_density(plan, ordered, terms, lanes=DENSITY_LANES)
-
+    # World k of a batch perceives what it would alone, bit for bit: nothing here may follow from
+    # the number of worlds.
+    densities = compute_densities(
+        plan,
+        ordered,
+        terms,
+        batch_listing(plan),
+        state_place=ordered.source if in_place else None,
+        with_particles=False,
+    )
     destination = ordered.source
     if places is not None:
         shift = (places - torch.arange(len(places), device=x.device)) * plan.particle_count

@@ -7,9 +7,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from npa_envs.kernels.update import update_kernels
+from npa_envs.errors import NPAError
+from npa_envs.kernels.update import CHANNEL_SHARE, TEAM, UPDATE_ALIGNMENT, update_kernels
 from npa_envs.sph.bridge import launch, scalar_type
+from npa_envs.sph.cells import LARGEST_INDEX
 from npa_envs.sph.operators import Rows
+
+
+def _sharers(count: int) -> int:
+    """Return how many threads share `count` channels."""
+    return -(-count // CHANNEL_SHARE)
 
 
 @torch.library.custom_op("npa::update_particles", mutates_args=())
@@ -27,23 +34,37 @@ def _update_particles(
     space_dim, state_dim = x.shape[2], s.shape[2]
     total = x.shape[0] * x.shape[1]
     kernels = update_kernels(space_dim, scalar_type(x.dtype))
+    if update.numel() >= LARGEST_INDEX:
+        raise NPAError(
+            f"updates must stay below {LARGEST_INDEX} numbers in one batch, got "
+            f"{update.numel()}: split the batch"
+        )
     outputs = torch.empty_like(x), torch.empty_like(s), torch.empty_like(path_length)
+    update = update.contiguous()
+    # Adjacent channels are then read and written at once: their places are aligned in memory.
+    alignment = UPDATE_ALIGNMENT[space_dim]
+    aligned = state_dim % CHANNEL_SHARE == 0 and s.data_ptr() % 16 == 0
+    aligned = aligned and (4 * update.shape[1]) % alignment == 0
+    aligned = aligned and update.data_ptr() % alignment == 0
     launch(
         kernels.apply_update,
-        total * (1 + state_dim),
+        -(-total // TEAM) * TEAM * (1 + _sharers(state_dim)),
         x.device,
         reach * dt,
         dt,
         int(box is not None),
         tuple(box) if box is not None else (1.0,) * space_dim,
         int(moving),
+        state_dim,
+        update.shape[1],
+        int(aligned),
         row_of,
-        update.contiguous(),
+        update.view(-1),
         x.view(total, space_dim),
-        s.view(total, state_dim),
+        s.view(-1),
         path_length.view(total),
         outputs[0].view(total, space_dim),
-        outputs[1].view(total, state_dim),
+        outputs[1].view(-1),
         outputs[2].view(total),
     )
     return outputs
@@ -74,19 +95,22 @@ def _update_particles_backward(
     update_bar = torch.empty_like(update, memory_format=torch.contiguous_format)
     launch(
         kernels.pull_back_update,
-        tuple(update.shape),
+        update.shape[0] * _sharers(update.shape[1]),
         update.device,
         reach * dt,
         dt,
         int(moving),
         row_base,
+        state_dim,
+        update.shape[1],
+        int(update.shape[1] % CHANNEL_SHARE == 0),
         starts,
         row_source,
-        update.contiguous(),
+        update.contiguous().view(-1),
         new_x_bar.contiguous().view(-1, space_dim),
-        new_s_bar.contiguous().view(-1, state_dim),
+        new_s_bar.contiguous().view(-1),
         new_path_bar.contiguous().view(-1),
-        update_bar,
+        update_bar.view(-1),
     )
     return update_bar
 

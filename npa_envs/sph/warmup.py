@@ -9,6 +9,7 @@ import torch
 from npa_envs.sph.actions import RepeatedActions
 from npa_envs.sph.draws import bernoulli_draw, integer_draw, normal_draw, uniform_draw
 from npa_envs.sph.fields import perceive
+from npa_envs.sph.network import arrange_weights, run_network
 from npa_envs.sph.operators import Rows
 from npa_envs.sph.passes import Terms
 from npa_envs.sph.picture_losses import picture_losses
@@ -44,12 +45,30 @@ def warmup(
         for space_dim in space_dims:
             x = torch.zeros(1, 2, space_dim, dtype=dtype, device=device, requires_grad=True)
             s = torch.zeros(1, 2, state_dim, dtype=dtype, device=device, requires_grad=True)
-            _pull_back(perceive(x, s, 0.1, detach_positions=False))
+            for detached in (False, True):
+                _pull_back(perceive(x, s, 0.1, detach_positions=detached))
+            _warm_network(x, s)
             _warm_update(x, s)
             _warm_actions(x, s)
             _warm_observation(x, s)
             if space_dim == 2:
                 _warm_pictures(x)
+
+
+def _warm_network(x: torch.Tensor, s: torch.Tensor) -> None:
+    """A rule's products, where they have kernels of their own."""
+    width = Terms().perception_dim(x.shape[2], s.shape[2]) + 1
+    rows, hidden, update = (
+        torch.zeros(*shape, dtype=x.dtype, device=x.device, requires_grad=True)
+        for shape in ((1, width + -width % 4), (128, width + -width % 4), (20, 128))
+    )
+    for gradients in (False, True):
+        with torch.set_grad_enabled(gradients):
+            arranged = arrange_weights(hidden, update)
+            if arranged is not None:
+                updates = run_network(rows, hidden, update, arranged)
+    if arranged is not None:
+        _pull_back(updates)
 
 
 def _warm_pictures(x: torch.Tensor) -> None:
@@ -61,8 +80,8 @@ def _warm_pictures(x: torch.Tensor) -> None:
 
 
 def _warm_observation(x: torch.Tensor, s: torch.Tensor) -> None:
-    """Small and large worlds have kernels of their own."""
-    for particle_count in (x.shape[1], 4096):
+    """Small, middling and large worlds have kernels of their own."""
+    for particle_count in (x.shape[1], 4096, 4097):
         places = x.detach()[:, :1].expand(-1, particle_count, -1)
         states = s.detach()[:, :1].expand(-1, particle_count, -1)
         survey(places, states, eps=0.1, eps0=0.1, box=None, terms=Terms(), limit=1.0).perceive()

@@ -1,0 +1,430 @@
+"""The adjoint of perception for states on CUDA in float32, by tiles of particles.
+
+The same sums as `gather_state_cotangents` of `adjoint`, in another order of work. A warp serves
+eight particles that follow each other in the sorted order: it lists the rows within eps of the box
+around them, and multiplies the rows' cotangents by the weights of all eight on tensor cores. A
+row's cotangents are so read once for eight particles.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from npa_envs.kernels.domain import domain_types, kernel_module
+from npa_envs.kernels.lanes import make_wide_load
+from npa_envs.kernels.slots import (
+    any_in_warp,
+    as_word,
+    inverse_root,
+    largest_in_warp,
+    of_lane,
+)
+from npa_envs.kernels.tiles import (
+    CHANNELS,
+    ENTRY,
+    LIST_ENTRIES,
+    TILE,
+    WARP,
+    append_entry,
+    carry_rest,
+    first_in_warp,
+    make_read_columns,
+    make_tiles,
+    of_thread,
+    pad_list,
+    prefetch_columns,
+    share_tile,
+    smallest_in_tile,
+    sum_up_to,
+    thread_of,
+    vote_of_warp,
+    write_columns,
+)
+from npa_envs.kernels.wide import make_fast_exp2, make_wide_store
+
+CUDA_REGISTERS = 64
+"""Registers of a thread that gathers state cotangents."""
+
+SHARE = 4
+"""Channels of a row that one thread unscales."""
+
+FAR = 3e38
+"""Farther than any particle, in length units."""
+
+SLACK = 1.0 + 1e-5
+"""Rows are listed within this much more than eps^2, whatever was rounded on the way."""
+
+LOG2_E = 1.4426950408889634
+
+load_integer = make_wide_load(wp.int32, wp.int32)
+load_scalar = make_wide_load(wp.float32, wp.float32)
+load_channels = make_wide_load(CHANNELS, wp.float32)
+store_channels = make_wide_store(CHANNELS, wp.float32)
+fast_exp2 = make_fast_exp2(wp.float32)
+read_channels = make_read_columns(SHARE)
+
+
+@wp.func_native("return __fdividef(value, divisor);")
+def ratio(value: wp.float32, divisor: wp.float32) -> wp.float32:
+    """A quotient, two units in the last place off at most."""
+    ...
+
+
+@wp.func
+def tangential_of(length: wp.float32, radial: wp.float32):
+    """`log_scale_tangential` |L| / (exp|L| - 1), given exp(-|L|); by its series below 1."""
+    squared = length * length
+    series = squared * (wp.float32(1.0 / 30240.0) - squared * wp.float32(1.0 / 1209600.0))
+    series = squared * (wp.float32(1.0 / 12.0) - squared * (wp.float32(1.0 / 720.0) - series))
+    series = wp.float32(1.0) - wp.float32(0.5) * length + series
+    quotient = ratio(length * radial, wp.float32(1.0) - radial)
+    return wp.where(length < wp.float32(1.0), series, quotient)
+
+
+@functools.cache
+def listed_adjoint(
+    space_dim: int,
+    width: int,
+    state_gradient: bool,
+    periodic: bool,
+    grouped: bool,
+) -> SimpleNamespace:
+    """Return the kernels of one variant.
+
+    A variant is made for a box or open space, and for channels that come in several groups. The
+    cotangents of a row's group lie together: [1 + D, W], first of the smoothed state, then of the
+    state gradient. One entry of zeros follows the last row's.
+    """
+    scalar = wp.float32
+    types = domain_types(space_dim, scalar)
+    vector, Domain = types.vector, types.Domain
+    cell_of, periodic_image = types.cell_of, types.periodic_image
+    cell_vector = wp.types.vector(space_dim, wp.int32)
+    share_gradient = wp.types.matrix((space_dim, SHARE), scalar)
+    kinds = 1 + space_dim if state_gradient else 1
+    topic = "listed_adjoint" if state_gradient else "listed_smoothing_adjoint"
+    topic += "_in_box" * periodic + "_grouped" * grouped
+    module = kernel_module(topic, space_dim, scalar, width)
+    load_vector = make_wide_load(vector, scalar)
+    parts = width // SHARE
+    tiles = make_tiles(space_dim, width, kinds, periodic)
+    list_address, sum_listed = tiles.list_address, tiles.sum_listed
+    read_gradients = make_read_columns(SHARE * space_dim)
+
+    @wp.func
+    def log_scale_pull(scaled: vector, cotangent: vector):
+        """`log_scale_adjoint` in fewer instructions."""
+        squared = wp.dot(scaled, scaled) + scalar(1e-37)
+        inverse = inverse_root(squared)
+        length = squared * inverse
+        radial = fast_exp2(scalar(-LOG2_E) * length)
+        tangential = tangential_of(length, radial)
+        along = (radial - tangential) * inverse * (inverse * wp.dot(scaled, cotangent))
+        return tangential * cotangent + along * scaled
+
+    @wp.kernel(enable_backward=False, module=module, grid_stride=False)
+    def unscale_cotangents(
+        state_dim: wp.int32,
+        gradient_scale: scalar,
+        blur_scale: scalar,
+        row_base: wp.int32,
+        row_capacity: wp.int32,
+        group_count: wp.int32,
+        starts: wp.array(dtype=wp.int32),
+        perception: wp.array(dtype=scalar, ndim=2),
+        perception_bar: wp.array(dtype=scalar, ndim=2),
+        # outputs
+        cotangents: wp.array(dtype=CHANNELS),
+    ):
+        """Pull the cotangent of z back through its scaling, into cotangents of the raw sums.
+
+        Those of the smoothed state are multiplied by `blur_scale`.
+        """
+        thread = wp.tid()
+        row_parts = group_count * wp.static(parts)
+        row = wp.int32(wp.uint32(thread) / wp.uint32(row_parts))
+        part = thread - row * row_parts
+        channel = part * wp.static(SHARE)
+        entry = row * group_count + part / wp.static(parts)
+        place = entry * wp.static(kinds * parts) + part % wp.static(parts)
+        if row == row_capacity and part < wp.static(parts):
+            for kind in range(wp.static(kinds)):
+                store_channels(cotangents, place + kind * wp.static(parts), CHANNELS())
+        if row < wp.min(load_integer(starts, starts.shape[0] - 1) - row_base, row_capacity):
+            column = state_dim + channel
+            blur = read_channels(perception_bar, row, column, 2 * state_dim)
+            store_channels(cotangents, place, blur_scale * blur)
+            if wp.static(state_gradient):
+                column = 2 * state_dim + channel * wp.static(space_dim)
+                end = (2 + wp.static(space_dim)) * state_dim
+                scaled = read_gradients(perception, row, column, end)
+                bars = read_gradients(perception_bar, row, column, end)
+                pulled = share_gradient()
+                for c in range(wp.static(SHARE)):
+                    value = vector()
+                    bar = vector()
+                    for d in range(wp.static(space_dim)):
+                        value[d] = scaled[c * wp.static(space_dim) + d]
+                        bar[d] = bars[c * wp.static(space_dim) + d]
+                    pull = gradient_scale * log_scale_pull(value, bar)
+                    for d in range(wp.static(space_dim)):
+                        pulled[d, c] = pull[d]
+                for d in range(wp.static(space_dim)):
+                    store_channels(cotangents, place + (d + 1) * wp.static(parts), pulled[d])
+
+    @wp.func
+    def lines_around(domain: Domain, d: wp.int32):
+        """Lines of cells along which neighbours lie, in one direction across them."""
+        return wp.min(wp.int32(2) * domain.reach + 1, domain.cell_shape[d])
+
+    @wp.func
+    def around(place: wp.int32, count: wp.int32):
+        """A place up to once around the grid off, within it."""
+        return wp.where(place < 0, place + count, wp.where(place < count, place, place - count))
+
+    @wp.func
+    def line_of(domain: Domain, cell: cell_vector):
+        """Number of the line of cells, in the grid's first direction, that a cell lies on."""
+        line = cell[1]
+        if wp.static(space_dim == 3):
+            line += cell[wp.static(space_dim - 1)] * domain.cell_shape[1]
+        return line
+
+    @wp.func
+    def run_cells(domain: Domain, line: wp.int32, begin: wp.int32, end: wp.int32, run: wp.int32):
+        """First cell and one past the last cell of a run, in row-major order within the world.
+
+        Runs go from a column to another on the lines around a line; where the columns wrap around
+        the grid, there are two of a line.
+        """
+        nx = domain.cell_shape[0]
+        first = begin
+        last = end
+        nearby = run
+        if end > nx:
+            nearby = run >> 1
+            first = wp.where((run & 1) == 0, begin, 0)
+            last = wp.where((run & 1) == 0, nx, end - nx)
+        base = wp.int32(0)
+        y = line
+        if wp.static(space_dim == 3):
+            z = wp.int32(wp.uint32(line) / wp.uint32(domain.cell_shape[1]))
+            y = line - z * domain.cell_shape[1]
+            lines = lines_around(domain, 1)
+            across = wp.int32(wp.uint32(nearby) / wp.uint32(lines))
+            nearby -= across * lines
+            z = around(z - domain.reach + across, domain.cell_shape[wp.static(space_dim - 1)])
+            base = z * domain.cell_shape[1]
+        base = (base + around(y - domain.reach + nearby, domain.cell_shape[1])) * nx
+        return base + first, base + last
+
+    @wp.func
+    def columns_around(domain: Domain, first: wp.int32, last: wp.int32):
+        """First column around some columns of cells and one past the last, not wrapped around."""
+        nx = domain.cell_shape[0]
+        width = wp.min(last - first + 2 * domain.reach + 1, nx)
+        begin = wp.where(width < nx, around(first - domain.reach, nx), 0)
+        return begin, begin + width
+
+    @wp.func
+    def count_runs(domain: Domain, to_column: wp.int32):
+        """Runs of cells around particles on a line, up to a column."""
+        runs = lines_around(domain, 1)
+        if wp.static(space_dim == 3):
+            runs *= lines_around(domain, wp.static(space_dim - 1))
+        return wp.where(to_column > domain.cell_shape[0], 2 * runs, runs)
+
+    @wp.func
+    def box_around(domain: Domain, position: vector, origin: vector, served: wp.bool):
+        """Middle, seen from an origin, and half sides of the box around the particles served."""
+        relative = position - origin
+        if wp.static(periodic):
+            relative = periodic_image(domain, relative)
+        middle = vector()
+        half = vector()
+        for d in range(wp.static(space_dim)):
+            low = smallest_in_tile(wp.where(served, relative[d], scalar(FAR)))
+            high = -smallest_in_tile(wp.where(served, -relative[d], scalar(FAR)))
+            middle[d] = scalar(0.5) * (low + high)
+            half[d] = scalar(0.5) * (high - low)
+        return middle, half
+
+    @wp.func
+    def near_box(domain: Domain, offset: vector, half: vector):
+        """Whether a place off the middle of a box of these half sides is within eps of the box."""
+        nearest = offset
+        if wp.static(periodic):
+            nearest = periodic_image(domain, nearest)
+        squared = scalar(0.0)
+        for d in range(wp.static(space_dim)):
+            beyond = wp.max(wp.abs(nearest[d]) - half[d], scalar(0.0))
+            squared += beyond * beyond
+        return squared < scalar(SLACK) * domain.squared_eps
+
+    @wp.func
+    def entry_of(position: vector, number: wp.int32):
+        """What a list holds of a row."""
+        entry = ENTRY()
+        for d in range(wp.static(space_dim)):
+            entry[d] = position[d]
+        entry[3] = as_word(number)
+        return entry
+
+    @wp.func
+    def load_position(particles: wp.array(dtype=scalar), k: wp.int32):
+        """Position of a particle [length units]."""
+        position = vector()
+        for d in range(wp.static(space_dim)):
+            position[d] = load_scalar(particles, k * wp.static(space_dim + 1) + d)
+        return position
+
+    @wp.func
+    def is_finite(position: vector):
+        """Whether all coordinates are numbers."""
+        finite = wp.bool(True)
+        for d in range(wp.static(space_dim)):
+            finite = finite and wp.abs(position[d]) < scalar(FAR)
+        return finite
+
+    @wp.kernel(
+        enable_backward=False, module=module, cuda_max_registers=CUDA_REGISTERS, grid_stride=False
+    )
+    def gather_state_cotangents(
+        domain: Domain,
+        norm: scalar,
+        particle_count: wp.int32,
+        tile_count: wp.int32,
+        state_dim: wp.int32,
+        active_offset: wp.int32,
+        row_base: wp.int32,
+        row_capacity: wp.int32,
+        group_count: wp.int32,
+        starts: wp.array(dtype=wp.int32),
+        particles: wp.array(dtype=scalar),
+        source: wp.array(dtype=wp.int32),
+        row_of: wp.array(dtype=wp.int32),
+        row_positions: wp.array(dtype=vector),
+        row_kernel_sum: wp.array(dtype=vector),
+        perception_bar: wp.array(dtype=scalar, ndim=2),
+        cotangents: wp.array(dtype=CHANNELS),
+        flat_cotangents: wp.array(dtype=scalar),
+        # outputs
+        states_bar: wp.array(dtype=scalar, ndim=2),
+    ):
+        """Write the cotangent of every particle's state, from the active rows around it.
+
+        A world has `tile_count` tiles; a warp serves a group of a tile's channels. All cotangents
+        are multiplied by `norm`.
+        """
+        thread = wp.tid()
+        lane = thread & wp.static(WARP - 1)
+        tile = thread / wp.static(WARP)
+        g = wp.int32(0)
+        if wp.static(grouped):
+            g = tile % group_count
+            tile = tile / group_count
+        world = wp.int32(wp.uint32(tile) / wp.uint32(tile_count))
+        first = world * particle_count + (tile - world * tile_count) * wp.static(TILE)
+        end = wp.min(first + wp.static(TILE), (world + 1) * particle_count)
+        base = active_offset + world * domain.cell_count
+        # A thread weighs rows for one particle, and in the end writes four channels of another.
+        k = first + (lane >> 2)
+        written = first + 2 * (lane & 3) + ((lane >> 2) & 1)
+        part = lane >> 3
+        channel = g * wp.static(width) + part * wp.static(SHARE)
+        i = load_integer(source, wp.min(written, end - 1))
+        position = load_position(particles, wp.min(k, end - 1))
+        own_row = load_integer(row_of, i)
+        if own_row >= 0 and channel < state_dim:
+            prefetch_columns(perception_bar, own_row, channel)
+        cell = cell_of(domain, position)
+        line = line_of(domain, cell)
+        list = list_address()
+        total = CHANNELS()
+        # A position that is not a number is near to nothing.
+        waiting = k < end and is_finite(position)
+        while any_in_warp(waiting):
+            # The first particle that waits is served, and with it those on its line of cells.
+            leader = first_in_warp(waiting)
+            column = of_lane(cell[0], leader, wp.uint32(WARP))
+            middle_line = of_lane(line, leader, wp.uint32(WARP))
+            served = waiting and line == middle_line
+            waiting = waiting and line != middle_line
+            origin = vector()
+            for d in range(wp.static(space_dim)):
+                origin[d] = of_thread(position[d], leader)
+            middle, half = box_around(domain, position, origin, served)
+            last_column = largest_in_warp(wp.where(served, cell[0], 0))
+            from_column, to_column = columns_around(domain, column, last_column)
+            run_count = count_runs(domain, to_column)
+            count = wp.int32(0)
+            found = CHANNELS()
+            for first_run in range(0, run_count, wp.static(WARP)):
+                run = first_run + lane
+                run_begin = wp.int32(0)
+                length = wp.int32(0)
+                if run < run_count:
+                    from_cell, to_cell = run_cells(domain, middle_line, from_column, to_column, run)
+                    run_begin = load_integer(starts, base + from_cell) - row_base
+                    run_end = load_integer(starts, base + to_cell) - row_base
+                    length = wp.max(wp.min(run_end, row_capacity) - run_begin, 0)
+                run_ends = sum_up_to(length)
+                candidates = of_lane(run_ends, wp.static(WARP - 1), wp.uint32(WARP))
+                shift = run_begin - (run_ends - length)
+                candidate = wp.int32(lane)
+                searching = wp.bool(True)
+                while searching:
+                    row = candidate + of_lane(
+                        shift, thread_of(run_ends, candidate), wp.uint32(WARP)
+                    )
+                    inside = candidate < candidates
+                    other = load_vector(row_positions, wp.where(inside, row, 0))
+                    near = near_box(domain, (other - origin) - middle, half)
+                    entry = entry_of(other, row * group_count + g)
+                    count = append_entry(list, count, inside and near, entry)
+                    candidate += wp.static(WARP)
+                    searching = candidate - lane < candidates
+                    finished = not searching and first_run + wp.static(WARP) >= run_count
+                    if finished or count > wp.static(LIST_ENTRIES - WARP):
+                        summed = count & ~wp.int32(wp.static(TILE - 1))
+                        if finished:
+                            # Beside the last row are cotangents of nothing.
+                            nothing = entry_of(origin, row_capacity * group_count)
+                            summed = pad_list(list, count, nothing)
+                        found = sum_listed(
+                            list,
+                            summed,
+                            position,
+                            domain.inverse_eps,
+                            domain.inverse_squared_eps,
+                            domain.box,
+                            domain.inverse_box,
+                            flat_cotangents,
+                            found,
+                        )
+                        carry_rest(list, summed, count)
+                        count = wp.max(count - summed, 0)
+            votes = vote_of_warp(served) >> wp.uint32(8 * (lane & 3))
+            for n in range(2):
+                if (votes & wp.uint32(1 << (4 * n))) != wp.uint32(0):
+                    total[n] += found[n]
+                    total[n + 2] += found[n + 2]
+        total = share_tile(total)
+        if written < end and part * wp.static(SHARE) < wp.static(width) and channel < state_dim:
+            volume_place = written * wp.static(space_dim + 1) + wp.static(space_dim)
+            bar = (norm * load_scalar(particles, volume_place)) * total
+            if own_row >= 0:
+                bar += read_channels(perception_bar, own_row, channel, state_dim)
+                if wp.static(state_gradient):
+                    place = (own_row * group_count + g) * wp.static(kinds * parts) + part
+                    kernel_sum = load_vector(row_kernel_sum, own_row)
+                    for d in range(wp.static(space_dim)):
+                        bar -= kernel_sum[d] * load_channels(
+                            cotangents, place + (d + 1) * wp.static(parts)
+                        )
+            write_columns(states_bar, i, channel, bar)
+
+    return SimpleNamespace(
+        unscale_cotangents=unscale_cotangents, gather_state_cotangents=gather_state_cotangents
+    )

@@ -1,0 +1,177 @@
+"""The rule's network on CUDA in float32: fused kernels, and the weights laid out for them."""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from npa_envs.kernels.products import (
+    OUTPUT_TARGET,
+    UNIT_TARGET,
+    make_two_layers,
+    scale_to,
+)
+from npa_envs.kernels.weight_sums import add_partial_sums, make_weight_sums
+
+LANES = 32
+"""Threads of a warp: each holds its part of every fragment."""
+
+LAYER_REGISTERS, GRADIENT_REGISTERS = 168, 255
+"""Registers of a thread of the two kinds of kernels."""
+
+
+@functools.cache
+def arrangement_kernels() -> SimpleNamespace:
+    """Return the kernels that lay out weights in the order in which the lanes of a warp read them.
+
+    Each number is split in two halves; `products` says how fragments lie in a warp.
+    """
+    module = wp.get_module("npa_envs.kernels.network_arrangement")
+
+    @wp.kernel(enable_backward=False, module=module)
+    def arrange_hidden(
+        weights: wp.array(dtype=wp.float32, ndim=2),
+        # outputs
+        unit_unscale: wp.array(dtype=wp.float32),
+        fragments: wp.array(dtype=wp.float16),
+    ):
+        """Scale and lay out a first layer [H, width]; threads (H / 8, width / 16, lanes)."""
+        tile, step, lane = wp.tid()
+        unit = 8 * tile + lane / 4
+        size = wp.float32(0.0)
+        for column in range(weights.shape[1]):
+            size += wp.abs(weights[unit, column])
+        scale = scale_to(size, wp.uint32(wp.static(UNIT_TARGET)))
+        if step == 0 and lane % 4 == 0:
+            unit_unscale[unit] = wp.float32(1.0) / scale
+        first = ((tile * ((weights.shape[1] + 15) / 16) + step) * wp.static(LANES) + lane) * 8
+        for i in range(4):
+            column = 16 * step + lane % 4 * 4 + i
+            value = wp.float32(0.0)
+            if column < weights.shape[1]:
+                value = weights[unit, column] * scale
+            high = wp.float16(value)
+            fragments[first + i] = high
+            fragments[first + 4 + i] = wp.float16(value - wp.float32(high))
+
+    @wp.kernel(enable_backward=False, module=module)
+    def arrange_output(
+        weights: wp.array(dtype=wp.float32, ndim=2),
+        unit_unscale: wp.array(dtype=wp.float32),
+        # outputs
+        output_unscale: wp.array(dtype=wp.float32),
+        fragments: wp.array(dtype=wp.float16),
+    ):
+        """Scale and lay out a second layer [width, H]; threads (H / 16, width / 8, lanes)."""
+        step, tile, lane = wp.tid()
+        column = 8 * tile + lane / 4
+        size = wp.float32(0.0)
+        if column < weights.shape[0]:
+            for unit in range(weights.shape[1]):
+                size = wp.max(size, wp.abs(weights[column, unit] * unit_unscale[unit]))
+        scale = scale_to(size, wp.uint32(wp.static(OUTPUT_TARGET)))
+        if step == 0 and lane % 4 == 0:
+            output_unscale[column] = wp.float32(1.0) / scale
+        first = ((step * ((weights.shape[0] + 7) / 8) + tile) * wp.static(LANES) + lane) * 8
+        for i in range(4):
+            unit = 16 * step + lane % 4 * 2 + i % 2 + i / 2 * 8
+            value = wp.float32(0.0)
+            if column < weights.shape[0]:
+                value = weights[column, unit] * unit_unscale[unit] * scale
+            high = wp.float16(value)
+            fragments[first + i] = high
+            fragments[first + 4 + i] = wp.float16(value - wp.float32(high))
+
+    @wp.kernel(enable_backward=False, module=module)
+    def arrange_left(
+        weights: wp.array(dtype=wp.float32, ndim=2),
+        # outputs
+        fragments: wp.array(dtype=wp.bfloat16),
+    ):
+        """Lay out [H, width] as a left operand; threads (H / 16, width / 16, lanes)."""
+        group, step, lane = wp.tid()
+        place = (group * ((weights.shape[1] + 15) / 16) + step) * 2 * wp.static(LANES)
+        first = (place + lane) * 8
+        for i in range(8):
+            unit = 16 * group + lane / 4 + i / 2 % 2 * 8
+            column = 16 * step + lane % 4 * 2 + i % 2 + i / 4 * 8
+            value = wp.float32(0.0)
+            if column < weights.shape[1]:
+                value = weights[unit, column]
+            high = wp.bfloat16(value)
+            fragments[first + i] = high
+            fragments[first + 8 * wp.static(LANES) + i] = wp.bfloat16(value - wp.float32(high))
+
+    return SimpleNamespace(
+        arrange_hidden=arrange_hidden, arrange_output=arrange_output, arrange_left=arrange_left
+    )
+
+
+@functools.cache
+def two_layer_kernel(steps: int, tiles: int, mode: str) -> wp.Kernel:
+    """Return the kernel of two products, row by row: `make_two_layers` names the variants."""
+    name = f"npa_envs.kernels.network_{mode}_{steps}_{tiles}"
+    two_layers = make_two_layers(steps, tiles, mode)
+
+    @wp.kernel(
+        enable_backward=False, module=wp.get_module(name), cuda_max_registers=LAYER_REGISTERS
+    )
+    def network_layers(
+        unit_count: wp.int32,
+        input: wp.array(dtype=wp.float32, ndim=2),
+        hidden_weights: wp.array(dtype=wp.float16),
+        output_weights: wp.array(dtype=wp.float16),
+        output_unscale: wp.array(dtype=wp.float32),
+        signs: wp.array(dtype=wp.int32, ndim=2),
+        # outputs
+        output: wp.array(dtype=wp.float32, ndim=2),
+    ):
+        """Map rows through both layers; the hidden units between stay in registers."""
+        two_layers(unit_count, input, hidden_weights, output_weights, output_unscale, signs, output)
+
+    return network_layers
+
+
+@functools.cache
+def weight_gradient_kernels(
+    steps: int, tiles: int, out_tiles: int, warps: int, unit_blocks: int, words: int
+) -> SimpleNamespace:
+    """Return the kernels of the weights' gradients: `make_weight_sums` names the variants."""
+    variant = f"{steps}_{tiles}_{out_tiles}_{warps}_{unit_blocks}_{words}"
+    module = wp.get_module(f"npa_envs.kernels.network_gradients_{variant}")
+    weight_sums = make_weight_sums(steps, tiles, out_tiles, warps, unit_blocks, words)
+
+    @wp.kernel(enable_backward=False, module=module, cuda_max_registers=GRADIENT_REGISTERS)
+    def sum_weight_gradients(
+        unit_count: wp.int32,
+        share_rows: wp.int32,
+        input: wp.array(dtype=wp.float32, ndim=2),
+        output_bar: wp.array(dtype=wp.float32, ndim=2),
+        signs: wp.array(dtype=wp.int32, ndim=2),
+        hidden_weights: wp.array(dtype=wp.bfloat16),
+        output_weights: wp.array(dtype=wp.bfloat16),
+        # outputs
+        partial_sums: wp.array(dtype=wp.float32, ndim=2),
+    ):
+        """Sum both weights' gradients over each share of the rows."""
+        weight_sums(
+            unit_count,
+            share_rows,
+            input,
+            output_bar,
+            signs,
+            hidden_weights,
+            output_weights,
+            partial_sums,
+        )
+
+    @wp.kernel(enable_backward=False, module=module)
+    def add_shares(
+        partial_sums: wp.array(dtype=wp.float32, ndim=2),
+        # outputs
+        total: wp.array(dtype=wp.float32),
+    ):
+        """Add the shares' sums."""
+        add_partial_sums(partial_sums, total)
+
+    return SimpleNamespace(sum_weight_gradients=sum_weight_gradients, add_shares=add_shares)

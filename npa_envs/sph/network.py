@@ -1,0 +1,339 @@
+"""The rule's network as fused operators on CUDA's tensor cores, with their adjoint."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from npa_envs.kernels.network import (
+    LANES,
+    arrangement_kernels,
+    two_layer_kernel,
+    weight_gradient_kernels,
+)
+from npa_envs.kernels.products import UNIT_GROUP
+from npa_envs.kernels.weight_sums import WARP_UNITS
+from npa_envs.sph.bridge import launch
+
+LARGEST_ROW, LARGEST_UPDATE, LARGEST_HIDDEN = 128, 32, 512
+"""Widest rows and updates, and most hidden units, that the fused kernels take."""
+
+SMALLEST_CAPABILITY = (8, 0)
+"""Compute capability from which on tensor cores multiply what the kernels need."""
+
+ROW_GROUP = 16
+"""Rows of a fragment."""
+
+LAYER_BLOCK = 64
+"""Threads of a block that maps rows: small, so that few rows still fill the device."""
+
+SHARES_PER_PROCESSOR = 2
+"""Blocks of a multiprocessor that sum weight gradients side by side."""
+
+SIGN_UNITS = 128
+"""Hidden units whose signs are one word for each of the four lanes that share a row."""
+
+
+class ArrangedWeights(NamedTuple):
+    """A rule's folded weights as the fused kernels read them."""
+
+    forward: list[Tensor]
+    """Fragments of W1 and of W2, float16, and the scales of updates, float32."""
+    backward: list[Tensor]
+    """The same of both transposed, then fragments of both, bfloat16; empty without gradients."""
+
+
+def fits_network(hidden_weight: Tensor, output_weight: Tensor) -> bool:
+    """Return whether the fused kernels take a rule's folded weights.
+
+    They run on CUDA from compute capability 8.0 on, in float32, for rows of up to 128 columns and
+    updates of up to 32, both multiples of 4, and for up to 512 hidden units, a multiple of 32.
+
+    Args:
+        hidden_weight: Weights of the hidden units, shape [H, row_width].
+        output_weight: Weights of the updates, shape [A', H].
+    """
+    hidden, width = hidden_weight.shape
+    return (
+        hidden_weight.is_cuda
+        and hidden_weight.dtype == torch.float32
+        and torch.cuda.get_device_capability(hidden_weight.device) >= SMALLEST_CAPABILITY
+        and width % 4 == output_weight.shape[0] % 4 == hidden % WARP_UNITS == 0
+        and width <= LARGEST_ROW
+        and output_weight.shape[0] <= LARGEST_UPDATE
+        and hidden <= LARGEST_HIDDEN
+    )
+
+
+def _arrange_layers(first: Tensor, second: Tensor) -> list[Tensor]:
+    """Lay out two layers' weights, [H, width] and [width', H]: fragments and output scales."""
+    hidden, width = first.shape
+    steps, tiles = -(-width // 16), -(-second.shape[0] // 8)
+    half = functools.partial(torch.empty, dtype=torch.float16, device=first.device)
+    fragments = half(hidden * steps * 32), half(hidden * tiles * 16)
+    unit_unscale, output_unscale = first.new_empty(hidden), first.new_empty(8 * tiles)
+    kernels = arrangement_kernels()
+    launch(
+        kernels.arrange_hidden,
+        (hidden // 8, steps, LANES),
+        first.device,
+        first,
+        unit_unscale,
+        fragments[0],
+    )
+    launch(
+        kernels.arrange_output,
+        (hidden // UNIT_GROUP, tiles, LANES),
+        first.device,
+        second,
+        unit_unscale,
+        output_unscale,
+        fragments[1],
+    )
+    return [*fragments, output_unscale]
+
+
+def _arrange_left(weight: Tensor) -> Tensor:
+    """Lay out weights [H, width] as the left operand of a product."""
+    hidden, width = weight.shape
+    steps = -(-width // 16)
+    fragments = torch.empty(hidden * steps * 32, dtype=torch.bfloat16, device=weight.device)
+    launch(
+        arrangement_kernels().arrange_left,
+        (hidden // UNIT_GROUP, steps, LANES),
+        weight.device,
+        weight,
+        fragments,
+    )
+    return fragments
+
+
+@torch.library.custom_op("npa::arrange_weights", mutates_args=())
+def _arrange_weights(
+    hidden_weight: Tensor, output_weight: Tensor, with_backward: bool
+) -> list[Tensor]:
+    arranged = _arrange_layers(hidden_weight, output_weight)
+    if with_backward:
+        arranged += _arrange_layers(output_weight.T, hidden_weight.T)
+        arranged += [_arrange_left(hidden_weight), _arrange_left(output_weight.T)]
+    return arranged
+
+
+@_arrange_weights.register_fake
+def _(hidden_weight: Tensor, output_weight: Tensor, with_backward: bool) -> list[Tensor]:
+    def layers(hidden: int, width: int, out_width: int) -> list[Tensor]:
+        steps, tiles = -(-width // 16), -(-out_width // 8)
+        half = functools.partial(hidden_weight.new_empty, dtype=torch.float16)
+        fragments = [half(hidden * steps * 32), half(hidden * tiles * 16)]
+        return [*fragments, hidden_weight.new_empty(8 * tiles)]
+
+    (hidden, width), out_width = hidden_weight.shape, output_weight.shape[0]
+    arranged = layers(hidden, width, out_width)
+    if with_backward:
+        arranged += layers(hidden, out_width, width)
+        for columns in (width, out_width):
+            size = hidden * -(-columns // 16) * 32
+            arranged.append(hidden_weight.new_empty(size, dtype=torch.bfloat16))
+    return arranged
+
+
+def arrange_weights(hidden_weight: Tensor, output_weight: Tensor) -> ArrangedWeights | None:
+    """Lay out a rule's folded weights for `run_network`; None where it does not take them.
+
+    Args:
+        hidden_weight: Weights of the hidden units, shape [H, row_width].
+        output_weight: Weights of the updates, shape [A', H].
+    """
+    fits = fits_network(hidden_weight, output_weight)
+    return _arrange(hidden_weight, output_weight) if fits else None
+
+
+def _arrange(hidden_weight: Tensor, output_weight: Tensor) -> ArrangedWeights:
+    """Lay out weights that fit, for the backward pass too where gradients are enabled."""
+    arranged = _arrange_weights(
+        hidden_weight.detach().contiguous(),
+        output_weight.detach().contiguous(),
+        torch.is_grad_enabled(),
+    )
+    return ArrangedWeights(arranged[:3], arranged[3:])
+
+
+def _aligned(rows: Tensor) -> Tensor:
+    """Return contiguous rows, which are read 16 bytes at a time, moved if they begin elsewhere."""
+    rows = rows.contiguous()
+    return rows if rows.data_ptr() % 16 == 0 else rows.clone()
+
+
+def _map_rows(
+    rows: Tensor,
+    arranged: list[Tensor],
+    out_width: int,
+    unit_count: int,
+    signs: Tensor | None,
+    mode: str,
+) -> Tensor:
+    """Run two layers on rows [K, width], as `make_two_layers` says; returns [K, out_width]."""
+    steps, tiles = -(-rows.shape[1] // 16), -(-out_width // 8)
+    output = rows.new_empty(rows.shape[0], out_width)
+    warps = -(-rows.shape[0] // ROW_GROUP)
+    launch(
+        two_layer_kernel(steps, tiles, mode),
+        -(-warps * LANES // LAYER_BLOCK) * LAYER_BLOCK,
+        rows.device,
+        unit_count,
+        _aligned(rows),
+        *arranged[:3],
+        signs,
+        output,
+        block_dim=LAYER_BLOCK,
+    )
+    return output
+
+
+@torch.library.custom_op("npa::run_network", mutates_args=())
+def _run_network(
+    rows: Tensor, arranged: list[Tensor], out_width: int, unit_count: int, noting: bool
+) -> tuple[Tensor, Tensor]:
+    words = _sign_words(unit_count) if noting else 0
+    signs = rows.new_empty(rows.shape[0], words, dtype=torch.int32)
+    mode = "note" if noting else "rectify"
+    return _map_rows(rows, arranged, out_width, unit_count, signs, mode), signs
+
+
+@_run_network.register_fake
+def _(
+    rows: Tensor, arranged: list[Tensor], out_width: int, unit_count: int, noting: bool
+) -> tuple[Tensor, Tensor]:
+    words = _sign_words(unit_count) if noting else 0
+    signs = rows.new_empty(rows.shape[0], words, dtype=torch.int32)
+    return rows.new_empty(rows.shape[0], out_width), signs
+
+
+def _sign_words(unit_count: int) -> int:
+    """Return how many words hold the signs of a row's hidden units."""
+    return 4 * -(-unit_count // SIGN_UNITS)
+
+
+@torch.library.custom_op("npa::run_network_backward", mutates_args=())
+def _run_network_backward(
+    update_bar: Tensor, arranged: list[Tensor], signs: Tensor, width: int, unit_count: int
+) -> Tensor:
+    return _map_rows(update_bar, arranged, width, unit_count, signs, "mask")
+
+
+@_run_network_backward.register_fake
+def _(
+    update_bar: Tensor, arranged: list[Tensor], signs: Tensor, width: int, unit_count: int
+) -> Tensor:
+    return update_bar.new_empty(update_bar.shape[0], width)
+
+
+@torch.library.custom_op("npa::network_weight_gradients", mutates_args=())
+def _weight_gradients(
+    rows: Tensor, update_bar: Tensor, signs: Tensor, arranged: list[Tensor], unit_count: int
+) -> Tensor:
+    count, width = rows.shape
+    out_width = update_bar.shape[1]
+    warps = next(n for n in (4, 3, 2, 1) if unit_count // WARP_UNITS % n == 0)
+    unit_blocks = unit_count // WARP_UNITS // warps
+    kernels = weight_gradient_kernels(
+        -(-width // 16), -(-width // 8), -(-out_width // 8), warps, unit_blocks, signs.shape[1]
+    )
+    processors = torch.cuda.get_device_properties(rows.device).multi_processor_count
+    most = max(SHARES_PER_PROCESSOR * processors // unit_blocks, 1)
+    share_rows = max(-(-count // (most * ROW_GROUP)), 1) * ROW_GROUP
+    shares = -(-count // share_rows)
+    partial_sums = rows.new_empty(shares, unit_count * (width + out_width))
+    launch(
+        kernels.sum_weight_gradients,
+        shares * unit_blocks * warps * LANES,
+        rows.device,
+        unit_count,
+        share_rows,
+        _aligned(rows),
+        _aligned(update_bar),
+        signs,
+        *arranged[3:],
+        partial_sums,
+        block_dim=warps * LANES,
+    )
+    total = rows.new_empty(partial_sums.shape[1])
+    launch(
+        kernels.add_shares,
+        -(-total.shape[0] // LANES) * 4 * LANES,
+        rows.device,
+        partial_sums,
+        total,
+    )
+    return total
+
+
+@_weight_gradients.register_fake
+def _(
+    rows: Tensor, update_bar: Tensor, signs: Tensor, arranged: list[Tensor], unit_count: int
+) -> Tensor:
+    return rows.new_empty(unit_count * (rows.shape[1] + update_bar.shape[1]))
+
+
+class _Network(torch.autograd.Function):
+    """Raw updates of rows of perception."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        rows: Tensor,
+        hidden_weight: Tensor,
+        output_weight: Tensor,
+        arranged: ArrangedWeights,
+        noting: bool,
+    ) -> Tensor:
+        out_width, unit_count = output_weight.shape
+        update: Tensor
+        update, signs = _run_network(rows, arranged.forward, out_width, unit_count, noting)
+        if noting:
+            ctx.save_for_backward(rows, signs, *arranged.backward)
+        ctx.unit_count = unit_count
+        return update
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, update_bar: Tensor) -> tuple[Tensor | None, ...]:
+        rows, signs, *arranged = ctx.saved_tensors
+        unit_count, width = ctx.unit_count, rows.shape[1]
+        rows_bar = hidden_bar = output_bar = None
+        if ctx.needs_input_grad[0]:
+            rows_bar = _run_network_backward(update_bar, arranged, signs, width, unit_count)
+        if any(ctx.needs_input_grad[1:3]):
+            total = _weight_gradients(rows, update_bar, signs, arranged, unit_count)
+            hidden_bar = total[: unit_count * width].view(unit_count, width)
+            output_bar = total[unit_count * width :].view(-1, unit_count)
+        return rows_bar, hidden_bar, output_bar, None, None
+
+
+def run_network(
+    rows: Tensor, hidden_weight: Tensor, output_weight: Tensor, arranged: ArrangedWeights
+) -> Tensor:
+    """Map rows to relu(rows W1.T) W2.T, as accurate as products in float32.
+
+    A row's result depends on nothing but that row and the weights.
+
+    Args:
+        rows: Rows of perception, dimensionless, shape [K, row_width].
+        hidden_weight: Weights W1 of the hidden units, shape [H, row_width].
+        output_weight: Weights W2 of the updates, shape [A', H].
+        arranged: The same weights as `arrange_weights` laid them out; again where gradients were
+            not enabled then and are now.
+
+    Returns:
+        Raw updates, dimensionless, shape [K, A'].
+    """
+    noting = torch.is_grad_enabled()
+    if noting and not arranged.backward:
+        arranged = _arrange(hidden_weight, output_weight)
+    update: Tensor = _Network.apply(  # type: ignore[no-untyped-call]
+        rows, hidden_weight, output_weight, arranged, noting
+    )
+    return update

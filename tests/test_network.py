@@ -1,0 +1,231 @@
+"""The rule's network as one operator: fused on CUDA in float32, plain products elsewhere."""
+
+import pytest
+import torch
+
+import npa_envs
+from npa_envs.rule import FoldedRule, NPARule
+
+# Norms of errors over norms of answers, against float64; beside, the worst measured on an H200.
+FORWARD_TOLERANCE = 1e-6  # 2.5e-7
+ROW_GRADIENT_TOLERANCE = 1e-6  # 2.1e-7
+WEIGHT_GRADIENT_TOLERANCE = 1e-5  # 6.9e-6
+
+SIZES = [
+    # space_dim, state_dim, hidden_dim, static
+    (2, 16, 128, False),
+    (2, 16, 64, False),
+    (2, 16, 256, True),
+    (3, 16, 256, False),
+    (2, 4, 32, False),
+    (2, 24, 512, False),
+    (3, 24, 128, False),
+]
+
+
+def trained_like_rule(device, space_dim=2, state_dim=16, hidden_dim=128, static=False):
+    torch.manual_seed(0)
+    rule = NPARule(space_dim, state_dim, hidden_dim, static=static)
+    with torch.no_grad():
+        for parameter in rule.parameters():
+            parameter.mul_(5.0)
+    return rule.to(device)
+
+
+def random_rows(rule, folded, row_count):
+    """Rows of perception whose hidden units all keep away from zero, where relu has a corner."""
+    generator = torch.Generator().manual_seed(1)
+    rows = torch.zeros(2 * row_count, folded.row_width)
+    rows[:, : rule.perception_dim] = torch.randn(
+        2 * row_count, rule.perception_dim, generator=generator
+    )
+    rows[:, rule.perception_dim] = 1.0
+    hidden = rows.double() @ folded.hidden_weight.detach().double().cpu().T
+    clear = hidden.abs().amin(dim=1) > 1e-6
+    return rows[clear][:row_count].to(folded.hidden_weight)
+
+
+def pulled_back(function, inputs, cotangent):
+    inputs = [value.detach().requires_grad_() for value in inputs]
+    update = function(*inputs)
+    bars = torch.autograd.grad(update, inputs, cotangent.expand_as(update))
+    return update.detach(), bars
+
+
+def error(value, answer):
+    return ((value.double() - answer).norm() / answer.norm()).item()
+
+
+def plain_update(rows, hidden_weight, output_weight):
+    return torch.relu(rows @ hidden_weight.T) @ output_weight.T
+
+
+def needs_cuda(device):
+    if device.type != "cuda":
+        pytest.skip("the fused network is CUDA's")
+
+
+@pytest.mark.parametrize("row_count", [1, 33, 2000])
+@pytest.mark.parametrize("sizes", SIZES)
+def test_network_and_its_gradients_equal_float64(sizes, row_count, device):
+    rule = trained_like_rule(device, *sizes)
+    folded = rule.folded()
+    assert (folded.arranged is not None) == (device.type == "cuda")
+    rows = random_rows(rule, folded, row_count)
+    inputs = (rows, folded.hidden_weight, folded.output_weight)
+    cotangent = torch.randn(row_count, folded.output_weight.shape[0], device=device)
+    cotangent *= 10.0 ** torch.linspace(-4.0, 2.0, row_count, device=device)[:, None]
+    got = pulled_back(lambda x, *w: FoldedRule(*w, folded.arranged)(x), inputs, cotangent)
+    wide = [value.double() for value in inputs]
+    want = pulled_back(plain_update, wide, cotangent.double())
+    assert error(got[0], want[0]) < FORWARD_TOLERANCE
+    assert error(got[1][0], want[1][0]) < ROW_GRADIENT_TOLERANCE
+    for value, answer in zip(got[1][1:], want[1][1:], strict=True):
+        assert error(value, answer) < WEIGHT_GRADIENT_TOLERANCE
+
+
+@pytest.mark.parametrize("scale", [1e-20, 1e-6, 1e6, 1e20])
+def test_network_is_as_accurate_at_any_scale(scale, device):
+    rule = trained_like_rule(device)
+    folded = rule.folded()
+    rows = random_rows(rule, folded, 200) * scale
+    expected = plain_update(
+        rows.double(), folded.hidden_weight.double(), folded.output_weight.double()
+    )
+    assert error(folded(rows), expected) < FORWARD_TOLERANCE
+
+
+def test_a_row_depends_on_no_other_row(device):
+    needs_cuda(device)
+    rule = trained_like_rule(device)
+    folded = rule.folded()
+    rows = random_rows(rule, folded, 1003)
+    cotangent = torch.randn(1003, folded.output_weight.shape[0], device=device)
+    copies = 2**16 // 1003 + 1
+    results = []
+    for count in (1, copies):
+        wide = rows.repeat(count, 1).requires_grad_()
+        update = folded(wide)
+        (rows_bar,) = torch.autograd.grad(update, wide, cotangent.repeat(count, 1))
+        results.append((update.view(count, 1003, -1), rows_bar.view(count, 1003, -1)))
+    for alone, among_others in zip(*results, strict=True):
+        assert torch.equal(alone.expand_as(among_others), among_others)
+    assert torch.equal(folded(rows[5:6]), folded(rows)[5:6])
+
+
+def test_network_is_bit_identical_from_run_to_run(device):
+    rule = trained_like_rule(device)
+    folded = rule.folded()
+    rows = random_rows(rule, folded, 5000)
+    inputs = (rows, folded.hidden_weight, folded.output_weight)
+    cotangent = torch.randn(5000, folded.output_weight.shape[0], device=device)
+    runs = [
+        pulled_back(lambda x, *w: FoldedRule(*w, folded.arranged)(x), inputs, cotangent)
+        for _ in range(2)
+    ]
+    assert torch.equal(runs[0][0], runs[1][0])
+    assert all(torch.equal(*pair) for pair in zip(runs[0][1], runs[1][1], strict=True))
+
+
+def test_network_without_gradients_is_the_same(device):
+    rule = trained_like_rule(device)
+    rows = random_rows(rule, rule.folded(), 300)
+    with torch.no_grad():
+        quiet = rule.folded()(rows)
+    assert torch.equal(quiet, rule.folded()(rows).detach())
+
+
+def test_rows_may_lie_anywhere(device):
+    rule = trained_like_rule(device)
+    folded = rule.folded()
+    rows = random_rows(rule, folded, 50)
+    shifted = torch.zeros(rows.numel() + 1, device=device)[1:].view_as(rows).copy_(rows)
+    strided = rows.repeat_interleave(2, dim=1)[:, ::2]
+    expected, (expected_bar,) = pulled_back(folded, [rows], torch.ones(50, 1, device=device))
+    for same in (shifted, strided):
+        update, (rows_bar,) = pulled_back(folded, [same], torch.ones(50, 1, device=device))
+        assert torch.equal(update, expected)
+        assert torch.equal(rows_bar, expected_bar)
+
+
+def test_weights_folded_without_gradients_still_have_them(device):
+    rule = trained_like_rule(device)
+    with torch.no_grad():
+        weights = rule.folded()
+    rows = random_rows(rule, weights, 100).requires_grad_()
+    (got,) = torch.autograd.grad(weights(rows).sum(), rows)
+    (want,) = torch.autograd.grad(rule.folded()(rows).sum(), rows)
+    assert torch.equal(got, want)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+def test_values_that_are_not_finite_stay_so(value, device):
+    rule = trained_like_rule(device)
+    folded = rule.folded()
+    rows = random_rows(rule, folded, 40)
+    clean = folded(rows)
+    rows[7, 3] = value
+    update = folded(rows)
+    assert not torch.isfinite(update[7, : rule.update_dim]).any()
+    assert torch.equal(update[:7], clean[:7])
+    assert torch.equal(update[8:], clean[8:])
+
+
+def test_rows_of_zeros_give_zeros_and_no_gradient(device):
+    rule = trained_like_rule(device)
+    folded = rule.folded()
+    rows = torch.zeros(50, folded.row_width, device=device, requires_grad=True)
+    update = folded(rows)
+    grads = torch.autograd.grad(update.sum(), (rows, *folded[:2]), retain_graph=True)
+    assert not update.any()
+    assert not any(grad.any() for grad in grads)
+
+
+def test_gradient_of_one_input_equals_that_of_all(device):
+    rule = trained_like_rule(device)
+    folded = rule.folded()
+    rows = random_rows(rule, folded, 100).requires_grad_()
+    total = folded(rows).square().sum()
+    together = torch.autograd.grad(total, (rows, *folded[:2]), retain_graph=True)
+    alone = [torch.autograd.grad(total, x, retain_graph=True)[0] for x in (rows, *folded[:2])]
+    assert all(torch.equal(a, b) for a, b in zip(together, alone, strict=True))
+
+
+@pytest.mark.parametrize("hidden_dim", [24, 544])
+def test_other_sizes_use_plain_products(hidden_dim, device):
+    rule = trained_like_rule(device, hidden_dim=hidden_dim)
+    folded = rule.folded()
+    assert folded.arranged is None
+    rows = random_rows(rule, folded, 20)
+    expected = plain_update(rows, folded.hidden_weight, folded.output_weight)
+    torch.testing.assert_close(folded(rows), expected)
+
+
+def test_float64_uses_plain_products(device):
+    assert trained_like_rule(device).double().folded().arranged is None
+
+
+def test_a_compiled_network_equals_the_eager_one(device):
+    needs_cuda(device)
+    rule = trained_like_rule(device)
+    rows = random_rows(rule, rule.folded(), 300)
+
+    def squares(rows):
+        return rule.folded()(rows).square().sum()
+
+    compiled = torch.compile(squares, backend="aot_eager", fullgraph=True)
+    got = torch.autograd.grad(compiled(rows), list(rule.parameters()))
+    want = torch.autograd.grad(squares(rows), list(rule.parameters()))
+    assert all(torch.equal(*pair) for pair in zip(got, want, strict=True))
+
+
+def test_rollout_of_a_world_is_the_same_alone_and_in_a_batch(device):
+    needs_cuda(device)
+    rule = trained_like_rule(device)
+    x = torch.rand(40, 1024, 2, device=device) - 0.5
+    s = torch.randn(40, 1024, 16, device=device) * 0.1
+    with torch.no_grad():
+        batch = npa_envs.rollout(rule, x, s, 3, update_prob=1.0)
+        alone = npa_envs.rollout(rule, x[7:8], s[7:8], 3, update_prob=1.0)
+    assert torch.equal(batch[0][7:8], alone[0])
+    assert torch.equal(batch[1][7:8], alone[1])
