@@ -1,8 +1,9 @@
 # Every target sets up what it needs in .venv; nothing has to be done before.
-#   make demo       grow, hurt and heal the shipped rule, train a small one (CPU); writes demo/
-#   make test       the test suite without the slow tests
-#   make test-all   all tests
-#   make check      ruff, formatting, types, spelling
+#   make demo         grow, hurt and heal the shipped rule, train a small one (CPU); writes demo/
+#   make test         the test suite without the slow tests
+#   make test-all     all tests
+#   make check        ruff, formatting, types, spelling
+#   make bench-check  is the library still as much faster than its alternatives as it was?
 # PIP_ARGS goes to pip: PIP_ARGS='--extra-index-url https://download.pytorch.org/whl/cpu' takes
 # torch's smaller CPU build.
 
@@ -19,7 +20,7 @@ INPUTS := pyproject.toml constraints.txt
 
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
 
-.PHONY: demo test test-all check clean
+.PHONY: demo test test-all check bench-check clean
 .DELETE_ON_ERROR:
 
 $(BIN)/python:
@@ -55,6 +56,9 @@ check: $(DEV)
 	cp -R pyproject.toml README.md LICENSE npa_envs envs wrappers agents $(CHECK)/source
 	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --target $(CHECK)/site $(CHECK)/source
 	cd $(CHECK)/site && ../../../$(BIN)/mypy --config-file ../../../pyproject.toml --cache-dir ../cache -p npa_envs
+
+bench-check: $(CORE)
+	OMP_NUM_THREADS=1 $(BIN)/npa-envs bench --quick --device cpu --check benchmarks/results/ratios.json --no-progress
 
 clean:
 	rm -rf build dist demo *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis

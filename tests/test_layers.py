@@ -56,6 +56,12 @@ LADDER = {
         never=("npa_envs.kernels", "npa_envs.reference"),
     ),
     "npa_envs.evaluation": rung(7, "torch numpy tqdm", never=INSIDES),
+    "npa_envs.bench.grid_kernels": rung(2, "warp"),
+    "npa_envs.bench.hash_grid": rung(3, "warp torch", never=("npa_envs.reference",)),
+    "npa_envs.bench.launches": rung(3, "warp"),
+    "npa_envs.bench": rung(
+        8, "torch numpy matplotlib scipy warpSPHCore", never=("npa_envs.kernels",)
+    ),
     "npa_envs.training": rung(
         8, "torch numpy tqdm yaml", never=("npa_envs.kernels", "npa_envs.reference")
     ),
@@ -73,7 +79,7 @@ LADDER = {
         13, "torch numpy tqdm gymnasium pettingzoo stable_baselines3", never=INSIDES
     ),
 }
-WARP_AND_TORCH = {"npa_envs.sph"}
+WARP_AND_TORCH = {"npa_envs.sph", "npa_envs.bench.hash_grid"}
 
 
 def source_files() -> list[Path]:
@@ -153,7 +159,7 @@ def test_every_source_file_keeps_to_the_ladder(path: Path) -> None:
     assert violations(module_name(path), path.read_text(), is_package=is_package) == []
 
 
-def test_only_sph_knows_both_warp_and_torch() -> None:
+def test_only_sph_and_the_benchmarked_hash_grid_know_both_warp_and_torch() -> None:
     both = {name for name, here in LADDER.items() if {"warp", "torch"} <= here.libraries}
     assert both == WARP_AND_TORCH
 

@@ -13,6 +13,7 @@ COMMANDS = {
     "train": "train a rule on a task",
     "rollout": "grow a rule from its seed, with damage on the way; writes GIF, MP4 and a filmstrip",
     "evaluate": "measure a rule: loss, PSNR, overflow and extent over thousands of steps",
+    "bench": "run time against error, the paper's table, scaling; a call explained",
     "list": "tasks, presets, built-in targets, shipped rules",
     "warmup": "compile the kernels ahead of time",
     "doctor": "versions, devices, kernel cache, fonts",
@@ -84,6 +85,10 @@ def _dispatch(words: list[str]) -> int:
             from npa_envs.cli import evaluate
 
             return evaluate.main(rest)
+        case "bench":
+            from npa_envs.cli import bench
+
+            return bench.main(rest)
         case "list":
             from npa_envs.cli import listing
 

@@ -13,12 +13,13 @@ class StepBar:
     Args:
         total: Steps to come; None where that is not known.
         show: Whether to show it at all.
+        unit: What is counted.
     """
 
-    def __init__(self, total: int | None, *, show: bool) -> None:
+    def __init__(self, total: int | None, *, show: bool, unit: str = "step") -> None:
         self.done = 0
         """Steps done so far."""
-        self._bar = tqdm(total=total, disable=not show, unit="step")
+        self._bar = tqdm(total=total, disable=not show, unit=unit)
 
     def advance(self, steps: int) -> None:
         """Count steps that are done.

@@ -9,18 +9,18 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 
-def table_text(rows: Sequence[Any]) -> str:
+def table_text(rows: Sequence[Any], *, missing: str = "never") -> str:
     """Return rows as a plain text table, one line each under a line of headings.
 
     Args:
         rows: Instances of one dataclass, for example what `npa_envs.evaluation.evaluate` returned.
-            A None is shown as "never".
+        missing: What a None is shown as.
     """
     if not rows:
         return ""
     names = [field.name for field in dataclasses.fields(rows[0])]
     cells = [[name.replace("_", " ") for name in names]]
-    cells += [[_cell(getattr(row, name)) for name in names] for row in rows]
+    cells += [[_cell(getattr(row, name), missing) for name in names] for row in rows]
     widths = [max(len(line[column]) for line in cells) for column in range(len(names))]
     return "\n".join(
         "  ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True))
@@ -45,7 +45,7 @@ def tables_json(tables: Mapping[str, Sequence[Any]]) -> str:
     return json.dumps(objects, indent=2, allow_nan=False) + "\n"
 
 
-def _cell(value: str | int | float | None) -> str:
+def _cell(value: object, missing: str) -> str:
     if value is None:
-        return "never"
+        return missing
     return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,129 @@
+"""What a run of the benchmark leaves: a text for the eye, JSON for the record."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import math
+import platform
+import subprocess
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from npa_envs.bench.session import LeftOut, Tables
+from npa_envs.render.tables import table_text
+
+LIBRARIES = ("npa-envs", "torch", "warp-lang", "numpy", "scipy", "warpSPHCore")
+"""Distributions whose versions are recorded."""
+
+
+@dataclass(frozen=True)
+class Report:
+    """One run of one suite."""
+
+    suite: str
+    """Its name."""
+    command: str
+    """The command line."""
+    commit: str
+    """Commit that was measured."""
+    device: torch.device
+    """Where."""
+    threads: int
+    """CPU threads of torch."""
+    tables: Tables
+    """Rows by the table's name."""
+    left_out: Sequence[LeftOut]
+    """What was not measured."""
+    ratios: Mapping[str, float] = field(default_factory=dict)
+    """How many times faster the library is than what it is compared with."""
+
+    def text(self) -> str:
+        """Return the tables as plain text."""
+        parts = [f"{self.suite} on {machine(self.device)}, commit {self.commit}"]
+        for name, rows in self.tables.items():
+            parts.append(f"{name}:\n{table_text(rows, missing='-')}")
+        if self.ratios:
+            lines = [f"  {name}: {value:.3g}" for name, value in self.ratios.items()]
+            parts.append("\n".join(["times faster:", *lines]))
+        if self.left_out:
+            parts.append("\n".join(["left out:", *self._reasons()]))
+        return "\n\n".join(parts)
+
+    def _reasons(self) -> list[str]:
+        """Return a line for each reason to leave something out."""
+        by_reason: dict[str, list[str]] = {}
+        for entry in self.left_out:
+            by_reason.setdefault(entry.why, []).append(entry.what)
+        return [f"  {why}: {'; '.join(names)}" for why, names in by_reason.items()]
+
+    def json(self) -> str:
+        """Return everything as JSON; a number that is not finite becomes null."""
+        content = {
+            "suite": self.suite,
+            "command": self.command,
+            "commit": self.commit,
+            "date": date.today().isoformat(),
+            "device": self.device.type,
+            "machine": machine(self.device),
+            "threads": self.threads,
+            "versions": versions(),
+            "tables": {name: [asdict(row) for row in rows] for name, rows in self.tables.items()},
+            "ratios": dict(self.ratios),
+            "left_out": [asdict(entry) for entry in self.left_out],
+        }
+        return json.dumps(_finite(content), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+
+
+def _finite(value: Any) -> Any:
+    """Return a tree of values in which numbers that are not finite are None."""
+    if isinstance(value, dict):
+        return {key: _finite(inner) for key, inner in value.items()}
+    if isinstance(value, list):
+        return [_finite(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def machine(device: torch.device) -> str:
+    """Return the name of a device's hardware."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    return f"CPU ({_processor()})"
+
+
+def _processor() -> str:
+    """Return the processor's name as Linux tells it, or what Python knows."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
+
+
+def versions() -> dict[str, str | None]:
+    """Return versions of Python and of the libraries that matter; None: not installed."""
+    found: dict[str, str | None] = {"python": platform.python_version()}
+    for name in LIBRARIES:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = None
+    return found
+
+
+def current_commit() -> str:
+    """Return the short hash of the checkout that this file lies in, "unknown" without one."""
+    command = ["git", "describe", "--always", "--dirty", "--exclude=*"]
+    try:
+        done = subprocess.run(
+            command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return done.stdout.strip()

@@ -1,0 +1,100 @@
+"""The suites of `npa-envs bench`: which tables each one makes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from npa_envs.bench import ratios as guard
+from npa_envs.bench.peers import peer_rows
+from npa_envs.bench.perception import perception_rows
+from npa_envs.bench.rollouts import rollout_rows
+from npa_envs.bench.scaling import scaling_rows, slope_rows
+from npa_envs.bench.session import Session, Tables
+from npa_envs.bench.throughput import CPU, PAPER, SMALL, aim_rows, throughput_rows
+from npa_envs.bench.workloads import Workload
+from npa_envs.errors import NPAError, suggest
+
+
+@dataclass(frozen=True)
+class Suite:
+    """Some measurements that belong together."""
+
+    summary: str
+    """What it measures, in a few words."""
+    run: Callable[[Session], Tables]
+    """Makes its tables."""
+    guarded: bool = False
+    """Whether ratios are measured as well."""
+
+    def ratios(self, session: Session) -> dict[str, float]:
+        """Return how many times faster the library is; empty where the suite does not ask."""
+        return guard.ratios(session) if self.guarded else {}
+
+
+def accuracy(session: Session) -> Tables:
+    """Return run time against error: of perception, of rollouts, of other libraries."""
+    geckos = [1024] if session.small else [1024, 4096]
+    return {
+        "perception": [
+            row for workload in _worlds(session) for row in perception_rows(session, workload)
+        ],
+        "rollouts": [row for count in geckos for row in rollout_rows(session, count)],
+        "peers": peers(session),
+    }
+
+
+def _worlds(session: Session) -> list[Workload]:
+    """Return the worlds that the suite `accuracy` perceives."""
+    if session.small:
+        return [Workload(2, 1, 1024, 1), Workload(3, 1, 512, 1)]
+    flat = [Workload(2, 1, count, 1) for count in (1024, 4096, 65536 if session.cuda else 16384)]
+    return [*flat, Workload(2, 8, 4096, 1), Workload(3, 1, 1024, 1), Workload(3, 1, 16384, 1)]
+
+
+def peers(session: Session) -> list[object]:
+    """Return the rows of other libraries, in 2D and 3D."""
+    worlds = (Workload(2, 1, 1024, 1), Workload(3, 1, 512 if session.small else 1024, 1))
+    return [row for workload in worlds for row in peer_rows(session, workload)]
+
+
+def paper(session: Session) -> Tables:
+    """Return the paper's table: inference, training and memory."""
+    workloads = SMALL if session.small else PAPER if session.cuda else CPU
+    rows = throughput_rows(session, workloads)
+    tables: Tables = {"throughput": rows}
+    if session.cuda and not session.small:
+        tables["aims"] = aim_rows(rows)
+    return tables
+
+
+def scaling(session: Session) -> Tables:
+    """Return time and memory against N, neighbours, B and C."""
+    rows = scaling_rows(session)
+    return {"scaling": rows, "slopes": slope_rows(rows)}
+
+
+def quick(session: Session) -> Tables:
+    """Return the small tables of the suites `accuracy` and `paper`."""
+    session.small = True
+    return {**accuracy(session), **paper(session)}
+
+
+SUITES = {
+    "quick": Suite("small worlds; about a minute on a CPU", quick, guarded=True),
+    "paper": Suite("inference, training and memory of the paper's workloads", paper),
+    "accuracy": Suite("run time against error, by strategy and precision; peers", accuracy),
+    "scaling": Suite("time and memory against N, neighbours, B and C", scaling),
+}
+"""Every suite by its name."""
+
+
+def suite_of(name: str) -> Suite:
+    """Return the suite of a name.
+
+    Raises:
+        NPAError: There is none.
+    """
+    if name not in SUITES:
+        raise NPAError(f"unknown suite {name!r}: {suggest(name, SUITES)}")
+    return SUITES[name]

@@ -1,0 +1,122 @@
+"""How long a call takes, and how much memory it takes while it runs."""
+
+from __future__ import annotations
+
+import gc
+import math
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+
+LEAST_SECONDS = {"cpu": 2e-3, "cuda": 1e-2}
+"""Short calls are made so many times in a row that one reading takes at least this long [s]."""
+
+ENOUGH = 1e6
+"""Readings of slow calls end after this long [µs], with three of them at least."""
+
+
+@dataclass(frozen=True)
+class Timing:
+    """The time of one call [µs]: the median of several readings, and the range of all of them."""
+
+    median: float
+    """Median of the readings [µs]."""
+    low: float
+    """Shortest reading [µs]."""
+    high: float
+    """Longest reading [µs]."""
+
+    def __str__(self) -> str:
+        """Return the median and how far the readings lie from it."""
+        off = max(self.high - self.median, self.median - self.low) / self.median
+        return f"{self.median:.4g} ±{off:.0%}"
+
+    def divided(self, count: int) -> Timing:
+        """Return the time of one of `count` equal parts of the call."""
+        return Timing(self.median / count, self.low / count, self.high / count)
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a call costs."""
+
+    time: Timing
+    """Time of the call."""
+    peak_mib: float | None
+    """Peak of memory allocated by torch, above what was there before [MiB]; None on a CPU."""
+
+
+def synchronize(device: torch.device) -> None:
+    """Wait until a device has done all its work."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def measure(
+    run: Callable[[], object],
+    device: torch.device,
+    *,
+    repeats: int,
+    graph: bool = True,
+    generator: torch.Generator | None = None,
+) -> Cost:
+    """Return what a call costs once its kernels are compiled.
+
+    Args:
+        run: The call.
+        device: Where it works.
+        repeats: Readings to take, at least 1; fewer of slow calls.
+        graph: On CUDA, capture the call in a graph and time its replay.
+        generator: A CUDA generator that the call draws from.
+    """
+    run()
+    synchronize(device)
+    if device.type != "cuda":
+        return Cost(_timing(run, device, repeats), None)
+    gc.collect()
+    torch.cuda.empty_cache()
+    torch.cuda.reset_peak_memory_stats(device)
+    before = torch.cuda.memory_allocated(device)
+    replay = _captured(run, device, generator) if graph else run
+    timing = _timing(replay, device, repeats)
+    return Cost(timing, (torch.cuda.max_memory_allocated(device) - before) / 2**20)
+
+
+def _captured(
+    run: Callable[[], object], device: torch.device, generator: torch.Generator | None
+) -> Callable[[], object]:
+    """Return the replay of a CUDA graph of `run`."""
+    stream = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
+    stream.wait_stream(torch.cuda.current_stream(device))
+    with torch.cuda.stream(stream):
+        run()
+    torch.cuda.synchronize(device)
+    graph = torch.cuda.CUDAGraph()
+    if generator is not None:
+        graph.register_generator_state(generator)
+    with torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
+        run()
+    replay: Callable[[], object] = graph.replay
+    return replay
+
+
+def _timing(run: Callable[[], object], device: torch.device, repeats: int) -> Timing:
+    first = _reading(run, device, 1)
+    calls = max(1, math.ceil(LEAST_SECONDS[device.type] / first))
+    readings = [_reading(run, device, calls) * 1e6]
+    while len(readings) < repeats and (len(readings) < 3 or sum(readings) * calls < ENOUGH):
+        readings.append(_reading(run, device, calls) * 1e6)
+    return Timing(statistics.median(readings), min(readings), max(readings))
+
+
+def _reading(run: Callable[[], object], device: torch.device, calls: int) -> float:
+    """Return the mean time of so many calls in a row [s]."""
+    synchronize(device)
+    start = time.perf_counter()
+    for _ in range(calls):
+        run()
+    synchronize(device)
+    return (time.perf_counter() - start) / calls

@@ -1,0 +1,122 @@
+"""Worlds to measure on: as many neighbours everywhere, and the gecko as it grows."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from npa_envs.dynamics import rollout
+from npa_envs.rule import NPARule
+from npa_envs.rule_io import load_rule
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
+from npa_envs.tasks.morphogenesis2d_config import Morphogenesis2DConfig
+
+SQUARE_HALF_WIDTH = 0.7
+"""Half the side of a square of 4096 particles [length units]; larger worlds are as dense."""
+
+CUBE_HALF_WIDTH = 0.8
+"""Half the side of a cube of 16 384 particles [length units]; other cubes are as dense."""
+
+
+@dataclass(frozen=True)
+class Workload:
+    """Worlds of uniformly scattered particles and a fresh rule; about 66 neighbours in 2D."""
+
+    space_dim: int
+    """Space dimension D."""
+    world_count: int
+    """Worlds B."""
+    particle_count: int
+    """Particles in each world N."""
+    steps: int
+    """Steps of a rollout T."""
+    hidden_dim: int = 128
+    """Width of the rule's hidden layer."""
+    state_dim: int = 16
+    """State channels C."""
+    eps: float = 0.1
+    """Perception radius [length units]."""
+    update_prob: float = 0.5
+    """Probability of each particle's update in a step (dimensionless)."""
+
+    @property
+    def name(self) -> str:
+        """Short name: dimension and (B, N, T)."""
+        return f"{self.space_dim}D ({self.world_count}, {self.particle_count}, {self.steps})"
+
+    @property
+    def half_width(self) -> float:
+        """Half the side of the square or cube that the particles fill [length units]."""
+        if self.space_dim == 2:
+            return SQUARE_HALF_WIDTH * math.sqrt(self.particle_count / 4096)
+        return CUBE_HALF_WIDTH * math.cbrt(self.particle_count / 16384)
+
+    @property
+    def neighbour_count(self) -> float:
+        """Mean number of particles within eps of one, itself included, far from the edges."""
+        ball = math.pi * self.eps**2 if self.space_dim == 2 else 4 / 3 * math.pi * self.eps**3
+        volume = math.prod((2.0 * self.half_width,) * self.space_dim)
+        return 1.0 + self.particle_count * ball / volume
+
+    def worlds(self, device: torch.device) -> tuple[Tensor, Tensor]:
+        """Return float32 positions [length units], [B, N, D], and states, [B, N, C]."""
+        generator = torch.Generator(device).manual_seed(0)
+        shape = (self.world_count, self.particle_count)
+        x = torch.rand(*shape, self.space_dim, generator=generator, device=device)
+        s = torch.randn(*shape, self.state_dim, generator=generator, device=device)
+        return x.mul_(2.0).sub_(1.0).mul_(self.half_width), s.mul_(0.1)
+
+    def rule(self, device: torch.device) -> NPARule:
+        """Return a rule with the same fresh weights at every call."""
+        # Weights are drawn from torch's global generators, which must be left as they were.
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(0)
+            rule = NPARule(self.space_dim, self.state_dim, self.hidden_dim, eps0=self.eps)
+        return rule.to(device)
+
+
+class Gecko(NamedTuple):
+    """The shipped rule and the task that it was trained on."""
+
+    rule: NPARule
+    """The rule `gecko`, float32."""
+    task: Morphogenesis2D
+    """2D morphogenesis with as many target points as particles."""
+    x: Tensor
+    """Positions of the seed [length units], shape [B, N, 2]."""
+    s: Tensor
+    """States of the seed, shape [B, N, C]."""
+
+    def grown(self, steps: int) -> Gecko:
+        """Return the same with worlds that are so many float32 steps older."""
+        generator = torch.Generator(self.x.device).manual_seed(1)
+        with torch.no_grad():
+            x, s = rollout(
+                self.rule,
+                self.x,
+                self.s,
+                steps,
+                eps=self.task.eps,
+                update_prob=self.task.update_prob,
+                generator=generator,
+            )
+        return self._replace(x=x, s=s)
+
+
+def gecko(world_count: int, particle_count: int, device: torch.device) -> Gecko:
+    """Return the shipped rule with seeds of its task.
+
+    Args:
+        world_count: Worlds B.
+        particle_count: Particles in each world N.
+        device: Where to put all of it.
+    """
+    config = Morphogenesis2DConfig(particle_count=particle_count, target_point_count=particle_count)
+    task = Morphogenesis2D(config, device=device)
+    generator = torch.Generator(device).manual_seed(0)
+    x, s = task.seed(world_count, generator=generator, device=device)
+    return Gecko(load_rule("gecko", device=device).float(), task, x, s)

@@ -1,0 +1,260 @@
+"""`npa-envs bench`: run time against error, the paper's table, scaling, and a call explained."""
+
+from __future__ import annotations
+
+import contextlib
+import shlex
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import tyro
+
+from npa_envs.errors import NPAError
+
+if TYPE_CHECKING:
+    import torch
+
+    from npa_envs.bench.report import Report
+
+CHECK_FAILED = 1
+
+QUICK = "quick"
+"""The suite that is run unless another one is asked for, and whose ratios are checked."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchOptions:
+    """Measure run time against error, the paper's table or scaling; or explain what a step runs."""
+
+    suite: str | None = None
+    """quick (the default), paper, accuracy or scaling."""
+
+    quick: bool = False
+    """Small worlds only: about a minute on a CPU."""
+
+    device: str = "cpu"
+    """Where to run: cpu, cuda, cuda:1."""
+
+    strategies: tuple[str, ...] = ()
+    """Ways to perceive: library, plain, hash_grid, dense, neighbour_cap; default: all."""
+
+    precisions: tuple[str, ...] = ()
+    """float64, float32, tf32, bf16_storage, mixed; default: all."""
+
+    repeats: int = 7
+    """Readings of every time; tables show their median and range."""
+
+    threads: int = 1
+    """CPU threads of torch; the kernels use one."""
+
+    output: Path | None = None
+    """Folder for SUITE_DEVICE.json and plots; default: nothing is written."""
+
+    plots: bool = False
+    """Also draw plots into the output folder; needs the extra `bench`."""
+
+    check: Path | None = None
+    """JSON of stored ratios: end with code 1 where one is missed threefold. Suite quick."""
+
+    commit: str | None = None
+    """Commit that is measured; default: that of the checkout."""
+
+    explain: bool = False
+    """Measure nothing: say which kernels a step launches, and why. The options below tell which."""
+
+    space_dim: Literal[2, 3] = 2
+    """Space dimension of the step explained."""
+
+    world_count: int = 1
+    """Its worlds B."""
+
+    particle_count: int = 4096
+    """Its particles in each world N."""
+
+    state_dim: int = 16
+    """Its state channels C."""
+
+    update_prob: float = 0.5
+    """Its probability of each particle's update."""
+
+    periodic: bool = False
+    """Its box is periodic."""
+
+    dtype: Literal["float32", "float64"] = "float32"
+    """Its precision."""
+
+    gradients: Literal["none", "weights", "positions"] = "weights"
+    """What it is differentiated by: nothing, weights and states, or positions as well."""
+
+    progress: bool = True
+    """Show a progress bar."""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run the command.
+
+    Args:
+        arguments: The words after `npa-envs bench`.
+
+    Returns:
+        0, or 1 where `--check` found a ratio that was missed.
+
+    Raises:
+        NPAError: There is no such suite, device, strategy or precision, or a file is wrong.
+    """
+    options = tyro.cli(BenchOptions, prog="npa-envs bench", args=arguments)
+    return run(options, shlex.join(["npa-envs", "bench", *arguments]))
+
+
+def run(options: BenchOptions, command: str = "npa-envs bench") -> int:
+    """Measure, print, write and check.
+
+    Args:
+        options: What the command line said.
+        command: The command line, for the record.
+
+    Raises:
+        NPAError: As for `main`.
+    """
+    from npa_envs.bench.ratios import missed_ratios, stored_ratios
+    from npa_envs.bench.suites import suite_of
+    from npa_envs.devices import check_device
+
+    _check(options)
+    device = check_device(options.device)
+    suite_of(options.suite or QUICK)
+    if options.explain:
+        print(_explanation(options, device))
+        return 0
+    if options.output is not None:
+        from npa_envs.cli.rollout import check_writable
+        from npa_envs.cli.worlds import make_folder
+
+        check_writable(make_folder(options.output))
+    if options.plots:
+        from npa_envs.bench.plots import check_matplotlib
+
+        check_matplotlib()
+    stored = {} if options.check is None else stored_ratios(options.check, device)
+    report = measured_report(options, device, command)
+    print(report.text())
+    if options.output is not None:
+        _write(report, options.output, plots=options.plots)
+    if options.check is None:
+        return 0
+    missed = missed_ratios(report.ratios, stored)
+    print("\n".join(f"missed: {line}" for line in missed) or "ratios are held")
+    return CHECK_FAILED if missed else 0
+
+
+def _check(options: BenchOptions) -> None:
+    """Check the numbers that nothing else checks, and which options go together."""
+    for name in ("repeats", "threads", "world_count", "particle_count", "state_dim"):
+        if getattr(options, name) < 1:
+            raise NPAError(f"{name} must be at least 1, got {getattr(options, name)}")
+    if options.plots and options.output is None:
+        raise NPAError("plots need a folder to be written to: give --output DIR as well")
+    if options.check is not None and options.suite not in (None, QUICK):
+        raise NPAError(
+            f"check compares ratios of the suite quick, got suite {options.suite!r}: "
+            "leave --suite out"
+        )
+
+
+def measured_report(options: BenchOptions, device: torch.device, command: str) -> Report:
+    """Run a suite.
+
+    Args:
+        options: What the command line said.
+        device: Where to run.
+        command: The command line, for the record.
+
+    Raises:
+        NPAError: There is no such suite, strategy or precision.
+    """
+    from npa_envs.bench.precisions import chosen_precisions
+    from npa_envs.bench.report import Report, current_commit
+    from npa_envs.bench.session import Session
+    from npa_envs.bench.strategies import chosen_strategies
+    from npa_envs.bench.suites import suite_of
+    from npa_envs.cli.progress import StepBar
+
+    name = options.suite or QUICK
+    suite = suite_of(name)
+    with StepBar(None, show=options.progress, unit="row") as bar, _torch_threads(options.threads):
+        session = Session(
+            device=device,
+            repeats=options.repeats,
+            small=options.quick,
+            strategies=chosen_strategies(options.strategies),
+            precisions=chosen_precisions(options.precisions),
+            progress=bar.advance,
+        )
+        tables, ratios = suite.run(session), suite.ratios(session)
+    return Report(
+        suite=name,
+        command=command,
+        commit=options.commit or current_commit(),
+        device=device,
+        threads=options.threads,
+        tables=tables,
+        left_out=session.left_out,
+        ratios=ratios,
+    )
+
+
+@contextlib.contextmanager
+def _torch_threads(count: int) -> Iterator[None]:
+    """Let torch use so many CPU threads while a block runs."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def _write(report: Report, folder: Path, *, plots: bool) -> None:
+    from npa_envs.files import write_bytes, write_text
+
+    stem = f"{report.suite}_{report.device.type}"
+    path = folder / f"{stem}.json"
+    write_text(path, report.json())
+    print(f"wrote {path}")
+    if plots:
+        from npa_envs.bench.plots import pictures
+
+        for name, data in pictures(report).items():
+            path = folder / f"{stem}_{name}.png"
+            write_bytes(path, data)
+            print(f"wrote {path}")
+
+
+def _explanation(options: BenchOptions, device: torch.device) -> str:
+    import torch
+
+    from npa_envs.bench.explain import Question, explain
+    from npa_envs.bench.workloads import Workload
+
+    workload = Workload(
+        options.space_dim,
+        options.world_count,
+        options.particle_count,
+        1,
+        state_dim=options.state_dim,
+        update_prob=options.update_prob,
+    )
+    dtype = {"float32": torch.float32, "float64": torch.float64}[options.dtype]
+    return explain(
+        Question(
+            workload=workload,
+            device=device,
+            dtype=dtype,
+            periodic=options.periodic,
+            gradients=options.gradients,
+        )
+    )

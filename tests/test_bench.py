@@ -1,0 +1,487 @@
+"""The benchmark measures what it says: real strategies, true errors, and a guard that bites."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+from npa_envs import reference
+from npa_envs.bench import ratios, scaling, suites
+from npa_envs.bench.explain import Question, explain
+from npa_envs.bench.hash_grid import grid_fields
+from npa_envs.bench.launches import recorded_launches
+from npa_envs.bench.peers import PEERS, peer_rows
+from npa_envs.bench.perception import perception_rows
+from npa_envs.bench.plots import Point, front, pictures
+from npa_envs.bench.precisions import PRECISIONS, MixedRule
+from npa_envs.bench.report import Report
+from npa_envs.bench.rollouts import RolloutRow, composed_step, mask_source, rollout_rows
+from npa_envs.bench.scaling import scaling_rows, slope_rows, varied
+from npa_envs.bench.session import LeftOut, Session
+from npa_envs.bench.strategies import NEIGHBOUR_CAP, STRATEGIES, nearest
+from npa_envs.bench.throughput import PAPER, aim_rows, throughput_rows
+from npa_envs.bench.timing import Timing, measure
+from npa_envs.bench.workloads import Workload, gecko
+from npa_envs.cli import main
+from npa_envs.dynamics import rollout, step
+from npa_envs.sph import perceive
+
+TINY = Workload(2, 2, 150, 2, hidden_dim=16, eps=0.2)
+FORWARD = 1e-5
+"""Relative error that float32 may have in one perception; the worst measured is 3.2e-7."""
+
+FAST = ["bench", "--no-progress", "--repeats", "1"]
+
+
+def session(**options) -> Session:
+    return Session(torch.device("cpu"), repeats=1, small=True, **options)
+
+
+def timing(median: float) -> Timing:
+    return Timing(median, median, median)
+
+
+def tiny_suite(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make the suite `quick` a tiny one of the same kind."""
+    suite = suites.Suite(
+        "tiny", lambda here: {"perception": perception_rows(here, TINY)}, guarded=True
+    )
+    monkeypatch.setitem(suites.SUITES, "quick", suite)
+    monkeypatch.setattr(ratios, "WORKLOAD", Workload(2, 1, 100, 1, hidden_dim=16))
+
+
+# Strategies and precisions
+
+
+@pytest.mark.parametrize("space_dim", [2, 3])
+@pytest.mark.parametrize("name", STRATEGIES)
+def test_every_strategy_perceives_what_the_reference_does(name, space_dim, device):
+    # So sparse that no particle has more neighbours than the cap.
+    workload = Workload(space_dim, 2, 150, 1, state_dim=5, eps=0.05 if space_dim == 2 else 0.1)
+    x, s = workload.worlds(device)
+    expected = reference.perceive(x.double(), s.double(), workload.eps, workload.eps)
+    for dtype, tolerance in ((torch.float32, FORWARD), (torch.float64, 1e-12)):
+        z = STRATEGIES[name].perceive(x.to(dtype), s.to(dtype), workload.eps)
+        assert z.dtype == dtype
+        assert float((z - expected).norm() / expected.norm()) < tolerance
+        rho = STRATEGIES[name].density(x.to(dtype), s.to(dtype), workload.eps)
+        exact = reference.fields(x.double(), s.double(), workload.eps).rho
+        assert float((rho - exact).norm() / exact.norm()) < tolerance
+
+
+def test_the_neighbour_cap_leaves_out_all_but_the_nearest():
+    x, s = Workload(2, 1, 400, 1).worlds(torch.device("cpu"))
+    index = nearest(x, 3)
+    distances = torch.cdist(x[0].double(), x[0].double())
+    assert torch.equal(index[0].sort().values, distances.topk(3, largest=False)[1].sort().values)
+    capped = STRATEGIES["neighbour_cap"].density(x, s, 0.1)
+    assert (capped <= STRATEGIES["dense"].density(x, s, 0.1) * (1 + 1e-5)).all()
+    crowded = (distances < 0.1).sum(1) > NEIGHBOUR_CAP
+    assert crowded.any()
+    lost = capped < 0.99 * STRATEGIES["dense"].density(x, s, 0.1)
+    assert not lost[0, ~crowded].any()
+
+
+def test_the_hash_grid_keeps_worlds_apart():
+    x, s = TINY.worlds(torch.device("cpu"))
+    both = grid_fields(x, s, TINY.eps)
+    alone = grid_fields(x[1:], s[1:], TINY.eps)
+    for together, single in zip(both, alone, strict=True):
+        torch.testing.assert_close(together[1:], single)
+
+
+def test_a_step_composed_in_torch_is_that_of_the_library():
+    start = gecko(1, 300, torch.device("cpu")).grown(3)
+    rule, x, s = start.rule.double(), start.x.double(), start.s.double()
+    composed = composed_step(STRATEGIES["dense"], rule, x, s, 0.5, mask_source(x))
+    own = step(rule, x, s, update_prob=0.5, generator=mask_source(x))
+    for value, expected in zip(composed, own, strict=True):
+        torch.testing.assert_close(value, expected, rtol=1e-12, atol=1e-12)
+    assert not torch.equal(own[0], x)
+
+
+def test_the_mixed_rule_is_the_rule_in_bfloat16():
+    rule = gecko(1, 64, torch.device("cpu")).rule
+    mixed = PRECISIONS["mixed"].rule(rule)
+    assert isinstance(mixed, MixedRule)
+    z = torch.randn(40, rule.perception_dim, generator=torch.Generator().manual_seed(0))
+    expected, value = rule(z).detach(), mixed(z).detach()
+    error = float((value - expected).norm() / expected.norm())
+    assert 1e-4 < error < 2e-2
+    assert value.dtype == torch.float32
+
+
+def test_bfloat16_storage_rounds_states_and_nothing_else():
+    s = torch.randn(2, 3, 4, generator=torch.Generator().manual_seed(0))
+    kept = PRECISIONS["bf16_storage"].kept(s)
+    assert torch.equal(kept, s.bfloat16().float())
+    assert torch.equal(PRECISIONS["float32"].kept(s), s)
+
+
+def test_a_rule_in_another_precision_has_the_same_weights():
+    rule = gecko(1, 64, torch.device("cpu")).rule
+    for precision in PRECISIONS.values():
+        own = precision.rule(rule)
+        assert own.hidden.weight.dtype == precision.dtype
+        assert torch.equal(own.output.weight.float(), rule.output.weight)
+    # The fused path does not see torch's switch.
+    assert not PRECISIONS["tf32"].rule(rule).is_plain()
+
+
+def test_the_switch_for_tf32_is_put_back():
+    before = torch.backends.cuda.matmul.allow_tf32
+    with PRECISIONS["tf32"].active():
+        assert torch.backends.cuda.matmul.allow_tf32
+    assert torch.backends.cuda.matmul.allow_tf32 == before
+
+
+# Timing and workloads
+
+
+def test_the_time_of_a_call_is_a_median_within_its_range():
+    calls = []
+    cost = measure(lambda: calls.append(0), torch.device("cpu"), repeats=5)
+    assert 0.0 < cost.time.low <= cost.time.median <= cost.time.high
+    assert len(calls) > 100
+    assert cost.peak_mib is None
+    assert str(Timing(100.0, 90.0, 120.0)) == "100 ±20%"
+    assert Timing(100.0, 90.0, 120.0).divided(10) == Timing(10.0, 9.0, 12.0)
+
+
+def test_workloads_have_the_neighbours_they_claim():
+    for workload in (Workload(2, 1, 2000, 1), Workload(3, 1, 2000, 1), varied("neighbours", 32)):
+        (x,), _ = workload.worlds(torch.device("cpu"))
+        inner = (x.abs() < workload.half_width - workload.eps).all(1)
+        counted = (torch.cdist(x[inner], x) < workload.eps).sum(1).double().mean()
+        assert float(counted) == pytest.approx(workload.neighbour_count, rel=0.1)
+
+
+def test_the_papers_workloads_are_as_dense_as_each_other():
+    flat = [workload for workload in PAPER if workload.space_dim == 2]
+    assert {round(workload.neighbour_count, 6) for workload in flat} == {66.652875}
+    assert max(workload.particle_count for workload in PAPER) == 16_777_216
+
+
+def test_fresh_rules_of_a_workload_are_equal_and_leave_the_generator_alone():
+    state = torch.get_rng_state()
+    one, other = (TINY.rule(torch.device("cpu")) for _ in range(2))
+    assert torch.equal(one.hidden.weight, other.hidden.weight)
+    assert torch.equal(state, torch.get_rng_state())
+
+
+# Suites
+
+
+def test_perception_in_float32_errs_little_and_the_reference_not_at_all():
+    here = session()
+    rows = perception_rows(here, TINY)
+    exact = [row for row in rows if (row.strategy, row.precision) == ("library", "float64")]
+    assert [row.perception for row in exact] == [0.0]
+    summed = [row for row in rows if row.strategy != "neighbour_cap"]
+    for row in (row for row in summed if row.precision == "float32"):
+        fields = (row.density, row.smoothed, row.state_gradient, row.density_gradient)
+        assert 0.0 < max(*fields, row.perception) < FORWARD
+    dense = next(row for row in rows if (row.strategy, row.precision) == ("dense", "float64"))
+    assert dense.perception < 1e-13
+    assert dense.cotangent < 1e-13
+    cut = next(row for row in rows if row.strategy == "neighbour_cap")
+    assert cut.perception > 1e-3
+    short = next(row for row in rows if row.precision == "bf16_storage")
+    assert 1e-5 < short.perception < 1e-2
+    left = {entry.what for entry in here.left_out}
+    assert {"tf32", "perception in mixed", "plain, float32, 2D (2, 150)"} <= left
+
+
+def test_rollouts_err_more_in_shorter_precisions():
+    chosen = [PRECISIONS[name] for name in ("float64", "float32", "bf16_storage", "mixed")]
+    here = session(strategies=[STRATEGIES["library"], STRATEGIES["dense"]], precisions=chosen)
+    exact, single, storage, mixed = rollout_rows(here, 200)
+    assert (exact.x_1, exact.s_64, exact.weights) == (0.0, 0.0, 0.0)
+    assert 0.0 < single.x_1 < FORWARD
+    assert single.s_1 < FORWARD
+    assert single.weights < 1e-4
+    for row in (storage, mixed):
+        assert 10 * single.s_8 < row.s_8 < 0.1
+    assert all(math.isfinite(row.psnr_512) for row in (exact, single, storage, mixed))
+    assert abs(exact.psnr_512 - single.psnr_512) < 1.0
+    assert {entry.what for entry in here.left_out} == {"rollouts of dense"}
+
+
+def test_throughput_stores_and_recomputes_and_compares_with_the_aims():
+    store, recompute = throughput_rows(session(), [TINY])
+    assert (store.memory, recompute.memory) == ("store", "recompute")
+    assert store.workload == "2D (2, 150, 2)"
+    assert store.worlds_mib == pytest.approx(2 * 150 * (2 + 16) * 4 / 2**20)
+    for row in (store, recompute):
+        assert min(row.infer_us.low, row.train_us.low) > 0.0
+    assert aim_rows([store, recompute]) == []
+
+
+def test_an_aim_takes_the_faster_training_and_the_smaller_memory():
+    here = session()
+    store, recompute = throughput_rows(here, [TINY])
+    name = PAPER[0].name
+    changes = {"workload": name, "infer_us": timing(80.0)}
+    store = type(store)(**vars(store) | changes | {"train_us": timing(150.0), "train_mib": 900.0})
+    recompute = type(store)(
+        **vars(recompute) | changes | {"train_us": timing(210.0), "train_mib": 300.0}
+    )
+    (row,) = aim_rows([store, recompute])
+    assert (row.train_us, row.recompute_mib, row.recompute_slower) == (150.0, 300.0, 1.4)
+    assert (row.infer_aim, row.train_aim, row.mib_aim) == (72, 163, 395)
+
+
+def test_scaling_varies_one_number_at_a_time(monkeypatch):
+    monkeypatch.setattr(scaling, "_values", lambda _: ((100, 200), (8, 16), (1, 2), (4, 20)))
+    here = session()
+    rows = scaling_rows(here)
+    assert [row.value for row in rows] == [100, 200, 8, 16, 1, 2, 4, 20]
+    assert [round(row.neighbours) for row in rows] == [67, 67, 8, 16, 67, 67, 67, 67]
+    assert [row.channels for row in rows] == [16] * 6 + [4, 20]
+    assert {slope.axis for slope in slope_rows(rows)} == set(scaling.AXES)
+
+
+def test_what_does_not_fit_into_memory_is_left_out():
+    def large():
+        raise torch.OutOfMemoryError("too large")
+
+    done = []
+    here = session(progress=done.append)
+    assert here.attempt("large", large) == []
+    assert here.attempt("small", lambda: 3) == [3]
+    assert here.left_out == [LeftOut("large", "not enough memory")]
+    assert done == [1, 1]
+
+
+def test_a_slope_is_that_of_the_logarithms():
+    row = scaling._row(session(), "particles", 64)
+    rows = [
+        type(row)(**vars(row) | {"value": n, "infer_us": timing(3 * n), "train_us": timing(n**2)})
+        for n in (16, 64, 256, 1024)
+    ]
+    slope = scaling._slope_row("particles", rows)
+    assert (slope.infer_slope, slope.train_slope) == pytest.approx((1.0, 2.0))
+
+
+def test_peers_that_are_there_are_right_and_others_are_left_out_with_a_reason(monkeypatch):
+    def missing(*_):
+        raise ModuleNotFoundError("No module named 'absent'")
+
+    monkeypatch.setitem(PEERS, "absent", missing)
+    here = session()
+    rows = peer_rows(here, Workload(3, 1, 120, 1, eps=0.2))
+    assert {"npa-envs", "wp.HashGrid", "dense torch"} <= {row.peer for row in rows}
+    assert max(row.error for row in rows) < FORWARD
+    assert LeftOut("absent", "ModuleNotFoundError: No module named 'absent'") in here.left_out
+    measured = {row.peer for row in rows} | {entry.what for entry in here.left_out}
+    assert measured == set(PEERS)
+
+
+def test_the_suites_measure_all_their_tables():
+    here = session(strategies=[STRATEGIES["library"]], precisions=[PRECISIONS["float32"]])
+    tables = suites.quick(here)
+    assert list(tables) == ["perception", "rollouts", "peers", "throughput"]
+    assert all(tables.values())
+    assert here.small
+    assert list(suites.paper(here)) == ["throughput"]
+
+
+# Plots, report
+
+
+def test_the_front_holds_what_nothing_beats():
+    points = [Point(1e-7, 5.0, "a", ""), Point(1e-3, 2.0, "b", ""), Point(1e-2, 3.0, "c", "")]
+    points.append(Point(1e-7, 6.0, "d", ""))
+    assert [point.strategy for point in front(points)] == ["a", "b"]
+
+
+def rollout_row(**values) -> RolloutRow:
+    numbers = dict.fromkeys(("x_1", "s_1", "x_8", "s_8", "x_64", "s_64"), 1e-6)
+    usual = {"strategy": "library", "precision": "float32", "particles": 10, **numbers}
+    usual |= {"step_us": timing(3.0), "training_us": None, "peak_mib": None}
+    return RolloutRow(**usual | {"weights": None, "psnr_512": math.nan} | values)
+
+
+def report_of(tables, **options) -> Report:
+    return Report("quick", "npa-envs bench", "abc", torch.device("cpu"), 1, tables, (), **options)
+
+
+def test_a_report_is_json_without_numbers_that_json_has_not():
+    loaded = json.loads(report_of({"rollouts": [rollout_row()]}, ratios={"a": 2.0}).json())
+    assert {"suite", "command", "commit", "date", "device", "machine", "versions"} <= set(loaded)
+    assert loaded["versions"]["torch"] == torch.__version__
+    (row,) = loaded["tables"]["rollouts"]
+    assert row["psnr_512"] is None
+    assert row["step_us"] == {"median": 3.0, "low": 3.0, "high": 3.0}
+    assert loaded["ratios"] == {"a": 2.0}
+
+
+def test_pictures_are_drawn_of_what_was_measured():
+    pytest.importorskip("matplotlib")
+    tables = {
+        "perception": perception_rows(session(), Workload(2, 1, 60, 1)),
+        "rollouts": [rollout_row(), rollout_row(precision="mixed", s_8=1e-3)],
+    }
+    drawn = pictures(report_of(tables))
+    assert list(drawn) == ["pareto"]
+    assert drawn["pareto"].startswith(b"\x89PNG")
+
+
+def test_plots_without_matplotlib_name_the_extra(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(__import__("sys").modules, "matplotlib", None)
+    assert main([*FAST, "--quick", "--plots", "--output", str(tmp_path)]) == 2
+    assert "pip install 'npa-envs[bench]'" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+# Explanations
+
+
+def question(**options) -> Question:
+    usual = {"workload": TINY, "device": torch.device("cpu"), "dtype": torch.float32}
+    return Question(**usual | {"periodic": False, "gradients": "weights"} | options)
+
+
+def test_an_explanation_names_the_kernels_of_both_passes():
+    text = explain(question())
+    forward, backward = text.split("backward:")
+    for kernel in ("count_cells", "compute_density", "perceive", "apply_update"):
+        assert f"  {kernel} " in forward
+    assert "  gather_state_cotangents " in backward
+    assert "Count the particles" in forward
+
+
+def test_an_explanation_follows_what_is_asked_for():
+    wide = Workload(2, 1, 900, 1)
+    plain = explain(question(workload=wide, gradients="none", periodic=True))
+    assert "backward:" not in plain
+    assert "periodic" in plain
+    assert "gather_position_cotangents" in explain(question(gradients="positions"))
+    assert "f64" in explain(question(dtype=torch.float64))
+
+
+def test_recorded_launches_are_those_of_the_block():
+    x, s = TINY.worlds(torch.device("cpu"))
+    with recorded_launches() as launches:
+        perceive(x, s, TINY.eps)
+    names = [launch.kernel for launch in launches]
+    perceive(x, s, TINY.eps)
+    assert [launch.kernel for launch in launches] == names
+    assert "perceive" in names
+
+
+# The guard
+
+
+def stored(tmp_path: Path, **values: float) -> Path:
+    path = tmp_path / "ratios.json"
+    path.write_text(json.dumps({"cpu": values}))
+    return path
+
+
+def test_a_ratio_is_held_down_to_a_third_and_missed_below(tmp_path):
+    path = stored(tmp_path, dense=30.0, grid=3.0)
+    wanted = ratios.stored_ratios(path, torch.device("cpu"))
+    assert ratios.missed_ratios({"dense": 10.1, "grid": 5.0}, wanted) == []
+    (line,) = ratios.missed_ratios({"dense": 9.9, "grid": 5.0}, wanted)
+    assert line == "dense: 9.9, stored 30, at least 10 wanted"
+    assert len(ratios.missed_ratios({"dense": math.nan}, wanted)) == 2
+
+
+def test_the_library_is_faster_than_dense_torch():
+    measured = ratios.ratios(session())
+    assert measured["perceive: dense torch over library"] > 3.0
+    assert all(value > 0.0 for value in measured.values())
+
+
+def test_the_stored_ratios_are_those_that_are_measured():
+    path = Path(__file__).resolve().parents[1] / "benchmarks" / "results" / "ratios.json"
+    kept = json.loads(path.read_text())
+    measured = ratios.ratios(session())
+    assert sorted(kept["cpu"]) == sorted(measured)
+
+
+def test_check_decides_the_exit_code(tmp_path, monkeypatch, capsys):
+    tiny_suite(monkeypatch)
+    name = "perceive: dense torch over library"
+    words = [*FAST, "--strategies", "library", "--check"]
+    assert main([*words, str(stored(tmp_path, **{name: 1e-3}))]) == 0
+    assert "ratios are held" in capsys.readouterr().out
+    assert main([*words, str(stored(tmp_path, **{name: 1e9}))]) == 1
+    assert f"missed: {name}" in capsys.readouterr().out
+
+
+# The command
+
+
+def test_the_command_prints_tables_and_writes_what_it_says(tmp_path, monkeypatch, capsys):
+    tiny_suite(monkeypatch)
+    folder = tmp_path / "results"
+    assert main([*FAST, "--output", str(folder), "--commit", "abc"]) == 0
+    text = capsys.readouterr().out
+    for word in ("perception:", "neighbour_cap", "bf16_storage", "left out:", "times faster:"):
+        assert word in text
+    (path,) = folder.iterdir()
+    assert f"wrote {path}" in text
+    loaded = json.loads(path.read_text())
+    assert (path.name, loaded["commit"]) == ("quick_cpu.json", "abc")
+    assert loaded["command"].startswith("npa-envs bench --no-progress")
+    strategies = {row["strategy"] for row in loaded["tables"]["perception"]}
+    assert strategies == set(STRATEGIES) - {"plain"}
+
+
+def test_the_command_writes_nothing_unless_asked(tmp_path, monkeypatch):
+    tiny_suite(monkeypatch)
+    monkeypatch.chdir(tmp_path)
+    assert main([*FAST, "--strategies", "library"]) == 0
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--suite", "papper", "--output", "results"], "did you mean 'paper'?"),
+        (["--strategies", "libraries"], "did you mean 'library'?"),
+        (["--precisions", "float16"], "unknown precision 'float16'"),
+        (["--device", "cuda:99"], "device must"),
+        (["--repeats", "0"], "repeats must be at least 1"),
+        (["--plots"], "give --output DIR"),
+        (["--suite", "paper", "--check", "x.json"], "leave --suite out"),
+    ],
+)
+def test_mistakes_are_refused_in_one_line(words, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["bench", "--no-progress", *words]) == 2
+    captured = capsys.readouterr()
+    assert message in captured.err
+    assert captured.err.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("content", ["{}", "[]", "no json", '{"cpu": {"a": "fast"}}'])
+def test_a_file_without_ratios_is_refused_before_anything_is_measured(
+    content, tmp_path, monkeypatch, capsys
+):
+    path = tmp_path / "ratios.json"
+    path.write_text(content)
+    monkeypatch.setattr("npa_envs.cli.bench.measured_report", None)
+    assert main([*FAST, "--check", str(path)]) == 2
+    assert "must hold ratios under 'cpu'" in capsys.readouterr().err
+
+
+def test_explain_prints_and_measures_nothing(capsys):
+    assert main(["bench", "--explain", "--particle-count", "64", "--gradients", "none"]) == 0
+    assert "One step of 1 x 64 particles in 2D" in capsys.readouterr().out
+
+
+def test_the_masks_of_a_composed_rollout_are_those_of_the_library():
+    start = gecko(1, 100, torch.device("cpu"))
+    own = rollout(start.rule, start.x, start.s, 3, update_prob=0.5, generator=mask_source(start.x))
+    x, s, generator = start.x, start.s, mask_source(start.x)
+    for _ in range(3):
+        x, s = composed_step(STRATEGIES["dense"], start.rule, x, s, 0.5, generator)
+    torch.testing.assert_close(x, own[0], rtol=1e-4, atol=1e-5)
