@@ -7,8 +7,7 @@ from worlds import degenerate_world, random_world, relative_error
 
 import npa_envs
 from npa_envs import reference as oracle
-from npa_envs.kernels import slots
-from npa_envs.sph import bridge, cells
+from npa_envs.sph import cells
 from npa_envs.sph.cells import make_plan, sort_worlds
 from npa_envs.sph.operators import Terms, perceive_rows
 from npa_envs.sph.rows import survey
@@ -273,10 +272,6 @@ def test_particles_in_one_cell_are_sorted_by_index(device, monkeypatch):
     assert torch.equal(found.source.cpu(), torch.arange(2200, dtype=torch.int32))
     for value, wanted in zip(found, expected, strict=True):
         assert torch.equal(value, wanted)
-
-
-def test_slots_fit_the_blocks_that_are_launched():
-    assert slots.CUDA_BLOCK == bridge.CUDA_BLOCK
 
 
 def test_detached_positions_get_no_gradient(device):

@@ -75,39 +75,46 @@ _SCATTER = """
     return result;
 """
 
-_LOAD = """
-#if defined(__CUDA_ARCH__)
+READ = """
     {entry} result;
-    constexpr unsigned size = sizeof(result);
-    constexpr unsigned bytes = size % 16 == 0 ? 16 : size % 8 == 0 ? 8 : 4;
-    struct alignas(bytes) Chunk {{ unsigned part[bytes / 4]; }};
-    const Chunk* from = reinterpret_cast<const Chunk*>(entries.data + index);
+#if defined(__CUDA_ARCH__)
+    struct alignas({bytes}) Chunk {{ unsigned part[{bytes} / 4]; }};
+    const Chunk* from = reinterpret_cast<const Chunk*>({place});
     unsigned* to = reinterpret_cast<unsigned*>(&result);
     #pragma unroll
-    for (unsigned i = 0; i < size / bytes; ++i) {{
+    for (unsigned i = 0; i < sizeof(result) / {bytes}; ++i) {{
         const Chunk chunk = from[i];
         #pragma unroll
-        for (unsigned k = 0; k < bytes / 4; ++k) to[bytes / 4 * i + k] = chunk.part[k];
+        for (unsigned k = 0; k < {bytes} / 4; ++k) to[{bytes} / 4 * i + k] = chunk.part[k];
     }}
-    return result;
 #else
-    return entries.data[index];
+    {otherwise}
 #endif
+    return result;
 """
+"""Reads a value in chunks of some bytes; also `otherwise`, without assumptions on alignment."""
 
 
-def _c_scalar(scalar: type) -> str:
+def c_scalar(scalar: type) -> str:
+    """Return the name of a scalar type in native code."""
     if scalar is wp.int32:
         return "int"
     return {"f32": "float", "f64": "double"}[scalar_name(scalar)]
 
 
-def _c_type(value_type: type, scalar: type) -> str:
+def c_type(value_type: type, scalar: type) -> str:
+    """Return the name of a scalar, vector or matrix type in native code."""
     if value_type is scalar:
-        return _c_scalar(scalar)
+        return c_scalar(scalar)
     shape = value_type._shape_
     kind = "vec_t" if len(shape) == 1 else "mat_t"
-    return f"wp::{kind}<{', '.join(str(size) for size in shape)}, {_c_scalar(scalar)}>"
+    return f"wp::{kind}<{', '.join(str(size) for size in shape)}, {c_scalar(scalar)}>"
+
+
+def chunk_bytes(value_type: type) -> int:
+    """Return how many bytes of a value an access takes: as many as 16 that divide its size."""
+    size = wp.types.type_size_in_bytes(value_type)
+    return next(count for count in (16, 8, 4) if size % count == 0)
 
 
 def share_type(value_type: type, scalar: type, lanes: int) -> type:
@@ -132,7 +139,7 @@ def make_lane_sum(
         whole_warps: All threads of a warp call it together, which takes fewer instructions.
         stride: Every so-manyth lane is added, a power of two.
     """
-    part = _c_scalar(scalar)
+    part = c_scalar(scalar)
     shuffles = _SHUFFLES.format(part=part, lanes=lanes, whole=int(whole_warps))
 
     @wp.func_native(_ADD.format(part=part, lanes=lanes, stride=stride, shuffles=shuffles))
@@ -150,14 +157,14 @@ def make_lane_scatter(value_type: type, scalar: type, lanes: int) -> Any:
         scalar: The scalar type that it is made of.
         lanes: Lanes of a particle, 1 on the CPU.
     """
-    part = _c_scalar(scalar)
+    part = c_scalar(scalar)
     shape = value_type._shape_
     result_type = share_type(value_type, scalar, lanes)
     snippet = _SCATTER.format(
         part=part,
         lanes=lanes,
         shuffles=_SHUFFLES.format(part=part, lanes=lanes, whole=0),
-        share=_c_type(result_type, scalar),
+        share=c_type(result_type, scalar),
         rows=shape[0] if len(shape) == 2 else 1,
         width=shape[-1],
     )
@@ -179,8 +186,14 @@ def make_wide_load(value_type: type, scalar: type) -> Any:
         value_type: A scalar, vector or matrix type.
         scalar: The scalar type that it is made of, `wp.int32` included.
     """
+    snippet = READ.format(
+        entry=c_type(value_type, scalar),
+        bytes=chunk_bytes(value_type),
+        place="entries.data + index",
+        otherwise="result = entries.data[index];",
+    )
 
-    @wp.func_native(_LOAD.format(entry=_c_type(value_type, scalar)))
+    @wp.func_native(snippet)
     def wide_load(entries: wp.array(dtype=value_type), index: wp.int32) -> value_type: ...
 
     return wide_load

@@ -17,19 +17,22 @@ from npa_envs.kernels.lanes import make_lane_sum, make_wide_load, share_type
 from npa_envs.kernels.listing import RECORD
 from npa_envs.kernels.slots import (
     SLOT_ENTRIES,
-    any_in_warp,
     as_number,
-    largest_in_warp,
     log_scale_of_square,
     make_lists,
     make_slots,
     make_stage,
-    meet_warp,
-    of_lane,
-    thread_number,
     within,
 )
 from npa_envs.kernels.spiky import make_spiky_wide
+from npa_envs.kernels.warps import (
+    any_in_warp,
+    largest_in_warp,
+    load_integer,
+    meet_warp,
+    of_lane,
+    thread_number,
+)
 
 CUDA_REGISTERS = 80
 """Registers of a thread of the perception pass."""
@@ -38,7 +41,6 @@ AHEAD = 2
 """Listed neighbours that a lane asks for together."""
 
 load_record = make_wide_load(RECORD, wp.float32)
-load_integer = make_wide_load(wp.int32, wp.int32)
 
 
 @functools.cache

@@ -13,33 +13,34 @@ import warp as wp
 
 from npa_envs.kernels.domain import domain_types, kernel_module
 from npa_envs.kernels.lanes import make_wide_load
-from npa_envs.kernels.slots import (
-    any_in_warp,
-    as_word,
-    inverse_root,
-    largest_in_warp,
-    of_lane,
-)
+from npa_envs.kernels.slots import as_word, inverse_root
 from npa_envs.kernels.tiles import (
     CHANNELS,
     ENTRY,
     LIST_ENTRIES,
     TILE,
-    WARP,
     append_entry,
     carry_rest,
-    first_in_warp,
     make_read_columns,
     make_tiles,
-    of_thread,
     pad_list,
     prefetch_columns,
     share_tile,
     smallest_in_tile,
+    write_columns,
+)
+from npa_envs.kernels.warps import (
+    WARP,
+    any_in_warp,
+    first_in_warp,
+    largest_in_warp,
+    load_integer,
+    load_scalar,
+    of_warp,
+    scalar_of_warp,
     sum_up_to,
     thread_of,
     vote_of_warp,
-    write_columns,
 )
 from npa_envs.kernels.wide import make_fast_exp2, make_wide_store
 
@@ -49,16 +50,14 @@ CUDA_REGISTERS = 64
 SHARE = 4
 """Channels of a row that one thread unscales."""
 
-FAR = 3e38
-"""Farther than any particle, in length units."""
+LARGEST_LENGTH = 3e38
+"""Farther than any particle [length units]."""
 
 SLACK = 1.0 + 1e-5
 """Rows are listed within this much more than eps^2, whatever was rounded on the way."""
 
 LOG2_E = 1.4426950408889634
 
-load_integer = make_wide_load(wp.int32, wp.int32)
-load_scalar = make_wide_load(wp.float32, wp.float32)
 load_channels = make_wide_load(CHANNELS, wp.float32)
 store_channels = make_wide_store(CHANNELS, wp.float32)
 fast_exp2 = make_fast_exp2(wp.float32)
@@ -244,8 +243,8 @@ def listed_adjoint(
         middle = vector()
         half = vector()
         for d in range(wp.static(space_dim)):
-            low = smallest_in_tile(wp.where(served, relative[d], scalar(FAR)))
-            high = -smallest_in_tile(wp.where(served, -relative[d], scalar(FAR)))
+            low = smallest_in_tile(wp.where(served, relative[d], scalar(LARGEST_LENGTH)))
+            high = -smallest_in_tile(wp.where(served, -relative[d], scalar(LARGEST_LENGTH)))
             middle[d] = scalar(0.5) * (low + high)
             half[d] = scalar(0.5) * (high - low)
         return middle, half
@@ -284,7 +283,7 @@ def listed_adjoint(
         """Whether all coordinates are numbers."""
         finite = wp.bool(True)
         for d in range(wp.static(space_dim)):
-            finite = finite and wp.abs(position[d]) < scalar(FAR)
+            finite = finite and wp.abs(position[d]) < scalar(LARGEST_LENGTH)
         return finite
 
     @wp.kernel(
@@ -340,20 +339,20 @@ def listed_adjoint(
             prefetch_columns(perception_bar, own_row, channel)
         cell = cell_of(domain, position)
         line = line_of(domain, cell)
-        list = list_address()
+        address = list_address()
         total = CHANNELS()
         # A position that is not a number is near to nothing.
         waiting = k < end and is_finite(position)
         while any_in_warp(waiting):
             # The first particle that waits is served, and with it those on its line of cells.
             leader = first_in_warp(waiting)
-            column = of_lane(cell[0], leader, wp.uint32(WARP))
-            middle_line = of_lane(line, leader, wp.uint32(WARP))
+            column = of_warp(cell[0], leader)
+            middle_line = of_warp(line, leader)
             served = waiting and line == middle_line
             waiting = waiting and line != middle_line
             origin = vector()
             for d in range(wp.static(space_dim)):
-                origin[d] = of_thread(position[d], leader)
+                origin[d] = scalar_of_warp(position[d], leader)
             middle, half = box_around(domain, position, origin, served)
             last_column = largest_in_warp(wp.where(served, cell[0], 0))
             from_column, to_column = columns_around(domain, column, last_column)
@@ -370,19 +369,17 @@ def listed_adjoint(
                     run_end = load_integer(starts, base + to_cell) - row_base
                     length = wp.max(wp.min(run_end, row_capacity) - run_begin, 0)
                 run_ends = sum_up_to(length)
-                candidates = of_lane(run_ends, wp.static(WARP - 1), wp.uint32(WARP))
+                candidates = of_warp(run_ends, wp.static(WARP - 1))
                 shift = run_begin - (run_ends - length)
                 candidate = wp.int32(lane)
                 searching = wp.bool(True)
                 while searching:
-                    row = candidate + of_lane(
-                        shift, thread_of(run_ends, candidate), wp.uint32(WARP)
-                    )
+                    row = candidate + of_warp(shift, thread_of(run_ends, candidate))
                     inside = candidate < candidates
                     other = load_vector(row_positions, wp.where(inside, row, 0))
                     near = near_box(domain, (other - origin) - middle, half)
                     entry = entry_of(other, row * group_count + g)
-                    count = append_entry(list, count, inside and near, entry)
+                    count = append_entry(address, count, inside and near, entry)
                     candidate += wp.static(WARP)
                     searching = candidate - lane < candidates
                     finished = not searching and first_run + wp.static(WARP) >= run_count
@@ -391,9 +388,9 @@ def listed_adjoint(
                         if finished:
                             # Beside the last row are cotangents of nothing.
                             nothing = entry_of(origin, row_capacity * group_count)
-                            summed = pad_list(list, count, nothing)
+                            summed = pad_list(address, count, nothing)
                         found = sum_listed(
-                            list,
+                            address,
                             summed,
                             position,
                             domain.inverse_eps,
@@ -403,7 +400,7 @@ def listed_adjoint(
                             flat_cotangents,
                             found,
                         )
-                        carry_rest(list, summed, count)
+                        carry_rest(address, summed, count)
                         count = wp.max(count - summed, 0)
             votes = vote_of_warp(served) >> wp.uint32(8 * (lane & 3))
             for n in range(2):

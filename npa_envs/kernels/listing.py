@@ -11,7 +11,8 @@ import warp as wp
 
 from npa_envs.kernels.domain import domain_types, kernel_module
 from npa_envs.kernels.lanes import make_lane_sum, make_wide_load
-from npa_envs.kernels.slots import CUDA_BLOCK, as_word, make_lists
+from npa_envs.kernels.slots import as_word, make_lists
+from npa_envs.kernels.warps import CUDA_BLOCK, load_integer
 from npa_envs.kernels.wide import make_wide_store
 
 AHEAD = 3
@@ -26,7 +27,6 @@ LONGEST_STEP = wp.constant(2**15 - 1)
 LIST_BYTES = 2 * CUDA_BLOCK
 """Bytes from one entry of a list to the next while it is made."""
 
-load_integer = make_wide_load(wp.int32, wp.int32)
 store_record = make_wide_store(RECORD, wp.float32)
 
 

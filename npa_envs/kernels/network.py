@@ -11,10 +11,8 @@ from npa_envs.kernels.products import (
     make_two_layers,
     scale_to,
 )
+from npa_envs.kernels.warps import WARP
 from npa_envs.kernels.weight_sums import add_partial_sums, make_weight_sums
-
-LANES = 32
-"""Threads of a warp: each holds its part of every fragment."""
 
 LAYER_REGISTERS, GRADIENT_REGISTERS = 168, 255
 """Registers of a thread of the two kinds of kernels."""
@@ -44,7 +42,7 @@ def arrangement_kernels() -> SimpleNamespace:
         scale = scale_to(size, wp.uint32(wp.static(UNIT_TARGET)))
         if step == 0 and lane % 4 == 0:
             unit_unscale[unit] = wp.float32(1.0) / scale
-        first = ((tile * ((weights.shape[1] + 15) / 16) + step) * wp.static(LANES) + lane) * 8
+        first = ((tile * ((weights.shape[1] + 15) / 16) + step) * wp.static(WARP) + lane) * 8
         for i in range(4):
             column = 16 * step + lane % 4 * 4 + i
             value = wp.float32(0.0)
@@ -72,7 +70,7 @@ def arrangement_kernels() -> SimpleNamespace:
         scale = scale_to(size, wp.uint32(wp.static(OUTPUT_TARGET)))
         if step == 0 and lane % 4 == 0:
             output_unscale[column] = wp.float32(1.0) / scale
-        first = ((step * ((weights.shape[0] + 7) / 8) + tile) * wp.static(LANES) + lane) * 8
+        first = ((step * ((weights.shape[0] + 7) / 8) + tile) * wp.static(WARP) + lane) * 8
         for i in range(4):
             unit = 16 * step + lane % 4 * 2 + i % 2 + i / 2 * 8
             value = wp.float32(0.0)
@@ -90,7 +88,7 @@ def arrangement_kernels() -> SimpleNamespace:
     ):
         """Lay out [H, width] as a left operand; threads (H / 16, width / 16, lanes)."""
         group, step, lane = wp.tid()
-        place = (group * ((weights.shape[1] + 15) / 16) + step) * 2 * wp.static(LANES)
+        place = (group * ((weights.shape[1] + 15) / 16) + step) * 2 * wp.static(WARP)
         first = (place + lane) * 8
         for i in range(8):
             unit = 16 * group + lane / 4 + i / 2 % 2 * 8
@@ -100,7 +98,7 @@ def arrangement_kernels() -> SimpleNamespace:
                 value = weights[unit, column]
             high = wp.bfloat16(value)
             fragments[first + i] = high
-            fragments[first + 8 * wp.static(LANES) + i] = wp.bfloat16(value - wp.float32(high))
+            fragments[first + 8 * wp.static(WARP) + i] = wp.bfloat16(value - wp.float32(high))
 
     return SimpleNamespace(
         arrange_hidden=arrange_hidden, arrange_output=arrange_output, arrange_left=arrange_left
@@ -118,7 +116,7 @@ def two_layer_kernel(steps: int, tiles: int, mode: str) -> wp.Kernel:
     )
     def network_layers(
         unit_count: wp.int32,
-        input: wp.array(dtype=wp.float32, ndim=2),
+        rows: wp.array(dtype=wp.float32, ndim=2),
         hidden_weights: wp.array(dtype=wp.float16),
         output_weights: wp.array(dtype=wp.float16),
         output_unscale: wp.array(dtype=wp.float32),
@@ -127,7 +125,7 @@ def two_layer_kernel(steps: int, tiles: int, mode: str) -> wp.Kernel:
         output: wp.array(dtype=wp.float32, ndim=2),
     ):
         """Map rows through both layers; the hidden units between stay in registers."""
-        two_layers(unit_count, input, hidden_weights, output_weights, output_unscale, signs, output)
+        two_layers(unit_count, rows, hidden_weights, output_weights, output_unscale, signs, output)
 
     return network_layers
 
@@ -145,7 +143,7 @@ def weight_gradient_kernels(
     def sum_weight_gradients(
         unit_count: wp.int32,
         share_rows: wp.int32,
-        input: wp.array(dtype=wp.float32, ndim=2),
+        rows: wp.array(dtype=wp.float32, ndim=2),
         output_bar: wp.array(dtype=wp.float32, ndim=2),
         signs: wp.array(dtype=wp.int32, ndim=2),
         hidden_weights: wp.array(dtype=wp.bfloat16),
@@ -157,7 +155,7 @@ def weight_gradient_kernels(
         weight_sums(
             unit_count,
             share_rows,
-            input,
+            rows,
             output_bar,
             signs,
             hidden_weights,

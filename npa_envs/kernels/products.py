@@ -58,7 +58,7 @@ _TWO_LAYERS = """
     constexpr int steps = $steps;    // of 16 input columns
     constexpr int tiles = $tiles;    // of 8 output columns
     const unsigned lane = threadIdx.x & 31u, t = lane & 3u;
-    const int count = input.shape[0], width = input.shape[1], out_width = output.shape[1];
+    const int count = rows.shape[0], width = rows.shape[1], out_width = output.shape[1];
     const int first = (blockIdx.x * blockDim.x + threadIdx.x) / 32 * 16 + lane / 4;
     const int units = unit_count / 16, words = (units + 7) / 8 * 4;
 
@@ -67,7 +67,7 @@ _TWO_LAYERS = """
     #pragma unroll
     for (int half = 0; half < 2; ++half) {
         const int row = first + 8 * half;
-        const float* from = input.data + (size_t)row * width + 4 * t;
+        const float* from = rows.data + (size_t)row * width + 4 * t;
         float part[steps][4];
         float largest = 0.0f;
         #pragma unroll
@@ -213,6 +213,14 @@ def make_two_layers(steps: int, tiles: int, mode: str) -> wp.Function:
         tiles: Groups of 8 output columns.
         mode: Between the products, "rectify" hidden units, "note" which are positive too, or
             "mask" by what was noted.
+
+    The function takes a number of hidden units H, a multiple of 16; rows [K, width] of at most 16
+    `steps` columns; both layers' fragments, as `arrange_hidden` and `arrange_output` leave them;
+    the outputs' scales [8 `tiles`]; for each row, 4 words of the signs of every 128 hidden units,
+    [K, 4 ceil(H / 128)], which "note" writes and "mask" reads; and writes outputs [K, out_width]
+    of at most 8 `tiles` columns. All are dimensionless. Rows are read 16 bytes at a time and
+    outputs written 8 at a time: rows must be dense, begin at a multiple of 16 bytes and have a
+    multiple of 4 columns, outputs of 8 bytes and 2 columns; fragments begin at 16 bytes, too.
     """
     between = {"rectify": _RECTIFY, "note": _RECTIFY_AND_NOTE, "mask": _MASK}[mode]
     body = Template(HALF_PAIRS + MULTIPLY + _TWO_LAYERS).substitute(
@@ -222,7 +230,7 @@ def make_two_layers(steps: int, tiles: int, mode: str) -> wp.Function:
     @wp.func_native(body)
     def two_layers(
         unit_count: wp.int32,
-        input: wp.array(dtype=wp.float32, ndim=2),
+        rows: wp.array(dtype=wp.float32, ndim=2),
         hidden_weights: wp.array(dtype=wp.float16),
         output_weights: wp.array(dtype=wp.float16),
         output_unscale: wp.array(dtype=wp.float32),

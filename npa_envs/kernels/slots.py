@@ -12,8 +12,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-CUDA_BLOCK = 128
-"""Threads of a block; kernels that use slots must be launched with it."""
+from npa_envs.kernels.warps import CUDA_BLOCK
 
 SLOT_ENTRIES = 32
 """Neighbours that a slot has room for; longer neighbourhoods are summed in several rounds."""
@@ -324,24 +323,6 @@ def make_stage(value_type: type) -> wp.Function:
     return stage
 
 
-@wp.func_native("__syncwarp();")
-def meet_warp():
-    """Wait until the whole warp is here, and sees what it wrote."""
-    ...
-
-
-@wp.func_native("return __any_sync(~0u, condition);")
-def any_in_warp(condition: wp.bool) -> wp.bool:
-    """Whether a condition holds for some thread of the warp."""
-    ...
-
-
-@wp.func_native("return __reduce_max_sync(~0u, value);")
-def largest_in_warp(value: wp.int32) -> wp.int32:
-    """The largest value of the warp's threads."""
-    ...
-
-
 @wp.func_native("return rsqrtf(value);")
 def inverse_root(value: wp.float32) -> wp.float32:
     """1 / sqrt(value), two units in the last place off at most."""
@@ -358,18 +339,6 @@ def inverse_root(value: wp.float32) -> wp.float32:
 """)
 def log_scale_of_square(squared: wp.float32) -> wp.float32:
     """L(v) / v of the logarithmic scaling, from v . v: log(1 + |v|) / |v|."""
-    ...
-
-
-@wp.func_native("return blockIdx.x * blockDim.x + threadIdx.x;")
-def thread_number() -> wp.int32:
-    """Number of this thread in its launch, without the divisions of `wp.tid`."""
-    ...
-
-
-@wp.func_native("return __shfl_sync(~0u, value, (threadIdx.x & 31u & ~(lanes - 1u)) + lane);")
-def of_lane(value: wp.int32, lane: wp.int32, lanes: wp.uint32) -> wp.int32:
-    """Another lane's value, of the same particle."""
     ...
 
 

@@ -265,8 +265,8 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
     def write_starts(
         memory: wp.uint64,
         cell_count: wp.int32,
-        slice: wp.int32,
-        slices: wp.int32,
+        slice_number: wp.int32,
+        slice_count: wp.int32,
         world: wp.int32,
         particle_count: wp.int32,
         masked: wp.int32,
@@ -275,8 +275,8 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
         starts: wp.array(dtype=wp.int32),
     ):
         """Write the first place, and the first row, of each of the slice's cells."""
-        share_of_cells = (cell_count + slices - 1) / slices
-        begin = slice * share_of_cells
+        share_of_cells = (cell_count + slice_count - 1) / slice_count
+        begin = slice_number * share_of_cells
         end = wp.min(begin + share_of_cells, cell_count)
         for cell in range(begin + thread_of_block(), end, wp.static(block)):
             start = start_of(memory, cell)
@@ -293,7 +293,7 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
     def sort_worlds(
         domain: Domain,
         particle_count: wp.int32,
-        slices: wp.int32,
+        slice_count: wp.int32,
         positions: wp.array(dtype=vector),
         state_dim: wp.int32,
         parts: wp.int32,
@@ -319,8 +319,8 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
 
         States and rows are left out where their arrays are empty.
         """
-        world = block_number() / slices
-        slice = block_number() - world * slices
+        world = block_number() / slice_count
+        slice_number = block_number() - world * slice_count
         lane = thread_of_block()
         first_particle = world * particle_count
         first_cell = world * domain.cell_count
@@ -354,8 +354,8 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
         write_starts(
             memory,
             domain.cell_count,
-            slice,
-            slices,
+            slice_number,
+            slice_count,
             world,
             particle_count,
             masked,
@@ -363,15 +363,16 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
             row_base,
             starts,
         )
-        if lane == 0 and slice == 0 and first_particle + particle_count == positions.shape[0]:
+        is_last_world = first_particle + particle_count == positions.shape[0]
+        if lane == 0 and slice_number == 0 and is_last_world:
             end_of_all = start_of(memory, domain.cell_count)
             starts[starts.shape[0] - 1] = row_base + end_of_all[1]
         for i in range(lane, particle_count, wp.static(block)):
             place_arrived(memory, i)
         meet_block()
 
-        share_of_places = (particle_count + slices - 1) / slices
-        begin = slice * share_of_places
+        share_of_places = (particle_count + slice_count - 1) / slice_count
+        begin = slice_number * share_of_places
         end = wp.min(begin + share_of_places, particle_count)
         if begin < end:
             span = span_of_slice(memory, begin, end)

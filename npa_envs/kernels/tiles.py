@@ -12,13 +12,10 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from npa_envs.kernels.slots import CUDA_BLOCK
+from npa_envs.kernels.warps import CUDA_BLOCK, WARP
 
 TILE = 8
 """Particles that a warp serves together, and rows of one product."""
-
-WARP = 32
-"""Threads of a warp."""
 
 LIST_ENTRIES = 96
 """Rows that a list has room for; longer ones are summed in several rounds."""
@@ -41,7 +38,7 @@ _APPEND = """
     const unsigned votes = __ballot_sync(~0u, accepted);
     const unsigned before = (1u << (threadIdx.x & 31u)) - 1u;
     if (accepted) {
-        const unsigned place = list + 16 * (count + __popc(votes & before));
+        const unsigned place = address + 16 * (count + __popc(votes & before));
         *reinterpret_cast<float4*>(__cvta_shared_to_generic(place)) =
             make_float4(entry[0], entry[1], entry[2], entry[3]);
     }
@@ -51,7 +48,7 @@ _APPEND = """
 _PAD = """
     const unsigned lane = threadIdx.x & 31u;
     if (lane < (-count & 7)) {
-        *reinterpret_cast<float4*>(__cvta_shared_to_generic(list + 16 * (count + lane))) =
+        *reinterpret_cast<float4*>(__cvta_shared_to_generic(address + 16 * (count + lane))) =
             make_float4(entry[0], entry[1], entry[2], entry[3]);
     }
     return (count + 7) & ~7;
@@ -61,9 +58,9 @@ _CARRY = """
     __syncwarp();
     const unsigned lane = threadIdx.x & 31u;
     if ((int)lane < count - summed) {
-        *reinterpret_cast<float4*>(__cvta_shared_to_generic(list + 16 * lane)) =
+        *reinterpret_cast<float4*>(__cvta_shared_to_generic(address + 16 * lane)) =
             *reinterpret_cast<const float4*>(
-                __cvta_shared_to_generic(list + 16 * (summed + lane)));
+                __cvta_shared_to_generic(address + 16 * (summed + lane)));
     }
     __syncwarp();
 """
@@ -81,7 +78,7 @@ _SUM = """
         unsigned values[{kinds}][4], value_rests[{kinds}][4];
         #pragma unroll
         for (unsigned half = 0; half < 2; ++half) {{
-            const unsigned place = list + 16 * (begin + first_row + 4 * half);
+            const unsigned place = address + 16 * (begin + first_row + 4 * half);
             const float4 row = *reinterpret_cast<const float4*>(__cvta_shared_to_generic(place));
             const float* from = columns + (size_t)__float_as_uint(row.w) * ({kinds} * {width});
             #pragma unroll
@@ -161,25 +158,8 @@ _SMALLEST = """
     return value;
 """
 
-_SUM_UP_TO = """
-    const unsigned lane = threadIdx.x & 31u;
-    #pragma unroll
-    for (unsigned offset = 1; offset < 32; offset <<= 1) {
-        const int before = __shfl_up_sync(~0u, value, offset);
-        if (lane >= offset) value += before;
-    }
-    return value;
-"""
-
-_FIND = """
-    unsigned found = 0;
-    #pragma unroll
-    for (unsigned step = 16; step > 0; step >>= 1) {
-        if (__shfl_sync(~0u, ends, found + step - 1) <= number) found += step;
-    }
-    return found;
-"""
-
+# Beside the reads and writes of `lanes` and `wide`, for aligned entries that are all there: here
+# a row may begin anywhere, and end before a group of columns does.
 _READ = """
     constexpr int count = {count};
     wp::vec_t<count, float> result;
@@ -242,7 +222,7 @@ def make_tiles(space_dim: int, width: int, kinds: int, periodic: bool) -> Simple
 
     @wp.func_native(_MULTIPLY + _SUM.format(**names))
     def sum_listed(
-        list: wp.uint32,
+        address: wp.uint32,
         count: wp.int32,
         position: vector,
         inverse_eps: wp.float32,
@@ -282,19 +262,19 @@ def write_columns(
 
 
 @wp.func_native(_APPEND)
-def append_entry(list: wp.uint32, count: wp.int32, accepted: wp.bool, entry: ENTRY) -> wp.int32:
+def append_entry(address: wp.uint32, count: wp.int32, accepted: wp.bool, entry: ENTRY) -> wp.int32:
     """Append the entries of the threads that accept theirs; return the new length."""
     ...
 
 
 @wp.func_native(_PAD)
-def pad_list(list: wp.uint32, count: wp.int32, entry: ENTRY) -> wp.int32:
+def pad_list(address: wp.uint32, count: wp.int32, entry: ENTRY) -> wp.int32:
     """Fill a list up to a multiple of a tile; return the new length."""
     ...
 
 
 @wp.func_native(_CARRY)
-def carry_rest(list: wp.uint32, summed: wp.int32, count: wp.int32):
+def carry_rest(address: wp.uint32, summed: wp.int32, count: wp.int32):
     """Move what is not summed yet, less than a tile, to a list's beginning."""
     ...
 
@@ -314,34 +294,4 @@ def share_tile(total: CHANNELS) -> CHANNELS:
 @wp.func_native(_SMALLEST)
 def smallest_in_tile(value: wp.float32) -> wp.float32:
     """The smallest value of the tile's particles, four threads each."""
-    ...
-
-
-@wp.func_native("return __ffs(__ballot_sync(~0u, condition)) - 1;")
-def first_in_warp(condition: wp.bool) -> wp.int32:
-    """The first thread for which a condition holds, -1 if there is none."""
-    ...
-
-
-@wp.func_native("return __ballot_sync(~0u, condition);")
-def vote_of_warp(condition: wp.bool) -> wp.uint32:
-    """For which threads a condition holds, a bit for each."""
-    ...
-
-
-@wp.func_native("return __shfl_sync(~0u, value, lane);")
-def of_thread(value: wp.float32, lane: wp.int32) -> wp.float32:
-    """Another thread's value."""
-    ...
-
-
-@wp.func_native(_SUM_UP_TO)
-def sum_up_to(value: wp.int32) -> wp.int32:
-    """The sum of the values of this thread and of those before it in the warp."""
-    ...
-
-
-@wp.func_native(_FIND)
-def thread_of(ends: wp.int32, number: wp.int32) -> wp.int32:
-    """The first thread whose end, one of an ascending order, is beyond a number."""
     ...

@@ -33,10 +33,10 @@ _WEIGHT_SUMS = """
     __shared__ __align__(16) unsigned short bars[2][$rows * out_pitch];
 
     const unsigned lane = threadIdx.x & 31u, t = lane & 3u, g = lane >> 2;
-    const int width = input.shape[1], out_width = output_bar.shape[1];
+    const int width = rows.shape[1], out_width = output_bar.shape[1];
     const int share = blockIdx.x / $unit_blocks;
     const int base = ((blockIdx.x % $unit_blocks) * warps + threadIdx.x / 32) * 32;
-    const int begin = share * share_rows, end = min(begin + share_rows, input.shape[0]);
+    const int begin = share * share_rows, end = min(begin + share_rows, rows.shape[0]);
 
     // Rows come in while the ones before them are summed. A thread splits what it asked for.
     const auto ask_for_rows = [&](int first) {
@@ -47,7 +47,7 @@ _WEIGHT_SUMS = """
             const int column = 4 * (is_input ? chunk : chunk - 4 * steps);
             const int columns = is_input ? width : out_width;
             const bool inside = row < end && column < columns;
-            const float* from = is_input ? input.data : output_bar.data;
+            const float* from = is_input ? rows.data : output_bar.data;
             from += inside ? (size_t)row * columns + column : 0;
             asm volatile("cp.async.cg.shared.global [%0], [%1], 16, %2;"
                 :: "r"((unsigned)__cvta_generic_to_shared(arriving + i)), "l"(from),
@@ -280,7 +280,7 @@ def make_weight_sums(
     def weight_sums(
         unit_count: wp.int32,
         share_rows: wp.int32,
-        input: wp.array(dtype=wp.float32, ndim=2),
+        rows: wp.array(dtype=wp.float32, ndim=2),
         output_bar: wp.array(dtype=wp.float32, ndim=2),
         signs_of: wp.array(dtype=wp.int32, ndim=2),
         hidden_weights: wp.array(dtype=wp.bfloat16),

@@ -9,58 +9,23 @@ from typing import Any
 import warp as wp
 
 from npa_envs.kernels.domain import scalar_name
-
-_STORE = """
-#if defined(__CUDA_ARCH__)
-    constexpr unsigned size = sizeof(value);
-    constexpr unsigned bytes = size % 16 == 0 ? 16 : size % 8 == 0 ? 8 : 4;
-    struct alignas(bytes) Chunk { unsigned part[bytes / 4]; };
-    Chunk* to = reinterpret_cast<Chunk*>(entries.data + index);
-    const unsigned* from = reinterpret_cast<const unsigned*>(&value);
-    #pragma unroll
-    for (unsigned i = 0; i < size / bytes; ++i) {
-        Chunk chunk;
-        #pragma unroll
-        for (unsigned k = 0; k < bytes / 4; ++k) chunk.part[k] = from[bytes / 4 * i + k];
-        to[i] = chunk;
-    }
-#else
-    entries.data[index] = value;
-#endif
-"""
-
-_READ = """
-    {entry} result;
-#if defined(__CUDA_ARCH__)
-    struct alignas({bytes}) Chunk {{ unsigned part[{bytes} / 4]; }};
-    const Chunk* from = reinterpret_cast<const Chunk*>(values.data + place);
-    unsigned* to = reinterpret_cast<unsigned*>(&result);
-    #pragma unroll
-    for (unsigned i = 0; i < sizeof(result) / {bytes}; ++i) {{
-        const Chunk chunk = from[i];
-        #pragma unroll
-        for (unsigned k = 0; k < {bytes} / 4; ++k) to[{bytes} / 4 * i + k] = chunk.part[k];
-    }}
-#else
-    for (unsigned k = 0; k < {count}; ++k) result[k] = values.data[place + k];
-#endif
-    return result;
-"""
+from npa_envs.kernels.lanes import READ, c_type, chunk_bytes
+from npa_envs.kernels.warps import of_warp as of_warp  # for `cells`
 
 _WRITE = """
 #if defined(__CUDA_ARCH__)
-    struct alignas(16) Chunk {{ unsigned part[4]; }};
-    Chunk* to = reinterpret_cast<Chunk*>(values.data + place);
-    const unsigned* from = reinterpret_cast<const unsigned*>(&entry);
+    struct alignas({bytes}) Chunk {{ unsigned part[{bytes} / 4]; }};
+    Chunk* to = reinterpret_cast<Chunk*>({place});
+    const unsigned* from = reinterpret_cast<const unsigned*>(&value);
     #pragma unroll
-    for (unsigned i = 0; i < sizeof(entry) / 16; ++i) {{
+    for (unsigned i = 0; i < sizeof(value) / {bytes}; ++i) {{
         Chunk chunk;
         #pragma unroll
-        for (unsigned k = 0; k < 4; ++k) chunk.part[k] = from[4 * i + k];
+        for (unsigned k = 0; k < {bytes} / 4; ++k) chunk.part[k] = from[{bytes} / 4 * i + k];
         to[i] = chunk;
     }}
 #else
-    for (unsigned k = 0; k < {count}; ++k) values.data[place + k] = entry[k];
+    {otherwise}
 #endif
 """
 
@@ -76,14 +41,6 @@ _WARP_SUM = """
         }
     }
     return parts;
-#else
-    return value;
-#endif
-"""
-
-_OF_WARP = """
-#if defined(__CUDA_ARCH__)
-    return __shfl_sync(0xffffffffu, value, lane);
 #else
     return value;
 #endif
@@ -108,12 +65,6 @@ _FAST_EXP2 = """
 """
 
 
-@wp.func_native(_OF_WARP)
-def of_warp(value: wp.int32, lane: wp.int32) -> wp.int32:
-    """What a thread of the warp has, all 32 of which must ask; on the CPU, the argument."""
-    ...
-
-
 @functools.cache
 def make_wide_store(value_type: type, scalar: type) -> Any:
     """Return a Warp function that writes an entry of a flat array, on CUDA in few, wide stores.
@@ -126,7 +77,13 @@ def make_wide_store(value_type: type, scalar: type) -> Any:
         scalar: The scalar type that it is made of.
     """
 
-    @wp.func_native(_STORE)
+    snippet = _WRITE.format(
+        bytes=chunk_bytes(value_type),
+        place="entries.data + index",
+        otherwise="entries.data[index] = value;",
+    )
+
+    @wp.func_native(snippet)
     def wide_store(entries: wp.array(dtype=value_type), index: wp.int32, value: value_type): ...
 
     return wide_store
@@ -143,8 +100,12 @@ def make_read_at(value_type: type, scalar: type, alignment: int) -> Any:
             or 16.
     """
     count = value_type._length_
-    name = {"f32": "wp::float32", "f64": "wp::float64"}[scalar_name(scalar)]
-    snippet = _READ.format(bytes=alignment, count=count, entry=f"wp::vec_t<{count}, {name}>")
+    snippet = READ.format(
+        entry=c_type(value_type, scalar),
+        bytes=alignment,
+        place="values.data + place",
+        otherwise=f"for (int k = 0; k < {count}; ++k) result[k] = values.data[place + k];",
+    )
 
     @wp.func_native(snippet)
     def read_at(values: wp.array(dtype=scalar), place: wp.int32) -> value_type: ...
@@ -194,8 +155,15 @@ def make_write_at(value_type: type, scalar: type) -> Any:
         scalar: The scalar type that it is made of.
     """
 
-    @wp.func_native(_WRITE.format(count=value_type._length_))
-    def write_at(values: wp.array(dtype=scalar), place: wp.int32, entry: value_type): ...
+    count = value_type._length_
+    snippet = _WRITE.format(
+        bytes=16,
+        place="values.data + place",
+        otherwise=f"for (int k = 0; k < {count}; ++k) values.data[place + k] = value[k];",
+    )
+
+    @wp.func_native(snippet)
+    def write_at(values: wp.array(dtype=scalar), place: wp.int32, value: value_type): ...
 
     return write_at
 

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from npa_envs.kernels.adjoint import adjoint_kernels
 from npa_envs.kernels.listed_adjoint import SHARE, listed_adjoint
-from npa_envs.kernels.tiles import TILE, WARP
+from npa_envs.kernels.tiles import TILE
+from npa_envs.kernels.warps import WARP
 from npa_envs.sph.bridge import launch
 from npa_envs.sph.cells import Plan, density_scale, make_plan
 

@@ -11,6 +11,7 @@ import warp as wp
 from torch import Tensor
 
 from npa_envs.kernels.lanes import CUDA_LANES
+from npa_envs.kernels.warps import CUDA_BLOCK
 from npa_envs.warp_report import quiet_warp, start_warp
 
 SCALARS: dict[torch.dtype, Any] = {torch.float32: wp.float32, torch.float64: wp.float64}
@@ -18,10 +19,6 @@ SCALARS: dict[torch.dtype, Any] = {torch.float32: wp.float32, torch.float64: wp.
 
 GROUP_WIDTHS = (4, 8, 16)
 """Channels of a group: its lanes serve it together; there are several beyond the largest width."""
-
-
-CUDA_BLOCK = 128
-"""Threads of a CUDA block, where a launch does not say otherwise."""
 
 
 def scalar_type(dtype: torch.dtype) -> Any:

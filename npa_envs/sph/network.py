@@ -9,12 +9,12 @@ import torch
 from torch import Tensor
 
 from npa_envs.kernels.network import (
-    LANES,
     arrangement_kernels,
     two_layer_kernel,
     weight_gradient_kernels,
 )
 from npa_envs.kernels.products import UNIT_GROUP
+from npa_envs.kernels.warps import WARP
 from npa_envs.kernels.weight_sums import WARP_UNITS
 from npa_envs.sph.bridge import launch
 
@@ -78,7 +78,7 @@ def _arrange_layers(first: Tensor, second: Tensor) -> list[Tensor]:
     kernels = arrangement_kernels()
     launch(
         kernels.arrange_hidden,
-        (hidden // 8, steps, LANES),
+        (hidden // 8, steps, WARP),
         first.device,
         first,
         unit_unscale,
@@ -86,7 +86,7 @@ def _arrange_layers(first: Tensor, second: Tensor) -> list[Tensor]:
     )
     launch(
         kernels.arrange_output,
-        (hidden // UNIT_GROUP, tiles, LANES),
+        (hidden // UNIT_GROUP, tiles, WARP),
         first.device,
         second,
         unit_unscale,
@@ -103,7 +103,7 @@ def _arrange_left(weight: Tensor) -> Tensor:
     fragments = torch.empty(hidden * steps * 32, dtype=torch.bfloat16, device=weight.device)
     launch(
         arrangement_kernels().arrange_left,
-        (hidden // UNIT_GROUP, steps, LANES),
+        (hidden // UNIT_GROUP, steps, WARP),
         weight.device,
         weight,
         fragments,
@@ -181,7 +181,7 @@ def _map_rows(
     warps = -(-rows.shape[0] // ROW_GROUP)
     launch(
         two_layer_kernel(steps, tiles, mode),
-        -(-warps * LANES // LAYER_BLOCK) * LAYER_BLOCK,
+        -(-warps * WARP // LAYER_BLOCK) * LAYER_BLOCK,
         rows.device,
         unit_count,
         _aligned(rows),
@@ -249,7 +249,7 @@ def _weight_gradients(
     partial_sums = rows.new_empty(shares, unit_count * (width + out_width))
     launch(
         kernels.sum_weight_gradients,
-        shares * unit_blocks * warps * LANES,
+        shares * unit_blocks * warps * WARP,
         rows.device,
         unit_count,
         share_rows,
@@ -258,12 +258,12 @@ def _weight_gradients(
         signs,
         *arranged[3:],
         partial_sums,
-        block_dim=warps * LANES,
+        block_dim=warps * WARP,
     )
     total = rows.new_empty(partial_sums.shape[1])
     launch(
         kernels.add_shares,
-        -(-total.shape[0] // LANES) * 4 * LANES,
+        -(-total.shape[0] // WARP) * 4 * WARP,
         rows.device,
         partial_sums,
         total,
