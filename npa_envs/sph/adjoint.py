@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -15,17 +15,49 @@ from npa_envs.sph.bridge import launch
 from npa_envs.sph.cells import Plan, density_scale, make_plan
 
 
+class SavedPerception(NamedTuple):
+    """What the forward pass leaves to the adjoint of perception, as tensors in this order."""
+
+    perception: Tensor
+    """Rows of perception, dimensionless, shape [K, row_width]."""
+    row_of: Tensor
+    """Row of each particle, -1 where it has none, int32, shape [B N]."""
+    starts: Tensor
+    """First sorted place of every cell, then first row of every cell (shifted), int32."""
+    source: Tensor
+    """Caller's index of each sorted particle, int32, shape [B N]."""
+    particles: Tensor
+    """Sorted positions [length units] with volumes 1 / rho, shape [B N, D + 1]."""
+    row_positions: Tensor
+    """Positions of the rows [length units], shape [K, D]; undefined beyond the last active row."""
+    row_kernel_sum: Tensor
+    """The rows' sums of v K [1 / length units], shape [K, D]; undefined beyond the last one."""
+    states: Tensor | None = None
+    """Sorted states, dimensionless, shape [B N G, W]; None where positions get no gradient."""
+
+    def tensors(self) -> list[Tensor]:
+        """Return those that are there, as a torch operator takes or returns them."""
+        return [tensor for tensor in self if tensor is not None]
+
+
+class RowCotangents(NamedTuple):
+    """Cotangents of the rows' raw sums, of G groups of W channels each."""
+
+    bar: Tensor
+    """Cotangents of rows of perception, as they came, shape [K, row_width]."""
+    blur: Tensor
+    """Of the smoothed states, shape [K G, W]."""
+    gradient: Tensor
+    """Of the state gradients before their scaling, shape [K G, D, W]."""
+    density_gradient: Tensor
+    """Of the density gradients before their scaling, shape [K, D]; empty without `states`."""
+
+
 @torch.library.custom_op("npa::perceive_rows_backward", mutates_args=())
 def perceive_rows_backward(
     perception_bar: Tensor,
-    perception: Tensor,
-    row_of: Tensor,
-    starts: Tensor,
-    source: Tensor,
-    particles: Tensor,
-    row_positions: Tensor,
-    row_kernel_sum: Tensor,
-    states: Tensor | None,
+    saved_tensors: list[Tensor],
+    *,
     particle_count: int,
     state_dim: int,
     masked: bool,
@@ -37,142 +69,166 @@ def perceive_rows_backward(
 ) -> tuple[Tensor, Tensor]:
     """Return the cotangents of states, [B N, C], and of positions, [B N, D] or empty.
 
-    Everything saved by the forward pass comes as it left it; `states` None skips positions.
+    The tensors are those of a `SavedPerception`; positions are skipped if it has no states.
     """
-    total, space_dim = particles.shape[0], particles.shape[1] - 1
-    row_capacity = perception.shape[0]
+    saved = SavedPerception(*saved_tensors)
+    total, space_dim = saved.particles.shape[0], saved.particles.shape[1] - 1
     plan = make_plan(
-        particles,
+        saved.particles,
         (total // particle_count, particle_count, space_dim),
         state_dim,
-        row_capacity,
+        saved.perception.shape[0],
         masked,
         eps,
         box,
     )
-    if plan.listed and states is None:
-        states_bar = _gather_by_tiles(
-            plan,
-            perception_bar,
-            perception,
-            row_of,
-            starts,
-            source,
-            particles,
-            row_positions,
-            row_kernel_sum,
-            scale,
-            state_gradient,
-        )
-        return states_bar, states_bar.new_empty(0)
-    width = plan.width
-    kernels = adjoint_kernels(space_dim, plan.scalar, width, plan.lanes, state_gradient)
-    device = particles.device
     bar = perception_bar.contiguous()
-    blur_bar = bar.new_empty(row_capacity * plan.group_count, width)
-    gradient_bar = bar.new_empty(row_capacity * plan.group_count, space_dim, width)
-    density_gradient_bar = bar.new_empty(0 if states is None else row_capacity, space_dim)
+    if plan.listed and saved.states is None:
+        states_bar = _gather_by_tiles(plan, saved, bar, scale, state_gradient)
+        return states_bar, states_bar.new_empty(0)
+    kernels = adjoint_kernels(space_dim, plan.scalar, plan.width, plan.lanes, state_gradient)
+    cotangents = _unscale(kernels, plan, saved, bar, scale, density_gradient)
+    states_bar = _gather_states(kernels, plan, saved, cotangents)
+    if saved.states is None:
+        return states_bar, bar.new_empty(0)
+    return states_bar, _gather_positions(kernels, plan, saved, cotangents)
+
+
+@perceive_rows_backward.register_fake
+def _(
+    perception_bar: Tensor,
+    saved_tensors: list[Tensor],
+    *,
+    state_dim: int,
+    **options: Any,
+) -> tuple[Tensor, Tensor]:
+    saved = SavedPerception(*saved_tensors)
+    particles = saved.particles
+    total, space_dim = particles.shape[0], particles.shape[1] - 1
+    positions_bar = (
+        particles.new_empty(0) if saved.states is None else particles.new_empty(total, space_dim)
+    )
+    return particles.new_empty(total, state_dim), positions_bar
+
+
+def _unscale(
+    kernels: Any,
+    plan: Plan,
+    saved: SavedPerception,
+    bar: Tensor,
+    scale: float,
+    density_gradient: bool,
+) -> RowCotangents:
+    """Pull the cotangents of rows back through their scaling."""
+    entries, space_dim = plan.row_capacity * plan.group_count, plan.space_dim
+    cotangents = RowCotangents(
+        bar,
+        bar.new_empty(entries, plan.width),
+        bar.new_empty(entries, space_dim, plan.width),
+        bar.new_empty(0 if saved.states is None else plan.row_capacity, space_dim),
+    )
     launch(
         kernels.unscale_cotangents,
-        (row_capacity, plan.group_count * width),
-        device,
-        state_dim,
+        (plan.row_capacity, plan.group_count * plan.width),
+        bar.device,
+        plan.state_dim,
         int(density_gradient),
         scale,
-        density_scale(scale, space_dim, particle_count),
+        density_scale(scale, space_dim, plan.particle_count),
         plan.row_base,
         plan.group_count,
-        starts,
-        perception,
+        saved.starts,
+        saved.perception,
         bar,
-        blur_bar.view(-1),
-        gradient_bar.view(-1),
-        density_gradient_bar,
+        cotangents.blur.view(-1),
+        cotangents.gradient.view(-1),
+        cotangents.density_gradient,
     )
-    states_bar = bar.new_empty(total, state_dim)
+    return cotangents
+
+
+def _gather_states(
+    kernels: Any, plan: Plan, saved: SavedPerception, cotangents: RowCotangents
+) -> Tensor:
+    """Return the cotangent of states, [B N, C]."""
+    states_bar = cotangents.bar.new_empty(plan.total, plan.state_dim)
     launch(
         kernels.gather_state_cotangents,
-        (total, plan.group_count, plan.lanes),
-        device,
+        (plan.total, plan.group_count, plan.lanes),
+        states_bar.device,
         plan.domain,
-        particle_count,
-        state_dim,
+        plan.particle_count,
+        plan.state_dim,
         plan.active_offset,
         plan.row_base,
-        row_capacity,
+        plan.row_capacity,
         plan.group_count,
-        starts,
-        particles,
-        source,
-        row_of,
-        row_positions,
-        row_kernel_sum,
-        bar,
-        blur_bar,
-        gradient_bar,
-        gradient_bar.view(-1),
+        saved.starts,
+        saved.particles,
+        saved.source,
+        saved.row_of,
+        saved.row_positions,
+        saved.row_kernel_sum,
+        cotangents.bar,
+        cotangents.blur,
+        cotangents.gradient,
+        cotangents.gradient.view(-1),
         states_bar,
     )
-    if states is None:
-        return states_bar, bar.new_empty(0)
-    density_bar = bar.new_empty(total)
+    return states_bar
+
+
+def _gather_positions(
+    kernels: Any, plan: Plan, saved: SavedPerception, cotangents: RowCotangents
+) -> Tensor:
+    """Return the cotangent of positions, [B N, D]."""
+    bar = cotangents.bar
+    density_bar = bar.new_empty(plan.total)
     launch(
         kernels.gather_density_cotangents,
-        total,
-        device,
+        plan.total,
+        bar.device,
         plan.domain,
-        particle_count,
+        plan.particle_count,
         plan.group_count,
-        starts,
-        particles,
-        states,
-        source,
-        row_of,
-        blur_bar,
-        gradient_bar,
+        saved.starts,
+        saved.particles,
+        saved.states,
+        saved.source,
+        saved.row_of,
+        cotangents.blur,
+        cotangents.gradient,
         density_bar,
     )
-    positions_bar = bar.new_empty(total, space_dim)
+    positions_bar = bar.new_empty(plan.total, plan.space_dim)
     launch(
         kernels.gather_position_cotangents,
-        total,
-        device,
+        plan.total,
+        bar.device,
         plan.domain,
-        particle_count,
+        plan.particle_count,
         plan.group_count,
-        starts,
-        particles,
-        states,
-        source,
-        row_of,
+        saved.starts,
+        saved.particles,
+        saved.states,
+        saved.source,
+        saved.row_of,
         density_bar,
-        blur_bar,
-        gradient_bar,
-        density_gradient_bar,
+        cotangents.blur,
+        cotangents.gradient,
+        cotangents.density_gradient,
         positions_bar,
     )
-    return states_bar, positions_bar
+    return positions_bar
 
 
 def _gather_by_tiles(
-    plan: Plan,
-    perception_bar: Tensor,
-    perception: Tensor,
-    row_of: Tensor,
-    starts: Tensor,
-    source: Tensor,
-    particles: Tensor,
-    row_positions: Tensor,
-    row_kernel_sum: Tensor,
-    scale: float,
-    state_gradient: bool,
+    plan: Plan, saved: SavedPerception, bar: Tensor, scale: float, state_gradient: bool
 ) -> Tensor:
     """Return the cotangent of states, [B N, C], on CUDA in float32."""
     kernels = listed_adjoint(
         plan.space_dim, plan.width, state_gradient, plan.periodic, plan.group_count > 1
     )
-    device = particles.device
-    bar = perception_bar.contiguous()
     # All cotangents are multiplied by one kernel's norm, those of the smoothed state before.
     norm = plan.domain.spiky_norm if state_gradient else plan.domain.smoothing_norm
     kinds = 1 + plan.space_dim * state_gradient
@@ -181,15 +237,15 @@ def _gather_by_tiles(
     launch(
         kernels.unscale_cotangents,
         entries * plan.width // SHARE,
-        device,
+        bar.device,
         plan.state_dim,
         scale,
         plan.domain.smoothing_norm / norm,
         plan.row_base,
         plan.row_capacity,
         plan.group_count,
-        starts,
-        perception,
+        saved.starts,
+        saved.perception,
         bar,
         cotangents,
     )
@@ -198,7 +254,7 @@ def _gather_by_tiles(
     launch(
         kernels.gather_state_cotangents,
         plan.world_count * tile_count * plan.group_count * WARP,
-        device,
+        bar.device,
         plan.domain,
         norm,
         plan.particle_count,
@@ -208,37 +264,15 @@ def _gather_by_tiles(
         plan.row_base,
         plan.row_capacity,
         plan.group_count,
-        starts,
-        particles.view(-1),
-        source,
-        row_of,
-        row_positions,
-        row_kernel_sum,
+        saved.starts,
+        saved.particles.view(-1),
+        saved.source,
+        saved.row_of,
+        saved.row_positions,
+        saved.row_kernel_sum,
         bar,
         cotangents,
         cotangents.view(-1),
         states_bar,
     )
     return states_bar
-
-
-@perceive_rows_backward.register_fake
-def _(
-    perception_bar: Tensor,
-    perception: Tensor,
-    row_of: Tensor,
-    starts: Tensor,
-    source: Tensor,
-    particles: Tensor,
-    row_positions: Tensor,
-    row_kernel_sum: Tensor,
-    states: Tensor | None,
-    particle_count: int,
-    state_dim: int,
-    *options: Any,
-) -> tuple[Tensor, Tensor]:
-    total, space_dim = particles.shape[0], particles.shape[1] - 1
-    positions_bar = (
-        particles.new_empty(0) if states is None else particles.new_empty(total, space_dim)
-    )
-    return particles.new_empty(total, state_dim), positions_bar

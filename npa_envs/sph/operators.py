@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from npa_envs.sph.adjoint import perceive_rows_backward
+from npa_envs.sph.adjoint import SavedPerception, perceive_rows_backward
 from npa_envs.sph.bridge import launch
 from npa_envs.sph.cells import make_plan, sort_worlds
 from npa_envs.sph.passes import Terms, compute_densities, perception_launch, rollout_listing
@@ -45,7 +45,8 @@ def _perceive_rows(
     moment_correction: bool,
     density_gradient: bool,
     for_adjoint: bool,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+) -> list[Tensor]:
+    """Return the particles of the rows, `row_source`, and then what a `SavedPerception` holds."""
     plan = make_plan(x, x.shape, s.shape[2], row_capacity, mask is not None, eps, box)
     terms = Terms(state_gradient, moment_correction, density_gradient)
     ordered = sort_worlds(plan, x, s, mask)
@@ -65,17 +66,17 @@ def _perceive_rows(
             row_kernel_sum=row_kernel_sum if for_adjoint else None,
         )
     )
-    return (
-        perception,
-        ordered.row_of,
-        ordered.row_source,
-        ordered.starts,
-        ordered.source,
-        densities.particles,
-        ordered.row_positions,
-        row_kernel_sum,
-        ordered.states,
+    saved = SavedPerception(
+        perception=perception,
+        row_of=ordered.row_of,
+        starts=ordered.starts,
+        source=ordered.source,
+        particles=densities.particles,
+        row_positions=ordered.row_positions,
+        row_kernel_sum=row_kernel_sum,
+        states=ordered.states,
     )
+    return [ordered.row_source, *saved.tensors()]
 
 
 @_perceive_rows.register_fake
@@ -89,22 +90,22 @@ def _(
     scale: float,
     box: list[float] | None,
     *options: bool,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+) -> list[Tensor]:
     plan = make_plan(x, x.shape, s.shape[2], row_capacity, mask is not None, eps, box)
     for_adjoint = options[-1]
     particle_count = plan.total if for_adjoint or not plan.listed else 0
     integers = torch.int32
-    return (
-        x.new_empty(row_capacity, row_width),
-        x.new_empty(plan.total, dtype=integers),
-        x.new_empty(row_capacity, dtype=integers),
-        x.new_empty(plan.start_count, dtype=integers),
-        x.new_empty(plan.total, dtype=integers),
-        x.new_empty(particle_count, plan.space_dim + 1),
-        x.new_empty(row_capacity, plan.space_dim),
-        x.new_empty(row_capacity if for_adjoint else 0, plan.space_dim),
-        s.new_empty(plan.total * plan.group_count, plan.width),
+    saved = SavedPerception(
+        perception=x.new_empty(row_capacity, row_width),
+        row_of=x.new_empty(plan.total, dtype=integers),
+        starts=x.new_empty(plan.start_count, dtype=integers),
+        source=x.new_empty(plan.total, dtype=integers),
+        particles=x.new_empty(particle_count, plan.space_dim + 1),
+        row_positions=x.new_empty(row_capacity, plan.space_dim),
+        row_kernel_sum=x.new_empty(row_capacity if for_adjoint else 0, plan.space_dim),
+        states=s.new_empty(plan.total * plan.group_count, plan.width),
     )
+    return [x.new_empty(row_capacity, dtype=integers), *saved.tensors()]
 
 
 class _PerceiveRows(torch.autograd.Function):
@@ -123,17 +124,7 @@ class _PerceiveRows(torch.autograd.Function):
         box: list[float] | None,
         terms: Terms,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        (
-            perception,
-            row_of,
-            row_source,
-            starts,
-            source,
-            particles,
-            row_positions,
-            row_kernel_sum,
-            states,
-        ) = _perceive_rows(
+        row_source, *tensors = _perceive_rows(
             x,
             s,
             mask,
@@ -145,38 +136,35 @@ class _PerceiveRows(torch.autograd.Function):
             *terms,
             for_adjoint=any(ctx.needs_input_grad),
         )
-        ctx.mark_non_differentiable(row_of, row_source, starts)
+        saved = SavedPerception(*tensors)
+        ctx.mark_non_differentiable(saved.row_of, row_source, saved.starts)
         ctx.set_materialize_grads(False)
         if any(ctx.needs_input_grad):
             ctx.options = (eps, scale, box, terms)
             ctx.shapes = (x.shape, s.shape, mask is not None)
-            saved = (perception, row_of, starts, source, particles, row_positions, row_kernel_sum)
-            ctx.save_for_backward(*saved, *((states,) if ctx.needs_input_grad[0] else ()))
-        return perception, row_of, row_source, starts
+            ctx.save_for_backward(*(saved if ctx.needs_input_grad[0] else saved[:-1]))
+        return saved.perception, saved.row_of, row_source, saved.starts
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *bars: Tensor | None) -> tuple[Tensor | None, ...]:
         if bars[0] is None:
             return (None,) * 9
-        saved = ctx.saved_tensors
-        states = saved[7] if len(saved) == 8 else None
         eps, scale, box, terms = ctx.options
         x_shape, s_shape, masked = ctx.shapes
         states_bar, positions_bar = perceive_rows_backward(
             bars[0],
-            *saved[:7],
-            states,
-            x_shape[1],
-            s_shape[2],
-            masked,
-            eps,
-            scale,
-            box,
-            terms.state_gradient,
-            terms.density_gradient,
+            list(ctx.saved_tensors),
+            particle_count=x_shape[1],
+            state_dim=s_shape[2],
+            masked=masked,
+            eps=eps,
+            scale=scale,
+            box=box,
+            state_gradient=terms.state_gradient,
+            density_gradient=terms.density_gradient,
         )
-        x_bar = None if states is None else positions_bar.view(x_shape)
+        x_bar = positions_bar.view(x_shape) if ctx.needs_input_grad[0] else None
         return (x_bar, states_bar.view(s_shape), None, None, None, None, None, None, None)
 
 
