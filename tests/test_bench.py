@@ -281,6 +281,26 @@ def test_peers_that_are_there_are_right_and_others_are_left_out_with_a_reason(mo
     assert measured == set(PEERS)
 
 
+def test_each_skip_is_measured_with_and_without():
+    here = session()
+    here.small = True
+    rows = suites.skipped(here)["skips"]
+    assert here.left_out == []
+    assert len({row.condition for row in rows}) == len(rows) == 9
+    assert all(row.done_us.median > 0 and row.skipped_us.median > 0 for row in rows)
+    assert all(row.saved.endswith("%") for row in rows)
+
+
+def test_kernels_are_cudas(device):
+    here = Session(device, repeats=1, small=True)
+    rows = suites.kernels(here)["kernels"]
+    if device.type == "cuda":
+        assert any("perceive" in row.kernel for row in rows)
+    else:
+        assert rows == []
+        assert [entry.what for entry in here.left_out] == ["kernels"]
+
+
 def test_the_suites_measure_all_their_tables():
     here = session(strategies=[STRATEGIES["library"]], precisions=[PRECISIONS["float32"]])
     tables = suites.quick(here)

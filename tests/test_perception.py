@@ -7,7 +7,7 @@ from worlds import degenerate_world, random_world, relative_error
 
 import npa_envs
 from npa_envs import reference as oracle
-from npa_envs.sph import cells
+from npa_envs.sph import cells, passes
 from npa_envs.sph.cells import make_plan, sort_worlds
 from npa_envs.sph.operators import Terms, perceive_rows
 from npa_envs.sph.rows import survey
@@ -136,9 +136,28 @@ def test_observation_is_perception_in_the_callers_order_and_clipped(
         assert relative_error(out, expected.clamp(-1.5, 1.5)) < FORWARD[dtype]
 
 
-def test_observation_of_a_world_does_not_depend_on_its_batch(device):
-    """333 particles: the worlds begin anywhere within a CUDA warp."""
-    x, s = random_world(5, 333, 2, 16, dtype=torch.float32, device=device)
+@pytest.mark.parametrize(
+    ("space_dim", "state_dim", "box"),
+    [(2, 20, (1.5, 1.7)), (2, 5, None), (3, 16, None), (3, 33, (1.5, 1.7, 1.6))],
+)
+@pytest.mark.parametrize("shared", [0, 4096], ids=("one thread", "several threads"))
+def test_rows_are_right_however_many_threads_share_them(
+    space_dim, state_dim, box, shared, device, monkeypatch
+):
+    monkeypatch.setattr(passes, "SHARED_WORLD", shared)
+    x, s = random_world(3, 211, space_dim, state_dim, dtype=torch.float32, device=device)
+    z = npa_envs.perceive(x, s, 0.3, 0.3, box=box)
+    expected = oracle.perceive(x.cpu().double(), s.cpu().double(), 0.3, 0.3, box)
+    assert relative_error(z, expected) < FORWARD[torch.float32]
+    for k in range(3):
+        alone = npa_envs.perceive(x[k : k + 1], s[k : k + 1], 0.3, 0.3, box=box)
+        assert torch.equal(z[k], alone[0])
+
+
+@pytest.mark.parametrize("count", [333, 2100])
+def test_observation_of_a_world_does_not_depend_on_its_batch(count, device):
+    """The worlds begin anywhere within a CUDA warp; large ones have longer lists."""
+    x, s = random_world(5, count, 2, 16, dtype=torch.float32, device=device)
 
     def run(x, s):
         return survey(x, s, eps=0.2, eps0=0.2, box=None, terms=Terms(), limit=16.0).perceive()
@@ -150,8 +169,10 @@ def test_observation_of_a_world_does_not_depend_on_its_batch(device):
 
 @pytest.mark.parametrize("masked", [False, True], ids=("all", "active"))
 @pytest.mark.parametrize("count", [40, 130, 300, 900])
-def test_rows_of_crowded_worlds_are_right(count, masked, device):
+@pytest.mark.parametrize("shared", [0, 4096], ids=("one thread", "several threads"))
+def test_rows_of_crowded_worlds_are_right(count, masked, shared, device, monkeypatch):
     """Everybody sees everybody: on CUDA, lists overflow, and before that a lane's share of one."""
+    monkeypatch.setattr(passes, "SHARED_WORLD", shared)
     x, s = random_world(2, count, 2, 16, dtype=torch.float32, device=device)
     x *= 0.05
     generator = torch.Generator().manual_seed(2)

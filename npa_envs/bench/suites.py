@@ -6,12 +6,21 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from npa_envs.bench import ratios as guard
+from npa_envs.bench.kernels import kernel_rows
 from npa_envs.bench.peers import peer_rows
 from npa_envs.bench.perception import perception_rows
 from npa_envs.bench.rollouts import rollout_rows
 from npa_envs.bench.scaling import scaling_rows, slope_rows
 from npa_envs.bench.session import Session, Tables
-from npa_envs.bench.throughput import CPU, PAPER, SMALL, aim_rows, throughput_rows
+from npa_envs.bench.skips import skip_rows
+from npa_envs.bench.throughput import (
+    CPU,
+    PAPER,
+    PROFILED,
+    SMALL,
+    aim_rows,
+    throughput_rows,
+)
 from npa_envs.bench.workloads import Workload
 from npa_envs.errors import NPAError, suggest
 
@@ -80,11 +89,23 @@ def quick(session: Session) -> Tables:
     return {**accuracy(session), **paper(session)}
 
 
+def skipped(session: Session) -> Tables:
+    """Return what it saves to leave out what a scene does not need."""
+    return {"skips": skip_rows(session)}
+
+
+def kernels(session: Session) -> Tables:
+    """Return the kernels of the paper's workloads."""
+    return {"kernels": kernel_rows(session, SMALL if session.small else PROFILED)}
+
+
 SUITES = {
     "quick": Suite("small worlds; about a minute on a CPU", quick, guarded=True),
     "paper": Suite("inference, training and memory of the paper's workloads", paper),
     "accuracy": Suite("run time against error, by strategy and precision; peers", accuracy),
     "scaling": Suite("time and memory against N, neighbours, B and C", scaling),
+    "skips": Suite("what it saves to leave out what a scene does not need", skipped),
+    "kernels": Suite("which CUDA kernels a step takes, and how long each", kernels),
 }
 """Every suite by its name."""
 

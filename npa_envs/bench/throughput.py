@@ -39,6 +39,9 @@ SIXTEEN_MILLION = Workload(2, 1, 2**24, 4)
 PAPER = (EIGHT_WORLDS, ONE_WORLD, LARGE_WORLDS, CUBES, MILLION, SIXTEEN_MILLION)
 """Workloads on CUDA."""
 
+PROFILED = PAPER[:4]
+"""Those of the authors' own table."""
+
 CPU = (Workload(2, 1, 4096, 16), Workload(2, 4, 1024, 16))
 """Workloads on a CPU."""
 

@@ -70,12 +70,18 @@ class Workload:
         s = torch.randn(*shape, self.state_dim, generator=generator, device=device)
         return x.mul_(2.0).sub_(1.0).mul_(self.half_width), s.mul_(0.1)
 
-    def rule(self, device: torch.device) -> NPARule:
-        """Return a rule with the same fresh weights at every call."""
+    def rule(self, device: torch.device, **options: bool) -> NPARule:
+        """Return a rule with the same fresh weights at every call.
+
+        Args:
+            device: Where it lives.
+            options: What `NPARule` takes besides its dimensions.
+        """
         # Weights are drawn from torch's global generators, which must be left as they were.
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)
-            rule = NPARule(self.space_dim, self.state_dim, self.hidden_dim, eps0=self.eps)
+            dims = (self.space_dim, self.state_dim, self.hidden_dim)
+            rule = NPARule(*dims, eps0=self.eps, **options)
         return rule.to(device)
 
 
