@@ -26,6 +26,7 @@ from npa_envs.kernels.domain import (
     spiky_factor_slope,
 )
 from npa_envs.kernels.lanes import make_lane_scatter, make_wide_load
+from npa_envs.kernels.ranges import PAIRS, in_ranges
 
 CUDA_REGISTERS = 64
 """Registers of a thread that gathers state cotangents: it mostly waits for memory."""
@@ -53,8 +54,10 @@ def adjoint_kernels(
     load_gradient = make_wide_load(group_gradient, scalar)
     scatter_group = make_lane_scatter(group, scalar, lanes)
 
+    @in_ranges(PAIRS)
     @wp.kernel(enable_backward=False, module=module)
     def unscale_cotangents(
+        range_start: wp.int32,
         state_dim: wp.int32,
         density_gradient: wp.int32,
         gradient_scale: scalar,
@@ -71,6 +74,7 @@ def adjoint_kernels(
     ):
         """Pull the cotangent of z back through its scaling, into cotangents of the raw sums."""
         row, channel = wp.tid()
+        row += range_start
         if row >= starts[starts.shape[0] - 1] - row_base:
             return
         gradient_start = 2 * state_dim
@@ -105,8 +109,10 @@ def adjoint_kernels(
                 pull = density_scale * log_scale_adjoint(scaled, bar)
             density_gradient_bar[row] = pull
 
+    @in_ranges(PAIRS)
     @wp.kernel(enable_backward=False, module=module, cuda_max_registers=CUDA_REGISTERS)
     def gather_state_cotangents(
+        range_start: wp.int32,
         domain: Domain,
         particle_count: wp.int32,
         state_dim: wp.int32,
@@ -129,6 +135,7 @@ def adjoint_kernels(
     ):
         """Write the cotangent of every particle's state, from the active rows around it."""
         k, g, lane = wp.tid()
+        k += range_start
         entry = particles[k]
         position = position_of(entry)
         total = group()
@@ -169,8 +176,10 @@ def adjoint_kernels(
                             )
                 states_bar[i, channel] = bar
 
+    @in_ranges(PAIRS)
     @wp.kernel(enable_backward=False, module=module)
     def gather_density_cotangents(
+        range_start: wp.int32,
         domain: Domain,
         particle_count: wp.int32,
         group_count: wp.int32,
@@ -185,7 +194,7 @@ def adjoint_kernels(
         density_bar: wp.array(dtype=scalar),
     ):
         """Write the cotangent of every particle's density, through its volume."""
-        k = wp.tid()
+        k = range_start + wp.tid()
         entry = particles[k]
         position = position_of(entry)
         volume = entry[wp.static(space_dim)]
@@ -229,8 +238,10 @@ def adjoint_kernels(
         along = smoothing_bar * slope + factor_slope * wp.dot(offset, kernel_bar)
         return along * offset + factor * kernel_bar
 
+    @in_ranges(PAIRS)
     @wp.kernel(enable_backward=False, module=module)
     def gather_position_cotangents(
+        range_start: wp.int32,
         domain: Domain,
         particle_count: wp.int32,
         group_count: wp.int32,
@@ -247,7 +258,7 @@ def adjoint_kernels(
         positions_bar: wp.array(dtype=vector),
     ):
         """Write the cotangent of every position: as a neighbour of others, and as a centre."""
-        k = wp.tid()
+        k = range_start + wp.tid()
         entry = particles[k]
         position = position_of(entry)
         volume = entry[wp.static(space_dim)]

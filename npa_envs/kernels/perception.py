@@ -21,6 +21,7 @@ from npa_envs.kernels.domain import (
     spiky_factor,
 )
 from npa_envs.kernels.lanes import make_lane_scatter, make_lane_sum, make_wide_load, share_type
+from npa_envs.kernels.ranges import PAIRS, in_ranges
 
 CUDA_REGISTERS = 128
 """Registers of a thread of the perception pass: more threads in flight are worth a few spills."""
@@ -87,8 +88,10 @@ def perception_kernels(
             kernel = (wp.float64(domain.spiky_norm) * falloff * falloff * inverse) * r
         return kernel
 
+    @in_ranges(PAIRS)
     @wp.kernel(enable_backward=False, module=module)
     def compute_density(
+        range_start: wp.int32,
         domain: Domain,
         particle_count: wp.int32,
         density_gradient: wp.int32,
@@ -106,6 +109,7 @@ def perception_kernels(
         rounding error: it stays in float64 up to its scaling, which costs little.
         """
         k, lane = wp.tid()
+        k += range_start
         position = sorted_positions[k]
         row = wp.int32(-1)
         if density_gradient != 0:
@@ -200,8 +204,10 @@ def perception_kernels(
             result = wp.clamp(value, -limit, limit)
         return result
 
+    @in_ranges(PAIRS)
     @wp.kernel(enable_backward=False, module=module, cuda_max_registers=CUDA_REGISTERS)
     def perceive(
+        range_start: wp.int32,
         domain: Domain,
         particle_count: wp.int32,
         state_dim: wp.int32,
@@ -228,6 +234,7 @@ def perception_kernels(
         in their own order if it is empty; clipped to plus and minus `limit` unless that is zero.
         """
         row, g, lane = wp.tid()
+        row += range_start
         if row >= starts[starts.shape[0] - 1] - row_base:
             for column in range(
                 g * wp.static(lanes) + lane, perception.shape[1], group_count * wp.static(lanes)
@@ -283,8 +290,10 @@ def perception_kernels(
             for padding in range(column, perception.shape[1]):
                 perception[to, padding] = wp.where(padding == column, scalar(1.0), scalar(0.0))
 
+    @in_ranges(PAIRS)
     @wp.kernel(enable_backward=False, module=module)
     def gather_fields(
+        range_start: wp.int32,
         domain: Domain,
         particle_count: wp.int32,
         state_dim: wp.int32,
@@ -302,6 +311,7 @@ def perception_kernels(
     ):
         """Write the unscaled fields of every particle, in the caller's order."""
         k, g, lane = wp.tid()
+        k += range_start
         i = source[k]
         entry = particles[k]
         blur, gradient, _kernel_sum, moment = sum_neighbours(
