@@ -124,10 +124,11 @@ def perception_kernels(
                 neighbour = sorted_positions[j]
                 offset = minimum_image(domain, neighbour - position)
                 squared = wp.dot(offset, offset)
-                if squared < domain.squared_eps and j != k:
-                    density += smoothing(squared, domain.inverse_squared_eps, domain.smoothing_norm)
-                    if row >= 0:
-                        gradient += spiky_wide(domain, position, neighbour)
+                seen = squared < domain.squared_eps and j != k
+                weight = smoothing(squared, domain.inverse_squared_eps, domain.smoothing_norm)
+                density += wp.where(seen, weight, scalar(0.0))
+                if row >= 0 and seen:
+                    gradient += spiky_wide(domain, position, neighbour)
         # A particle always sees itself: a position that is not finite would otherwise have rho 0.
         density = domain.smoothing_norm + add_scalar(density)
         gradient = add_wide(gradient)
