@@ -25,8 +25,10 @@ from npa_envs.kernels.domain import (
     spiky_factor,
     spiky_factor_slope,
 )
+from npa_envs.kernels.groups import make_add_scaled
 from npa_envs.kernels.lanes import make_lane_scatter, make_wide_load
 from npa_envs.kernels.ranges import PAIRS, in_ranges
+from npa_envs.kernels.sifting import make_sift
 
 CUDA_REGISTERS = 64
 """Registers of a thread that gathers state cotangents: it mostly waits for memory."""
@@ -50,6 +52,8 @@ def adjoint_kernels(
     share = width // lanes
     topic = "adjoint" if state_gradient else "smoothing_adjoint"
     module = kernel_module(topic, space_dim, scalar, width, lanes)
+    sift, sift_stride = make_sift(space_dim, scalar, vector, lanes)
+    add_scaled = make_add_scaled(group, scalar)
     load_group = make_wide_load(group, scalar)
     load_gradient = make_wide_load(group_gradient, scalar)
     scatter_group = make_lane_scatter(group, scalar, lanes)
@@ -145,13 +149,15 @@ def adjoint_kernels(
             first_cell, last_cell = segment_cells(domain, cell, segment)
             begin = starts[base + first_cell] - row_base
             end = wp.min(starts[base + last_cell] - row_base, row_capacity)
-            for row in range(begin + lane, end, wp.static(lanes)):
-                offset = minimum_image(domain, position - row_positions[row])
-                squared = wp.dot(offset, offset)
-                if squared < domain.squared_eps:
-                    total += smoothing(
-                        squared, domain.inverse_squared_eps, domain.smoothing_norm
-                    ) * load_group(blur_bar, row * group_count + g)
+            for start in range(begin + lane, end, wp.static(sift_stride)):
+                near, count = sift(domain, row_positions, position, start, end)
+                for n in range(count):
+                    row = near[n]
+                    offset = minimum_image(domain, position - row_positions[row])
+                    squared = wp.dot(offset, offset)
+                    weight = smoothing(squared, domain.inverse_squared_eps, domain.smoothing_norm)
+                    blur = load_group(blur_bar, row * group_count + g)
+                    total = add_scaled(total, weight, blur)
                     if wp.static(state_gradient):
                         kernel = offset * spiky_factor(
                             wp.sqrt(squared), domain.inverse_eps, domain.spiky_norm

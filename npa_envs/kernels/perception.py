@@ -20,8 +20,10 @@ from npa_envs.kernels.domain import (
     smoothing,
     spiky_factor,
 )
+from npa_envs.kernels.groups import make_add_scaled
 from npa_envs.kernels.lanes import make_lane_scatter, make_lane_sum, make_wide_load, share_type
 from npa_envs.kernels.ranges import PAIRS, in_ranges
+from npa_envs.kernels.sifting import make_sift
 
 CUDA_REGISTERS = 128
 """Registers of a thread of the perception pass: more threads in flight are worth a few spills."""
@@ -58,6 +60,8 @@ def perception_kernels(
     if state_gradient:
         topic = "perception" if moment_correction else "uncorrected_perception"
     module = kernel_module(topic, space_dim, scalar, width, lanes)
+    sift, sift_stride = make_sift(space_dim, scalar, particle, lanes)
+    add_scaled = make_add_scaled(group, scalar)
     load_group = make_wide_load(group, scalar)
     add_scalar = make_lane_sum(scalar, scalar, lanes)
     add_wide = make_lane_sum(wide, wp.float64, lanes)
@@ -164,22 +168,26 @@ def perception_kernels(
         cell = cell_of(domain, position)
         for segment in range(segment_count(domain, cell)):
             first, last = segment_cells(domain, cell, segment)
-            for j in range(starts[base + first] + lane, starts[base + last], wp.static(lanes)):
-                entry = particles[j]
-                offset = minimum_image(domain, position_of(entry) - position)
-                squared = wp.dot(offset, offset)
-                if squared < domain.squared_eps:
+            end = starts[base + last]
+            for begin in range(starts[base + first] + lane, end, wp.static(sift_stride)):
+                near, count = sift(domain, particles, position, begin, end)
+                for n in range(count):
+                    j = near[n]
+                    entry = particles[j]
+                    offset = minimum_image(domain, position_of(entry) - position)
+                    squared = wp.dot(offset, offset)
                     volume = entry[wp.static(space_dim)]
                     state = load_group(states, j * group_count + g)
                     weight = smoothing(squared, domain.inverse_squared_eps, domain.smoothing_norm)
-                    blur += (volume * weight) * state
+                    blur = add_scaled(blur, volume * weight, state)
                     if wp.static(state_gradient):
                         kernel = offset * spiky_factor(
                             wp.sqrt(squared), domain.inverse_eps, domain.spiky_norm
                         )
                         weighted = volume * kernel
                         kernel_sum += weighted
-                        gradient += wp.outer(weighted, state - own)
+                        for d in range(wp.static(space_dim)):
+                            gradient[d] = add_scaled(gradient[d], weighted[d], state - own)
                         if wp.static(moment_correction):
                             moment += wp.outer(offset, weighted)
         gradients = gradient_share()
