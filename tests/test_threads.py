@@ -9,7 +9,7 @@ import torch
 from worlds import random_world
 
 import npa_envs
-from npa_envs.sph import bridge
+from npa_envs.sph import bridge, threads
 from npa_envs.sph.actions import RepeatedActions
 from npa_envs.sph.operators import Terms, perceive_rows
 from npa_envs.sph.picture_losses import picture_losses
@@ -138,12 +138,12 @@ def test_results_are_the_same_bits_for_every_number_of_threads(
     set_threads(1)
     expected = run(x, s)
     assert not cuts
-    for threads in (2, 3):
+    for thread_count in (2, 3):
         cuts.clear()
-        set_threads(threads)
+        set_threads(thread_count)
         for value, alone in zip(run(x, s), expected, strict=True):
             assert torch.equal(value, alone)
-        assert max(cuts) == threads * 4
+        assert max(cuts) == thread_count * threads.SHARES
 
 
 def test_a_step_of_a_large_world_is_cut(set_threads, cuts, monkeypatch):
@@ -164,12 +164,20 @@ def test_small_worlds_are_not_cut(set_threads, cuts, monkeypatch):
 
 @pytest.mark.parametrize("count", [0, 1, 20, 21, 1000])
 def test_ranges_cover_every_index_once_and_none_is_too_small(count, set_threads):
-    for threads in (1, 2, 3):
-        set_threads(threads)
+    for thread_count in (1, 2, 3):
+        set_threads(thread_count)
         ranges = even_ranges(count, 10)
         assert [index for part in ranges for index in part] == list(range(count))
         assert len(ranges) == 1 or min(len(part) for part in ranges) >= 10
-        assert threads > 1 or len(ranges) == 1
+        assert thread_count > 1 or len(ranges) == 1
+
+
+def test_threads_of_torch_and_of_a_pool_are_both_used(set_threads, monkeypatch):
+    set_threads(2)
+    for team in (threads._team, lambda: None):
+        monkeypatch.setattr(threads, "_team", team)
+        meeting = threading.Barrier(2, timeout=10.0)
+        run_together([meeting.wait, meeting.wait])
 
 
 def test_an_error_in_another_thread_is_raised_after_every_call(set_threads):
@@ -190,22 +198,18 @@ def test_an_error_in_another_thread_is_raised_after_every_call(set_threads):
 
 
 def test_a_forked_process_starts_threads_of_its_own():
-    """Its parent's are gone: a call handed to them would never run."""
+    """Its parent's are gone: what is handed to them would never run."""
     program = (
         "import os, threading, torch, npa_envs\n"
         "torch.set_num_threads(2)\n"
         "x = torch.rand(1, 1500, 2, generator=torch.Generator().manual_seed(0))\n"
         "s = x.repeat(1, 1, 2)\n"
-        "def perceived():\n"
-        "    result = npa_envs.perceive(x, s, 0.1)\n"
-        "    names = [thread.name for thread in threading.enumerate()]\n"
-        "    assert any(name.startswith('npa_envs') for name in names), names\n"
-        "    return result\n"
-        "expected = perceived()\n"
+        "expected = npa_envs.perceive(x, s, 0.1)\n"
         "child = os.fork()\n"
         "if child == 0:\n"
         "    torch.set_num_threads(2)\n"
-        "    os._exit(0 if torch.equal(perceived(), expected) else 1)\n"
+        "    same = torch.equal(npa_envs.perceive(x, s, 0.1), expected)\n"
+        "    os._exit(0 if same and threading.active_count() > 1 else 1)\n"
         "print(os.waitpid(child, 0)[1])\n"
     )
     done = subprocess.run(
