@@ -151,12 +151,12 @@ def test_a_step_of_a_large_world_is_cut(set_threads, cuts, monkeypatch):
     x, s = random_world(1, 2000, 2, STATE_DIM, dtype=torch.float32, device="cpu")
     set_threads(2)
     npa_envs.perceive(x, s, 0.1)
-    assert cuts == [8, 8]
+    assert cuts == [3, 3]
 
 
 def test_small_worlds_are_not_cut(set_threads, cuts, monkeypatch):
     monkeypatch.setattr(bridge, "even_ranges", even_ranges)
-    x, s = random_world(1, 100, 2, STATE_DIM, dtype=torch.float32, device="cpu")
+    x, s = random_world(1, 1000, 2, STATE_DIM, dtype=torch.float32, device="cpu")
     set_threads(2)
     stepped(x, s)
     assert not cuts

@@ -360,10 +360,8 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
                         drawn = picture[world, p, q]
                         picture[world, p, q] = drawn + scratch[world, q - left] * along
 
-    @in_ranges(WORLDS)
     @wp.kernel(enable_backward=False, module=module)
     def sum_errors(
-        range_start: wp.int32,
         picture: wp.array(dtype=colour_type, ndim=3),
         target: wp.array(dtype=colour_type, ndim=2),
         # outputs
@@ -371,7 +369,6 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
     ):
         """Write the sums of both errors over each row of the pictures."""
         world, row = wp.tid()
-        world += range_start
         sums = wp.vec2d()
         for column in range(picture.shape[2]):
             sums += pixel_errors(picture[world, row, column], target[row, column])
