@@ -47,7 +47,7 @@ class BenchOptions:
     """Readings of every time; tables show their median and range."""
 
     threads: int = 1
-    """CPU threads of torch; the kernels use one."""
+    """CPU threads of torch and of the kernels."""
 
     output: Path | None = None
     """Folder for SUITE_DEVICE.json and plots; default: nothing is written."""

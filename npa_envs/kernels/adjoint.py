@@ -25,7 +25,10 @@ from npa_envs.kernels.domain import (
     spiky_factor,
     spiky_factor_slope,
 )
+from npa_envs.kernels.groups import make_add_scaled
 from npa_envs.kernels.lanes import make_lane_scatter, make_wide_load
+from npa_envs.kernels.ranges import PAIRS, in_ranges
+from npa_envs.kernels.sifting import make_sift
 
 CUDA_REGISTERS = 64
 """Registers of a thread that gathers state cotangents: it mostly waits for memory."""
@@ -49,12 +52,16 @@ def adjoint_kernels(
     share = width // lanes
     topic = "adjoint" if state_gradient else "smoothing_adjoint"
     module = kernel_module(topic, space_dim, scalar, width, lanes)
+    sift, sift_stride = make_sift(space_dim, scalar, vector, lanes)
+    add_scaled = make_add_scaled(group, scalar)
     load_group = make_wide_load(group, scalar)
     load_gradient = make_wide_load(group_gradient, scalar)
     scatter_group = make_lane_scatter(group, scalar, lanes)
 
+    @in_ranges(PAIRS)
     @wp.kernel(enable_backward=False, module=module)
     def unscale_cotangents(
+        range_start: wp.int32,
         state_dim: wp.int32,
         density_gradient: wp.int32,
         gradient_scale: scalar,
@@ -71,6 +78,7 @@ def adjoint_kernels(
     ):
         """Pull the cotangent of z back through its scaling, into cotangents of the raw sums."""
         row, channel = wp.tid()
+        row += range_start
         if row >= starts[starts.shape[0] - 1] - row_base:
             return
         gradient_start = 2 * state_dim
@@ -105,8 +113,10 @@ def adjoint_kernels(
                 pull = density_scale * log_scale_adjoint(scaled, bar)
             density_gradient_bar[row] = pull
 
+    @in_ranges(PAIRS)
     @wp.kernel(enable_backward=False, module=module, cuda_max_registers=CUDA_REGISTERS)
     def gather_state_cotangents(
+        range_start: wp.int32,
         domain: Domain,
         particle_count: wp.int32,
         state_dim: wp.int32,
@@ -129,6 +139,7 @@ def adjoint_kernels(
     ):
         """Write the cotangent of every particle's state, from the active rows around it."""
         k, g, lane = wp.tid()
+        k += range_start
         entry = particles[k]
         position = position_of(entry)
         total = group()
@@ -138,13 +149,15 @@ def adjoint_kernels(
             first_cell, last_cell = segment_cells(domain, cell, segment)
             begin = starts[base + first_cell] - row_base
             end = wp.min(starts[base + last_cell] - row_base, row_capacity)
-            for row in range(begin + lane, end, wp.static(lanes)):
-                offset = minimum_image(domain, position - row_positions[row])
-                squared = wp.dot(offset, offset)
-                if squared < domain.squared_eps:
-                    total += smoothing(
-                        squared, domain.inverse_squared_eps, domain.smoothing_norm
-                    ) * load_group(blur_bar, row * group_count + g)
+            for start in range(begin + lane, end, wp.static(sift_stride)):
+                near, count = sift(domain, row_positions, position, start, end)
+                for n in range(count):
+                    row = near[n]
+                    offset = minimum_image(domain, position - row_positions[row])
+                    squared = wp.dot(offset, offset)
+                    weight = smoothing(squared, domain.inverse_squared_eps, domain.smoothing_norm)
+                    blur = load_group(blur_bar, row * group_count + g)
+                    total = add_scaled(total, weight, blur)
                     if wp.static(state_gradient):
                         kernel = offset * spiky_factor(
                             wp.sqrt(squared), domain.inverse_eps, domain.spiky_norm
@@ -169,8 +182,10 @@ def adjoint_kernels(
                             )
                 states_bar[i, channel] = bar
 
+    @in_ranges(PAIRS)
     @wp.kernel(enable_backward=False, module=module)
     def gather_density_cotangents(
+        range_start: wp.int32,
         domain: Domain,
         particle_count: wp.int32,
         group_count: wp.int32,
@@ -185,7 +200,7 @@ def adjoint_kernels(
         density_bar: wp.array(dtype=scalar),
     ):
         """Write the cotangent of every particle's density, through its volume."""
-        k = wp.tid()
+        k = range_start + wp.tid()
         entry = particles[k]
         position = position_of(entry)
         volume = entry[wp.static(space_dim)]
@@ -229,8 +244,10 @@ def adjoint_kernels(
         along = smoothing_bar * slope + factor_slope * wp.dot(offset, kernel_bar)
         return along * offset + factor * kernel_bar
 
+    @in_ranges(PAIRS)
     @wp.kernel(enable_backward=False, module=module)
     def gather_position_cotangents(
+        range_start: wp.int32,
         domain: Domain,
         particle_count: wp.int32,
         group_count: wp.int32,
@@ -247,7 +264,7 @@ def adjoint_kernels(
         positions_bar: wp.array(dtype=vector),
     ):
         """Write the cotangent of every position: as a neighbour of others, and as a centre."""
-        k = wp.tid()
+        k = range_start + wp.tid()
         entry = particles[k]
         position = position_of(entry)
         volume = entry[wp.static(space_dim)]

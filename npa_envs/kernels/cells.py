@@ -14,6 +14,7 @@ import warp as wp
 
 from npa_envs.kernels.domain import domain_types, kernel_module
 from npa_envs.kernels.lanes import make_wide_load
+from npa_envs.kernels.ranges import PARTICLES, in_ranges
 from npa_envs.kernels.wide import make_read_channels, make_wide_store, of_warp
 
 load_integer = make_wide_load(wp.int32, wp.int32)
@@ -87,8 +88,10 @@ def cell_kernels(space_dim: int, scalar: type, width: int, lanes: int) -> Simple
         place = load_integer(starts, c) + load_integer(arrival, i)
         store_pair(arrived, place, wp.vec2i(entry, c))
 
+    @in_ranges(PARTICLES)
     @wp.kernel(enable_backward=False, module=module)
     def order_particles(
+        range_start: wp.int32,
         positions: wp.array(dtype=vector),
         state_dim: wp.int32,
         group_count: wp.int32,
@@ -114,7 +117,7 @@ def cell_kernels(space_dim: int, scalar: type, width: int, lanes: int) -> Simple
         States and rows are left out where their arrays are empty. Threads come in whole warps on
         CUDA, some of them beyond the last particle.
         """
-        k = wp.tid()
+        k = range_start + wp.tid()
         total = arrived.shape[0]
         own = load_pair(arrived, wp.min(k, total - 1))
         i = own[0] / 2

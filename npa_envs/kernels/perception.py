@@ -20,7 +20,10 @@ from npa_envs.kernels.domain import (
     smoothing,
     spiky_factor,
 )
+from npa_envs.kernels.groups import make_add_scaled
 from npa_envs.kernels.lanes import make_lane_scatter, make_lane_sum, make_wide_load, share_type
+from npa_envs.kernels.ranges import PAIRS, in_ranges
+from npa_envs.kernels.sifting import make_sift
 
 CUDA_REGISTERS = 128
 """Registers of a thread of the perception pass: more threads in flight are worth a few spills."""
@@ -57,6 +60,8 @@ def perception_kernels(
     if state_gradient:
         topic = "perception" if moment_correction else "uncorrected_perception"
     module = kernel_module(topic, space_dim, scalar, width, lanes)
+    sift, sift_stride = make_sift(space_dim, scalar, particle, lanes)
+    add_scaled = make_add_scaled(group, scalar)
     load_group = make_wide_load(group, scalar)
     add_scalar = make_lane_sum(scalar, scalar, lanes)
     add_wide = make_lane_sum(wide, wp.float64, lanes)
@@ -87,8 +92,10 @@ def perception_kernels(
             kernel = (wp.float64(domain.spiky_norm) * falloff * falloff * inverse) * r
         return kernel
 
+    @in_ranges(PAIRS)
     @wp.kernel(enable_backward=False, module=module)
     def compute_density(
+        range_start: wp.int32,
         domain: Domain,
         particle_count: wp.int32,
         density_gradient: wp.int32,
@@ -106,6 +113,7 @@ def perception_kernels(
         rounding error: it stays in float64 up to its scaling, which costs little.
         """
         k, lane = wp.tid()
+        k += range_start
         position = sorted_positions[k]
         row = wp.int32(-1)
         if density_gradient != 0:
@@ -120,10 +128,11 @@ def perception_kernels(
                 neighbour = sorted_positions[j]
                 offset = minimum_image(domain, neighbour - position)
                 squared = wp.dot(offset, offset)
-                if squared < domain.squared_eps and j != k:
-                    density += smoothing(squared, domain.inverse_squared_eps, domain.smoothing_norm)
-                    if row >= 0:
-                        gradient += spiky_wide(domain, position, neighbour)
+                seen = squared < domain.squared_eps and j != k
+                weight = smoothing(squared, domain.inverse_squared_eps, domain.smoothing_norm)
+                density += wp.where(seen, weight, scalar(0.0))
+                if row >= 0 and seen:
+                    gradient += spiky_wide(domain, position, neighbour)
         # A particle always sees itself: a position that is not finite would otherwise have rho 0.
         density = domain.smoothing_norm + add_scalar(density)
         gradient = add_wide(gradient)
@@ -159,22 +168,26 @@ def perception_kernels(
         cell = cell_of(domain, position)
         for segment in range(segment_count(domain, cell)):
             first, last = segment_cells(domain, cell, segment)
-            for j in range(starts[base + first] + lane, starts[base + last], wp.static(lanes)):
-                entry = particles[j]
-                offset = minimum_image(domain, position_of(entry) - position)
-                squared = wp.dot(offset, offset)
-                if squared < domain.squared_eps:
+            end = starts[base + last]
+            for begin in range(starts[base + first] + lane, end, wp.static(sift_stride)):
+                near, count = sift(domain, particles, position, begin, end)
+                for n in range(count):
+                    j = near[n]
+                    entry = particles[j]
+                    offset = minimum_image(domain, position_of(entry) - position)
+                    squared = wp.dot(offset, offset)
                     volume = entry[wp.static(space_dim)]
                     state = load_group(states, j * group_count + g)
                     weight = smoothing(squared, domain.inverse_squared_eps, domain.smoothing_norm)
-                    blur += (volume * weight) * state
+                    blur = add_scaled(blur, volume * weight, state)
                     if wp.static(state_gradient):
                         kernel = offset * spiky_factor(
                             wp.sqrt(squared), domain.inverse_eps, domain.spiky_norm
                         )
                         weighted = volume * kernel
                         kernel_sum += weighted
-                        gradient += wp.outer(weighted, state - own)
+                        for d in range(wp.static(space_dim)):
+                            gradient[d] = add_scaled(gradient[d], weighted[d], state - own)
                         if wp.static(moment_correction):
                             moment += wp.outer(offset, weighted)
         gradients = gradient_share()
@@ -200,8 +213,10 @@ def perception_kernels(
             result = wp.clamp(value, -limit, limit)
         return result
 
+    @in_ranges(PAIRS)
     @wp.kernel(enable_backward=False, module=module, cuda_max_registers=CUDA_REGISTERS)
     def perceive(
+        range_start: wp.int32,
         domain: Domain,
         particle_count: wp.int32,
         state_dim: wp.int32,
@@ -228,6 +243,7 @@ def perception_kernels(
         in their own order if it is empty; clipped to plus and minus `limit` unless that is zero.
         """
         row, g, lane = wp.tid()
+        row += range_start
         if row >= starts[starts.shape[0] - 1] - row_base:
             for column in range(
                 g * wp.static(lanes) + lane, perception.shape[1], group_count * wp.static(lanes)
@@ -283,8 +299,10 @@ def perception_kernels(
             for padding in range(column, perception.shape[1]):
                 perception[to, padding] = wp.where(padding == column, scalar(1.0), scalar(0.0))
 
+    @in_ranges(PAIRS)
     @wp.kernel(enable_backward=False, module=module)
     def gather_fields(
+        range_start: wp.int32,
         domain: Domain,
         particle_count: wp.int32,
         state_dim: wp.int32,
@@ -302,6 +320,7 @@ def perception_kernels(
     ):
         """Write the unscaled fields of every particle, in the caller's order."""
         k, g, lane = wp.tid()
+        k += range_start
         i = source[k]
         entry = particles[k]
         blur, gradient, _kernel_sum, moment = sum_neighbours(

@@ -25,6 +25,7 @@ from npa_envs.kernels.lens import (
     TILE_WIDTH,
     splat_types,
 )
+from npa_envs.kernels.ranges import PAIRS, WORLDS, in_ranges
 from npa_envs.kernels.wide import make_fast_exp2, make_warp_sum, make_wide_store
 
 
@@ -315,8 +316,10 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         if t % wp.static(group_tiles * lanes) == 0:
             partial_sums[world, group] = sums
 
+    @in_ranges(WORLDS)
     @wp.kernel(enable_backward=False, module=module)
     def scatter_splats(
+        range_start: wp.int32,
         lens: Lens,
         particle_count: wp.int32,
         positions: wp.array(dtype=vector),
@@ -333,7 +336,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         source: wp.array(dtype=wp.int32),
     ):
         """Draw a whole world, particle after particle; for devices of few threads."""
-        world = wp.tid()
+        world = range_start + wp.tid()
         for i in range(world * particle_count, (world + 1) * particle_count):
             place = pixel_place(lens, positions[i], centred, means, goal, world)
             footprint = footprint_of(lens, place, i, states, shift)
@@ -371,8 +374,10 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
             sums += pixel_errors(picture[world, row, column], target[row, column])
         partial_sums[world, row] = sums
 
+    @in_ranges(PAIRS)
     @wp.kernel(enable_backward=False, module=module)
     def pull_back_splats(
+        range_start: wp.int32,
         lens: Lens,
         particle_count: wp.int32,
         footprints: wp.array(dtype=footprint_type),
@@ -384,6 +389,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
     ):
         """Write the cotangents of each particle's position and colours from its patch."""
         k, lane = wp.tid()
+        k += range_start
         world = k / particle_count
         footprint = load_footprint(footprints, k)
         colours = footprint_colours(footprint)

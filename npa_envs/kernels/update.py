@@ -12,6 +12,7 @@ import warp as wp
 
 from npa_envs.kernels.domain import domain_types, kernel_module
 from npa_envs.kernels.lanes import make_wide_load
+from npa_envs.kernels.ranges import ELEMENTS, in_ranges
 from npa_envs.kernels.wide import make_read_at, make_write_at
 
 CHANNEL_SHARE = 4
@@ -75,8 +76,10 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
             moved = wp.int32(1)
         return result, moved
 
+    @in_ranges(ELEMENTS)
     @wp.kernel(enable_backward=False, module=module)
     def apply_update(
+        range_start: wp.int32,
         largest_step: wp.float64,
         dt: scalar,
         periodic: wp.int32,
@@ -98,7 +101,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         """Move and change the particles that have a row; copy the others."""
         # The first threads of a team move a particle each, the others change some channels each.
         sharers = (state_dim + wp.static(CHANNEL_SHARE - 1)) / wp.static(CHANNEL_SHARE)
-        t = wp.tid()
+        t = range_start + wp.tid()
         team = t / (wp.static(TEAM) * (1 + sharers))
         turn = t - team * (wp.static(TEAM) * (1 + sharers))
         i = team * wp.static(TEAM) + turn
@@ -145,8 +148,10 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
                         value += dt * update[change_begin + k]
                     new_states[states_begin + k] = value
 
+    @in_ranges(ELEMENTS)
     @wp.kernel(enable_backward=False, module=module)
     def pull_back_update(
+        range_start: wp.int32,
         largest_step: scalar,
         dt: scalar,
         moving: wp.int32,
@@ -166,7 +171,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         """Write the cotangent of every row's update, zero beyond the last active row."""
         # A thread has some adjacent columns of a row.
         sharers = (update_width + wp.static(CHANNEL_SHARE - 1)) / wp.static(CHANNEL_SHARE)
-        t = wp.tid()
+        t = range_start + wp.tid()
         row = t / sharers
         first = (t - row * sharers) * wp.static(CHANNEL_SHARE)
         row_begin = row * update_width
@@ -202,8 +207,10 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
                 if first + k < update_width:
                     update_bar[row_begin + first + k] = bar[k]
 
+    @in_ranges(ELEMENTS)
     @wp.kernel(enable_backward=False, module=module)
     def apply_actions(
+        range_start: wp.int32,
         particle_count: wp.int32,
         largest_step: wp.float64,
         largest_change: wp.float64,
@@ -230,7 +237,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         """Move and change the particles that act, and mark the worlds that had to be held back."""
         # All that is read is asked for before any of it is used: the kernel waits for memory.
         sharers = (state_dim + wp.static(CHANNEL_SHARE - 1)) / wp.static(CHANNEL_SHARE)
-        t = wp.tid()
+        t = range_start + wp.tid()
         i = t / sharers
         sharer = t - i * sharers
         happens = wp.uint8(1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import functools
 from typing import Any
 
@@ -11,7 +12,9 @@ import warp as wp
 from torch import Tensor
 
 from npa_envs.kernels.lanes import CUDA_LANES
+from npa_envs.kernels.ranges import SMALLEST_RANGES
 from npa_envs.kernels.warps import CUDA_BLOCK
+from npa_envs.sph.threads import even_ranges, run_together
 from npa_envs.warp_report import quiet_warp, start_warp
 
 SCALARS: dict[torch.dtype, Any] = {torch.float32: wp.float32, torch.float64: wp.float64}
@@ -67,10 +70,37 @@ _launched: set[tuple[Any, torch.device]] = set()
 
 
 def _converted(kernel: Any, arguments: tuple[Any, ...]) -> list[Any]:
+    """Return a kernel's arguments as Warp takes them; one that is cut into ranges begins at 0."""
+    arguments = (*_range_start(kernel), *arguments)
     return [
         value if array_type is None else _as_array(value, array_type)
         for value, array_type in zip(arguments, _array_types(kernel), strict=True)
     ]
+
+
+def _range_start(kernel: Any) -> tuple[int, ...]:
+    return (0,) if kernel in SMALLEST_RANGES else ()
+
+
+def _ranges(kernel: Any, size: tuple[int, ...], device: torch.device) -> list[range]:
+    """Return what threads of the CPU run of a launch's first dimension; one range: no cut."""
+    smallest = SMALLEST_RANGES.get(kernel)
+    if device.type != "cpu" or smallest is None:
+        return [range(size[0])]
+    return even_ranges(size[0], smallest)
+
+
+def _launch_range(recorded: Any, size: tuple[int, ...], indices: range) -> None:
+    """Launch a part of a recorded launch, with which it shares all other arguments."""
+    part = copy.copy(recorded)
+    part.params = list(recorded.params)
+    part.set_dim((len(indices), *size[1:]))
+    part.set_param_at_index(0, indices.start)
+    part.launch()
+
+
+def _launch_ranges(recorded: Any, size: tuple[int, ...], ranges: list[range]) -> None:
+    run_together([functools.partial(_launch_range, recorded, size, part) for part in ranges])
 
 
 def _current_stream(device: torch.device) -> Any:
@@ -107,13 +137,25 @@ def launch(
         kernel: A Warp kernel; its own signature says how each tensor is read.
         size: Number of threads along each dimension.
         device: Device of every tensor among the arguments.
-        arguments: Kernel arguments in order: tensors (None for an absent one), structs and numbers.
+        arguments: Kernel arguments in order: tensors (None for an absent one), structs and numbers;
+            without `range_start`, where the kernel has it.
         block_dim: Threads of a CUDA block.
     """
+    size = (size,) if isinstance(size, int) else size
     converted = _converted(kernel, arguments)
     placement = _placement(device, block_dim)
+    ranges = _ranges(kernel, size, device)
     with _quiet_at_first(kernel, device):
-        wp.launch(kernel, size, inputs=converted, record_tape=False, **placement)
+        recorded = wp.launch(
+            kernel,
+            size,
+            inputs=converted,
+            record_tape=False,
+            record_cmd=len(ranges) > 1,
+            **placement,
+        )
+    if len(ranges) > 1:
+        _launch_ranges(recorded, size, ranges)
 
 
 def _form(tensor: Tensor) -> tuple[Any, ...]:
@@ -139,6 +181,8 @@ class Repeated:
         *arguments: Any,
         changing: Tensor,
     ) -> None:
+        self._kernel = kernel
+        self._size = (size,) if isinstance(size, int) else size
         self._device = device
         # The recorded launch knows addresses alone.
         self._kept = [value for value in arguments if value is not changing]
@@ -150,6 +194,7 @@ class Repeated:
             )
         self._form = _form(changing)
         place = next(k for k, value in enumerate(arguments) if value is changing)
+        place += len(_range_start(kernel))
         self._argument = converted[place]
         self._recorded.set_param_at_index_from_ctype(place, self._argument)
 
@@ -162,4 +207,8 @@ class Repeated:
         """
         assert _form(tensor) == self._form, "only an address is replaced"
         self._argument.data = tensor.data_ptr()
-        self._recorded.launch(_current_stream(self._device))
+        ranges = _ranges(self._kernel, self._size, self._device)
+        if len(ranges) > 1:
+            _launch_ranges(self._recorded, self._size, ranges)
+        else:
+            self._recorded.launch(_current_stream(self._device))
