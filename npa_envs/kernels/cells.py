@@ -15,9 +15,9 @@ import warp as wp
 from npa_envs.kernels.domain import domain_types, kernel_module
 from npa_envs.kernels.lanes import make_wide_load
 from npa_envs.kernels.ranges import PARTICLES, in_ranges
-from npa_envs.kernels.wide import make_read_channels, make_wide_store, of_warp
+from npa_envs.kernels.warps import WARP, load_integer, of_warp
+from npa_envs.kernels.wide import make_read_channels, make_wide_store
 
-load_integer = make_wide_load(wp.int32, wp.int32)
 store_integer = make_wide_store(wp.int32, wp.int32)
 load_pair = make_wide_load(wp.vec2i, wp.int32)
 store_pair = make_wide_store(wp.vec2i, wp.int32)
@@ -38,7 +38,7 @@ def cell_kernels(space_dim: int, scalar: type, width: int, lanes: int) -> Simple
     cell_of, cell_index = types.cell_of, types.cell_index
     share = wp.types.vector(width // lanes, scalar)
     shares = wp.types.matrix((lanes, width // lanes), scalar)
-    warp_size = 32 if lanes > 1 else 1
+    warp_size = WARP if lanes > 1 else 1
     read_channels = make_read_channels(share, scalar)
     store_vector = make_wide_store(vector, scalar)
     store_share = make_wide_store(share, scalar)

@@ -13,6 +13,7 @@ import warp as wp
 from npa_envs.kernels.domain import domain_types, kernel_module
 from npa_envs.kernels.lanes import make_wide_load
 from npa_envs.kernels.ranges import ELEMENTS, in_ranges
+from npa_envs.kernels.warps import load_integer
 from npa_envs.kernels.wide import make_read_at, make_write_at
 
 CHANNEL_SHARE = 4
@@ -23,8 +24,6 @@ UPDATE_ALIGNMENT = {2: 8, 3: 4}
 
 TEAM = 32
 """Particles that a warp moves; the next warps change their states."""
-
-load_integer = make_wide_load(wp.int32, wp.int32)
 
 
 @functools.cache

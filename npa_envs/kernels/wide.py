@@ -10,7 +10,6 @@ import warp as wp
 
 from npa_envs.kernels.domain import scalar_name
 from npa_envs.kernels.lanes import READ, c_type, chunk_bytes
-from npa_envs.kernels.warps import of_warp as of_warp  # for `cells`
 
 _WRITE = """
 #if defined(__CUDA_ARCH__)

@@ -12,13 +12,11 @@ from npa_envs.errors import NPAError
 from npa_envs.kernels.cells import cell_kernels
 from npa_envs.kernels.domain import make_domain
 from npa_envs.kernels.small_worlds import BLOCKS, LARGEST_GRID, STATE_SHARE, sort_small_worlds
+from npa_envs.kernels.warps import WARP
 from npa_envs.sph.bridge import channel_width, lane_count, launch, scalar_type
 
 LARGEST_INDEX = 2**31 - 1
 """Kernels index with 32 bits."""
-
-CUDA_WARP = 32
-"""Threads of a CUDA warp, which move the states of as many particles together."""
 
 LARGEST_MASK = 2**20
 """Particles of masked worlds that blocks sort: each block counts the active ones before it."""
@@ -197,7 +195,8 @@ def sort_worlds(
     # A thread reads and writes its share of a particle's channels at once where it is aligned.
     share = plan.width // plan.lanes
     aligned = s is not None and plan.state_dim % share == 0 and s.data_ptr() % 16 == 0
-    warps = CUDA_WARP if plan.lanes > 1 else 1
+    # A warp moves the states of as many particles as it has threads.
+    warps = WARP if plan.lanes > 1 else 1
     launch(
         kernels.order_particles,
         -(-total // warps) * warps,

@@ -10,10 +10,8 @@ from torch import Tensor
 from npa_envs.kernels.network import two_layer_kernel, weight_gradient_kernels
 from npa_envs.kernels.warps import WARP
 from npa_envs.kernels.weight_sums import WARP_UNITS
-from npa_envs.sph.arranged import ArrangedWeights, arrange, arrange_weights
+from npa_envs.sph.arranged import ArrangedWeights, arrange
 from npa_envs.sph.bridge import launch
-
-__all__ = ["arrange_weights", "run_network"]
 
 ROW_GROUP = 16
 """Rows of a fragment."""

@@ -7,9 +7,10 @@ from collections.abc import Iterable
 import torch
 
 from npa_envs.sph.actions import RepeatedActions
+from npa_envs.sph.arranged import arrange_weights
 from npa_envs.sph.draws import bernoulli_draw, integer_draw, normal_draw, uniform_draw
 from npa_envs.sph.fields import perceive
-from npa_envs.sph.network import arrange_weights, run_network
+from npa_envs.sph.network import run_network
 from npa_envs.sph.operators import Rows, perceive_rows
 from npa_envs.sph.passes import SHARED_WORLD, Terms
 from npa_envs.sph.picture_losses import picture_losses
