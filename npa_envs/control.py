@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.randomness import WorldRandom
-from npa_envs.sph.actions import RepeatedActions
+from npa_envs.sph.actions import ActionRules, RepeatedActions
 from npa_envs.sph.passes import Terms
 from npa_envs.sph.rows import SurveyedWorlds, survey
 
@@ -132,11 +132,7 @@ class Actions:
             self._mask = torch.zeros(x.shape[:2], dtype=torch.uint8, device=x.device)
         if physics.position_noise > 0.0:
             self._noise = torch.zeros_like(x)
-        self._apply = RepeatedActions(
-            x,
-            s,
-            mask=self._mask,
-            noise=self._noise,
+        rules = ActionRules(
             reach=physics.reach,
             dt=physics.dt,
             state_scale=physics.state_scale,
@@ -144,8 +140,9 @@ class Actions:
             box=physics.box,
             position_limit=physics.position_limit,
             state_limit=physics.state_limit,
-            enabled=enabled,
-            diverged=diverged,
+        )
+        self._apply = RepeatedActions(
+            x, s, rules, mask=self._mask, noise=self._noise, enabled=enabled, diverged=diverged
         )
 
     @torch.no_grad()

@@ -8,7 +8,7 @@ import torch
 
 from npa_envs.errors import NPAError
 from npa_envs.sph import apply_actions
-from npa_envs.sph.actions import RepeatedActions
+from npa_envs.sph.actions import ActionRules, RepeatedActions
 from npa_envs.sph.operators import Rows
 from npa_envs.sph.update import update_particles
 
@@ -308,19 +308,14 @@ def repeated(x, s, **options):
     """Return the actions on copies of a world, with these copies, and what switches them off."""
     x, s = x.clone(), s.clone()
     enabled = torch.ones(1, dtype=torch.uint8, device=x.device)
+    rules = ActionRules(REACH, DT, STATE_SCALE, True, None, *LIMITS.values())
     given = {
         "mask": None,
         "noise": None,
-        "reach": REACH,
-        "dt": DT,
-        "state_scale": STATE_SCALE,
-        "moving": True,
-        "box": None,
         "diverged": torch.zeros(x.shape[0], dtype=torch.uint8, device=x.device),
-        **LIMITS,
         **options,
     }
-    return RepeatedActions(x, s, enabled=enabled, **given), (x, s), enabled
+    return RepeatedActions(x, s, rules, enabled=enabled, **given), (x, s), enabled
 
 
 @pytest.mark.parametrize("how", ["plain", "strided", "misaligned", "other dtype", "on the host"])

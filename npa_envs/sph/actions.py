@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,6 +14,25 @@ from npa_envs.kernels.update import CHANNEL_SHARE, update_kernels
 from npa_envs.sph.bridge import Repeated, launch, scalar_type
 from npa_envs.sph.cells import LARGEST_INDEX
 from npa_envs.sph.checks import check_world
+
+
+class ActionRules(NamedTuple):
+    """What actions do, the same in every step: the keywords of `apply_actions` of these names."""
+
+    reach: float
+    """Largest displacement alpha eps in a unit of time [length units]."""
+    dt: float
+    """Time step, dimensionless."""
+    state_scale: float
+    """Largest change of a state in a unit of time, dimensionless."""
+    moving: bool
+    """Whether actions begin with a displacement."""
+    box: tuple[float, ...] | None
+    """Sides of the periodic box [length units], or None in open space."""
+    position_limit: float
+    """Largest coordinate's size [length units]."""
+    state_limit: float
+    """Largest state's size, dimensionless."""
 
 
 def apply_actions(
@@ -62,25 +81,11 @@ def apply_actions(
             contiguous.
     """
     _check_worlds(action, x, s, mask, noise, enabled, diverged, moving)
+    sides = None if box is None else tuple(box)
+    rules = ActionRules(reach, dt, state_scale, moving, sides, position_limit, state_limit)
     aligned = s.data_ptr() % 16 == 0 and action.data_ptr() % 16 == 0
     launch(
-        *_launch_of(
-            action.view(-1),
-            x,
-            s,
-            mask=mask,
-            noise=noise,
-            reach=reach,
-            dt=dt,
-            state_scale=state_scale,
-            moving=moving,
-            box=box,
-            position_limit=position_limit,
-            state_limit=state_limit,
-            enabled=enabled,
-            diverged=diverged,
-            aligned=aligned,
-        )
+        *_launch_of(action.view(-1), x, s, rules, mask, noise, enabled, diverged, aligned=aligned)
     )
 
 
@@ -90,24 +95,37 @@ class RepeatedActions:
     Args:
         x: As for `apply_actions`.
         s: As for `apply_actions`.
+        rules: What actions do.
+        mask: As for `apply_actions`; may get other numbers before each call.
+        noise: Likewise.
         enabled: Whether anything happens, uint8, shape [1]: set to 0 where an action is not finite,
             and never to 1.
-        options: The other keywords of `apply_actions`.
+        diverged: As for `apply_actions`.
 
     Raises:
         NPAError: As `apply_actions`.
     """
 
-    def __init__(self, x: Tensor, s: Tensor, *, enabled: Tensor, **options: Any) -> None:
-        action_dim = s.shape[2] + (x.shape[2] if options["moving"] else 0)
+    def __init__(
+        self,
+        x: Tensor,
+        s: Tensor,
+        rules: ActionRules,
+        *,
+        mask: Tensor | None,
+        noise: Tensor | None,
+        enabled: Tensor,
+        diverged: Tensor,
+    ) -> None:
+        action_dim = s.shape[2] + (x.shape[2] if rules.moving else 0)
         self._buffer = s.new_zeros(*s.shape[:2], action_dim)
         self._worlds = (x, s)
-        self._options = {"enabled": enabled, **options}
+        self._rules = rules
+        self._enabled = enabled
+        self._step = (mask, noise, enabled, diverged)
         self._check: Repeated | None = None
         self._apply: Repeated | None = None
-        names = ("mask", "noise", "diverged", "moving")
-        given = {name: options[name] for name in names}
-        _check_worlds(self._buffer, x, s, enabled=enabled, **given)
+        _check_worlds(self._buffer, x, s, mask, noise, enabled, diverged, rules.moving)
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the recorded launches, which cannot be pickled."""
@@ -147,11 +165,12 @@ class RepeatedActions:
             x.device,
             thread_count,
             flat,
-            self._options["enabled"],
+            self._enabled,
             changing=flat,
         )
         aligned = s.data_ptr() % 16 == 0
-        apply = Repeated(*_launch_of(flat, x, s, aligned=aligned, **self._options), changing=flat)
+        launched = _launch_of(flat, x, s, self._rules, *self._step, aligned=aligned)
+        apply = Repeated(*launched, changing=flat)
         return check, apply
 
 
@@ -159,37 +178,33 @@ def _launch_of(
     action: Tensor,
     x: Tensor,
     s: Tensor,
-    *,
+    rules: ActionRules,
     mask: Tensor | None,
     noise: Tensor | None,
-    reach: float,
-    dt: float,
-    state_scale: float,
-    moving: bool,
-    box: Sequence[float] | None,
-    position_limit: float,
-    state_limit: float,
     enabled: Tensor | None,
     diverged: Tensor,
+    *,
     aligned: bool,
 ) -> tuple[Any, ...]:
     """Return what to give to `launch`; `aligned` says where actions and states lie in memory."""
     world_count, particle_count, space_dim = x.shape
     state_dim = s.shape[2]
     # Adjacent channels are then read and written at once.
-    aligned = aligned and state_dim % CHANNEL_SHARE == 0 and (space_dim % 2 == 0 or not moving)
+    aligned = (
+        aligned and state_dim % CHANNEL_SHARE == 0 and (space_dim % 2 == 0 or not rules.moving)
+    )
     return (
         update_kernels(space_dim, scalar_type(x.dtype)).apply_actions,
         world_count * particle_count * -(-state_dim // CHANNEL_SHARE),
         x.device,
         particle_count,
-        reach * dt,
-        state_scale * dt,
-        int(box is not None),
-        tuple(box) if box is not None else (1.0,) * space_dim,
-        int(moving),
-        position_limit,
-        state_limit,
+        rules.reach * rules.dt,
+        rules.state_scale * rules.dt,
+        int(rules.box is not None),
+        rules.box or (1.0,) * space_dim,
+        int(rules.moving),
+        rules.position_limit,
+        rules.state_limit,
         int(mask is not None),
         None if mask is None else mask.view(-1),
         int(noise is not None),

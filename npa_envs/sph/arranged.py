@@ -12,13 +12,10 @@ from npa_envs.kernels.network import arrangement_kernels
 from npa_envs.kernels.products import UNIT_GROUP
 from npa_envs.kernels.warps import WARP
 from npa_envs.kernels.weight_sums import WARP_UNITS
-from npa_envs.sph.bridge import launch
+from npa_envs.sph.bridge import is_modern, launch
 
 LARGEST_ROW, LARGEST_UPDATE, LARGEST_HIDDEN = 128, 32, 512
 """Widest rows and updates, and most hidden units, that the fused kernels take."""
-
-SMALLEST_CAPABILITY = (8, 0)
-"""Compute capability from which on tensor cores multiply what the kernels need."""
 
 
 class ArrangedWeights(NamedTuple):
@@ -42,9 +39,8 @@ def fits_network(hidden_weight: Tensor, output_weight: Tensor) -> bool:
     """
     hidden, width = hidden_weight.shape
     return (
-        hidden_weight.is_cuda
+        is_modern(hidden_weight.device)
         and hidden_weight.dtype == torch.float32
-        and torch.cuda.get_device_capability(hidden_weight.device) >= SMALLEST_CAPABILITY
         and width % 4 == output_weight.shape[0] % 4 == hidden % WARP_UNITS == 0
         and width <= LARGEST_ROW
         and output_weight.shape[0] <= LARGEST_UPDATE

@@ -34,6 +34,12 @@ def channel_width(state_dim: int) -> int:
     return next((width for width in GROUP_WIDTHS if width >= state_dim), GROUP_WIDTHS[-1])
 
 
+@functools.lru_cache
+def is_modern(device: torch.device) -> bool:
+    """Return whether a device has the tensor cores and warp-wide sums of compute capability 8.0."""
+    return device.type == "cuda" and torch.cuda.get_device_capability(device) >= (8, 0)
+
+
 def lane_count(device: torch.device) -> int:
     """Return how many lanes of a device share a particle."""
     return CUDA_LANES if device.type == "cuda" else 1

@@ -13,13 +13,13 @@ from npa_envs.kernels.cells import cell_kernels
 from npa_envs.kernels.domain import make_domain
 from npa_envs.kernels.small_worlds import BLOCKS, LARGEST_GRID, STATE_SHARE, sort_small_worlds
 from npa_envs.kernels.warps import WARP
-from npa_envs.sph.bridge import channel_width, lane_count, launch, scalar_type
+from npa_envs.sph.bridge import channel_width, is_modern, lane_count, launch, scalar_type
 
 LARGEST_INDEX = 2**31 - 1
 """Kernels index with 32 bits."""
 
-LARGEST_MASK = 2**20
-"""Particles of masked worlds that blocks sort: each block counts the active ones before it."""
+LARGEST_MASK = 2**28
+"""Worlds times particles of masks that blocks sort: each block counts what is active before."""
 
 BUSY_BLOCKS = 128
 """Blocks that occupy a device: fewer worlds are cut into slices."""
@@ -41,11 +41,8 @@ class Plan(NamedTuple):
     row_capacity: int
     masked: bool
     domain: Any
-
-    @property
-    def listed(self) -> bool:
-        """Whether neighbours are listed in a CUDA block's fast memory, which float32 fits into."""
-        return self.lanes > 1 and self.scalar is scalar_type(torch.float32)
+    listed: bool
+    """Whether neighbours are listed: on CUDA, in float32, with instructions of whole warps."""
 
     @property
     def periodic(self) -> bool:
@@ -136,6 +133,7 @@ def make_plan(
         row_capacity=row_capacity,
         masked=masked,
         domain=make_domain(space_dim, scalar, eps, sides, particle_count, reach),
+        listed=like.dtype == torch.float32 and is_modern(like.device),
     )
     largest = max(2 * plan.cell_total, plan.total * (1 + plan.state_dim))
     if largest >= LARGEST_INDEX:
@@ -234,7 +232,7 @@ def _empty_worlds(plan: Plan, x: Tensor, s: Tensor | None, with_rows: bool) -> l
 
 def _block_capacity(plan: Plan, *tensors: Tensor | None) -> int:
     """Return how many particles a block that sorts these worlds has room for, 0 if none has."""
-    earlier = plan.total if plan.masked else 0
+    earlier = plan.world_count * plan.total if plan.masked else 0
     if not plan.listed or plan.domain.cell_count > LARGEST_GRID or earlier > LARGEST_MASK:
         return 0
     if any(tensor is not None and tensor.data_ptr() % 16 for tensor in tensors):

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import torch
 
-from npa_envs.sph.actions import RepeatedActions
+from npa_envs.sph.actions import ActionRules, RepeatedActions
 from npa_envs.sph.arranged import arrange_weights
 from npa_envs.sph.draws import bernoulli_draw, integer_draw, normal_draw, uniform_draw
 from npa_envs.sph.fields import perceive
@@ -129,15 +129,9 @@ def _warm_actions(x: torch.Tensor, s: torch.Tensor) -> None:
     actions = RepeatedActions(
         x.detach().clone(),
         s.detach().clone(),
+        ActionRules(0.1, 1.0, 1.0, True, None, 1.0, 1.0),
         mask=None,
         noise=None,
-        reach=0.1,
-        dt=1.0,
-        state_scale=1.0,
-        moving=True,
-        box=None,
-        position_limit=1.0,
-        state_limit=1.0,
         enabled=torch.ones(1, dtype=torch.uint8, device=x.device),
         diverged=torch.zeros(x.shape[0], dtype=torch.uint8, device=x.device),
     )
