@@ -10,7 +10,7 @@ from worlds import random_world
 
 import npa_envs
 from npa_envs.sph import bridge, threads
-from npa_envs.sph.actions import RepeatedActions
+from npa_envs.sph.actions import ActionRules, RepeatedActions
 from npa_envs.sph.operators import Terms, perceive_rows
 from npa_envs.sph.picture_losses import picture_losses
 from npa_envs.sph.rows import survey
@@ -94,15 +94,9 @@ def acted(x, s):
     actions = RepeatedActions(
         x,
         s,
+        ActionRules(0.1, 1.0, 1.0, True, None, position_limit=0.6, state_limit=10.0),
         mask=None,
         noise=None,
-        reach=0.1,
-        dt=1.0,
-        state_scale=1.0,
-        moving=True,
-        box=None,
-        position_limit=0.6,
-        state_limit=10.0,
         enabled=torch.ones(1, dtype=torch.uint8),
         diverged=diverged,
     )
