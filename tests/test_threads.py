@@ -1,5 +1,6 @@
 """Launches on the CPU in ranges: the same bits for every number of threads, also after a fork."""
 
+import os
 import subprocess
 import sys
 import threading
@@ -189,6 +190,27 @@ def test_an_error_in_another_thread_is_raised_after_every_call(set_threads):
     with pytest.raises(ValueError, match="broken"):
         run_together([wait_for_it, fail])
     assert done == [True]
+
+
+def test_worker_processes_use_one_thread_unless_told_otherwise(tmp_path):
+    script = tmp_path / "workers.py"
+    script.write_text(
+        "import multiprocessing\n"
+        "import torch\n"
+        "from npa_envs.sph.threads import thread_count\n"
+        "def counts(_):\n"
+        "    default = thread_count()\n"
+        "    torch.set_num_threads(5)\n"
+        "    return default, thread_count()\n"
+        "if __name__ == '__main__':\n"
+        "    torch.set_num_threads(3)\n"
+        "    assert thread_count() == 3\n"
+        "    with multiprocessing.get_context('spawn').Pool(1) as pool:\n"
+        "        assert pool.map(counts, [0]) == [(1, 5)]\n"
+    )
+    environment = {k: v for k, v in os.environ.items() if k != "OMP_NUM_THREADS"}
+    done = subprocess.run([sys.executable, str(script)], env=environment, capture_output=True)
+    assert done.returncode == 0, done.stderr.decode()
 
 
 def test_a_forked_process_starts_threads_of_its_own():

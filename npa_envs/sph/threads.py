@@ -9,6 +9,7 @@ from __future__ import annotations
 import ctypes
 import functools
 import itertools
+import multiprocessing
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -23,6 +24,9 @@ SHARES = 4
 _Task = ctypes.CFUNCTYPE(None, ctypes.c_void_p)
 
 _forked = False
+
+_DEFAULT_THREADS = torch.get_num_threads()
+"""What torch chose, unless somebody has chosen before."""
 
 
 @functools.cache
@@ -54,9 +58,20 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_leave_threads)
 
 
-def even_ranges(count: int, smallest: int) -> list[range]:
-    """Return ranges of [0, count) for torch's threads, of `smallest` indices or more; or one."""
+def thread_count() -> int:
+    """Return how many threads kernels run on: torch's number.
+
+    In a process that Python's `multiprocessing` has started it is one, unless the number was
+    chosen: such processes, as vector environments start them, are meant to share the cores.
+    """
     threads = torch.get_num_threads()
+    chosen = threads != _DEFAULT_THREADS or "OMP_NUM_THREADS" in os.environ
+    return threads if chosen or multiprocessing.parent_process() is None else 1
+
+
+def even_ranges(count: int, smallest: int) -> list[range]:
+    """Return ranges of [0, count) for all threads, of `smallest` indices or more; or one."""
+    threads = thread_count()
     parts = max(min(threads * SHARES, count // smallest), 1) if threads > 1 else 1
     ends = [count * k // parts for k in range(parts + 1)]
     return [range(begin, end) for begin, end in itertools.pairwise(ends)]
