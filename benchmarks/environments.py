@@ -31,6 +31,8 @@ import torch
 from torch.autograd import DeviceType
 from torch.profiler import ProfilerActivity, profile
 
+from npa_envs.bench.timing import synchronize
+
 
 class Case(NamedTuple):
     """Worlds B of particles N, perceiving within eps."""
@@ -144,12 +146,6 @@ def random_actions(env: Any, device: torch.device) -> list[Any]:
     drawn = torch.rand((ACTION_SETS, *shape), generator=generator, device=device)
     sets = list(CALM * (2.0 * drawn - 1.0))
     return sets if config.output == "torch" else [actions.numpy() for actions in sets]
-
-
-def synchronize(device: torch.device) -> None:
-    """Wait until the device has done all its work."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
 
 
 def run_steps(env: Any, actions: list[Any], device: torch.device, steps: int) -> float:

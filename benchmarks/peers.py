@@ -16,6 +16,8 @@ from typing import Any
 import gymnasium
 import torch
 
+from npa_envs.bench.timing import synchronize
+
 GYMNASIUM_WORLDS, GYMNASIUM_PARTICLES = 8, 1024
 EPISODE_STEPS = 64
 
@@ -34,10 +36,10 @@ def median_time(run: Callable[[], None], device: torch.device, seconds: float) -
     times: list[float] = []
     run()
     while len(times) < 3 or sum(times) < seconds:
-        _synchronize(device)
+        synchronize(device)
         start = time.perf_counter()
         run()
-        _synchronize(device)
+        synchronize(device)
         times.append(time.perf_counter() - start)
     return statistics.median(times)
 
@@ -127,8 +129,3 @@ def measure_all(device: torch.device, quick: bool, calm: float) -> Iterator[dict
     for scenario, keywords in VMAS_SCENARIOS[:1] if quick else VMAS_SCENARIOS:
         for world_count in VMAS_WORLDS[:1] if quick else VMAS_WORLDS:
             yield measure_vmas(scenario, keywords, world_count, device, quick)
-
-
-def _synchronize(device: torch.device) -> None:
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)

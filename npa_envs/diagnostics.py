@@ -77,7 +77,8 @@ def _python() -> list[Finding]:
     return [Finding("python", version), Finding("system", f"{system}, {os.cpu_count()} cores")]
 
 
-def _version(name: str) -> str | None:
+def installed_version(name: str) -> str | None:
+    """Return the version of a distribution, None where it is not installed."""
     try:
         return importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:
@@ -87,11 +88,11 @@ def _version(name: str) -> str | None:
 def _packages() -> list[Finding]:
     findings = []
     for name in PACKAGES:
-        version = _version(name)
+        version = installed_version(name)
         cure = None if version else f"pip install {name}"
         findings.append(Finding(name, version or "not installed", cure))
     for name in OPTIONAL_PACKAGES:
-        findings.append(Finding(name, _version(name) or "not installed (optional)"))
+        findings.append(Finding(name, installed_version(name) or "not installed (optional)"))
     return findings
 
 

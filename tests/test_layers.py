@@ -60,7 +60,7 @@ LADDER = {
     "npa_envs.bench.hash_grid": rung(3, "warp torch", never=("npa_envs.reference",)),
     "npa_envs.bench.launches": rung(3, "warp"),
     "npa_envs.bench": rung(
-        8, "torch numpy matplotlib scipy warpSPHCore", never=("npa_envs.kernels",)
+        9, "torch numpy matplotlib scipy warpSPHCore", never=("npa_envs.kernels",)
     ),
     "npa_envs.training": rung(
         8, "torch numpy tqdm yaml", never=("npa_envs.kernels", "npa_envs.reference")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -10,8 +10,7 @@ from torch.autograd import DeviceType  # type: ignore[attr-defined]
 from torch.profiler import ProfilerActivity, profile
 
 from npa_envs.bench.session import Session
-from npa_envs.bench.workloads import Workload
-from npa_envs.dynamics import rollout
+from npa_envs.bench.workloads import Workload, rollout_call
 
 LEAST_SHARE = 0.005
 """Kernels that take less of a step are left out."""
@@ -41,8 +40,9 @@ def kernel_rows(session: Session, workloads: Sequence[Workload]) -> list[KernelR
         return []
     rows: list[KernelRow] = []
     for workload in workloads:
+        x, s = workload.worlds(session.device)
         for train in (False, True):
-            run = _rollout(workload, session.device, train)
+            run, _ = rollout_call(workload, x, s, train=train)
             run()
             torch.cuda.synchronize(session.device)
             with profile(activities=[ProfilerActivity.CUDA]) as profiler:
@@ -52,27 +52,6 @@ def kernel_rows(session: Session, workloads: Sequence[Workload]) -> list[KernelR
             rows += _rows(name, profiler, workload.steps)
             session.progress(1)
     return rows
-
-
-def _rollout(workload: Workload, device: torch.device, train: bool) -> Callable[[], None]:
-    rule, (x, s) = workload.rule(device), workload.worlds(device)
-    generator = torch.Generator(device).manual_seed(1)
-
-    def run() -> None:
-        with torch.set_grad_enabled(train):
-            new_x, new_s = rollout(
-                rule,
-                x,
-                s,
-                workload.steps,
-                eps=workload.eps,
-                update_prob=workload.update_prob,
-                generator=generator,
-            )
-            if train:
-                torch.autograd.grad(new_x.sum() + new_s.sum(), list(rule.parameters()))
-
-    return run
 
 
 def _rows(workload: str, profiler: profile, steps: int) -> list[KernelRow]:

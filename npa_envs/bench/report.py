@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import json
 import math
 import platform
@@ -16,6 +15,7 @@ from typing import Any
 import torch
 
 from npa_envs.bench.session import LeftOut, Tables
+from npa_envs.diagnostics import installed_version
 from npa_envs.render.tables import table_text
 
 LIBRARIES = ("npa-envs", "torch", "warp-lang", "numpy", "scipy", "warpSPHCore")
@@ -108,13 +108,8 @@ def _processor() -> str:
 
 def versions() -> dict[str, str | None]:
     """Return versions of Python and of the libraries that matter; None: not installed."""
-    found: dict[str, str | None] = {"python": platform.python_version()}
-    for name in LIBRARIES:
-        try:
-            found[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            found[name] = None
-    return found
+    found: dict[str, str | None] = {name: installed_version(name) for name in LIBRARIES}
+    return {"python": platform.python_version(), **found}
 
 
 def current_commit() -> str:

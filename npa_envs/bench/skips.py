@@ -7,12 +7,9 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-import torch
-
 from npa_envs.bench.session import Session
 from npa_envs.bench.timing import Timing
-from npa_envs.bench.workloads import Workload
-from npa_envs.dynamics import rollout
+from npa_envs.bench.workloads import Workload, rollout_call
 
 WORLDS, CPU_WORLDS, SMALL_WORLDS = (
     Workload(2, 8, 4096, 16),
@@ -47,7 +44,7 @@ class Skip:
     condition: str
     """The condition."""
     done: dict[str, Any]
-    """Options of the rollout that does it: `Rollouts.cost` says which there are."""
+    """Options of the rollout that does it: `rollout_call` says which there are."""
     skipped: dict[str, Any]
     """Options of the one that leaves it out."""
 
@@ -102,59 +99,19 @@ def skips(workload: Workload) -> list[Skip]:
 def skip_rows(session: Session) -> list[SkipRow]:
     """Return what each omission saves, measured with and without it in one run."""
     workload = SMALL_WORLDS if session.small else WORLDS if session.cuda else CPU_WORLDS
-    rollouts = Rollouts(session, workload)
+    x, s = workload.worlds(session.device)
+
+    def cost(options: dict[str, Any]) -> Timing:
+        run, generator = rollout_call(workload, x, s, **options)
+        return session.cost(run, generator=generator).time.divided(workload.steps)
+
     rows: list[SkipRow] = []
     for skip in skips(workload):
-        rows += session.attempt(skip.left_out, partial(_row, skip, rollouts.cost))
+        rows += session.attempt(skip.left_out, partial(_row, skip, cost))
     return rows
 
 
-def _row(skip: Skip, cost: Callable[..., Timing]) -> SkipRow:
-    done, skipped = cost(**skip.done), cost(**skip.skipped)
+def _row(skip: Skip, cost: Callable[[dict[str, Any]], Timing]) -> SkipRow:
+    done, skipped = cost(skip.done), cost(skip.skipped)
     saved = 1.0 - skipped.median / done.median
     return SkipRow(skip.left_out, skip.condition, done, skipped, f"{saved:.0%}")
-
-
-class Rollouts:
-    """Rollouts of the same worlds under different conditions.
-
-    Args:
-        session: Device and readings.
-        workload: Worlds, radius and steps.
-    """
-
-    def __init__(self, session: Session, workload: Workload) -> None:
-        self._session = session
-        self._workload = workload
-        self._x, self._s = workload.worlds(session.device)
-
-    def cost(
-        self,
-        *,
-        train: bool = False,
-        gradients: bool = False,
-        rule: dict[str, bool] | None = None,
-        **options: Any,
-    ) -> Timing:
-        """Return the time of one step.
-
-        Args:
-            train: Include the backward pass.
-            gradients: Without it, let autograd store what it would read.
-            rule: Options of the rule.
-            options: Options of `rollout`.
-        """
-        session, workload = self._session, self._workload
-        network = workload.rule(session.device, **(rule or {}))
-        generator = torch.Generator(session.device).manual_seed(1)
-        given = {"eps": workload.eps, "update_prob": workload.update_prob, **options}
-
-        def run() -> None:
-            with torch.set_grad_enabled(train or gradients):
-                x, s = rollout(
-                    network, self._x, self._s, workload.steps, generator=generator, **given
-                )
-                if train:
-                    torch.autograd.grad(x.sum() + s.sum(), list(network.parameters()))
-
-        return session.cost(run, generator=generator).time.divided(workload.steps)

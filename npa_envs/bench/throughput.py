@@ -12,8 +12,7 @@ import torch
 
 from npa_envs.bench.session import Session
 from npa_envs.bench.timing import Cost, Timing
-from npa_envs.bench.workloads import Workload
-from npa_envs.dynamics import rollout
+from npa_envs.bench.workloads import Workload, rollout_call
 
 Memory = Literal["store", "recompute"]
 
@@ -155,35 +154,12 @@ def rollout_costs(
         memory: What training does about what the backward pass reads.
         train: Whether to measure training at all.
     """
-    rule = workload.rule(session.device)
-    generator = torch.Generator(session.device).manual_seed(1)
-    parameters = list(rule.parameters())
-
-    def run() -> tuple[torch.Tensor, torch.Tensor]:
-        return rollout(
-            rule,
-            x,
-            s,
-            workload.steps,
-            eps=workload.eps,
-            update_prob=workload.update_prob,
-            memory=memory,
-            generator=generator,
-        )
-
-    infer = session.cost(torch.no_grad()(run), generator=generator)
+    infer, generator = rollout_call(workload, x, s)
+    inference = session.cost(infer, generator=generator)
     if not train:
-        return infer, None
-    draws = torch.Generator(session.device).manual_seed(2)
-    x_weight = torch.randn(x.shape, generator=draws, device=x.device)
-    s_weight = torch.randn(s.shape, generator=draws, device=x.device)
-
-    def pull_back() -> None:
-        new_x, new_s = run()
-        loss = (new_x * x_weight).sum() + (new_s * s_weight).sum()
-        torch.autograd.grad(loss, parameters)
-
-    return infer, session.cost(pull_back, generator=generator)
+        return inference, None
+    pull_back, generator = rollout_call(workload, x, s, train=True, memory=memory)
+    return inference, session.cost(pull_back, generator=generator)
 
 
 def aim_rows(rows: Sequence[ThroughputRow]) -> list[AimRow]:

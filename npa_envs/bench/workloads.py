@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -83,6 +84,46 @@ class Workload:
             dims = (self.space_dim, self.state_dim, self.hidden_dim)
             rule = NPARule(*dims, eps0=self.eps, **options)
         return rule.to(device)
+
+
+def rollout_call(
+    workload: Workload,
+    x: Tensor,
+    s: Tensor,
+    *,
+    train: bool = False,
+    gradients: bool = False,
+    rule: Mapping[str, bool] | None = None,
+    **options: Any,
+) -> tuple[Callable[[], None], torch.Generator]:
+    """Return a call that rolls worlds out, and the source of its update masks.
+
+    Args:
+        workload: Rule, radius, probability of updates and steps.
+        x: Positions [length units], shape [B, N, D].
+        s: States, dimensionless, shape [B, N, C].
+        train: Also take the gradient of a random linear functional by the rule's weights.
+        gradients: Without that, let autograd store what it would read.
+        rule: Options of the rule.
+        options: Options of `rollout`, instead of the workload's.
+    """
+    network = workload.rule(x.device, **(rule or {}))
+    generator = torch.Generator(x.device).manual_seed(1)
+    given = {"eps": workload.eps, "update_prob": workload.update_prob, **options}
+    draws = torch.Generator(x.device).manual_seed(2)
+    weights = [
+        torch.randn(worlds.shape, generator=draws, device=x.device)
+        for worlds in ((x, s) if train else ())
+    ]
+
+    def run() -> None:
+        with torch.set_grad_enabled(train or gradients):
+            worlds = rollout(network, x, s, workload.steps, generator=generator, **given)
+            if train:
+                terms = [(a * b).sum() for a, b in zip(worlds, weights, strict=True)]
+                torch.autograd.grad(terms[0] + terms[1], list(network.parameters()))
+
+    return run, generator
 
 
 class Gecko(NamedTuple):

@@ -126,9 +126,11 @@ def listed_perception(
     @wp.func
     def weigh(
         domain: Domain,
+        state_place: wp.array(dtype=wp.int32),
+        part_count: wp.int32,
         slot: wp.uint32,
         entry: wp.int32,
-        number: wp.int32,
+        j: wp.int32,
         position: vector,
         record: RECORD,
         counts: wp.bool,
@@ -136,10 +138,15 @@ def listed_perception(
         moment: square,
         density_gradient: wide,
     ):
-        """Weigh a neighbour for all lanes, and add it to this lane's share of the short sums.
+        """Weigh neighbour j for all lanes, and add it to this lane's share of the short sums.
 
         What fills up a list does not count and lies at the centre: it adds nothing.
         """
+        number = j
+        if wp.static(flat):
+            number = as_number(record[3])
+        elif state_place.shape[0] > 0:
+            number = load_integer(state_place, j)
         neighbour = vector()
         for d in range(wp.static(space_dim)):
             neighbour[d] = record[d]
@@ -161,7 +168,7 @@ def listed_perception(
                 for row in range(wp.static(space_dim)):
                     for column in range(row, wp.static(space_dim)):
                         moment[row, column] += offset[row] * weighted[column]
-        put_entry(slot, entry, weight, weighted, number)
+        put_entry(slot, entry, weight, weighted, number * part_count)
         return kernel_sum, moment, density_gradient
 
     @wp.func
@@ -185,19 +192,15 @@ def listed_perception(
         for entry in range(lane, padded(count), wp.static(lanes)):
             listed = entry >= begin and entry < count
             j = wp.where(listed, number_at(slot, entry), k)
-            record = load_record(records, j)
-            number = j
-            if wp.static(flat):
-                number = as_number(record[3])
-            elif state_place.shape[0] > 0:
-                number = load_integer(state_place, j)
             kernel_sum, moment, density_gradient = weigh(
                 domain,
+                state_place,
+                part_count,
                 slot,
                 entry,
-                number * part_count,
+                j,
                 position,
-                record,
+                load_record(records, j),
                 listed,
                 kernel_sum,
                 moment,
@@ -241,16 +244,13 @@ def listed_perception(
             for a in range(wp.static(AHEAD)):
                 entry = first + wp.static(lanes) * a
                 if entry < padded(count):
-                    number = places[a]
-                    if wp.static(flat):
-                        number = as_number(ahead[a][3])
-                    elif state_place.shape[0] > 0:
-                        number = load_integer(state_place, places[a])
                     kernel_sum, moment, density_gradient = weigh(
                         domain,
+                        state_place,
+                        part_count,
                         slot,
                         entry,
-                        number * part_count,
+                        places[a],
                         position,
                         ahead[a],
                         entry < count,

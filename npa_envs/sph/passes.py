@@ -10,11 +10,9 @@ from torch import Tensor
 from npa_envs.kernels.listed import listed_perception
 from npa_envs.kernels.listing import listed_density
 from npa_envs.kernels.perception import perception_kernels
+from npa_envs.kernels.warps import WARP
 from npa_envs.sph.bridge import launch
 from npa_envs.sph.cells import Plan, SortedWorlds, density_scale
-
-WARP = 32
-"""Threads of a CUDA warp: rows come in whole warps, and the lists of so many rows lie together."""
 
 CAPACITY, LARGE_CAPACITY = 64, 128
 """Neighbours that lists have room for, in small worlds of a batch and elsewhere."""
