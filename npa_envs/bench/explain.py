@@ -130,7 +130,7 @@ def _boundary(question: Question) -> str:
 
 def _threads(plan: Plan) -> str:
     if plan.lanes == 1:
-        return "one a particle: a CPU runs them one after the other"
+        return "one a particle: a CPU runs them in ranges, on as many threads as torch uses"
     if not plan.listed:
         return f"{plan.lanes} share a particle and split its candidates"
     listing = rollout_listing(plan)
