@@ -333,7 +333,7 @@ def report_of(tables, **options) -> Report:
 def test_a_report_is_json_without_numbers_that_json_has_not():
     loaded = json.loads(report_of({"rollouts": [rollout_row()]}, ratios={"a": 2.0}).json())
     assert {"suite", "command", "commit", "date", "device", "machine", "versions"} <= set(loaded)
-    assert loaded["versions"]["torch"] == torch.__version__
+    assert torch.__version__.startswith(loaded["versions"]["torch"])
     (row,) = loaded["tables"]["rollouts"]
     assert row["psnr_512"] is None
     assert row["step_us"] == {"median": 3.0, "low": 3.0, "high": 3.0}

@@ -16,6 +16,7 @@ import torch
 from circle_task import CircleTask, circle_config, plain_rollout
 from PIL import Image
 
+import npa_envs
 from npa_envs.errors import NPAError
 from npa_envs.rule import NPARule
 from npa_envs.rule_io import load_rule, rule_metadata, save_rule
@@ -141,7 +142,9 @@ train(circle_config(out), KilledTask(iteration, end), resume=resume)
 
 
 def run_script(*arguments):
-    environment = os.environ | {"PYTHONPATH": f"{TESTS.parent}{os.pathsep}{TESTS}"}
+    # The package first: its root may hold only a part of it, where it was copied from a checkout.
+    paths = [Path(npa_envs.__file__).parent.parent, TESTS, os.environ.get("PYTHONPATH", "")]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, paths))}
     command = [sys.executable, "-c", SCRIPT, *map(str, arguments)]
     return subprocess.run(command, env=environment, capture_output=True, timeout=120, check=False)
 
