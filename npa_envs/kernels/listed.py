@@ -34,8 +34,8 @@ from npa_envs.kernels.warps import (
     thread_number,
 )
 
-CUDA_REGISTERS = 80
-"""Registers of a thread of the perception pass."""
+CUDA_REGISTERS, TEAM_REGISTERS = 80, 96
+"""Registers of a thread of the perception pass, of one team and of several."""
 
 AHEAD = 2
 """Listed neighbours that a lane asks for together."""
@@ -98,6 +98,7 @@ def listed_perception(
     topic += "_in_box" * periodic + "_grouped" * grouped
     topic += f"_{capacity}" + "_for_adjoint" * for_adjoint
     module = kernel_module(topic, space_dim, scalar, width, lanes)
+    registers = CUDA_REGISTERS if teams == 1 else TEAM_REGISTERS
     load_share = make_wide_load(share, scalar)
     load_vector = make_wide_load(vector, scalar)
     add_vector = make_lane_sum(vector, scalar, lanes, whole_warps=True)
@@ -286,7 +287,7 @@ def listed_perception(
         meet_warp()
         return blur, gradient
 
-    @wp.kernel(enable_backward=False, module=module, cuda_max_registers=CUDA_REGISTERS)
+    @wp.kernel(enable_backward=False, module=module, cuda_max_registers=registers)
     def perceive(
         domain: Domain,
         state_dim: wp.int32,

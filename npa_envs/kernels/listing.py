@@ -15,8 +15,8 @@ from npa_envs.kernels.slots import as_word, make_lists
 from npa_envs.kernels.warps import CUDA_BLOCK, load_integer
 from npa_envs.kernels.wide import make_wide_store
 
-AHEAD = 3
-"""Candidates that a thread with lists to make looks at together."""
+AHEAD, SHARED_AHEAD = 3, 5
+"""Candidates that a thread looks at together: alone with a particle, and one of several lanes."""
 
 RECORD = wp.types.vector(4, wp.float32)
 """What perception reads of a neighbour: position, volume, and in 2D where its state is."""
@@ -55,7 +55,8 @@ def listed_density(
     periodic_image = types.periodic_image
     load_vector = make_wide_load(vector, scalar)
     add_scalar = make_lane_sum(scalar, scalar, lanes)
-    positions_ahead = wp.types.matrix((AHEAD, space_dim), scalar)
+    many = AHEAD if lanes == 1 else SHARED_AHEAD
+    positions_ahead = wp.types.matrix((many, space_dim), scalar)
     keep = make_lists(capacity, lanes)
     list_address, append_step, leave_list = keep.list_address, keep.append_step, keep.leave_list
 
@@ -118,22 +119,22 @@ def listed_density(
             far = far or (begin < end and wp.max(k - begin, end - k) > LONGEST_STEP)
             j = begin + lane
             # Several positions are asked for before the first is used.
-            while j + wp.static((AHEAD - 1) * lanes) < end:
+            while j + wp.static((many - 1) * lanes) < end:
                 ahead = positions_ahead()
-                for a in range(wp.static(AHEAD)):
+                for a in range(wp.static(many)):
                     ahead[a] = load_vector(sorted_positions, j + a * wp.static(lanes))
-                for a in range(wp.static(AHEAD)):
+                for a in range(wp.static(many)):
                     step = j + a * wp.static(lanes) - k
                     falloff = falloff_at(domain, ahead[a] - position)
                     list_end = append_step(list_begin, list_end, falloff, step)
                     total += falloff * falloff * falloff
-                j += wp.static(AHEAD * lanes)
+                j += wp.static(many * lanes)
             if j < end:
                 ahead = positions_ahead()
-                for a in range(wp.static(AHEAD - 1)):
+                for a in range(wp.static(many - 1)):
                     place = wp.min(j + a * wp.static(lanes), end - 1)
                     ahead[a] = load_vector(sorted_positions, place)
-                for a in range(wp.static(AHEAD - 1)):
+                for a in range(wp.static(many - 1)):
                     candidate = j + a * wp.static(lanes)
                     falloff = falloff_at(domain, ahead[a] - position)
                     falloff = wp.where(candidate < end, falloff, scalar(0.0))
