@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import gc
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -10,19 +11,6 @@ from typing import Any
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-
-
-@contextlib.contextmanager
-def no_garbage_collection() -> Iterator[None]:
-    """Collect garbage now and none inside: freeing an old graph would break a capture."""
-    gc.collect()
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()
 
 
 def sent(values: NDArray[Any], device: torch.device) -> Tensor:
@@ -37,6 +25,87 @@ def sent(values: NDArray[Any], device: torch.device) -> Tensor:
     return tensor.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else tensor
 
 
+@contextlib.contextmanager
+def no_garbage_collection() -> Iterator[None]:
+    """Collect no garbage inside: freeing an old graph would break a capture."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
+@functools.cache
+def _capture_stream(device_index: int) -> torch.cuda.Stream:
+    """The one stream of a device that is captured: graphs can share memory only within a stream."""
+    return torch.cuda.Stream(device_index)  # type: ignore[no-untyped-call]
+
+
+def capture(
+    function: Callable[[], object],
+    device: torch.device,
+    *,
+    pool: Any = None,
+    generator: torch.Generator | None = None,
+    warm_up: Callable[[], object] | None = None,
+) -> torch.cuda.CUDAGraph:
+    """Record what a function launches as a CUDA graph, without running it.
+
+    The host waits for nothing, but for the warm-up if there is one. Unlike `torch.cuda.graph` this
+    neither waits for the device nor frees the allocator's cache, and no garbage is collected:
+    where a program captures one graph after another, that would take longer than the captures.
+    What the graph allocates comes from its pool, so that free memory of the allocator's cache is
+    of no use to it; only a warm-up leaves much of that, so it is given back then.
+
+    Args:
+        function: Launches kernels that are loaded already, and never waits for the device.
+        device: A CUDA device, where it works.
+        pool: Memory (`torch.cuda.graph_pool_handle()`) to share with graphs that never run at the
+            same time as this one; None is a new pool.
+        generator: A CUDA generator that the function draws from: each replay draws anew.
+        warm_up: Run first, on the stream that is captured: loads kernels, allocates workspaces.
+
+    Returns:
+        The graph, to be replayed on any stream.
+
+    Raises:
+        Exception: Whatever the function raises; the device can be used as before.
+    """
+    with torch.cuda.device(device):
+        current = torch.cuda.current_stream()
+        stream = _capture_stream(torch.cuda.current_device())
+        stream.wait_stream(current)
+        if warm_up is not None:
+            with torch.cuda.stream(stream):
+                warm_up()
+            torch.cuda.synchronize()
+            torch.cuda.empty_cache()
+        graph = torch.cuda.CUDAGraph()
+        if generator is not None:
+            # Without this every replay would draw the numbers of the capture again.
+            graph.register_generator_state(generator)
+        with torch.cuda.stream(stream), no_garbage_collection():
+            _record(function, graph, pool)
+        current.wait_stream(stream)
+    return graph
+
+
+def _record(function: Callable[[], object], graph: torch.cuda.CUDAGraph, pool: Any) -> None:
+    """Capture the current stream while the function runs."""
+    # A backward pass runs on a thread of its own, whose calls the strict mode would refuse.
+    graph.capture_begin(pool=pool, capture_error_mode="thread_local")
+    try:
+        function()
+    except BaseException:
+        # What broke the capture says more than the complaint that it is broken.
+        with contextlib.suppress(RuntimeError):
+            graph.capture_end()
+        raise
+    graph.capture_end()
+
+
 class Replayed:
     """A function without arguments that is run as it is on a CPU, and as a CUDA graph on CUDA.
 
@@ -46,11 +115,19 @@ class Replayed:
     Args:
         function: Reads and writes the same tensors in every call, and never waits for the device.
         device: Where these are.
+        generator: A generator on the device that the function draws from; the numbers are the same
+            whether it is captured or not.
     """
 
-    def __init__(self, function: Callable[[], None], device: torch.device) -> None:
+    def __init__(
+        self,
+        function: Callable[[], None],
+        device: torch.device,
+        generator: torch.Generator | None = None,
+    ) -> None:
         self._function = function
         self._device = device
+        self._generator = generator
         self._warm = False
         self._graph: torch.cuda.CUDAGraph | None = None
 
@@ -65,10 +142,7 @@ class Replayed:
             self._warm = True
             return
         if self._graph is None:
-            graph = torch.cuda.CUDAGraph()
-            with no_garbage_collection(), torch.cuda.graph(graph):
-                self._function()
-            self._graph = graph
+            self._graph = capture(self._function, self._device, generator=self._generator)
         self._graph.replay()
 
 
