@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import os
 import signal
@@ -293,7 +294,12 @@ def test_tensorboard_gets_the_same_numbers_as_the_log(tmp_path):
     losses = [(event.step, event.value) for event in events.Scalars("loss")]
     expected = [(record["iteration"], record["loss"]) for record in log_of(tmp_path)]
     assert losses == [(k, pytest.approx(loss, rel=1e-6)) for k, loss in expected]
-    assert [event.step for event in events.Images("batch")] == [6]
+    (picture,) = events.Images("batch")
+    assert (picture.step, picture.width, picture.height) == (6, 24, 8)
+    written = np.asarray(Image.open(tmp_path / "pictures" / "000006.png")).astype(float)
+    shown = np.asarray(Image.open(io.BytesIO(picture.encoded_image_string)))
+    # A JPEG of few pixels: seen 5.6 of 255.
+    assert np.abs(shown - written).mean() < 12
 
 
 class BrokenTask(CircleTask):

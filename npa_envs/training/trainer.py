@@ -268,9 +268,7 @@ class Trainer:
     def _write_picture(self, board: Any) -> None:
         with torch.no_grad():
             picture = self.task.picture(self._batch.x, self._batch.s)
-        frame = write_batch_picture(self.folder.picture(self.iteration), picture)
-        if board is not None:
-            board.add_image("batch", frame, self.iteration, dataformats="HWC")
+        write_batch_picture(self.folder.picture(self.iteration), picture, board, self.iteration)
 
     def _stop_if_diverged(self) -> None:
         if self._meter.bad_iteration() is None:
