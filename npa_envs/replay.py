@@ -53,11 +53,10 @@ def capture(
 ) -> torch.cuda.CUDAGraph:
     """Record what a function launches as a CUDA graph, without running it.
 
-    The host waits for nothing, but for the warm-up if there is one. Unlike `torch.cuda.graph` this
-    neither waits for the device nor frees the allocator's cache, and no garbage is collected:
-    where a program captures one graph after another, that would take longer than the captures.
-    What the graph allocates comes from its pool, so that free memory of the allocator's cache is
-    of no use to it; only a warm-up leaves much of that, so it is given back then.
+    Without a warm-up the host waits for nothing. `torch.cuda.graph` waits for the device, frees the
+    allocator's cache and may collect garbage at each capture, which can take longer than the
+    capture itself. That makes room, as a graph's pool has no use for memory in that cache. Here
+    room is made after the warm-up, which leaves most of it, and where a capture has not enough.
 
     Args:
         function: Launches kernels that are loaded already, and never waits for the device.
@@ -74,36 +73,43 @@ def capture(
         Exception: Whatever the function raises; the device can be used as before.
     """
     with torch.cuda.device(device):
-        current = torch.cuda.current_stream()
         stream = _capture_stream(torch.cuda.current_device())
-        stream.wait_stream(current)
+        stream.wait_stream(torch.cuda.current_stream())
         if warm_up is not None:
             with torch.cuda.stream(stream):
                 warm_up()
             torch.cuda.synchronize()
             torch.cuda.empty_cache()
-        graph = torch.cuda.CUDAGraph()
-        if generator is not None:
-            # Without this every replay would draw the numbers of the capture again.
-            graph.register_generator_state(generator)
-        with torch.cuda.stream(stream), no_garbage_collection():
-            _record(function, graph, pool)
-        current.wait_stream(stream)
+        with contextlib.suppress(torch.OutOfMemoryError):
+            return _recorded(function, stream, pool, generator)
+        # Only here: the error that is gone by now held the memory of the first attempt.
+        torch.cuda.empty_cache()
+        return _recorded(function, stream, pool, generator)
+
+
+def _recorded(
+    function: Callable[[], object],
+    stream: torch.cuda.Stream,
+    pool: Any,
+    generator: torch.Generator | None,
+) -> torch.cuda.CUDAGraph:
+    """Capture a stream while the function runs."""
+    graph = torch.cuda.CUDAGraph()
+    if generator is not None:
+        # Without this every replay would draw the numbers of the capture again.
+        graph.register_generator_state(generator)
+    with torch.cuda.stream(stream), no_garbage_collection():
+        # A backward pass runs on a thread of its own, whose calls the strict mode would refuse.
+        graph.capture_begin(pool=pool, capture_error_mode="thread_local")
+        try:
+            function()
+        except BaseException:
+            # What broke the capture says more than the complaint that it is broken.
+            with contextlib.suppress(RuntimeError):
+                graph.capture_end()
+            raise
+        graph.capture_end()
     return graph
-
-
-def _record(function: Callable[[], object], graph: torch.cuda.CUDAGraph, pool: Any) -> None:
-    """Capture the current stream while the function runs."""
-    # A backward pass runs on a thread of its own, whose calls the strict mode would refuse.
-    graph.capture_begin(pool=pool, capture_error_mode="thread_local")
-    try:
-        function()
-    except BaseException:
-        # What broke the capture says more than the complaint that it is broken.
-        with contextlib.suppress(RuntimeError):
-            graph.capture_end()
-        raise
-    graph.capture_end()
 
 
 class Replayed:
