@@ -74,8 +74,8 @@ def capture(
     """
     with torch.cuda.device(device):
         stream = _capture_stream(torch.cuda.current_device())
-        stream.wait_stream(torch.cuda.current_stream())
         if warm_up is not None:
+            stream.wait_stream(torch.cuda.current_stream())
             with torch.cuda.stream(stream):
                 warm_up()
             torch.cuda.synchronize()
@@ -94,22 +94,37 @@ def _recorded(
     generator: torch.Generator | None,
 ) -> torch.cuda.CUDAGraph:
     """Capture a stream while the function runs."""
+    current = torch.cuda.current_stream()
     graph = torch.cuda.CUDAGraph()
     if generator is not None:
         # Without this every replay would draw the numbers of the capture again.
         graph.register_generator_state(generator)
-    with torch.cuda.stream(stream), no_garbage_collection():
-        # A backward pass runs on a thread of its own, whose calls the strict mode would refuse.
-        graph.capture_begin(pool=pool, capture_error_mode="thread_local")
-        try:
-            function()
-        except BaseException:
-            # What broke the capture says more than the complaint that it is broken.
-            with contextlib.suppress(RuntimeError):
-                graph.capture_end()
-            raise
-        graph.capture_end()
+    # A capture runs nothing, but for this: torch resets the generators' places on the device, which
+    # the graphs before read and the next replay writes. So the two streams take turns.
+    stream.wait_stream(current)
+    try:
+        with torch.cuda.stream(stream), no_garbage_collection():
+            _record(function, graph, pool)
+    except BaseException:
+        with contextlib.suppress(RuntimeError):
+            current.wait_stream(stream)
+        raise
+    current.wait_stream(stream)
     return graph
+
+
+def _record(function: Callable[[], object], graph: torch.cuda.CUDAGraph, pool: Any) -> None:
+    """Capture the current stream while the function runs."""
+    # A backward pass runs on a thread of its own, whose calls the strict mode would refuse.
+    graph.capture_begin(pool=pool, capture_error_mode="thread_local")
+    try:
+        function()
+    except BaseException:
+        # What broke the capture says more than the complaint that it is broken.
+        with contextlib.suppress(RuntimeError):
+            graph.capture_end()
+        raise
+    graph.capture_end()
 
 
 class Replayed:

@@ -50,8 +50,10 @@ def events(monkeypatch):
     @contextlib.contextmanager
     def within(where):
         seen.append(f"enter {where.name}")
-        yield
-        seen.append(f"leave {where.name}")
+        try:
+            yield
+        finally:
+            seen.append(f"leave {where.name}")
 
     monkeypatch.setattr(torch.cuda, "CUDAGraph", Graph)
     monkeypatch.setattr(torch.cuda, "stream", within)
@@ -73,13 +75,14 @@ def test_a_capture_waits_for_nothing_and_collects_nothing(events, monkeypatch):
     capture(function, CUDA, pool="memory", generator="dice")
     assert gc.isenabled()
     assert events == [
-        "side waits for current",
         "register dice",
+        "side waits for current",
         "enter side",
         "begin memory thread_local",
         "run, collecting False",
         "end",
         "leave side",
+        "current waits for side",
     ]
 
 
@@ -92,11 +95,13 @@ def test_what_a_warm_up_leaves_is_given_back_before_the_capture(events):
         "leave side",
         "synchronize",
         "empty",
+        "side waits for current",
         "enter side",
         "begin None thread_local",
         "run",
         "end",
         "leave side",
+        "current waits for side",
     ]
 
 
@@ -110,6 +115,7 @@ def test_a_failed_capture_is_ended_and_tells_its_own_reason(events, broken):
     with pytest.raises(Boom):
         capture(function, CUDA)
     assert events.count("end") == 1
+    assert events[-2:] == ["leave side", "current waits for side"]
     assert gc.isenabled()
 
 
@@ -167,6 +173,34 @@ def test_replays_draw_what_launches_would_have_drawn():
         drawn.append((torch.stack(rows), generator.get_state()))
     assert torch.equal(drawn[0][0], drawn[1][0])
     assert torch.equal(drawn[0][1], drawn[1][1])
+
+
+@pytest.mark.gpu
+@needs_cuda
+def test_a_capture_in_between_leaves_the_numbers_of_busy_graphs_alone():
+    drawn = []
+    for busy in (True, False):
+        generator = torch.Generator(CUDA).manual_seed(6)
+        numbers = torch.zeros(4000, device=CUDA)
+        work = torch.rand(2048, 2048, device=CUDA)
+
+        def draw(numbers=numbers, generator=generator, work=work):
+            for _ in range(20):
+                torch.mm(work, work)
+            numbers.copy_(torch.rand(4000, generator=generator, device=CUDA))
+
+        draw()
+        rows = []
+        for _ in range(8):
+            graph = capture(draw, CUDA, generator=generator)
+            for _ in range(3):
+                graph.replay()
+                rows.append(numbers.clone())
+            if not busy:
+                torch.cuda.synchronize()
+        drawn.append(torch.stack(rows))
+    assert torch.equal(drawn[0], drawn[1])
+    assert len(drawn[0].unique(dim=0)) == len(drawn[0])
 
 
 @pytest.mark.gpu
