@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import gc
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -10,19 +11,6 @@ from typing import Any
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-
-
-@contextlib.contextmanager
-def no_garbage_collection() -> Iterator[None]:
-    """Collect garbage now and none inside: freeing an old graph would break a capture."""
-    gc.collect()
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()
 
 
 def sent(values: NDArray[Any], device: torch.device) -> Tensor:
@@ -37,6 +25,108 @@ def sent(values: NDArray[Any], device: torch.device) -> Tensor:
     return tensor.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else tensor
 
 
+@contextlib.contextmanager
+def no_garbage_collection() -> Iterator[None]:
+    """Collect no garbage inside: freeing an old graph would break a capture."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
+@functools.cache
+def _capture_stream(device_index: int) -> torch.cuda.Stream:
+    """The one stream of a device that is captured: graphs can share memory only within a stream."""
+    return torch.cuda.Stream(device_index)  # type: ignore[no-untyped-call]
+
+
+def capture(
+    function: Callable[[], object],
+    device: torch.device,
+    *,
+    pool: Any = None,
+    generator: torch.Generator | None = None,
+    warm_up: Callable[[], object] | None = None,
+) -> torch.cuda.CUDAGraph:
+    """Record what a function launches as a CUDA graph, without running it.
+
+    Without a warm-up the host waits for nothing. `torch.cuda.graph` waits for the device, frees the
+    allocator's cache and may collect garbage at each capture, which can take longer than the
+    capture itself. That makes room, as a graph's pool has no use for memory in that cache. Here
+    room is made after the warm-up, which leaves most of it, and where a capture has not enough.
+
+    Args:
+        function: Launches kernels that are loaded already, and never waits for the device.
+        device: A CUDA device, where it works.
+        pool: Memory (`torch.cuda.graph_pool_handle()`) to share with graphs that never run at the
+            same time as this one; None is a new pool.
+        generator: A CUDA generator that the function draws from: each replay draws anew.
+        warm_up: Run first, on the stream that is captured: loads kernels, allocates workspaces.
+
+    Returns:
+        The graph, to be replayed on any stream.
+
+    Raises:
+        Exception: Whatever the function raises; the device can be used as before.
+    """
+    with torch.cuda.device(device):
+        stream = _capture_stream(torch.cuda.current_device())
+        if warm_up is not None:
+            stream.wait_stream(torch.cuda.current_stream())
+            with torch.cuda.stream(stream):
+                warm_up()
+            torch.cuda.synchronize()
+            torch.cuda.empty_cache()
+        with contextlib.suppress(torch.OutOfMemoryError):
+            return _recorded(function, stream, pool, generator)
+        # Only here: the error that is gone by now held the memory of the first attempt.
+        torch.cuda.empty_cache()
+        return _recorded(function, stream, pool, generator)
+
+
+def _recorded(
+    function: Callable[[], object],
+    stream: torch.cuda.Stream,
+    pool: Any,
+    generator: torch.Generator | None,
+) -> torch.cuda.CUDAGraph:
+    """Capture a stream while the function runs."""
+    current = torch.cuda.current_stream()
+    graph = torch.cuda.CUDAGraph()
+    if generator is not None:
+        # Without this every replay would draw the numbers of the capture again.
+        graph.register_generator_state(generator)
+    # A capture runs nothing, but for this: torch resets the generators' places on the device, which
+    # the graphs before read and the next replay writes. So the two streams take turns.
+    stream.wait_stream(current)
+    try:
+        with torch.cuda.stream(stream), no_garbage_collection():
+            _record(function, graph, pool)
+    except BaseException:
+        with contextlib.suppress(RuntimeError):
+            current.wait_stream(stream)
+        raise
+    current.wait_stream(stream)
+    return graph
+
+
+def _record(function: Callable[[], object], graph: torch.cuda.CUDAGraph, pool: Any) -> None:
+    """Capture the current stream while the function runs."""
+    # A backward pass runs on a thread of its own, whose calls the strict mode would refuse.
+    graph.capture_begin(pool=pool, capture_error_mode="thread_local")
+    try:
+        function()
+    except BaseException:
+        # What broke the capture says more than the complaint that it is broken.
+        with contextlib.suppress(RuntimeError):
+            graph.capture_end()
+        raise
+    graph.capture_end()
+
+
 class Replayed:
     """A function without arguments that is run as it is on a CPU, and as a CUDA graph on CUDA.
 
@@ -46,11 +136,19 @@ class Replayed:
     Args:
         function: Reads and writes the same tensors in every call, and never waits for the device.
         device: Where these are.
+        generator: A generator on the device that the function draws from; the numbers are the same
+            whether it is captured or not.
     """
 
-    def __init__(self, function: Callable[[], None], device: torch.device) -> None:
+    def __init__(
+        self,
+        function: Callable[[], None],
+        device: torch.device,
+        generator: torch.Generator | None = None,
+    ) -> None:
         self._function = function
         self._device = device
+        self._generator = generator
         self._warm = False
         self._graph: torch.cuda.CUDAGraph | None = None
 
@@ -65,10 +163,7 @@ class Replayed:
             self._warm = True
             return
         if self._graph is None:
-            graph = torch.cuda.CUDAGraph()
-            with no_garbage_collection(), torch.cuda.graph(graph):
-                self._function()
-            self._graph = graph
+            self._graph = capture(self._function, self._device, generator=self._generator)
         self._graph.replay()
 
 

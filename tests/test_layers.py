@@ -63,7 +63,7 @@ LADDER = {
         9, "torch numpy matplotlib scipy warpSPHCore", never=("npa_envs.kernels",)
     ),
     "npa_envs.training": rung(
-        8, "torch numpy tqdm yaml", never=("npa_envs.kernels", "npa_envs.reference")
+        8, "torch numpy tqdm yaml tensorboard", never=("npa_envs.kernels", "npa_envs.reference")
     ),
     "npa_envs.diagnostics": rung(8, "torch PIL imageio_ffmpeg", never=INSIDES),
     "npa_envs.api": rung(8, "torch", never=("npa_envs.kernels", "npa_envs.reference")),

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from PIL import Image
 
 from npa_envs.errors import MissingDependencyError, NPAError
 from npa_envs.render import to_uint8, write_filmstrip, write_gif, write_mp4, write_png
+from npa_envs.render.film import encode_frame
 
 WRITERS = [write_gif, write_mp4, write_filmstrip]
 
@@ -94,6 +96,20 @@ def test_png_is_read_back_exactly(tmp_path):
     frame = np.random.default_rng(0).integers(0, 256, (7, 9, 3), dtype=np.uint8)
     write_png(tmp_path / "picture.png", frame)
     np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "picture.png")), frame)
+
+
+def test_an_encoded_png_is_exact_and_a_jpeg_is_smaller_and_nearly_exact():
+    axis = np.linspace(0, 6, 96)
+    wave = 127.5 + 120 * np.sin(axis[:, None, None] + axis[:, None] * [1.0, 1.1, 1.2])
+    frame = (wave + np.random.default_rng(0).normal(0, 1, wave.shape)).astype(np.uint8)
+    png, jpeg = encode_frame(frame, "PNG"), encode_frame(frame, "JPEG")
+    np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(png))), frame)
+    shown = np.asarray(Image.open(io.BytesIO(jpeg)))
+    # Seen: 1.2, and 0.16 of the bytes.
+    assert np.abs(shown.astype(float) - frame).mean() < 3
+    assert len(jpeg) < 0.5 * len(png)
+    with pytest.raises(NPAError, match=r"uint8 of shape \[H, W, 3\]"):
+        encode_frame(frame[..., :2], "PNG")
 
 
 def test_gif_holds_every_frame_with_nearly_exact_colours(tmp_path):

@@ -15,14 +15,15 @@ from npa_envs.errors import NPAError
 from npa_envs.training.checkpoint import check_same_run, load_checkpoint, save_checkpoint
 from npa_envs.training.folder import JsonlLog
 from npa_envs.training.graphs import EagerIteration, GraphedIteration
-from npa_envs.training.meter import LossMeter
-from npa_envs.training.optimiser import RuleOptimiser, normalise_gradients
+from npa_envs.training.meter import Interval, LossMeter
+from npa_envs.training.optimiser import RuleOptimiser, clear_non_finite, normalise_gradients
 from npa_envs.training.overrides import config_to_dict
 from npa_envs.training.pool import WorldPool
 
 
-def make_pool(pool_size=6, particle_count=4, limit=10.0):
-    x = torch.arange(pool_size, dtype=torch.float32)[:, None, None].repeat(1, particle_count, 2)
+def make_pool(pool_size=6, particle_count=4, limit=10.0, device="cpu"):
+    x = torch.arange(pool_size, dtype=torch.float32, device=device)
+    x = x[:, None, None].repeat(1, particle_count, 2)
     return WorldPool(x, x[..., :1].repeat(1, 1, 3), runaway_limit=limit)
 
 
@@ -50,12 +51,12 @@ def test_pool_reads_copies():
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 11.0, -11.0])
 @pytest.mark.parametrize("where", ["x", "s"])
-def test_pool_replaces_worlds_that_run_away_and_only_those(bad, where):
-    pool = make_pool()
-    x, s = torch.full((3, 4, 2), 7.0), torch.full((3, 4, 3), 8.0)
+def test_pool_replaces_worlds_that_run_away_and_only_those(bad, where, device):
+    pool = make_pool(device=device)
+    x, s = (torch.full((3, 4, c), v, device=device) for c, v in ((2, 7.0), (3, 8.0)))
     (x if where == "x" else s)[1, 2, 1] = bad
     fresh_x, fresh_s = torch.full_like(x, 0.5), torch.full_like(s, 0.25)
-    replaced = pool.write(torch.tensor([5, 0, 3]), x, s, fresh_x, fresh_s)
+    replaced = pool.write(torch.tensor([5, 0, 3], device=device), x, s, fresh_x, fresh_s)
     assert replaced.tolist() == [False, True, False]
     assert pool.x[:, 0, 0].tolist() == [0.5, 1, 2, 7, 4, 7]
     assert pool.s[:, 0, 0].tolist() == [0.25, 1, 2, 8, 4, 8]
@@ -70,11 +71,15 @@ def test_each_gradient_is_divided_by_its_own_norm():
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-def test_gradient_that_is_not_finite_becomes_zero_and_its_neighbour_stays(bad):
-    gradients = [torch.tensor([1.0, bad]), torch.tensor([2.0])]
+def test_gradient_that_is_not_finite_becomes_zero_and_its_neighbour_stays(bad, device):
+    gradients = [torch.tensor(v, device=device) for v in ([1.0, bad], [2.0])]
     normalise_gradients(gradients)
     assert gradients[0].tolist() == [0.0, 0.0]
     assert gradients[1].tolist() == [1.0]
+    for entries, cleared in (([1.0, bad], [0.0, 0.0]), ([3.0, -2.0], [3.0, -2.0])):
+        gradient = torch.tensor(entries, device=device)
+        clear_non_finite(gradient)
+        assert gradient.tolist() == cleared
 
 
 def step_with(config, gradient_values):
@@ -83,6 +88,7 @@ def step_with(config, gradient_values):
     path = []
     for iteration, value in enumerate(gradient_values):
         parameter.grad = torch.tensor([value])
+        optimiser.prepare_gradients()
         optimiser.step(iteration)
         path.append(parameter.item())
     return path
@@ -169,31 +175,36 @@ def test_a_parameter_outside_the_loss_gets_a_zero_gradient(tmp_path):
     assert rule.unused.grad.tolist() == [0.0, 0.0]
 
 
-def test_meter_gives_the_means_of_the_interval(tmp_path):
-    _, _, iteration = make_iteration(circle_config(tmp_path))
+def test_meter_gives_the_means_of_the_interval(tmp_path, device):
+    _, _, iteration = make_iteration(circle_config(tmp_path), device=device)
     meter = LossMeter(iteration)
     for number, value in enumerate([1.0, 2.0, 6.0], start=1):
         iteration.terms.fill_(value)
-        meter.observe(number, 4 * number, torch.tensor([number == 2, False]))
-    expected = dict.fromkeys(iteration.term_names, 3.0) | {"steps": 8.0, "replaced_worlds": 1}
-    assert meter.read() == expected
-    meter.clear()
+        meter.begin(number, 4 * number)
+        meter.observe(torch.tensor([number == 2, False], device=device))
+    meter.send()
+    # What is observed before the numbers are received belongs to the next interval.
     iteration.terms.fill_(5.0)
-    meter.observe(4, 7, torch.tensor([False]))
-    assert meter.read() == dict.fromkeys(iteration.term_names, 5.0) | {
-        "steps": 7.0,
-        "replaced_worlds": 0,
-    }
+    meter.begin(4, 7)
+    meter.observe(torch.tensor([False], device=device))
+    expected = dict.fromkeys(iteration.term_names, 3.0) | {"steps": 8.0, "replaced_worlds": 1}
+    assert meter.receive() == Interval(expected, None)
+    meter.send()
+    expected = dict.fromkeys(iteration.term_names, 5.0) | {"steps": 7.0, "replaced_worlds": 0}
+    assert meter.receive() == Interval(expected, None)
 
 
-def test_meter_keeps_the_first_bad_iteration_and_not_a_later_one(tmp_path):
-    _, _, iteration = make_iteration(circle_config(tmp_path))
+def test_meter_keeps_the_first_bad_iteration_and_not_a_later_one(tmp_path, device):
+    _, _, iteration = make_iteration(circle_config(tmp_path), device=device)
     meter = LossMeter(iteration)
     for number, (term, mark) in enumerate([(1.0, 10.0), (math.nan, 20.0), (math.inf, 30.0)], 1):
         iteration.terms.fill_(1.0)
         iteration.terms[2] = term
         iteration.x0.fill_(mark)
-        meter.observe(number, 100 + number, torch.tensor([False]))
+        meter.begin(number, 100 + number)
+        meter.observe(torch.tensor([False], device=device))
+        meter.send()
+        assert meter.receive().bad_iteration == (None if number == 1 else 2)
     assert meter.bad_iteration() == 2
     snapshot = meter.snapshot()
     assert (snapshot["iteration"], snapshot["steps"]) == (2, 102)

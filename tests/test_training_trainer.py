@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import os
 import signal
@@ -296,7 +297,12 @@ def test_tensorboard_gets_the_same_numbers_as_the_log(tmp_path):
     losses = [(event.step, event.value) for event in events.Scalars("loss")]
     expected = [(record["iteration"], record["loss"]) for record in log_of(tmp_path)]
     assert losses == [(k, pytest.approx(loss, rel=1e-6)) for k, loss in expected]
-    assert [event.step for event in events.Images("batch")] == [6]
+    (picture,) = events.Images("batch")
+    assert (picture.step, picture.width, picture.height) == (6, 24, 8)
+    written = np.asarray(Image.open(tmp_path / "pictures" / "000006.png")).astype(float)
+    shown = np.asarray(Image.open(io.BytesIO(picture.encoded_image_string)))
+    # A JPEG of few pixels: seen 5.6 of 255.
+    assert np.abs(shown - written).mean() < 12
 
 
 class BrokenTask(CircleTask):
@@ -342,6 +348,71 @@ def test_loss_that_is_not_finite_stops_the_run_with_a_report(tmp_path):
     assert diagnosis["iteration"] == 5
     assert torch.isfinite(diagnosis["x0"]).all()
     assert torch.isfinite(diagnosis["x"]).flatten(1).all(1).tolist() == [True, True, False]
+
+
+def logging_late(config, **options):
+    """A trainer that writes each record an iteration later, as it does on CUDA."""
+    trainer = trainer_of(config, **options)
+    trainer._log_late = True
+    return trainer
+
+
+def test_late_records_are_the_same_and_written_while_the_next_iteration_is_under_way(tmp_path):
+    fields = {"iterations": 7, "log_interval": 2, "checkpoint_interval": 3, "picture_interval": 4}
+    train(circle_config(tmp_path / "prompt", **fields))
+    trainer = logging_late(circle_config(tmp_path / "late", **fields))
+    events = []
+
+    def noted(name, function):
+        def call(*args):
+            function(*args)
+            events.append((name, trainer.iteration))
+
+        return call
+
+    trainer._log.append = noted("record", trainer._log.append)
+    trainer._write_picture = noted("picture", trainer._write_picture)
+    trainer.save = noted("checkpoint", trainer.save)
+    result = trainer.run(progress=False)
+    # Only the first record is late: the others must precede a picture or a checkpoint.
+    assert events == [
+        ("record", 3),
+        ("checkpoint", 3),
+        ("record", 4),
+        ("picture", 4),
+        ("record", 6),
+        ("checkpoint", 6),
+        ("record", 7),
+        ("checkpoint", 7),
+    ]
+    assert log_of(tmp_path / "late") == log_of(tmp_path / "prompt")
+    assert result.record["iteration"] == 7
+
+
+@pytest.mark.parametrize("checkpoint_interval", [1, 100])
+def test_late_records_find_a_loss_that_is_not_finite(tmp_path, checkpoint_interval):
+    fields = {"iterations": 20, "log_interval": 2, "checkpoint_interval": checkpoint_interval}
+    trainer = logging_late(circle_config(tmp_path, **fields), rollout=explode_after(5))
+    with pytest.raises(DivergedError, match="distance was not in iteration 5 "):
+        trainer.run(progress=False)
+    # Found at the next line of the log or checkpoint, and an iteration later at most.
+    assert trainer.iteration == (5 if checkpoint_interval == 1 else 7)
+    assert [record["iteration"] for record in log_of(tmp_path)] == [2, 4]
+    saved = load_checkpoint(tmp_path / "checkpoint.pt")["iteration"]
+    assert saved == (4 if checkpoint_interval == 1 else 0)
+    with pytest.raises(DivergedError):
+        trainer.save()
+
+
+def test_a_stopped_run_has_its_late_record(tmp_path):
+    config = circle_config(tmp_path, checkpoint_interval=100)
+    task = KilledTask(iteration=2, end=lambda: os.kill(os.getpid(), signal.SIGINT))
+    result = logging_late(config, task=task).run(progress=False)
+    assert (result.iteration, result.record["iteration"]) == (2, 2)
+    assert [record["iteration"] for record in log_of(tmp_path)] == [1, 2]
+    assert train(config, resume=True).finished
+    train(circle_config(tmp_path / "whole", checkpoint_interval=100))
+    assert log_of(tmp_path) == log_of(tmp_path / "whole")
 
 
 def test_bad_term_is_named_when_the_worlds_are_sound(tmp_path):

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 
 import torch
 
+from npa_envs.replay import capture
+
 LEAST_SECONDS = {"cpu": 2e-3, "cuda": 1e-2}
 """Short calls are made so many times in a row that one reading takes at least this long [s]."""
 
@@ -80,27 +82,9 @@ def measure(
     torch.cuda.empty_cache()
     torch.cuda.reset_peak_memory_stats(device)
     before = torch.cuda.memory_allocated(device)
-    replay = _captured(run, device, generator) if graph else run
+    replay = capture(run, device, generator=generator, warm_up=run).replay if graph else run
     timing = _timing(replay, device, repeats)
     return Cost(timing, (torch.cuda.max_memory_allocated(device) - before) / 2**20)
-
-
-def _captured(
-    run: Callable[[], object], device: torch.device, generator: torch.Generator | None
-) -> Callable[[], object]:
-    """Return the replay of a CUDA graph of `run`."""
-    stream = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
-    stream.wait_stream(torch.cuda.current_stream(device))
-    with torch.cuda.stream(stream):
-        run()
-    torch.cuda.synchronize(device)
-    graph = torch.cuda.CUDAGraph()
-    if generator is not None:
-        graph.register_generator_state(generator)
-    with torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
-        run()
-    replay: Callable[[], object] = graph.replay
-    return replay
 
 
 def _timing(run: Callable[[], object], device: torch.device, repeats: int) -> Timing:

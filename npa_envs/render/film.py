@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import importlib
+import io
 import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +26,7 @@ _MARGIN = 8
 
 
 def write_png(path: str | Path, frame: Frame) -> None:
-    """Write one picture.
+    """Write one picture, as small as a PNG can be.
 
     Args:
         path: The PNG file.
@@ -37,6 +38,23 @@ def write_png(path: str | Path, frame: Frame) -> None:
     (checked,) = _check_frames([frame])
     with atomic_path(path) as temporary:
         Image.fromarray(checked).save(temporary, format="PNG", optimize=True)
+
+
+def encode_frame(frame: Frame, kind: Literal["PNG", "JPEG"]) -> bytes:
+    """Return the content of a picture's file, soon rather than small.
+
+    Args:
+        frame: Pixels, uint8, shape [H, W, 3].
+        kind: A PNG is exact, a JPEG is nearly so.
+
+    Raises:
+        NPAError: A wrong shape or dtype.
+    """
+    (checked,) = _check_frames([frame])
+    options = {"compress_level": 1} if kind == "PNG" else {"quality": 90}
+    buffer = io.BytesIO()
+    Image.fromarray(checked).save(buffer, format=kind, **options)
+    return buffer.getvalue()
 
 
 def write_gif(path: str | Path, frames: Iterable[Frame], fps: float = 25) -> None:

@@ -15,7 +15,8 @@ class Task(Protocol):
     """A thing to learn. Shapes: B worlds, N particles, D space, C channels, R pixels.
 
     No method may wait for the device (no `.item()`, no branch on a tensor's value): the trainer
-    captures the loss in a CUDA graph and never reads a number back between two log lines.
+    captures `seed`, `damage` and `loss` in CUDA graphs and never reads a number back between two
+    log lines. So these must do the same in every iteration, and draw from their generator alone.
     """
 
     @property

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import io
 import zipfile
+from io import FileIO
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from npa_envs.errors import NPAError
-from npa_envs.files import write_bytes
+from npa_envs.files import atomic_path
 from npa_envs.training.config import TrainConfig
 from npa_envs.training.overrides import config_to_dict
 
@@ -64,10 +64,30 @@ def save_checkpoint(path: Path, content: dict[str, Any]) -> None:
     Raises:
         NPAError: The file cannot be written.
     """
-    # torch.save straight to the file would hide the system's reason (disk full) from the caller.
-    buffer = io.BytesIO()
-    torch.save({"format": FORMAT, "format_version": FORMAT_VERSION, **content}, buffer)
-    write_bytes(path, buffer.getvalue())
+    with atomic_path(path) as temporary, _PatientFile(temporary, "wb") as file:
+        torch.save({"format": FORMAT, "format_version": FORMAT_VERSION, **content}, file)
+        if file.error is not None:
+            raise file.error
+
+
+class _PatientFile(FileIO):
+    """A file that keeps its first error of writing, and writes no more from then on.
+
+    Torch would raise an error of its own instead, which hides the system's reason (disk full).
+    """
+
+    error: OSError | None = None
+    """What went wrong first."""
+
+    def write(self, data: Any, /) -> int:
+        """Write all of the data, unless something went wrong before."""
+        rest = memoryview(data)
+        try:
+            while self.error is None and len(rest) > 0:
+                rest = rest[super().write(rest) :]
+        except OSError as error:
+            self.error = error
+        return len(data)
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:

@@ -82,7 +82,7 @@ class TrainConfig(Generic[TaskConfigT]):
     """Keep the perception of every step for the backward pass, or compute it again there."""
 
     cuda_graph: bool = True
-    """On CUDA, capture rollout, loss and backward pass as one graph per number of steps."""
+    """On CUDA, capture an iteration: rollout and gradients as one graph per number of steps."""
 
     out: Path = Path("runs/morphogenesis2d")
     """Folder that log, pictures, checkpoint and rule are written to; created where missing."""

@@ -9,7 +9,7 @@ from torch import Tensor
 
 import npa_envs.dynamics
 from npa_envs.dynamics import Memory
-from npa_envs.replay import no_garbage_collection
+from npa_envs.replay import capture
 from npa_envs.rule import NPARule
 from npa_envs.tasks.task import Task
 from npa_envs.training.config import TrainConfig
@@ -131,7 +131,6 @@ class GraphedIteration(EagerIteration):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self._graphs: dict[int, torch.cuda.CUDAGraph] = {}
-        self._stream = torch.cuda.Stream(self.x0.device)  # type: ignore[no-untyped-call]
         self._memory_pool = torch.cuda.graph_pool_handle()
 
     def run(self, steps: int) -> None:
@@ -142,36 +141,18 @@ class GraphedIteration(EagerIteration):
         """
         with torch.cuda.device(self.x0.device):
             if steps not in self._graphs:
-                self._graphs[steps] = self._capture(steps)
+                self._graphs[steps] = capture(
+                    lambda: self._forward_backward(steps),
+                    self.x0.device,
+                    pool=self._memory_pool,
+                    generator=self._generator,
+                    warm_up=None if self._graphs else self._warm_up,
+                )
             self._graphs[steps].replay()
-
-    def _capture(self, steps: int) -> torch.cuda.CUDAGraph:
-        if not self._graphs:
-            self._warm_up()
-        graph = torch.cuda.CUDAGraph()
-        # Without this every replay would draw the masks of the capture again.
-        graph.register_generator_state(self._generator)
-        # The backward pass runs on a thread of its own, whose calls the strict mode would refuse.
-        with (
-            no_garbage_collection(),
-            torch.cuda.graph(
-                graph,
-                pool=self._memory_pool,
-                stream=self._stream,
-                capture_error_mode="thread_local",
-            ),
-        ):
-            self._forward_backward(steps)
-        return graph
 
     def _warm_up(self) -> None:
         """Run eagerly once: load kernels and allocate workspaces, which no capture may do."""
         # A resumed run warms up again: the masks that follow must not depend on that.
         state = self._generator.get_state()
-        current = torch.cuda.current_stream()
-        self._stream.wait_stream(current)
-        with torch.cuda.stream(self._stream):
-            self._forward_backward(WARM_UP_STEPS)
-        current.wait_stream(self._stream)
-        torch.cuda.synchronize()
+        self._forward_backward(WARM_UP_STEPS)
         self._generator.set_state(state)

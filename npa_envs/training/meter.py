@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -13,10 +15,22 @@ NONE_YET = -1
 """Marks that no loss was infinite or NaN so far."""
 
 
+@dataclass(frozen=True)
+class Interval:
+    """What happened between two log lines."""
+
+    means: dict[str, float]
+    """The mean terms by name, the mean `steps`, and how many `replaced_worlds` there were."""
+
+    bad_iteration: int | None
+    """The first iteration of the run whose loss was not finite, or None."""
+
+
 class LossMeter:
     """Sums of the loss terms, and a snapshot of the first iteration whose loss is not finite.
 
-    `observe` only launches kernels; `read` waits for the device.
+    `begin`, `observe` and `send` launch kernels and wait for nothing. `observe` can be captured
+    in a CUDA graph: the same tensors are read and written in each iteration.
 
     Args:
         iteration: The iteration's buffers.
@@ -25,53 +39,75 @@ class LossMeter:
     def __init__(self, iteration: EagerIteration) -> None:
         self._iteration = iteration
         device = iteration.terms.device
-        # float64: a float32 sum over a long interval would lose digits of the mean.
-        self._sums = torch.zeros(len(iteration.terms), dtype=torch.float64, device=device)
-        self._replaced = torch.zeros((), dtype=torch.int64, device=device)
-        self._bad_iteration = torch.full((), NONE_YET, dtype=torch.int64, device=device)
-        self._bad_steps = torch.zeros((), dtype=torch.int64, device=device)
+        # In one tensor, so that one copy brings all to the host. In float64, because a float32 sum
+        # over a long interval would lose digits of the mean; whole numbers are exact in it.
+        numbers = torch.zeros(len(iteration.terms) + 3, dtype=torch.float64, device=device)
+        self._numbers = numbers
+        self._sums, self._replaced, self._bad = numbers[:-3], numbers[-3], numbers[-2:]
+        self._bad[0] = NONE_YET
+        self._now = torch.zeros_like(self._bad)
+        self._snapshot = {name: value.clone() for name, value in self._observed().items()}
         self._count = 0
         self._step_sum = 0
-        self._snapshot = {name: value.clone() for name, value in self._observed().items()}
+        on_cuda = device.type == "cuda"
+        self._sent = torch.zeros(numbers.shape, dtype=numbers.dtype, pin_memory=on_cuda)
+        self._sent_counts = (0, 0)
+        self._arrival = torch.cuda.Event() if on_cuda else None  # type: ignore[no-untyped-call]
 
-    def observe(self, number: int, steps: int, replaced: Tensor) -> None:
-        """Take note of an iteration, before the optimiser changes the parameters.
+    def begin(self, number: int, steps: int) -> None:
+        """Say which iteration is observed next.
 
         Args:
             number: The iteration's number, counted from 1.
             steps: Steps of its rollout, T.
-            replaced: Which of its worlds left the pool, shape [B], bool.
         """
-        self._sums += self._iteration.terms
-        self._replaced += replaced.sum()
+        self._now[0].fill_(number)
+        self._now[1].fill_(steps)
         self._count += 1
         self._step_sum += steps
-        first = ~torch.isfinite(self._iteration.terms).all() & (self._bad_iteration == NONE_YET)
-        self._bad_iteration.masked_fill_(first, number)
-        self._bad_steps.masked_fill_(first, steps)
+
+    def observe(self, replaced: Tensor) -> None:
+        """Take note of an iteration, before the optimiser changes the parameters.
+
+        Args:
+            replaced: Which of its worlds left the pool, shape [B], bool.
+        """
+        terms = self._iteration.terms
+        self._sums += terms
+        self._replaced += replaced.sum()
+        # A comparison with NaN is false: one reduction finds both NaN and infinity.
+        finite = torch.linalg.vector_norm(terms, math.inf) < math.inf
+        first = ~finite & (self._bad[0] == NONE_YET)
+        torch.where(first, self._now, self._bad, out=self._bad)
         for name, value in self._observed().items():
             torch.where(first, value, self._snapshot[name], out=self._snapshot[name])
 
-    def bad_iteration(self) -> int | None:
-        """Return the first iteration whose loss was not finite, or None; waits for the device."""
-        number = int(self._bad_iteration.item())
-        return None if number == NONE_YET else number
-
-    def read(self) -> dict[str, float]:
-        """Return the mean terms, mean steps and worlds replaced since `clear`; waits."""
-        count = max(self._count, 1)
-        means = (self._sums / count).tolist()
-        result = dict(zip(self._iteration.term_names, means, strict=True))
-        result["steps"] = self._step_sum / count
-        result["replaced_worlds"] = int(self._replaced.item())
-        return result
-
-    def clear(self) -> None:
-        """Start the next interval."""
-        self._sums.zero_()
-        self._replaced.zero_()
+    def send(self) -> None:
+        """Let the interval's numbers go to the host, and start the next interval."""
+        self._sent.copy_(self._numbers, non_blocking=True)
+        if self._arrival is not None:
+            self._arrival.record(torch.cuda.current_stream(self._numbers.device))
+        self._sent_counts = self._count, self._step_sum
+        self._numbers[:-2].zero_()
         self._count = 0
         self._step_sum = 0
+
+    def receive(self) -> Interval:
+        """Return what `send` sent last; waits for that, and not for what was launched since."""
+        if self._arrival is not None:
+            self._arrival.synchronize()
+        count, step_sum = self._sent_counts
+        count = max(count, 1)
+        means = (self._sent[:-3] / count).tolist()
+        replaced, bad_iteration, _ = map(int, self._sent[-3:].tolist())
+        result = dict(zip(self._iteration.term_names, means, strict=True))
+        result |= {"steps": step_sum / count, "replaced_worlds": replaced}
+        return Interval(result, None if bad_iteration == NONE_YET else bad_iteration)
+
+    def bad_iteration(self) -> int | None:
+        """Return the first iteration whose loss was not finite, or None; waits for the device."""
+        number = int(self._bad[0].item())
+        return None if number == NONE_YET else number
 
     def snapshot(self) -> dict[str, Any]:
         """Return what the first iteration with a bad loss saw, on the CPU.
@@ -82,9 +118,10 @@ class LossMeter:
         """
         kept = {name: value.cpu() for name, value in self._snapshot.items()}
         terms = kept.pop("terms").tolist()
+        iteration, steps = map(int, self._bad.tolist())
         return {
-            "iteration": int(self._bad_iteration.item()),
-            "steps": int(self._bad_steps.item()),
+            "iteration": iteration,
+            "steps": steps,
             "terms": dict(zip(self._iteration.term_names, terms, strict=True)),
             **kept,
         }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -20,23 +21,25 @@ def normalise_gradients(gradients: Sequence[Tensor]) -> None:
     Args:
         gradients: One tensor for each parameter, any shape.
     """
-    for gradient in gradients:
-        gradient.div_(torch.linalg.vector_norm(gradient) + NORM_FLOOR)
-        clear_non_finite(gradient)
+    norms = torch.stack([torch.linalg.vector_norm(gradient) for gradient in gradients])
+    # A norm is not finite where an entry is not.
+    bad = ~(norms < math.inf)
+    norms += NORM_FLOOR
+    for gradient, norm, is_bad in zip(gradients, norms.unbind(), bad.unbind(), strict=True):
+        gradient.div_(norm).masked_fill_(is_bad, 0.0)
 
 
 def clear_non_finite(gradient: Tensor) -> None:
     """Set a gradient to 0 in place where any of its entries is not finite."""
-    # A sum is not finite where an entry is not: one reduction instead of a mask and a reduction.
-    bad = ~torch.isfinite(gradient).all()
-    gradient.masked_fill_(bad, 0.0)
+    largest = torch.linalg.vector_norm(gradient, math.inf)
+    gradient.masked_fill_(~(largest < math.inf), 0.0)
 
 
 class RuleOptimiser:
     """AdamW for a rule's parameters; nothing in it waits for the device.
 
     Args:
-        parameters: The rule's parameters; their `.grad` is set before `step`.
+        parameters: The rule's parameters; their `.grad` is set before `prepare_gradients`.
         config: Learning rates, weight decay, gradient normalisation.
     """
 
@@ -45,20 +48,23 @@ class RuleOptimiser:
         self._config = config
         self._adamw = self._fresh()
 
-    def step(self, iteration: int) -> None:
-        """Normalise the gradients and take one step; at the start of a repeat, with fresh moments.
-
-        Args:
-            iteration: Iterations done so far in the run.
-        """
-        if iteration > 0 and iteration % self._config.iterations == 0:
-            self._adamw = self._fresh()
+    def prepare_gradients(self) -> None:
+        """Normalise the gradients, where that is asked for; what is not finite becomes 0."""
         gradients = [p.grad for p in self._parameters if p.grad is not None]
         if self._config.normalise_gradients:
             normalise_gradients(gradients)
         else:
             for gradient in gradients:
                 clear_non_finite(gradient)
+
+    def step(self, iteration: int) -> None:
+        """Take one step along the prepared gradients; at the start of a repeat, with fresh moments.
+
+        Args:
+            iteration: Iterations done so far in the run.
+        """
+        if iteration > 0 and iteration % self._config.iterations == 0:
+            self._adamw = self._fresh()
         for group in self._adamw.param_groups:
             group["lr"] = self._config.learning_rate_at(iteration)
         self._adamw.step()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -55,10 +57,16 @@ class WorldPool:
         Returns:
             Which worlds were replaced, shape [B], bool.
         """
+        farthest = torch.maximum(_largest(x), _largest(s))
         # A comparison with NaN is false, so what is not finite is not kept either.
-        keep = (x.abs() <= self._runaway_limit).flatten(1).all(1)
-        keep &= (s.abs() <= self._runaway_limit).flatten(1).all(1)
+        keep = farthest <= self._runaway_limit
         mask = keep[:, None, None]
         self.x.index_copy_(0, index, torch.where(mask, x, fresh_x))
         self.s.index_copy_(0, index, torch.where(mask, s, fresh_s))
         return ~keep
+
+
+def _largest(worlds: Tensor) -> Tensor:
+    """Return each world's largest absolute value, NaN where there is one; shape [B]."""
+    largest: Tensor = torch.linalg.vector_norm(worlds.flatten(1), math.inf, dim=1)
+    return largest

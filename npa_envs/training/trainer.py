@@ -1,4 +1,4 @@
-"""The trainer: pool, rollout, loss, optimiser, and everything that a run leaves behind."""
+"""The trainer: one iteration after another, and everything that a run leaves behind."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 from tqdm import tqdm
 
 from npa_envs.devices import check_device
@@ -20,15 +19,13 @@ from npa_envs.rule_io import load_rule, save_rule
 from npa_envs.tasks.task import Task
 from npa_envs.training.checkpoint import check_same_run, load_checkpoint, save_checkpoint
 from npa_envs.training.config import TrainConfig
+from npa_envs.training.cycle import TrainingCycle
 from npa_envs.training.divergence import divergence_error
 from npa_envs.training.folder import JsonlLog, RunFolder, open_tensorboard
-from npa_envs.training.graphs import EagerIteration, GraphedIteration, Rollout
+from npa_envs.training.graphs import Rollout
 from npa_envs.training.interrupt import stop_flag
-from npa_envs.training.meter import LossMeter
-from npa_envs.training.optimiser import RuleOptimiser
 from npa_envs.training.overrides import config_to_dict
 from npa_envs.training.pictures import write_batch_picture
-from npa_envs.training.pool import WorldPool
 
 
 @dataclass(frozen=True)
@@ -87,31 +84,22 @@ class Trainer:
         """Iterations done."""
         self.folder = RunFolder(config.out)
         self._log = JsonlLog(self.folder.log)
+        self._record: dict[str, Any] = {}
+        self._record_begun: dict[str, Any] | None = None
+        self._board: Any = None
         self._seconds_before = 0.0
         self._started: float | None = None
         content = self._open_folder(resume=resume, overwrite=overwrite)
 
         device = check_device(config.device)
-        self._schedule_generator = torch.Generator().manual_seed(config.seed)
-        self._world_generator = torch.Generator(device).manual_seed(config.seed + 1)
-        self._mask_generator = torch.Generator(device).manual_seed(config.seed + 2)
-        self.rule = self._make_rule().to(device, config.torch_dtype)
-        x, s = self._seeds(config.pool_size)
-        self.pool = WorldPool(x, s, runaway_limit=config.runaway_limit)
-        graphed = device.type == "cuda" and config.cuda_graph
-        self._batch: EagerIteration = (GraphedIteration if graphed else EagerIteration)(
-            task,
-            self.rule,
-            config,
-            x[: config.world_count],
-            s[: config.world_count],
-            self._mask_generator,
-            rollout,
-        )
-        self._optimiser = RuleOptimiser(self._batch.parameters, config)
-        self._meter = LossMeter(self._batch)
-        pool_bytes = x.nbytes + s.nbytes
-        self.folder.prepare(pool_bytes + 16 * sum(p.nbytes for p in self._batch.parameters))
+        # While the host waits for the numbers, a GPU would have nothing to do; a CPU has done all.
+        self._log_late = device.type == "cuda"
+        schedule = torch.Generator().manual_seed(config.seed)
+        self.rule = self._make_rule(schedule).to(device, config.torch_dtype)
+        self._cycle = TrainingCycle(task, self.rule, config, device, schedule, rollout)
+        self.pool = self._cycle.pool
+        rule_bytes = sum(p.nbytes for p in self.rule.parameters())
+        self.folder.prepare(self.pool.x.nbytes + self.pool.s.nbytes + 16 * rule_bytes)
         if content is not None:
             self._restore(content)
         else:
@@ -135,9 +123,9 @@ class Trainer:
         """
         config = self.config
         start = self._started = time.perf_counter()
-        records = self._log.records()
-        record = records[-1] if records else {}
-        board = open_tensorboard(self.folder, self.iteration) if config.tensorboard else None
+        self._record = next(iter(self._log.records()[-1:]), {})
+        if config.tensorboard:
+            self._board = open_tensorboard(self.folder, self.iteration)
         total = config.total_iterations
         bar = tqdm(total=total, initial=self.iteration, disable=not progress, unit="it")
         try:
@@ -148,25 +136,29 @@ class Trainer:
                     if max_seconds is not None and time.perf_counter() - start >= max_seconds:
                         break
                     self._iterate()
-                    bar.update()
+                    # Of the iteration before: meanwhile the device has this one to do.
+                    self._finish_record()
                     if self._due(config.log_interval) or self.iteration == total:
-                        record = self._write_log(board)
-                        bar.set_postfix(loss=f"{record['loss']:.4g}", refresh=False)
+                        self._begin_record()
                     if self._due(config.picture_interval):
-                        self._write_picture(board)
+                        self._write_picture()
                     if self._due(config.checkpoint_interval) and self.iteration < total:
                         self.save()
+                    bar.update()
+                    if self._record:
+                        bar.set_postfix(loss=f"{self._record['loss']:.4g}", refresh=False)
                 self.save()
         finally:
             bar.close()
-            if board is not None:
-                board.close()
+            if self._board is not None:
+                self._board.close()
+                self._board = None
         return TrainResult(
             self.rule,
             self.iteration,
             self.iteration >= total,
             flag.requested,
-            record,
+            self._record,
             self.folder.path,
         )
 
@@ -177,6 +169,7 @@ class Trainer:
             DivergedError: The loss was not finite in an iteration before; nothing is written.
             NPAError: A file cannot be written; the last checkpoint is intact.
         """
+        self._finish_record()
         self._stop_if_diverged()
         save_checkpoint(
             self.folder.checkpoint,
@@ -187,10 +180,7 @@ class Trainer:
                 "seconds": self._seconds(),
                 "rule": self.rule.state_dict(),
                 "rule_hyper_parameters": dict(self.rule.hyper_parameters()),
-                "optimiser": self._optimiser.state_dict(),
-                "pool": {"x": self.pool.x, "s": self.pool.s},
-                "meter": self._meter.state_dict(),
-                "random_states": {n: g.get_state() for n, g in self._generators().items()},
+                **self._cycle.state_dict(),
             },
         )
         # A rule is passed on: where and on what it was trained is nobody's business.
@@ -204,26 +194,11 @@ class Trainer:
         save_rule(self.rule, self.folder.rule, metadata=metadata)
 
     def _iterate(self) -> None:
-        config, batch = self.config, self._batch
-        lo, hi = config.steps
-        steps = int(torch.randint(lo, hi, (), generator=self._schedule_generator))
-        index = self.pool.sample(config.world_count, self._world_generator)
-        x0, s0 = self.pool.read(index)
-        if config.damage:
-            x0, s0 = self.task.damage(x0, s0, self._world_generator)
-        fresh_x, fresh_s = self._seeds(config.world_count)
-        if self.iteration % config.seed_interval == 0:
-            x0[0], s0[0] = fresh_x[0], fresh_s[0]
-        batch.x0.copy_(x0)
-        batch.s0.copy_(s0)
-        batch.run(steps)
-        replaced = self.pool.write(index, batch.x, batch.s, fresh_x, fresh_s)
-        self._meter.observe(self.iteration + 1, steps, replaced)
-        self._optimiser.step(self.iteration)
+        self._cycle.run(self.iteration)
         self.iteration += 1
 
-    def _make_rule(self) -> NPARule:
-        rule = self.task.make_rule(self._schedule_generator)
+    def _make_rule(self, generator: torch.Generator) -> NPARule:
+        rule = self.task.make_rule(generator)
         if not self.config.initial_rule:
             return rule
         source = self.config.initial_rule
@@ -237,11 +212,6 @@ class Trainer:
             )
         return initial
 
-    def _seeds(self, world_count: int) -> tuple[Tensor, Tensor]:
-        device = self._world_generator.device
-        x, s = self.task.seed(world_count, generator=self._world_generator, device=device)
-        return x.to(self.config.torch_dtype), s.to(self.config.torch_dtype)
-
     def _due(self, interval: int) -> bool:
         return interval > 0 and self.iteration % interval == 0
 
@@ -249,33 +219,53 @@ class Trainer:
         running = 0.0 if self._started is None else time.perf_counter() - self._started
         return self._seconds_before + running
 
-    def _write_log(self, board: Any) -> dict[str, Any]:
-        self._stop_if_diverged()
-        record: dict[str, Any] = {
+    def _begin_record(self) -> None:
+        """Ask the device for what the log is to say of the interval that ends here."""
+        self._cycle.meter.send()
+        self._record_begun = {
             "iteration": self.iteration,
-            **self._meter.read(),
             "learning_rate": self.config.learning_rate_at(self.iteration - 1),
+        }
+        if not self._log_late:
+            self._finish_record()
+
+    def _finish_record(self) -> None:
+        """Write the record that was begun, if there is one.
+
+        Raises:
+            DivergedError: The loss was not finite in the interval.
+            NPAError: The log cannot be written.
+        """
+        begun, self._record_begun = self._record_begun, None
+        if begun is None:
+            return
+        interval = self._cycle.meter.receive()
+        if interval.bad_iteration is not None:
+            self._stop_if_diverged()
+        self._record = {
+            "iteration": begun["iteration"],
+            **interval.means,
+            "learning_rate": begun["learning_rate"],
             "seconds": round(self._seconds(), 3),
         }
-        self._meter.clear()
-        self._log.append(record)
-        if board is not None:
-            for name, value in record.items():
+        self._log.append(self._record)
+        if self._board is not None:
+            for name, value in self._record.items():
                 if name != "iteration":
-                    board.add_scalar(name, value, self.iteration)
-        return record
+                    self._board.add_scalar(name, value, begun["iteration"])
 
-    def _write_picture(self, board: Any) -> None:
+    def _write_picture(self) -> None:
+        self._finish_record()
         with torch.no_grad():
-            picture = self.task.picture(self._batch.x, self._batch.s)
-        frame = write_batch_picture(self.folder.picture(self.iteration), picture)
-        if board is not None:
-            board.add_image("batch", frame, self.iteration, dataformats="HWC")
+            picture = self.task.picture(self._cycle.batch.x, self._cycle.batch.s)
+        path = self.folder.picture(self.iteration)
+        write_batch_picture(path, picture, self._board, self.iteration)
 
     def _stop_if_diverged(self) -> None:
-        if self._meter.bad_iteration() is None:
+        meter = self._cycle.meter
+        if meter.bad_iteration() is None:
             return
-        snapshot = self._meter.snapshot()
+        snapshot = meter.snapshot()
         diagnosis = self.folder.diagnosis
         hyper_parameters = dict(self.rule.hyper_parameters())
         save_checkpoint(
@@ -306,17 +296,5 @@ class Trainer:
         self.iteration = content["iteration"]
         self._seconds_before = content["seconds"]
         self.rule.load_state_dict(content["rule"])
-        self._optimiser.load_state_dict(content["optimiser"])
-        self.pool.x.copy_(content["pool"]["x"])
-        self.pool.s.copy_(content["pool"]["s"])
-        self._meter.load_state_dict(content["meter"])
-        for name, generator in self._generators().items():
-            generator.set_state(content["random_states"][name])
+        self._cycle.load_state_dict(content)
         self._log.truncate(self.iteration)
-
-    def _generators(self) -> dict[str, torch.Generator]:
-        return {
-            "schedule": self._schedule_generator,
-            "worlds": self._world_generator,
-            "masks": self._mask_generator,
-        }

@@ -1,0 +1,241 @@
+"""Recorded CUDA work: when it is recorded, what that may not do, and that it is what it was."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from npa_envs import replay
+from npa_envs.replay import Replayed, capture
+
+CUDA = torch.device("cuda", 0)
+
+
+class Boom(Exception):
+    pass
+
+
+@pytest.fixture
+def events(monkeypatch):
+    """Replace CUDA by a list of what is asked of it."""
+    seen = []
+
+    def note(text):
+        return lambda *_args: seen.append(text)
+
+    def stream(name):
+        return SimpleNamespace(
+            wait_stream=lambda other: seen.append(f"{name} waits for {other.name}"), name=name
+        )
+
+    class Graph:
+        def register_generator_state(self, generator):
+            seen.append(f"register {generator}")
+
+        def capture_begin(self, pool, capture_error_mode):
+            seen.append(f"begin {pool} {capture_error_mode}")
+
+        def capture_end(self):
+            seen.append("end")
+            if "broken" in seen:
+                raise RuntimeError("the capture is not valid")
+
+        def replay(self):
+            seen.append("replay")
+
+    @contextlib.contextmanager
+    def within(where):
+        seen.append(f"enter {where.name}")
+        try:
+            yield
+        finally:
+            seen.append(f"leave {where.name}")
+
+    monkeypatch.setattr(torch.cuda, "CUDAGraph", Graph)
+    monkeypatch.setattr(torch.cuda, "stream", within)
+    monkeypatch.setattr(torch.cuda, "device", lambda device: contextlib.nullcontext())
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda: stream("current"))
+    monkeypatch.setattr(torch.cuda, "synchronize", note("synchronize"))
+    monkeypatch.setattr(torch.cuda, "empty_cache", note("empty"))
+    monkeypatch.setattr(replay, "_capture_stream", lambda index: stream("side"))
+    return seen
+
+
+def test_a_capture_waits_for_nothing_and_collects_nothing(events, monkeypatch):
+    monkeypatch.setattr(gc, "collect", lambda *_args: events.append("collect"))
+
+    def function():
+        events.append(f"run, collecting {gc.isenabled()}")
+
+    capture(function, CUDA, pool="memory", generator="dice")
+    assert gc.isenabled()
+    assert events == [
+        "register dice",
+        "side waits for current",
+        "enter side",
+        "begin memory thread_local",
+        "run, collecting False",
+        "end",
+        "leave side",
+        "current waits for side",
+    ]
+
+
+def test_what_a_warm_up_leaves_is_given_back_before_the_capture(events):
+    capture(lambda: events.append("run"), CUDA, warm_up=lambda: events.append("warm up"))
+    assert events == [
+        "side waits for current",
+        "enter side",
+        "warm up",
+        "leave side",
+        "synchronize",
+        "empty",
+        "side waits for current",
+        "enter side",
+        "begin None thread_local",
+        "run",
+        "end",
+        "leave side",
+        "current waits for side",
+    ]
+
+
+@pytest.mark.parametrize("broken", [True, False])
+def test_a_failed_capture_is_ended_and_tells_its_own_reason(events, broken):
+    def function():
+        if broken:
+            events.append("broken")
+        raise Boom
+
+    with pytest.raises(Boom):
+        capture(function, CUDA)
+    assert events.count("end") == 1
+    assert events[-2:] == ["leave side", "current waits for side"]
+    assert gc.isenabled()
+
+
+def test_a_capture_without_enough_memory_is_tried_again_once_room_is_made(events):
+    def function(attempts):
+        events.append("run")
+        if events.count("run") < attempts:
+            raise torch.OutOfMemoryError
+
+    assert capture(lambda: function(2), CUDA) is not None
+    kept = [event for event in events if event.split()[0] in ("begin", "run", "end", "empty")]
+    once = ["begin None thread_local", "run", "end"]
+    assert kept == [*once, "empty", *once]
+    events.clear()
+    with pytest.raises(torch.OutOfMemoryError):
+        capture(lambda: function(3), CUDA)
+    assert events.count("run") == 2
+
+
+def test_a_replayed_function_runs_once_is_captured_once_and_then_replayed(events):
+    replayed = Replayed(lambda: events.append("run"), CUDA, "dice")
+    counts = []
+    for _ in range(4):
+        replayed()
+        counts.append((events.count("run"), events.count("register dice"), events.count("replay")))
+    assert counts == [(1, 0, 0), (2, 1, 1), (2, 1, 2), (2, 1, 3)]
+
+
+def test_on_a_cpu_a_replayed_function_is_simply_called(events):
+    replayed = Replayed(lambda: events.append("run"), torch.device("cpu"))
+    for _ in range(3):
+        replayed()
+    assert events == ["run"] * 3
+
+
+needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+
+
+@pytest.mark.gpu
+@needs_cuda
+def test_replays_draw_what_launches_would_have_drawn():
+    drawn = []
+    for replayed in (True, False):
+        generator = torch.Generator(CUDA).manual_seed(5)
+        numbers = torch.zeros(1000, device=CUDA)
+
+        def draw(numbers=numbers, generator=generator):
+            numbers.copy_(torch.rand(1000, generator=generator, device=CUDA))
+
+        call = Replayed(draw, CUDA, generator) if replayed else draw
+        rows = []
+        for _ in range(5):
+            call()
+            rows.append(numbers.clone())
+        drawn.append((torch.stack(rows), generator.get_state()))
+    assert torch.equal(drawn[0][0], drawn[1][0])
+    assert torch.equal(drawn[0][1], drawn[1][1])
+
+
+@pytest.mark.gpu
+@needs_cuda
+def test_a_capture_in_between_leaves_the_numbers_of_busy_graphs_alone():
+    drawn = []
+    for busy in (True, False):
+        generator = torch.Generator(CUDA).manual_seed(6)
+        numbers = torch.zeros(4000, device=CUDA)
+        work = torch.rand(2048, 2048, device=CUDA)
+
+        def draw(numbers=numbers, generator=generator, work=work):
+            for _ in range(20):
+                torch.mm(work, work)
+            numbers.copy_(torch.rand(4000, generator=generator, device=CUDA))
+
+        draw()
+        rows = []
+        for _ in range(8):
+            graph = capture(draw, CUDA, generator=generator)
+            for _ in range(3):
+                graph.replay()
+                rows.append(numbers.clone())
+            if not busy:
+                torch.cuda.synchronize()
+        drawn.append(torch.stack(rows))
+    assert torch.equal(drawn[0], drawn[1])
+    assert len(drawn[0].unique(dim=0)) == len(drawn[0])
+
+
+@pytest.mark.gpu
+@needs_cuda
+def test_after_a_failed_capture_the_device_captures_and_replays_as_before():
+    numbers = torch.zeros(10, device=CUDA)
+
+    def broken():
+        numbers.add_(1)
+        raise Boom
+
+    with pytest.raises(Boom):
+        capture(broken, CUDA)
+    graph = capture(lambda: numbers.add_(2), CUDA)
+    assert numbers.tolist() == [0.0] * 10
+    graph.replay()
+    assert numbers.tolist() == [2.0] * 10
+
+
+@pytest.mark.gpu
+@needs_cuda
+def test_a_capture_with_a_backward_pass_does_not_wait_for_the_device():
+    x = torch.ones(10, device=CUDA, requires_grad=True)
+    gradient = torch.zeros(10, device=CUDA)
+
+    def function():
+        (found,) = torch.autograd.grad((x**3).sum(), x)
+        gradient.add_(found)
+
+    function()
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        graph = capture(function, CUDA)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert gradient.tolist() == [3.0] * 10
+    graph.replay()
+    assert gradient.tolist() == [6.0] * 10

@@ -1,0 +1,126 @@
+"""What a training iteration does before and after the rollout, recorded and replayed."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from circle_task import CircleTask, circle_config, plain_rollout
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
+from npa_envs.training import preset
+from npa_envs.training.cycle import TrainingCycle
+
+needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+
+
+class Recording(TorchDispatchMode):
+    """A CUDA graph for the CPU: the same operations on the same memory, with numbers as they were.
+
+    The second call of the function is recorded, as by `npa_envs.replay.Replayed`.
+    """
+
+    def __init__(self, function):
+        super().__init__()
+        self.function = function
+        self.calls = 0
+        self.recorded = []
+
+    @torch.no_grad()
+    def __call__(self):
+        self.calls += 1
+        if self.calls == 2:
+            with self:
+                self.function()
+        elif self.calls == 1:
+            self.function()
+        else:
+            for operation, args, kwargs, out in self.recorded:
+                again = operation(*args, **kwargs)
+                memory = {t.untyped_storage().data_ptr() for t in tensors(args, kwargs)}
+                for old, new in zip(tensors(out), tensors(again), strict=True):
+                    if old.untyped_storage().data_ptr() not in memory:
+                        old.copy_(new)
+
+    def __torch_dispatch__(self, operation, types, args=(), kwargs=None):
+        assert "_local_scalar_dense" not in operation.name(), "this would wait for the device"
+        out = operation(*args, **(kwargs or {}))
+        self.recorded.append((operation, args, kwargs or {}, out))
+        return out
+
+
+def tensors(*values):
+    return [leaf for leaf in tree_leaves(values) if isinstance(leaf, torch.Tensor)]
+
+
+def make_cycle(config, task, device="cpu", rollout=None):
+    device = torch.device(device)
+    schedule = torch.Generator().manual_seed(config.seed)
+    rule = task.make_rule(schedule).to(device, config.torch_dtype)
+    return TrainingCycle(task, rule, config, device, schedule, rollout), rule
+
+
+def circle_cycle(tmp_path, **fields):
+    fields = {"seed_interval": 3, "iterations": 5, "repeats": 2, "milestones": [2]} | fields
+    return make_cycle(circle_config(tmp_path, **fields), CircleTask(), rollout=runaway())
+
+
+def tiny_cycle(tmp_path, **fields):
+    config = preset("tiny", out=tmp_path, **fields)
+    return make_cycle(config, Morphogenesis2D(config.task))
+
+
+def runaway():
+    """A rollout that makes the second world run away each time it ran, so that it is replaced."""
+
+    def rollout(rule, x, s, steps, **options):
+        x, s, path_length = plain_rollout(rule, x, s, steps, **options)
+        return x + torch.tensor([0.0, 100.0, 0.0])[:, None, None], s, path_length
+
+    return rollout
+
+
+def assert_same(ours, theirs):
+    ours, theirs = tensors(ours), tensors(theirs)
+    assert len(ours) == len(theirs) > 0
+    for one, other in zip(ours, theirs, strict=True):
+        assert torch.equal(one, other)
+
+
+@pytest.mark.parametrize(
+    ("make", "fields"),
+    [
+        (circle_cycle, {}),
+        (circle_cycle, {"dtype": "float64", "damage": False, "normalise_gradients": False}),
+        (tiny_cycle, {}),
+    ],
+)
+def test_replayed_operations_train_the_same_rule_as_called_ones(tmp_path, make, fields):
+    (called, called_rule), (replayed, replayed_rule) = (make(tmp_path, **fields) for _ in range(2))
+    replayed._draw, replayed._keep = Recording(replayed._draw), Recording(replayed._keep)
+    for iteration in range(8):
+        for cycle in (called, replayed):
+            cycle.run(iteration)
+            cycle.meter.send()
+        assert replayed.meter.receive() == called.meter.receive()
+        assert_same(replayed.batch.x0, called.batch.x0)
+        assert_same(replayed_rule.state_dict(), called_rule.state_dict())
+    assert_same(replayed.state_dict(), called.state_dict())
+    assert len(replayed._draw.recorded) > 5
+    assert len(replayed._keep.recorded) > 5
+
+
+@pytest.mark.gpu
+@needs_cuda
+def test_graphs_draw_the_worlds_that_launches_draw(tmp_path):
+    drawn = []
+    for graphed in (True, False):
+        config = preset("tiny", out=tmp_path, device="cuda", cuda_graph=graphed, steps=(4, 6))
+        cycle, _ = make_cycle(config, Morphogenesis2D(config.task, device="cuda"), "cuda:0")
+        rows = []
+        for iteration in range(5):
+            cycle.run(iteration)
+            rows += [cycle._index.clone(), cycle._fresh_x.clone()]
+        drawn.append((rows, cycle.generators["worlds"].get_state()))
+    assert_same(*drawn)
