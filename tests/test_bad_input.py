@@ -118,7 +118,7 @@ class TestRollout:
             ({"box": 0.1}, "box sides"),
             ({"dt": "fast"}, "dt must be a number"),
             ({"generator": 3}, "generator must be a torch.Generator or a WorldRandom, got int"),
-            ({"memory": "forget"}, "memory must be 'store' or 'recompute'"),
+            ({"memory": "forget"}, "memory must be 'store', 'recompute' or 'minimal'"),
         ],
     )
     def test_options_out_of_range(self, options, message):

@@ -177,11 +177,20 @@ def test_masked_gradients_equal_plain_torch(device):
         assert relative_error(value, answer) < 1e-11
 
 
-def test_recomputing_gives_the_gradients_of_storing(device):
+def test_recomputing_gives_the_gradients_of_storing(device, monkeypatch):
+    advanced = []
+    advance = npa_envs.dynamics._advance
+
+    def counted(*args):
+        advanced[-1] += 1
+        return advance(*args)
+
+    monkeypatch.setattr(npa_envs.dynamics, "_advance", counted)
     rule = small_rule(device, dtype=torch.float32)
     x, s = random_world(2, 200, 2, 5, dtype=torch.float32, device=device)
     results = []
-    for memory in ("store", "recompute"):
+    for memory in ("store", "recompute", "minimal"):
+        advanced.append(0)
         s_ = s.clone().requires_grad_()
         generator = torch.Generator(device).manual_seed(1)
         out = npa_envs.rollout(
@@ -191,7 +200,10 @@ def test_recomputing_gives_the_gradients_of_storing(device):
             out[0].square().sum() + out[1].square().sum(), [s_, *rule.parameters()]
         )
         results.append((*out, *gradients))
-    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+    for stored, *others in zip(*results, strict=True):
+        assert all(torch.equal(stored, other) for other in others)
+    # Of five steps, "recompute" stores the last and the second, "minimal" the last.
+    assert advanced == [5, 5 + 3, 5 + 4]
 
 
 def test_seeded_rollouts_are_bit_identical(device):

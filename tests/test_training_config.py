@@ -76,7 +76,7 @@ def test_no_field_of_the_run_hides_one_of_the_task(name):
         ("seed", 2**63, r"at least 0 and below 2\*\*63, got 9223372036854775808"),
         ("picture_interval", -1, "picture_interval must be a whole number of at least 0, got -1"),
         ("dtype", "float16", "dtype must be one of float32, float64, got 'float16'"),
-        ("memory", "disk", "memory must be one of store, recompute, got 'disk'"),
+        ("memory", "disk", "memory must be one of store, recompute, minimal, got 'disk'"),
         ("device", "gpu", "device must name a device, got 'gpu'"),
         ("device", "meta", "device must be 'cpu' or 'cuda', got 'meta'"),
         ("device", "cpu:3", "device must be 'cpu' without a number, got 'cpu:3'"),

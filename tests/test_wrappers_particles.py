@@ -206,7 +206,8 @@ def test_ppo_learns_on_the_rows():
     rows = VecMonitor(ParticleVecEnv(batched()))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        model = sb3.PPO("MlpPolicy", rows, n_steps=4, batch_size=128, n_epochs=1, seed=0, device="cpu")
+        options = {"n_steps": 4, "batch_size": 128, "n_epochs": 1, "seed": 0, "device": "cpu"}
+        model = sb3.PPO("MlpPolicy", rows, **options)
         model.learn(2 * STEPS * 64)
     assert model.num_timesteps == 2 * STEPS * 64
     assert len(model.ep_info_buffer) == 100

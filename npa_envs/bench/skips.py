@@ -90,7 +90,7 @@ def skips(workload: Workload) -> list[Skip]:
         Skip(
             "a second forward pass, for the backward pass",
             "memory='store' (default)",
-            {**training, "memory": "recompute"},
+            {**training, "memory": "minimal"},
             training,
         ),
     ]

@@ -6,15 +6,14 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 
 from npa_envs.bench.session import Session
 from npa_envs.bench.timing import Cost, Timing
 from npa_envs.bench.workloads import Workload, rollout_call
-
-Memory = Literal["store", "recompute"]
+from npa_envs.dynamics import Memory
 
 
 class Aim(NamedTuple):
@@ -67,7 +66,7 @@ class ThroughputRow:
     workload: str
     """Dimension and (worlds B, particles N, steps T)."""
     memory: str
-    """Whether training stores what the backward pass reads, or recomputes it."""
+    """Whether training stores what the backward pass reads, or recomputes two steps in three."""
     infer_us: Timing
     """A step of inference [µs]."""
     train_us: Timing | None

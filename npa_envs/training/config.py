@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Generic, Literal, TypeVar
+from typing import Generic, Literal, TypeVar, get_args
 
 import torch
 
 from npa_envs.devices import parse_device
+from npa_envs.dynamics import Memory
 from npa_envs.errors import NPAError
 from npa_envs.tasks.checks import check_fraction, check_non_negative, check_positive, is_whole
 from npa_envs.tasks.morphogenesis2d_config import Morphogenesis2DConfig
@@ -78,8 +79,8 @@ class TrainConfig(Generic[TaskConfigT]):
     dtype: Literal["float32", "float64"] = "float32"
     """Precision of the worlds and of the rule."""
 
-    memory: Literal["store", "recompute"] = "store"
-    """Keep the perception of every step for the backward pass, or compute it again there."""
+    memory: Memory = "store"
+    """What the backward pass reads: stored, recomputed for two steps in three, or for all but one."""
 
     cuda_graph: bool = True
     """On CUDA, capture an iteration: rollout and gradients as one graph per number of steps."""
@@ -128,7 +129,7 @@ class TrainConfig(Generic[TaskConfigT]):
                 f"set pool_size={self.world_count} or more"
             )
         self._check_choice("dtype", ("float32", "float64"))
-        self._check_choice("memory", ("store", "recompute"))
+        self._check_choice("memory", get_args(Memory))
         parse_device(self.device)
         if not isinstance(self.out, Path):
             raise NPAError(f"out must be a pathlib.Path, got {self.out!r}: Path({self.out!r})")
