@@ -10,7 +10,7 @@ import torch
 from worlds import random_world
 
 import npa_envs
-from npa_envs.sph import bridge, threads
+from npa_envs.sph import bridge, orbit, render_gaussians, threads
 from npa_envs.sph.actions import ActionRules, RepeatedActions
 from npa_envs.sph.operators import Terms, perceive_rows
 from npa_envs.sph.picture_losses import picture_losses
@@ -121,7 +121,18 @@ def drawn(x, s):
     return [picture, *bars, *losses]
 
 
-@pytest.mark.parametrize("run", [stepped, states_only, acted, drawn])
+def rendered(x, s):
+    """Return what cameras see of Gaussians, and all cotangents."""
+    means = torch.nn.functional.pad(x, (0, 3 - x.shape[2]))
+    scales = 0.1 + 0.1 * s[..., :3].sigmoid()
+    gaussians = [means, scales, s[..., :4], s[..., 4].sigmoid(), s[..., 1:4]]
+    gaussians = [t.detach().clone().requires_grad_() for t in gaussians]
+    pictures = render_gaussians(*gaussians, orbit(3, width=50, height=40))[:2]
+    bars = [torch.linspace(-1.0, 1.0, p.numel()).view_as(p) for p in pictures]
+    return [*pictures, *torch.autograd.grad(pictures, gaussians, bars)]
+
+
+@pytest.mark.parametrize("run", [stepped, states_only, acted, drawn, rendered])
 @pytest.mark.parametrize(("world_count", "particle_count"), [(1, 101), (3, 57)])
 @pytest.mark.parametrize("space_dim", [2, 3])
 def test_results_are_the_same_bits_for_every_number_of_threads(

@@ -17,6 +17,9 @@ PAIRS = 512
 WORLDS = 2
 """Smallest range of a kernel whose threads each go through a whole world."""
 
+TILES = 4
+"""Smallest range of a kernel whose threads each go through a tile of a picture."""
+
 PARTICLES = 4096
 """Smallest range of a kernel whose threads each move a particle with its state."""
 

@@ -1,16 +1,24 @@
 """SPH operators as torch functions: the one place that knows both torch and Warp."""
 
 from npa_envs.sph.actions import apply_actions
+from npa_envs.sph.cameras import Cameras, cameras_of_poses, look_at, orbit
 from npa_envs.sph.fields import PerceptionFields, perceive, perception_fields
+from npa_envs.sph.gaussians import GaussianPictures, render_gaussians
 from npa_envs.sph.splat import splat
 from npa_envs.sph.warmup import warmup
 from npa_envs.sph.worlds import world_mean
 
 __all__ = [
+    "Cameras",
+    "GaussianPictures",
     "PerceptionFields",
     "apply_actions",
+    "cameras_of_poses",
+    "look_at",
+    "orbit",
     "perceive",
     "perception_fields",
+    "render_gaussians",
     "splat",
     "warmup",
     "world_mean",

@@ -1,0 +1,429 @@
+"""Pictures of 3D Gaussians: footprints laid over each other, near ones first, and the adjoint.
+
+A pixel at d from a footprint's mean is covered by alpha = min(0.99, o exp(-1/2 dᵀ Q d)), nothing
+below 1/255; its colour is the sum of c alpha T with T the product of 1 - alpha of those before,
+until T would fall below 1e-4 (Kerbl et al. 2023: equation 3 and their rasterizer's limits).
+
+Backwards, T is divided by 1 - alpha on the way from the last Gaussian to the first. With b the sum
+over those behind of (c . c̄) alpha T, and T times its cotangent at the end, the cotangent of alpha
+is T (c . c̄) - b / (1 - alpha).
+
+On CUDA a block serves a tile, a thread a pixel; its sums over pixels are taken over warps by
+shuffles and over the block's warps in fast memory. On the CPU a thread serves a tile, one Gaussian
+after the other, each at those pixels only that it reaches. Either way every pair of a tile and a
+Gaussian has a slot of its own for what the tile pulls: no sum depends on which thread came first.
+"""
+
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from npa_envs.kernels.domain import scalar_name
+from npa_envs.kernels.lanes import c_scalar, make_lane_sum, make_wide_load
+from npa_envs.kernels.projection import (
+    CHANNELS,
+    PULLS,
+    SMALLEST_ALPHA,
+    TILE,
+    gaussian_types,
+    projection_functions,
+)
+from npa_envs.kernels.ranges import TILES, in_ranges
+from npa_envs.kernels.small_worlds import meet_block
+from npa_envs.kernels.warps import WARP, any_in_warp, load_integer
+from npa_envs.kernels.wide import make_fast_exp2
+
+LARGEST_ALPHA = 0.99
+"""What a Gaussian covers of a pixel, at most: the adjoint divides by the rest."""
+
+SMALLEST_PASSING = 1e-4
+"""Share of light below which nothing farther is seen."""
+
+TILE_PIXELS = TILE * TILE
+"""Pixels of a tile, and threads of its block."""
+
+PATCH_WIDTH, PATCH_HEIGHT = 8, 4
+"""Pixels of a tile that a warp serves: as square as can be, for Gaussians that it may skip."""
+
+BATCH = 32
+"""Pairs whose pulls a block keeps in fast memory before it adds up those of its warps."""
+
+TO_POWER_OF_TWO = -0.7213475204444817
+"""-1/2 log2(e): of exp(-1/2 p) as a power of two."""
+
+_KEEP = """
+    __shared__ {part} kept[{batch}][{warps}][{pulls}];
+    {part} sum = 0;
+    if (!write) {{
+        #pragma unroll
+        for (unsigned warp = 0; warp < {warps}; ++warp) sum += kept[i][warp][entry];
+    }} else if ((threadIdx.x & 31u) == 0) {{
+        #pragma unroll
+        for (unsigned k = 0; k < {pulls}; ++k) kept[i][threadIdx.x / 32u][k] = value[k];
+    }}
+    return sum;
+"""
+
+
+@functools.cache
+def make_keep(value_type: type, scalar: type) -> Any:
+    """Return a Warp function, of CUDA alone, for what the warps of a block have for some pairs.
+
+    It writes the value that a warp's first thread has for pair i, or returns an entry of the sum
+    over the warps; both in one function, as they share its memory.
+
+    Args:
+        value_type: A vector type.
+        scalar: The scalar type that it is made of.
+    """
+    snippet = _KEEP.format(
+        part=c_scalar(scalar), batch=BATCH, warps=TILE_PIXELS // WARP, pulls=value_type._length_
+    )
+
+    @wp.func_native(snippet)
+    def keep(write: wp.bool, i: wp.int32, entry: wp.int32, value: value_type) -> scalar: ...
+
+    return keep
+
+
+@functools.cache
+def blending_functions(scalar: type) -> SimpleNamespace:
+    """Return what all kernels share: what one Gaussian does to one pixel, and its adjoint."""
+    types = gaussian_types(scalar)
+    Frame, quad, footprint_type, pulls_type = types.Frame, types.quad, types.footprint, types.pulls
+    fast_exp2 = make_fast_exp2(scalar)
+
+    @wp.func
+    def strength(footprint: footprint_type, x: scalar, y: scalar):
+        """What a footprint covers of a pixel in its way (x, y), before it is limited."""
+        power = footprint[2] * x * x + footprint[4] * y * y
+        power += scalar(2.0) * footprint[3] * x * y
+        return footprint[5] * fast_exp2(scalar(TO_POWER_OF_TWO) * power)
+
+    @wp.func
+    def colours_of(footprint: footprint_type):
+        return quad(footprint[6], footprint[7], footprint[8], footprint[9])
+
+    @wp.func
+    def pull(
+        footprint: footprint_type,
+        x: scalar,
+        y: scalar,
+        strength: scalar,
+        bar: quad,
+        through: scalar,
+        behind: scalar,
+    ):
+        """A pixel's pull at a footprint; light that comes before it, and what is behind that."""
+        alpha = wp.min(strength, scalar(LARGEST_ALPHA))
+        rest = scalar(1.0) / (scalar(1.0) - alpha)
+        before = through * rest
+        gained = wp.dot(colours_of(footprint), bar)
+        share = alpha * before
+        slope = scalar(0.0)
+        if strength <= scalar(LARGEST_ALPHA):
+            slope = alpha * (before * gained - behind * rest)
+        slope_x = slope * x
+        slope_y = slope * y
+        pulls = pulls_type()
+        pulls[0] = slope
+        pulls[1] = slope_x
+        pulls[2] = slope_y
+        pulls[3] = slope_x * x
+        pulls[4] = slope_x * y
+        pulls[5] = slope_y * y
+        for c in range(wp.static(CHANNELS)):
+            pulls[6 + c] = share * bar[c]
+        return pulls, before, behind + share * gained
+
+    @wp.func
+    def channels_at(values: wp.array(dtype=scalar, ndim=2), pixel: wp.int32):
+        result = quad()
+        # A loop that is unrolled leaves the vector in registers.
+        for c in range(wp.static(CHANNELS)):
+            if c < values.shape[1]:
+                result[c] = values[pixel, c]
+        return result
+
+    @wp.func
+    def pixel_of(frame: Frame, image: wp.int32, row: wp.int32, column: wp.int32):
+        """Index of a pixel in all pictures, -1 where it lies outside."""
+        pixel = wp.int32(-1)
+        if row < frame.height and column < frame.width:
+            pixel = (image * frame.height + row) * frame.width + column
+        return pixel
+
+    @wp.func
+    def middle_of(pixel: wp.int32):
+        """Place of the middle of a row's or a column's pixels."""
+        return scalar(pixel) + scalar(0.5)
+
+    return SimpleNamespace(
+        strength=strength,
+        colours_of=colours_of,
+        pull=pull,
+        channels_at=channels_at,
+        pixel_of=pixel_of,
+        middle_of=middle_of,
+    )
+
+
+@functools.cache
+def tile_kernels(scalar: type) -> SimpleNamespace:
+    """Return the kernels of one scalar type in which a thread serves a tile; for the CPU."""
+    types = gaussian_types(scalar)
+    Frame, footprint_type, pulls_type = types.Frame, types.footprint, types.pulls
+    functions = blending_functions(scalar)
+    strength_at, pull = functions.strength, functions.pull
+    channels_at, pixel_of, middle_of = (
+        functions.channels_at,
+        functions.pixel_of,
+        functions.middle_of,
+    )
+    covered = projection_functions(scalar).covered
+    module = wp.get_module(f"npa_envs.kernels.blending_tiles_{scalar_name(scalar)}")
+
+    @wp.func
+    def shared_pixels(frame: Frame, tile: wp.int32, footprint: footprint_type):
+        """First column and row of the pixels in a tile within reach, and one past the last."""
+        place = tile % frame.tile_count
+        row = place / frame.tile_columns * wp.static(TILE)
+        column = place % frame.tile_columns * wp.static(TILE)
+        left, right = covered(footprint[0], footprint[10], frame.width)
+        top, bottom = covered(footprint[1], footprint[11], frame.height)
+        return wp.vec4i(
+            wp.max(left, column),
+            wp.max(top, row),
+            wp.min(right, column + wp.static(TILE)),
+            wp.min(bottom, row + wp.static(TILE)),
+        )
+
+    @in_ranges(TILES)
+    @wp.kernel(enable_backward=False, module=module)
+    def draw_tiles(
+        range_start: wp.int32,
+        frame: Frame,
+        starts: wp.array(dtype=wp.int32),
+        owners: wp.array(dtype=wp.int32),
+        footprints: wp.array(dtype=footprint_type),
+        # added to, from zeros and ones
+        picture: wp.array(dtype=scalar, ndim=2),
+        passing: wp.array(dtype=scalar),
+        # outputs
+        stops: wp.array(dtype=wp.int32),
+    ):
+        """Draw a tile; `stops` is one past the last pair that a pixel has seen.
+
+        `stops` must be beyond all pairs at first.
+        """
+        tile = range_start + wp.tid()
+        image = tile / frame.tile_count
+        for j in range(starts[tile], starts[tile + 1]):
+            footprint = footprints[owners[j]]
+            pixels = shared_pixels(frame, tile, footprint)
+            for row in range(pixels[1], pixels[3]):
+                y = middle_of(row) - footprint[1]
+                for column in range(pixels[0], pixels[2]):
+                    strength = strength_at(footprint, middle_of(column) - footprint[0], y)
+                    pixel = pixel_of(frame, image, row, column)
+                    if strength >= scalar(SMALLEST_ALPHA) and j < stops[pixel]:
+                        before = passing[pixel]
+                        alpha = wp.min(strength, scalar(LARGEST_ALPHA))
+                        after = before * (scalar(1.0) - alpha)
+                        if after < scalar(SMALLEST_PASSING):
+                            stops[pixel] = j
+                        else:
+                            passing[pixel] = after
+                            for c in range(frame.channels):
+                                added = alpha * before * footprint[6 + c]
+                                picture[pixel, c] = picture[pixel, c] + added
+
+    @in_ranges(TILES)
+    @wp.kernel(enable_backward=False, module=module)
+    def pull_back_tiles(
+        range_start: wp.int32,
+        frame: Frame,
+        starts: wp.array(dtype=wp.int32),
+        owners: wp.array(dtype=wp.int32),
+        places: wp.array(dtype=wp.int64),
+        footprints: wp.array(dtype=footprint_type),
+        stops: wp.array(dtype=wp.int32),
+        picture_bar: wp.array(dtype=scalar, ndim=2),
+        # changed: what passes at the end, and that times its cotangent
+        through: wp.array(dtype=scalar),
+        behind: wp.array(dtype=scalar),
+        # outputs
+        pulls: wp.array(dtype=pulls_type),
+    ):
+        """Write what a tile pulls at each of its Gaussians to the pair's slot."""
+        tile = range_start + wp.tid()
+        image = tile / frame.tile_count
+        begin = starts[tile]
+        end = starts[tile + 1]
+        for k in range(end - begin):
+            j = end - 1 - k
+            footprint = footprints[owners[j]]
+            pixels = shared_pixels(frame, tile, footprint)
+            total = pulls_type()
+            for row in range(pixels[1], pixels[3]):
+                y = middle_of(row) - footprint[1]
+                for column in range(pixels[0], pixels[2]):
+                    x = middle_of(column) - footprint[0]
+                    strength = strength_at(footprint, x, y)
+                    pixel = pixel_of(frame, image, row, column)
+                    if strength >= scalar(SMALLEST_ALPHA) and j < stops[pixel]:
+                        bar = channels_at(picture_bar, pixel)
+                        added, before, rest = pull(
+                            footprint, x, y, strength, bar, through[pixel], behind[pixel]
+                        )
+                        total += added
+                        through[pixel] = before
+                        behind[pixel] = rest
+            pulls[wp.int32(places[j])] = total
+
+    return SimpleNamespace(draw_tiles=draw_tiles, pull_back_tiles=pull_back_tiles)
+
+
+@functools.cache
+def block_kernels(scalar: type) -> SimpleNamespace:
+    """Return the kernels of one scalar type in which a block serves a tile; for CUDA.
+
+    Drawing runs on the CPU, too.
+    """
+    types = gaussian_types(scalar)
+    Frame, quad, footprint_type, pulls_type = types.Frame, types.quad, types.footprint, types.pulls
+    functions = blending_functions(scalar)
+    strength_at, colours_of, pull = functions.strength, functions.colours_of, functions.pull
+    channels_at, pixel_of, middle_of = (
+        functions.channels_at,
+        functions.pixel_of,
+        functions.middle_of,
+    )
+    name = scalar_name(scalar)
+    drawing = wp.get_module(f"npa_envs.kernels.blending_blocks_{name}")
+    pulling = wp.get_module(f"npa_envs.kernels.blending_blocks_adjoint_{name}")
+    load_footprint = make_wide_load(footprint_type, scalar)
+    add_warp = make_lane_sum(pulls_type, scalar, WARP, whole_warps=True)
+    keep = make_keep(pulls_type, scalar)
+
+    @wp.func
+    def own_pixel(frame: Frame, tile: wp.int32, k: wp.int32):
+        """Column and row of a thread's pixel; a warp has a patch of its tile."""
+        patch = k / wp.static(WARP)
+        lane = k % wp.static(WARP)
+        across = wp.static(TILE // PATCH_WIDTH)
+        place = tile % frame.tile_count
+        column = place % frame.tile_columns * wp.static(TILE)
+        column += patch % across * wp.static(PATCH_WIDTH) + lane % wp.static(PATCH_WIDTH)
+        row = place / frame.tile_columns * wp.static(TILE)
+        row += patch / across * wp.static(PATCH_HEIGHT) + lane / wp.static(PATCH_WIDTH)
+        return column, row
+
+    @wp.kernel(enable_backward=False, module=drawing)
+    def draw_blocks(
+        frame: Frame,
+        starts: wp.array(dtype=wp.int32),
+        owners: wp.array(dtype=wp.int32),
+        footprints: wp.array(dtype=footprint_type),
+        # outputs
+        picture: wp.array(dtype=scalar, ndim=2),
+        passing: wp.array(dtype=scalar),
+        stops: wp.array(dtype=wp.int32),
+    ):
+        """Draw a pixel; `stops` is one past the last pair that it has seen."""
+        t = wp.tid()
+        tile = t / wp.static(TILE_PIXELS)
+        column, row = own_pixel(frame, tile, t % wp.static(TILE_PIXELS))
+        pixel = pixel_of(frame, tile / frame.tile_count, row, column)
+        if pixel >= 0:
+            left = middle_of(column)
+            top = middle_of(row)
+            total = quad()
+            through = scalar(1.0)
+            j = starts[tile]
+            end = starts[tile + 1]
+            stop = end
+            while j < stop:
+                footprint = load_footprint(footprints, load_integer(owners, j))
+                strength = strength_at(footprint, left - footprint[0], top - footprint[1])
+                if strength >= scalar(SMALLEST_ALPHA):
+                    alpha = wp.min(strength, scalar(LARGEST_ALPHA))
+                    after = through * (scalar(1.0) - alpha)
+                    if after < scalar(SMALLEST_PASSING):
+                        stop = j
+                    else:
+                        total += alpha * through * colours_of(footprint)
+                        through = after
+                j += 1
+            for c in range(wp.static(CHANNELS)):
+                if c < frame.channels:
+                    picture[pixel, c] = total[c]
+            passing[pixel] = through
+            stops[pixel] = stop
+
+    @wp.kernel(enable_backward=False, module=pulling)
+    def pull_back_blocks(
+        frame: Frame,
+        starts: wp.array(dtype=wp.int32),
+        owners: wp.array(dtype=wp.int32),
+        places: wp.array(dtype=wp.int64),
+        footprints: wp.array(dtype=footprint_type),
+        stops: wp.array(dtype=wp.int32),
+        picture_bar: wp.array(dtype=scalar, ndim=2),
+        passing: wp.array(dtype=scalar),
+        passing_bar: wp.array(dtype=scalar),
+        # outputs
+        pulls: wp.array(dtype=scalar),
+    ):
+        """Write what a tile pulls at each of its Gaussians to the pair's slot.
+
+        A block is a tile's; all its threads go through all pairs, as they add up together.
+        """
+        t = wp.tid()
+        tile = t / wp.static(TILE_PIXELS)
+        k = t % wp.static(TILE_PIXELS)
+        column, row = own_pixel(frame, tile, k)
+        pixel = pixel_of(frame, tile / frame.tile_count, row, column)
+        left = middle_of(column)
+        top = middle_of(row)
+        begin = starts[tile]
+        end = starts[tile + 1]
+        stop = wp.int32(0)
+        bar = quad()
+        through = scalar(0.0)
+        behind = scalar(0.0)
+        if pixel >= 0:
+            stop = stops[pixel]
+            bar = channels_at(picture_bar, pixel)
+            through = passing[pixel]
+            behind = through * passing_bar[pixel]
+        while end > begin:
+            count = wp.min(end - begin, wp.static(BATCH))
+            for i in range(count):
+                j = end - 1 - i
+                total = pulls_type()
+                if any_in_warp(j < stop):
+                    footprint = load_footprint(footprints, load_integer(owners, j))
+                    x = left - footprint[0]
+                    y = top - footprint[1]
+                    strength = strength_at(footprint, x, y)
+                    seen = j < stop and strength >= scalar(SMALLEST_ALPHA)
+                    if any_in_warp(seen):
+                        if seen:
+                            total, through, behind = pull(
+                                footprint, x, y, strength, bar, through, behind
+                            )
+                        total = add_warp(total)
+                keep(True, i, 0, total)
+            meet_block()
+            for entry in range(k, count * wp.static(PULLS), wp.static(TILE_PIXELS)):
+                i = entry / wp.static(PULLS)
+                part = entry - i * wp.static(PULLS)
+                slot = wp.int32(places[end - 1 - i])
+                pulls[slot * wp.static(PULLS) + part] = keep(False, i, part, pulls_type())
+            meet_block()
+            end -= count
+
+    return SimpleNamespace(draw_blocks=draw_blocks, pull_back_blocks=pull_back_blocks)

@@ -1,0 +1,277 @@
+"""3D Gaussians on pictures: their footprints, the tiles that these cover, and the adjoint of both.
+
+A footprint is all that `blending` needs of a Gaussian. It reaches to where the Gaussian falls below
+the smallest alpha, so that tiles leave out nothing.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from npa_envs.kernels.domain import scalar_name
+from npa_envs.kernels.lanes import make_wide_load
+from npa_envs.kernels.projection import (
+    CHANNELS,
+    FOOTPRINT,
+    HARMONIC_1,
+    REACH_SLACK,
+    SMALLEST_ALPHA,
+    gaussian_types,
+    projection_functions,
+)
+from npa_envs.kernels.ranges import PAIRS, in_ranges
+from npa_envs.kernels.wide import make_wide_store
+
+
+@functools.cache
+def gaussian_kernels(scalar: type) -> SimpleNamespace:
+    """Return the kernels of one scalar type."""
+    types = gaussian_types(scalar)
+    Frame, pair, triple, quad = types.Frame, types.pair, types.triple, types.quad
+    footprint_type, pulls_type, harmonics_type = types.footprint, types.pulls, types.harmonics
+    square, cube, motion_type = types.square, types.cube, types.motion
+    functions = projection_functions(scalar)
+    unit_quaternion, rotation_of = functions.unit_quaternion, functions.rotation_of
+    pull_back_rotation, scaled_columns = functions.pull_back_rotation, functions.scaled_columns
+    rotation_part, shift_part = functions.rotation_part, functions.shift_part
+    outlook = functions.outlook
+    limited_ratios, jacobian_of = functions.limited_ratios, functions.jacobian_of
+    harmonics_at, harmonic_basis = functions.harmonics_at, functions.harmonic_basis
+    colours_of, covered_tiles = functions.colours_of, functions.covered_tiles
+    module = wp.get_module(f"npa_envs.kernels.gaussians_{scalar_name(scalar)}")
+    load_footprint = make_wide_load(footprint_type, scalar)
+    store_footprint = make_wide_store(footprint_type, scalar)
+    load_pulls = make_wide_load(pulls_type, scalar)
+
+    @in_ranges(PAIRS)
+    @wp.kernel(enable_backward=False, module=module)
+    def project_gaussians(
+        range_start: wp.int32,
+        frame: Frame,
+        means: wp.array(dtype=triple),
+        scales: wp.array(dtype=triple),
+        quaternions: wp.array(dtype=quad),
+        opacities: wp.array(dtype=scalar),
+        colours: wp.array(dtype=scalar, ndim=2),
+        motions: wp.array(dtype=motion_type),
+        intrinsics: wp.array(dtype=quad),
+        # outputs
+        footprints: wp.array(dtype=footprint_type),
+        depths: wp.array(dtype=scalar),
+        counts: wp.array(dtype=wp.int32),
+    ):
+        """Write footprint, depth and number of covered tiles of each Gaussian in each picture.
+
+        One that is not seen covers none and lies infinitely far away; neither is one seen of which
+        a number is not finite. There are as many motions, and intrinsics, as pictures, as views of
+        a world, or one.
+        """
+        entry = range_start + wp.tid()
+        image = entry / frame.particle_count
+        i = image / frame.view_count * frame.particle_count + entry % frame.particle_count
+        motion = motions[image % motions.shape[0]]
+        lens = intrinsics[image % intrinsics.shape[0]]
+        mean = means[i]
+        opacity = opacities[i]
+        rotation = rotation_part(motion)
+        place = rotation * mean + shift_part(motion)
+        depth = scalar(wp.inf)
+        count = wp.int32(0)
+        footprint = footprint_type()
+        if place[2] >= frame.near and opacity >= scalar(SMALLEST_ALPHA):
+            unit, _inverse = unit_quaternion(quaternions[i])
+            spread = scaled_columns(rotation * rotation_of(unit), scales[i])
+            root = jacobian_of(frame, lens, place) * spread
+            x = root[0]
+            y = root[1]
+            squared_x = wp.dot(x, x)
+            squared_y = wp.dot(y, y)
+            # Binet and Cauchy: the difference of products would cancel for a thin Gaussian.
+            normal = wp.cross(x, y)
+            determinant = wp.dot(normal, normal)
+            determinant += frame.dilation * (squared_x + squared_y + frame.dilation)
+            inverse = scalar(1.0) / determinant
+            squared_x += frame.dilation
+            squared_y += frame.dilation
+            reach = scalar(2.0) * (wp.log(scalar(255.0) * opacity) + scalar(REACH_SLACK))
+            footprint[0] = lens[0] * place[0] / place[2] + lens[2]
+            footprint[1] = lens[1] * place[1] / place[2] + lens[3]
+            footprint[2] = squared_y * inverse
+            footprint[3] = -wp.dot(x, y) * inverse
+            footprint[4] = squared_x * inverse
+            footprint[5] = opacity
+            colour = colours_of(colours, i, motion, mean)
+            for c in range(wp.static(CHANNELS)):
+                footprint[6 + c] = colour[c]
+            footprint[10] = wp.sqrt(reach * squared_x)
+            footprint[11] = wp.sqrt(reach * squared_y)
+            total = scalar(0.0)
+            for k in range(wp.static(FOOTPRINT)):
+                total += footprint[k]
+            if wp.isfinite(total) and determinant > scalar(0.0):
+                tiles = covered_tiles(frame, footprint)
+                count = (tiles[2] - tiles[0]) * (tiles[3] - tiles[1])
+                if count > 0:
+                    depth = place[2]
+        store_footprint(footprints, entry, footprint)
+        depths[entry] = depth
+        counts[entry] = count
+
+    @in_ranges(PAIRS)
+    @wp.kernel(enable_backward=False, module=module)
+    def list_pairs(
+        range_start: wp.int32,
+        frame: Frame,
+        footprints: wp.array(dtype=footprint_type),
+        order: wp.array(dtype=wp.int64),
+        ends: wp.array(dtype=wp.int64),
+        room: wp.int32,
+        # outputs
+        tiles: wp.array(dtype=wp.int32),
+        owners: wp.array(dtype=wp.int32),
+        slots: wp.array(dtype=wp.int32),
+    ):
+        """List tile and Gaussian of each pair, near Gaussians first; and each one's first slot.
+
+        A picture has `room` slots. What finds no room has no slot, -1, nor has what covers no tile.
+        """
+        k = range_start + wp.tid()
+        image = k / frame.particle_count
+        first = image * frame.particle_count
+        entry = first + wp.int32(order[k])
+        begin = wp.int64(0)
+        if k > first:
+            begin = ends[k - 1]
+        end = ends[k]
+        slot = wp.int32(-1)
+        if begin < end and end <= wp.int64(room):
+            slot = image * room + wp.int32(begin)
+            covers = covered_tiles(frame, load_footprint(footprints, entry))
+            place = slot
+            for row in range(covers[1], covers[3]):
+                for column in range(covers[0], covers[2]):
+                    tiles[place] = image * frame.tile_count + row * frame.tile_columns + column
+                    owners[place] = entry
+                    place += 1
+        slots[entry] = slot
+
+    @in_ranges(PAIRS)
+    @wp.kernel(enable_backward=False, module=module)
+    def pull_back_gaussians(
+        range_start: wp.int32,
+        frame: Frame,
+        means: wp.array(dtype=triple),
+        scales: wp.array(dtype=triple),
+        quaternions: wp.array(dtype=quad),
+        colours: wp.array(dtype=scalar, ndim=2),
+        motions: wp.array(dtype=motion_type),
+        intrinsics: wp.array(dtype=quad),
+        footprints: wp.array(dtype=footprint_type),
+        counts: wp.array(dtype=wp.int32),
+        slots: wp.array(dtype=wp.int32),
+        pulls: wp.array(dtype=pulls_type),
+        # outputs
+        means_bar: wp.array(dtype=triple),
+        scales_bar: wp.array(dtype=triple),
+        quaternions_bar: wp.array(dtype=quad),
+        opacities_bar: wp.array(dtype=scalar),
+        colours_bar: wp.array(dtype=scalar, ndim=2),
+    ):
+        """Write the cotangents of each Gaussian: sums over its views and, in each, its tiles."""
+        i = range_start + wp.tid()
+        world = i / frame.particle_count
+        mean = means[i]
+        scale = scales[i]
+        unit, inverse = unit_quaternion(quaternions[i])
+        turned = rotation_of(unit)
+        mean_bar = triple()
+        scale_bar = triple()
+        rotation_bar = cube()
+        opacity_bar = scalar(0.0)
+        colour_bar = quad()
+        harmonics_bar = harmonics_type()
+        seen = wp.bool(False)
+        for view in range(frame.view_count):
+            image = world * frame.view_count + view
+            entry = image * frame.particle_count + i % frame.particle_count
+            slot = slots[entry]
+            if slot >= 0:
+                seen = wp.bool(True)
+                pull = pulls_type()
+                for k in range(slot, slot + counts[entry]):
+                    pull += load_pulls(pulls, k)
+                footprint = load_footprint(footprints, entry)
+                motion = motions[image % motions.shape[0]]
+                lens = intrinsics[image % intrinsics.shape[0]]
+                rotation = rotation_part(motion)
+                place = rotation * mean + shift_part(motion)
+                conic = square(footprint[2], footprint[3], footprint[3], footprint[4])
+                centre_bar = conic * pair(pull[1], pull[2])
+                opacity_bar += pull[0] / footprint[5]
+
+                # Of Q = (A Aᵀ + dilation)⁻¹ with A = J W R S.
+                moments = square(pull[3], pull[4], pull[4], pull[5])
+                jacobian = jacobian_of(frame, lens, place)
+                towards = rotation * turned
+                spread = scaled_columns(towards, scale)
+                root_bar = conic * moments * conic * (jacobian * spread)
+                jacobian_bar = root_bar * wp.transpose(spread)
+                spread_bar = wp.transpose(jacobian) * root_bar
+                for d in range(3):
+                    for row in range(3):
+                        scale_bar[d] += spread_bar[row, d] * towards[row, d]
+                rotation_bar += wp.transpose(rotation) * scaled_columns(spread_bar, scale)
+
+                ratios = limited_ratios(frame, lens, place)
+                place_bar = triple()
+                for d in range(2):
+                    focal = lens[d] / place[2]
+                    ratio = place[d] / place[2]
+                    place_bar[d] = focal * centre_bar[d]
+                    place_bar[2] -= focal * centre_bar[d] * ratio
+                    place_bar[2] -= focal / place[2] * jacobian_bar[d, d]
+                    place_bar[2] += focal / place[2] * ratios[d] * jacobian_bar[d, 2]
+                    if ratios[d] == ratio:
+                        ratio_bar = -focal / place[2] * jacobian_bar[d, 2]
+                        place_bar[d] += ratio_bar
+                        place_bar[2] -= ratio_bar * ratio
+                mean_bar += wp.transpose(rotation) * place_bar
+
+                if colours.shape[1] <= wp.static(CHANNELS):
+                    for c in range(wp.static(CHANNELS)):
+                        colour_bar[c] += pull[6 + c]
+                else:
+                    seen_bar = triple()
+                    for c in range(3):
+                        if footprint[6 + c] > scalar(0.0):
+                            seen_bar[c] = pull[6 + c]
+                    way = outlook(motion, mean)
+                    direction = wp.normalize(way)
+                    harmonics_bar += wp.outer(harmonic_basis(direction), seen_bar)
+                    basis_bar = harmonics_at(colours, i) * seen_bar
+                    factor = scalar(HARMONIC_1) / wp.length(way)
+                    way_bar = factor * triple(-basis_bar[3], -basis_bar[1], basis_bar[2])
+                    mean_bar += way_bar - wp.dot(way_bar, direction) * direction
+        means_bar[i] = mean_bar
+        scales_bar[i] = scale_bar
+        quaternion_bar = quad()
+        if seen:
+            unit_bar = pull_back_rotation(unit, rotation_bar)
+            quaternion_bar = inverse * (unit_bar - wp.dot(unit_bar, unit) * unit)
+        quaternions_bar[i] = quaternion_bar
+        opacities_bar[i] = opacity_bar
+        if colours.shape[1] <= wp.static(CHANNELS):
+            for c in range(wp.static(CHANNELS)):
+                if c < colours.shape[1]:
+                    colours_bar[i, c] = colour_bar[c]
+        else:
+            for k in range(4):
+                for c in range(3):
+                    colours_bar[i, 3 * k + c] = harmonics_bar[k, c]
+
+    return SimpleNamespace(
+        project_gaussians=project_gaussians,
+        list_pairs=list_pairs,
+        pull_back_gaussians=pull_back_gaussians,
+    )

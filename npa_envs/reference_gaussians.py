@@ -1,0 +1,159 @@
+"""3D Gaussian splatting in plain torch, O(pixels x Gaussians): the oracle of its tests.
+
+Every Gaussian is weighed at every pixel, without tiles; autograd gives the adjoints. Memory is
+N H W K numbers for a picture.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+SMALLEST_ALPHA = 1.0 / 255.0
+LARGEST_ALPHA = 0.99
+SMALLEST_PASSING = 1e-4
+CLAMP_MARGIN = 0.3
+HARMONICS = (0.28209479177387814, 0.4886025119029199)
+"""Factors of the real spherical harmonics of degree 0 and 1: 1/2 sqrt(1/pi), 1/2 sqrt(3/pi)."""
+
+
+def rotations(quaternions: Tensor) -> Tensor:
+    """Return rotation matrices [..., 3, 3] of quaternions (w, x, y, z) of any length, [..., 4]."""
+    w, x, y, z = (quaternions / quaternions.norm(dim=-1, keepdim=True)).unbind(-1)
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+
+
+def seen_colours(coefficients: Tensor, directions: Tensor) -> Tensor:
+    """Return colours [N, 3] of harmonics [N, 4, 3] seen along unit vectors [N, 3]."""
+    x, y, z = directions.unbind(-1)
+    basis = torch.stack((torch.full_like(x, HARMONICS[0] / HARMONICS[1]), -y, z, -x), dim=-1)
+    return (HARMONICS[1] * torch.einsum("nk,nkc->nc", basis, coefficients) + 0.5).clamp(min=0.0)
+
+
+def projected(
+    places: Tensor,
+    spreads: Tensor,
+    intrinsics: Tensor,
+    width: int,
+    height: int,
+    dilation: float,
+) -> tuple[Tensor, Tensor]:
+    """Return means [N, 2] and covariances [N, 2, 2] on the picture [pixels, pixels squared].
+
+    Args:
+        places: Means in the camera's frame [length units], in front of it, shape [N, 3].
+        spreads: Square roots of the covariances in the camera's frame [length units], [N, 3, 3].
+        intrinsics: fx, fy, cx and cy [pixels], shape [4].
+        width: Pixels across.
+        height: Pixels down.
+        dilation: Added to both variances [pixels squared].
+    """
+    focal, middle = intrinsics[:2], intrinsics[2:]
+    depth = places[:, 2:]
+    ratio = places[:, :2] / depth
+    size = torch.tensor([width, height], dtype=places.dtype)
+    margin = CLAMP_MARGIN * 0.5 * size / focal
+    near_view = ratio.clamp(-middle / focal - margin, (size - middle) / focal + margin)
+    jacobian = torch.cat(
+        ((focal / depth)[..., None] * torch.eye(2), (-focal * near_view / depth)[..., None]), -1
+    )
+    root = jacobian @ spreads
+    covariance = root @ root.mT + dilation * torch.eye(2, dtype=places.dtype)
+    return focal * ratio + middle, covariance
+
+
+def blended(alphas: Tensor, colours: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the sum of colours [H, W, K] and what passes [H, W] of sorted alphas [N, H, W]."""
+    alphas = torch.where(alphas >= SMALLEST_ALPHA, alphas, 0.0)
+    after = torch.cumprod(1.0 - alphas, dim=0)
+    alphas = torch.where(after >= SMALLEST_PASSING, alphas, 0.0)
+    after = torch.cumprod(1.0 - alphas, dim=0)
+    before = torch.cat((torch.ones_like(after[:1]), after[:-1]))
+    return torch.einsum("nhw,nhw,nk->hwk", alphas, before, colours), after[-1]
+
+
+def draw(
+    means: Tensor,
+    scales: Tensor,
+    quaternions: Tensor,
+    opacities: Tensor,
+    colours: Tensor,
+    *,
+    view: Tensor,
+    intrinsics: Tensor,
+    width: int,
+    height: int,
+    near: float,
+    dilation: float = 0.3,
+) -> tuple[Tensor, Tensor]:
+    """Return one picture [H, W, K], without background, and what passes [H, W].
+
+    Arguments are those of `npa_envs.sph.render_gaussians` for one world, with one camera's
+    world-to-camera matrix [4, 4] and fx, fy, cx, cy [4].
+    """
+    rotation, shift = view[:3, :3], view[:3, 3]
+    places = means @ rotation.mT + shift
+    seen = places[:, 2] >= near
+    # Replaced before dividing: what is left out must not reach the gradients as 0 times infinity.
+    places = torch.where(seen[:, None], places, places.new_tensor([0.0, 0.0, 1.0]))
+    spreads = rotation @ rotations(quaternions) * scales[:, None, :]
+    centres, covariance = projected(places, spreads, intrinsics, width, height, dilation)
+    if colours.ndim == 3:
+        directions = means + rotation.mT @ shift
+        colours = seen_colours(colours, directions / directions.norm(dim=-1, keepdim=True))
+    rows = torch.arange(height, dtype=means.dtype) + 0.5
+    columns = torch.arange(width, dtype=means.dtype) + 0.5
+    pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=-1)
+    away = pixels - centres[:, None, None, :]
+    power = torch.einsum("nhwi,nij,nhwj->nhw", away, torch.linalg.inv(covariance), away)
+    alphas = (opacities[:, None, None] * torch.exp(-0.5 * power)).clamp(max=LARGEST_ALPHA)
+    alphas = torch.where(seen[:, None, None], alphas, 0.0)
+    order = torch.argsort(places[:, 2].detach(), stable=True)
+    return blended(alphas[order], colours[order])
+
+
+def render_gaussians(
+    means: Tensor,
+    scales: Tensor,
+    quaternions: Tensor,
+    opacities: Tensor,
+    colours: Tensor,
+    world_to_camera: Tensor,
+    intrinsics: Tensor,
+    *,
+    width: int,
+    height: int,
+    near: float,
+    dilation: float = 0.3,
+    background: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Return pictures [B, V, H, W, K] and alphas [B, V, H, W].
+
+    Arguments as `npa_envs.sph.render_gaussians`, with world-to-camera matrices [B, V, 4, 4] and fx,
+    fy, cx, cy [B, V, 4].
+    """
+    shapes = (means, scales, quaternions, opacities, colours)
+    worlds, views = world_to_camera.shape[:2]
+    drawn = [
+        draw(
+            *(tensor[world] for tensor in shapes),
+            view=world_to_camera[world, view],
+            intrinsics=intrinsics[world, view],
+            width=width,
+            height=height,
+            near=near,
+            dilation=dilation,
+        )
+        for world in range(worlds)
+        for view in range(views)
+    ]
+    image = torch.stack([picture for picture, _ in drawn]).view(worlds, views, height, width, -1)
+    passing = torch.stack([rest for _, rest in drawn]).view(worlds, views, height, width)
+    if background is not None:
+        image = image + passing[..., None] * background
+    return image, 1.0 - passing

@@ -1,0 +1,294 @@
+"""Pictures of 3D Gaussians as a differentiable torch operator."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from npa_envs.errors import NPAError
+from npa_envs.kernels.gaussians import gaussian_kernels
+from npa_envs.kernels.projection import FOOTPRINT, make_frame, tile_total
+from npa_envs.sph.bridge import launch, scalar_type
+from npa_envs.sph.cameras import Cameras
+from npa_envs.sph.gaussian_checks import check_cameras, check_gaussians
+from npa_envs.sph.gaussian_tiles import blend, pull_back_tiles, sort_pairs
+
+PAIRS_PER_PARTICLE = 8
+"""Tiles of a picture that its Gaussians cover on average, at most: what CUDA has room for."""
+
+DILATION = 0.3
+"""Added to variances on the picture [pixels squared]: about the blur of a pixel (Kerbl et al.)."""
+
+
+class GaussianPictures(NamedTuple):
+    """What cameras see."""
+
+    image: Tensor
+    """Colours, dimensionless, shape [B, V, H, W, K]; the first row is the upper one."""
+
+    alpha: Tensor
+    """What Gaussians cover of each pixel, in [0, 1], shape [B, V, H, W]."""
+
+    overflow: Tensor
+    """Pictures without room for all pairs, whose farthest Gaussians are missing: bool, [B, V]."""
+
+
+def _frame(
+    means: Tensor,
+    colours: Tensor,
+    motions: Tensor,
+    sizes: tuple[int, int],
+    near: float,
+    dilation: float,
+) -> Any:
+    # As integers: a shape that torch.compile left open is fixed here, another one compiled anew.
+    shape = (int(means.shape[1]), int(motions.shape[-3]), int(colours.shape[-1]))
+    return make_frame(scalar_type(means.dtype), shape, sizes, near, dilation)
+
+
+def _scene(
+    means: Tensor,
+    scales: Tensor,
+    quaternions: Tensor,
+    colours: Tensor,
+    motions: Tensor,
+    lenses: Tensor,
+) -> tuple[list[Tensor], Tensor, list[Tensor]]:
+    """Return what kernels read, with worlds, or worlds and views, counted through."""
+    total = means.shape[0] * means.shape[1]
+    shapes = [means.view(total, 3), scales.view(total, 3), quaternions.view(total, 4)]
+    return shapes, colours.view(total, -1), [motions.view(-1, 4, 4), lenses.view(-1, 4)]
+
+
+@torch.library.custom_op("npa::gaussians", mutates_args=())
+def _gaussians(
+    means: Tensor,
+    scales: Tensor,
+    quaternions: Tensor,
+    opacities: Tensor,
+    colours: Tensor,
+    motions: Tensor,
+    lenses: Tensor,
+    width: int,
+    height: int,
+    near: float,
+    dilation: float,
+    pairs_per_particle: int,
+) -> tuple[
+    Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor
+]:  # picture, overflow and what the adjoint reads
+    frame = _frame(means, colours, motions, (width, height), near, dilation)
+    worlds, views = means.shape[0], frame.view_count
+    images, particles = worlds * views, means.shape[1]
+    footprints = means.new_empty(images * particles, FOOTPRINT)
+    depths = means.new_empty(images, particles)
+    counts = torch.empty(images, particles, dtype=torch.int32, device=means.device)
+    shapes, flat, cameras = _scene(means, scales, quaternions, colours, motions, lenses)
+    seen = (footprints, depths.view(-1), counts.view(-1))
+    kernels = gaussian_kernels(scalar_type(means.dtype))
+    arguments = (*shapes, opacities.view(-1), flat, *cameras, *seen)
+    launch(kernels.project_gaussians, images * particles, means.device, frame, *arguments)
+    pairs = sort_pairs(frame, footprints, depths, counts, pairs_per_particle)
+    picture, passing, stops = blend(frame, footprints, pairs, images)
+    return (
+        picture.view(worlds, views, height, width, -1),
+        pairs.overflow.view(worlds, views),
+        passing.view(worlds, views, height, width),
+        stops,
+        footprints,
+        counts.view(-1),
+        *pairs[1:],
+    )
+
+
+@_gaussians.register_fake
+def _(
+    means: Tensor,
+    scales: Tensor,
+    quaternions: Tensor,
+    opacities: Tensor,
+    colours: Tensor,
+    motions: Tensor,
+    lenses: Tensor,
+    width: int,
+    height: int,
+    near: float,
+    dilation: float,
+    pairs_per_particle: int,
+) -> tuple[Tensor, ...]:
+    views = (means.shape[0], motions.shape[-3])
+    images = views[0] * views[1]
+    seen = images * means.shape[1]
+    slots: Any = seen * pairs_per_particle
+    if pairs_per_particle == 0:
+        slots = torch.library.get_ctx().new_dynamic_size()
+    return (
+        means.new_empty(*views, height, width, colours.shape[-1]),
+        means.new_empty(views, dtype=torch.bool),
+        means.new_empty(*views, height, width),
+        means.new_empty(images * height * width, dtype=torch.int32),
+        means.new_empty(seen, FOOTPRINT),
+        means.new_empty(seen, dtype=torch.int32),
+        means.new_empty(seen, dtype=torch.int32),
+        means.new_empty(images * tile_total(width, height) + 1, dtype=torch.int32),
+        means.new_empty(slots, dtype=torch.int32),
+        means.new_empty(slots, dtype=torch.int64),
+    )
+
+
+@torch.library.custom_op("npa::gaussians_backward", mutates_args=())
+def _gaussians_backward(
+    means: Tensor,
+    scales: Tensor,
+    quaternions: Tensor,
+    colours: Tensor,
+    motions: Tensor,
+    lenses: Tensor,
+    passing: Tensor,
+    stops: Tensor,
+    footprints: Tensor,
+    counts: Tensor,
+    slots: Tensor,
+    starts: Tensor,
+    owners: Tensor,
+    places: Tensor,
+    picture_bar: Tensor,
+    passing_bar: Tensor,
+    near: float,
+    dilation: float,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    height, width = (int(side) for side in passing.shape[2:])
+    frame = _frame(means, colours, motions, (width, height), near, dilation)
+    bars = (picture_bar.contiguous().view(-1, frame.channels), passing_bar.contiguous().view(-1))
+    drawn = (passing.view(-1), stops)
+    pulls = pull_back_tiles(frame, footprints, (starts, owners, places), drawn, bars)
+    shapes, flat, cameras = _scene(means, scales, quaternions, colours, motions, lenses)
+    out = [torch.empty_like(tensor) for tensor in (means, scales, quaternions)]
+    opacities_bar = means.new_empty(means.shape[:2])
+    colours_bar = torch.empty_like(colours)
+    bars_out = (
+        *(bar.view(shape.shape) for bar, shape in zip(out, shapes, strict=True)),
+        opacities_bar.view(-1),
+        colours_bar.view(flat.shape),
+    )
+    arguments = (*shapes, flat, *cameras, footprints, counts, slots, pulls, *bars_out)
+    kernel = gaussian_kernels(scalar_type(means.dtype)).pull_back_gaussians
+    launch(kernel, opacities_bar.numel(), means.device, frame, *arguments)
+    return out[0], out[1], out[2], opacities_bar, colours_bar
+
+
+@_gaussians_backward.register_fake
+def _(
+    means: Tensor, scales: Tensor, quaternions: Tensor, colours: Tensor, *rest: Any
+) -> tuple[Tensor, ...]:
+    out = [torch.empty_like(tensor) for tensor in (means, scales, quaternions)]
+    return (*out, means.new_empty(means.shape[:2]), torch.empty_like(colours))
+
+
+class _Gaussians(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        means: Tensor,
+        scales: Tensor,
+        quaternions: Tensor,
+        opacities: Tensor,
+        colours: Tensor,
+        motions: Tensor,
+        lenses: Tensor,
+        *sizes: Any,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        shapes = (means, scales, quaternions)
+        picture, overflow, *saved = _gaussians(*shapes, opacities, colours, motions, lenses, *sizes)
+        ctx.numbers = sizes[2:4]
+        ctx.save_for_backward(*shapes, colours, motions, lenses, *saved)
+        ctx.mark_non_differentiable(overflow, saved[-1])
+        ctx.set_materialize_grads(False)
+        # The last one for torch.compile alone, which must see every size that data decide.
+        return picture, saved[0], overflow, saved[-1]
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(
+        ctx: Any, picture_bar: Tensor | None, passing_bar: Tensor | None, *_: None
+    ) -> tuple[Tensor | None, ...]:
+        colours, passing = ctx.saved_tensors[3], ctx.saved_tensors[6]
+        if picture_bar is None:
+            picture_bar = passing.new_zeros(*passing.shape, colours.shape[-1])
+        if passing_bar is None:
+            passing_bar = torch.zeros_like(passing)
+        bars = _gaussians_backward(*ctx.saved_tensors, picture_bar, passing_bar, *ctx.numbers)
+        return (*bars, *(None,) * 7)
+
+
+def render_gaussians(
+    means: Tensor,
+    scales: Tensor,
+    quaternions: Tensor,
+    opacities: Tensor,
+    colours: Tensor,
+    cameras: Cameras,
+    *,
+    background: Tensor | None = None,
+    dilation: float = DILATION,
+    pairs_per_particle: int | None = None,
+) -> GaussianPictures:
+    """Draw 3D worlds: each particle is a Gaussian, seen by cameras; differentiable.
+
+    This is 3D Gaussian splatting (Kerbl et al. 2023) with EWA's local affine projection (Zwicker et
+    al. 2002): docs/mathematics.md has the formulas. Nothing differentiates by the cameras, by the
+    order of Gaussians, or by where they end, at an alpha of 1/255.
+
+    Gaussians nearer than `cameras.near`, and those of which a number is not finite, are not seen.
+    The same worlds give the same bits on every run, and alone the same as in a batch.
+
+    Args:
+        means: Particle positions [length units], shape [B, N, 3].
+        scales: Standard deviations along the Gaussians' own axes [length units], not negative,
+            shape [B, N, 3].
+        quaternions: Rotations of these axes (w, x, y, z), of any length: they are normalised here;
+            a zero stands for no rotation. Shape [B, N, 4].
+        opacities: What each covers in its middle, in [0, 1], shape [B, N].
+        colours: Dimensionless; K = 1 to 4 channels, shape [B, N, K], or coefficients of real
+            spherical harmonics up to degree 1 for red, green and blue, shape [B, N, 4, 3], whose
+            sum plus 0.5 is cut off below 0.
+        cameras: V cameras, on the same device.
+        background: What is seen behind the Gaussians; its shape broadcasts to [B, V, H, W, K]. None
+            is black.
+        dilation: Added to both variances on the picture [pixels squared].
+        pairs_per_particle: Room for so many pairs of a tile (16 pixels square) and a Gaussian that
+            covers it for each particle of a picture. None is 8 on CUDA, where reading the number
+            back would stall the stream, and as many as are needed on the CPU. A pair takes about 60
+            bytes.
+
+    Returns:
+        Image, alpha, and for each picture whether its pairs found no room.
+
+    Raises:
+        NPAError: A shape, dtype or device does not fit, or a number is out of its range; signs of
+            scales are looked at on the CPU alone.
+    """
+    check_gaussians(means, scales, quaternions, opacities, colours)
+    check_cameras(cameras, means, background, colours.shape[-1])
+    if not (math.isfinite(dilation) and dilation >= 0.0):
+        raise NPAError(f"dilation must be finite and at least 0 pixels squared, got {dilation}")
+    if pairs_per_particle is None:
+        pairs_per_particle = PAIRS_PER_PARTICLE if means.is_cuda else 0
+    elif pairs_per_particle < 1:
+        raise NPAError(f"pairs_per_particle must be at least 1, got {pairs_per_particle}")
+    image, passing, overflow, _ = _Gaussians.apply(  # type: ignore[no-untyped-call]
+        *(tensor.contiguous() for tensor in (means, scales, quaternions, opacities, colours)),
+        cameras.world_to_camera.to(means.dtype).contiguous(),
+        cameras.intrinsics.to(means.dtype).contiguous(),
+        cameras.width,
+        cameras.height,
+        float(cameras.near),
+        float(dilation),
+        int(pairs_per_particle),
+    )
+    if background is not None:
+        image = image + passing[..., None] * background
+    return GaussianPictures(image, 1.0 - passing, overflow)

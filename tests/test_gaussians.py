@@ -1,0 +1,666 @@
+"""The renderer of 3D Gaussians and its adjoint against plain torch, and what must hold of both."""
+
+import dataclasses
+import functools
+import math
+
+import pytest
+import torch
+from worlds import relative_error
+
+from npa_envs import NPAError
+from npa_envs import reference_gaussians as oracle
+from npa_envs.kernels.blending import TILE_PIXELS, block_kernels
+from npa_envs.sph import render_gaussians
+from npa_envs.sph.bridge import launch, scalar_type
+from npa_envs.sph.cameras import Cameras, look_at, orbit
+from npa_envs.sph.gaussians import _frame, _gaussians
+
+# Worst error measured over all scenes, then the bound.
+PICTURE_BOUND = {torch.float32: 1e-5, torch.float64: 1e-13}  # 2e-6, 3e-15
+GRADIENT_BOUND = {torch.float32: 3e-5, torch.float64: 1e-12}  # 5e-6, 8e-15
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """What a random scene is made of."""
+
+    worlds: int = 1
+    particles: int = 50
+    views: int = 1
+    size: tuple[int, int] = (45, 37)
+    spread: float = 1.2
+    scales: tuple[float, float] = (0.02, 0.2)
+    opacities: tuple[float, float] = (0.0, 1.0)
+    channels: int | None = 3
+    """None: spherical harmonics."""
+    own_cameras: bool = False
+    own_intrinsics: str = "shared"
+    radius: float = 3.0
+    dilation: float = 0.3
+    near: float = 0.2
+
+    @property
+    def gaussians(self):
+        """Means, scales, quaternions, opacities and colours in float64 on the CPU."""
+        generator = torch.Generator().manual_seed(self.particles + self.views)
+        lead = (self.worlds, self.particles)
+
+        def uniform(low, high, *shape):
+            numbers = torch.rand(*lead, *shape, generator=generator, dtype=torch.float64)
+            return low + (high - low) * numbers
+
+        return [
+            uniform(-self.spread, self.spread, 3),
+            uniform(*self.scales, 3),
+            torch.randn(*lead, 4, generator=generator, dtype=torch.float64),
+            uniform(*self.opacities),
+            uniform(0.0, 1.0, self.channels) if self.channels else uniform(-1.0, 1.0, 4, 3),
+        ]
+
+    @property
+    def cameras(self):
+        """Cameras of a turntable; where worlds have their own, all of them differ."""
+        count = self.views * (self.worlds if self.own_cameras else 1)
+        width, height = self.size
+        cameras = orbit(
+            count, 20.0, self.radius, 45.0, width=width, height=height, azimuth=10.0, near=self.near
+        )
+        motions = cameras.world_to_camera.double()
+        if self.own_cameras:
+            motions = motions.unflatten(0, (self.worlds, self.views))
+        lenses = cameras.intrinsics.double()
+        if self.own_intrinsics != "shared":
+            shape = motions.shape[:-2] if self.own_intrinsics == "each" else motions.shape[-3:-2]
+            factors = torch.linspace(0.8, 1.3, shape.numel(), dtype=torch.float64)
+            lenses = lenses * factors.view(*shape, 1)
+        return dataclasses.replace(cameras, world_to_camera=motions, intrinsics=lenses)
+
+    def of(self, dtype, device):
+        """Return Gaussians that want gradients, and cameras."""
+        gaussians = [t.to(device, dtype).requires_grad_() for t in self.gaussians]
+        return gaussians, self.cameras.to(device).to(dtype)
+
+
+SCENES = {
+    "one world": Scene(),
+    "batch": Scene(worlds=3, views=2),
+    "a camera for each": Scene(worlds=3, views=2, own_cameras=True, own_intrinsics="each"),
+    "shared lenses": Scene(worlds=2, views=2, own_cameras=True, own_intrinsics="views"),
+    "harmonics": Scene(worlds=2, views=2, channels=None),
+    "four channels": Scene(channels=4),
+    "one channel": Scene(channels=1),
+    "whole tiles": Scene(size=(32, 16)),
+    "one pixel": Scene(size=(1, 1)),
+    "a row": Scene(size=(70, 1)),
+    "thick": Scene(particles=300, opacities=(0.8, 1.0), scales=(0.1, 0.4), size=(20, 33)),
+    "tiny": Scene(scales=(1e-4, 1e-3), opacities=(0.5, 1.0)),
+    "thin": Scene(scales=(1e-3, 0.5), dilation=0.05),
+    "no dilation": Scene(scales=(0.05, 0.3), dilation=0.0),
+    "off-screen": Scene(particles=120, spread=4.0, scales=(0.1, 1.0), views=2, size=(40, 30)),
+    "among them": Scene(particles=80, radius=0.5, near=0.3, views=2),
+}
+
+
+def expand(cameras, world_count):
+    """Return world-to-camera matrices [B, V, 4, 4] and intrinsics [B, V, 4]."""
+    shape = (world_count, cameras.count)
+    return (
+        cameras.world_to_camera.expand(*shape, 4, 4),
+        cameras.intrinsics.expand(*shape, 4),
+    )
+
+
+def expected_pictures(gaussians, cameras, *, background=None, dilation=0.3):
+    return oracle.render_gaussians(
+        *gaussians,
+        *expand(cameras, gaussians[0].shape[0]),
+        width=cameras.width,
+        height=cameras.height,
+        near=cameras.near,
+        dilation=dilation,
+        background=background,
+    )
+
+
+def cotangents(image, alpha):
+    generator = torch.Generator().manual_seed(1)
+    return [
+        torch.randn(t.shape, generator=generator, dtype=torch.float64).to(t) for t in (image, alpha)
+    ]
+
+
+def pulled(gaussians, cameras, **options):
+    """Return image, alpha and the gradients of both along random cotangents."""
+    pictures = render_gaussians(*gaussians, cameras, **options)
+    drawn = (pictures.image, pictures.alpha)
+    return [*drawn, *torch.autograd.grad(drawn, gaussians, cotangents(*drawn))]
+
+
+@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=("float32", "float64"))
+def test_pictures_and_adjoints_equal_the_oracle(name, dtype, device):
+    scene = SCENES[name]
+    exact, exact_cameras = scene.of(torch.float64, "cpu")
+    behind = torch.linspace(0.2, 0.9, scene.channels or 3, dtype=torch.float64).requires_grad_()
+    drawn = expected_pictures(exact, exact_cameras, background=behind, dilation=scene.dilation)
+    expected = torch.autograd.grad(drawn, [*exact, behind], cotangents(*drawn))
+
+    gaussians, cameras = scene.of(dtype, device)
+    background = behind.detach().to(device, dtype).requires_grad_()
+    pictures = render_gaussians(*gaussians, cameras, background=background, dilation=scene.dilation)
+    got = (pictures.image, pictures.alpha)
+    gradients = torch.autograd.grad(got, [*gaussians, background], cotangents(*got))
+    assert not pictures.overflow.any()
+    for value, wanted in zip(got, drawn, strict=True):
+        assert relative_error(value, wanted) < PICTURE_BOUND[dtype]
+    for value, wanted in zip(gradients, expected, strict=True):
+        assert float(wanted.norm()) > 0.0
+        assert relative_error(value, wanted) < GRADIENT_BOUND[dtype]
+
+
+@pytest.mark.parametrize("channels", [3, None], ids=("colours", "harmonics"))
+def test_gradients_pass_gradcheck(channels, device):
+    scene = Scene(particles=4, views=2, size=(18, 7), scales=(0.2, 0.4), channels=channels)
+    gaussians, cameras = scene.of(torch.float64, device)
+    background = torch.rand(1, 2, 7, 18, 3, dtype=torch.float64, device=device).requires_grad_()
+
+    def drawn(*inputs):
+        *gaussians, background = inputs
+        return render_gaussians(*gaussians, cameras, background=background)[:2]
+
+    assert torch.autograd.gradcheck(drawn, (*gaussians, background))
+
+
+@pytest.mark.parametrize("name", ["batch", "thick", "off-screen", "harmonics"])
+def test_blocks_and_tiles_draw_the_same(name, device):
+    """What CUDA draws with, beside what the CPU draws with."""
+    gaussians, cameras = SCENES[name].of(torch.float32, device)
+    means, *_, colours = gaussians
+    lens = (cameras.world_to_camera, cameras.intrinsics)
+    size = (cameras.width, cameras.height)
+    picture, _, passing, stops, footprints, *lists = _gaussians(
+        *(t.detach() for t in gaussians), *lens, *size, cameras.near, 0.3, 0
+    )
+    _, _, starts, owners, _ = lists
+    frame = _frame(means, colours, cameras.world_to_camera, size, cameras.near, 0.3)
+    drawn = [torch.full_like(t.view(stops.shape[0], -1), torch.nan) for t in (picture, passing)]
+    ends = torch.empty_like(stops)
+    launch(
+        block_kernels(scalar_type(means.dtype)).draw_blocks,
+        (starts.shape[0] - 1) * TILE_PIXELS,
+        means.device,
+        frame,
+        *(starts, owners, footprints, drawn[0], drawn[1].view(-1), ends),
+        block_dim=TILE_PIXELS,
+    )
+    torch.testing.assert_close(drawn[0].view_as(picture), picture, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(drawn[1].view_as(passing), passing, rtol=1e-5, atol=1e-6)
+    # A pixel that is not full stops at its tile's end in one, nowhere in the other.
+    stopped = stops <= starts.shape[0] * gaussians[0].shape[1]
+    assert torch.equal(ends[stopped], stops[stopped])
+
+
+def frontal(width, height, focal=50.0, dtype=torch.float64, device="cpu"):
+    """Return a camera at the origin that looks along z, the picture's middle at the centre."""
+    lens = [focal, focal, 0.5 * width, 0.5 * height]
+    return Cameras(
+        world_to_camera=torch.eye(4, dtype=dtype, device=device)[None],
+        intrinsics=torch.tensor(lens, dtype=dtype, device=device),
+        width=width,
+        height=height,
+    )
+
+
+def single(mean, *, scale=(0.1, 0.1, 0.1), opacity=0.5, colour=(1.0, 0.5, 0.25), **options):
+    """Return one Gaussian."""
+    options = {"dtype": torch.float64, **options}
+    return [
+        torch.tensor(values, **options)[None, None]
+        for values in (mean, scale, (1.0, 0.0, 0.0, 0.0), opacity, colour)
+    ]
+
+
+def test_a_gaussian_on_a_tile_border_is_the_same_on_both_sides(device):
+    """Its middle lies where four tiles meet: at pixel 16 across and down."""
+    gaussians = single((0.0, 0.0, 2.0), device=device)
+    image, alpha, _ = render_gaussians(*gaussians, frontal(32, 32, device=device))
+    assert float(alpha.max()) > 0.45
+    torch.testing.assert_close(image.flip(2), image, rtol=1e-12, atol=0.0)
+    torch.testing.assert_close(image.flip(3), image, rtol=1e-12, atol=0.0)
+    (expected, _) = expected_pictures([t.cpu() for t in gaussians], frontal(32, 32))
+    assert relative_error(image, expected) < PICTURE_BOUND[torch.float64]
+
+
+def test_a_gaussian_has_its_opacity_colour_and_place(device):
+    """At depth 2 and focal length 50, 0.3 to the right are 7.5 pixels; y points down."""
+    gaussians = single((0.3, -0.1, 2.0), device=device)
+    image, alpha, _ = render_gaussians(*gaussians, frontal(40, 32, device=device))
+    row, column = divmod(int(alpha[0, 0].argmax()), 40)
+    assert (row, column) == (13, 27)
+    middle = image[0, 0, 13, 27].cpu()
+    torch.testing.assert_close(
+        middle, 0.5 * torch.tensor([1.0, 0.5, 0.25], dtype=torch.float64), rtol=1e-9, atol=0.0
+    )
+
+
+def test_a_footprint_has_the_covariance_of_projected_samples(device):
+    """Against perspective itself, which the affine approximation follows near the mean."""
+    generator = torch.Generator().manual_seed(3)
+    scale = torch.tensor([0.03, 0.01, 0.02], dtype=torch.float64)
+    quaternion = torch.tensor([0.9, 0.2, -0.3, 0.4], dtype=torch.float64)
+    mean = torch.tensor([0.25, -0.1, 2.0], dtype=torch.float64)
+    normal = torch.randn(400_000, 3, generator=generator, dtype=torch.float64)
+    w, *axis = quaternion / quaternion.norm()
+    axis = torch.stack(axis).expand_as(normal)
+    stretched = normal * scale
+    turned = torch.linalg.cross(axis, torch.linalg.cross(axis, stretched) + w * stretched)
+    places = mean + stretched + 2.0 * turned
+    pixels = 400.0 * places[:, :2] / places[:, 2:] + 50.0
+    wanted = torch.cov((pixels - pixels.mean(0)).T) + 0.3 * torch.eye(2)
+
+    camera = frontal(120, 100, focal=400.0, device=device)
+    lens = torch.tensor([400.0, 400.0, 50.0, 50.0], dtype=torch.float64, device=device)
+    camera = dataclasses.replace(camera, intrinsics=lens)
+    gaussians = single(tuple(mean.tolist()), scale=tuple(scale.tolist()), device=device)
+    gaussians[2] = quaternion.to(device)[None, None]
+    alpha = render_gaussians(*gaussians, camera).alpha[0, 0].cpu()
+    rows, columns = torch.nonzero(alpha, as_tuple=True)
+    away = torch.stack((columns + 0.5, rows + 0.5), -1) - pixels.mean(0)
+    x, y = away.unbind(-1)
+    terms = torch.stack((x * x, 2 * x * y, y * y, x, y, torch.ones_like(x)), -1)
+    fit = torch.linalg.lstsq(terms, -2.0 * torch.log(alpha[rows, columns] / 0.5)[:, None])
+    xx, xy, yy = fit.solution[:3, 0]
+    covariance = torch.linalg.inv(torch.stack((torch.stack((xx, xy)), torch.stack((xy, yy)))))
+    assert relative_error(covariance, wanted) < 0.01  # 3e-3 of samples and of perspective
+
+
+def test_harmonics_colour_a_gaussian_by_where_it_is_seen_from(device):
+    """Kerbl's signs and order: with r the direction from the camera, -y, z and -x."""
+    factors = (0.5 / math.sqrt(math.pi), 0.5 * math.sqrt(3.0 / math.pi))
+    coefficients = torch.zeros(4, 3, dtype=torch.float64, device=device)
+    coefficients[0] = coefficients.new_tensor([0.4, -0.2, -5.0])
+    coefficients[1:, 0] = coefficients.new_tensor([0.3, 0.5, -0.2])
+    gaussians = single((0.0, 0.0, 0.0), device=device)
+    gaussians[4] = coefficients[None, None]
+    eyes = torch.tensor([[0.0, 0.0, 2.0], [2.0, 0.0, 0.0], [1.0, 1.5, 0.7]], dtype=torch.float64)
+    cameras = dataclasses.replace(frontal(33, 33), world_to_camera=look_at(eyes, (0.0, 0.0, 0.0)))
+    image = render_gaussians(*gaussians, cameras.to(device)).image[0, :, 16, 16].cpu()
+    x, y, z = (-eyes / eyes.norm(dim=-1, keepdim=True)).unbind(-1)
+    red = 0.5 + factors[0] * 0.4 + factors[1] * (-0.3 * y + 0.5 * z + 0.2 * x)
+    torch.testing.assert_close(image[:, 0], 0.5 * red, rtol=1e-9, atol=0.0)
+    green = torch.full_like(red, 0.5 - 0.2 * factors[0])
+    torch.testing.assert_close(image[:, 1], 0.5 * green, rtol=1e-9, atol=0.0)
+    assert float(image[:, 2].abs().max()) == 0.0
+
+
+def test_the_nearest_is_on_top_and_covers_at_most_nine_tenths_and_nine(device):
+    near, far = (
+        single((0.0, 0.0, depth), scale=(0.5,) * 3, opacity=1.0, colour=colour, device=device)
+        for depth, colour in ((2.0, (1.0, 0.0, 0.0)), (3.0, (0.0, 1.0, 0.0)))
+    )
+    both = [torch.cat(pair, dim=1) for pair in zip(far, near, strict=True)]
+    image, alpha, _ = render_gaussians(*both, frontal(31, 31, device=device))
+    expected = torch.tensor([0.99, 0.0099, 0.0], dtype=torch.float64)
+    torch.testing.assert_close(image[0, 0, 15, 15].cpu(), expected)
+    assert float(alpha[0, 0, 15, 15]) == pytest.approx(0.9999)
+
+
+def test_what_lies_behind_enough_is_not_seen_and_has_no_gradient(device):
+    """Two at 0.99 leave 1e-4; a third would leave less."""
+    layers = [
+        single((0.0, 0.0, 2.0 + k), scale=(50.0, 50.0, 0.1), opacity=1.0, device=device)
+        for k in range(3)
+    ]
+    gaussians = [torch.cat(parts, dim=1).requires_grad_() for parts in zip(*layers, strict=True)]
+    pictures = render_gaussians(*gaussians, frontal(20, 20, device=device))
+    gradients = torch.autograd.grad(pictures.image.sum(), gaussians)
+    assert float(pictures.alpha.detach().min()) == pytest.approx(0.9999)
+    for gradient in gradients:
+        assert float(gradient[0, 2].abs().max()) == 0.0
+    assert float(gradients[4][0, 1].min()) == pytest.approx(400 * 0.0099)
+
+
+def test_without_visible_gaussians_there_is_the_background(device):
+    scene = Scene(worlds=2, views=2, size=(20, 18))
+    gaussians, cameras = scene.of(torch.float32, device)
+    with torch.no_grad():
+        gaussians[0][..., 1] -= 50.0
+        gaussians[3][1] = 0.003
+        gaussians[0][1, ..., 1] += 50.0
+    background = torch.rand(2, 2, 18, 20, 3, device=device).requires_grad_()
+    pictures = render_gaussians(*gaussians, cameras, background=background)
+    assert torch.equal(pictures.image, background)
+    assert float(pictures.alpha.detach().abs().max()) == 0.0
+    gradients = torch.autograd.grad(pictures.image.sum(), [*gaussians, background])
+    assert all(float(gradient.abs().max()) == 0.0 for gradient in gradients[:5])
+    assert torch.equal(gradients[5], torch.ones_like(background))
+
+
+@pytest.mark.parametrize("shape", [(3,), (2, 1, 1, 1, 3), (1, 2, 18, 20, 1), (18, 20, 3)])
+def test_backgrounds_are_seen_through_the_gaussians(shape, device):
+    scene = Scene(worlds=2, views=2, size=(20, 18))
+    gaussians, cameras = scene.of(torch.float64, device)
+    background = torch.rand(shape, dtype=torch.float64, device=device)
+    image, alpha, _ = render_gaussians(*gaussians, cameras, background=background)
+    alone = render_gaussians(*gaussians, cameras).image
+    torch.testing.assert_close(image, alone + (1.0 - alpha)[..., None] * background)
+
+
+def test_the_order_of_particles_does_not_matter(device):
+    gaussians, cameras = SCENES["batch"].of(torch.float32, device)
+    order = torch.randperm(50, generator=torch.Generator().manual_seed(4)).to(device)
+    shuffled = [t.detach()[:, order].requires_grad_() for t in gaussians]
+    image, alpha, *gradients = pulled(gaussians, cameras)
+    other_image, other_alpha, *others = pulled(shuffled, cameras)
+    assert torch.equal(image, other_image)
+    assert torch.equal(alpha, other_alpha)
+    assert all(torch.equal(g[:, order], o) for g, o in zip(gradients, others, strict=True))
+
+
+def test_a_turned_world_looks_the_same_to_a_turned_camera(device):
+    """The world's motion g: means g p, rotations g R; a camera's frame is W inverse(g)."""
+    gaussians, cameras = SCENES["batch"].of(torch.float64, device)
+    turn = torch.tensor([0.3, -0.7, 0.5, 0.2], dtype=torch.float64, device=device)
+    turn = turn / turn.norm()
+    rotation = oracle.rotations(turn)
+    shift = torch.tensor([0.4, -1.0, 2.0], dtype=torch.float64, device=device)
+    w, v = turn[:1], turn[1:]
+    own_w, own_v = gaussians[2][..., :1], gaussians[2][..., 1:]
+    product = torch.cat(
+        (
+            w * own_w - (own_v * v).sum(-1, keepdim=True),
+            w * own_v + own_w * v + torch.linalg.cross(v.expand_as(own_v), own_v),
+        ),
+        dim=-1,
+    )
+    motion = torch.eye(4, dtype=torch.float64, device=device)
+    motion[:3, :3], motion[:3, 3] = rotation, shift
+    moved = [gaussians[0] @ rotation.mT + shift, gaussians[1], product, *gaussians[3:]]
+    turned = dataclasses.replace(
+        cameras, world_to_camera=cameras.world_to_camera @ torch.linalg.inv(motion)
+    )
+    expected = render_gaussians(*gaussians, cameras)
+    pictures = render_gaussians(*moved, turned)
+    assert relative_error(pictures.image, expected.image) < 1e-11  # 2e-14
+    assert relative_error(pictures.alpha, expected.alpha) < 1e-11
+
+
+def test_equally_deep_gaussians_lie_in_the_order_of_their_indices(device):
+    """Hundreds at one depth: the first is on top, on every run."""
+    generator = torch.Generator().manual_seed(5)
+    count = 300
+    means = torch.rand(1, count, 3, generator=generator).to(device) * 2.0 - 1.0
+    means[..., 2] = 3.0
+    colours = torch.rand(1, count, 3, generator=generator).to(device)
+    others = [
+        torch.full((1, count, 3), 0.2, device=device),
+        torch.tensor([1.0, 0.0, 0.0, 0.0], device=device).expand(1, count, 4),
+        torch.full((1, count), 0.7, device=device),
+    ]
+    camera = frontal(40, 40, dtype=torch.float32, device=device)
+    image = render_gaussians(means, *others, colours, camera).image
+    exact = [t.cpu().double() for t in (means, *others, colours)]
+    expected, _ = expected_pictures(exact, frontal(40, 40))
+    assert relative_error(image, expected) < PICTURE_BOUND[torch.float32]
+    turned = render_gaussians(means.flip(1), *others, colours.flip(1), camera).image
+    assert relative_error(turned, expected) > 0.01
+    assert torch.equal(render_gaussians(means, *others, colours, camera).image, image)
+
+
+@pytest.mark.parametrize("name", ["a camera for each", "harmonics"])
+def test_results_are_bit_identical_and_independent_of_the_batch(name, device):
+    gaussians, cameras = SCENES[name].of(torch.float32, device)
+    expected = pulled(gaussians, cameras)
+    assert all(
+        torch.equal(*pair) for pair in zip(pulled(gaussians, cameras), expected, strict=True)
+    )
+    bars = cotangents(*expected[:2])
+    for world in range(gaussians[0].shape[0]):
+        only = slice(world, world + 1)
+        alone = [t.detach()[only].requires_grad_() for t in gaussians]
+        own = cameras
+        if cameras.world_count is not None:
+            own = dataclasses.replace(
+                cameras,
+                world_to_camera=cameras.world_to_camera[only],
+                intrinsics=cameras.intrinsics[only],
+            )
+        drawn = render_gaussians(*alone, own)[:2]
+        gradients = torch.autograd.grad(drawn, alone, [bar[only] for bar in bars])
+        for value, wanted in zip((*drawn, *gradients), expected, strict=True):
+            assert torch.equal(value, wanted[only])
+
+
+def test_quaternions_may_have_any_length(device):
+    gaussians, cameras = SCENES["one world"].of(torch.float64, device)
+    image, _, *gradients = pulled(gaussians, cameras)
+    longer = [t.detach().clone().requires_grad_() for t in gaussians]
+    with torch.no_grad():
+        longer[2] *= 7.0
+    other, _, *others = pulled(longer, cameras)
+    assert relative_error(other, image) < 1e-12
+    assert relative_error(7.0 * others[2], gradients[2]) < 1e-12
+    along = (gradients[2] * gaussians[2].detach()).sum(-1)
+    assert float(along.abs().max()) < 1e-10 * float(gradients[2].abs().max())
+
+
+def test_a_zero_quaternion_is_no_rotation_and_has_no_gradient(device):
+    gaussians = single((0.1, 0.2, 2.0), scale=(0.3, 0.1, 0.2), device=device)
+    camera = frontal(30, 30, device=device)
+    expected = render_gaussians(*gaussians, camera).image
+    gaussians[2] = torch.zeros_like(gaussians[2]).requires_grad_()
+    image = render_gaussians(*gaussians, camera).image
+    assert torch.equal(image, expected)
+    (gradient,) = torch.autograd.grad(image.square().sum(), gaussians[2])
+    assert float(gradient.abs().max()) == 0.0
+
+
+NAMES = ("means", "scales", "quaternions", "opacities", "colours")
+HOSTILE = [
+    *((name, value) for name in NAMES for value in (math.nan, math.inf)),
+    *((name, 1e30) for name in ("means", "scales")),
+]
+
+
+@pytest.mark.parametrize(("name", "value"), HOSTILE)
+def test_gaussians_that_are_not_finite_leave_the_picture_alone(name, value, device):
+    gaussians, cameras = SCENES["batch"].of(torch.float32, device)
+    expected = pulled(gaussians, cameras)
+    hostile = [torch.cat((t.detach()[:, :1], t.detach()), dim=1) for t in gaussians]
+    hostile[NAMES.index(name)][:, 0] = value
+    got = pulled([t.requires_grad_() for t in hostile], cameras)
+    assert torch.equal(got[0], expected[0])
+    assert torch.equal(got[1], expected[1])
+    for value_bar, wanted in zip(got[2:], expected[2:], strict=True):
+        assert torch.equal(value_bar[:, 1:], wanted)
+        assert float(value_bar[:, 0].abs().max()) == 0.0
+
+
+class TestRoom:
+    """A picture has room for so many pairs of a tile and a Gaussian."""
+
+    @functools.cached_property
+    def scene(self):
+        return Scene(worlds=2, particles=40, size=(64, 64), scales=(0.1, 0.2), spread=0.8)
+
+    def test_enough_room_changes_nothing(self, device):
+        gaussians, cameras = self.scene.of(torch.float32, device)
+        expected = pulled(gaussians, cameras, pairs_per_particle=16)
+        for value, wanted in zip(
+            pulled(gaussians, cameras, pairs_per_particle=20), expected, strict=True
+        ):
+            assert torch.equal(value, wanted)
+        assert not render_gaussians(*gaussians, cameras, pairs_per_particle=16).overflow.any()
+
+    def test_without_room_the_farthest_are_missing(self, device):
+        gaussians, cameras = self.scene.of(torch.float32, device)
+        with torch.no_grad():
+            gaussians[1][1] = 1e-3  # the second world needs little room
+        full = render_gaussians(*gaussians, cameras, pairs_per_particle=16)
+        pictures = render_gaussians(*gaussians, cameras, pairs_per_particle=3)
+        assert pictures.overflow.tolist() == [[True], [False]]
+        assert torch.equal(pictures.image[1], full.image[1])
+        assert bool(pictures.image.isfinite().all())
+        (gradient,) = torch.autograd.grad(pictures.image.sum(), gaussians[4])
+        drawn = gradient[0].abs().amax(-1) > 0.0
+        motion = cameras.world_to_camera[0]
+        opacities = gaussians[3][0].detach()
+        depths = (gaussians[0][0].detach() @ motion[:3, :3].mT + motion[:3, 3])[:, 2]
+        assert 5 < int(drawn.sum()) < 35
+        assert float(depths[drawn].max()) < float(depths[~drawn & (opacities > 0.1)].min())
+        nearest = [t.detach()[:1, drawn] for t in gaussians]
+        assert torch.equal(render_gaussians(*nearest, cameras).image[0], pictures.image[0])
+
+    def test_a_gaussian_with_one_pair_too_many_is_missing(self, device):
+        """The nearer one covers a tile, the farther one two: room for two pairs, or for four."""
+        near = single((-0.15, 0.0, 1.0), scale=(0.005,) * 3, device=device)
+        far = single((0.0, 0.0, 2.0), scale=(0.01,) * 3, device=device)
+        both = [torch.cat(pair, dim=1) for pair in zip(far, near, strict=True)]
+        camera = frontal(32, 16, device=device)
+        full = render_gaussians(*both, camera, pairs_per_particle=2)
+        assert not bool(full.overflow.any())
+        pictures = render_gaussians(*both, camera, pairs_per_particle=1)
+        assert bool(pictures.overflow.all())
+        assert torch.equal(pictures.image, render_gaussians(*near, camera).image)
+        assert float(full.alpha[..., 15:17].min(-1).values.max()) > 0.1
+
+    def test_pairs_are_sorted_by_tile_and_depth(self, device):
+        """Straight from the lists: no pair twice, each as near as the next or nearer."""
+        gaussians, cameras = self.scene.of(torch.float32, device)
+        lens = (cameras.world_to_camera, cameras.intrinsics)
+        size = (cameras.width, cameras.height)
+        *_, slots, starts, owners, places = _gaussians(
+            *(t.detach() for t in gaussians), *lens, *size, cameras.near, 0.3, 16
+        )
+        motion = cameras.world_to_camera[0]
+        depths = (gaussians[0] @ motion[:3, :3].mT + motion[:3, 3])[..., 2].view(-1)
+        bounds = starts.tolist()
+        assert len(bounds) == 2 * 16 + 1
+        assert bounds[-1] > 100
+        for tile in range(32):
+            owned = owners[bounds[tile] : bounds[tile + 1]].long()
+            assert bool((owned // 40 == tile // 16).all())
+            assert bool((depths[owned].diff() > 0.0).all())
+        used = places[: bounds[-1]]
+        assert used.unique().numel() == bounds[-1]
+        assert bool((slots[owners[: bounds[-1]].long()] <= used).all())
+
+
+def test_a_gaussian_is_seen_from_the_near_plane_on(device):
+    for depth, seen in ((0.999, False), (1.001, True)):
+        camera = dataclasses.replace(frontal(20, 20, device=device), near=1.0)
+        alpha = render_gaussians(*single((0.0, 0.0, depth), device=device), camera).alpha
+        assert bool(alpha.max() > 0.4) == seen
+
+
+def test_inputs_may_lie_anywhere_in_memory(device):
+    gaussians, cameras = SCENES["batch"].of(torch.float32, device)
+    expected = pulled(gaussians, cameras)
+    strided = [t.detach().transpose(0, 1).contiguous().transpose(0, 1) for t in gaussians]
+    turned = dataclasses.replace(
+        cameras, world_to_camera=cameras.world_to_camera.mT.contiguous().mT
+    )
+    for value, wanted in zip(
+        pulled([t.requires_grad_() for t in strided], turned), expected, strict=True
+    ):
+        assert torch.equal(value, wanted)
+
+
+def test_alpha_alone_has_gradients(device):
+    gaussians, cameras = SCENES["one world"].of(torch.float64, device)
+    exact = [t.detach().cpu().requires_grad_() for t in gaussians]
+    _, alpha = expected_pictures(exact, cameras.to("cpu"))
+    wanted = torch.autograd.grad(alpha.square().sum(), exact[:4])
+    drawn = render_gaussians(*gaussians, cameras).alpha
+    got = torch.autograd.grad(drawn.square().sum(), gaussians)
+    for value, expected in zip(got[:4], wanted, strict=True):
+        assert relative_error(value, expected) < GRADIENT_BOUND[torch.float64]
+    assert float(got[4].abs().max()) == 0.0
+
+
+@pytest.mark.parametrize("pairs", [None, 12])
+def test_a_compiled_function_equals_the_eager_one(pairs, device):
+    def loss(*gaussians):
+        pictures = render_gaussians(*gaussians, cameras, pairs_per_particle=pairs)
+        return pictures.image.square().sum() + pictures.alpha.sum()
+
+    gaussians, cameras = SCENES["batch"].of(torch.float32, device)
+    compiled = torch.compile(loss, backend="aot_eager", fullgraph=True)
+    value, expected = compiled(*gaussians), loss(*gaussians)
+    assert torch.equal(value, expected)
+    got = torch.autograd.grad(value, gaussians)
+    wanted = torch.autograd.grad(expected, gaussians)
+    assert all(torch.equal(*pair) for pair in zip(got, wanted, strict=True))
+
+
+@pytest.mark.gpu
+def test_a_recorded_graph_draws_what_it_is_given():
+    if not torch.cuda.is_available():
+        pytest.skip("needs a CUDA device")
+    gaussians, cameras = SCENES["batch"].of(torch.float32, torch.device("cuda"))
+    bars = cotangents(*render_gaussians(*gaussians, cameras)[:2])
+
+    def drawn():
+        pictures = render_gaussians(*gaussians, cameras)[:2]
+        return [*pictures, *torch.autograd.grad(pictures, gaussians, bars)]
+
+    expected = drawn()
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        recorded = drawn()
+    with torch.no_grad():
+        gaussians[0].mul_(0.5)
+    graph.replay()
+    assert relative_error(recorded[0], expected[0]) > 0.01
+    with torch.no_grad():
+        gaussians[0].mul_(2.0)
+    graph.replay()
+    assert all(torch.equal(*pair) for pair in zip(recorded, expected, strict=True))
+
+
+ONE = torch.zeros(1, 2, 3)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"means": torch.zeros(2, 3)}, r"means must have shape \[B, N, 3\].*means\[None\]"),
+        ({"means": torch.zeros(1, 2, 2)}, r"got \(1, 2, 2\)"),
+        ({"means": torch.zeros(1, 0, 3)}, "at least one world and one particle"),
+        ({"means": torch.zeros(1, 2, 3, dtype=torch.float16)}, "means must be float32 or float64"),
+        ({"means": [[0.0] * 3]}, "means must be a torch tensor"),
+        ({"scales": torch.zeros(1, 3, 3)}, r"scales must have shape .* \[B, N\] = \[1, 2\]"),
+        ({"scales": torch.tensor([[[1.0] * 3, [1.0, -1.0, 1.0]]])}, "must not be negative .* 1"),
+        ({"scales": torch.zeros(1, 2, 3).double()}, "scales and means must share dtype"),
+        ({"quaternions": torch.zeros(1, 2, 3)}, r"quaternions must have shape \[B, N, 4\]"),
+        ({"opacities": torch.zeros(1, 2, 1)}, r"opacities must have shape \[B, N\]"),
+        ({"colours": torch.zeros(1, 2, 5)}, r"colours must have shape .* K from 1 to 4"),
+        ({"colours": torch.zeros(1, 2, 3, 3)}, r"\[B, N, 4, 3\]"),
+        ({"cameras": torch.eye(4)}, "cameras must be Cameras, got Tensor"),
+        ({"background": torch.zeros(2)}, r"must broadcast to .* = \[1, 1, 8, 8, 3\]"),
+        ({"background": torch.zeros(4, 1, 1, 1, 3)}, r"got \(4, 1, 1, 1, 3\)"),
+        ({"dilation": -0.1}, "dilation must be finite and at least 0"),
+        ({"dilation": math.nan}, "dilation must be finite"),
+        ({"pairs_per_particle": 0}, "pairs_per_particle must be at least 1"),
+        ({"pairs_per_particle": 2**30}, "split the batch or lower pairs_per_particle"),
+    ],
+)
+def test_what_does_not_fit_is_a_clear_error(change, message):
+    given = {
+        "means": ONE,
+        "scales": ONE + 0.1,
+        "quaternions": torch.ones(1, 2, 4),
+        "opacities": torch.ones(1, 2),
+        "colours": ONE,
+        "cameras": frontal(8, 8, dtype=torch.float32),
+    }
+    with pytest.raises(NPAError, match=message):
+        render_gaussians(**{**given, **change})
+
+
+def test_each_world_needs_cameras_where_they_are_its_own():
+    gaussians, _ = Scene(worlds=2).of(torch.float32, "cpu")
+    _, cameras = Scene(worlds=3, own_cameras=True).of(torch.float32, "cpu")
+    with pytest.raises(NPAError, match=r"each of 2 worlds, got .* \(3, 1, 4, 4\)"):
+        render_gaussians(*gaussians, cameras)
