@@ -85,7 +85,7 @@ def test_gradients_equal_finite_differences(loss):
         total, _ = task.loss(x, s, path_length)
         (gradient,) = torch.autograd.grad(total, moved)
         moved.requires_grad_(False)
-        step = 1e-6
+        step = 1e-8
         ahead, behind = (
             task.loss(
                 x + sign * step * way if moved is x else x,
@@ -95,8 +95,8 @@ def test_gradients_equal_finite_differences(loss):
             for sign in (1.0, -1.0)
         )
         slope = float(ahead - behind) / (2.0 * step)
-        # Relative error up to 2e-6 seen: sorting has kinks.
-        assert float((gradient * way).sum()) == pytest.approx(slope, rel=1e-4)
+        # Up to 2e-6 was seen; it falls with the step, as sorting has kinks.
+        assert float((gradient * way).sum()) == pytest.approx(slope, rel=2e-5)
 
 
 def test_loss_is_the_weighted_sum_of_its_parts():
@@ -136,8 +136,8 @@ def test_particles_in_the_target_s_place_are_nearer_than_any_others():
     drawn = float(task.metric(places, s))
     shuffled = float(task.metric(places, s[:, torch.randperm(48**2)]))
     blank = float(task.metric(places, torch.zeros_like(s)))
-    # 0.08, 1.3 and 1.7 were seen.
-    assert drawn < 0.2
+    # 0.07, 0.98 and 3.7 were seen.
+    assert drawn < 0.1
     assert min(shuffled, blank) > 5.0 * drawn
 
 
@@ -199,9 +199,9 @@ def test_tiny_preset_learns_where_the_dots_are(tmp_path):
     def mean(records, name):
         return sum(record[name] for record in records) / len(records)
 
-    # Seen over four seeds: TODO
+    # Seen over four seeds: 1.92 to 1.96 at first, 0.33 to 0.40 at last.
     assert mean(log[:4], "density") > 1.5
-    assert mean(log[-8:], "density") < 0.9
+    assert mean(log[-8:], "density") < 0.6
     assert len(list(tmp_path.glob("run/pictures/*.png"))) == 3
 
     rule = load_rule(tmp_path / "run" / "rule.safetensors")
