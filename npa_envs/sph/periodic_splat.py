@@ -6,7 +6,6 @@ import math
 
 from torch import Tensor
 
-from npa_envs.errors import NPAError
 from npa_envs.kernels.lens import PATCH_SIGMAS
 from npa_envs.sph.splat import check_particles, check_window, splat
 
@@ -45,19 +44,13 @@ def periodic_splat(
         weights, which sum to (R h / (hi - lo))^2 for each particle; y points to higher rows.
 
     Raises:
-        NPAError: A shape does not fit, a number is out of its range, or a particle's patch is wider
-            than the box.
+        NPAError: A shape does not fit or a number is out of its range.
     """
     check_particles(x, colour, 3)
     check_window(resolution, pixel_size, sigma, lo, hi)
     step = (hi - lo) / resolution
     # A particle at the upper edge may round to the pixel behind the last one.
     margin = math.ceil(PATCH_SIGMAS * sigma * pixel_size / step) + 1
-    if margin > resolution:
-        raise NPAError(
-            f"pixel_size times sigma must be small against the box, got {pixel_size} and {sigma} "
-            f"in a box of side {hi - lo:g}: a particle's patch may reach at most around it once"
-        )
     side = resolution + 2 * margin
     # Whole boxes are taken off without gradient: what is left moves as the particle does.
     boxes = ((x.detach() - lo) / (hi - lo)).floor()
@@ -71,13 +64,19 @@ def periodic_splat(
         lo=lo + (0.5 - margin) * step,
         hi=hi + (margin - 0.5) * step,
     )
-    return _folded(_folded(canvas, 1, margin), 2, margin)
+    return _folded(_folded(canvas, 1, margin, resolution), 2, margin, resolution)
 
 
-def _folded(canvas: Tensor, dim: int, margin: int) -> Tensor:
-    """Return the canvas with its margins along a dimension added to the opposite sides."""
-    low, inside, high = canvas.split((margin, canvas.shape[dim] - 2 * margin, margin), dim=dim)
-    folded = inside.clone()
-    folded.narrow(dim, inside.shape[dim] - margin, margin).add_(low)
-    folded.narrow(dim, 0, margin).add_(high)
+def _folded(canvas: Tensor, dim: int, margin: int, period: int) -> Tensor:
+    """Return the sum of a canvas's pixels that are a period apart; the first lies in a margin."""
+    length = canvas.shape[dim]
+    shape = list(canvas.shape)
+    shape[dim] = period
+    folded = canvas.new_zeros(shape)
+    begin = 0
+    while begin < length:
+        place = (begin - margin) % period
+        count = min(period - place, length - begin)
+        folded.narrow(dim, place, count).add_(canvas.narrow(dim, begin, count))
+        begin += count
     return folded

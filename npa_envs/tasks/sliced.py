@@ -36,15 +36,19 @@ FLOOR = 0.01
 """Variance that is added to the target's, so that an even target can be compared with, too."""
 
 
-class Descriptor(Protocol):
-    """What numbers describe an image."""
+ALIGNMENT = 64
+"""Bytes that a table's address is a multiple of."""
 
-    def __call__(self, image: Tensor, *, wrap: bool, thinned: bool) -> list[Tensor]:
-        """Return the numbers at each place of one image, a table for each size, [M, F] each.
+
+class Descriptor(Protocol):
+    """What numbers describe images."""
+
+    def __call__(self, images: Tensor, *, wrap: bool, thinned: bool) -> list[Tensor]:
+        """Return the numbers at each place of images, a table for each size, [B, M, F] each.
 
         Args:
-            image: The image, shape [K, R, R].
-            wrap: Whether its opposite edges meet; otherwise places near them are left out.
+            images: The images, shape [B, K, R, R].
+            wrap: Whether their opposite edges meet; otherwise places near them are left out.
             thinned: Whether at most `PLACES` along each side are enough.
         """
 
@@ -74,13 +78,13 @@ class SlicedWasserstein:
         self._shape = tuple(target.shape)
         with torch.no_grad():
             # The worlds' own number of places decides how finely the target's are resolved.
-            counts = [len(numbers) for numbers in descriptor(target, wrap=True, thinned=True)]
-            described = descriptor(target.double(), wrap=tiles, thinned=False)
+            thinned = descriptor(target[None], wrap=True, thinned=True)
+            described = descriptor(target[None].double(), wrap=tiles, thinned=False)
             self._quantiles = [
-                quantiles(numbers.T, count).to(target)
-                for numbers, count in zip(described, counts, strict=True)
+                quantiles(numbers[0].T, found.shape[1]).to(target)
+                for numbers, found in zip(described, thinned, strict=True)
             ]
-            self._scales = [1.0 / (numbers.var(0).mean() + FLOOR) for numbers in described]
+            self._scales = [1.0 / (numbers[0].var(0).mean() + FLOOR) for numbers in described]
 
     def __call__(self, images: Tensor) -> Tensor:
         """Return the distance of each image (dimensionless), shape [B]; differentiable.
@@ -92,12 +96,10 @@ class SlicedWasserstein:
             NPAError: They have another shape than the target.
         """
         check_images(images, self._shape)
-        # One by one: the products of a batch may round otherwise than those of one image.
-        described = [self._descriptor(image, wrap=True, thinned=True) for image in images]
+        described = self._descriptor(images, wrap=True, thinned=True)
         total = images.new_zeros(len(images))
-        levels = zip(zip(*described, strict=True), self._quantiles, self._scales, strict=True)
-        for numbers, expected, scale in levels:
-            ordered = torch.stack([table.T for table in numbers]).sort(dim=-1).values
+        for numbers, expected, scale in zip(described, self._quantiles, self._scales, strict=True):
+            ordered = numbers.transpose(1, 2).contiguous().sort(dim=-1).values
             squares = (ordered - expected.to(ordered)).square()
             distance = world_mean(squares.flatten(1)[..., None])[:, 0]
             total = total + scale.to(distance) * distance
@@ -121,11 +123,11 @@ class PatchDescriptor:
             orthogonal(size, size, generator).to(like) for _ in range(level_count(like.shape[-1]))
         ]
 
-    def __call__(self, image: Tensor, *, wrap: bool, thinned: bool) -> list[Tensor]:
-        """Return the patches' coordinates, [M, K PATCH²] for each size."""
-        sizes = pyramid(image, len(self._directions))
+    def __call__(self, images: Tensor, *, wrap: bool, thinned: bool) -> list[Tensor]:
+        """Return the patches' coordinates, [B, M, K PATCH²] for each size."""
+        sizes = pyramid(images, len(self._directions))
         return [
-            patches(level, PATCH, stride=stride_of(level, thinned), wrap=wrap) @ direction.to(image)
+            products(patches(level, PATCH, stride=stride_of(level, thinned), wrap=wrap), direction)
             for level, direction in zip(sizes, self._directions, strict=True)
         ]
 
@@ -154,18 +156,20 @@ class FilterDescriptor:
             second = orthogonal(2 * FILTERS * SECOND_PATCH**2, 2 * FILTERS, generator)
             self._levels.append((first.to(like), second.to(like)))
 
-    def __call__(self, image: Tensor, *, wrap: bool, thinned: bool) -> list[Tensor]:
-        """Return the features of both layers, [M, 2 FILTERS] for each size and layer."""
+    def __call__(self, images: Tensor, *, wrap: bool, thinned: bool) -> list[Tensor]:
+        """Return the features of both layers, [B, M, 2 FILTERS] for each size and layer."""
         result = []
-        for level, filters in zip(pyramid(image, len(self._levels)), self._levels, strict=True):
-            first, second = (weights.to(image) for weights in filters)
-            signed = patches(level, PATCH, stride=1, wrap=wrap) @ first
-            features = torch.cat((signed, -signed), dim=1).relu()
+        for level, (first, second) in zip(
+            pyramid(images, len(self._levels)), self._levels, strict=True
+        ):
+            signed = products(patches(level, PATCH, stride=1, wrap=wrap), first)
+            features = torch.cat((signed, -signed), dim=2).relu()
             side = level.shape[-1] - (0 if wrap else PATCH - 1)
-            field = features.T.reshape(-1, side, side)
+            field = features.transpose(1, 2).unflatten(2, (side, side))
             stride = stride_of(level, thinned)
-            result.append(field[:, ::stride, ::stride].flatten(1).T)
-            result.append(patches(field, SECOND_PATCH, stride=stride, wrap=wrap) @ second)
+            result.append(field[:, :, ::stride, ::stride].flatten(2).transpose(1, 2))
+            seen = patches(field, SECOND_PATCH, stride=stride, wrap=wrap)
+            result.append(products(seen, second))
         return result
 
 
@@ -195,14 +199,14 @@ def level_count(resolution: int) -> int:
     return count
 
 
-def pyramid(image: Tensor, count: int) -> list[Tensor]:
-    """Return an image [K, R, R] and `count` - 1 smaller ones, each of means of 2 x 2 pixels."""
-    levels = [image]
+def pyramid(images: Tensor, count: int) -> list[Tensor]:
+    """Return images [B, K, R, R] and `count` - 1 smaller ones, each of means of 2 x 2 pixels."""
+    levels = [images]
     while len(levels) < count:
         fine = levels[-1]
         # Written out: each sum has an order of its own, whatever the size of the batch.
-        rows = fine[:, ::2] + fine[:, 1::2]
-        levels.append(0.25 * (rows[:, :, ::2] + rows[:, :, 1::2]))
+        rows = fine[:, :, ::2] + fine[:, :, 1::2]
+        levels.append(0.25 * (rows[..., ::2] + rows[..., 1::2]))
     return levels
 
 
@@ -211,21 +215,36 @@ def stride_of(level: Tensor, thinned: bool) -> int:
     return max(1, level.shape[-1] // PLACES) if thinned else 1
 
 
-def patches(image: Tensor, size: int, *, stride: int, wrap: bool) -> Tensor:
-    """Return the square patches of an image as rows, shape [M, K size²].
+def patches(images: Tensor, size: int, *, stride: int, wrap: bool) -> Tensor:
+    """Return the square patches of images as rows, shape [B, M, K size²].
 
     Args:
-        image: The image, shape [K, R, R].
+        images: The images, shape [B, K, R, R].
         size: Pixels along each side, odd.
         stride: Pixels from one patch to the next.
         wrap: Whether patches reach across the edges; otherwise M is smaller.
     """
     if wrap:
         reach = size // 2
-        image = torch.cat((image[:, -reach:], image, image[:, :reach]), dim=1)
-        image = torch.cat((image[:, :, -reach:], image, image[:, :, :reach]), dim=2)
-    windows = image.unfold(1, size, stride).unfold(2, size, stride)
-    return windows.permute(1, 2, 0, 3, 4).flatten(2).flatten(0, 1)
+        images = torch.cat((images[:, :, -reach:], images, images[:, :, :reach]), dim=2)
+        images = torch.cat((images[..., -reach:], images, images[..., :reach]), dim=3)
+    windows = images.unfold(2, size, stride).unfold(3, size, stride)
+    return windows.permute(0, 2, 3, 1, 4, 5).flatten(3).flatten(1, 2)
+
+
+def products(rows: Tensor, weights: Tensor) -> Tensor:
+    """Return the rows of each image times weights, shape [B, M, F].
+
+    Image by image: the product of a whole batch may round otherwise than that of one image, and so
+    may that of numbers that lie otherwise in memory.
+
+    Args:
+        rows: Contiguous rows, shape [B, M, E].
+        weights: Shape [E, F].
+    """
+    weights = weights.to(rows)
+    tables = [one if one.data_ptr() % ALIGNMENT == 0 else one.clone() for one in rows]
+    return torch.stack([table @ weights for table in tables])
 
 
 def orthogonal(size: int, count: int, generator: torch.Generator) -> Tensor:
