@@ -124,7 +124,7 @@ def test_a_page_lists_the_arguments_with_their_defaults(registration, builder):
     config = builder.environment_class(registration).task_type.config_type()
     arguments = section(page, "Arguments")
     assert sorted(first_cells(arguments)) == sorted(vars(config))
-    assert '| `target` | str | `"gecko"` |' in arguments
+    assert f'| `target` | str | `"{config.target}"` |' in arguments
     assert "| `success_loss` | float or None | `None` |" in arguments
 
 

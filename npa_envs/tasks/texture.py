@@ -10,7 +10,7 @@ from torch import Tensor
 from npa_envs.errors import NPAError
 from npa_envs.randomness import Randomness
 from npa_envs.rule import COLOUR_OFFSET, NPARule
-from npa_envs.sph import periodic_splat
+from npa_envs.sph import periodic_splat, world_mean
 from npa_envs.tasks.damage import erase_state, random_particle
 from npa_envs.tasks.rules import untrained_rule
 from npa_envs.tasks.seeds import uniform_box
@@ -134,16 +134,7 @@ class Texture:
             x: Positions [length units], shape [B, N, 2].
             s: States, dimensionless, shape [B, N, C].
         """
-        half = 0.5 * self.config.box_size
-        return periodic_splat(
-            x,
-            s[..., -3:] + COLOUR_OFFSET,
-            resolution=self.config.resolution,
-            pixel_size=self.pixel_size,
-            sigma=self.config.sigma,
-            lo=-half,
-            hi=half,
-        )
+        return self._splat(x, s[..., -3:] + COLOUR_OFFSET)
 
     def texture_losses(self, x: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return each world's loss of the colour image and of the density image, shape [B] each.
@@ -158,17 +149,40 @@ class Texture:
         Raises:
             NPAError: The loss needs weights that are missing.
         """
-        compare_colours, compare_densities = self._losses
-        picture = self.picture(x - x[:, :1].detach(), s).movedim(-1, 1)
-        colour = compare_colours(picture[:, :3])
-        # One by one: the end of a tensor, which lies elsewhere in other batches, rounds otherwise.
-        density = torch.stack([density_image(world) for world in picture[:, 3:]])
-        return colour, compare_densities(density)
+        return self._compare(self.picture(x - x[:, :1].detach(), s))
 
     def metric(self, x: Tensor, s: Tensor) -> Tensor:
         """Return each world's texture loss, colour and density weighted, shape [B]."""
-        colour, density = self.texture_losses(x, s)
-        return self.config.colour_weight * colour + self.config.density_weight * density
+        return self._weighted(*self.texture_losses(x, s))
+
+    def particle_shares(self, x: Tensor, s: Tensor) -> Tensor:
+        """Return each particle's share of its world's texture loss, times N; [B, N].
+
+        To first order, the loss changes by some amount with what a particle adds to the picture.
+        Its share is the loss plus N times the amount by which it does worse there than the mean of
+        all; so the mean of the shares is `metric`, up to rounding.
+
+        Args:
+            x: Positions [length units], shape [B, N, 2].
+            s: States, dimensionless, shape [B, N, C].
+        """
+        x, s = x.detach(), s.detach()
+        x = x - x[:, :1]
+        blank = s.new_zeros(*s.shape[:2], 3).requires_grad_()
+        with torch.enable_grad():
+            picture = self.picture(x, s).requires_grad_()
+            loss = self._weighted(*self._compare(picture))
+            (slope,) = torch.autograd.grad(loss.sum(), picture)
+            # The picture is linear in the colours: its pull-back sums over a particle's patch.
+            drawn = self._splat(x, blank)
+            (pulled,) = torch.autograd.grad(drawn, blank, slope, retain_graph=True)
+            by_density = torch.zeros_like(slope)
+            by_density[..., 0] = slope[..., 3]
+            (density,) = torch.autograd.grad(drawn, blank, by_density)
+        red, green, blue = ((s[..., -3:] + COLOUR_OFFSET) * pulled).unbind(dim=-1)
+        amounts = (red + green + blue + density[..., 0])[..., None]
+        worse = amounts - world_mean(amounts)[:, None]
+        return loss.detach()[:, None] + x.shape[1] * worse[..., 0]
 
     def loss(self, x: Tensor, s: Tensor, path_length: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the training loss and its named parts, unweighted.
@@ -194,12 +208,33 @@ class Texture:
             "overflow": (s - s.clamp(-1.0, 1.0)).abs().mean(),
         }
         total = (
-            config.colour_weight * colour
-            + config.density_weight * density
+            self._weighted(colour, density)
             + config.motion_weight * parts["motion"]
             + config.overflow_weight * parts["overflow"]
         )
         return total, parts
+
+    def _splat(self, x: Tensor, colour: Tensor) -> Tensor:
+        half = 0.5 * self.config.box_size
+        return periodic_splat(
+            x,
+            colour,
+            resolution=self.config.resolution,
+            pixel_size=self.pixel_size,
+            sigma=self.config.sigma,
+            lo=-half,
+            hi=half,
+        )
+
+    def _compare(self, picture: Tensor) -> tuple[Tensor, Tensor]:
+        compare_colours, compare_densities = self._losses
+        channels = picture.movedim(-1, 1)
+        # One by one: the end of a tensor, which lies elsewhere in other batches, rounds otherwise.
+        density = torch.stack([density_image(world) for world in channels[:, 3:]])
+        return compare_colours(channels[:, :3]), compare_densities(density)
+
+    def _weighted(self, colour: Tensor, density: Tensor) -> Tensor:
+        return self.config.colour_weight * colour + self.config.density_weight * density
 
     @cached_property
     def _losses(self) -> tuple[TextureLoss, TextureLoss]:

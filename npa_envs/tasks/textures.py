@@ -35,6 +35,12 @@ class TextureTarget:
         """Mean density: how much of the square particles should cover (dimensionless)."""
         return float(self.picture[..., 3].double().mean())
 
+    @property
+    def mean_colour(self) -> Tensor:
+        """Mean red, green and blue of what is covered (dimensionless), shape [3]."""
+        sums = self.picture.double().sum(dim=(0, 1))
+        return (sums[:3] / sums[3]).to(self.picture)
+
 
 def builtin_textures() -> tuple[str, ...]:
     """Return the names of the textures that come with the package, in alphabetical order."""
