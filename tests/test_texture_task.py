@@ -124,6 +124,28 @@ def test_metric_is_the_same_in_every_batch():
     )
 
 
+@pytest.mark.parametrize("loss", ["patch_swd", "filter_swd"])
+def test_shares_average_to_the_loss_and_tell_what_a_particle_changes(loss):
+    task = Texture(dataclasses.replace(SMALL, loss=loss))
+    x, s = worlds(task, 2, torch.float64)
+    shares = task.particle_shares(x, s)
+    torch.testing.assert_close(shares.mean(1), task.metric(x, s), rtol=1e-9, atol=0.0)
+    # The change of the loss where a particle is drawn a little more strongly, by differences: its
+    # colours and its density grow by a share that a twin in the same place adds.
+    compare = task._compare
+    places = x[:1] - x[:1, :1]
+    colour = s[:1, :, -3:] + 0.5
+    picture = task.picture(places, s[:1])
+    values = []
+    for k in (3, 40, 41):
+        twin = task._splat(places[:, k : k + 1], colour[:, k : k + 1])
+        ahead, behind = (task._weighted(*compare(picture + h * twin)) for h in (1e-7, -1e-7))
+        values.append(float(ahead - behind) / 2e-7)
+    found = shares[0, [3, 40, 41]]
+    assert float(found[0] - found[1]) == pytest.approx(300 * (values[0] - values[1]), rel=1e-4)
+    assert float(found[2] - found[1]) == pytest.approx(300 * (values[2] - values[1]), rel=1e-4)
+
+
 def test_particles_in_the_target_s_place_are_nearer_than_any_others():
     """Particles on a fine lattice, coloured as the target, against the same colours shuffled."""
     config = TextureConfig(target="cells", particle_count=48**2, resolution=48, eps=0.2)

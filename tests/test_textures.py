@@ -59,6 +59,10 @@ def test_targets_are_colour_sums_and_density():
     assert (picture[..., :3] <= picture[..., 3:] + 1e-6).all()
     assert float(picture.min()) == 0.0
     assert float(picture[..., 3].max()) == 1.0
+    covered = picture[..., 3].double() / picture[..., 3].double().sum()
+    colour = picture[..., :3].double() / picture[..., 3:].double().clamp_min(1e-9)
+    expected = (colour * covered[..., None]).sum((0, 1)).float()
+    torch.testing.assert_close(target.mean_colour, expected)
 
 
 def test_a_picture_is_cropped_scaled_and_turned_upright(tmp_path):
