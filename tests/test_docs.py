@@ -218,6 +218,12 @@ def test_the_code_about_training_runs(capsys):
     assert capsys.readouterr().out.startswith("random: ")
 
 
+def test_the_code_about_textures_runs(capsys):
+    (block,) = code_blocks(DOCS / "textures.md")
+    exec(compile(block, "textures.md", "exec"), {})
+    assert capsys.readouterr().out.count("tensor([") == 2
+
+
 def test_the_code_of_the_readme_runs():
     operators, environments = code_blocks(ROOT / "README.md")
     names = {}

@@ -7,7 +7,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
@@ -133,7 +133,7 @@ def run(options: RolloutOptions) -> int:
             f"raise --steps above {late[0].step}"
         )
     rule = load_rule(options.rule, device=device).float()
-    fields = {
+    fields: dict[str, Any] = {
         "particle_count": options.particle_count,
         "target": options.target,
         "loss": options.loss,

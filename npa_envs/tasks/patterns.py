@@ -94,7 +94,7 @@ def bubbles(u: Array, v: Array, random: np.random.Generator) -> Array:
     """Rings of several sizes with a glint, nothing around them."""
     places = _scattered(random, 12, 0.23)
     gaps = [
-        min(math.hypot(*_away(*place, other)) for other in places if other is not place)
+        min(math.hypot(*_away(place[0], place[1], other)) for other in places if other is not place)
         for place in places
     ]
     tints = _colours("#48cae4", "#0096c7", "#5e60ce", "#80ffdb")
@@ -161,7 +161,7 @@ def _scattered(random: np.random.Generator, count: int, gap: float) -> list[Arra
     places: list[Array] = []
     while len(places) < count:
         place = random.random(2)
-        if all(math.hypot(*_away(*place, other)) >= gap for other in places):
+        if all(math.hypot(*_away(place[0], place[1], other)) >= gap for other in places):
             places.append(place)
         # Drawn less far apart rather than never.
         gap *= 0.999

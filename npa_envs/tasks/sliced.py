@@ -165,7 +165,7 @@ class FilterDescriptor:
             signed = products(patches(level, PATCH, stride=1, wrap=wrap), first)
             features = torch.cat((signed, -signed), dim=2).relu()
             side = level.shape[-1] - (0 if wrap else PATCH - 1)
-            field = features.transpose(1, 2).unflatten(2, (side, side))
+            field = features.transpose(1, 2).reshape(len(images), -1, side, side)
             stride = stride_of(level, thinned)
             result.append(field[:, :, ::stride, ::stride].flatten(2).transpose(1, 2))
             seen = patches(field, SECOND_PATCH, stride=stride, wrap=wrap)

@@ -61,7 +61,7 @@ class Texture:
         """What worlds are to look like."""
         self.target_picture = target.picture.to(device)
         """Its picture: colour sums and density, dimensionless, shape [R, R, 4]."""
-        self.pixel_size = config.box_size * (target.coverage / config.particle_count) ** 0.5
+        self.pixel_size: float = config.box_size * (target.coverage / config.particle_count) ** 0.5
         """Side of the square that a particle fills [length units]: all together have the target's
         mean density."""
 
