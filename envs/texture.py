@@ -228,7 +228,8 @@ class TextureEnv(NPAEnv):
 
     ## Vectorized environment
 
-    As in `Morphogenesis2DEnv`.
+    As in `Morphogenesis2DEnv`. With `loss="vgg_ot"` and `reward="particle"` particles' own rewards
+    may differ in their last bits from one number of worlds to another; nothing else does.
 
     ## References
 

@@ -16,6 +16,7 @@ from npa_envs.tasks.texture_config import TextureConfig
 from npa_envs.tasks.textures import load_texture
 from npa_envs.training import JsonlLog, Trainer, preset, train
 
+needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 SMALL = TextureConfig(target="bubbles", particle_count=300, resolution=24, eps=0.3)
 
 
@@ -248,6 +249,63 @@ def test_resumed_run_is_bit_identical(tmp_path):
     trainer.save()
     train(broken, "texture", resume=True, progress=False)
     assert log_of(tmp_path / "broken")[-2:] == log_of(tmp_path / "whole")[-2:]
+
+
+def test_training_runs_in_double_precision(tmp_path):
+    fields = {"iterations": 2, "milestones": (), "dtype": "float64", "loss": "filter_swd"}
+    result = train(
+        preset("tiny", "texture", out=tmp_path / "run", **fields), "texture", progress=False
+    )
+    assert {p.dtype for p in result.rule.parameters()} == {torch.float64}
+    assert result.record["loss"] > 0
+
+
+@pytest.mark.gpu
+@needs_cuda
+@pytest.mark.parametrize("loss", ["patch_swd", "filter_swd"])
+def test_graphs_train_the_same_rule_as_eager_launches(tmp_path, loss):
+    logs = []
+    for name, graphed in (("graph", True), ("eager", False)):
+        fields = {"iterations": 12, "device": "cuda", "cuda_graph": graphed, "loss": loss}
+        config = preset("tiny", "texture", out=tmp_path / name, milestones=(), **fields)
+        train(config, "texture", progress=False)
+        logs.append(log_of(tmp_path / name))
+    # The same kernels on the same numbers: only AdamW's amplification of rounding is allowed for.
+    for replayed, launched in zip(*logs, strict=True):
+        assert replayed == pytest.approx(launched, rel=1e-3)
+
+
+@pytest.mark.gpu
+@needs_cuda
+@pytest.mark.parametrize("loss", ["patch_swd", "filter_swd"])
+def test_iterations_never_wait_for_the_device(tmp_path, loss):
+    config = preset("tiny", "texture", out=tmp_path / "run", device="cuda", steps=(8, 9), loss=loss)
+    trainer = Trainer(Texture(config.task, device="cuda"), config, task_name="texture")
+    trainer._iterate()  # Captures the only graph, which does wait.
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        for _ in range(5):
+            trainer._iterate()
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert trainer.iteration == 6
+
+
+@pytest.mark.gpu
+@needs_cuda
+@pytest.mark.parametrize("loss", ["patch_swd", "filter_swd"])
+def test_losses_and_gradients_on_cuda_are_those_on_the_cpu(loss):
+    config = dataclasses.replace(SMALL, loss=loss, resolution=128, particle_count=2000)
+    found = []
+    for device in ("cpu", "cuda"):
+        task = Texture(config, device=device)
+        x, s = (t.to(device).requires_grad_() for t in worlds(task, 2, torch.float64))
+        value = task.metric(x, s)
+        gradients = torch.autograd.grad(value.sum(), (x, s))
+        found.append([t.detach().cpu() for t in (value, *gradients)])
+    # Sorted numbers that are equal up to rounding may change places.
+    for on_cpu, on_cuda in zip(*found, strict=True):
+        assert float((on_cpu - on_cuda).norm() / on_cpu.norm()) < 1e-6
 
 
 def test_missing_weights_are_named_before_anything_is_written(tmp_path, monkeypatch):

@@ -157,6 +157,14 @@ def test_densities_and_targets_that_do_not_tile_are_compared_too(options):
     assert float(edged(density[None])) > 1e-3
 
 
+def test_worlds_of_double_precision_are_compared_too(options):
+    loss = make_texture_loss("vgg_ot", colours("cells"), options)
+    image = torch.rand(1, 3, 32, 32, generator=torch.Generator().manual_seed(1))
+    double = loss(image.double())
+    assert double.dtype == torch.float64
+    torch.testing.assert_close(double.float(), loss(image))
+
+
 def test_missing_weights_are_an_error_that_says_how_to_get_them(tmp_path, monkeypatch):
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
     with pytest.raises(NPAError) as caught:

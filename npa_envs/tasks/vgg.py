@@ -67,7 +67,8 @@ class VGGFeatures:
             wrap: Whether opposite edges meet; otherwise images are mirrored at their edges.
         """
         mode = "circular" if wrap else "reflect"
-        field = (images - self._mean) / self._deviation
+        # In the weights' precision, whatever the worlds' is.
+        field = (images.to(self._mean) - self._mean) / self._deviation
         found = []
         index, last = 0, max(self._layers)
         for step in self._steps:
