@@ -11,7 +11,7 @@ from npa_envs.errors import NPAError
 from npa_envs.evaluation import evaluate
 from npa_envs.randomness import WorldRandom
 from npa_envs.rule_io import load_rule
-from npa_envs.tasks.texture import Texture, density_image
+from npa_envs.tasks.texture import Texture, colour_image, density_image
 from npa_envs.tasks.texture_config import TextureConfig
 from npa_envs.tasks.textures import load_texture
 from npa_envs.training import JsonlLog, Trainer, preset, train
@@ -58,6 +58,22 @@ def test_density_is_compared_as_its_tenth_root():
     expected = torch.tensor([1e-6, 1.001e-3, 1.000001, 2.000001], dtype=torch.float64) ** 0.1
     torch.testing.assert_close(values, expected)
     assert float(values[0]) == pytest.approx(10.0**-0.6)
+
+
+def test_colours_are_compared_as_the_mean_where_particles_overlap():
+    task = Texture(dataclasses.replace(SMALL, target="cells", particle_count=24**2))
+    axis = (torch.arange(24) + 0.5) / 12.0 - 1.0
+    y, x = torch.meshgrid(axis, axis, indexing="ij")
+    places = torch.stack((x, y), dim=-1).view(1, -1, 2)
+    _, s = worlds(task, 1)
+    colour, density = task.texture_losses(places, s)
+    # Every particle stands twice where it stood: as before, but twice as dense.
+    twice = task.texture_losses(places.repeat(1, 2, 1), s.repeat(1, 2, 1))
+    torch.testing.assert_close(twice[0], colour, rtol=1e-4, atol=0.0)
+    assert float(density) < 1e-4 < float(twice[1])
+    half = torch.tensor([0.1, 0.2, 0.3, 0.5])[:, None, None]
+    assert torch.equal(colour_image(half), half[:3])
+    torch.testing.assert_close(colour_image(4.0 * half), 2.0 * half[:3])
 
 
 @pytest.mark.parametrize("loss", ["patch_swd", "filter_swd"])

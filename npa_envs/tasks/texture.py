@@ -231,7 +231,7 @@ class Texture:
         channels = picture.movedim(-1, 1)
         # One by one: the end of a tensor, which lies elsewhere in other batches, rounds otherwise.
         density = torch.stack([density_image(world) for world in channels[:, 3:]])
-        return compare_colours(channels[:, :3]), compare_densities(density)
+        return compare_colours(colour_image(channels)), compare_densities(density)
 
     def _weighted(self, colour: Tensor, density: Tensor) -> Tensor:
         return self.config.colour_weight * colour + self.config.density_weight * density
@@ -243,9 +243,22 @@ class Texture:
         options = LossOptions(self.target.tiles, config.loss_seed, config.vgg_weights)
         target = self.target_picture.movedim(-1, 0)
         return (
-            make_texture_loss(config.loss, target[:3], options),
+            make_texture_loss(config.loss, colour_image(target), options),
             make_texture_loss(config.loss, density_image(target[3:]), options),
         )
+
+
+def colour_image(channels: Tensor) -> Tensor:
+    """Return colours as they are compared, and shown: where particles overlap, their mean.
+
+    Args:
+        channels: Colour sums and density, dimensionless, shape [..., 4, R, R].
+
+    Returns:
+        Red, green and blue, shape [..., 3, R, R]; black where nothing is.
+    """
+    sums, density = channels[..., :3, :, :], channels[..., 3:, :, :]
+    return sums / density.clamp_min(1.0)
 
 
 def density_image(density: Tensor) -> Tensor:
