@@ -113,9 +113,7 @@ def options() -> argparse.Namespace:
     parser.add_argument("--target", default="dots", help="a built-in texture or a picture")
     parser.add_argument("--losses", nargs="+", choices=TEXTURE_LOSSES, default=list(TEXTURE_LOSSES))
     parser.add_argument("--preset", default="paper", help="what the runs start from")
-    parser.add_argument(
-        "--quick", action="store_true", help="a minute on a CPU: preset fast, short"
-    )
+    parser.add_argument("--quick", action="store_true", help="preset fast, short: a CPU will do")
     parser.add_argument("--iterations", type=int, help="default: the preset's")
     parser.add_argument("--vgg-weights", default="", help="file of VGG16's weights")
     parser.add_argument("--steps", type=int, default=256, help="steps that worlds grow")
