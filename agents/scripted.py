@@ -114,7 +114,7 @@ class PaintPolicy(SpreadPolicy):
             goal = getattr(unwrapped(env).task, "goal", None)
             if goal is None:
                 raise NPAError("colour must be given where env has no target: colour=(0, 0.5, 0)")
-            colour = goal.target.colours.mean(dim=0)
+            colour = goal.target.mean_colour
         self._colour = torch.as_tensor(colour, dtype=torch.float32)
         if self._colour.shape != (3,):
             raise NPAError(

@@ -32,6 +32,10 @@ from npa_envs.agents import (
 from npa_envs.registration import ENVIRONMENTS
 
 TARGET = "gecko"
+"""What pictures are of; the shipped rule of that name plays where there are pictures."""
+
+NO_RULE = ("npa/Texture-v0",)
+"""Environments with targets of their own, for which no rule is shipped."""
 
 POLICIES: dict[str, Callable[[Any], Any]] = {
     "random": RandomPolicy,
@@ -91,17 +95,20 @@ def main() -> None:
     print(f"{'environment':24} {'policy':8} {'return':>15} {'start':>9} {'final':>8} {'steps':>6}")
     rows = []
     for registration in ENVIRONMENTS:
+        other = registration.id in NO_RULE
         env = gymnasium.make_vec(
             registration.id,
             num_envs=arguments.episodes,
             vectorization_mode="vector_entry_point",
-            target=TARGET,
             particle_count=arguments.particle_count,
             device=arguments.device,
             output="torch",
+            **({} if other else {"target": TARGET}),
             **keywords,
         )
         for name in arguments.policies:
+            if other and name == "rule":
+                continue
             episodes = evaluate_policy(env, POLICIES[name](env), range(arguments.episodes))
             rows.append(row_of(registration.id, name, episodes))
             print_row(rows[-1])

@@ -14,7 +14,7 @@ import gymnasium
 import numpy as np
 
 from npa_envs import load_rule
-from npa_envs.agents import RulePolicy
+from npa_envs.agents import RulePolicy, SpreadPolicy
 from npa_envs.registration import ENVIRONMENTS, Registration
 from npa_envs.render import write_filmstrip
 
@@ -35,8 +35,8 @@ class Film(NamedTuple):
     caption: str
     """What one sees."""
 
-    rule: str = "gecko"
-    """The shipped rule that acts."""
+    rule: str | None = "gecko"
+    """The shipped rule that acts; None: `SpreadPolicy`."""
 
 
 FILMS = {
@@ -50,6 +50,13 @@ FILMS = {
         rows=({"damage": "erase"}, {"damage": "cut"}, {"damage": "clump"}),
         caption="Episodes of the shipped rule `gecko`, one row for each kind of damage. They go on "
         "after success here, so that all of the healing can be seen.",
+    ),
+    "Texture": Film(
+        steps=(0, 1, 2, 8, 32, 64, 128),
+        rows=({},),
+        caption="An episode of `SpreadPolicy`, for which nothing was trained: particles repel each "
+        "other.",
+        rule=None,
     ),
 }
 """By the names of the environments."""
@@ -72,7 +79,7 @@ def film_episode(
         success_loss=0.0,
         **keywords,
     )
-    policy = RulePolicy(load_rule(film.rule), env)
+    policy = SpreadPolicy(env) if film.rule is None else RulePolicy(load_rule(film.rule), env)
     observation, _ = env.reset(seed=SEED)
     shots = []
     for step in range(max(film.steps) + 1):

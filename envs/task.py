@@ -151,6 +151,7 @@ class EnvTask(Generic[Config]):
                 pixel_size=self.pixel_size,
                 sigma=SHARPNESS,
                 half_width=max(1.0, 0.5 * (self.config.box or 0.0)),
+                periodic=self.space_dim == 2 and (self.config.box or 0.0) >= 2.0,
                 azimuth=TURN * float(steps[batch][0]),
             )
             for batch in batches

@@ -54,17 +54,24 @@ class EvaluationRow:
     loss_worst: float
     """The task's metric in the worst world."""
 
-    psnr: float
-    """PSNR of the picture against the target's, four channels in [0, 1], mean [dB]."""
+    psnr: float | None
+    """PSNR of the picture against the target's, four channels in [0, 1], mean [dB]; None where a
+    world is not to match the target pixel by pixel."""
 
-    psnr_worst: float
-    """PSNR in the worst world [dB]."""
+    psnr_worst: float | None
+    """PSNR in the worst world [dB], likewise."""
 
     overflow: float
     """mean |s − clip(s, −1, 1)|, mean of the worlds (dimensionless)."""
 
     extent: float
     """Longest side of a world's bounding box, mean of the worlds [length units]."""
+
+    @property
+    def figures(self) -> str:
+        """The loss and, where there is one, the PSNR, in words."""
+        psnr = "" if self.psnr is None else f", PSNR {self.psnr:5.2f} dB"
+        return f"loss {self.loss:.4f}{psnr}"
 
 
 @dataclass(frozen=True)
@@ -139,15 +146,17 @@ def measure(task: PictureTask, x: Tensor, s: Tensor, step: int) -> EvaluationRow
         step: Steps they have behind them.
     """
     loss = task.metric(x, s)
-    ratio = psnr(task.picture(x, s), task.target_picture.to(x.device))
+    ratio = None
+    if task.aligned:
+        ratio = psnr(task.picture(x, s), task.target_picture.to(x.device))
     overflow = (s - s.clamp(-1.0, 1.0)).abs().mean()
     extent = (x.amax(1) - x.amin(1)).amax(1).mean()
     return EvaluationRow(
         step=step,
         loss=loss.mean().item(),
         loss_worst=loss.max().item(),
-        psnr=ratio.mean().item(),
-        psnr_worst=ratio.min().item(),
+        psnr=None if ratio is None else ratio.mean().item(),
+        psnr_worst=None if ratio is None else ratio.min().item(),
         overflow=overflow.item(),
         extent=extent.item(),
     )

@@ -23,6 +23,8 @@ class CircleTask:
     eps = 0.2
     box: tuple[float, ...] | None = None
     update_prob = 0.5
+    aligned = True
+    metric_name = "distance from the circle"
 
     def __init__(self) -> None:
         self.loss_calls = 0

@@ -124,7 +124,7 @@ def test_a_page_lists_the_arguments_with_their_defaults(registration, builder):
     config = builder.environment_class(registration).task_type.config_type()
     arguments = section(page, "Arguments")
     assert sorted(first_cells(arguments)) == sorted(vars(config))
-    assert '| `target` | str | `"gecko"` |' in arguments
+    assert f'| `target` | str | `"{config.target}"` |' in arguments
     assert "| `success_loss` | float or None | `None` |" in arguments
 
 
@@ -216,6 +216,12 @@ def test_the_code_about_training_runs(capsys):
     (block,) = code_blocks(DOCS / "training.md")
     exec(compile(block, "training.md", "exec"), {})
     assert capsys.readouterr().out.startswith("random: ")
+
+
+def test_the_code_about_textures_runs(capsys):
+    (block,) = code_blocks(DOCS / "textures.md")
+    exec(compile(block, "textures.md", "exec"), {})
+    assert capsys.readouterr().out.count("tensor([") == 2
 
 
 def test_the_code_of_the_readme_runs():

@@ -72,7 +72,7 @@ def test_reference_answers_are_met(name, dtype, device, reference):
 def test_perception_and_its_adjoints_equal_the_oracle(dtype, space_dim, box, state_dim, device):
     x, s = random_world(3, 83, space_dim, state_dim, dtype=dtype, device=device)
     box = sides(box, space_dim)
-    exact_x, exact_s = x.cpu().double().requires_grad_(), s.cpu().double().requires_grad_()
+    exact_x, exact_s = (t.cpu().double().clone().requires_grad_() for t in (x, s))
     expected = oracle.perceive(exact_x, exact_s, 0.3, 0.2, box, detach_positions=False)
     cotangent = torch.randn(
         expected.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1)
@@ -92,7 +92,7 @@ def test_perception_and_its_adjoints_equal_the_oracle(dtype, space_dim, box, sta
 @pytest.mark.parametrize("dtype", DTYPES, ids=("float32", "float64"))
 def test_degenerate_geometry_equals_the_oracle(dtype, space_dim, device):
     x, s = degenerate_world(space_dim, 4, dtype=dtype, device=device)
-    exact_x, exact_s = x.cpu().double().requires_grad_(), s.cpu().double().requires_grad_()
+    exact_x, exact_s = (t.cpu().double().clone().requires_grad_() for t in (x, s))
     expected = oracle.perceive(exact_x, exact_s, 0.15, 0.15, detach_positions=False)
     expected.backward(torch.ones_like(expected))
     x.requires_grad_()

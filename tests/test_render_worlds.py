@@ -42,6 +42,24 @@ def test_particles_look_as_the_splat_of_their_clipped_colours():
 
 
 @pytest.mark.parametrize("style", STYLES)
+def test_a_periodic_picture_has_no_seam(style):
+    x, s = random_worlds()
+    picture = draw_worlds(x, s, style=style, half_width=0.8, periodic=True, **VIEW)
+    moved = draw_worlds(x + 0.4, s, style=style, half_width=0.8, periodic=True, **VIEW)
+    # By a quarter of the side to the right and up; rounding may change a last bit.
+    rolled = np.roll(picture, (-8, 8), axis=(1, 2)).astype(int)
+    assert np.abs(moved - rolled).max() <= 1
+    assert np.abs(moved.astype(int) - picture).max() > 50
+    x[0, 0] = math.nan
+    x[0, 1] = 1e9
+    hidden = draw_worlds(x, s, style=style, half_width=0.8, periodic=True, **VIEW)
+    left = draw_worlds(x[:, 2:], s[:, 2:], style=style, half_width=0.8, periodic=True, **VIEW)
+    np.testing.assert_array_equal(hidden[0], left[0])
+    with pytest.raises(NPAError, match="periodic pictures are of 2D worlds"):
+        draw_worlds(*random_worlds(3), periodic=True, **VIEW)
+
+
+@pytest.mark.parametrize("style", STYLES)
 @pytest.mark.parametrize("space_dim", [2, 3])
 def test_a_world_looks_the_same_alone_and_in_a_batch(style, space_dim):
     x, s = random_worlds(space_dim)

@@ -27,7 +27,7 @@ def scattered(world_count, particle_count, dtype, device, seed=0):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=("float32", "float64"))
 def test_picture_and_adjoints_equal_the_oracle(dtype, options, device):
     x, colour = scattered(3, 61, dtype, device)
-    exact = [t.cpu().double().requires_grad_() for t in (x, colour)]
+    exact = [t.cpu().double().clone().requires_grad_() for t in (x, colour)]
     expected = oracle.splat(*exact, resolution=37, pixel_size=0.09, **options)
     cotangent = torch.randn(
         expected.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1)

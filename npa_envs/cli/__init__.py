@@ -14,7 +14,7 @@ COMMANDS = {
     "rollout": "grow a rule from its seed, with damage on the way; writes GIF, MP4 and a filmstrip",
     "evaluate": "measure a rule: loss, PSNR, overflow and extent over thousands of steps",
     "bench": "run time against error, the paper's table, scaling; a call explained",
-    "list": "tasks, presets, built-in targets, shipped rules",
+    "list": "tasks, presets, environments, built-in targets, losses, shipped rules",
     "warmup": "compile the kernels ahead of time",
     "doctor": "versions, devices, kernel cache, fonts",
 }

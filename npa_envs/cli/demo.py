@@ -197,7 +197,7 @@ def grow_and_heal(options: DemoOptions, report: Report) -> None:
         if trained.doubt is not None:
             return f"no figures ({trained.doubt})"
         row = measure(task, x, s, step)
-        return f"PSNR {row.psnr:5.2f} dB, loss {row.loss:.3f}"
+        return row.figures
 
     with StepBar(GROW_STEPS + 2 * HEAL_STEPS, show=options.progress) as bar:
         common: dict[str, Any] = {
@@ -285,7 +285,7 @@ def train_small(options: DemoOptions, report: Report) -> None:
             result.rule, task, x, s, steps, generator=generator, every=1, progress=bar.advance
         )
     row = measure(task, x, s, steps)
-    report.line(f"  grown for {steps} steps: PSNR {row.psnr:5.2f} dB, loss {row.loss:.3f}")
+    report.line(f"  grown for {steps} steps: {row.figures}")
     name = f"trained-{Path(options.target).stem}"
     report.wrote(*write_film(film, options.out, name))
     comparison = options.out / f"{name}-comparison.png"

@@ -14,7 +14,7 @@ from npa_envs.errors import NPAError
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateOptions:
-    """Measure splat loss, PSNR, overflow and extent of a rule over thousands of steps."""
+    """Measure loss, PSNR, overflow and extent of a rule over thousands of steps."""
 
     rule: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RULE")]
     """A shipped rule (`npa-envs list`), a file of ours or the authors' (.safetensors, .pth), or a
@@ -22,6 +22,9 @@ class EvaluateOptions:
 
     target: str | None = None
     """The target to measure against; default: the one that the rule was trained on."""
+
+    loss: str | None = None
+    """Textures only: the loss to measure by (`npa-envs list`); default: as trained."""
 
     checkpoints: tuple[int, ...] = (64, 128, 256, 512, 1024, 2048, 4096)
     """Steps from the seed to measure at, increasing."""
@@ -96,16 +99,16 @@ def run(options: EvaluateOptions) -> int:
         options.rule,
         rule,
         device,
-        target=options.target,
         particle_count=options.particle_count,
-        target_point_count=options.particle_count,
+        target=options.target,
+        loss=options.loss,
         eps=options.eps,
         update_prob=options.update_prob,
     )
     if trained.doubt is not None:
         raise NPAError(
             f"cannot measure {options.rule!r}: {trained.doubt}: "
-            "give --target, a built-in name, an emoji or a picture"
+            "give --target, a built-in name or a picture"
         )
     seeds = range(options.first_seed, options.first_seed + options.seed_count)
     with StepBar(max(options.checkpoints), show=options.progress) as bar:
@@ -117,8 +120,9 @@ def run(options: EvaluateOptions) -> int:
             device=device,
             progress=bar.advance,
         )
-    print(f"{options.rule}: {options.seed_count} worlds")
-    print(table_text(rows))
+    measure = trained.task.metric_name
+    print(f"{options.rule}: {options.seed_count} worlds, loss: {measure}")
+    print(table_text(rows, missing="-"))
     tables: dict[str, Sequence[Any]] = {"growth": rows}
     if options.healing:
         with StepBar(None, show=options.progress) as bar:
@@ -126,6 +130,6 @@ def run(options: EvaluateOptions) -> int:
         print(table_text(healed))
         tables["healing"] = healed
     if options.json is not None:
-        write_text(options.json, tables_json(tables))
+        write_text(options.json, tables_json(tables, metric=measure))
         print(f"wrote {options.json}")
     return 0

@@ -10,7 +10,7 @@ import tyro
 
 @dataclass(frozen=True)
 class ListOptions:
-    """Tasks and their presets, environments, built-in targets, shipped rules."""
+    """Tasks and their presets, environments, built-in targets, texture losses, shipped rules."""
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -25,7 +25,7 @@ def main(arguments: Sequence[str]) -> int:
     tyro.cli(ListOptions, prog="npa-envs list", args=arguments)
     from npa_envs.registration import ENVIRONMENTS
     from npa_envs.rule_io import load_rule, shipped_rules
-    from npa_envs.tasks.targets import builtin_targets
+    from npa_envs.tasks.texture_losses import TEXTURE_LOSSES
     from npa_envs.training import TASKS
 
     print("tasks (npa-envs train TASK --preset PRESET)")
@@ -38,8 +38,12 @@ def main(arguments: Sequence[str]) -> int:
     print("environments (import npa_envs; gymnasium.make(NAME) or make_vec(NAME, num_envs=64))")
     for environment in ENVIRONMENTS:
         print(f"  {environment.id}: episodes of {environment.max_episode_steps} steps")
-    print("targets (--target NAME, the path of a picture, or one emoji)")
-    print(f"  {', '.join(builtin_targets())}")
+    print("targets (--target NAME, or the path of a picture; for morphogenesis also one emoji)")
+    for name, entry in TASKS.items():
+        print(f"  {name}: {', '.join(entry.targets())}")
+    print("texture losses (--loss NAME)")
+    for name, loss in TEXTURE_LOSSES.items():
+        print(f"  {name}: {loss.summary}")
     print("rules (npa-envs rollout NAME)")
     for name in shipped_rules():
         rule = load_rule(name)

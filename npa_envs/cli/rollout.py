@@ -7,7 +7,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
@@ -40,6 +40,9 @@ class RolloutOptions:
 
     target: str | None = None
     """The target to measure against; default: the one that the rule was trained on."""
+
+    loss: str | None = None
+    """Textures only: the loss to measure by (`npa-envs list`); default: as trained."""
 
     particle_count: int | None = None
     """Particles N; default: as trained."""
@@ -130,10 +133,10 @@ def run(options: RolloutOptions) -> int:
             f"raise --steps above {late[0].step}"
         )
     rule = load_rule(options.rule, device=device).float()
-    fields = {
-        "target": options.target,
+    fields: dict[str, Any] = {
         "particle_count": options.particle_count,
-        "target_point_count": options.particle_count,
+        "target": options.target,
+        "loss": options.loss,
         "eps": options.eps,
         "update_prob": options.update_prob,
     }
@@ -169,7 +172,7 @@ def run(options: RolloutOptions) -> int:
         print(f"no figures for {options.rule}: {trained.doubt}; give --target")
     else:
         row = measure(task, x, s, done)
-        print(f"step {done}: loss {row.loss:.4f}, PSNR {row.psnr:.2f} dB, extent {row.extent:.3f}")
+        print(f"step {done}: {row.figures}, extent {row.extent:.3f}")
     for path in write_film(film, folder, "growth", fps=options.fps):
         print(f"wrote {path}")
     return 0

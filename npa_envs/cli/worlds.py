@@ -13,7 +13,6 @@ import torch
 from npa_envs.errors import NPAError
 from npa_envs.rule import NPARule
 from npa_envs.rule_io import rule_metadata, shipped_rules
-from npa_envs.tasks.targets import builtin_targets
 
 if TYPE_CHECKING:
     from npa_envs.tasks.task import PictureTask
@@ -30,7 +29,14 @@ class TrainedTask:
     """Why figures against the target would mean nothing; None where they do mean something."""
 
 
-def task_of_rule(source: str, rule: NPARule, device: torch.device, **fields: Any) -> TrainedTask:
+def task_of_rule(
+    source: str,
+    rule: NPARule,
+    device: torch.device,
+    *,
+    particle_count: int | None = None,
+    **fields: Any,
+) -> TrainedTask:
     """Return the task that a rule was trained on, as its file tells.
 
     A rule whose file says nothing of a task, as the authors' do, is run in the paper's world of
@@ -41,6 +47,7 @@ def task_of_rule(source: str, rule: NPARule, device: torch.device, **fields: Any
         source: What the rule was loaded from.
         rule: The rule.
         device: Where the task keeps its target.
+        particle_count: Particles N; None: as trained.
         fields: Fields of the task's configuration to change; None leaves one as it is.
 
     Raises:
@@ -61,16 +68,20 @@ def task_of_rule(source: str, rule: NPARule, device: torch.device, **fields: Any
     told = "config" in metadata
     config = preset("paper", task_name, **own) if not told else _told_config(path, metadata)
     config = override(config, **{k: v for k, v in fields.items() if v is not None})
-    make = task_entry(task_name).make
+    if particle_count is not None:
+        config = override(config, task=config.task.with_particle_count(particle_count))
+    entry = task_entry(task_name)
     chosen = fields.get("target") is not None
     doubt = None if told or chosen else "its file does not say what it grows"
     try:
-        return TrainedTask(make(config.task, device), doubt)
+        return TrainedTask(entry.make(config.task, device), doubt)
     except NPAError as error:
         if chosen:
             raise
-        stand_in = override(config, target=builtin_targets()[0])
-        return TrainedTask(make(stand_in.task, device), f"its target cannot be loaded: {error}")
+        stand_in = override(config, target=entry.targets()[0])
+        return TrainedTask(
+            entry.make(stand_in.task, device), f"its target cannot be loaded: {error}"
+        )
 
 
 def _told_config(path: Path, metadata: Mapping[str, str]) -> Any:

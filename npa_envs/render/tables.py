@@ -28,21 +28,22 @@ def table_text(rows: Sequence[Any], *, missing: str = "never") -> str:
     )
 
 
-def tables_json(tables: Mapping[str, Sequence[Any]]) -> str:
+def tables_json(tables: Mapping[str, Sequence[Any]], **facts: str) -> str:
     """Return tables as a JSON object of lists; a number that is not finite becomes null.
 
     Args:
         tables: Rows, instances of dataclasses, by the table's name.
+        facts: What else the object says, by name.
     """
 
     def plain(value: Any) -> Any:
         return None if isinstance(value, float) and not math.isfinite(value) else value
 
-    objects = {
+    objects: dict[str, Any] = {
         name: [{k: plain(v) for k, v in dataclasses.asdict(row).items()} for row in rows]
         for name, rows in tables.items()
     }
-    return json.dumps(objects, indent=2, allow_nan=False) + "\n"
+    return json.dumps({**facts, **objects}, indent=2, allow_nan=False) + "\n"
 
 
 def _cell(value: object, missing: str) -> str:

@@ -15,7 +15,7 @@ from npa_envs.errors import NPAError, suggest
 from npa_envs.render.colours import density_colours, state_colours
 from npa_envs.render.picture import Background, background_colour, to_uint8
 from npa_envs.rule import COLOUR_OFFSET
-from npa_envs.sph import splat
+from npa_envs.sph import periodic_splat, splat
 from npa_envs.sph.checks import check_world
 
 STYLES = ("particles", "density", "states")
@@ -47,6 +47,7 @@ def draw_worlds(
     sigma: float = 1.0,
     centre: Tensor | Sequence[float] | None = None,
     half_width: float = 1.0,
+    periodic: bool = False,
     azimuth: float = 0.0,
     elevation: float = 20.0,
     background: Background = "white",
@@ -75,6 +76,7 @@ def draw_worlds(
         centre: What lies in the middle of the picture [length units], shape [D] or [B, D]; None is
             the origin.
         half_width: From the middle of the picture to its edge [length units].
+        periodic: 2D only: the picture shows a periodic box, and particles reach across its edges.
         azimuth: 3D only: how far the camera has gone round [degrees], seen from above against the
             clock; 0 has x to the right and z towards the viewer.
         elevation: 3D only: how far above the horizon the camera is [degrees].
@@ -95,6 +97,8 @@ def draw_worlds(
     for name, value in (("azimuth", azimuth), ("elevation", elevation)):
         if not math.isfinite(value):
             raise NPAError(f"{name} must be a finite angle in degrees, got {value}")
+    if periodic and x.shape[2] != 2:
+        raise NPAError(f"periodic pictures are of 2D worlds, got D = {x.shape[2]}: leave it out")
     behind = background_colour(background)
     with torch.no_grad():
         places = (x - _middle(centre, x)).float()
@@ -106,8 +110,10 @@ def draw_worlds(
         shown = (places.abs() <= limit).all(-1, keepdim=True)
         if style != "density":
             shown = shown & s.isfinite().all(-1, keepdim=True)
-        places, colour = places.where(shown, limit), colour.where(shown, 0.0)
-        lens = _Lens(resolution, pixel_size, sigma, half_width)
+        # Nobody sees a place that is no number, but the images of all others in a periodic box.
+        nowhere = math.nan if periodic else limit
+        places, colour = places.where(shown, nowhere), colour.where(shown, 0.0)
+        lens = _Lens(resolution, pixel_size, sigma, half_width, periodic)
         if style == "density":
             density = lens.draw(places, colour)[..., 3]
             if depth is not None:
@@ -126,10 +132,12 @@ class _Lens:
     pixel_size: float
     sigma: float
     half_width: float
+    periodic: bool
 
     def draw(self, x: Tensor, colour: Tensor, *, scale: float = 1.0) -> Tensor:
         """Return colour sums and density, [B, R, R, 4], of spots `scale` times their size."""
-        return splat(
+        drawn_by = periodic_splat if self.periodic else splat
+        return drawn_by(
             x,
             colour,
             resolution=self.resolution,

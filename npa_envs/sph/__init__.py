@@ -4,6 +4,7 @@ from npa_envs.sph.actions import apply_actions
 from npa_envs.sph.cameras import Cameras, cameras_of_poses, look_at, orbit
 from npa_envs.sph.fields import PerceptionFields, perceive, perception_fields
 from npa_envs.sph.gaussians import GaussianPictures, render_gaussians
+from npa_envs.sph.periodic_splat import periodic_splat
 from npa_envs.sph.splat import splat
 from npa_envs.sph.warmup import warmup
 from npa_envs.sph.worlds import world_mean
@@ -18,6 +19,7 @@ __all__ = [
     "orbit",
     "perceive",
     "perception_fields",
+    "periodic_splat",
     "render_gaussians",
     "splat",
     "warmup",

@@ -30,8 +30,24 @@ def read_image(path: Path) -> Image.Image:
         path: A PNG, JPEG, WebP or other file that Pillow reads; of an animation, the first frame.
 
     Raises:
-        NPAError: The file is missing, not readable, empty, truncated, no picture, too large, fully
-            transparent, or has neither transparency nor a plain background.
+        NPAError: As for `open_image`, or the picture is fully transparent, or has neither
+            transparency nor a plain background.
+    """
+    image = open_image(path)
+    if np.asarray(image.getchannel("A")).min() == 255:
+        return cut_out_background(image, label=str(path))
+    require_opaque_pixels(image, label=str(path))
+    return image
+
+
+def open_image(path: Path) -> Image.Image:
+    """Read a picture as RGBA, as it is.
+
+    Args:
+        path: A PNG, JPEG, WebP or other file that Pillow reads; of an animation, the first frame.
+
+    Raises:
+        NPAError: The file is missing, not readable, empty, truncated, no picture, or too large.
     """
     try:
         if path.is_dir():
@@ -44,7 +60,7 @@ def read_image(path: Path) -> Image.Image:
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             with Image.open(path) as opened:
                 opened.load()
-                image = _to_rgba(ImageOps.exif_transpose(opened))
+                return _to_rgba(ImageOps.exif_transpose(opened))
     except FileNotFoundError as error:
         raise NPAError(f"target {str(path)!r} does not exist: check the path") from error
     except PermissionError as error:
@@ -71,10 +87,6 @@ def read_image(path: Path) -> Image.Image:
             f"target {str(path)!r} cannot be decoded, it is truncated or damaged ({error}): "
             "save the picture anew, as PNG"
         ) from error
-    if np.asarray(image.getchannel("A")).min() == 255:
-        return cut_out_background(image, label=str(path))
-    require_opaque_pixels(image, label=str(path))
-    return image
 
 
 def require_opaque_pixels(image: Image.Image, *, label: str) -> None:

@@ -12,6 +12,7 @@ from npa_envs.sph import splat, world_mean
 from npa_envs.sph.picture_losses import picture_losses
 from npa_envs.tasks.damage import erase_state, random_particle
 from npa_envs.tasks.morphogenesis2d_config import Morphogenesis2DConfig
+from npa_envs.tasks.rules import untrained_rule
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.tasks.targets import PointTarget, load_target
 
@@ -72,17 +73,25 @@ class Morphogenesis2D:
         """Probability of a particle's update in a step, dimensionless."""
         return self.config.update_prob
 
+    @property
+    def metric_name(self) -> str:
+        """The splat loss."""
+        return "splat loss"
+
+    @property
+    def aligned(self) -> bool:
+        """The picture is moved onto the target's place and compared pixel by pixel."""
+        return True
+
     def make_rule(self, generator: torch.Generator) -> NPARule:
         """Return an untrained rule on the CPU; its weights are drawn from `generator`."""
-        with torch.random.fork_rng(devices=()):
-            torch.manual_seed(int(torch.randint(2**31, (), generator=generator)))
-            return NPARule(
-                2,
-                self.config.state_dim,
-                self.config.hidden_dim,
-                eps0=self.config.eps,
-                alpha=self.config.alpha,
-            )
+        return untrained_rule(
+            generator,
+            state_dim=self.config.state_dim,
+            hidden_dim=self.config.hidden_dim,
+            eps0=self.config.eps,
+            alpha=self.config.alpha,
+        )
 
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"

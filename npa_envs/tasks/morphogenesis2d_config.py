@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from npa_envs.errors import NPAError
 from npa_envs.tasks.checks import check_fraction, check_non_negative, check_positive
@@ -92,3 +92,7 @@ class Morphogenesis2DConfig:
         )
         check_positive(self, int, "state_dim", at_least=3)
         check_positive(self, int, "resolution", at_least=8)
+
+    def with_particle_count(self, particle_count: int) -> Morphogenesis2DConfig:
+        """Return the same task with another number of particles, and of the target's points."""
+        return replace(self, particle_count=particle_count, target_point_count=particle_count)

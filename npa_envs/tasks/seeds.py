@@ -44,6 +44,37 @@ def uniform_ball(
     return radius * distance ** (1.0 / space_dim) * direction
 
 
+def uniform_box(
+    world_count: int,
+    particle_count: int,
+    box: tuple[float, ...],
+    *,
+    generator: Randomness | None = None,
+    device: str | torch.device = "cpu",
+    dtype: torch.dtype = torch.float32,
+) -> Tensor:
+    """Return points uniform in a box around the origin [length units], shape [B, N, D].
+
+    Args:
+        world_count: Worlds B.
+        particle_count: Particles in each world N.
+        box: Sides of the box [length units], one for each of D dimensions.
+        generator: As for `uniform_ball`.
+        device: Where the points are made.
+        dtype: Their floating dtype.
+
+    Raises:
+        NPAError: The generator is on another device or for another number of worlds.
+    """
+    check_generator(generator, torch.device(device), world_count)
+    if isinstance(generator, WorldRandom):
+        share = generator.uniform(particle_count, len(box), dtype=dtype)
+    else:
+        shape = (world_count, particle_count, len(box))
+        share = torch.rand(shape, generator=generator, device=device, dtype=dtype)
+    return torch.stack([side * (share[..., d] - 0.5) for d, side in enumerate(box)], dim=-1)
+
+
 def _unit_ball_by_world(
     generator: WorldRandom, particle_count: int, space_dim: int, dtype: torch.dtype
 ) -> Tensor:

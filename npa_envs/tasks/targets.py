@@ -39,6 +39,11 @@ class PointTarget:
         """Number of points M."""
         return self.points.shape[0]
 
+    @property
+    def mean_colour(self) -> Tensor:
+        """Mean red, green and blue of the points (dimensionless), shape [3]."""
+        return self.colours.mean(dim=0)
+
     def to(self, device: str | torch.device) -> PointTarget:
         """Return the same target with its tensors on another device."""
         return replace(self, points=self.points.to(device), colours=self.colours.to(device))

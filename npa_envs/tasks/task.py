@@ -59,8 +59,16 @@ class Task(Protocol):
 
 
 class PictureTask(Task, Protocol):
-    """A task that is learned from a picture: what the evaluation needs for its PSNR."""
+    """A task that is learned from a picture: what films and the evaluation need besides."""
 
     @property
     def target_picture(self) -> Tensor:
         """The picture to match: rgb sums and density, shape [R, R, 4]."""
+
+    @property
+    def aligned(self) -> bool:
+        """Whether worlds are to match it pixel by pixel, so that a PSNR means something."""
+
+    @property
+    def metric_name(self) -> str:
+        """What `metric` is, in a word or two."""

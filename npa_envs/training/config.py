@@ -80,7 +80,7 @@ class TrainConfig(Generic[TaskConfigT]):
     """Precision of the worlds and of the rule."""
 
     memory: Memory = "store"
-    """What the backward pass reads: stored, recomputed for two steps in three, or for all but one."""
+    """What the backward pass reads: all stored, two steps in three recomputed, all but one."""
 
     cuda_graph: bool = True
     """On CUDA, capture an iteration: rollout and gradients as one graph per number of steps."""

@@ -12,6 +12,7 @@ import torch
 from npa_envs.errors import NPAError, suggest
 from npa_envs.tasks.morphogenesis2d_config import Morphogenesis2DConfig
 from npa_envs.tasks.task import PictureTask
+from npa_envs.tasks.texture_config import TextureConfig
 from npa_envs.training.config import Morphogenesis2DTrainConfig, TrainConfig
 from npa_envs.training.overrides import override
 
@@ -29,6 +30,9 @@ class TaskEntry:
     make: Callable[[Any, torch.device], PictureTask]
     """Builds the task from its own configuration, on a device."""
 
+    targets: Callable[[], tuple[str, ...]]
+    """Returns the names of its built-in targets."""
+
 
 def _make_morphogenesis2d(config: Morphogenesis2DConfig, device: torch.device) -> PictureTask:
     # Imported late: a task brings the kernels along, which a list of presets does not need.
@@ -37,7 +41,26 @@ def _make_morphogenesis2d(config: Morphogenesis2DConfig, device: torch.device) -
     return Morphogenesis2D(config, device=device)
 
 
+def _morphogenesis2d_targets() -> tuple[str, ...]:
+    from npa_envs.tasks.targets import builtin_targets
+
+    return builtin_targets()
+
+
+def _make_texture(config: TextureConfig, device: torch.device) -> PictureTask:
+    from npa_envs.tasks.texture import Texture
+
+    return Texture(config, device=device)
+
+
+def _texture_targets() -> tuple[str, ...]:
+    from npa_envs.tasks.textures import builtin_textures
+
+    return builtin_textures()
+
+
 _OUT = Path("runs/morphogenesis2d")
+_TEXTURE_OUT = Path("runs/texture")
 
 MORPHOGENESIS2D_PRESETS: Mapping[str, Morphogenesis2DTrainConfig] = {
     "paper": TrainConfig(task=Morphogenesis2DConfig(), out=_OUT),
@@ -91,11 +114,70 @@ MORPHOGENESIS2D_PRESETS: Mapping[str, Morphogenesis2DTrainConfig] = {
 }
 """2D morphogenesis: `paper` (arXiv 2601.16096), `fast` (minutes on one core), `tiny` (tests)."""
 
+_PAPER_TEXTURE: TrainConfig[TextureConfig] = TrainConfig(
+    task=TextureConfig(loss="vgg_ot"),
+    iterations=12_000,
+    repeats=1,
+    steps=(16, 32),
+    learning_rate=1e-4,
+    weight_decay=0.1,
+    milestones=(3_000, 6_000, 9_000),
+    out=_TEXTURE_OUT,
+)
+
+TEXTURE_PRESETS: Mapping[str, TrainConfig[TextureConfig]] = {
+    "paper": _PAPER_TEXTURE,
+    # Dots of both colours after some three minutes on one core.
+    "fast": TrainConfig(
+        task=TextureConfig(
+            target="dots", particle_count=1024, hidden_dim=64, resolution=64, damage_radius=0.2
+        ),
+        iterations=1200,
+        repeats=1,
+        world_count=2,
+        pool_size=32,
+        steps=(12, 24),
+        learning_rate=2e-3,
+        milestones=(800, 1050),
+        seed_interval=4,
+        out=_TEXTURE_OUT,
+        picture_interval=100,
+        checkpoint_interval=200,
+        tensorboard=False,
+    ),
+    "tiny": TrainConfig(
+        task=TextureConfig(
+            target="dots", particle_count=256, hidden_dim=32, eps=0.3, resolution=24
+        ),
+        iterations=60,
+        repeats=1,
+        world_count=2,
+        pool_size=8,
+        steps=(8, 16),
+        learning_rate=5e-3,
+        milestones=(45,),
+        seed_interval=4,
+        out=_TEXTURE_OUT,
+        log_interval=1,
+        picture_interval=20,
+        checkpoint_interval=20,
+        tensorboard=False,
+    ),
+}
+"""Textures: `paper` (arXiv 2601.16096, needs VGG16's weights), `fast` (on one core), `tiny`."""
+
 TASKS: Mapping[str, TaskEntry] = {
     "morphogenesis2d": TaskEntry(
         summary="grow a picture from a disk of blank particles",
         presets=MORPHOGENESIS2D_PRESETS,
         make=_make_morphogenesis2d,
+        targets=_morphogenesis2d_targets,
+    ),
+    "texture": TaskEntry(
+        summary="arrange particles all over a periodic box to a texture",
+        presets=TEXTURE_PRESETS,
+        make=_make_texture,
+        targets=_texture_targets,
     ),
 }
 """Every task that can be trained, by its name on the command line and in checkpoints."""

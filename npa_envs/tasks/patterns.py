@@ -1,0 +1,168 @@
+"""The built-in textures, drawn by the project itself: they tile, at any resolution.
+
+A pattern is a function of places on the unit torus. It returns red, green, blue and alpha in
+[0, 1]; where alpha is 0 no particles belong.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import ImageColor
+
+from npa_envs.errors import NPAError, suggest
+
+Array = NDArray[np.floating[Any]]
+Pattern = Callable[[Array, Array, np.random.Generator], Array]
+
+OVERSAMPLING = 4
+"""Samples along each side of a pixel."""
+
+
+def draw_pattern(name: str, resolution: int, *, seed: int = 0) -> Array:
+    """Draw a built-in texture.
+
+    Args:
+        name: One of `PATTERNS`.
+        resolution: Pixels R along each side.
+        seed: Where those that scatter things have their places from.
+
+    Returns:
+        Red, green and blue, each times alpha, and alpha, float64, shape [R, R, 4]; pixel r is
+        centred at (r + 1/2) / R, and rows point up.
+
+    Raises:
+        NPAError: There is no such texture, or the resolution is not positive.
+    """
+    if name not in PATTERNS:
+        raise NPAError(f"unknown texture {name!r}: {suggest(name, PATTERNS)}")
+    if resolution < 1:
+        raise NPAError(f"resolution must be at least 1 pixel, got {resolution}: try 128")
+    samples = resolution * OVERSAMPLING
+    axis = (np.arange(samples) + 0.5) / samples
+    rgba = PATTERNS[name](*np.meshgrid(axis, axis), np.random.default_rng(seed))
+    rgba[..., :3] *= rgba[..., 3:]
+    blocks = rgba.reshape(resolution, OVERSAMPLING, resolution, OVERSAMPLING, 4)
+    averaged: Array = blocks.mean(axis=(1, 3))
+    return averaged
+
+
+def stripes(u: Array, v: Array, _: np.random.Generator) -> Array:
+    """Slanted, slightly waving bands in four colours."""
+    phase = 3.0 * u + 2.0 * v + 0.12 * np.sin(2.0 * math.pi * (2.0 * u - 3.0 * v))
+    bands = _colours("#1d3557", "#457b9d", "#f1faee", "#e63946")
+    return _opaque(bands[np.floor(4.0 * phase).astype(int) % 4])
+
+
+def dots(u: Array, v: Array, _: np.random.Generator) -> Array:
+    """Rimmed dots of two sorts on a slanted lattice, nothing between them."""
+    # Two lattice vectors, (1/4, 0) and (1/8, 1/4), of which the sum of sorts is even or odd.
+    row, along = 4.0 * v, 4.0 * u - 2.0 * v
+    best = np.full(u.shape, np.inf)
+    sort = np.zeros(u.shape, dtype=int)
+    for dr in (0, 1):
+        for da in (-1, 0, 1):
+            j = np.floor(row) + dr
+            k = np.round(along) + da
+            distance = np.hypot((along - k + 0.5 * (row - j)) / 4.0, (row - j) / 4.0)
+            nearer = distance < best
+            best, sort = np.where(nearer, distance, best), np.where(nearer, (k % 2), sort)
+    inner = _colours("#f4a261", "#2a9d8f")[sort.astype(int)]
+    rim = _colours("#6b2d0c", "#0b3b3f")[sort.astype(int)]
+    colour = np.where((best < 0.062)[..., None], inner, rim)
+    return _with_alpha(colour, best < 0.09)
+
+
+def cells(u: Array, v: Array, random: np.random.Generator) -> Array:
+    """Polygons around scattered points, dark between them."""
+    places = _scattered(random, 20, 0.17)
+    distance = np.stack([np.hypot(*_away(u, v, place)) for place in places])
+    order = np.argsort(distance, axis=0)
+    nearest = np.take_along_axis(distance, order[:2], axis=0)
+    shades = _colours("#e9c46a", "#f4a261", "#e76f51", "#d4a373", "#faedcd")
+    colour = shades[order[0] % len(shades)]
+    shine = np.clip(1.15 - 2.2 * nearest[0], 0.55, 1.0)[..., None]
+    wall = (nearest[1] - nearest[0] < 0.028)[..., None]
+    return _opaque(np.where(wall, _colours("#3d1f14"), colour * shine))
+
+
+def bubbles(u: Array, v: Array, random: np.random.Generator) -> Array:
+    """Rings of several sizes with a glint, nothing around them."""
+    places = _scattered(random, 12, 0.23)
+    gaps = [
+        min(math.hypot(*_away(place[0], place[1], other)) for other in places if other is not place)
+        for place in places
+    ]
+    tints = _colours("#48cae4", "#0096c7", "#5e60ce", "#80ffdb")
+    colour = np.zeros((*u.shape, 3))
+    covered = np.zeros(u.shape, dtype=bool)
+    for k, place in enumerate(places):
+        radius = 0.46 * gaps[k]
+        away = np.hypot(*_away(u, v, place))
+        body, rim = away < radius, (away > 0.72 * radius) & (away < radius)
+        glint = np.hypot(*_away(u, v, place + radius * np.array([-0.3, 0.35]))) < 0.2 * radius
+        colour[body] = 0.45 + 0.55 * tints[k % len(tints)]
+        colour[rim] = 0.75 * tints[k % len(tints)]
+        colour[glint] = 1.0
+        covered |= body
+    return _with_alpha(colour, covered)
+
+
+def grid(u: Array, v: Array, _: np.random.Generator) -> Array:
+    """Bands woven over and under each other, with holes between them."""
+    across, along = 4.0 * u, 4.0 * v
+    upright = np.abs(across % 1.0 - 0.5) < 0.27
+    level = np.abs(along % 1.0 - 0.5) < 0.27
+    over = (np.floor(across) + np.floor(along)) % 2 == 0
+    warm, cold = _colours("#ffb703", "#8e3b02"), _colours("#8ecae6", "#023047")
+    edge_upright = np.abs(across % 1.0 - 0.5) > 0.19
+    edge_level = np.abs(along % 1.0 - 0.5) > 0.19
+    first = np.where(edge_upright[..., None], warm[1], warm[0])
+    second = np.where(edge_level[..., None], cold[1], cold[0])
+    shown = upright & (over | ~level)
+    return _with_alpha(np.where(shown[..., None], first, second), upright | level)
+
+
+PATTERNS: dict[str, Pattern] = {
+    "bubbles": bubbles,
+    "cells": cells,
+    "dots": dots,
+    "grid": grid,
+    "stripes": stripes,
+}
+"""Every built-in texture by name."""
+
+
+def _colours(*names: str) -> Array:
+    """Return colours such as "#20a040", shape [K, 3]."""
+    return np.array([ImageColor.getrgb(name)[:3] for name in names]) / 255.0
+
+
+def _with_alpha(colour: Array, covered: NDArray[np.bool_]) -> Array:
+    return np.concatenate([colour, covered[..., None].astype(float)], axis=-1)
+
+
+def _opaque(colour: Array) -> Array:
+    return _with_alpha(colour, np.ones(colour.shape[:2], dtype=bool))
+
+
+def _away(u: Any, v: Any, place: Array) -> tuple[Any, Any]:
+    """Return the way from a place to others on the torus, the short way round."""
+    across, along = u - place[0], v - place[1]
+    return across - np.round(across), along - np.round(along)
+
+
+def _scattered(random: np.random.Generator, count: int, gap: float) -> list[Array]:
+    """Return places that keep a distance from each other, as far as that can be had."""
+    places: list[Array] = []
+    while len(places) < count:
+        place = random.random(2)
+        if all(math.hypot(*_away(place[0], place[1], other)) >= gap for other in places):
+            places.append(place)
+        # Drawn less far apart rather than never.
+        gap *= 0.999
+    return places

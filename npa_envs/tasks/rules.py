@@ -1,0 +1,31 @@
+"""Untrained rules for tasks."""
+
+from __future__ import annotations
+
+import torch
+
+from npa_envs.rule import NPARule
+
+
+def untrained_rule(
+    generator: torch.Generator,
+    *,
+    state_dim: int,
+    hidden_dim: int,
+    eps0: float,
+    alpha: float,
+    space_dim: int = 2,
+) -> NPARule:
+    """Return a rule on the CPU whose weights are drawn from `generator` alone.
+
+    Args:
+        generator: On the CPU; torch's own randomness is left as it is.
+        state_dim: State channels C.
+        hidden_dim: Width of the hidden layer.
+        eps0: Perception radius that the rule is trained at [length units].
+        alpha: Largest displacement in one step, as a fraction of ε (dimensionless).
+        space_dim: Space dimension D.
+    """
+    with torch.random.fork_rng(devices=()):
+        torch.manual_seed(int(torch.randint(2**31, (), generator=generator)))
+        return NPARule(space_dim, state_dim, hidden_dim, eps0=eps0, alpha=alpha)

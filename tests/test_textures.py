@@ -1,0 +1,127 @@
+"""Built-in textures and those from pictures."""
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from npa_envs.errors import NPAError
+from npa_envs.tasks.patterns import PATTERNS, draw_pattern
+from npa_envs.tasks.textures import builtin_textures, load_texture
+
+
+def roughness(picture, dim):
+    """Mean difference of neighbours inside, and across the seam."""
+    steps = (picture - np.roll(picture, 1, axis=dim)).__abs__().mean(axis=(1 - dim, 2))
+    return steps[1:].mean(), steps[1:].max(), steps[0]
+
+
+@pytest.mark.parametrize("dim", [0, 1])
+@pytest.mark.parametrize("name", PATTERNS)
+def test_patterns_have_no_seam(name, dim):
+    mean, largest, seam = roughness(draw_pattern(name, 96), dim)
+    assert mean > 0.005
+    assert seam < largest * 1.05
+
+
+@pytest.mark.parametrize("name", PATTERNS)
+def test_patterns_are_the_same_at_every_resolution(name):
+    fine = draw_pattern(name, 96).reshape(24, 4, 24, 4, 4).mean(axis=(1, 3))
+    # The samples of both lie elsewhere: 0.031 was the largest mean difference seen.
+    assert np.abs(fine - draw_pattern(name, 24)).mean() < 0.05
+    assert np.abs(fine - fine.mean(axis=(0, 1))).mean() > 0.1
+
+
+@pytest.mark.parametrize(
+    ("name", "scattered"), [("cells", True), ("bubbles", True), ("grid", False)]
+)
+def test_seeds_move_what_is_scattered(name, scattered):
+    same = np.array_equal(draw_pattern(name, 16, seed=3), draw_pattern(name, 16, seed=4))
+    assert same is not scattered
+    assert np.array_equal(draw_pattern(name, 16, seed=3), draw_pattern(name, 16, seed=3))
+
+
+@pytest.mark.parametrize(
+    ("name", "coverage"),
+    [("cells", 1.0), ("stripes", 1.0), ("dots", 16 * np.pi * 0.09**2), ("grid", 1 - 0.46**2)],
+)
+def test_coverage_is_what_the_geometry_says(name, coverage):
+    # Dots: 16 in the unit square; bands: 0.54 of a mesh in each direction.
+    assert load_texture(name, resolution=96).coverage == pytest.approx(coverage, abs=0.01)
+
+
+def test_targets_are_colour_sums_and_density():
+    target = load_texture("bubbles", resolution=48)
+    picture = target.picture
+    assert target.tiles
+    assert picture.shape == (48, 48, 4)
+    assert picture.dtype == torch.float32
+    assert (picture[..., :3] <= picture[..., 3:] + 1e-6).all()
+    assert float(picture.min()) == 0.0
+    assert float(picture[..., 3].max()) == 1.0
+    covered = picture[..., 3].double() / picture[..., 3].double().sum()
+    colour = picture[..., :3].double() / picture[..., 3:].double().clamp_min(1e-9)
+    expected = (colour * covered[..., None]).sum((0, 1)).float()
+    torch.testing.assert_close(target.mean_colour, expected)
+
+
+def test_a_picture_is_cropped_scaled_and_turned_upright(tmp_path):
+    image = Image.new("RGB", (60, 40), "white")
+    image.paste((255, 0, 0), (10, 0, 50, 20))
+    image.save(tmp_path / "flag.png")
+    target = load_texture(str(tmp_path / "flag.png"), resolution=20)
+    assert (target.name, target.tiles, target.coverage) == ("flag", False, 1.0)
+    # The upper half of the picture is the upper half of y, which are the last rows.
+    assert (target.picture[10:, :, :3] == torch.tensor([1.0, 0.0, 0.0])).all()
+    assert (target.picture[:10, :, :3] == 1.0).all()
+    assert load_texture(tmp_path / "flag.png", tiles=True).tiles
+
+
+def test_transparency_is_the_density_and_colours_do_not_leak(tmp_path):
+    pixels = np.zeros((32, 32, 4), dtype=np.uint8)
+    pixels[..., 1] = 255
+    pixels[:, 16:] = (255, 0, 0, 255)
+    Image.fromarray(pixels).save(tmp_path / "half.png")
+    target = load_texture(tmp_path / "half.png", resolution=8)
+    assert target.coverage == 0.5
+    assert float(target.picture[..., 1].max()) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("source", "options", "message"),
+    [
+        ("cels", {}, "did you mean 'cells'"),
+        ("", {}, "for example 'cells'"),
+        (3, {}, "must be a built-in texture"),
+        ("missing.png", {}, "does not exist"),
+        ("cells", {"resolution": 0}, "resolution must be an integer of at least 1"),
+        ("cells", {"resolution": 8.0}, "resolution must be an integer of at least 1"),
+    ],
+)
+def test_bad_sources_are_refused(source, options, message):
+    with pytest.raises(NPAError, match=message):
+        load_texture(source, **options)
+
+
+def test_bad_pictures_are_refused(tmp_path):
+    Image.new("RGBA", (8, 8), (0, 0, 0, 0)).save(tmp_path / "empty.png")
+    Image.new("RGB", (1, 9)).save(tmp_path / "thin.png")
+    (tmp_path / "text.png").write_text("no picture")
+    for name, message in (
+        ("empty.png", "alpha above 0.5"),
+        ("thin.png", "at least 2 x 2 pixels"),
+        ("text.png", "must be a picture"),
+    ):
+        with pytest.raises(NPAError, match=message):
+            load_texture(tmp_path / name)
+
+
+def test_unknown_patterns_are_refused():
+    with pytest.raises(NPAError, match="did you mean 'dots'"):
+        draw_pattern("dot", 8)
+    with pytest.raises(NPAError, match="at least 1 pixel"):
+        draw_pattern("dots", 0)
+
+
+def test_names_are_sorted():
+    assert builtin_textures() == ("bubbles", "cells", "dots", "grid", "stripes")
