@@ -78,6 +78,8 @@ class FoldedRule(NamedTuple):
     """W2 and rows of zeros up to a multiple of `FOLD`, shape [A', H]."""
     arranged: ArrangedWeights | None = None
     """Both as the fused kernels read them, where there are such for their device and sizes."""
+    joined: Tensor | None = None
+    """Both one after the other where there are: gradients of many steps are added up at once."""
 
     @property
     def row_width(self) -> int:
@@ -86,10 +88,24 @@ class FoldedRule(NamedTuple):
 
     def __call__(self, rows: Tensor) -> Tensor:
         """Map rows [z | 1 | 0], shape [K, row_width], to raw updates [y | 0], shape [K, A']."""
-        if self.arranged is not None:
-            return run_network(rows, self.hidden_weight, self.output_weight, self.arranged)
+        if self.arranged is not None and self.joined is not None:
+            return run_network(rows, self.joined, self.output_weight.shape, self.arranged)
         hidden = torch.relu(rows @ self.hidden_weight.T)
         return _BlockedProduct.product(hidden, self.output_weight)
+
+
+def fold_weights(hidden_weight: Tensor, output_weight: Tensor) -> FoldedRule:
+    """Return folded weights as they are run on their device, differentiable in both.
+
+    Args:
+        hidden_weight: [W1 | b1 | 0], shape [H, row_width].
+        output_weight: W2 and rows of zeros up to a multiple of `FOLD`, shape [A', H].
+    """
+    arranged = arrange_weights(hidden_weight, output_weight)
+    if arranged is None:
+        return FoldedRule(hidden_weight, output_weight)
+    joined = torch.cat((hidden_weight.flatten(), output_weight.flatten()))
+    return FoldedRule(hidden_weight, output_weight, arranged, joined)
 
 
 class NPARule(nn.Module):
@@ -226,8 +242,7 @@ class NPARule(nn.Module):
         weight = torch.cat((self.hidden.weight, self.hidden.bias[:, None]), dim=1)
         output_weight = nn.functional.pad(self.output.weight, (0, 0, 0, -self.update_dim % FOLD))
         hidden_weight = nn.functional.pad(weight, (0, padding))
-        arranged = arrange_weights(hidden_weight, output_weight)
-        return FoldedRule(hidden_weight, output_weight, arranged)
+        return fold_weights(hidden_weight, output_weight)
 
     def read_out(self, states: Tensor) -> Tensor:
         """Return the rule's outputs: the read-out network's, or the states where it has none.

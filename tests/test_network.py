@@ -4,7 +4,7 @@ import pytest
 import torch
 
 import npa_envs
-from npa_envs.rule import FoldedRule, NPARule
+from npa_envs.rule import NPARule, fold_weights
 
 # Norms of errors over norms of answers, against float64; beside, the worst measured on an H200.
 FORWARD_TOLERANCE = 1e-6  # 2.5e-7
@@ -75,7 +75,7 @@ def test_network_and_its_gradients_equal_float64(sizes, row_count, device):
     inputs = (rows, folded.hidden_weight, folded.output_weight)
     cotangent = torch.randn(row_count, folded.output_weight.shape[0], device=device)
     cotangent *= 10.0 ** torch.linspace(-4.0, 2.0, row_count, device=device)[:, None]
-    got = pulled_back(lambda x, *w: FoldedRule(*w, folded.arranged)(x), inputs, cotangent)
+    got = pulled_back(lambda x, *w: fold_weights(*w)(x), inputs, cotangent)
     wide = [value.double() for value in inputs]
     want = pulled_back(plain_update, wide, cotangent.double())
     assert error(got[0], want[0]) < FORWARD_TOLERANCE
@@ -119,10 +119,7 @@ def test_network_is_bit_identical_from_run_to_run(device):
     rows = random_rows(rule, folded, 5000)
     inputs = (rows, folded.hidden_weight, folded.output_weight)
     cotangent = torch.randn(5000, folded.output_weight.shape[0], device=device)
-    runs = [
-        pulled_back(lambda x, *w: FoldedRule(*w, folded.arranged)(x), inputs, cotangent)
-        for _ in range(2)
-    ]
+    runs = [pulled_back(lambda x, *w: fold_weights(*w)(x), inputs, cotangent) for _ in range(2)]
     assert torch.equal(runs[0][0], runs[1][0])
     assert all(torch.equal(*pair) for pair in zip(runs[0][1], runs[1][1], strict=True))
 

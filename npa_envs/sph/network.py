@@ -150,12 +150,12 @@ class _Network(torch.autograd.Function):
     def forward(
         ctx: Any,
         rows: Tensor,
-        hidden_weight: Tensor,
-        output_weight: Tensor,
+        weights: Tensor,
+        out_width: int,
+        unit_count: int,
         arranged: ArrangedWeights,
         noting: bool,
     ) -> Tensor:
-        out_width, unit_count = output_weight.shape
         update: Tensor
         update, signs = _run_network(rows, arranged.forward, out_width, unit_count, noting)
         if noting:
@@ -168,18 +168,16 @@ class _Network(torch.autograd.Function):
     def backward(ctx: Any, update_bar: Tensor) -> tuple[Tensor | None, ...]:
         rows, signs, *arranged = ctx.saved_tensors
         unit_count, width = ctx.unit_count, rows.shape[1]
-        rows_bar = hidden_bar = output_bar = None
+        rows_bar = weights_bar = None
         if ctx.needs_input_grad[0]:
             rows_bar = _run_network_backward(update_bar, arranged, signs, width, unit_count)
-        if any(ctx.needs_input_grad[1:3]):
-            total = _weight_gradients(rows, update_bar, signs, arranged, unit_count)
-            hidden_bar = total[: unit_count * width].view(unit_count, width)
-            output_bar = total[unit_count * width :].view(-1, unit_count)
-        return rows_bar, hidden_bar, output_bar, None, None
+        if ctx.needs_input_grad[1]:
+            weights_bar = _weight_gradients(rows, update_bar, signs, arranged, unit_count)
+        return rows_bar, weights_bar, None, None, None, None
 
 
 def run_network(
-    rows: Tensor, hidden_weight: Tensor, output_weight: Tensor, arranged: ArrangedWeights
+    rows: Tensor, weights: Tensor, output_shape: tuple[int, ...], arranged: ArrangedWeights
 ) -> Tensor:
     """Map rows to relu(rows W1.T) W2.T, as accurate as products in float32.
 
@@ -187,20 +185,22 @@ def run_network(
 
     Args:
         rows: Rows of perception, dimensionless, shape [K, row_width].
-        hidden_weight: Weights W1 of the hidden units, shape [H, row_width].
-        output_weight: Weights W2 of the updates, shape [A', H].
+        weights: W1 [H, row_width] and W2 [A', H], one after the other, shape [H (row_width + A')].
+        output_shape: Shape (A', H) of W2.
         arranged: The same weights as `arrange_weights` laid them out; again where gradients were
             not enabled then and are now.
 
     Returns:
         Raw updates, dimensionless, shape [K, A'].
     """
-    noting = torch.is_grad_enabled() and (
-        rows.requires_grad or hidden_weight.requires_grad or output_weight.requires_grad
-    )
+    out_width, unit_count = output_shape
+    noting = torch.is_grad_enabled() and (rows.requires_grad or weights.requires_grad)
     if noting and not arranged.backward:
+        end = unit_count * rows.shape[1]
+        hidden_weight = weights[:end].view(unit_count, -1)
+        output_weight = weights[end:].view(out_width, unit_count)
         arranged = arrange(hidden_weight, output_weight, with_backward=True)
     update: Tensor = _Network.apply(  # type: ignore[no-untyped-call]
-        rows, hidden_weight, output_weight, arranged, noting
+        rows, weights, out_width, unit_count, arranged, noting
     )
     return update

@@ -92,7 +92,8 @@ def _warm_network(x: torch.Tensor, s: torch.Tensor) -> None:
         with torch.set_grad_enabled(gradients):
             arranged = arrange_weights(hidden, update)
             if arranged is not None:
-                updates = run_network(rows, hidden, update, arranged)
+                weights = torch.cat((hidden.flatten(), update.flatten()))
+                updates = run_network(rows, weights, update.shape, arranged)
     if arranged is not None:
         _pull_back(updates)
 

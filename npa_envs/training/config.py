@@ -94,7 +94,7 @@ class TrainConfig(Generic[TaskConfigT]):
     picture_interval: int = 250
     """Iterations between two pictures of the batch; 0: none."""
 
-    checkpoint_interval: int = 500
+    checkpoint_interval: int = 1000
     """Iterations between two checkpoints."""
 
     tensorboard: bool = True
