@@ -11,6 +11,7 @@ from worlds import relative_error
 from npa_envs import NPAError
 from npa_envs import reference_gaussians as oracle
 from npa_envs.kernels.blending import TILE_PIXELS, block_kernels
+from npa_envs.replay import capture
 from npa_envs.sph import render_gaussians
 from npa_envs.sph.bridge import launch, scalar_type
 from npa_envs.sph.cameras import Cameras, look_at, orbit
@@ -599,16 +600,17 @@ def test_a_recorded_graph_draws_what_it_is_given():
     if not torch.cuda.is_available():
         pytest.skip("needs a CUDA device")
     gaussians, cameras = SCENES["batch"].of(torch.float32, torch.device("cuda"))
-    bars = cotangents(*render_gaussians(*gaussians, cameras)[:2])
+    with torch.no_grad():
+        bars = cotangents(*render_gaussians(*gaussians, cameras)[:2])
+    results = []
 
-    def drawn():
+    def draw():
         pictures = render_gaussians(*gaussians, cameras)[:2]
-        return [*pictures, *torch.autograd.grad(pictures, gaussians, bars)]
+        gradients = torch.autograd.grad(pictures, gaussians, bars)
+        results.append([*(picture.detach() for picture in pictures), *gradients])
 
-    expected = drawn()
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        recorded = drawn()
+    graph = capture(draw, torch.device("cuda"), warm_up=draw)
+    expected, recorded = results
     with torch.no_grad():
         gaussians[0].mul_(0.5)
     graph.replay()

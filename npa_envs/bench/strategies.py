@@ -18,7 +18,7 @@ NEIGHBOUR_CAP = 32
 
 MOST_PAIRS = {
     "dense": {"cpu": 2**22, "cuda": 2**24},
-    "neighbour_cap": {"cpu": 2**26, "cuda": 2**34},
+    "neighbour_cap": {"cpu": 2**26, "cuda": 2**30},
 }
 """Pairs B N² that quadratic strategies are given; one takes dense torch about a kilobyte."""
 
