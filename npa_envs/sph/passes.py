@@ -14,14 +14,17 @@ from npa_envs.kernels.warps import WARP
 from npa_envs.sph.bridge import launch
 from npa_envs.sph.cells import Plan, SortedWorlds, density_scale
 
-CAPACITY, LARGE_CAPACITY = 64, 128
-"""Neighbours that lists have room for, in small worlds of a batch and elsewhere."""
+CAPACITY, LARGE_CAPACITY, HUGE_CAPACITY = 64, 128, 96
+"""Neighbours that lists have room for: in small worlds of a batch, elsewhere, in huge worlds."""
 
 SMALL_WORLD = 2048
 """Particles of a small world."""
 
 SHARED_WORLD = 4096
 """Particles of worlds that are often rolled out few at a time: several threads share a particle."""
+
+HUGE_WORLD = 2**22
+"""Particles of the largest world whose lists of neighbours may take more memory than its rows."""
 
 
 class Terms(NamedTuple):
@@ -92,7 +95,9 @@ def rollout_listing(plan: Plan) -> Listing:
     """Return how rollouts list neighbours: few worlds shall fill a device, too."""
     if plan.particle_count <= SHARED_WORLD:
         return Listing(LARGE_CAPACITY, lanes=plan.lanes, teams=2)
-    return Listing(LARGE_CAPACITY, lanes=1, teams=1)
+    # The lists of worlds that fill a device's memory would be the largest part of it.
+    huge = plan.particle_count > HUGE_WORLD
+    return Listing(HUGE_CAPACITY if huge else LARGE_CAPACITY, lanes=1, teams=1)
 
 
 def batch_listing(plan: Plan) -> Listing:
