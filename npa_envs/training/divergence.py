@@ -12,7 +12,7 @@ from torch import nn
 
 from npa_envs.errors import NPAError
 from npa_envs.rule import NPARule
-from npa_envs.tasks.task import Task, task_for_rule
+from npa_envs.tasks.task import Task, task_for_rule, task_toward
 
 
 class DivergedError(NPAError):
@@ -49,20 +49,21 @@ def bad_worlds(task: Task, rule: NPARule, snapshot: dict[str, Any]) -> list[int]
         task: The run's task.
         rule: The run's rule.
         snapshot: `LossMeter.snapshot()`, with `x` [B, N, D] and `s` [B, N, C] after the rollout,
-            and the `parameters` at that time.
+            the `parameters` at that time, and `goal` [B] where the task has goals.
     """
     rule = copy.deepcopy(rule).cpu()
     trained = [parameter for parameter in rule.parameters() if parameter.requires_grad]
     nn.utils.vector_to_parameters(snapshot["parameters"], trained)
     task = task_for_rule(task, rule)
-    x, s = snapshot["x"], snapshot["s"]
+    x, s, goal = snapshot["x"], snapshot["s"], snapshot.get("goal")
     found = []
     for world in range(len(x)):
         one = slice(world, world + 1)
         finite = bool(torch.isfinite(x[one]).all() and torch.isfinite(s[one]).all())
         if finite:
             with torch.no_grad():
-                total, parts = task.loss(x[one], s[one], torch.zeros_like(x[one][..., 0]))
+                aimed = task_toward(task, None if goal is None else goal[one])
+                total, parts = aimed.loss(x[one], s[one], torch.zeros_like(x[one][..., 0]))
             finite = all(bool(torch.isfinite(v).all()) for v in (total, *parts.values()))
         if not finite:
             found.append(world)
