@@ -58,6 +58,7 @@ LADDER = {
         "torch numpy PIL imageio imageio_ffmpeg pygame",
         never=("npa_envs.kernels", "npa_envs.reference"),
     ),
+    "npa_envs.classification": rung(8, "torch", never=INSIDES),
     "npa_envs.evaluation": rung(7, "torch numpy tqdm", never=INSIDES),
     "npa_envs.bench.grid_kernels": rung(2, "warp"),
     "npa_envs.bench.hash_grid": rung(3, "warp torch", never=("npa_envs.reference",)),

@@ -117,7 +117,7 @@ def sample_ink(
     while len(waiting) > 0:
         cells, places = _places(side, share.shape[1:], random)
         finer = []
-        for part in waiting.split(chunk):
+        for part in torch.split(waiting, chunk):
             has_ink = _look(share[part], cells, side)
             counts = has_ink.sum(1)
             enough = (counts >= least) | (side >= FINEST)

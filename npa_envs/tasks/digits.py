@@ -142,7 +142,8 @@ def _mnist(split: Split, folder: str) -> DigitPictures:
             f"MNIST is not in the folder {folder!r}, and nothing is downloaded unasked: "
             f'python -c "{MNIST_DOWNLOAD.format(folder=folder)}", or name its folder'
         ) from error
-    return DigitPictures(mnist.data.numpy() / np.float32(255.0), mnist.targets.numpy())
+    ink = (mnist.data.numpy() / 255.0).astype(np.float32)
+    return DigitPictures(ink, mnist.targets.numpy().astype(np.int64))
 
 
 def _idx_folder(folder: Path, split: Split) -> DigitPictures:
@@ -152,7 +153,7 @@ def _idx_folder(folder: Path, split: Split) -> DigitPictures:
             f"the {split} files of {str(folder)!r} must hold pictures [M, H, W] and classes [M], "
             f"got {list(images.shape)} and {list(labels.shape)}: get them anew"
         )
-    return DigitPictures(images / np.float32(255.0), labels.astype(np.int64))
+    return DigitPictures((images / 255.0).astype(np.float32), labels.astype(np.int64))
 
 
 def _find(folder: Path, name: str) -> Path:

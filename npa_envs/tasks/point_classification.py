@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from functools import cached_property
 from typing import Self
 
@@ -33,9 +34,6 @@ class PointClassification:
         config: Data, variation, world and rule size.
         device: Where the clouds are kept.
         split: Which clouds worlds are made of; those of "test" are not varied.
-
-    Raises:
-        NPAError: The data cannot be loaded.
     """
 
     aligned = False
@@ -57,18 +55,16 @@ class PointClassification:
         self._device = torch.device(device)
         self._rule: NPARule | None = None
         self._goal: Tensor | None = None
-        highest = int(self.clouds.label.max())
-        if highest >= config.class_count:
-            raise NPAError(
-                f"class_count must be more than the highest class of the data, {highest}, got "
-                f"{config.class_count}: set class_count={highest + 1}"
-            )
 
     @cached_property
     def clouds(self) -> PointClouds:
-        """All clouds that worlds are made of."""
+        """All clouds that worlds are made of, loaded when first asked for.
+
+        Raises:
+            NPAError: They cannot be loaded, or are of more classes than the configuration says.
+        """
         config = self.config
-        return load_clouds(
+        clouds = load_clouds(
             config.data,
             self.split,
             config.particle_count,
@@ -76,6 +72,13 @@ class PointClassification:
             sample_seed=config.sample_seed,
             device=self._device,
         )
+        highest = int(clouds.label.max())
+        if highest >= config.class_count:
+            raise NPAError(
+                f"class_count must be more than the highest class of the data, {highest}, got "
+                f"{config.class_count}: set class_count={highest + 1}"
+            )
+        return clouds
 
     @property
     def eps(self) -> float:
@@ -100,7 +103,7 @@ class PointClassification:
     @property
     def pixel_size(self) -> float:
         """Side of the square that a particle fills [length units]."""
-        return (self.clouds.coverage / self.config.particle_count) ** 0.5
+        return math.sqrt(self.clouds.coverage / self.config.particle_count)
 
     def make_rule(self, generator: torch.Generator) -> NPARule:
         """Return an untrained rule on the CPU; its weights are drawn from `generator`."""
@@ -118,6 +121,12 @@ class PointClassification:
     def for_rule(self, rule: NPARule) -> Self:
         """Return the task with losses and pictures that read states through `rule`."""
         return self._with(_rule=rule)
+
+    def on(self, split: Split) -> Self:
+        """Return the task with the clouds of "train" or "test"."""
+        other = self._with(split=split)
+        vars(other).pop("clouds", None)
+        return other
 
     def toward(self, goal: Tensor) -> Self:
         """Return the task with loss and metric for worlds of these classes, shape [B]."""
