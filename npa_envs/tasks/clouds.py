@@ -28,8 +28,11 @@ CANDIDATES = (2, 3)
 FINEST = 1024
 """Places along a side, at most, that are looked at for ink."""
 
-CHUNK = {"cpu": 256, "cuda": 4096}
+CHUNK = {"cpu": 256, "cuda": 1024}
 """Pictures that are sampled together: on a CPU as many as fit into its caches."""
+
+CHUNK_CELLS = 1 << 24
+"""Cells of a grid, of all pictures that are sampled together, at most."""
 
 CACHED = 4
 """Data sets that are kept in memory."""
@@ -117,7 +120,7 @@ def sample_ink(
     while len(waiting) > 0:
         cells, places = _places(side, share.shape[1:], random)
         finer = []
-        for part in torch.split(waiting, chunk):
+        for part in torch.split(waiting, max(1, min(chunk, CHUNK_CELLS // side**2))):
             has_ink = _look(share[part], cells, side)
             counts = has_ink.sum(1)
             enough = (counts >= least) | (side >= FINEST)

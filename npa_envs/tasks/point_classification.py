@@ -213,12 +213,7 @@ class PointClassification:
         outputs = self.outputs(s)
         classes = torch.arange(self.config.class_count, device=s.device)
         wanted = (self._goal[:, None] == classes).to(outputs.dtype)
-        squares = (outputs - wanted[:, None]).square()
-        # One by one: torch's mean may round otherwise in another batch.
-        first, *rest = squares.unbind(-1)
-        for term in rest:
-            first = first + term
-        return first / len(classes)
+        return channel_mean((outputs - wanted[:, None]).square())
 
     def metric(self, x: Tensor, s: Tensor) -> Tensor:
         """Return each world's mean squared error, shape [B]; for `x` and `s` as in `loss`."""
@@ -264,7 +259,25 @@ class PointClassification:
             hi=1.0,
         )
 
+    def __getstate__(self) -> dict[str, object]:
+        """Leave out the clouds, which are loaded again when they are asked for."""
+        return {name: value for name, value in vars(self).items() if name != "clouds"}
+
     def _with(self, **fields: object) -> Self:
         bound = copy.copy(self)
+        vars(bound).update({"clouds": self.clouds} if "clouds" in vars(self) else {})
         vars(bound).update(fields)
         return bound
+
+
+def channel_mean(values: Tensor) -> Tensor:
+    """Return the mean over the last dimension, rounded alike in every batch.
+
+    Args:
+        values: Shape [..., K].
+    """
+    # One by one: torch's mean may round otherwise in another batch.
+    total, *rest = values.unbind(-1)
+    for term in rest:
+        total = total + term
+    return total / values.shape[-1]
