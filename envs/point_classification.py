@@ -19,10 +19,9 @@ from npa_envs.errors import NPAError
 from npa_envs.randomness import WorldRandom
 from npa_envs.rule import COLOUR_OFFSET, NPARule
 from npa_envs.rule_io import load_rule
-from npa_envs.sph import world_mean
 from npa_envs.tasks.checks import check_non_negative, check_positive
 from npa_envs.tasks.digits import Split
-from npa_envs.tasks.point_classification import PointClassification, channel_mean
+from npa_envs.tasks.point_classification import PointClassification
 from npa_envs.tasks.point_classification_config import PointClassificationConfig
 from npa_envs.tasks.votes import class_colours
 
@@ -140,12 +139,12 @@ class PointClassificationTask(EnvTask[PointClassificationEnvConfig]):
 
     def losses(self, x: Tensor, s: Tensor) -> Mapping[str, Tensor]:
         """Return each world's mean squared error to its class, and its weighted overflow."""
-        overflow = world_mean(self._overflow(s)[..., None])[:, 0]
+        overflow = self.config.overflow_weight * self.goal.overflow(s)
         return {"error": self.goal.metric(x, s), "overflow": overflow}
 
     def particle_losses(self, x: Tensor, s: Tensor) -> Tensor:
         """Return each particle's own error and overflow."""
-        return self.goal.errors(s) + self._overflow(s)
+        return self.goal.errors(s) + self.config.overflow_weight * self.goal.overflows(s)
 
     def draw(self, x: Tensor, s: Tensor, steps: NDArray[np.int64]) -> NDArray[np.uint8]:
         """Return pictures of the unit square; particles have the colours of what they say."""
@@ -156,9 +155,6 @@ class PointClassificationTask(EnvTask[PointClassificationEnvConfig]):
     def pixel_size(self) -> float:
         """Size of a particle in pictures, which show the unit square at twice its size."""
         return 2.0 * self.goal.pixel_size
-
-    def _overflow(self, s: Tensor) -> Tensor:
-        return self.config.overflow_weight * channel_mean((s - s.clamp(-1.0, 1.0)).abs())
 
 
 def _read_out_rule(config: PointClassificationEnvConfig, device: torch.device) -> NPARule:
@@ -202,9 +198,16 @@ class PointClassificationEnv(NPAEnv):
 
     ## Action space
 
-    `Box(-1, 1, (N, C), float32)`: one row for each particle, the change of its state, of which an
-    action of 1 is `state_scale`: s ← s + dt `state_scale` a. There are no displacements; all else
-    is as in `Morphogenesis2DEnv`.
+    `Box(-1, 1, (N, A), float32)` with A = C: one row for each particle, which never moves.
+
+    | Columns | Action a | An action of 1 is | Effect on an updated particle |
+    |---|---|---|---|
+    | `0 : C` | change of the state | `state_scale`, no unit | s ← s + dt `state_scale` a |
+
+    In every step each particle is updated with probability `update_prob`, on its own; the rows of
+    the others are ignored in this step. Entries are clipped to [-1, 1]. A number that is not finite
+    raises `NPAError` and leaves the world as it was. An update rule's output Δs is the action
+    Δs / `state_scale`; see [one step](../mathematics.md#one-step).
 
     ## Reward
 
@@ -245,12 +248,23 @@ class PointClassificationEnv(NPAEnv):
 
     ## Info
 
-    As in `Morphogenesis2DEnv`.
+    | Key | In | Value |
+    |---|---|---|
+    | `loss` | reset, step | L as it is now |
+    | `loss_error`, `loss_overflow` | reset, step | its two parts |
+    | `reward_error`, `reward_overflow` | step | how much each part improved in this step |
+    | `success`, `diverged` | step | whether the episode ended in this way, bool |
+    | `reason` | last step | why the episode ended, see above |
+    | `particle_reward` | step, where `reward="particle"` | each particle's own reward, shape [N] |
 
     ## Rendering
 
-    As in `Morphogenesis2DEnv`, but that pictures show [0, 1] × [0, 1], and the colour of a particle
-    is that of the class that it says, greyer the less sure it is.
+    `render_mode="rgb_array"` makes uint8 pictures of shape [R, R, 3], R = `render_size`, that show
+    [0, 1] × [0, 1] with y up: a particle has the colour of the class that it says, greyer the less
+    sure it is. `render_mode="human"` shows them in a window while the environment is stepped; it
+    needs `pip install 'npa-envs[human]'` and a screen: without one, it warns once and goes on.
+    `render_style` chooses between these colours, how dense the particles lie, and their hidden
+    channels.
 
     ## Arguments
 

@@ -219,6 +219,14 @@ class PointClassification:
         """Return each world's mean squared error, shape [B]; for `x` and `s` as in `loss`."""
         return world_mean(self.errors(s)[..., None])[:, 0]
 
+    def overflows(self, s: Tensor) -> Tensor:
+        """Return each particle's mean |s − clip(s, −1, 1)|, [B, N]; for `s` as in `errors`."""
+        return channel_mean((s - s.clamp(-1.0, 1.0)).abs())
+
+    def overflow(self, s: Tensor) -> Tensor:
+        """Return each world's mean |s − clip(s, −1, 1)|, shape [B]; for `s` as in `errors`."""
+        return world_mean(self.overflows(s)[..., None])[:, 0]
+
     def loss(self, x: Tensor, s: Tensor, path_length: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the training loss and its named parts, unweighted, and the share that is right.
 
