@@ -231,6 +231,14 @@ def test_the_code_about_textures_runs(capsys):
     assert capsys.readouterr().out.count("tensor([") == 2
 
 
+def test_the_code_about_point_clouds_runs(capsys):
+    (block,) = code_blocks(DOCS / "point_classification.md")
+    names = {}
+    exec(compile(block, "point_classification.md", "exec"), names)
+    assert "AccuracyRow(step=8" in capsys.readouterr().out
+    assert names["points"].shape == (1, 128, 2)
+
+
 def test_the_code_of_the_readme_runs():
     operators, environments = code_blocks(ROOT / "README.md")
     names = {}

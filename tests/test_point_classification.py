@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 
+import gymnasium
 import pytest
 import torch
 from small_digits import write_idx
 from test_training_cycle import Recording, assert_same, make_cycle
 
+from npa_envs.agents import RulePolicy
 from npa_envs.classification import _chimera, _cut, _partners, accuracies, changes_of_mind
 from npa_envs.cli import main
 from npa_envs.dynamics import rollout
@@ -343,3 +345,68 @@ def test_the_paper_recipe_runs_on_files_of_mnists_format(folder, tmp_path):
     assert result.finished
     # Blank outputs would have 1/3.
     assert 0.05 < result.record["error"] < 0.6
+
+
+def environment(folder, trained, **keywords):
+    rule = trained.folder / "rule.safetensors"
+    fields = {"particle_count": 32, "eps": 0.3, "eps0": 0.3, "state_dim": 6, "class_count": 3}
+    fields |= {"data": folder, "split": "test", "rule": str(rule)}
+    return gymnasium.make("npa/PointClassification-v0", **fields | keywords)
+
+
+def environments(folder, trained, count):
+    return gymnasium.make_vec(
+        "npa/PointClassification-v0",
+        num_envs=count,
+        vectorization_mode="vector_entry_point",
+        **environment(folder, trained).spec.kwargs,
+    )
+
+
+def test_a_trained_rule_is_a_policy_of_the_environment(folder, trained):
+    env = environment(folder, trained)
+    policy = RulePolicy(load_rule(trained.folder / "rule.safetensors"), env)
+    first, last = [], []
+    for seed in range(6):
+        observation, info = env.reset(seed=seed)
+        first.append(info["loss"])
+        for _ in range(16):
+            observation, _, _, _, info = env.step(policy(observation))
+        last.append(info["loss"])
+    print("MEASURED", sum(first) / 6, sum(last) / 6)
+    assert sum(last) < 0.5 * sum(first)
+
+
+def test_worlds_of_a_batch_have_their_own_classes_and_equal_single_ones(folder, trained):
+    batch = environments(folder, trained, 5)
+    singles = [environment(folder, trained) for _ in range(5)]
+    together, infos = batch.reset(seed=3)
+    for k, env in enumerate(singles):
+        alone, info = env.reset(seed=3 + k)
+        assert (together[k] == alone).all()
+        assert infos["loss"][k] == info["loss"]
+    random_actions = torch.rand(4, *batch.action_space.shape, generator=random()).numpy() * 2 - 1
+    for action in random_actions:
+        together, rewards, *_ = batch.step(action)
+        for k, env in enumerate(singles):
+            alone, reward, *_ = env.step(action[k])
+            assert (together[k] == alone).all()
+            assert rewards[k] == reward
+    classes = batch.unwrapped.worlds._goal
+    assert len(set(classes.tolist())) > 1
+    # A mask resets some worlds: the others keep their classes, and their losses.
+    before = classes.clone()
+    batch.reset(options={"reset_mask": torch.tensor([True, False, False, True, False]).numpy()})
+    assert torch.equal(classes[[1, 2, 4]], before[[1, 2, 4]])
+
+
+def test_placed_particles_keep_the_class_of_their_world(folder, trained):
+    env = environment(folder, trained, rule="").unwrapped
+    env.reset(seed=0)
+    label = int(env.worlds._goal)
+    x, s = env.particles()
+    s = torch.zeros_like(torch.as_tensor(s))
+    s[:, 3 + label] = 1.0
+    env.place_particles(x, s.numpy())
+    _, _, _, _, info = env.step(torch.zeros(env.action_space.shape).numpy())
+    assert info["loss"] == 0.0
