@@ -195,6 +195,7 @@ POINT_CLASSIFICATION_PRESETS: Mapping[str, TrainConfig[PointClassificationConfig
     "fast": TrainConfig(
         task=PointClassificationConfig(
             stretch=0.1,
+            mutated_share=0.25,
             particle_count=128,
             hidden_dim=128,
             readout_hidden_dim=64,
