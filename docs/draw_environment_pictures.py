@@ -14,7 +14,7 @@ import gymnasium
 import numpy as np
 
 from npa_envs import load_rule
-from npa_envs.agents import RulePolicy, SpreadPolicy
+from npa_envs.agents import Policy, RandomPolicy, RulePolicy, SpreadPolicy
 from npa_envs.registration import ENVIRONMENTS, Registration
 from npa_envs.render import write_filmstrip
 
@@ -29,14 +29,17 @@ class Film(NamedTuple):
     steps: tuple[int, ...]
     """Steps after which the world is shown."""
 
-    rows: tuple[dict[str, str], ...]
+    rows: tuple[dict[str, Any], ...]
     """Keywords of `gymnasium.make`, one set for each row of the picture."""
 
     caption: str
     """What one sees."""
 
     rule: str | None = "gecko"
-    """The shipped rule that acts; None: `SpreadPolicy`."""
+    """The shipped rule that acts; None: `policy`."""
+
+    policy: type[Policy] = SpreadPolicy
+    """What acts where no rule does."""
 
 
 FILMS = {
@@ -57,6 +60,13 @@ FILMS = {
         caption="An episode of `SpreadPolicy`, for which nothing was trained: particles repel each "
         "other.",
         rule=None,
+    ),
+    "PointClassification": Film(
+        steps=(0, 1, 2, 8, 16, 32, 64),
+        rows=({"state_scale": 0.2},),
+        caption="An episode of `RandomPolicy`: every particle says something else.",
+        rule=None,
+        policy=RandomPolicy,
     ),
 }
 """By the names of the environments."""
@@ -79,12 +89,12 @@ def film_episode(
         success_loss=0.0,
         **keywords,
     )
-    policy = SpreadPolicy(env) if film.rule is None else RulePolicy(load_rule(film.rule), env)
+    policy = film.policy(env) if film.rule is None else RulePolicy(load_rule(film.rule), env)
     observation, _ = env.reset(seed=SEED)
     shots = []
     for step in range(max(film.steps) + 1):
         if step in film.steps:
-            caption = ", ".join((*keywords.values(), f"step {step}"))
+            caption = ", ".join((*filter(str.isalpha, map(str, keywords.values())), f"step {step}"))
             shots.append((caption, np.asarray(env.render())))
         observation, *_ = env.step(policy(observation))
     env.close()

@@ -115,7 +115,7 @@ class RegenerationTask(PictureTask[Regeneration2DEnvConfig]):
 
     def start(self, random: WorldRandom) -> Start:
         """Return damaged worlds; they are healed once their loss is near the undamaged one."""
-        x, s, threshold = super().start(random)
+        x, s, threshold, _ = super().start(random)
         kinds = RANDOM_KINDS if self.config.damage == RANDOM_DAMAGE else (self.config.damage,)
         chosen = random.integers(len(kinds), 1, 1)
         hurt_x, hurt_s = x, s

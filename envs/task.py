@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar, Generic, NamedTuple, TypeVar
+from typing import ClassVar, Generic, NamedTuple, Self, TypeVar
 
 import numpy as np
 import torch
@@ -35,6 +35,9 @@ class Start(NamedTuple):
 
     success_loss: Tensor | None = None
     """Loss at which each world's episode ends in success, shape [B]; None: never."""
+
+    goal: Tensor | None = None
+    """What each world is to come to, int64, shape [B], where worlds differ in that."""
 
 
 class EnvTask(Generic[Config]):
@@ -81,6 +84,22 @@ class EnvTask(Generic[Config]):
         """
         raise NotImplementedError
 
+    def fresh(self, random: WorldRandom) -> Start:
+        """Return fresh worlds, with their goals where the task has such: by default `seed`'s.
+
+        Args:
+            random: As for `seed`.
+        """
+        return Start(*self.seed(random))
+
+    def toward(self, goal: Tensor) -> Self:
+        """Return the task with losses for worlds of these goals; by default there are none.
+
+        Args:
+            goal: The worlds' goals, int64, shape [B]; read anew at each call of `losses`.
+        """
+        return self
+
     def losses(self, x: Tensor, s: Tensor) -> Mapping[str, Tensor]:
         """Return the named parts of each world's loss, shape [B] each; their sum is the loss.
 
@@ -117,19 +136,20 @@ class EnvTask(Generic[Config]):
             random: Where they come from, one stream a world.
         """
         if self.config.seed_pool == 0:
-            x, s = self.seed(random)
+            start = self.fresh(random)
         else:
             pool = self.pool()
             chosen = random.integers(self.config.seed_pool, 1)[:, 0]
-            x, s = pool.x[chosen], pool.s[chosen]
-        return Start(x, s, self._constant_success(len(x)))
+            goal = None if pool.goal is None else pool.goal[chosen]
+            start = Start(pool.x[chosen], pool.s[chosen], goal=goal)
+        return start._replace(success_loss=self._constant_success(len(start.x)))
 
     def pool(self) -> Start:
         """Return the worlds that episodes start from, made when first asked for."""
         if self._pool is None:
             # Not the streams that episodes with these seeds go on with.
             random = WorldRandom(range(self.config.seed_pool), device=self.device)
-            self._pool = Start(*self.seed(random.beside(Purpose.GROWTH)))
+            self._pool = self.fresh(random.beside(Purpose.GROWTH))
         return self._pool
 
     def draw(self, x: Tensor, s: Tensor, steps: NDArray[np.int64]) -> NDArray[np.uint8]:

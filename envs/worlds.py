@@ -104,6 +104,8 @@ class Worlds:
         """Each particle's share of the loss, shape [B, N], where rewards are shared out."""
         self.particle_reward = zeros(count) if config.reward == "particle" else None
         """Each particle's own reward of the last step, shape [B, N], likewise."""
+        self._goal = zeros(dtype=torch.int64)
+        self._aimed = self.task.toward(self._goal)
         self._start_loss = zeros()
         self._success_loss = zeros()
         self._diverged = zeros(dtype=torch.uint8)
@@ -191,7 +193,12 @@ class Worlds:
             start: Their particles.
         """
         x, s = start.x.contiguous(), start.s.contiguous()
-        parts = self.task.losses(x, s)
+        task = self.task
+        if self._aimed is not task:
+            goal = self._goal[worlds] if start.goal is None else start.goal
+            self._goal.index_copy_(0, worlds, goal)
+            task = task.toward(goal)
+        parts = task.losses(x, s)
         if not self.part_names:
             self.part_names = tuple(parts)
             self.report = Report.empty(self.world_count, len(parts), x.device)
@@ -202,7 +209,7 @@ class Worlds:
         numbers = torch.cat((still[:1], total(values)[None], values, still))
         self.report.numbers.index_copy_(1, worlds, numbers)
         if self.particle_loss is not None and self.particle_reward is not None:
-            self.particle_loss[worlds] = self.task.particle_losses(x, s)
+            self.particle_loss[worlds] = task.particle_losses(x, s)
             self.particle_reward.index_fill_(0, worlds, 0.0)
         self.report.endings.index_fill_(1, worlds, False)
 
@@ -268,7 +275,7 @@ class Worlds:
 
     def _judge(self) -> None:
         """Write rewards, losses and endings of the worlds as they now are."""
-        config, task = self.task.config, self.task
+        config, task = self.task.config, self._aimed
         diverged = self._diverged.bool()
         parts = torch.stack(list(task.losses(self.x, self.s).values()))
         loss = total(parts)

@@ -11,11 +11,16 @@ from npa_envs.registration import ENVIRONMENTS
 IDS = [environment.id for environment in ENVIRONMENTS]
 
 SMALL: dict[str, Any] = {"particle_count": 61, "eps": 0.3, "resolution": 16, "render_size": 24}
-SPECIAL: dict[str, dict[str, Any]] = {"npa/Regeneration2D-v0": {"rule": "picture"}}
+# None: the environment has no such field.
+SPECIAL: dict[str, dict[str, Any]] = {
+    "npa/Regeneration2D-v0": {"rule": "picture"},
+    "npa/PointClassification-v0": {"resolution": None},
+}
 
 
 def small(name: str, **keywords: Any) -> dict[str, Any]:
-    return SMALL | SPECIAL.get(name, {}) | keywords
+    fields = SMALL | SPECIAL.get(name, {})
+    return {key: value for key, value in fields.items() if value is not None} | keywords
 
 
 def make(name: str, **keywords: Any) -> gymnasium.Env:

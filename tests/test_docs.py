@@ -22,7 +22,13 @@ OWN = DOCS / "own_environment.md"
 PAGES = [DOCS / "environments" / f"{registration.name}.md" for registration in ENVIRONMENTS]
 TEXTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
 SMALL = {"particle_count": 64, "eps": 0.3, "resolution": 16}
+NO_PICTURE = ("PointClassification",)
 BY_ID = {registration.id: registration for registration in ENVIRONMENTS}
+
+
+def small(name):
+    """Keywords that make an environment small, by its name."""
+    return {k: v for k, v in SMALL.items() if k != "resolution" or name not in NO_PICTURE}
 
 
 def code_blocks(path: Path) -> list[str]:
@@ -124,13 +130,14 @@ def test_a_page_lists_the_arguments_with_their_defaults(registration, builder):
     config = builder.environment_class(registration).task_type.config_type()
     arguments = section(page, "Arguments")
     assert sorted(first_cells(arguments)) == sorted(vars(config))
-    assert f'| `target` | str | `"{config.target}"` |' in arguments
+    name = "data" if registration.name == "PointClassification" else "target"
+    assert f'| `{name}` | str | `"{getattr(config, name)}"` |' in arguments
     assert "| `success_loss` | float or None | `None` |" in arguments
 
 
 @pytest.mark.parametrize("registration", ENVIRONMENTS, ids=lambda row: row.name)
 def test_a_page_lists_the_keys_of_info(registration):
-    keywords = {"reward": "particle", "success_loss": 1e6, **SMALL}
+    keywords = {"reward": "particle", "success_loss": 1e6, **small(registration.name)}
     if registration.name == "Regeneration2D":
         keywords["rule"] = "picture"
     env = gym.make(registration.id, **keywords)
@@ -148,9 +155,9 @@ def test_a_page_lists_the_keys_of_info(registration):
 def test_the_example_of_a_page_runs(page):
     (example,) = code_blocks(page)
     # Small worlds: what is tested is that the calls are right.
-    small = ", ".join(f"{name}={value}" for name, value in SMALL.items())
+    fields = ", ".join(f"{name}={value}" for name, value in small(page.stem).items())
     names = {}
-    exec(re.sub(r'(-v\d+")', rf"\1, {small}", example), names)
+    exec(re.sub(r'(-v\d+")', rf"\1, {fields}", example), names)
     assert names["observation"].shape == (64, 66)
     assert names["envs"].num_envs == 8
 
@@ -222,6 +229,14 @@ def test_the_code_about_textures_runs(capsys):
     (block,) = code_blocks(DOCS / "textures.md")
     exec(compile(block, "textures.md", "exec"), {})
     assert capsys.readouterr().out.count("tensor([") == 2
+
+
+def test_the_code_about_point_clouds_runs(capsys):
+    (block,) = code_blocks(DOCS / "point_classification.md")
+    names = {}
+    exec(compile(block, "point_classification.md", "exec"), names)
+    assert "AccuracyRow(step=8" in capsys.readouterr().out
+    assert names["points"].shape == (1, 128, 2)
 
 
 def test_the_code_of_the_readme_runs():

@@ -50,12 +50,15 @@ LADDER = {
     "npa_envs.rule_io": rung(4, "torch safetensors", never=INSIDES),
     "npa_envs.control": rung(4, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
     "npa_envs.dynamics": rung(4, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
-    "npa_envs.tasks": rung(5, "torch numpy PIL", never=("npa_envs.kernels", "npa_envs.reference")),
+    "npa_envs.tasks": rung(
+        5, "torch numpy PIL sklearn torchvision", never=("npa_envs.kernels", "npa_envs.reference")
+    ),
     "npa_envs.render": rung(
         6,
         "torch numpy PIL imageio imageio_ffmpeg pygame",
         never=("npa_envs.kernels", "npa_envs.reference"),
     ),
+    "npa_envs.classification": rung(8, "torch", never=INSIDES),
     "npa_envs.evaluation": rung(7, "torch numpy tqdm", never=INSIDES),
     "npa_envs.bench.grid_kernels": rung(2, "warp"),
     "npa_envs.bench.hash_grid": rung(3, "warp torch", never=("npa_envs.reference",)),

@@ -5,16 +5,24 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from npa_envs.errors import NPAError
 
+if TYPE_CHECKING:
+    from npa_envs.rule import NPARule
+    from npa_envs.tasks.point_classification import PointClassification
+
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateOptions:
-    """Measure loss, PSNR, overflow and extent of a rule over thousands of steps."""
+    """Measure loss, PSNR, overflow and extent of a rule over thousands of steps.
+
+    Of a rule that classifies point clouds: the accuracy on clouds it was not trained on, and what
+    they say when they are cut or become others.
+    """
 
     rule: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RULE")]
     """A shipped rule (`npa-envs list`), a file of ours or the authors' (.safetensors, .pth), or a
@@ -26,17 +34,25 @@ class EvaluateOptions:
     loss: str | None = None
     """Textures only: the loss to measure by (`npa-envs list`); default: as trained."""
 
-    checkpoints: tuple[int, ...] = (64, 128, 256, 512, 1024, 2048, 4096)
-    """Steps from the seed to measure at, increasing."""
+    data: str | None = None
+    """Point clouds only: "digits", "mnist" or a folder of IDX files; default: as trained."""
+
+    data_folder: str | None = None
+    """Point clouds only: where torchvision keeps "mnist"; default: as trained."""
+
+    checkpoints: tuple[int, ...] | None = None
+    """Steps from the seed to measure at, increasing; default: 64, 128, ... 4096, or 8, 16, 24, 32,
+    64, 128 of point clouds."""
 
     seed_count: int = 8
-    """Worlds to measure, each from a seed of its own."""
+    """Worlds to measure, each from a seed of its own; of point clouds all test clouds are taken."""
 
     first_seed: int = 1_000_000
     """The first world's number; training uses others."""
 
     healing: bool = False
-    """Also cut the grown worlds and erase a part, and measure how they heal."""
+    """Also cut the grown worlds and erase a part, and measure how they heal. Point clouds are
+    always cut and changed."""
 
     particle_count: int | None = None
     """Particles N; default: as trained."""
@@ -85,12 +101,13 @@ def run(options: EvaluateOptions) -> int:
     """
     from npa_envs.cli.progress import StepBar
     from npa_envs.cli.worlds import task_of_rule
-    from npa_envs.evaluation import check_steps, evaluate, healing, table_text, tables_json
-    from npa_envs.files import write_text
+    from npa_envs.evaluation import CHECKPOINTS, check_steps, evaluate, healing, table_text
     from npa_envs.rule_io import load_rule
+    from npa_envs.tasks.point_classification import PointClassification
     from npa_envs.training import check_device
 
-    check_steps("checkpoints", options.checkpoints)
+    checkpoints = options.checkpoints or CHECKPOINTS
+    check_steps("checkpoints", checkpoints)
     if options.seed_count < 1:
         raise NPAError(f"seed_count must be at least 1, got {options.seed_count}")
     device = check_device(options.device)
@@ -102,6 +119,8 @@ def run(options: EvaluateOptions) -> int:
         particle_count=options.particle_count,
         target=options.target,
         loss=options.loss,
+        data=options.data,
+        data_folder=options.data_folder,
         eps=options.eps,
         update_prob=options.update_prob,
     )
@@ -110,12 +129,14 @@ def run(options: EvaluateOptions) -> int:
             f"cannot measure {options.rule!r}: {trained.doubt}: "
             "give --target, a built-in name or a picture"
         )
+    if isinstance(trained.task, PointClassification):
+        return _evaluate_clouds(options, rule, trained.task)
     seeds = range(options.first_seed, options.first_seed + options.seed_count)
-    with StepBar(max(options.checkpoints), show=options.progress) as bar:
+    with StepBar(max(checkpoints), show=options.progress) as bar:
         rows = evaluate(
             rule,
             trained.task,
-            checkpoints=options.checkpoints,
+            checkpoints=checkpoints,
             seeds=seeds,
             device=device,
             progress=bar.advance,
@@ -129,7 +150,32 @@ def run(options: EvaluateOptions) -> int:
             healed = healing(rule, trained.task, seeds=seeds, device=device, progress=bar.advance)
         print(table_text(healed))
         tables["healing"] = healed
+    _write(options, tables, measure)
+    return 0
+
+
+def _evaluate_clouds(options: EvaluateOptions, rule: NPARule, task: PointClassification) -> int:
+    """Measure and print what a rule says of the clouds of a task."""
+    from npa_envs.classification import CLOUD_CHECKPOINTS, accuracies, changes_of_mind
+    from npa_envs.cli.progress import StepBar
+    from npa_envs.evaluation import table_text
+
+    with StepBar(None, show=options.progress) as bar:
+        told: dict[str, Any] = {"seed": options.first_seed, "progress": bar.advance}
+        checkpoints = options.checkpoints or CLOUD_CHECKPOINTS
+        rows = accuracies(rule, task, checkpoints=checkpoints, **told)
+        changes = changes_of_mind(rule, task, **told)
+    print(f"{options.rule}: {len(task.clouds.label)} {task.split} clouds, loss: {task.metric_name}")
+    print(table_text(rows))
+    print(table_text(changes))
+    _write(options, {"accuracy": rows, "changes": changes}, task.metric_name)
+    return 0
+
+
+def _write(options: EvaluateOptions, tables: dict[str, Sequence[Any]], measure: str) -> None:
+    from npa_envs.evaluation import tables_json
+    from npa_envs.files import write_text
+
     if options.json is not None:
         write_text(options.json, tables_json(tables, metric=measure))
         print(f"wrote {options.json}")
-    return 0

@@ -10,7 +10,7 @@ import tyro
 
 @dataclass(frozen=True)
 class ListOptions:
-    """Tasks and their presets, environments, built-in targets, texture losses, shipped rules."""
+    """Tasks and presets, environments, targets, texture losses, data sets, shipped rules."""
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -25,6 +25,7 @@ def main(arguments: Sequence[str]) -> int:
     tyro.cli(ListOptions, prog="npa-envs list", args=arguments)
     from npa_envs.registration import ENVIRONMENTS
     from npa_envs.rule_io import load_rule, shipped_rules
+    from npa_envs.tasks.digits import BUILT_IN
     from npa_envs.tasks.texture_losses import TEXTURE_LOSSES
     from npa_envs.training import TASKS
 
@@ -40,10 +41,13 @@ def main(arguments: Sequence[str]) -> int:
         print(f"  {environment.id}: episodes of {environment.max_episode_steps} steps")
     print("targets (--target NAME, or the path of a picture; for morphogenesis also one emoji)")
     for name, entry in TASKS.items():
-        print(f"  {name}: {', '.join(entry.targets())}")
+        if entry.targets():
+            print(f"  {name}: {', '.join(entry.targets())}")
     print("texture losses (--loss NAME)")
     for name, loss in TEXTURE_LOSSES.items():
         print(f"  {name}: {loss.summary}")
+    print("data sets of point clouds (--data NAME, or the path of a folder with MNIST's IDX files)")
+    print(f"  point_classification: {', '.join(BUILT_IN)}")
     print("rules (npa-envs rollout NAME)")
     for name in shipped_rules():
         rule = load_rule(name)

@@ -44,6 +44,9 @@ class RolloutOptions:
     loss: str | None = None
     """Textures only: the loss to measure by (`npa-envs list`); default: as trained."""
 
+    data: str | None = None
+    """Point clouds only: "digits", "mnist" or a folder of IDX files; default: as trained."""
+
     particle_count: int | None = None
     """Particles N; default: as trained."""
 
@@ -121,6 +124,9 @@ def run(options: RolloutOptions) -> int:
     from npa_envs.evaluation import measure
     from npa_envs.rule_io import load_rule
     from npa_envs.tasks.damage import parse_damage
+    from npa_envs.tasks.point_classification import PointClassification
+    from npa_envs.tasks.task import seed_worlds, task_toward
+    from npa_envs.tasks.votes import majority
     from npa_envs.training import check_device
     from npa_envs.training.interrupt import stop_flag
 
@@ -137,6 +143,7 @@ def run(options: RolloutOptions) -> int:
         "particle_count": options.particle_count,
         "target": options.target,
         "loss": options.loss,
+        "data": options.data,
         "eps": options.eps,
         "update_prob": options.update_prob,
     }
@@ -148,7 +155,8 @@ def run(options: RolloutOptions) -> int:
     folder = make_folder(options.out)
     check_writable(folder)
     generator = torch.Generator(device).manual_seed(options.seed)
-    x, s = task.seed(1, generator=generator, device=device)
+    x, s, goal = seed_worlds(task, 1, generator=generator, device=device)
+    task = task_toward(task, goal)
     with (
         stop_flag() as flag,
         StepBar(options.steps, show=options.progress) as bar,
@@ -173,6 +181,9 @@ def run(options: RolloutOptions) -> int:
     else:
         row = measure(task, x, s, done)
         print(f"step {done}: {row.figures}, extent {row.extent:.3f}")
+    if isinstance(task, PointClassification) and goal is not None:
+        vote = int(majority(task.outputs(s)))
+        print(f"most particles say {vote}; the cloud is a {int(goal)}")
     for path in write_film(film, folder, "growth", fps=options.fps):
         print(f"wrote {path}")
     return 0

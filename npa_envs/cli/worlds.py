@@ -53,18 +53,21 @@ def task_of_rule(
     Raises:
         NPAError: The rule does not fit the task, or a field is wrong.
     """
+    from npa_envs.tasks.point_classification import PointClassification
+    from npa_envs.tasks.task import task_for_rule
     from npa_envs.training import override, preset, task_entry
 
-    if rule.space_dim != 2 or rule.static:
-        raise NPAError(
-            f"the command line shows moving rules in 2D, got space_dim={rule.space_dim}, "
-            f"static={rule.static}: run this one in Python with npa_envs.rollout"
-        )
     path = shipped_rules().get(source, Path(source))
     metadata = rule_metadata(path) if path.suffix == ".safetensors" else {}
     task_name = metadata.get("task", "morphogenesis2d")
+    if rule.space_dim != 2 or rule.static != (task_name == "point_classification"):
+        raise NPAError(
+            f"the command line shows moving rules in 2D, and static ones that were trained on "
+            f"point_classification, got space_dim={rule.space_dim}, static={rule.static} of task "
+            f"{task_name!r}: run this one in Python with npa_envs.rollout"
+        )
     own: dict[str, Any] = {"state_dim": rule.state_dim, "hidden_dim": rule.hidden_dim}
-    own |= {"eps": rule.eps0, "alpha": rule.alpha}
+    own |= {"eps": rule.eps0} | ({} if rule.static else {"alpha": rule.alpha})
     told = "config" in metadata
     config = preset("paper", task_name, **own) if not told else _told_config(path, metadata)
     config = override(config, **{k: v for k, v in fields.items() if v is not None})
@@ -74,14 +77,17 @@ def task_of_rule(
     chosen = fields.get("target") is not None
     doubt = None if told or chosen else "its file does not say what it grows"
     try:
-        return TrainedTask(entry.make(config.task, device), doubt)
+        task = entry.make(config.task, device)
+        if isinstance(task, PointClassification):
+            # What a rule was trained on it may know by heart.
+            task = task.on("test")
+        return TrainedTask(task_for_rule(task, rule), doubt)
     except NPAError as error:
-        if chosen:
+        if chosen or not entry.targets():
             raise
         stand_in = override(config, target=entry.targets()[0])
-        return TrainedTask(
-            entry.make(stand_in.task, device), f"its target cannot be loaded: {error}"
-        )
+        task = task_for_rule(entry.make(stand_in.task, device), rule)
+        return TrainedTask(task, f"its target cannot be loaded: {error}")
 
 
 def _told_config(path: Path, metadata: Mapping[str, str]) -> Any:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, TypeVar, cast, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -72,3 +72,86 @@ class PictureTask(Task, Protocol):
     @property
     def metric_name(self) -> str:
         """What `metric` is, in a word or two."""
+
+
+@runtime_checkable
+class ReadOutTask(Protocol):
+    """A task that compares what a rule reads out of the states, instead of the states themselves.
+
+    It has all that `Task` has besides.
+    """
+
+    def for_rule(self, rule: NPARule) -> Task:
+        """Return the task with losses, metric and pictures that read states through `rule`.
+
+        Its parameters are read anew at each call, so that losses are differentiable in them and
+        change with them. The task itself stays as it is.
+
+        Args:
+            rule: The rule, where the worlds are.
+        """
+
+
+@runtime_checkable
+class GoalTask(Protocol):
+    """A task in which every world has a goal of its own, such as the class of what it shows.
+
+    It has all that `Task` has besides; goals are int64, shape [B], and stay with their worlds.
+    """
+
+    def seed_with_goals(
+        self, world_count: int, *, generator: Randomness, device: torch.device
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return fresh worlds as `seed` does, and their goals."""
+
+    def damage_with_goals(
+        self, x: Tensor, s: Tensor, goal: Tensor, generator: Randomness
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the worlds damaged as `damage` does, and what their goals are then."""
+
+    def toward(self, goal: Tensor) -> Task:
+        """Return the task with loss and metric for worlds of these goals.
+
+        The tensor is read anew at each call. The task itself stays as it is.
+        """
+
+
+TaskT = TypeVar("TaskT", bound=Task)
+
+
+def task_for_rule(task: TaskT, rule: NPARule) -> TaskT:
+    """Return a task as it is for the worlds of one rule; most are the same for all rules.
+
+    Args:
+        task: Any task.
+        rule: The rule that runs the worlds, where they are.
+    """
+    return cast(TaskT, task.for_rule(rule)) if isinstance(task, ReadOutTask) else task
+
+
+def task_toward(task: TaskT, goal: Tensor | None) -> TaskT:
+    """Return a task as it is for worlds of some goals; most tasks have none.
+
+    Args:
+        task: Any task.
+        goal: The worlds' goals, int64, shape [B], or None.
+    """
+    return (
+        task if goal is None or not isinstance(task, GoalTask) else cast(TaskT, task.toward(goal))
+    )
+
+
+def seed_worlds(
+    task: Task, world_count: int, *, generator: Randomness, device: torch.device
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Return fresh worlds of any task: positions, states, and goals where it has such.
+
+    Args:
+        task: The task.
+        world_count: Worlds B.
+        generator: Randomness, on the device.
+        device: Where the worlds are made.
+    """
+    if isinstance(task, GoalTask):
+        return task.seed_with_goals(world_count, generator=generator, device=device)
+    return *task.seed(world_count, generator=generator, device=device), None

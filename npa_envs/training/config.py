@@ -64,6 +64,9 @@ class TrainConfig(Generic[TaskConfigT]):
     seed_interval: int = 16
     """The first world of every this-many-th batch is a fresh seed; 1: of every batch."""
 
+    fresh_share: float = 0.0
+    """Share of the worlds of such a batch that are fresh seeds, at least one of them."""
+
     damage: bool = True
     """Worlds from the pool are damaged before the rollout, so that the rule learns to heal."""
 
@@ -110,7 +113,9 @@ class TrainConfig(Generic[TaskConfigT]):
         check_positive(self, int, "seed_interval", "log_interval", "checkpoint_interval")
         check_positive(self, float, "learning_rate", "runaway_limit")
         check_fraction(self, "decay")
-        check_non_negative(self, "weight_decay")
+        check_non_negative(self, "weight_decay", "fresh_share")
+        if self.fresh_share > 1.0:
+            raise NPAError(f"fresh_share must be at most 1, got {self.fresh_share}: try 0.5")
         interval = self.picture_interval
         if not is_whole(interval) or interval < 0:
             raise NPAError(
@@ -160,6 +165,11 @@ class TrainConfig(Generic[TaskConfigT]):
             raise NPAError(
                 f"{name} must be one of {', '.join(choices)}, got {getattr(self, name)!r}"
             )
+
+    @property
+    def fresh_count(self) -> int:
+        """Fresh seeds in a batch that has such."""
+        return max(1, round(self.fresh_share * self.world_count))
 
     @property
     def total_iterations(self) -> int:

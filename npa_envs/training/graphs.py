@@ -11,7 +11,7 @@ import npa_envs.dynamics
 from npa_envs.dynamics import Memory
 from npa_envs.replay import capture
 from npa_envs.rule import NPARule
-from npa_envs.tasks.task import Task
+from npa_envs.tasks.task import Task, task_toward
 from npa_envs.training.config import TrainConfig
 
 WARM_UP_STEPS = 2
@@ -53,6 +53,7 @@ class EagerIteration:
         s: States of any batch, shape [B, N, C], likewise.
         generator: Randomness of the update masks, on the worlds' device.
         rollout: The rollout to run; another one only in tests.
+        goal: The worlds' goals, int64, shape [B], where the task has such.
     """
 
     def __init__(
@@ -64,7 +65,12 @@ class EagerIteration:
         s: Tensor,
         generator: torch.Generator,
         rollout: Rollout | None = None,
+        *,
+        goal: Tensor | None = None,
     ) -> None:
+        self.goal = None if goal is None else goal.clone()
+        """Goals of the worlds, int64, shape [B], or None; filled like `x0`."""
+        task = task_toward(task, self.goal)
         self.x0, self.s0 = x.clone(), s.clone()
         """Worlds before the rollout."""
         self.x, self.s = torch.empty_like(x), torch.empty_like(s)
@@ -85,6 +91,11 @@ class EagerIteration:
         self._memory = config.memory
         self._generator = generator
         self._rollout: Rollout = npa_envs.dynamics.rollout if rollout is None else rollout
+
+    def aim(self, goal: Tensor) -> None:
+        """Give the worlds their goals, int64, shape [B]."""
+        assert self.goal is not None, "made with goals"
+        self.goal.copy_(goal)
 
     def run(self, steps: int) -> None:
         """Run the rollout, the loss and the backward pass.

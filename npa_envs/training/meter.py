@@ -114,7 +114,7 @@ class LossMeter:
 
         Returns:
             `iteration`, `steps`, `terms` (by name), `x0`, `s0` (before the rollout), `x`, `s`
-            (after it) and `parameters` (one flat vector).
+            (after it), `parameters` (one flat vector), and `goal` where the task has goals.
         """
         kept = {name: value.cpu() for name, value in self._snapshot.items()}
         terms = kept.pop("terms").tolist()
@@ -144,7 +144,8 @@ class LossMeter:
 
     def _observed(self) -> dict[str, Tensor]:
         iteration = self._iteration
-        return {
+        goals = {} if iteration.goal is None else {"goal": iteration.goal}
+        return goals | {
             "terms": iteration.terms,
             "x0": iteration.x0,
             "s0": iteration.s0,

@@ -14,14 +14,19 @@ class WorldPool:
     Args:
         x: Positions of every world [length units], shape [W, N, D], W the pool's size.
         s: States, shape [W, N, C].
+        goal: The goal of every world, shape [W], where the task has such.
         runaway_limit: A world with a larger |x| or |s|, or one that is not finite, is not kept.
     """
 
-    def __init__(self, x: Tensor, s: Tensor, *, runaway_limit: float) -> None:
+    def __init__(
+        self, x: Tensor, s: Tensor, goal: Tensor | None = None, *, runaway_limit: float
+    ) -> None:
         self.x = x
         """Positions [length units], shape [W, N, D]."""
         self.s = s
         """States (dimensionless), shape [W, N, C]."""
+        self.goal = goal
+        """Goals, int64, shape [W], or None."""
         self._runaway_limit = runaway_limit
 
     def sample(self, world_count: int, generator: torch.Generator) -> Tensor:
@@ -41,6 +46,11 @@ class WorldPool:
     def read(self, index: Tensor) -> tuple[Tensor, Tensor]:
         """Return copies of the worlds at `index` [B]: x [B, N, D] and s [B, N, C]."""
         return self.x.index_select(0, index), self.s.index_select(0, index)
+
+    def read_goals(self, index: Tensor) -> Tensor:
+        """Return a copy of the goals of the worlds at `index` [B], shape [B]."""
+        assert self.goal is not None, "asked for where the task has goals"
+        return self.goal.index_select(0, index)
 
     def write(
         self, index: Tensor, x: Tensor, s: Tensor, fresh_x: Tensor, fresh_s: Tensor
@@ -64,6 +74,18 @@ class WorldPool:
         self.x.index_copy_(0, index, torch.where(mask, x, fresh_x))
         self.s.index_copy_(0, index, torch.where(mask, s, fresh_s))
         return ~keep
+
+    def write_goals(self, index: Tensor, goal: Tensor, fresh: Tensor, replaced: Tensor) -> None:
+        """Put the goals of worlds back that `write` put back.
+
+        Args:
+            index: Where to, shape [B].
+            goal: Their goals, shape [B].
+            fresh: Goals of the fresh worlds, shape [B].
+            replaced: Which worlds are fresh ones, bool, shape [B].
+        """
+        assert self.goal is not None, "asked for where the task has goals"
+        self.goal.index_copy_(0, index, torch.where(replaced, fresh, goal))
 
 
 def _largest(worlds: Tensor) -> Tensor:

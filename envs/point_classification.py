@@ -1,0 +1,292 @@
+"""`npa/PointClassification-v0`: particles that stay where they are agree on what they form."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from npa_envs.envs.config import EnvConfig
+from npa_envs.envs.single import NPAEnv
+from npa_envs.envs.task import EnvTask, Start
+from npa_envs.envs.vector import NPAVectorEnv
+from npa_envs.errors import NPAError
+from npa_envs.randomness import WorldRandom
+from npa_envs.rule import COLOUR_OFFSET, NPARule
+from npa_envs.rule_io import load_rule
+from npa_envs.tasks.checks import check_non_negative, check_positive
+from npa_envs.tasks.digits import Split
+from npa_envs.tasks.point_classification import PointClassification
+from npa_envs.tasks.point_classification_config import PointClassificationConfig
+from npa_envs.tasks.votes import class_colours
+
+
+@dataclass(frozen=True, kw_only=True)
+class PointClassificationEnvConfig(EnvConfig):
+    """What the classification environment can be told besides."""
+
+    particle_count: int = 512
+    """Particles in a world, N: points of a cloud."""
+
+    data: str = "digits"
+    """The pictures: "digits" (scikit-learn), "mnist" (torchvision), or a folder of IDX files."""
+
+    data_folder: str = "data"
+    """Where torchvision keeps "mnist"."""
+
+    split: Split = "train"
+    """Which pictures: "train" or "test", which are never varied."""
+
+    class_count: int = 10
+    """Classes that there are."""
+
+    rotation: float = 0.0
+    """Clouds are turned by up to this, either way [degrees]."""
+
+    stretch: float = 0.0
+    """Clouds are stretched and sheared by up to this share (dimensionless)."""
+
+    jitter: float = 0.0
+    """Standard deviation of what is added to clouds' coordinates [length units]."""
+
+    rule: str = ""
+    """Rule whose read-out tells classes from states, a file; empty: the last channels are them."""
+
+    overflow_weight: float = 1.0
+    """Weight of mean |s − clip(s, −1, 1)| in the loss (dimensionless)."""
+
+    def __post_init__(self) -> None:
+        """Check every field.
+
+        Raises:
+            NPAError: A field has the wrong type or lies outside its range.
+        """
+        super().__post_init__()
+        if self.boundary != "open":
+            raise NPAError(
+                f"boundary must be 'open' for point clouds, got {self.boundary!r}: leave it out"
+            )
+        if self.split not in ("train", "test"):
+            raise NPAError(f"split must be 'train' or 'test', got {self.split!r}")
+        if not isinstance(self.rule, str):
+            raise NPAError(f"rule must be the path of a rule as a string, got {self.rule!r}")
+        check_positive(self, int, "class_count", at_least=2)
+        check_positive(self, int, "state_dim", at_least=3 if self.rule else self.class_count)
+        check_non_negative(self, "overflow_weight")
+
+
+class _WorldByWorld(NPARule):
+    """A rule whose read-out rounds alike in every batch."""
+
+    def read_out(self, states: Tensor) -> Tensor:
+        return torch.stack([super(_WorldByWorld, self).read_out(world) for world in states])
+
+
+class PointClassificationTask(EnvTask[PointClassificationEnvConfig]):
+    """Clouds of digits, and the error of what their particles say of them.
+
+    Args:
+        config: The environment's configuration.
+        device: Where the worlds live.
+
+    Raises:
+        NPAError: The data or the rule cannot be loaded, or the rule does not fit.
+    """
+
+    config_type = PointClassificationEnvConfig
+    static = True
+
+    def __init__(self, config: PointClassificationEnvConfig, device: torch.device) -> None:
+        super().__init__(config, device)
+        self.goal = PointClassification(
+            PointClassificationConfig(
+                data=config.data,
+                data_folder=config.data_folder,
+                class_count=config.class_count,
+                rotation=config.rotation,
+                stretch=config.stretch,
+                jitter=config.jitter,
+                particle_count=config.particle_count,
+                state_dim=config.state_dim,
+                eps=config.eps,
+                overflow_weight=config.overflow_weight,
+            ),
+            device=device,
+            split=config.split,
+        )
+        """The task with its clouds and its loss."""
+        if config.rule:
+            self.goal = self.goal.for_rule(_read_out_rule(config, device))
+        self._coverage = self.goal.clouds.coverage
+
+    def fresh(self, random: WorldRandom) -> Start:
+        """Return random clouds with all states zero, and their classes."""
+        x, s, label = self.goal.seed_with_goals(
+            random.world_count, generator=random, device=self.device
+        )
+        return Start(x, s, goal=label)
+
+    def toward(self, goal: Tensor) -> Self:
+        """Return the task with losses for worlds of these classes."""
+        aimed = type(self).__new__(type(self))
+        vars(aimed).update(vars(self) | {"goal": self.goal.toward(goal)})
+        return aimed
+
+    def losses(self, x: Tensor, s: Tensor) -> Mapping[str, Tensor]:
+        """Return each world's mean squared error to its class, and its weighted overflow."""
+        overflow = self.config.overflow_weight * self.goal.overflow(s)
+        return {"error": self.goal.metric(x, s), "overflow": overflow}
+
+    def particle_losses(self, x: Tensor, s: Tensor) -> Tensor:
+        """Return each particle's own error and overflow."""
+        return self.goal.errors(s) + self.config.overflow_weight * self.goal.overflows(s)
+
+    def draw(self, x: Tensor, s: Tensor, steps: NDArray[np.int64]) -> NDArray[np.uint8]:
+        """Return pictures of the unit square; particles have the colours of what they say."""
+        colours = class_colours(self.goal.outputs(s)) - COLOUR_OFFSET
+        return super().draw(2.0 * x - 1.0, torch.cat((s[..., :-3], colours), dim=-1), steps)
+
+    @property
+    def pixel_size(self) -> float:
+        """Size of a particle in pictures, which show the unit square at twice its size."""
+        return 2.0 * self.goal.pixel_size
+
+
+def _read_out_rule(config: PointClassificationEnvConfig, device: torch.device) -> NPARule:
+    given = load_rule(config.rule, device=device).float()
+    if given.readout is None or given.state_dim != config.state_dim:
+        raise NPAError(
+            f"rule must have a read-out of state_dim = {config.state_dim} channels, but "
+            f"{config.rule!r} has {given.state_dim} channels and {given.readout_dim} outputs: "
+            "choose one that was trained on point_classification"
+        )
+    rule = _WorldByWorld(**given.hyper_parameters()).to(device)
+    rule.load_state_dict(given.state_dict())
+    return rule.requires_grad_(False)
+
+
+class PointClassificationEnv(NPAEnv):
+    """Let particles that never move agree on which digit they form.
+
+    ## Description
+
+    A world holds N particles that lie on the ink of a digit, spread evenly over it, and stay where
+    they are. Each has a state of C numbers, zero at first. Step by step the particles have to find
+    out what they form, and every one of them has to say it: the last `class_count` channels of a
+    state are what its particle says of class 0, 1, ..., and should be 1 for the digit's own class
+    and 0 for all others.
+
+    No particle sees more than its neighbourhood within the radius ε, and the digit is ten times as
+    large: news have to travel. As in `npa/Morphogenesis2D-v0` one small network, applied to every
+    row of the observation alike, is the usual policy. Rules are trained by gradient with `npa-envs
+    train point_classification`; they say classes through a read-out network, so to run one as a
+    policy give its file to the environment as well: `gym.make(id, rule="rule.safetensors")` with
+    `npa_envs.agents.RulePolicy(npa_envs.load_rule("rule.safetensors"), env)`. The task is that of
+    Neural Particle Automata, "self-classifying point clouds".
+
+    `data="digits"` needs `pip install 'npa-envs[points]'`; see
+    [point clouds](../point_classification.md) for MNIST and data of one's own.
+
+    ## Observation space
+
+    As in `Morphogenesis2DEnv`.
+
+    ## Action space
+
+    `Box(-1, 1, (N, A), float32)` with A = C: one row for each particle, which never moves.
+
+    | Columns | Action a | An action of 1 is | Effect on an updated particle |
+    |---|---|---|---|
+    | `0 : C` | change of the state | `state_scale`, no unit | s ← s + dt `state_scale` a |
+
+    In every step each particle is updated with probability `update_prob`, on its own; the rows of
+    the others are ignored in this step. Entries are clipped to [-1, 1]. A number that is not finite
+    raises `NPAError` and leaves the world as it was. An update rule's output Δs is the action
+    Δs / `state_scale`; see [one step](../mathematics.md#one-step).
+
+    ## Reward
+
+    The loss L is the mean squared difference of what all particles say and what they should say,
+    plus `overflow_weight` times the mean of |s − clip(s, −1, 1)|. Blank states have
+    L = 1 / `class_count`.
+
+    | `reward` | Reward of step t |
+    |---|---|
+    | `"dense"` | L before the step minus L after it |
+    | `"sparse"` | 0, and minus L in the last step |
+    | `"particle"` | as dense; besides, `info["particle_reward"]` has each particle's own |
+
+    Dense rewards telescope: their sum over an episode is L at its start minus L at its end. `info`
+    holds the reward's two parts, as `reward_error` and `reward_overflow`. A particle's own reward
+    is its own loss's; the mean of all is the dense reward, up to rounding. In a step that diverges
+    L counts as at least its value at the start.
+
+    ## Starting state
+
+    A random cloud of the `split`, turned, stretched and shaken as `rotation`, `stretch` and
+    `jitter` say; all states are zero. `reset(seed=k)` begins the sequence of episodes that belongs
+    to k, and `reset()` goes on with the next one. With `seed_pool=K` there are only K different
+    starts. `place_particles` leaves a world the class that it has.
+
+    ## Episode end
+
+    | Cause | Returned as | `info["reason"]` |
+    |---|---|---|
+    | the loss is at most `success_loss` | terminated | `"success"` |
+    | a particle's state has run away | terminated | `"diverged"` |
+    | `max_episode_steps` steps are done, by default 64 | truncated | `"time limit"` |
+
+    `success_loss` is None by default. A state has run away beyond ±`observation_limit`. The steps
+    of a single environment are counted by Gymnasium, which truncates without a reason; with
+    `reward="sparse"` such an environment has to be told the number of steps twice, as
+    `max_episode_steps` and as `episode_steps`.
+
+    ## Info
+
+    | Key | In | Value |
+    |---|---|---|
+    | `loss` | reset, step | L as it is now |
+    | `loss_error`, `loss_overflow` | reset, step | its two parts |
+    | `reward_error`, `reward_overflow` | step | how much each part improved in this step |
+    | `success`, `diverged` | step | whether the episode ended in this way, bool |
+    | `reason` | last step | why the episode ended, see above |
+    | `particle_reward` | step, where `reward="particle"` | each particle's own reward, shape [N] |
+
+    ## Rendering
+
+    `render_mode="rgb_array"` makes uint8 pictures of shape [R, R, 3], R = `render_size`, that show
+    [0, 1] × [0, 1] with y up: a particle has the colour of the class that it says, greyer the less
+    sure it is. `render_mode="human"` shows them in a window while the environment is stepped; it
+    needs `pip install 'npa-envs[human]'` and a screen: without one, it warns once and goes on.
+    `render_style` chooses between these colours, how dense the particles lie, and their hidden
+    channels.
+
+    ## Arguments
+
+    As in `Morphogenesis2DEnv`.
+
+    ## Vectorized environment
+
+    As in `Morphogenesis2DEnv`.
+
+    ## References
+
+    As in `Morphogenesis2DEnv`.
+
+    ## Version history
+
+    - v0: first version.
+    """
+
+    task_type = PointClassificationTask
+
+
+class PointClassificationVectorEnv(NPAVectorEnv):
+    """Worlds of `PointClassificationEnv`, batched on one device; its docstring describes both."""
+
+    task_type = PointClassificationTask

@@ -1,0 +1,273 @@
+"""Clouds of points: farthest-point samples of pictures, and how they are varied."""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from npa_envs.errors import NPAError
+from npa_envs.randomness import Randomness, WorldRandom
+from npa_envs.tasks.digits import Split, load_pictures
+
+LEVELS = 2048
+"""Coordinates are whole numbers below this while points are chosen: squares of distances are exact
+in float32, so that every device chooses the same points."""
+
+INK = 0.5
+"""A place has ink where there is at least this share of the picture's darkest pixel."""
+
+CANDIDATES = (2, 3)
+"""Points to choose from, at least and at most, for each one that is chosen."""
+
+FINEST = 1024
+"""Places along a side, at most, that are looked at for ink."""
+
+CHUNK = {"cpu": 256, "cuda": 1024}
+"""Pictures that are sampled together: on a CPU as many as fit into its caches."""
+
+CHUNK_CELLS = 1 << 24
+"""Cells of a grid, of all pictures that are sampled together, at most."""
+
+CACHED = 4
+"""Data sets that are kept in memory."""
+
+
+@dataclass(frozen=True)
+class PointClouds:
+    """Clouds, and the class of each."""
+
+    x: Tensor
+    """Positions in [0, 1]² [length units], shape [M, N, 2]; y is up."""
+
+    label: Tensor
+    """Classes, int64, shape [M]."""
+
+    coverage: float
+    """Share of the unit square that has ink, mean of the clouds."""
+
+
+@functools.lru_cache(CACHED)
+def load_clouds(
+    data: str,
+    split: Split,
+    particle_count: int,
+    *,
+    folder: str = "data",
+    sample_seed: int = 0,
+    device: torch.device,
+) -> PointClouds:
+    """Return all clouds of a data set; computed once and kept in memory.
+
+    Args:
+        data: Data set, as for `npa_envs.tasks.digits.load_pictures`.
+        split: "train" or "test".
+        particle_count: Points N of each cloud.
+        folder: Where torchvision keeps "mnist".
+        sample_seed: What the places are drawn from that points are chosen among.
+        device: Where the clouds are made and kept.
+
+    Raises:
+        NPAError: The data cannot be loaded, or a picture has no ink.
+    """
+    pictures = load_pictures(data, split, folder=folder)
+    x, coverage = sample_ink(pictures.ink, particle_count, sample_seed=sample_seed, device=device)
+    return PointClouds(x, torch.from_numpy(pictures.label).to(device), coverage)
+
+
+def sample_ink(
+    ink: NDArray[np.float32],
+    particle_count: int,
+    *,
+    sample_seed: int = 0,
+    device: str | torch.device = "cpu",
+) -> tuple[Tensor, float]:
+    """Return farthest-point samples of the ink of pictures, the same on every device.
+
+    The picture, enlarged bilinearly, is looked at in one random place of each cell of a grid; the
+    grid is refined until there are enough places with ink.
+
+    Args:
+        ink: Pictures, shape [M, H, W]; the longer side becomes 1 length unit.
+        particle_count: Points N of each cloud.
+        sample_seed: What the places are drawn from.
+        device: Where points are chosen.
+
+    Returns:
+        Positions in [0, 1]² [length units], shape [M, N, 2], and the mean share of ink.
+
+    Raises:
+        NPAError: A picture has no ink.
+    """
+    darkest = ink.max((1, 2))
+    if (darkest <= 0).any():
+        raise NPAError(
+            f"every picture must have ink, got an empty one at {int(np.argmin(darkest))}: remove it"
+        )
+    least, most = (share * particle_count for share in CANDIDATES)
+    share = torch.from_numpy(ink / darkest[:, None, None])
+    x = torch.empty(len(ink), particle_count, 2, device=device)
+    areas = torch.empty(len(ink))
+    random = torch.Generator().manual_seed(sample_seed)
+    chunk = CHUNK[torch.device(device).type]
+    waiting = torch.arange(len(ink))
+    side = 1 << math.ceil(math.log2(2.0 * math.sqrt(least)))
+    while len(waiting) > 0:
+        cells, places = _places(side, share.shape[1:], random)
+        finer = []
+        for part in torch.split(waiting, max(1, min(chunk, CHUNK_CELLS // side**2))):
+            has_ink = _look(share[part], cells, side)
+            counts = has_ink.sum(1)
+            enough = (counts >= least) | (side >= FINEST)
+            finer.append(part[~enough])
+            part, has_ink, counts = part[enough], has_ink[enough], counts[enough]
+            if len(part) == 0:
+                continue
+            areas[part] = counts / len(cells)
+            x[part.to(device)] = _farthest_points(
+                places[_first(has_ink, most)].to(device), counts.to(device), particle_count
+            )
+        waiting = torch.cat(finer)
+        side *= 2
+    return (x + 0.5) / LEVELS, float(areas.mean())
+
+
+def _places(side: int, shape: tuple[int, ...], random: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Return one random place in each cell of a grid, in random order.
+
+    Returns:
+        The cells' numbers, shape [K], and the places as whole numbers below `LEVELS`, [K, 2].
+    """
+    height, width = shape
+    longer = max(height, width)
+    order = torch.randperm(side * side, generator=random)
+    corner = torch.stack((order % side, side - 1 - order // side), dim=1)
+    within = torch.rand(len(order), 2, generator=random)
+    places = (corner + within) * (LEVELS / side)
+    places *= torch.tensor((width / longer, height / longer))
+    return order, places.floor().clamp(max=LEVELS - 1)
+
+
+def _look(share: Tensor, cells: Tensor, side: int) -> Tensor:
+    """Return whether there is ink in each cell of a grid, [M, K], in the order of `cells`."""
+    enlarged = torch.nn.functional.interpolate(
+        share[:, None], size=(side, side), mode="bilinear", align_corners=False
+    )
+    return enlarged.flatten(1)[:, cells] >= INK
+
+
+def _first(has_ink: Tensor, most: int) -> Tensor:
+    """Return where the first `most` of each row are, [M, most]; 0 behind the last."""
+    # They are in random order, so these are a fair choice.
+    slot = (has_ink.cumsum(1) - 1).where(has_ink, most).clamp(max=most)
+    place = torch.arange(has_ink.shape[1]).expand_as(slot)
+    return slot.new_zeros(len(slot), most + 1).scatter_(1, slot, place)[:, :most]
+
+
+def _farthest_points(candidates: Tensor, counts: Tensor, particle_count: int) -> Tensor:
+    """Choose points one by one, each as far from those before as can be.
+
+    Args:
+        candidates: Points as whole numbers, shape [M, K, 2].
+        counts: How many of each row are to be chosen from, shape [M], at least 1.
+        particle_count: Points N; where a row has fewer, they are repeated.
+
+    Returns:
+        Shape [M, N, 2]; the first is the first of the candidates.
+    """
+    across, up = candidates.unbind(-1)
+    valid = torch.arange(across.shape[1], device=across.device) < counts[:, None]
+    # Never the farthest, even where all that may be chosen has been.
+    distance = torch.where(valid, 1e9, -1.0)
+    latest = torch.zeros(len(across), 1, dtype=torch.int64, device=across.device)
+    chosen = [latest]
+    for _ in range(particle_count - 1):
+        away_x = across - across.gather(1, latest)
+        away_y = up - up.gather(1, latest)
+        distance = torch.minimum(distance, away_x.square_().addcmul_(away_y, away_y))
+        latest = distance.argmax(1, keepdim=True)
+        chosen.append(latest)
+    index = torch.cat(chosen, dim=1)[..., None].expand(-1, -1, 2)
+    return candidates.gather(1, index)
+
+
+def varied(
+    x: Tensor, *, rotation: float, stretch: float, jitter: float, generator: Randomness
+) -> Tensor:
+    """Return clouds turned, stretched and shaken around the middle of the unit square.
+
+    Args:
+        x: Clouds [length units], shape [B, N, 2].
+        rotation: Largest angle [degrees], either way.
+        stretch: Largest share by which a cloud grows or shrinks, along each axis by itself, and by
+            which it is sheared (dimensionless).
+        jitter: Standard deviation of what is added to every coordinate [length units].
+        generator: Randomness, on the device of the clouds.
+    """
+    world_count, particle_count = x.shape[:2]
+    if rotation > 0.0 or stretch > 0.0:
+        draws = 2.0 * _uniform(generator, world_count, 4, x) - 1.0
+        angle = math.radians(rotation) * draws[:, 0]
+        cos, sin = angle.cos(), angle.sin()
+        wide, high = 1.0 + stretch * draws[:, 1], 1.0 + stretch * draws[:, 2]
+        shear = stretch * draws[:, 3]
+        across, up = (x - 0.5).unbind(-1)
+        across = wide[:, None] * across + shear[:, None] * up
+        up = high[:, None] * up
+        turned_x = cos[:, None] * across - sin[:, None] * up
+        turned_y = sin[:, None] * across + cos[:, None] * up
+        x = torch.stack((turned_x, turned_y), dim=-1) + 0.5
+    if jitter > 0.0:
+        x = x + jitter * _normal(generator, world_count, particle_count, x)
+    return x
+
+
+def _uniform(generator: Randomness, world_count: int, count: int, like: Tensor) -> Tensor:
+    if isinstance(generator, WorldRandom):
+        return generator.uniform(count, dtype=like.dtype)
+    return torch.rand(world_count, count, generator=generator, device=like.device, dtype=like.dtype)
+
+
+def _normal(generator: Randomness, world_count: int, count: int, like: Tensor) -> Tensor:
+    if isinstance(generator, WorldRandom):
+        return generator.normal(count, 2, dtype=like.dtype)
+    return torch.randn(
+        world_count, count, 2, generator=generator, device=like.device, dtype=like.dtype
+    )
+
+
+def drawn_indices(
+    count: int, world_count: int, generator: Randomness, device: torch.device
+) -> Tensor:
+    """Return one random number below `count` for each world, int64, shape [B].
+
+    Args:
+        count: How many clouds there are.
+        world_count: Worlds B.
+        generator: Randomness, on `device`.
+        device: Where the numbers are made.
+    """
+    if isinstance(generator, WorldRandom):
+        return generator.integers(count, 1)[:, 0]
+    return torch.randint(count, (world_count,), generator=generator, device=device)
+
+
+def share_of_worlds(
+    share: float, world_count: int, generator: Randomness, device: torch.device
+) -> Tensor:
+    """Return for each world whether it is one of a random share, bool, shape [B].
+
+    Args:
+        share: Probability of each, in [0, 1].
+        world_count: Worlds B.
+        generator: Randomness, on `device`.
+        device: Where the numbers are made.
+    """
+    if isinstance(generator, WorldRandom):
+        return generator.uniform(1)[:, 0] < share
+    return torch.rand(world_count, generator=generator, device=device) < share

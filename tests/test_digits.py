@@ -1,0 +1,209 @@
+"""Pictures of digits, and the clouds of points that are made of them."""
+
+from __future__ import annotations
+
+import builtins
+import sys
+import types
+
+import numpy as np
+import pytest
+import torch
+from small_digits import COUNTS, idx, pictures, write_idx
+
+from npa_envs.errors import MissingDependencyError, NPAError
+from npa_envs.randomness import WorldRandom
+from npa_envs.tasks.clouds import _farthest_points, load_clouds, sample_ink, varied
+from npa_envs.tasks.digits import load_pictures, read_idx
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return write_idx(tmp_path_factory.mktemp("idx"))
+
+
+def test_idx_files_are_read_as_they_were_written(folder):
+    for seed, (split, part) in enumerate((("train", "train"), ("test", "t10k"))):
+        images, label = pictures(COUNTS[part], seed)
+        read = load_pictures(str(folder), split)
+        assert np.array_equal(np.round(read.ink * 255), images)
+        assert np.array_equal(read.label, label)
+        assert read.ink.dtype == np.float32
+        assert read.label.dtype == np.int64
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "begins with nothing"),
+        (b"\0\0\x0d\x01\0\0\0\x01\0", "IDX file of unsigned bytes"),
+        (b"\0\0\x08\x03\0\0", "IDX file of unsigned bytes"),
+        (idx(np.zeros((2, 3), np.uint8))[:-1], r"must hold 6 bytes of data.*2 x 3.*holds 5"),
+        (b"\x1f\x8bnonsense", "cannot read the IDX file"),
+    ],
+)
+def test_a_damaged_idx_file_is_a_clear_error(tmp_path, content, message):
+    path = tmp_path / "file"
+    path.write_bytes(content)
+    with pytest.raises(NPAError, match=message):
+        read_idx(path)
+
+
+def test_data_that_are_not_there_are_clear_errors(tmp_path, folder):
+    with pytest.raises(NPAError, match="did you mean 'digits'"):
+        load_pictures("digit")
+    with pytest.raises(NPAError, match="must hold train-images-idx3-ubyte or"):
+        load_pictures(str(tmp_path))
+    with pytest.raises(NPAError, match="split must be"):
+        load_pictures(str(folder), "half")
+    for name in ("train-images-idx3-ubyte", "train-labels-idx1-ubyte"):
+        (tmp_path / name).write_bytes(idx(np.zeros((3, 2), np.uint8)))
+    with pytest.raises(NPAError, match=r"must hold pictures \[M, H, W\].*got \[3, 2\]"):
+        load_pictures(str(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("data", "module", "cure"),
+    [
+        ("digits", "sklearn", r"pip install 'npa-envs\[points\]'"),
+        ("mnist", "torchvision", "pip install torchvision"),
+    ],
+)
+def test_a_missing_package_is_named_with_its_command(data, module, cure, monkeypatch):
+    real = builtins.__import__
+
+    def without(name, *rest):
+        if name.split(".")[0] == module:
+            raise ImportError(name)
+        return real(name, *rest)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(MissingDependencyError, match=cure):
+        load_pictures(data)
+
+
+def test_mnist_is_what_torchvision_has_and_never_downloaded(monkeypatch):
+    asked = []
+
+    class MNIST:
+        def __init__(self, root, train, download):
+            asked.append((root, train, download))
+            if root == "empty":
+                raise RuntimeError("Dataset not found")
+            self.data = torch.tensor([[[0, 255]], [[51, 0]]], dtype=torch.uint8)
+            self.targets = torch.tensor([7, 1])
+
+    module = types.ModuleType("torchvision.datasets")
+    module.MNIST = MNIST
+    monkeypatch.setitem(sys.modules, "torchvision", types.ModuleType("torchvision"))
+    monkeypatch.setitem(sys.modules, "torchvision.datasets", module)
+    read = load_pictures("mnist", "test", folder="here")
+    assert asked == [("here", False, False)]
+    assert read.ink.tolist() == [[[0.0, 1.0]], [[pytest.approx(0.2), 0.0]]]
+    assert read.label.tolist() == [7, 1]
+    with pytest.raises(NPAError, match=r"nothing is downloaded unasked.*MNIST.'empty', download"):
+        load_pictures("mnist", folder="empty")
+
+
+def test_the_built_in_digits_are_split_fairly_and_without_overlap():
+    pytest.importorskip("sklearn")
+    train, test = load_pictures("digits"), load_pictures("digits", "test")
+    assert (len(train.label), len(test.label)) == (1438, 359)
+    assert np.bincount(test.label).min() >= 35
+    assert np.bincount(test.label).max() <= 37
+    assert train.ink.max() == 1.0
+    known = {picture.tobytes() for picture in train.ink}
+    assert sum(picture.tobytes() in known for picture in test.ink) == 0
+
+
+def test_each_point_is_as_far_as_can_be_from_those_before():
+    random = torch.Generator().manual_seed(0)
+    candidates = torch.randint(2048, (3, 60, 2), generator=random).float()
+    counts = torch.tensor([60, 31, 5])
+    chosen = _farthest_points(candidates, counts, 9).double()
+    for cloud, given, count in zip(chosen, candidates.double(), counts.tolist(), strict=True):
+        assert torch.equal(cloud[0], given[0])
+        for k in range(1, min(9, count)):
+            nearest = torch.cdist(given[:count], cloud[:k]).amin(1)
+            assert torch.cdist(cloud[k : k + 1], cloud[:k]).min() == nearest.max()
+        # Where there are no more, those that there are come again, and nothing else.
+        assert {tuple(p) for p in cloud.tolist()} <= {tuple(p) for p in given[:count].tolist()}
+
+
+def test_points_lie_on_the_ink_and_the_first_row_is_the_highest():
+    ink = np.zeros((2, 8, 4), np.float32)
+    ink[0, :2, 3] = 0.7
+    ink[1, 6:, :] = 0.2
+    x, coverage = sample_ink(ink, 40)
+    # Enlarged bilinearly, ink ends within a quarter of a pixel of the pixels' edges.
+    assert x[0, :, 0].min() > (3 - 0.26) / 8
+    assert x[0, :, 0].max() < 4 / 8
+    assert x[0, :, 1].min() > (6 - 0.26) / 8
+    assert x[1, :, 1].max() < (2 + 0.26) / 8
+    assert x[1, :, 0].max() < 0.5
+    # Shares of the picture: 2 of 32 pixels and 8 of 32, measured 0.154.
+    assert coverage == pytest.approx((2 / 32 + 8 / 32) / 2, abs=0.02)
+    with pytest.raises(NPAError, match="empty one at 1"):
+        sample_ink(np.stack([ink[0], 0 * ink[0]]), 10)
+
+
+def test_points_are_spread_evenly():
+    x, coverage = sample_ink(np.ones((1, 8, 8), np.float32), 256)
+    assert coverage == 1.0
+    nearest = torch.cdist(x, x)[0].fill_diagonal_(9.0).amin(1) * 16
+    # In distances of an even lattice: measured 0.66 and 0.81; of random points 0.03 and 0.5.
+    assert nearest.min() > 0.6
+    assert nearest.mean() > 0.75
+
+
+def test_a_cloud_does_not_depend_on_the_others_nor_on_the_device(device, monkeypatch):
+    images = np.concatenate([pictures(6, 3)[0], pictures(6, 4)[0] // 2]).astype(np.float32)
+    x, _ = sample_ink(images, 100, sample_seed=5)
+    for k in (0, 1, 11):
+        assert torch.equal(sample_ink(images[k : k + 1], 100, sample_seed=5)[0][0], x[k])
+    monkeypatch.setattr("npa_envs.tasks.clouds.CHUNK", {"cpu": 5, "cuda": 5})
+    assert torch.equal(sample_ink(images, 100, sample_seed=5, device=device)[0].cpu(), x)
+    assert not torch.equal(sample_ink(images, 100, sample_seed=6)[0], x)
+
+
+def test_clouds_are_kept_in_memory(folder):
+    ours = [load_clouds(str(folder), "test", 20, device=torch.device("cpu")) for _ in range(2)]
+    assert ours[0] is ours[1]
+    assert ours[0].x.shape == (18, 20, 2)
+    assert ours[0].label.tolist() == [0, 1, 2] * 6
+
+
+def test_turned_clouds_keep_their_distances_and_their_middle():
+    x = torch.rand(40, 9, 2, dtype=torch.float64)
+    generator = torch.Generator().manual_seed(1)
+    turned = varied(x, rotation=30.0, stretch=0.0, jitter=0.0, generator=generator)
+    torch.testing.assert_close(torch.cdist(turned, turned), torch.cdist(x, x))
+    torch.testing.assert_close((turned - 0.5).norm(dim=-1), (x - 0.5).norm(dim=-1))
+    angles = [torch.atan2(*(cloud - 0.5)[:, 0].T.flip(0)) for cloud in (turned, x)]
+    turn = torch.rad2deg(torch.remainder(angles[0] - angles[1] + torch.pi, 2 * torch.pi)) - 180
+    assert turn.abs().max() <= 30.0
+    assert turn.min() < -15.0
+    assert turn.max() > 15.0
+
+
+def test_stretched_clouds_are_linear_and_shaken_ones_are_off_by_a_little():
+    x = torch.rand(200, 3, 2, dtype=torch.float64)
+    generator = torch.Generator().manual_seed(1)
+    stretched = varied(x, rotation=0.0, stretch=0.2, jitter=0.0, generator=generator) - 0.5
+    maps = torch.linalg.lstsq(x - 0.5, stretched).solution.mT
+    torch.testing.assert_close(torch.einsum("bij,bnj->bni", maps, x - 0.5), stretched)
+    off = maps - torch.eye(2)
+    assert off.abs().max() <= 0.2 + 1e-9
+    assert off[:, 1, 0].abs().max() < 1e-9
+    for i, j in ((0, 0), (1, 1), (0, 1)):
+        assert off[:, i, j].abs().max() > 0.18
+    shaken = varied(x, rotation=0.0, stretch=0.0, jitter=0.01, generator=generator) - x
+    # 1200 numbers: the standard deviation is within 10 % but for one case in a million.
+    assert shaken.std() == pytest.approx(0.01, rel=0.1)
+
+
+def test_a_world_is_varied_as_it_would_be_alone():
+    x = torch.rand(3, 7, 2)
+    many, one = WorldRandom([4, 5, 6]), WorldRandom([5])
+    how = {"rotation": 40.0, "stretch": 0.1, "jitter": 0.02}
+    assert torch.equal(varied(x, **how, generator=many)[1], varied(x[1:2], **how, generator=one)[0])

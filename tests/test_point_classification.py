@@ -1,0 +1,412 @@
+"""Self-classifying point clouds: task, goals that stay with their worlds, training, measures."""
+
+from __future__ import annotations
+
+import json
+
+import gymnasium
+import pytest
+import torch
+from small_digits import write_idx
+from test_training_cycle import Recording, assert_same, make_cycle
+
+from npa_envs.agents import RulePolicy
+from npa_envs.classification import _chimera, _cut, _partners, accuracies, changes_of_mind
+from npa_envs.cli import main
+from npa_envs.dynamics import rollout
+from npa_envs.errors import NPAError
+from npa_envs.rule_io import load_rule
+from npa_envs.tasks.point_classification import PointClassification
+from npa_envs.tasks.point_classification_config import PointClassificationConfig
+from npa_envs.tasks.task import task_for_rule
+from npa_envs.tasks.votes import PALETTE, UNDECIDED, class_colours, majority
+from npa_envs.training import Trainer, preset, train
+
+SMALL = {"class_count": 3, "particle_count": 24, "state_dim": 6, "hidden_dim": 8, "eps": 0.3}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return str(write_idx(tmp_path_factory.mktemp("idx")))
+
+
+@pytest.fixture
+def task(folder, device):
+    config = PointClassificationConfig(data=folder, readout_hidden_dim=5, **SMALL)
+    return PointClassification(config, device=device)
+
+
+def small_config(folder, out, **fields):
+    return preset("tiny", "point_classification", data=folder, out=out, **(SMALL | fields))
+
+
+def assert_goals_fit(x, goals, clouds):
+    """Each world is a cloud, and of no other class."""
+    for cloud, goal in zip(x, goals, strict=True):
+        same = (clouds.x == cloud).flatten(1).all(1)
+        assert set(clouds.label[same].tolist()) == {int(goal)}
+
+
+def random(seed=0, device="cpu"):
+    return torch.Generator(device).manual_seed(seed)
+
+
+def test_worlds_are_clouds_of_their_class_with_blank_states(task, device):
+    x, s, goal = task.seed_with_goals(50, generator=random(1, device), device=device)
+    assert s.shape == (50, 24, 6)
+    assert not s.any()
+    assert_goals_fit(x, goal, task.clouds)
+    assert set(goal.tolist()) == {0, 1, 2}
+
+
+def test_test_clouds_are_others_and_never_varied(folder):
+    config = PointClassificationConfig(data=folder, rotation=90.0, jitter=0.1, **SMALL)
+    train_task = PointClassification(config)
+    test_task = train_task.on("test")
+    assert len(train_task.clouds.label) == 36
+    assert len(test_task.clouds.label) == 18
+    x, _, _ = test_task.seed_with_goals(5, generator=random())
+    assert all((test_task.clouds.x == cloud).flatten(1).all(1).any() for cloud in x)
+    x, _, _ = train_task.seed_with_goals(5, generator=random())
+    assert not any((train_task.clouds.x == cloud).flatten(1).all(1).any() for cloud in x)
+
+
+def test_loss_is_the_error_to_the_class_and_the_overflow(task, device):
+    rule = task.make_rule(random()).to(device).double()
+    goal = torch.tensor([2, 0], device=device)
+    aimed = task_for_rule(task, rule).toward(goal)
+    s = 2.0 * torch.randn(2, 24, 6, dtype=torch.float64, device=device)
+    x = torch.rand(2, 24, 2, dtype=torch.float64, device=device)
+    total, parts = aimed.loss(x, s, x[..., 0])
+    wanted = torch.nn.functional.one_hot(goal, 3)[:, None]
+    outputs = rule.readout(s)
+    error = (outputs - wanted).square().mean()
+    overflow = torch.relu(s.abs() - 1.0).mean()
+    # Worst error measured: 1e-16.
+    torch.testing.assert_close(parts["error"], error, rtol=1e-12, atol=0)
+    torch.testing.assert_close(parts["overflow"], overflow, rtol=1e-12, atol=0)
+    torch.testing.assert_close(total, error + overflow, rtol=1e-12, atol=0)
+    right = (outputs.argmax(-1) == goal[:, None]).double().mean()
+    assert parts["accuracy"].item() == pytest.approx(right.item())
+    torch.testing.assert_close(aimed.metric(x, s).mean(), error, rtol=1e-6, atol=0)
+    # The goals are read when they are asked for.
+    goal.copy_(torch.tensor([1, 1]))
+    assert aimed.loss(x, s, x[..., 0])[1]["error"] != error
+
+
+def test_without_read_out_the_last_channels_are_the_classes(task, device):
+    s = torch.zeros(1, 24, 6, device=device)
+    s[..., 4] = 1.0
+    goals = [torch.tensor([k], device=device) for k in range(3)]
+    errors = [task.toward(goal).metric(s, s).item() for goal in goals]
+    assert errors == pytest.approx([2 / 3, 0.0, 2 / 3])
+    with pytest.raises(NPAError, match="classes must be given first"):
+        task.metric(s, s)
+    with pytest.raises(NPAError, match="at least as many outputs as there are classes, 3, got 2"):
+        task.outputs(s[..., :2])
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"data": ""}, "data must be a name or a path"),
+        ({"stretch": 1.5}, "stretch must be at most 1"),
+        ({"rotation": -1.0}, "rotation must be a finite number of at least 0"),
+        ({"class_count": 1}, "class_count must be a whole number of at least 2"),
+        ({"sample_seed": -1}, "sample_seed must be a whole number"),
+    ],
+)
+def test_a_wrong_field_is_a_clear_error(fields, message):
+    with pytest.raises(NPAError, match=message):
+        PointClassificationConfig(**fields)
+
+
+def test_data_of_more_classes_than_told_are_refused(folder):
+    task = PointClassification(PointClassificationConfig(data=folder, **SMALL | {"class_count": 2}))
+    with pytest.raises(NPAError, match="more than the highest class of the data, 2, got 2"):
+        task.seed(1, generator=random())
+
+
+def test_majority_counts_votes_and_breaks_ties_by_certainty():
+    votes = torch.tensor([[0, 1, 1, 2], [0, 0, 2, 2], [2, 2, 0, 0]])
+    outputs = torch.nn.functional.one_hot(votes, 3).float()
+    outputs[0, 0, 0] = 50.0
+    outputs[1, 3, 2] = 1.5
+    outputs[2, 2, 0] = 1.5
+    assert majority(outputs).tolist() == [1, 2, 0]
+
+
+def test_colours_are_of_the_class_and_grey_where_undecided():
+    outputs = torch.tensor([[[0.0, 1.0, 0.2], [0.0, 0.0, 0.0], [0.1, 0.2, 0.5]]])
+    colours = class_colours(outputs)[0]
+    half = [(a + b) / 2 for a, b in zip(PALETTE[2], UNDECIDED, strict=True)]
+    torch.testing.assert_close(colours, torch.tensor([PALETTE[1], UNDECIDED, half]))
+
+
+def cycle_of(folder, tmp_path, **fields):
+    config = small_config(folder, tmp_path, **{"steps": (2, 4), "pool_size": 10, **fields})
+    return make_cycle(config, PointClassification(config.task))
+
+
+@pytest.mark.parametrize("mutated_share", [0.0, 0.6])
+@pytest.mark.parametrize("runaway_limit", [10.0, 1e-6])
+def test_classes_stay_with_their_worlds(folder, tmp_path, mutated_share, runaway_limit):
+    cycle, _ = cycle_of(
+        folder, tmp_path, mutated_share=mutated_share, runaway_limit=runaway_limit, world_count=6
+    )
+    before = cycle.pool.x.clone()
+    for iteration in range(5):
+        cycle.run(iteration)
+        assert_goals_fit(cycle.pool.x, cycle.pool.goal, cycle.task.clouds)
+        assert torch.equal(cycle.batch.x, cycle.batch.x0)
+    assert not torch.equal(cycle.pool.x, before)
+
+
+@pytest.mark.parametrize(("share", "count"), [(0.0, 1), (0.5, 3), (1.0, 6)])
+def test_so_many_worlds_of_a_batch_are_fresh_clouds(folder, tmp_path, share, count):
+    cycle, _ = cycle_of(folder, tmp_path, fresh_share=share, world_count=6, damage=False)
+    cycle.pool.s += 0.5
+    cycle.run(0)
+    blank = (cycle.batch.s0 == 0.0).flatten(1).all(1)
+    assert blank.tolist() == [True] * count + [False] * (6 - count)
+    with pytest.raises(NPAError, match="fresh_share must be at most 1"):
+        small_config(folder, tmp_path, fresh_share=1.1)
+
+
+def test_mutated_worlds_keep_their_states(folder):
+    config = PointClassificationConfig(data=folder, mutated_share=0.5, **SMALL)
+    task = PointClassification(config)
+    x, s, goal = task.seed_with_goals(200, generator=random(1))
+    s = s + torch.arange(200.0)[:, None, None]
+    new_x, new_s, new_goal = task.damage_with_goals(x, s, goal, random(2))
+    assert torch.equal(new_s, s)
+    moved = (new_x != x).flatten(1).any(1)
+    # Half of 200, less one in 36 that becomes what it was: 97 ± 7.
+    assert 65 < int(moved.sum()) < 130
+    assert torch.equal(new_goal[~moved], goal[~moved])
+    assert_goals_fit(new_x, new_goal, task.clouds)
+
+
+def test_replayed_operations_train_the_same_rule_as_called_ones(folder, tmp_path):
+    fields = {"mutated_share": 0.3, "rotation": 20.0, "stretch": 0.1, "jitter": 0.01}
+    cycles = [cycle_of(folder, tmp_path, **fields) for _ in range(2)]
+    (called, called_rule), (replayed, replayed_rule) = cycles
+    replayed._draw, replayed._keep = Recording(replayed._draw), Recording(replayed._keep)
+    for iteration in range(6):
+        for cycle in (called, replayed):
+            cycle.run(iteration)
+        assert_same(replayed.batch.goal, called.batch.goal)
+        assert_same(replayed_rule.state_dict(), called_rule.state_dict())
+    assert_same(replayed.state_dict(), called.state_dict())
+    assert "goal" in called.state_dict()["pool"]
+
+
+def test_a_resumed_run_equals_one_that_was_never_stopped(folder, tmp_path):
+    runs = {}
+    for name in ("whole", "resumed"):
+        config = small_config(
+            folder, tmp_path / name, iterations=6, checkpoint_interval=3, picture_interval=6
+        )
+        task = PointClassification(config.task)
+        trainer = Trainer(task, config, task_name="point_classification")
+        if name == "resumed":
+            for _ in range(3):
+                trainer._iterate()
+            trainer.save()
+            trainer = Trainer(task, config, task_name="point_classification", resume=True)
+        runs[name] = trainer.run(progress=False).rule.state_dict()
+    assert_same(runs["whole"], runs["resumed"])
+
+
+def test_accuracies_are_those_of_a_rollout(task):
+    task = task.on("test")
+    rule = task.make_rule(random(3))
+    sure = PointClassificationConfig(data=task.config.data, update_prob=1.0, **SMALL)
+    task = PointClassification(sure, device=task._device).on("test")
+    with torch.no_grad():
+        for parameter in rule.parameters():
+            parameter.mul_(10.0)
+    rows = accuracies(rule, task, checkpoints=(1, 4))
+    x, label = task.clouds.x, task.clouds.label
+    s = x.new_zeros(18, 24, 6)
+    rule = rule.to(x.device)
+    for steps, row in zip((1, 3), rows, strict=True):
+        _, s = rollout(rule, x, s, steps, eps=sure.eps, update_prob=1.0)
+        says = rule.readout(s).argmax(-1)
+        most = says.mode(dim=1).values
+        assert row.particle == pytest.approx((says == label[:, None]).double().mean().item())
+        assert row.majority == pytest.approx((most == label).double().mean().item())
+        assert row.agreement == pytest.approx((says == most[:, None]).double().mean().item())
+        error = rule.readout(s) - torch.nn.functional.one_hot(label, 3)[:, None]
+        assert row.loss == pytest.approx(error.square().mean().item(), rel=1e-5)
+    assert rows[1].step == 4
+
+
+def test_clouds_are_cut_and_mutated_as_told():
+    label = torch.tensor([2, 0, 1, 0, 2, 1, 0])
+    partner = _partners(label)
+    assert sorted(partner.tolist()) == list(range(7))
+    assert (label[partner] != label).all()
+    with pytest.raises(NPAError, match="more than half of the clouds, got 3 of 4"):
+        _partners(torch.tensor([1, 1, 0, 1]))
+    x, other = torch.rand(5, 8, 2), torch.rand(5, 8, 2)
+    s = x.sum(-1, keepdim=True)
+    cut_x, cut_s = _cut(x, s, random())
+    assert cut_x.shape == (5, 6, 2)
+    torch.testing.assert_close(cut_x.sum(-1, keepdim=True), cut_s)
+    new_x, new_s = _chimera(x, s, other)
+    assert torch.equal(new_x[:, :4, 1], x[..., 1].sort(1).values[:, :4])
+    assert torch.equal(new_x[:, 4:, 1], other[..., 1].sort(1).values[:, 4:])
+    torch.testing.assert_close(new_x[:, :4].sum(-1, keepdim=True), new_s[:, :4])
+    assert torch.equal(new_s.sort(1).values, s.sort(1).values)
+
+
+@pytest.fixture(scope="module")
+def trained(folder, tmp_path_factory):
+    """A rule that has learned three shapes, in some seconds."""
+    config = small_config(
+        folder,
+        tmp_path_factory.mktemp("run"),
+        particle_count=32,
+        hidden_dim=32,
+        readout_hidden_dim=16,
+        iterations=250,
+        milestones=(200,),
+        world_count=16,
+        steps=(5, 9),
+        rotation=10.0,
+        jitter=0.005,
+        mutated_share=0.3,
+    )
+    return train(config, "point_classification", progress=False)
+
+
+def test_particles_learn_to_say_what_they_form(trained):
+    rule = load_rule(trained.folder / "rule.safetensors")
+    config = json.loads((trained.folder / "config.json").read_text())
+    task = PointClassification(PointClassificationConfig(**config["task"])).on("test")
+    (row,) = accuracies(rule, task, checkpoints=(16,))
+    print("MEASURED", row)
+    assert row.majority >= 0.9
+    assert row.particle >= 0.85
+    changes = {(row.change, row.steps): row for row in changes_of_mind(rule, task, steps=(0, 16))}
+    print("MEASURED", changes["all mutated", 0], changes["all mutated", 16])
+    assert changes["all mutated", 0].majority_before >= 0.9
+    assert changes["all mutated", 16].majority >= 0.7
+    assert changes["all mutated", 16].majority > changes["upper half mutated", 16].majority
+
+
+def test_the_commands_measure_and_film_a_rule_that_classifies(trained, tmp_path, capsys):
+    rule = str(trained.folder / "rule.safetensors")
+    figures = tmp_path / "figures.json"
+    options = ["--checkpoints", "4", "8", "--json", str(figures), "--no-progress"]
+    assert main(["evaluate", rule, *options]) == 0
+    text = capsys.readouterr().out
+    assert "18 test clouds, loss: mean squared error to the class" in text
+    assert "all mutated" in text
+    written = json.loads(figures.read_text())
+    assert [row["step"] for row in written["accuracy"]] == [4, 8]
+    assert {row["change"] for row in written["changes"]} == {
+        "25% cut off",
+        "upper half mutated",
+        "all mutated",
+    }
+    folder = tmp_path / "film"
+    assert main(["rollout", rule, "--steps", "8", "--out", str(folder), "--no-progress"]) == 0
+    text = capsys.readouterr().out
+    assert "most particles say" in text
+    assert (folder / "growth.gif").is_file()
+
+
+def test_a_static_rule_of_no_known_task_is_refused(task, tmp_path, capsys):
+    from npa_envs.rule_io import save_rule
+
+    path = tmp_path / "rule.safetensors"
+    save_rule(task.make_rule(random()), path)
+    assert main(["evaluate", str(path), "--no-progress"]) != 0
+    assert "static ones that were trained on point_classification" in capsys.readouterr().err
+
+
+def test_the_paper_recipe_runs_on_files_of_mnists_format(folder, tmp_path):
+    config = preset(
+        "paper",
+        "point_classification",
+        data=folder,
+        out=tmp_path,
+        class_count=3,
+        iterations=2,
+        pool_size=64,
+        log_interval=1,
+        tensorboard=False,
+    )
+    assert (config.world_count, config.steps, config.fresh_count) == (64, (12, 24), 32)
+    assert config.task.particle_count == 512
+    result = train(config, "point_classification", progress=False)
+    assert result.finished
+    # Blank outputs would have 1/3.
+    assert 0.05 < result.record["error"] < 0.6
+
+
+def environment(folder, trained, **keywords):
+    rule = trained.folder / "rule.safetensors"
+    fields = {"particle_count": 32, "eps": 0.3, "eps0": 0.3, "state_dim": 6, "class_count": 3}
+    fields |= {"data": folder, "split": "test", "rule": str(rule)}
+    return gymnasium.make("npa/PointClassification-v0", **fields | keywords)
+
+
+def environments(folder, trained, count):
+    return gymnasium.make_vec(
+        "npa/PointClassification-v0",
+        num_envs=count,
+        vectorization_mode="vector_entry_point",
+        **environment(folder, trained).spec.kwargs,
+    )
+
+
+def test_a_trained_rule_is_a_policy_of_the_environment(folder, trained):
+    env = environment(folder, trained)
+    policy = RulePolicy(load_rule(trained.folder / "rule.safetensors"), env)
+    first, last = [], []
+    for seed in range(6):
+        observation, info = env.reset(seed=seed)
+        first.append(info["loss"])
+        for _ in range(16):
+            observation, _, _, _, info = env.step(policy(observation))
+        last.append(info["loss"])
+    print("MEASURED", sum(first) / 6, sum(last) / 6)
+    assert sum(last) < 0.5 * sum(first)
+
+
+def test_worlds_of_a_batch_have_their_own_classes_and_equal_single_ones(folder, trained):
+    batch = environments(folder, trained, 5)
+    singles = [environment(folder, trained) for _ in range(5)]
+    together, infos = batch.reset(seed=3)
+    for k, env in enumerate(singles):
+        alone, info = env.reset(seed=3 + k)
+        assert (together[k] == alone).all()
+        assert infos["loss"][k] == info["loss"]
+    random_actions = torch.rand(4, *batch.action_space.shape, generator=random()).numpy() * 2 - 1
+    for action in random_actions:
+        together, rewards, *_ = batch.step(action)
+        for k, env in enumerate(singles):
+            alone, reward, *_ = env.step(action[k])
+            assert (together[k] == alone).all()
+            assert rewards[k] == reward
+    classes = batch.unwrapped.worlds._goal
+    assert len(set(classes.tolist())) > 1
+    # A mask resets some worlds: the others keep their classes, and their losses.
+    before = classes.clone()
+    batch.reset(options={"reset_mask": torch.tensor([True, False, False, True, False]).numpy()})
+    assert torch.equal(classes[[1, 2, 4]], before[[1, 2, 4]])
+
+
+def test_placed_particles_keep_the_class_of_their_world(folder, trained):
+    env = environment(folder, trained, rule="").unwrapped
+    env.reset(seed=0)
+    label = int(env.worlds._goal)
+    x, s = env.particles()
+    s = torch.zeros_like(torch.as_tensor(s))
+    s[:, 3 + label] = 1.0
+    env.place_particles(x, s.numpy())
+    _, _, _, _, info = env.step(torch.zeros(env.action_space.shape).numpy())
+    assert info["loss"] == 0.0
