@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import math
+from collections.abc import Callable
 from typing import Literal, NamedTuple, overload
 
 import torch
@@ -23,12 +25,23 @@ from npa_envs.sph.checks import (
     checked_number,
 )
 from npa_envs.sph.operators import Terms, perceive_rows
-from npa_envs.sph.update import update_particles
+from npa_envs.sph.settled import SettledWorlds, settle
+from npa_envs.sph.settled_perception import perceive_settled
+from npa_envs.sph.settled_states import (
+    settled_rows,
+    settled_states,
+    unsettled_states,
+    update_settled,
+)
+from npa_envs.sph.update import update_particles, wrapped
 
 Memory = Literal["store", "recompute", "minimal"]
 
 STORED_INTERVAL: dict[Memory, float] = {"store": 1, "recompute": 3, "minimal": math.inf}
 """The last step and every so-manyth before it store what the backward pass reads."""
+
+FEWEST_SETTLED = 4
+"""Steps from which on it pays to compute once what follows from positions that stay."""
 
 OVERFLOW_LOG_PROBABILITY = 34.5
 """Row capacities hold with probability 1 - exp(-34.5), about 1 - 1e-15, for each step."""
@@ -123,6 +136,18 @@ def _draw(
     return mask, noise
 
 
+def _rows_of(mask: Tensor | None, total: int, update_prob: float) -> int:
+    """Return how many rows a step needs."""
+    if mask is None:
+        return total
+    # Counting is free on the CPU; on CUDA it would stall the stream.
+    return row_capacity(total, update_prob) if mask.is_cuda else max(int(mask.sum()), 1)
+
+
+def _terms(rule: NPARule) -> Terms:
+    return Terms(rule.state_gradient, rule.moment_correction, rule.density_gradient)
+
+
 def _advance(
     rule: NPARule,
     folded: FoldedRule | None,
@@ -134,23 +159,16 @@ def _advance(
     noise: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Advance checked worlds by one step whose random draws are given."""
-    total = x.shape[0] * x.shape[1]
-    capacity = total
-    if mask is not None:
-        # Counting is free on the CPU; on CUDA it would stall the stream.
-        capacity = (
-            row_capacity(total, options.update_prob) if x.is_cuda else max(int(mask.sum()), 1)
-        )
     perception, rows = perceive_rows(
         x.detach() if options.detach_positions else x,
         s,
         mask=mask,
-        row_capacity=capacity,
+        row_capacity=_rows_of(mask, x.shape[0] * x.shape[1], options.update_prob),
         row_width=rule.perception_dim if folded is None else folded.row_width,
         eps=options.eps,
         eps0=rule.eps0,
         box=options.box,
-        terms=Terms(rule.state_gradient, rule.moment_correction, rule.density_gradient),
+        terms=_terms(rule),
     )
     return update_particles(
         rule(perception) if folded is None else folded(perception),
@@ -162,6 +180,39 @@ def _advance(
         dt=options.dt,
         moving=not rule.static,
         box=options.box,
+    )
+
+
+def _advance_settled(
+    rule: NPARule,
+    folded: FoldedRule | None,
+    options: StepOptions,
+    worlds: SettledWorlds,
+    states: Tensor,
+    mask: Tensor | None,
+    _noise: None,
+) -> tuple[Tensor]:
+    """Advance worlds whose particles stay where they are by one step."""
+    capacity = _rows_of(mask, worlds.total, options.update_prob)
+    rows = settled_rows(worlds, mask, capacity)
+    perception = perceive_settled(
+        worlds,
+        states,
+        rows,
+        row_capacity=capacity,
+        row_width=rule.perception_dim if folded is None else folded.row_width,
+    )
+    update = rule(perception) if folded is None else folded(perception)
+    return (update_settled(worlds, states, update, rows, options.dt),)
+
+
+def _settle(rule: NPARule, x: Tensor, steps: int, options: StepOptions) -> SettledWorlds | None:
+    """Compute what follows from positions, where they stay and it pays."""
+    moving = not rule.static or options.position_noise > 0.0 or not options.detach_positions
+    if moving or steps < FEWEST_SETTLED:
+        return None
+    return settle(
+        x, rule.state_dim, eps=options.eps, eps0=rule.eps0, box=options.box, terms=_terms(rule)
     )
 
 
@@ -300,22 +351,24 @@ def rollout(
     interval = STORED_INTERVAL[memory] if torch.is_grad_enabled() else 1
     # Worlds keep their dtype under autocast: the kernels read what the rule writes.
     with torch.autocast(x.device.type, enabled=False):
+        settled = _settle(rule, x, steps, options)
+        advance: Callable[..., tuple[Tensor, ...]]
+        worlds: tuple[Tensor, ...]
+        if settled is None:
+            worlds = x, s, path_length
+            advance = functools.partial(_advance, rule, folded, options)
+        else:
+            worlds = (settled_states(settled, s),)
+            advance = functools.partial(_advance_settled, rule, folded, options, settled)
         for number in range(steps):
-            mask, noise = _draw(x, options, generator)
+            drawn = _draw(x, options, generator)
             if (steps - 1 - number) % interval > 0:
-                x, s, path_length = checkpoint(
-                    _advance,
-                    rule,
-                    folded,
-                    options,
-                    x,
-                    s,
-                    path_length,
-                    mask,
-                    noise,
-                    use_reentrant=False,
-                    preserve_rng_state=False,
+                worlds = checkpoint(
+                    advance, *worlds, *drawn, use_reentrant=False, preserve_rng_state=False
                 )
             else:
-                x, s, path_length = _advance(rule, folded, options, x, s, path_length, mask, noise)
+                worlds = advance(*worlds, *drawn)
+        if settled is not None:
+            worlds = wrapped(x, options.box), unsettled_states(settled, *worlds), path_length
+    x, s, path_length = worlds
     return (x, s, path_length) if return_path_length else (x, s)
