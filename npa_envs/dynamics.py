@@ -40,7 +40,7 @@ Memory = Literal["store", "recompute", "minimal"]
 STORED_INTERVAL: dict[Memory, float] = {"store": 1, "recompute": 3, "minimal": math.inf}
 """The last step and every so-manyth before it store what the backward pass reads."""
 
-FEWEST_SETTLED = 4
+FEWEST_SETTLED = 3
 """Steps from which on it pays to compute once what follows from positions that stay."""
 
 OVERFLOW_LOG_PROBABILITY = 34.5

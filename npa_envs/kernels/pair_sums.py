@@ -18,7 +18,7 @@ from npa_envs.kernels.domain import (
     log_scale_adjoint,
     log_scale_factor,
 )
-from npa_envs.kernels.groups import make_add_scaled
+from npa_envs.kernels.groups import make_add_scaled, of_groups
 from npa_envs.kernels.lanes import make_wide_load
 from npa_envs.kernels.pairs import ENTRY_SIZE, make_weigh, packing
 from npa_envs.kernels.ranges import PAIRS, in_ranges
@@ -69,6 +69,7 @@ def pair_sum_kernels(
     entries_ahead = wp.types.matrix((ahead, ENTRY_SIZE), scalar)
     groups_ahead = wp.types.matrix((ahead, width), scalar)
     places_ahead = wp.types.vector(ahead, wp.int32)
+    cotangents_ahead = wp.types.matrix((ahead * kinds, width), scalar)
     flat = space_dim == 2
     topic = "pair_smoothing"
     if state_gradient:
@@ -77,6 +78,8 @@ def pair_sum_kernels(
     module = kernel_module(topic, space_dim, scalar, width, lanes)
     sift, stride = make_sift(space_dim, scalar, particle, lanes)
     stride //= lanes
+    sifted = stride if ahead == 1 else 1
+    sifted_places = wp.types.vector(sifted, wp.int32)
     weigh = make_weigh(space_dim, scalar)
     unpacked = packing(scalar).unpacked
     add_scaled = make_add_scaled(group, scalar)
@@ -96,6 +99,19 @@ def pair_sum_kernels(
         else:
             j = load_integer(neighbours, place)
         return j
+
+    @wp.func
+    def row_at(
+        weights: wp.array(dtype=entry_type),
+        neighbours: wp.array(dtype=wp.int32),
+        row_of: wp.array(dtype=wp.int32),
+        place: wp.int32,
+    ):
+        """Return the row of a listed neighbour, -1 where it has none."""
+        row = neighbour_of(load_entry(weights, place), neighbours, place)
+        if row_of.shape[0] > 0:
+            row = load_integer(row_of, row)
+        return row
 
     @wp.func
     def add_state(
@@ -218,12 +234,11 @@ def pair_sum_kernels(
 
         Rows beyond the last active one are zero.
         """
-        row, g = wp.tid()
-        row += range_start
+        row, g = of_groups(range_start + wp.tid(), group_count)
         row_begin = row * row_width
         k = row
         if row_place.shape[0] > 0:
-            if row >= active_before[active_before.shape[0] - 1]:
+            if row >= load_integer(active_before, active_before.shape[0] - 1):
                 for column in range(g, row_width, group_count):
                     perception[row_begin + column] = scalar(0.0)
                 return
@@ -316,11 +331,10 @@ def pair_sum_kernels(
         cotangents: wp.array(dtype=cotangent),
     ):
         """Pull the cotangents of rows back through their scaling, and divide them by volumes."""
-        row, g = wp.tid()
-        row += range_start
+        row, g = of_groups(range_start + wp.tid(), group_count)
         k = row
         if row_place.shape[0] > 0:
-            if row >= active_before[active_before.shape[0] - 1]:
+            if row >= load_integer(active_before, active_before.shape[0] - 1):
                 return
             k = load_integer(row_place, row)
         density = scalar(1.0) / particles[k][wp.static(space_dim)]
@@ -366,8 +380,7 @@ def pair_sum_kernels(
         states_bar: wp.array(dtype=group),
     ):
         """Write the cotangent of every particle's state, from the active rows around it."""
-        k, g = wp.tid()
-        k += range_start
+        k, g = of_groups(range_start + wp.tid(), group_count)
         length = load_integer(lengths, k)
         volume = particles[k][wp.static(space_dim)]
         total = group()
@@ -375,18 +388,40 @@ def pair_sum_kernels(
             place = k * capacity
             if ends.shape[0] > 0:
                 place = ends[k] - length
-            for first in range(place, place + length, wp.static(ahead)):
-                entries = entries_ahead()
-                rows = places_ahead()
-                for a in range(wp.static(ahead)):
-                    entries[a] = load_entry(weights, first + a)
-                    rows[a] = neighbour_of(entries[a], neighbours, first + a)
-                if row_of.shape[0] > 0:
+            if wp.static(sifted > 1):
+                # Whether a neighbour has a row is often predicted wrongly: those are listed first.
+                rows = sifted_places()
+                places = sifted_places()
+                for first in range(place, place + length, wp.static(sifted)):
+                    count = wp.int32(0)
+                    for at in range(first, wp.min(first + wp.static(sifted), place + length)):
+                        row = row_at(weights, neighbours, row_of, at)
+                        rows[count] = row
+                        places[count] = at
+                        count += wp.where(row >= 0, 1, 0)
+                    for n in range(count):
+                        bar = load_cotangent(cotangents, rows[n] * group_count + g)
+                        total = add_cotangent(load_entry(weights, places[n]), bar, total)
+            else:
+                for first in range(place, place + length, wp.static(ahead)):
+                    entries = entries_ahead()
+                    seen = places_ahead()
                     for a in range(wp.static(ahead)):
-                        rows[a] = load_integer(row_of, rows[a])
-                for a in range(wp.static(ahead)):
-                    if rows[a] >= 0:
-                        bar = load_cotangent(cotangents, rows[a] * group_count + g)
+                        entries[a] = load_entry(weights, first + a)
+                        seen[a] = neighbour_of(entries[a], neighbours, first + a)
+                    if row_of.shape[0] > 0:
+                        for a in range(wp.static(ahead)):
+                            seen[a] = load_integer(row_of, seen[a])
+                    bars = cotangents_ahead()
+                    for a in range(wp.static(ahead)):
+                        if seen[a] >= 0:
+                            bar = load_cotangent(cotangents, seen[a] * group_count + g)
+                            for kind in range(wp.static(kinds)):
+                                bars[a * wp.static(kinds) + kind] = bar[kind]
+                    for a in range(wp.static(ahead)):
+                        bar = cotangent()
+                        for kind in range(wp.static(kinds)):
+                            bar[kind] = bars[a * wp.static(kinds) + kind]
                         total = add_cotangent(entries[a], bar, total)
         else:
             total = gather_searched(

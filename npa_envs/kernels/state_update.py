@@ -6,10 +6,11 @@ from types import SimpleNamespace
 import warp as wp
 
 from npa_envs.kernels.domain import kernel_module
+from npa_envs.kernels.groups import of_groups
 from npa_envs.kernels.lanes import make_wide_load
 from npa_envs.kernels.ranges import PARTICLES, in_ranges
 from npa_envs.kernels.warps import load_integer
-from npa_envs.kernels.wide import make_read_channels, make_wide_store
+from npa_envs.kernels.wide import make_read_channels, make_wide_store, make_write_at
 
 
 @functools.cache
@@ -18,6 +19,7 @@ def state_update_kernels(scalar: type, width: int) -> SimpleNamespace:
     group = wp.types.vector(width, scalar)
     load_group = make_wide_load(group, scalar)
     store_group = make_wide_store(group, scalar)
+    write_group = make_write_at(group, scalar)
     read_channels = make_read_channels(group, scalar)
     module = kernel_module("state_update", 0, scalar, width)
 
@@ -59,8 +61,7 @@ def state_update_kernels(scalar: type, width: int) -> SimpleNamespace:
         new_states: wp.array(dtype=group),
     ):
         """Change the states of the particles that have a row; copy the others."""
-        k, g = wp.tid()
-        k += range_start
+        k, g = of_groups(range_start + wp.tid(), group_count)
         place = k * group_count + g
         state = load_group(states, place)
         row = k
@@ -82,25 +83,36 @@ def state_update_kernels(scalar: type, width: int) -> SimpleNamespace:
         state_dim: wp.int32,
         group_count: wp.int32,
         update_width: wp.int32,
+        aligned: wp.int32,
         row_place: wp.array(dtype=wp.int32),
         active_before: wp.array(dtype=wp.int32),
-        new_states_bar: wp.array(dtype=scalar),
+        new_states_bar: wp.array(dtype=group),
         # outputs
         update_bar: wp.array(dtype=scalar),
     ):
         """Write the cotangent of every row's update, zero beyond the last active row."""
-        row, column = wp.tid()
-        row += range_start
+        parts = (update_width + wp.static(width - 1)) / wp.static(width)
+        row, part = of_groups(range_start + wp.tid(), parts)
         k = row
-        active = column < state_dim
+        active = part < group_count
         if row_place.shape[0] > 0:
-            active = active and row < active_before[active_before.shape[0] - 1]
+            active = active and row < load_integer(active_before, active_before.shape[0] - 1)
             if active:
                 k = load_integer(row_place, row)
-        bar = scalar(0.0)
+        first = part * wp.static(width)
+        bar = group()
         if active:
-            bar = dt * new_states_bar[k * group_count * wp.static(width) + column]
-        update_bar[row * update_width + column] = bar
+            state_bar = load_group(new_states_bar, k * group_count + part)
+            for c in range(wp.static(width)):
+                if first + c < state_dim:
+                    bar[c] = dt * state_bar[c]
+        place = row * update_width + first
+        if aligned != 0:
+            write_group(update_bar, place, bar)
+        else:
+            for c in range(wp.static(width)):
+                if first + c < update_width:
+                    update_bar[place + c] = bar[c]
 
     return SimpleNamespace(
         give_rows=give_rows, update_states=update_states, pull_back_update=pull_back_update

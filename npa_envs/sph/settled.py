@@ -80,6 +80,11 @@ def entries_ahead(plan: Plan) -> int:
     return AHEAD if plan.lanes > 1 else 1
 
 
+def list_capacity(x: Tensor) -> int:
+    """Return how much room each list has; 0: as much as it needs, which only a CPU can tell."""
+    return CAPACITY if x.is_cuda else 0
+
+
 def _entry_bytes(x: Tensor) -> int:
     return ENTRY_SIZE * x.element_size() + (4 if x.shape[-1] == 3 else 0)
 
@@ -96,6 +101,7 @@ def _sort_settled(
     state_dim: int,
     eps: float,
     box: list[float] | None,
+    moment_correction: bool,
     density_gradient: bool,
     counted: bool,
 ) -> list[Tensor]:
@@ -108,7 +114,7 @@ def _sort_settled(
     lengths = x.new_empty(total if counted else 0, dtype=torch.int32)
     if counted:
         launch(
-            _kernels(plan, False).count_pairs,
+            _kernels(plan, moment_correction).count_pairs,
             total,
             x.device,
             plan.domain,
@@ -133,6 +139,7 @@ def _(
     state_dim: int,
     eps: float,
     box: list[float] | None,
+    moment_correction: bool,
     density_gradient: bool,
     counted: bool,
 ) -> list[Tensor]:
@@ -240,19 +247,19 @@ def settle(
     x = x.detach().contiguous()
     world_count, particle_count, space_dim = x.shape
     total = world_count * particle_count
-    capacity = CAPACITY if x.is_cuda else 0
+    capacity = list_capacity(x)
     sides = None if box is None else list(box)
     if total * capacity * _entry_bytes(x) > LARGEST_LISTS:
         return None
+    corrected = terms.state_gradient and terms.moment_correction
     source, place, starts, particles, gradients, ends = _sort_settled(
-        x, state_dim, eps, sides, terms.density_gradient, capacity == 0
+        x, state_dim, eps, sides, corrected, terms.density_gradient, capacity == 0
     )
     # Reading the number is free on the CPU.
     entry_count = total * capacity if capacity else int(ends[-1])
     if entry_count * _entry_bytes(x) > LARGEST_LISTS:
         return None
     ends = ends.to(torch.int32)
-    corrected = terms.state_gradient and terms.moment_correction
     weights, neighbours, *rest = _list_pairs(
         starts,
         particles,

@@ -75,7 +75,7 @@ def _perceive_settled(
     perception = states.new_empty(row_capacity, row_width)
     launch(
         kernels.perceive,
-        (row_capacity, group_count),
+        row_capacity * group_count,
         states.device,
         plan.domain,
         plan.particle_count,
@@ -142,7 +142,7 @@ def _perceive_settled_backward(
     cotangents = bar.new_empty(row_capacity * group_count, kinds, width)
     launch(
         kernels.unscale_cotangents,
-        (row_capacity, group_count),
+        row_capacity * group_count,
         bar.device,
         state_dim,
         group_count,
@@ -158,7 +158,7 @@ def _perceive_settled_backward(
     states_bar = bar.new_empty(plan.total, group_count * width)
     launch(
         kernels.gather_state_cotangents,
-        (plan.total, group_count),
+        plan.total * group_count,
         bar.device,
         plan.domain,
         plan.particle_count,

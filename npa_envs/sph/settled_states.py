@@ -133,7 +133,7 @@ def _update_settled(
     aligned = update.shape[1] % width == 0 and update.data_ptr() % 16 == 0
     launch(
         state_update_kernels(scalar_type(states.dtype), width).update_states,
-        (states.shape[0], group_count),
+        states.shape[0] * group_count,
         states.device,
         dt,
         state_dim,
@@ -167,15 +167,16 @@ def _update_settled_backward(
     update_bar = new_states_bar.new_empty(row_capacity, update_width)
     launch(
         state_update_kernels(scalar_type(new_states_bar.dtype), width).pull_back_update,
-        tuple(update_bar.shape),
+        row_capacity * -(-update_width // width),
         update_bar.device,
         dt,
         state_dim,
         new_states_bar.shape[1] // width,
         update_width,
+        int(update_width % width == 0),
         row_place,
         active_before,
-        new_states_bar.contiguous().view(-1),
+        new_states_bar.contiguous().view(-1, width),
         update_bar.view(-1),
     )
     return update_bar
