@@ -216,6 +216,15 @@ def _settle(rule: NPARule, x: Tensor, steps: int, options: StepOptions) -> Settl
     )
 
 
+def _advancing(
+    rule: NPARule, folded: FoldedRule | None, options: StepOptions, settled: SettledWorlds | None
+) -> Callable[..., tuple[Tensor, ...]]:
+    """Return what advances the changing part of worlds, given that and a step's draws."""
+    if settled is None:
+        return functools.partial(_advance, rule, folded, options)
+    return functools.partial(_advance_settled, rule, folded, options, settled)
+
+
 def step(
     rule: NPARule,
     x: Tensor,
@@ -352,14 +361,10 @@ def rollout(
     # Worlds keep their dtype under autocast: the kernels read what the rule writes.
     with torch.autocast(x.device.type, enabled=False):
         settled = _settle(rule, x, steps, options)
-        advance: Callable[..., tuple[Tensor, ...]]
-        worlds: tuple[Tensor, ...]
-        if settled is None:
-            worlds = x, s, path_length
-            advance = functools.partial(_advance, rule, folded, options)
-        else:
+        advance = _advancing(rule, folded, options, settled)
+        worlds: tuple[Tensor, ...] = x, s, path_length
+        if settled is not None:
             worlds = (settled_states(settled, s),)
-            advance = functools.partial(_advance_settled, rule, folded, options, settled)
         for number in range(steps):
             drawn = _draw(x, options, generator)
             if (steps - 1 - number) % interval > 0:

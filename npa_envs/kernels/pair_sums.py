@@ -93,12 +93,9 @@ def pair_sum_kernels(
 
     @wp.func
     def neighbour_of(entry: entry_type, neighbours: wp.array(dtype=wp.int32), place: wp.int32):
-        j = wp.int32(0)
-        if wp.static(flat):
-            j = unpacked(entry[3])
-        else:
-            j = load_integer(neighbours, place)
-        return j
+        if wp.static(not flat):
+            return load_integer(neighbours, place)
+        return unpacked(entry[3])
 
     @wp.func
     def row_at(
@@ -261,9 +258,7 @@ def pair_sum_kernels(
                 for a in range(wp.static(ahead)):
                     neighbour_states[a] = load_group(states, others[a] * group_count + g)
                 for a in range(wp.static(ahead)):
-                    blur, gradient = add_state(
-                        entries[a], neighbour_states[a], own, blur, gradient
-                    )
+                    blur, gradient = add_state(entries[a], neighbour_states[a], own, blur, gradient)
         else:
             blur, gradient = sum_searched(
                 domain,
@@ -438,12 +433,11 @@ def pair_sum_kernels(
         row = k
         if row_of.shape[0] > 0:
             row = load_integer(row_of, k)
-        if row >= 0:
-            if wp.static(state_gradient):
-                own = load_cotangent(cotangents, row * group_count + g)
-                along = kernel_sum[k]
-                for d in range(wp.static(space_dim)):
-                    total = add_scaled(total, -along[d], own[d + 1])
+        if wp.static(state_gradient) and row >= 0:
+            own = load_cotangent(cotangents, row * group_count + g)
+            along = kernel_sum[k]
+            for d in range(wp.static(space_dim)):
+                total = add_scaled(total, -along[d], own[d + 1])
         total = volume * total
         if row >= 0:
             mine = g * wp.static(width)

@@ -17,6 +17,7 @@ from npa_envs.sph.bridge import channel_width, lane_count, launch, scalar_type
 from npa_envs.sph.cells import LARGEST_INDEX
 from npa_envs.sph.settled import SettledWorlds
 
+
 class SettledRows(NamedTuple):
     """Which sorted particles a batch of rows stands for; all empty where each has its own."""
 
