@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import functools
 import math
-from collections.abc import Callable
-from typing import Literal, NamedTuple, overload
+from collections.abc import Callable, Iterable
+from typing import Any, Literal, NamedTuple, overload
 
 import torch
 from torch import Tensor
@@ -26,13 +25,8 @@ from npa_envs.sph.checks import (
 )
 from npa_envs.sph.operators import Terms, perceive_rows
 from npa_envs.sph.settled import SettledWorlds, settle
-from npa_envs.sph.settled_perception import perceive_settled
-from npa_envs.sph.settled_states import (
-    settled_rows,
-    settled_states,
-    unsettled_states,
-    update_settled,
-)
+from npa_envs.sph.settled_states import settled_states, unsettled_states
+from npa_envs.sph.settled_steps import advance_settled, drawn_rows
 from npa_envs.sph.update import update_particles, wrapped
 
 Memory = Literal["store", "recompute", "minimal"]
@@ -136,14 +130,6 @@ def _draw(
     return mask, noise
 
 
-def _rows_of(mask: Tensor | None, total: int, update_prob: float) -> int:
-    """Return how many rows a step needs."""
-    if mask is None:
-        return total
-    # Counting is free on the CPU; on CUDA it would stall the stream.
-    return row_capacity(total, update_prob) if mask.is_cuda else max(int(mask.sum()), 1)
-
-
 def _terms(rule: NPARule) -> Terms:
     return Terms(rule.state_gradient, rule.moment_correction, rule.density_gradient)
 
@@ -159,11 +145,18 @@ def _advance(
     noise: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Advance checked worlds by one step whose random draws are given."""
+    total = x.shape[0] * x.shape[1]
+    capacity = total
+    if mask is not None:
+        # Counting is free on the CPU; on CUDA it would stall the stream.
+        capacity = (
+            row_capacity(total, options.update_prob) if x.is_cuda else max(int(mask.sum()), 1)
+        )
     perception, rows = perceive_rows(
         x.detach() if options.detach_positions else x,
         s,
         mask=mask,
-        row_capacity=_rows_of(mask, x.shape[0] * x.shape[1], options.update_prob),
+        row_capacity=capacity,
         row_width=rule.perception_dim if folded is None else folded.row_width,
         eps=options.eps,
         eps0=rule.eps0,
@@ -183,29 +176,6 @@ def _advance(
     )
 
 
-def _advance_settled(
-    rule: NPARule,
-    folded: FoldedRule | None,
-    options: StepOptions,
-    worlds: SettledWorlds,
-    states: Tensor,
-    mask: Tensor | None,
-    _noise: None,
-) -> tuple[Tensor]:
-    """Advance worlds whose particles stay where they are by one step."""
-    capacity = _rows_of(mask, worlds.total, options.update_prob)
-    rows = settled_rows(worlds, mask, capacity)
-    perception = perceive_settled(
-        worlds,
-        states,
-        rows,
-        row_capacity=capacity,
-        row_width=rule.perception_dim if folded is None else folded.row_width,
-    )
-    update = rule(perception) if folded is None else folded(perception)
-    return (update_settled(worlds, states, update, rows, options.dt),)
-
-
 def _settle(rule: NPARule, x: Tensor, steps: int, options: StepOptions) -> SettledWorlds | None:
     """Compute what follows from positions, where they stay and it pays."""
     moving = not rule.static or options.position_noise > 0.0 or not options.detach_positions
@@ -214,15 +184,6 @@ def _settle(rule: NPARule, x: Tensor, steps: int, options: StepOptions) -> Settl
     return settle(
         x, rule.state_dim, eps=options.eps, eps0=rule.eps0, box=options.box, terms=_terms(rule)
     )
-
-
-def _advancing(
-    rule: NPARule, folded: FoldedRule | None, options: StepOptions, settled: SettledWorlds | None
-) -> Callable[..., tuple[Tensor, ...]]:
-    """Return what advances the changing part of worlds, given that and a step's draws."""
-    if settled is None:
-        return functools.partial(_advance, rule, folded, options)
-    return functools.partial(_advance_settled, rule, folded, options, settled)
 
 
 def step(
@@ -361,18 +322,28 @@ def rollout(
     # Worlds keep their dtype under autocast: the kernels read what the rule writes.
     with torch.autocast(x.device.type, enabled=False):
         settled = _settle(rule, x, steps, options)
-        advance = _advancing(rule, folded, options, settled)
         worlds: tuple[Tensor, ...] = x, s, path_length
+        draws: Iterable[tuple[Any, ...]] = (_draw(x, options, generator) for _ in range(steps))
+        advance: Callable[..., tuple[Tensor, ...]] = _advance
+        fixed: tuple[Any, ...] = rule, folded, options
         if settled is not None:
             worlds = (settled_states(settled, s),)
-        for number in range(steps):
-            drawn = _draw(x, options, generator)
+            capacity = row_capacity(settled.total, options.update_prob)
+            draws = drawn_rows(settled, lambda: _draw(x, options, generator)[0], steps, capacity)
+            advance = advance_settled
+            fixed = (
+                rule if folded is None else folded,
+                rule.perception_dim if folded is None else folded.row_width,
+                options.dt,
+                settled,
+            )
+        for number, drawn in enumerate(draws):
             if (steps - 1 - number) % interval > 0:
                 worlds = checkpoint(
-                    advance, *worlds, *drawn, use_reentrant=False, preserve_rng_state=False
+                    advance, *fixed, *worlds, *drawn, use_reentrant=False, preserve_rng_state=False
                 )
             else:
-                worlds = advance(*worlds, *drawn)
+                worlds = advance(*fixed, *worlds, *drawn)
         if settled is not None:
             worlds = wrapped(x, options.box), unsettled_states(settled, *worlds), path_length
     x, s, path_length = worlds

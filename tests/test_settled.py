@@ -8,10 +8,11 @@ import npa_envs
 from npa_envs import dynamics
 from npa_envs import reference as oracle
 from npa_envs.dynamics import FEWEST_SETTLED
-from npa_envs.sph import settled, settled_perception
+from npa_envs.sph import settled, settled_perception, settled_steps
+from npa_envs.sph import settled_states as settled_states_module
 from npa_envs.sph.passes import Terms
 from npa_envs.sph.settled_perception import perceive_settled
-from npa_envs.sph.settled_states import settled_rows, settled_states, unsettled_states
+from npa_envs.sph.settled_states import all_rows, settled_rows, settled_states, unsettled_states
 
 STEPS = 5
 
@@ -135,8 +136,7 @@ def test_perception_equals_the_oracle(device):
     for box in (None, (1.4, 1.8)):
         worlds = settled.settle(x, 7, eps=0.3, eps0=0.2, box=box, terms=Terms())
         states = settled_states(worlds, s)
-        rows = settled_rows(worlds, None, 160)
-        z = perceive_settled(worlds, states, rows, row_capacity=160, row_width=30)
+        z = perceive_settled(worlds, states, all_rows(worlds), row_width=30)
         expected = oracle.perceive(x.cpu(), s.cpu(), 0.3, 0.2, box).view(160, 30)
         source = worlds.tensors.source.cpu()
         # Worst seen 6e-16.
@@ -144,23 +144,54 @@ def test_perception_equals_the_oracle(device):
         assert torch.equal(unsettled_states(worlds, states), s)
 
 
-def test_rows_follow_the_mask(device):
+def test_rows_follow_the_masks(device):
     x, s = random_world(2, 50, 2, 4, dtype=torch.float32, device=device)
     worlds = settled.settle(x, 4, eps=0.3, eps0=0.3, box=None, terms=Terms())
-    mask = (torch.arange(100, device=device).view(2, 50) % 3 == 0).to(torch.uint8)
-    rows = settled_rows(worlds, mask, 30)
-    active = mask.view(-1)[worlds.tensors.source.long()].nonzero().view(-1)
-    assert len(active) == 34
-    assert torch.equal(rows.row_place.long(), active[:30])
-    expected = torch.full((100,), -1, device=device)
-    expected[active[:30]] = torch.arange(30, device=device)
-    assert torch.equal(rows.row_of.long(), expected)
-    z = perceive_settled(
-        worlds, settled_states(worlds, s), settled_rows(worlds, mask, 40), row_capacity=40,
-        row_width=20,
-    )  # fmt: skip
-    assert (z[:34, 18] == 1.0).all()
-    assert (z[34:] == 0.0).all()
+    states = settled_states(worlds, s)
+    everything = perceive_settled(worlds, states, all_rows(worlds), row_width=20)
+    numbers = torch.arange(100, device=device).view(2, 50)
+    masks = [(numbers % count == 1).to(torch.uint8) for count in (3, 200, 7)]
+    masks.append(torch.zeros_like(masks[0]))
+    for mask, rows in zip(masks, settled_rows(worlds, masks, 40), strict=True):
+        active = mask.view(-1)[worlds.tensors.source.long()].nonzero().view(-1)
+        count = len(active)
+        assert rows.row_capacity == (40 if device.type == "cuda" else max(count, 1))
+        assert torch.equal(rows.row_place[:count].long(), active)
+        expected = torch.full((100,), -1, device=device)
+        expected[active] = torch.arange(count, device=device)
+        assert torch.equal(rows.row_of.long(), expected)
+        z = perceive_settled(worlds, states, rows, row_width=20)
+        assert torch.equal(z[:count], everything[active])
+        assert (z[count:] == 0.0).all()
+
+
+def test_active_particles_beyond_the_rows_have_none(device):
+    source = torch.arange(50, dtype=torch.int32, device=device).flip(0)
+    masks = torch.ones(3, 1, 50, dtype=torch.uint8, device=device)
+    masks[1, 0, :25] = 0
+    row_of, row_place, before = settled_states_module._settled_rows(masks, source, 30)
+    for step, count in enumerate((50, 25, 50)):
+        active = min(count, 30)
+        assert torch.equal(row_place[step, :active].long(), torch.arange(active, device=device))
+        assert (row_of[step, :active] == row_place[step, :active]).all()
+        assert (row_of[step, active:] == -1).all()
+        assert int(before[step, -1]) == count
+
+
+@pytest.mark.parametrize("ahead", [1, 2, 100])
+def test_how_far_ahead_masks_are_drawn_changes_no_bit(ahead, device, monkeypatch):
+    rule = static_rule(device, torch.float32)
+    x, s = random_world(3, 40, 2, 5, dtype=torch.float32, device=device)
+    for source in (lambda: torch.Generator(device).manual_seed(1), lambda: own_streams(device)):
+        monkeypatch.setattr(settled_steps, "DRAWN_AHEAD", 3)
+        expected = npa_envs.rollout(rule, x, s, STEPS, generator=source())[1]
+        monkeypatch.setattr(settled_steps, "DRAWN_AHEAD", ahead)
+        assert torch.equal(npa_envs.rollout(rule, x, s, STEPS, generator=source())[1], expected)
+
+
+def own_streams(device):
+    """Random streams of three worlds."""
+    return npa_envs.WorldRandom([1, 2, 3], device=device)
 
 
 @pytest.mark.parametrize("space_dim", [2, 3])
@@ -195,10 +226,8 @@ def test_a_world_perceives_the_same_alone_and_in_a_batch(device):
 
     def perceived(x, s):
         worlds = settled.settle(x, 6, eps=0.3, eps0=0.2, box=None, terms=Terms())
-        total = x.shape[0] * x.shape[1]
-        rows = settled_rows(worlds, None, total)
         states = settled_states(worlds, s)
-        z = perceive_settled(worlds, states, rows, row_capacity=total, row_width=28)
+        z = perceive_settled(worlds, states, all_rows(worlds), row_width=28)
         return z.view(x.shape[0], x.shape[1], -1)
 
     together = perceived(x, s)

@@ -27,23 +27,29 @@ def state_update_kernels(scalar: type, width: int) -> SimpleNamespace:
     @wp.kernel(enable_backward=False, module=module)
     def give_rows(
         range_start: wp.int32,
+        total: wp.int32,
         row_capacity: wp.int32,
         active_before: wp.array(dtype=wp.int32),
         # outputs
         row_of: wp.array(dtype=wp.int32),
         row_place: wp.array(dtype=wp.int32),
     ):
-        """Give the active particles rows in their order; `active_before` counts each one itself."""
-        k = range_start + wp.tid()
-        count = active_before[k]
+        """Give the active particles of each step rows in their order.
+
+        `active_before` counts each active particle itself.
+        """
+        t = range_start + wp.tid()
+        step = t / total
+        k = t - step * total
+        count = load_integer(active_before, t)
         before = wp.int32(0)
         if k > 0:
-            before = active_before[k - 1]
+            before = load_integer(active_before, t - 1)
         row = wp.int32(-1)
         if count > before and before < row_capacity:
             row = before
-            row_place[row] = k
-        row_of[k] = row
+            row_place[step * row_capacity + row] = k
+        row_of[t] = row
 
     @in_ranges(PARTICLES)
     @wp.kernel(enable_backward=False, module=module)

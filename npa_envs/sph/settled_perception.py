@@ -202,7 +202,6 @@ class _PerceiveSettled(torch.autograd.Function):
         states: Tensor,
         worlds: SettledWorlds,
         rows: SettledRows,
-        row_capacity: int,
         row_width: int,
     ) -> Tensor:
         ctx.options = _options(worlds)
@@ -211,23 +210,23 @@ class _PerceiveSettled(torch.autograd.Function):
             list(worlds.tensors),
             rows.row_place,
             rows.active_before,
-            row_capacity,
+            rows.row_capacity,
             row_width,
             *ctx.options,
         )
         if ctx.needs_input_grad[0]:
-            ctx.save_for_backward(perception, *rows, *worlds.tensors)
+            ctx.save_for_backward(perception, *rows[:-1], *worlds.tensors)
         return perception
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, bar: Tensor) -> tuple[Tensor | None, ...]:
         perception, *tensors = ctx.saved_tensors
-        count = len(SettledRows._fields)
+        count = len(tensors) - len(SettledTensors._fields)
         states_bar = _perceive_settled_backward(
             bar, perception, tensors[count:], tensors[:count], *ctx.options
         )
-        return states_bar, None, None, None, None
+        return states_bar, None, None, None
 
 
 def _options(worlds: SettledWorlds) -> tuple[Any, ...]:
@@ -237,26 +236,20 @@ def _options(worlds: SettledWorlds) -> tuple[Any, ...]:
 
 
 def perceive_settled(
-    worlds: SettledWorlds,
-    states: Tensor,
-    rows: SettledRows,
-    *,
-    row_capacity: int,
-    row_width: int,
+    worlds: SettledWorlds, states: Tensor, rows: SettledRows, *, row_width: int
 ) -> Tensor:
     """Perceive the active particles.
 
     Args:
         worlds: The worlds.
         states: States as `settled_states` returns them, shape [B N, C'].
-        rows: Their rows.
-        row_capacity: Rows K of the result.
+        rows: Which particles are active.
         row_width: Columns of a row, at least P: a one follows the perception vector, then zeros.
 
     Returns:
         Rows of perception, dimensionless, shape [K, row_width], zero beyond the last active row.
     """
     perception: Tensor = _PerceiveSettled.apply(  # type: ignore[no-untyped-call]
-        states, worlds, rows, row_capacity, row_width
+        states, worlds, rows, row_width
     )
     return perception

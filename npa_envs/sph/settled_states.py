@@ -19,7 +19,7 @@ from npa_envs.sph.settled import SettledWorlds
 
 
 class SettledRows(NamedTuple):
-    """Which sorted particles a batch of rows stands for; all empty where each has its own."""
+    """Which sorted particles a step's rows stand for; tensors are empty where each has its own."""
 
     row_of: Tensor
     """Row of each sorted particle, -1 where it has none, int32, shape [B N]."""
@@ -27,6 +27,8 @@ class SettledRows(NamedTuple):
     """Sorted place of each row, int32, shape [K]; undefined beyond the last active row."""
     active_before: Tensor
     """Active particles up to each sorted place, itself included, int32, shape [B N]."""
+    row_capacity: int
+    """Rows K."""
 
 
 def group_width(like: Tensor, state_dim: int) -> int:
@@ -80,42 +82,66 @@ def unsettled_states(worlds: SettledWorlds, states: Tensor) -> Tensor:
 
 
 @torch.library.custom_op("npa::settled_rows", mutates_args=())
-def _settled_rows(mask: Tensor, source: Tensor, row_capacity: int) -> list[Tensor]:
-    total = source.shape[0]
-    active = mask.reshape(total).index_select(0, source)
-    active_before = torch.cumsum(active, 0, dtype=torch.int32)
-    rows = SettledRows(torch.empty_like(source), source.new_empty(row_capacity), active_before)
+def _settled_rows(masks: Tensor, source: Tensor, row_capacity: int) -> list[Tensor]:
+    step_count, total = masks.shape[0], source.shape[0]
+    active = masks.view(step_count, total).index_select(1, source)
+    active_before = torch.cumsum(active, 1, dtype=torch.int32)
+    row_of = torch.empty_like(active_before)
+    row_place = source.new_empty(step_count, row_capacity)
     launch(
         state_update_kernels(scalar_type(torch.float32), 4).give_rows,
+        step_count * total,
+        masks.device,
         total,
-        mask.device,
         row_capacity,
-        active_before,
-        rows.row_of,
-        rows.row_place,
+        active_before.view(-1),
+        row_of.view(-1),
+        row_place.view(-1),
     )
-    return list(rows)
+    return [row_of, row_place, active_before]
 
 
 @_settled_rows.register_fake
-def _(mask: Tensor, source: Tensor, row_capacity: int) -> list[Tensor]:
-    return [torch.empty_like(source), source.new_empty(row_capacity), torch.empty_like(source)]
+def _(masks: Tensor, source: Tensor, row_capacity: int) -> list[Tensor]:
+    steps, total = masks.shape[0], source.shape[0]
+    sizes = total, row_capacity, total
+    return [source.new_empty(steps, size) for size in sizes]
 
 
-def settled_rows(worlds: SettledWorlds, mask: Tensor | None, row_capacity: int) -> SettledRows:
-    """Give the active particles rows.
+def settled_rows(
+    worlds: SettledWorlds, masks: list[Tensor], row_capacity: int
+) -> list[SettledRows]:
+    """Give the active particles of each of some steps rows, all steps at once.
 
     Args:
         worlds: The worlds.
-        mask: Which particles are active in the caller's order, uint8 of ones and zeros, shape
-            [B, N], or None for all.
-        row_capacity: Rows K; active particles beyond it get none.
+        masks: Which particles are active in each step, in the caller's order, uint8 of ones and
+            zeros, shape [B, N].
+        row_capacity: Rows K on CUDA; active particles beyond them get none. On the CPU each step
+            has as many as it needs, at least one.
     """
     source = worlds.tensors.source
-    if mask is None:
-        none = source.new_empty(0)
-        return SettledRows(none, none, none)
-    return SettledRows(*_settled_rows(mask, source, row_capacity))
+    if not source.is_cuda:
+        row_capacity = worlds.total
+    found = _settled_rows(torch.stack(masks), source, row_capacity)
+    steps = [
+        SettledRows(row_of, row_place, active_before, row_capacity)
+        for row_of, row_place, active_before in zip(*found, strict=True)
+    ]
+    if source.is_cuda:
+        return steps
+    # Counting is free on the CPU; on CUDA it would stall the stream.
+    counts = [max(count, 1) for count in found[2][:, -1].tolist()]
+    return [
+        rows._replace(row_place=rows.row_place[:count], row_capacity=count)
+        for rows, count in zip(steps, counts, strict=True)
+    ]
+
+
+def all_rows(worlds: SettledWorlds) -> SettledRows:
+    """Return the rows of a step in which all particles are active."""
+    none = worlds.tensors.source.new_empty(0)
+    return SettledRows(none, none, none, worlds.total)
 
 
 @torch.library.custom_op("npa::update_settled", mutates_args=())

@@ -87,13 +87,12 @@ def _warm_settled(x: torch.Tensor, s: torch.Tensor) -> None:
     """A step of particles that never move."""
     worlds = settle(x, s.shape[2], eps=0.1, eps0=0.1, box=None, terms=Terms())
     assert worlds is not None
-    count = worlds.total
     width = Terms().perception_dim(x.shape[2], s.shape[2]) + 1
     mask = torch.ones(x.shape[:2], dtype=torch.uint8, device=x.device)
-    rows = settled_rows(worlds, mask, count)
+    (rows,) = settled_rows(worlds, [mask], worlds.total)
     states = settled_states(worlds, s)
     for row_width in (width, width + -width % 4):
-        perceived = perceive_settled(worlds, states, rows, row_capacity=count, row_width=row_width)
+        perceived = perceive_settled(worlds, states, rows, row_width=row_width)
         _pull_back(update_settled(worlds, states, perceived, rows, 1.0))
 
 
