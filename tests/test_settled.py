@@ -265,11 +265,13 @@ def test_what_moves_or_is_short_or_too_large_is_rebuilt(device, monkeypatch):
     assert calls == []
     npa_envs.rollout(rule, x, s, FEWEST_SETTLED)
     assert len(calls) == 1
-    monkeypatch.setattr(settled, "LARGEST_LISTS", 1000)
-    values = outcome(rule, x, s)
-    assert calls[1] is None
-    for value, expected in zip(values, outcome(rule, x, s, rebuilt=True), strict=True):
-        assert torch.equal(value, expected)
+    for limit in ("LARGEST_LISTS", "LARGEST_INDEX"):
+        with monkeypatch.context() as patch:
+            patch.setattr(settled, limit, 40 * 15)
+            values = outcome(rule, x, s)
+        assert calls.pop() is None
+        for value, expected in zip(values, outcome(rule, x, s, rebuilt=True), strict=True):
+            assert torch.equal(value, expected)
 
 
 def test_a_module_in_the_rules_place_is_run(device):

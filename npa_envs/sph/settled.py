@@ -9,7 +9,7 @@ from torch import Tensor
 
 from npa_envs.kernels.pairs import ENTRY_SIZE, pair_kernels
 from npa_envs.sph.bridge import launch
-from npa_envs.sph.cells import Plan, density_scale, make_plan, sort_worlds
+from npa_envs.sph.cells import LARGEST_INDEX, Plan, density_scale, make_plan, sort_worlds
 from npa_envs.sph.passes import Terms, compute_density_gradients
 
 CAPACITY = 128
@@ -20,6 +20,9 @@ AHEAD = 4
 
 LARGEST_LISTS = 2**31
 """Bytes of all lists, at most."""
+
+LARGEST_PADDING = 4
+"""Columns of a row beyond what is perceived, at most."""
 
 
 class SettledTensors(NamedTuple):
@@ -242,14 +245,16 @@ def settle(
         terms: Groups of the perception vector.
 
     Returns:
-        The worlds, or None where the lists would take more than `LARGEST_LISTS` bytes.
+        The worlds, or None where the lists would take more than `LARGEST_LISTS` bytes, or all rows
+        more numbers than kernels index.
     """
     x = x.detach().contiguous()
     world_count, particle_count, space_dim = x.shape
     total = world_count * particle_count
     capacity = list_capacity(x)
     sides = None if box is None else list(box)
-    if total * capacity * _entry_bytes(x) > LARGEST_LISTS:
+    row_numbers = total * (terms.perception_dim(space_dim, state_dim) + LARGEST_PADDING)
+    if row_numbers >= LARGEST_INDEX or total * capacity * _entry_bytes(x) > LARGEST_LISTS:
         return None
     corrected = terms.state_gradient and terms.moment_correction
     source, place, starts, particles, gradients, ends = _sort_settled(
