@@ -321,24 +321,32 @@ def test_a_compiled_rollout_equals_the_eager_one(device):
     assert relative_error(first.grad, second.grad) < 1e-6
 
 
-def test_a_recorded_rollout_equals_the_eager_one(device):
-    if device.type == "cpu":
-        pytest.skip("graphs of kernels are recorded on CUDA")
+def test_other_streams_and_recorded_graphs_give_the_same(device):
+    if device.type != "cuda":
+        pytest.skip("streams and graphs are CUDA's")
     rule = static_rule(device, torch.float32)
-    x, s = random_world(2, 300, 2, 5, dtype=torch.float32, device=device)
+    x, s = random_world(2, 3000, 2, 5, dtype=torch.float32, device=device)
+    generator = torch.Generator(device)
 
     def states():
         with torch.no_grad():
-            return npa_envs.rollout(rule, x, s, STEPS, eps=0.3, update_prob=1.0, box=(1.4, 1.4))[1]
+            return npa_envs.rollout(rule, x, s, 20, eps=0.1, box=1.4, generator=generator)[1]
 
+    generator.manual_seed(3)
     expected = states()
     stream = torch.cuda.Stream()
     stream.wait_stream(torch.cuda.current_stream())
     with torch.cuda.stream(stream):
-        assert torch.equal(states(), expected)
+        generator.manual_seed(3)
+        beside = states()
     torch.cuda.current_stream().wait_stream(stream)
+    assert torch.equal(beside, expected)
     graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
+    generator.manual_seed(3)
+    graph.register_generator_state(generator)
+    with torch.cuda.graph(graph, capture_error_mode="thread_local"):
         recorded = states()
+    generator.manual_seed(3)
     graph.replay()
+    torch.cuda.synchronize()
     assert torch.equal(recorded, expected)
