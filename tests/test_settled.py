@@ -8,7 +8,7 @@ import npa_envs
 from npa_envs import dynamics
 from npa_envs import reference as oracle
 from npa_envs.dynamics import FEWEST_SETTLED
-from npa_envs.sph import settled, settled_perception, settled_steps
+from npa_envs.sph import bridge, settled, settled_perception, settled_steps, warmup
 from npa_envs.sph import settled_states as settled_states_module
 from npa_envs.sph.passes import Terms
 from npa_envs.sph.settled_perception import perceive_settled
@@ -319,6 +319,16 @@ def test_a_compiled_rollout_equals_the_eager_one(device):
     value.backward()
     expected.backward()
     assert relative_error(first.grad, second.grad) < 1e-6
+
+
+def test_warmup_leaves_nothing_to_compile(device):
+    warmup(device)
+    rule = npa_envs.NPARule(static=True).to(device)
+    x, s = random_world(1, 40, 2, 16, dtype=torch.float32, device=device)
+    warm = set(bridge._launched)
+    for update_prob in (0.5, 1.0):
+        outcome(rule, x, s, update_prob=update_prob)
+    assert bridge._launched == warm
 
 
 def test_other_streams_and_recorded_graphs_give_the_same(device):

@@ -90,8 +90,8 @@ def _warm_settled(x: torch.Tensor, s: torch.Tensor) -> None:
     width = Terms().perception_dim(x.shape[2], s.shape[2]) + 1
     mask = torch.ones(x.shape[:2], dtype=torch.uint8, device=x.device)
     (rows,) = settled_rows(worlds, [mask], worlds.total)
-    states = settled_states(worlds, s)
     for row_width in (width, width + -width % 4):
+        states = settled_states(worlds, s)
         perceived = perceive_settled(worlds, states, rows, row_width=row_width)
         _pull_back(update_settled(worlds, states, perceived, rows, 1.0))
 
