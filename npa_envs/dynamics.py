@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import Literal, NamedTuple, overload
+from collections.abc import Callable, Iterable
+from typing import Any, Literal, NamedTuple, overload
 
 import torch
 from torch import Tensor
@@ -23,12 +24,18 @@ from npa_envs.sph.checks import (
     checked_number,
 )
 from npa_envs.sph.operators import Terms, perceive_rows
-from npa_envs.sph.update import update_particles
+from npa_envs.sph.settled import SettledWorlds, settle
+from npa_envs.sph.settled_states import settled_states, unsettled_states
+from npa_envs.sph.settled_steps import advance_settled, drawn_rows
+from npa_envs.sph.update import update_particles, wrapped
 
 Memory = Literal["store", "recompute", "minimal"]
 
 STORED_INTERVAL: dict[Memory, float] = {"store": 1, "recompute": 3, "minimal": math.inf}
 """The last step and every so-manyth before it store what the backward pass reads."""
+
+FEWEST_SETTLED = 3
+"""Steps from which on it pays to compute once what follows from positions that stay."""
 
 OVERFLOW_LOG_PROBABILITY = 34.5
 """Row capacities hold with probability 1 - exp(-34.5), about 1 - 1e-15, for each step."""
@@ -123,6 +130,10 @@ def _draw(
     return mask, noise
 
 
+def _terms(rule: NPARule) -> Terms:
+    return Terms(rule.state_gradient, rule.moment_correction, rule.density_gradient)
+
+
 def _advance(
     rule: NPARule,
     folded: FoldedRule | None,
@@ -150,7 +161,7 @@ def _advance(
         eps=options.eps,
         eps0=rule.eps0,
         box=options.box,
-        terms=Terms(rule.state_gradient, rule.moment_correction, rule.density_gradient),
+        terms=_terms(rule),
     )
     return update_particles(
         rule(perception) if folded is None else folded(perception),
@@ -162,6 +173,16 @@ def _advance(
         dt=options.dt,
         moving=not rule.static,
         box=options.box,
+    )
+
+
+def _settle(rule: NPARule, x: Tensor, steps: int, options: StepOptions) -> SettledWorlds | None:
+    """Compute what follows from positions, where they stay and it pays."""
+    moving = not rule.static or options.position_noise > 0.0 or not options.detach_positions
+    if moving or steps < FEWEST_SETTLED:
+        return None
+    return settle(
+        x, rule.state_dim, eps=options.eps, eps0=rule.eps0, box=options.box, terms=_terms(rule)
     )
 
 
@@ -300,22 +321,30 @@ def rollout(
     interval = STORED_INTERVAL[memory] if torch.is_grad_enabled() else 1
     # Worlds keep their dtype under autocast: the kernels read what the rule writes.
     with torch.autocast(x.device.type, enabled=False):
-        for number in range(steps):
-            mask, noise = _draw(x, options, generator)
+        settled = _settle(rule, x, steps, options)
+        worlds: tuple[Tensor, ...] = x, s, path_length
+        draws: Iterable[tuple[Any, ...]] = (_draw(x, options, generator) for _ in range(steps))
+        advance: Callable[..., tuple[Tensor, ...]] = _advance
+        fixed: tuple[Any, ...] = rule, folded, options
+        if settled is not None:
+            worlds = (settled_states(settled, s),)
+            capacity = row_capacity(settled.total, options.update_prob)
+            draws = drawn_rows(settled, lambda: _draw(x, options, generator)[0], steps, capacity)
+            advance = advance_settled
+            fixed = (
+                rule if folded is None else folded,
+                rule.perception_dim if folded is None else folded.row_width,
+                options.dt,
+                settled,
+            )
+        for number, drawn in enumerate(draws):
             if (steps - 1 - number) % interval > 0:
-                x, s, path_length = checkpoint(
-                    _advance,
-                    rule,
-                    folded,
-                    options,
-                    x,
-                    s,
-                    path_length,
-                    mask,
-                    noise,
-                    use_reentrant=False,
-                    preserve_rng_state=False,
+                worlds = checkpoint(
+                    advance, *fixed, *worlds, *drawn, use_reentrant=False, preserve_rng_state=False
                 )
             else:
-                x, s, path_length = _advance(rule, folded, options, x, s, path_length, mask, noise)
+                worlds = advance(*fixed, *worlds, *drawn)
+        if settled is not None:
+            worlds = wrapped(x, options.box), unsettled_states(settled, *worlds), path_length
+    x, s, path_length = worlds
     return (x, s, path_length) if return_path_length else (x, s)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -17,6 +17,9 @@ WORLDS, CPU_WORLDS, SMALL_WORLDS = (
     Workload(2, 1, 256, 2),
 )
 """Worlds to measure on: of CUDA, of a CPU, of small sessions."""
+
+STATIC_STEPS = 32
+"""Steps of a rollout that does once what never changes."""
 
 
 @dataclass(frozen=True)
@@ -47,12 +50,17 @@ class Skip:
     """Options of the rollout that does it: `rollout_call` says which there are."""
     skipped: dict[str, Any]
     """Options of the one that leaves it out."""
+    steps: int | None = None
+    """Steps of both; default: the workload's."""
 
 
 def skips(workload: Workload) -> list[Skip]:
     """Return all that rollouts leave out."""
     side = 2.0 * workload.half_width
     training = {"train": True}
+    # What follows from positions is computed anew in each step if they may get a gradient.
+    rebuilt = {"detach_positions": False}
+    static = {"rule": {"static": True}}
     return [
         Skip(
             "what a backward pass reads: signs of hidden units, volumes, kernel sums",
@@ -85,7 +93,14 @@ def skips(workload: Workload) -> list[Skip]:
             {},
             {"rule": {"density_gradient": False}},
         ),
-        Skip("displacements", "static=True", {}, {"rule": {"static": True}}),
+        Skip("displacements", "static=True", rebuilt, {**static, **rebuilt}),
+        Skip(
+            "cells, densities, moments and pair weights",
+            "static=True, without position_noise",
+            {**static, **rebuilt},
+            static,
+            STATIC_STEPS,
+        ),
         Skip("periodic images", "box=None (default)", {"box": (side, side)}, {}),
         Skip(
             "a second forward pass, for the backward pass",
@@ -101,9 +116,10 @@ def skip_rows(session: Session) -> list[SkipRow]:
     workload = SMALL_WORLDS if session.small else WORLDS if session.cuda else CPU_WORLDS
     x, s = workload.worlds(session.device)
 
-    def cost(options: dict[str, Any]) -> Timing:
-        run, generator = rollout_call(workload, x, s, **options)
-        return session.cost(run, generator=generator).time.divided(workload.steps)
+    def cost(options: dict[str, Any], steps: int | None) -> Timing:
+        rolled = replace(workload, steps=steps or workload.steps)
+        run, generator = rollout_call(rolled, x, s, **options)
+        return session.cost(run, generator=generator).time.divided(rolled.steps)
 
     rows: list[SkipRow] = []
     for skip in skips(workload):
@@ -111,7 +127,7 @@ def skip_rows(session: Session) -> list[SkipRow]:
     return rows
 
 
-def _row(skip: Skip, cost: Callable[[dict[str, Any]], Timing]) -> SkipRow:
-    done, skipped = cost(skip.done), cost(skip.skipped)
+def _row(skip: Skip, cost: Callable[[dict[str, Any], int | None], Timing]) -> SkipRow:
+    done, skipped = cost(skip.done, skip.steps), cost(skip.skipped, skip.steps)
     saved = 1.0 - skipped.median / done.median
     return SkipRow(skip.left_out, skip.condition, done, skipped, f"{saved:.0%}")

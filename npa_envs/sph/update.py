@@ -189,3 +189,16 @@ def update_particles(
         None if box is None else list(box),
     )
     return outputs
+
+
+def wrapped(x: Tensor, box: tuple[float, ...] | None) -> Tensor:
+    """Return a copy of positions, wrapped into the periodic box if there is one.
+
+    Args:
+        x: Positions [length units], shape [B, N, D].
+        box: Sides of the box, centred on the origin [length units], or None.
+    """
+    if box is None:
+        return x.clone()
+    images = [torch.floor(x.detach()[..., d] / side + 0.5) for d, side in enumerate(box)]
+    return x - torch.stack([side * image for side, image in zip(box, images, strict=True)], dim=-1)

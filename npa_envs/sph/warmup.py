@@ -15,6 +15,9 @@ from npa_envs.sph.operators import Rows, perceive_rows
 from npa_envs.sph.passes import SHARED_WORLD, Terms
 from npa_envs.sph.picture_losses import picture_losses
 from npa_envs.sph.rows import survey
+from npa_envs.sph.settled import settle
+from npa_envs.sph.settled_perception import perceive_settled
+from npa_envs.sph.settled_states import settled_rows, settled_states, update_settled
 from npa_envs.sph.splat import splat
 from npa_envs.sph.update import update_particles
 from npa_envs.sph.worlds import world_mean
@@ -48,6 +51,7 @@ def warmup(
             s = torch.zeros(1, 2, state_dim, dtype=dtype, device=device, requires_grad=True)
             _pull_back(perceive(x, s, 0.1, detach_positions=False))
             _warm_rows(x, s)
+            _warm_settled(x, s)
             _warm_network(x, s)
             _warm_update(x, s)
             _warm_actions(x, s)
@@ -77,6 +81,19 @@ def _warm_rows(x: torch.Tensor, s: torch.Tensor) -> None:
                 )
                 if gradients:
                     _pull_back(rows)
+
+
+def _warm_settled(x: torch.Tensor, s: torch.Tensor) -> None:
+    """A step of particles that never move."""
+    worlds = settle(x, s.shape[2], eps=0.1, eps0=0.1, box=None, terms=Terms())
+    assert worlds is not None
+    width = Terms().perception_dim(x.shape[2], s.shape[2]) + 1
+    mask = torch.ones(x.shape[:2], dtype=torch.uint8, device=x.device)
+    (rows,) = settled_rows(worlds, [mask], worlds.total)
+    for row_width in (width, width + -width % 4):
+        states = settled_states(worlds, s)
+        perceived = perceive_settled(worlds, states, rows, row_width=row_width)
+        _pull_back(update_settled(worlds, states, perceived, rows, 1.0))
 
 
 def _warm_network(x: torch.Tensor, s: torch.Tensor) -> None:
