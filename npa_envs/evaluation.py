@@ -16,7 +16,7 @@ from npa_envs.errors import NPAError
 from npa_envs.render.tables import table_text, tables_json
 from npa_envs.rule import NPARule
 from npa_envs.tasks.damage import cut, erase_state, random_particle
-from npa_envs.tasks.task import PictureTask
+from npa_envs.tasks.task import PictureTask, task_for_rule
 
 __all__ = [
     "CHECKPOINTS",
@@ -128,7 +128,7 @@ def evaluate(
     """
     check_steps("checkpoints", checkpoints)
     worlds = _Worlds(rule, task, seeds, check_device(device), progress)
-    x, s = worlds.x, worlds.s
+    x, s, task = worlds.x, worlds.s, worlds.task
     rows = []
     for step, before in zip(checkpoints, (0, *checkpoints), strict=False):
         x, s = worlds.grow(x, s, step - before)
@@ -213,6 +213,7 @@ def healing(
     check_steps("every", [every])
     worlds = _Worlds(rule, task, seeds, check_device(device), progress)
     x, s = worlds.grow(worlds.x, worlds.s, grow_steps)
+    task = worlds.task
     before = task.metric(x, s)
     normal = torch.randn(
         len(x), x.shape[2], generator=worlds.generator, dtype=x.dtype, device=x.device
@@ -295,7 +296,7 @@ class _Worlds:
         self.x = torch.cat([x for x, _ in worlds]).to(dtype)
         self.s = torch.cat([s for _, s in worlds]).to(dtype)
         self.generator = torch.Generator(device).manual_seed(seeds[0] + len(seeds))
-        self._task = task
+        self.task = task_for_rule(task, self._rule)
         self._progress = progress
 
     def grow(self, x: Tensor, s: Tensor, steps: int) -> tuple[Tensor, Tensor]:
@@ -306,9 +307,9 @@ class _Worlds:
                 x,
                 s,
                 some,
-                eps=self._task.eps,
-                box=self._task.box,
-                update_prob=self._task.update_prob,
+                eps=self.task.eps,
+                box=self.task.box,
+                update_prob=self.task.update_prob,
                 generator=self.generator,
             )
             if self._progress is not None:

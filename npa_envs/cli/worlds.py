@@ -53,6 +53,7 @@ def task_of_rule(
     Raises:
         NPAError: The rule does not fit the task, or a field is wrong.
     """
+    from npa_envs.tasks.task import task_for_rule
     from npa_envs.training import override, preset, task_entry
 
     if rule.space_dim != 2 or rule.static:
@@ -74,14 +75,14 @@ def task_of_rule(
     chosen = fields.get("target") is not None
     doubt = None if told or chosen else "its file does not say what it grows"
     try:
-        return TrainedTask(entry.make(config.task, device), doubt)
+        task = entry.make(config.task, device)
+        return TrainedTask(task_for_rule(task, rule), doubt)
     except NPAError as error:
         if chosen:
             raise
         stand_in = override(config, target=entry.targets()[0])
-        return TrainedTask(
-            entry.make(stand_in.task, device), f"its target cannot be loaded: {error}"
-        )
+        task = task_for_rule(entry.make(stand_in.task, device), rule)
+        return TrainedTask(task, f"its target cannot be loaded: {error}")
 
 
 def _told_config(path: Path, metadata: Mapping[str, str]) -> Any:

@@ -15,6 +15,9 @@ def untrained_rule(
     eps0: float,
     alpha: float,
     space_dim: int = 2,
+    static: bool = False,
+    readout_dim: int = 0,
+    readout_hidden_dim: int = 0,
 ) -> NPARule:
     """Return a rule on the CPU whose weights are drawn from `generator` alone.
 
@@ -25,7 +28,19 @@ def untrained_rule(
         eps0: Perception radius that the rule is trained at [length units].
         alpha: Largest displacement in one step, as a fraction of ε (dimensionless).
         space_dim: Space dimension D.
+        static: Particles never move.
+        readout_dim: Outputs of the read-out network; 0 for none.
+        readout_hidden_dim: Width of its hidden layer.
     """
     with torch.random.fork_rng(devices=()):
         torch.manual_seed(int(torch.randint(2**31, (), generator=generator)))
-        return NPARule(space_dim, state_dim, hidden_dim, eps0=eps0, alpha=alpha)
+        return NPARule(
+            space_dim,
+            state_dim,
+            hidden_dim,
+            eps0=eps0,
+            alpha=alpha,
+            static=static,
+            readout_dim=readout_dim,
+            readout_hidden_dim=readout_hidden_dim,
+        )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, TypeVar, cast, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -72,3 +72,34 @@ class PictureTask(Task, Protocol):
     @property
     def metric_name(self) -> str:
         """What `metric` is, in a word or two."""
+
+
+@runtime_checkable
+class ReadOutTask(Protocol):
+    """A task that compares what a rule reads out of the states, instead of the states themselves.
+
+    It has all that `Task` has besides.
+    """
+
+    def for_rule(self, rule: NPARule) -> Task:
+        """Return the task with losses, metric and pictures that read states through `rule`.
+
+        Its parameters are read anew at each call, so that losses are differentiable in them and
+        change with them. The task itself stays as it is.
+
+        Args:
+            rule: The rule, where the worlds are.
+        """
+
+
+TaskT = TypeVar("TaskT", bound=Task)
+
+
+def task_for_rule(task: TaskT, rule: NPARule) -> TaskT:
+    """Return a task as it is for the worlds of one rule; most are the same for all rules.
+
+    Args:
+        task: Any task.
+        rule: The rule that runs the worlds, where they are.
+    """
+    return cast(TaskT, task.for_rule(rule)) if isinstance(task, ReadOutTask) else task

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from npa_envs.replay import Replayed
 from npa_envs.rule import NPARule
-from npa_envs.tasks.task import Task
+from npa_envs.tasks.task import Task, task_for_rule
 from npa_envs.training.config import TrainConfig
 from npa_envs.training.graphs import EagerIteration, GraphedIteration, Rollout
 from npa_envs.training.meter import LossMeter
@@ -38,7 +38,8 @@ class TrainingCycle:
         schedule: torch.Generator,
         rollout: Rollout | None = None,
     ) -> None:
-        self._task = task
+        self.task = task_for_rule(task, rule)
+        """The task, as it is for worlds of this rule."""
         self._config = config
         worlds = torch.Generator(device).manual_seed(config.seed + 1)
         masks = torch.Generator(device).manual_seed(config.seed + 2)
@@ -50,7 +51,7 @@ class TrainingCycle:
         batch = x[: config.world_count], s[: config.world_count]
         graphed = device.type == "cuda" and config.cuda_graph
         iteration = GraphedIteration if graphed else EagerIteration
-        self.batch = iteration(task, rule, config, *batch, masks, rollout)
+        self.batch = iteration(self.task, rule, config, *batch, masks, rollout)
         """Worlds before and after the last rollout, the loss and its gradients."""
         self.optimiser = RuleOptimiser(self.batch.parameters, config)
         """Changes the rule."""
@@ -103,7 +104,7 @@ class TrainingCycle:
         self._index.copy_(self.pool.sample(config.world_count, worlds))
         x0, s0 = self.pool.read(self._index)
         if config.damage:
-            x0, s0 = self._task.damage(x0, s0, worlds)
+            x0, s0 = self.task.damage(x0, s0, worlds)
         self.batch.x0.copy_(x0)
         self.batch.s0.copy_(s0)
         # Drawn in every iteration, needed or not: nobody on the host knows which worlds run away.
@@ -122,5 +123,5 @@ class TrainingCycle:
 
     def _seeds(self, world_count: int) -> tuple[Tensor, Tensor]:
         worlds, dtype = self.generators["worlds"], self._config.torch_dtype
-        x, s = self._task.seed(world_count, generator=worlds, device=worlds.device)
+        x, s = self.task.seed(world_count, generator=worlds, device=worlds.device)
         return x.to(dtype), s.to(dtype)

@@ -2,31 +2,37 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import nn
 
 from npa_envs.errors import NPAError
-from npa_envs.tasks.task import Task
+from npa_envs.rule import NPARule
+from npa_envs.tasks.task import Task, task_for_rule
 
 
 class DivergedError(NPAError):
     """The loss became infinite or NaN; the message says when, which term, and in which worlds."""
 
 
-def divergence_error(task: Task, snapshot: dict[str, Any], diagnosis: Path) -> DivergedError:
+def divergence_error(
+    task: Task, rule: NPARule, snapshot: dict[str, Any], diagnosis: Path
+) -> DivergedError:
     """Return the error that ends a run whose loss is not finite.
 
     Args:
         task: The run's task, to find the worlds at fault.
+        rule: The run's rule; its parameters may have changed since.
         snapshot: `LossMeter.snapshot()`.
         diagnosis: Where the snapshot was written.
     """
     terms = [name for name, value in snapshot["terms"].items() if not math.isfinite(value)]
     shown = [name for name in terms if name != "loss"] or terms
-    worlds = bad_worlds(task, snapshot)
+    worlds = bad_worlds(task, rule, snapshot)
     where = f"world{'s' * (len(worlds) > 1)} {', '.join(map(str, worlds))}" if worlds else "no one"
     return DivergedError(
         f"the loss must stay finite, but {' and '.join(shown)} was not in iteration "
@@ -36,13 +42,19 @@ def divergence_error(task: Task, snapshot: dict[str, Any], diagnosis: Path) -> D
     )
 
 
-def bad_worlds(task: Task, snapshot: dict[str, Any]) -> list[int]:
+def bad_worlds(task: Task, rule: NPARule, snapshot: dict[str, Any]) -> list[int]:
     """Return which worlds of the batch alone give a loss that is not finite.
 
     Args:
         task: The run's task.
-        snapshot: `LossMeter.snapshot()`, with `x` [B, N, D] and `s` [B, N, C] after the rollout.
+        rule: The run's rule.
+        snapshot: `LossMeter.snapshot()`, with `x` [B, N, D] and `s` [B, N, C] after the rollout,
+            and the `parameters` at that time.
     """
+    rule = copy.deepcopy(rule).cpu()
+    trained = [parameter for parameter in rule.parameters() if parameter.requires_grad]
+    nn.utils.vector_to_parameters(snapshot["parameters"], trained)
+    task = task_for_rule(task, rule)
     x, s = snapshot["x"], snapshot["s"]
     found = []
     for world in range(len(x)):

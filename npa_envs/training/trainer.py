@@ -257,7 +257,7 @@ class Trainer:
     def _write_picture(self) -> None:
         self._finish_record()
         with torch.no_grad():
-            picture = self.task.picture(self._cycle.batch.x, self._cycle.batch.s)
+            picture = self._cycle.task.picture(self._cycle.batch.x, self._cycle.batch.s)
         path = self.folder.picture(self.iteration)
         write_batch_picture(path, picture, self._board, self.iteration)
 
@@ -277,7 +277,7 @@ class Trainer:
                 **snapshot,
             },
         )
-        raise divergence_error(self.task, snapshot, diagnosis)
+        raise divergence_error(self.task, self.rule, snapshot, diagnosis)
 
     def _open_folder(self, *, resume: bool, overwrite: bool) -> dict[str, Any] | None:
         path = self.folder.checkpoint
