@@ -56,14 +56,16 @@ def task_of_rule(
     from npa_envs.tasks.task import task_for_rule
     from npa_envs.training import override, preset, task_entry
 
-    if rule.space_dim != 2 or rule.static:
-        raise NPAError(
-            f"the command line shows moving rules in 2D, got space_dim={rule.space_dim}, "
-            f"static={rule.static}: run this one in Python with npa_envs.rollout"
-        )
     path = shipped_rules().get(source, Path(source))
     metadata = rule_metadata(path) if path.suffix == ".safetensors" else {}
     task_name = metadata.get("task", "morphogenesis2d")
+    entry = task_entry(task_name)
+    if rule.space_dim != entry.space_dim or rule.static:
+        raise NPAError(
+            f"the command line shows moving rules in the {entry.space_dim}D worlds of {task_name}, "
+            f"got space_dim={rule.space_dim}, static={rule.static}: run this one in Python with "
+            "npa_envs.rollout"
+        )
     own: dict[str, Any] = {"state_dim": rule.state_dim, "hidden_dim": rule.hidden_dim}
     own |= {"eps": rule.eps0, "alpha": rule.alpha}
     told = "config" in metadata
@@ -71,7 +73,6 @@ def task_of_rule(
     config = override(config, **{k: v for k, v in fields.items() if v is not None})
     if particle_count is not None:
         config = override(config, task=config.task.with_particle_count(particle_count))
-    entry = task_entry(task_name)
     chosen = fields.get("target") is not None
     doubt = None if told or chosen else "its file does not say what it grows"
     try:

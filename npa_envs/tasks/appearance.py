@@ -9,8 +9,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from npa_envs.rule import COLOUR_OFFSET
-
 OUTPUTS = 20
 """Read-out dimensions: rotation 4, log-anisotropy 3, opacity 1, colours of degree 1 9, of 0 3."""
 
@@ -63,7 +61,8 @@ class Appearance:
             outputs: A rule's outputs (`NPARule.read_out`), dimensionless, shape [B, N, K], K >= 3.
         """
         lead = outputs.shape[:-1]
-        flat = outputs[..., None, -3:] + (COLOUR_OFFSET - 0.5)
+        # The renderer adds one half, as `NPARule.colour` does.
+        flat = outputs[..., None, -3:]
         if outputs.shape[-1] == OUTPUTS:
             rotation, stretch, opacity, turning = outputs[..., :17].split((4, 3, 1, 9), dim=-1)
             upright = torch.ones_like(rotation[..., :1])

@@ -103,3 +103,32 @@ def task_for_rule(task: TaskT, rule: NPARule) -> TaskT:
         rule: The rule that runs the worlds, where they are.
     """
     return cast(TaskT, task.for_rule(rule)) if isinstance(task, ReadOutTask) else task
+
+
+@runtime_checkable
+class ScheduledTask(Protocol):
+    """A task whose loss changes from iteration to iteration: by a curriculum, or by draws.
+
+    It has all that `Task` has besides.
+    """
+
+    def begin(self, iteration: int) -> None:
+        """Prepare the loss of an iteration, without waiting for the device.
+
+        Recorded graphs read what is written here: always into the same tensors. What is written
+        must follow from the iteration alone, so that a resumed run goes on as it would have.
+
+        Args:
+            iteration: Iterations done so far in the run.
+        """
+
+
+@runtime_checkable
+class ViewTask(Protocol):
+    """A task whose goal is seen in several views, over which its PSNR is taken.
+
+    It has all that `PictureTask` has besides.
+    """
+
+    def view_psnr(self, x: Tensor, s: Tensor) -> Tensor:
+        """Return each world's mean PSNR over the views that it is measured by [dB], shape [B]."""

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from npa_envs.replay import Replayed
 from npa_envs.rule import NPARule
-from npa_envs.tasks.task import Task, task_for_rule
+from npa_envs.tasks.task import ScheduledTask, Task, task_for_rule
 from npa_envs.training.config import TrainConfig
 from npa_envs.training.graphs import EagerIteration, GraphedIteration, Rollout
 from npa_envs.training.meter import LossMeter
@@ -71,6 +71,8 @@ class TrainingCycle:
         config, batch = self._config, self.batch
         lo, hi = config.steps
         steps = int(torch.randint(lo, hi, (), generator=self.generators["schedule"]))
+        if isinstance(self.task, ScheduledTask):
+            self.task.begin(iteration)
         self._draw()
         if iteration % config.seed_interval == 0:
             batch.x0[0], batch.s0[0] = self._fresh_x[0], self._fresh_s[0]

@@ -11,10 +11,12 @@ import torch
 
 from npa_envs.errors import NPAError, suggest
 from npa_envs.tasks.morphogenesis2d_config import Morphogenesis2DConfig
+from npa_envs.tasks.morphogenesis3d_config import Morphogenesis3DConfig
 from npa_envs.tasks.task import PictureTask
 from npa_envs.tasks.texture_config import TextureConfig
 from npa_envs.training.config import Morphogenesis2DTrainConfig, TrainConfig
 from npa_envs.training.overrides import override
+from npa_envs.training.presets3d import MORPHOGENESIS3D_PRESETS
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,9 @@ class TaskEntry:
 
     targets: Callable[[], tuple[str, ...]]
     """Returns the names of its built-in targets."""
+
+    space_dim: int = 2
+    """Space dimension D of its worlds."""
 
 
 def _make_morphogenesis2d(config: Morphogenesis2DConfig, device: torch.device) -> PictureTask:
@@ -57,6 +62,18 @@ def _texture_targets() -> tuple[str, ...]:
     from npa_envs.tasks.textures import builtin_textures
 
     return builtin_textures()
+
+
+def _make_morphogenesis3d(config: Morphogenesis3DConfig, device: torch.device) -> PictureTask:
+    from npa_envs.tasks.morphogenesis3d import Morphogenesis3D
+
+    return Morphogenesis3D(config, device=device)
+
+
+def _morphogenesis3d_targets() -> tuple[str, ...]:
+    from npa_envs.tasks.meshes import builtin_meshes
+
+    return builtin_meshes()
 
 
 _OUT = Path("runs/morphogenesis2d")
@@ -172,6 +189,13 @@ TASKS: Mapping[str, TaskEntry] = {
         presets=MORPHOGENESIS2D_PRESETS,
         make=_make_morphogenesis2d,
         targets=_morphogenesis2d_targets,
+    ),
+    "morphogenesis3d": TaskEntry(
+        summary="grow a thing seen from all sides from a ball of blank particles",
+        presets=MORPHOGENESIS3D_PRESETS,
+        make=_make_morphogenesis3d,
+        targets=_morphogenesis3d_targets,
+        space_dim=3,
     ),
     "texture": TaskEntry(
         summary="arrange particles all over a periodic box to a texture",
