@@ -40,6 +40,7 @@ ENVIRONMENTS = (
     Registration("npa/Morphogenesis2D-v0", "npa_envs.envs.morphogenesis2d", "Morphogenesis2D", 256),
     Registration("npa/Regeneration2D-v0", "npa_envs.envs.regeneration2d", "Regeneration2D", 128),
     Registration("npa/Texture-v0", "npa_envs.envs.texture", "Texture", 128),
+    Registration("npa/Morphogenesis3D-v0", "npa_envs.envs.morphogenesis3d", "Morphogenesis3D", 128),
 )
 """All of them. A change of behaviour is a new version of the id."""
 

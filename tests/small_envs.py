@@ -11,7 +11,10 @@ from npa_envs.registration import ENVIRONMENTS
 IDS = [environment.id for environment in ENVIRONMENTS]
 
 SMALL: dict[str, Any] = {"particle_count": 61, "eps": 0.3, "resolution": 16, "render_size": 24}
-SPECIAL: dict[str, dict[str, Any]] = {"npa/Regeneration2D-v0": {"rule": "picture"}}
+SPECIAL: dict[str, dict[str, Any]] = {
+    "npa/Regeneration2D-v0": {"rule": "picture"},
+    "npa/Morphogenesis3D-v0": {"seed_radius": 0.2, "view_count": 2, "target": "doughnut"},
+}
 
 
 def small(name: str, **keywords: Any) -> dict[str, Any]:

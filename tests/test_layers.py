@@ -50,7 +50,11 @@ LADDER = {
     "npa_envs.rule_io": rung(4, "torch safetensors", never=INSIDES),
     "npa_envs.control": rung(4, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
     "npa_envs.dynamics": rung(4, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
-    "npa_envs.tasks": rung(5, "torch numpy PIL", never=("npa_envs.kernels", "npa_envs.reference")),
+    "npa_envs.tasks": rung(
+        5,
+        "torch numpy PIL trimesh pytorch_msssim gsplat",
+        never=("npa_envs.kernels", "npa_envs.reference"),
+    ),
     "npa_envs.render": rung(
         6,
         "torch numpy PIL imageio imageio_ffmpeg pygame",

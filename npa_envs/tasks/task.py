@@ -9,6 +9,8 @@ from torch import Tensor
 
 from npa_envs.randomness import Randomness
 from npa_envs.rule import NPARule
+from npa_envs.sph import Cameras
+from npa_envs.tasks.appearance import Gaussians
 
 
 class Task(Protocol):
@@ -125,10 +127,16 @@ class ScheduledTask(Protocol):
 
 @runtime_checkable
 class ViewTask(Protocol):
-    """A task whose goal is seen in several views, over which its PSNR is taken.
+    """A task of 3D worlds that cameras see as Gaussians, from several sides.
 
     It has all that `PictureTask` has besides.
     """
 
     def view_psnr(self, x: Tensor, s: Tensor) -> Tensor:
         """Return each world's mean PSNR over the views that it is measured by [dB], shape [B]."""
+
+    def views(self, x: Tensor, s: Tensor, cameras: Cameras) -> Tensor:
+        """Return what cameras see: colours times alpha, and alpha, shape [B, V, H, W, 4]."""
+
+    def gaussians(self, s: Tensor) -> Gaussians:
+        """Return how particles of states s [B, N, C] look."""
