@@ -44,13 +44,13 @@ class MultiScaleSimilarity:
         self, resolution: int, channels: int, *, device: str | torch.device = "cpu"
     ) -> None:
         try:
-            from pytorch_msssim import ssim
+            from pytorch_msssim.ssim import _ssim
         except ImportError as error:
             raise MissingDependencyError(
                 "comparing views by MS-SSIM needs pytorch-msssim, which is not installed: "
                 "pip install 'npa-envs[views]', or set ssim_weight to 0"
             ) from error
-        self._compare: Any = ssim._ssim
+        self._compare: Any = _ssim
         if resolution < 2 ** len(WEIGHTS[1:]):
             raise NPAError(
                 f"resolution must be at least {2 ** len(WEIGHTS[1:])} pixels for MS-SSIM, got "
