@@ -218,6 +218,15 @@ def test_the_code_about_training_runs(capsys):
     assert capsys.readouterr().out.startswith("random: ")
 
 
+def test_the_code_about_3d_morphogenesis_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (block,) = code_blocks(DOCS / "morphogenesis3d.md")
+    names = {}
+    exec(compile(block, "morphogenesis3d.md", "exec"), names)
+    assert [frame.shape for frame in names["frames"]] == [(256, 256, 3)] * 4
+    assert (tmp_path / "seed.ply").stat().st_size > 512 * 26 * 4
+
+
 def test_the_code_about_textures_runs(capsys):
     (block,) = code_blocks(DOCS / "textures.md")
     exec(compile(block, "textures.md", "exec"), {})

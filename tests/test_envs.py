@@ -511,7 +511,7 @@ def test_bad_keyword_is_a_clear_error(name, keywords, message):
         ("npa/Texture-v0", {"boundary": "open"}, "boundary must be 'periodic' for textures"),
         ("npa/Texture-v0", {"loss": "swd"}, "did you mean 'patch_swd'|known: filter_swd"),
         ("npa/Texture-v0", {"resolution": 8}, "resolution must be a whole number of at least 12"),
-        ("npa/Morphogenesis3D-v0", {"target": "mushrom"}, "did you mean 'mushroom'"),
+        ("npa/Morphogenesis3D-v0", {"target": "rocke"}, "did you mean 'rocket'"),
         ("npa/Morphogenesis3D-v0", {"readout": "gecko"}, "reads out states of 16 channels"),
         ("npa/Morphogenesis3D-v0", {"opacity": 1.0}, "opacity must lie below 1"),
         ("npa/Morphogenesis3D-v0", {"seed_radius": 5.0}, "seed_radius must be below"),

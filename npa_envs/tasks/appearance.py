@@ -64,7 +64,9 @@ class Appearance:
         # The renderer adds one half, as `NPARule.colour` does.
         flat = outputs[..., None, -3:]
         if outputs.shape[-1] == OUTPUTS:
-            rotation, stretch, opacity, turning = outputs[..., :17].split((4, 3, 1, 9), dim=-1)
+            rotation, stretch, opacity, turning = torch.split(
+                outputs[..., :17], [4, 3, 1, 9], dim=-1
+            )
             upright = torch.ones_like(rotation[..., :1])
             quaternions = torch.cat((rotation[..., :1] + upright, rotation[..., 1:]), dim=-1)
             stretch = self.anisotropy * torch.tanh(stretch)
@@ -77,6 +79,4 @@ class Appearance:
             opacities = outputs.new_full(lead, self.opacity)
             degree_one = outputs.new_zeros(*lead, 3, 3)
         colours = torch.cat((flat / FLAT, degree_one), dim=-2)
-        return Gaussians(
-            self.sigma * torch.exp(stretch), quaternions, opacities, colours, stretch
-        )
+        return Gaussians(self.sigma * torch.exp(stretch), quaternions, opacities, colours, stretch)

@@ -56,7 +56,8 @@ class Mesh:
         for k in range(3):
             np.add.at(sums, self.faces[:, k], flat)
         length = np.linalg.norm(sums, axis=1, keepdims=True)
-        return np.divide(sums, length, out=np.zeros_like(sums), where=length > 0)
+        unit: FloatArray = np.divide(sums, length, out=np.zeros_like(sums), where=length > 0)
+        return unit
 
 
 def turned(
@@ -179,9 +180,7 @@ def make_duck() -> Mesh:
     ]
     for side in (-1.0, 1.0):
         parts.append(ellipsoid((0.19 * side, 0.48, 0.62), (0.07, 0.07, 0.07), eye))
-        parts.append(
-            ellipsoid((0.50 * side, -0.22, -0.08), (0.12, 0.24, 0.40), (0.90, 0.66, 0.08))
-        )
+        parts.append(ellipsoid((0.50 * side, -0.22, -0.08), (0.12, 0.24, 0.40), (0.90, 0.66, 0.08)))
     return joined(parts)
 
 

@@ -1,4 +1,4 @@
-"""What 3D morphogenesis can be told: the target, its views, the world, the rule's size, the loss."""
+"""What 3D morphogenesis can be told: target and views, the world, the rule's size, the loss."""
 
 from __future__ import annotations
 

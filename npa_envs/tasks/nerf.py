@@ -156,7 +156,9 @@ def _read_split(path: Path) -> _Split:
         )
     if not isinstance(frames, list) or not frames:
         raise NPAError(f"frames in {str(path)!r} must be a list with at least one view")
-    files, poses = zip(*(_read_frame(path, k, frame) for k, frame in enumerate(frames)), strict=True)
+    files, poses = zip(
+        *(_read_frame(path, k, frame) for k, frame in enumerate(frames)), strict=True
+    )
     return _Split(path, float(angle or 0.0), files, torch.stack(poses))
 
 

@@ -108,7 +108,7 @@ def _fragments(
     """Return pixel, nearness and colour wherever the triangles of `part` cover a pixel's middle."""
     offset = np.stack(np.meshgrid(np.arange(side), np.arange(side), indexing="xy"), axis=-1)
     pixels = low[part][:, None] + offset.reshape(-1, 2)
-    middle = pixels + 0.5
+    middle: FloatArray = pixels.astype(np.float64) + 0.5
     a, b, c = (corners[part, k][:, None] for k in range(3))
     opposite = [_cross(b, c, middle), _cross(c, a, middle), _cross(a, b, middle)]
     area = opposite[0][:, :1] + opposite[1][:, :1] + opposite[2][:, :1]

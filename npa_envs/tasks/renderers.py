@@ -60,6 +60,11 @@ def gsplat_renderer(x: Tensor, gaussians: Gaussians, cameras: Cameras) -> tuple[
         raise NPAError(
             f"renderer='gsplat' draws worlds on CUDA, got {x.device}: set renderer to 'own'"
         )
+    if torch.cuda.is_available() and torch.cuda.is_current_stream_capturing():
+        raise NPAError(
+            "renderer='gsplat' cannot be recorded in a CUDA graph: set cuda_graph to False "
+            "(--no-cuda-graph), or renderer to 'own'"
+        )
     fx, fy, cx, cy = cameras.intrinsics.to(x.dtype).expand(cameras.count, 4).unbind(dim=-1)
     zero, one = torch.zeros_like(fx), torch.ones_like(fx)
     lenses = torch.stack((fx, zero, cx, zero, fy, cy, zero, zero, one), dim=-1).view(-1, 3, 3)

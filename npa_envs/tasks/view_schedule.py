@@ -1,4 +1,4 @@
-"""What changes from iteration to iteration when views are compared: which, before what, how sharp."""
+"""What changes from iteration to iteration: which views, before what, and how sharp."""
 
 from __future__ import annotations
 
@@ -67,8 +67,8 @@ class ViewSchedule:
 def blurred(pictures: Tensor, sigma: Tensor) -> Tensor:
     """Return pictures blurred by a Gaussian; beyond their edges they are 0.
 
-    Two products with a matrix of weights: the standard deviation may change without the host knowing
-    it, and one of 0 leaves the pictures as they are, bit for bit.
+    Two products with a matrix of weights: the standard deviation may change without the host
+    knowing it, and one of 0 leaves the pictures as they are, bit for bit.
 
     Args:
         pictures: Shape [V, H, W, K]; colours times alpha, and alpha.
