@@ -33,13 +33,13 @@ SEEN_BYTES = 700
 class Morphogenesis3DEnvConfig(EnvConfig):
     """What 3D morphogenesis can be told besides."""
 
-    eps: float = 0.2
+    eps: float = 0.3
     """Perception radius ε [length units]."""
 
-    eps0: float = 0.2
+    eps0: float = 0.3
     """Radius ε0 that perception is scaled to: that of the rules run here [length units]."""
 
-    alpha: float = 1.0
+    alpha: float = 0.3
     """Largest displacement in one step, as a fraction of ε (dimensionless)."""
 
     target: str = "mushroom"
@@ -55,13 +55,13 @@ class Morphogenesis3DEnvConfig(EnvConfig):
     resolution: int = 48
     """Pixels on each side of a view."""
 
-    sigma: float = 0.05
+    sigma: float = 0.06
     """Standard deviation of a round particle [length units]."""
 
     opacity: float = 0.5
     """Opacity of a particle, in (0, 1); with a read-out, where that is 0."""
 
-    seed_radius: float = 1.0
+    seed_radius: float = 0.6
     """Radius of the ball that the particles start in [length units]."""
 
     def __post_init__(self) -> None:
@@ -185,11 +185,30 @@ class Morphogenesis3DEnv(NPAEnv):
 
     ## Observation space
 
-    As in `Morphogenesis2DEnv`.
+    `Box(-64, 64, (N, P), float32)` with P = 5C + 3: one row for each particle, always in the same
+    order. Numbers beyond ±`observation_limit` are clipped.
+
+    | Columns | Perceived | Unit |
+    |---|---|---|
+    | `0 : C` | the particle's own state s | dimensionless |
+    | `C : 2C` | mean state of the neighbourhood, itself included | dimensionless |
+    | `2C : 5C` | gradient of the state: x, y, z of channel 0, then of channel 1, ... | 1 / length |
+    | `5C : 5C + 3` | gradient of the density over N: where it gets denser | 1 / length⁴ |
+
+    Gradients are on a logarithmic scale and scaled by powers of ε / ε0, as in
+    `npa/Morphogenesis2D-v0`: [perception](../mathematics.md#perception).
 
     ## Action space
 
-    As in `Morphogenesis2DEnv`.
+    `Box(-1, 1, (N, A), float32)` with A = 3 + C: one row for each particle.
+
+    | Columns | Action a | An action of 1 is | Effect on an updated particle |
+    |---|---|---|---|
+    | `0 : 3` | displacement along x, y and z | α ε, a length | x ← x + dt α ε a |
+    | `3 : 3 + C` | change of the state | `state_scale`, no unit | s ← s + dt `state_scale` a |
+
+    All else is as in `npa/Morphogenesis2D-v0`: only particles that are updated act, displacements
+    longer than 1 are shortened to length 1.
 
     ## Reward
 
