@@ -151,7 +151,7 @@ def test_the_example_of_a_page_runs(page):
     small = ", ".join(f"{name}={value}" for name, value in SMALL.items())
     names = {}
     exec(re.sub(r'(-v\d+")', rf"\1, {small}", example), names)
-    assert names["observation"].shape == (64, 66)
+    assert names["observation"].shape == (64, 83 if "3D" in page.stem else 66)
     assert names["envs"].num_envs == 8
 
 

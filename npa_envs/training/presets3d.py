@@ -23,7 +23,8 @@ MORPHOGENESIS3D_PRESETS: Mapping[str, TrainConfig[Morphogenesis3DConfig]] = {
         seed_interval=1,
         out=_OUT,
     ),
-    # FASTNOTE
+    # A mushroom of the right shape and colours, without its dots, after about seven minutes on one
+    # core (means of 4 worlds: PSNR of held-out views 19.9 dB at step 32, 19.1 dB at step 512).
     "fast": TrainConfig(
         task=Morphogenesis3DConfig(
             particle_count=768,
