@@ -22,12 +22,12 @@ from npa_envs.rule_io import load_rule
 from npa_envs.sph import orbit
 from npa_envs.tasks.appearance import FLAT, OUTPUTS, Appearance
 from npa_envs.tasks.meshes import load_mesh
-from npa_envs.tasks.morphogenesis3d import Morphogenesis3D, over, some_views
+from npa_envs.tasks.morphogenesis3d import Morphogenesis3D
 from npa_envs.tasks.morphogenesis3d_config import Morphogenesis3DConfig
 from npa_envs.tasks.raster import AMBIENT, LIGHT
 from npa_envs.tasks.renderers import gsplat_renderer, own_renderer
 from npa_envs.tasks.task import ReadOutTask, ScheduledTask, ViewTask
-from npa_envs.tasks.views import ANGLE, DISTANCE, load_views
+from npa_envs.tasks.views import ANGLE, DISTANCE, load_views, over, some_views
 from npa_envs.training import JsonlLog, Trainer, preset, train
 
 needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
@@ -121,6 +121,10 @@ def test_states_are_colours_where_there_is_no_read_out(task):
     x, s = worlds(task, 1)
     silent = task.for_rule(NPARule(3, 16, 8))
     assert torch.equal(task.picture(x, s), silent.picture(x, s))
+    # As many channels as a read-out has outputs are no read-out.
+    wide = torch.cat((torch.ones(1, 150, 4), s), dim=-1)
+    broad = task.for_rule(NPARule(3, 20, 8))
+    assert torch.equal(broad.picture(x, wide), task.picture(x, s))
     look = task.gaussians(s)
     torch.testing.assert_close(FLAT * look.colours[..., 0, :], s[..., -3:])
     assert not torch.equal(task.for_rule(lively_rule(task)).picture(x, s), task.picture(x, s))
@@ -546,6 +550,7 @@ def test_turntables_go_once_around(task):
 @pytest.mark.gpu
 @needs_cuda
 def test_graphs_train_the_same_rule_as_eager_launches(tmp_path):
+    pytest.importorskip("pytorch_msssim")
     logs = []
     for name, graphed in (("graph", True), ("eager", False)):
         fields = {"iterations": 12, "device": "cuda", "cuda_graph": graphed, "ssim_weight": 0.2}
@@ -559,6 +564,7 @@ def test_graphs_train_the_same_rule_as_eager_launches(tmp_path):
 @pytest.mark.gpu
 @needs_cuda
 def test_iterations_never_wait_for_the_device(tmp_path):
+    pytest.importorskip("pytorch_msssim")
     fields = {"device": "cuda", "steps": (8, 9), "ssim_weight": 0.2}
     config = preset("tiny", "morphogenesis3d", out=tmp_path / "run", **fields)
     task = Morphogenesis3D(config.task, device="cuda")

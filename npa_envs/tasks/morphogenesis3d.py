@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import copy
-import dataclasses
-import math
 
 import torch
 from torch import Tensor
@@ -21,7 +19,7 @@ from npa_envs.tasks.rules import untrained_rule
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.tasks.structure import MultiScaleSimilarity
 from npa_envs.tasks.view_schedule import ViewSchedule, blurred
-from npa_envs.tasks.views import Views, ViewTarget, load_views
+from npa_envs.tasks.views import ViewTarget, load_views, nearest_elevation, over, some_views
 
 SHOWN_FROM = 20.0
 """Pictures show the held-out view whose elevation is nearest to this [degrees]."""
@@ -71,7 +69,7 @@ class Morphogenesis3D:
                     f"views must have {side} x {side} pixels as config.resolution says, "
                     f"got {tuple(views.pictures.shape[1:])}: load them at that size"
                 )
-        shown = _nearest_elevation(target.held_out.cameras)
+        shown = nearest_elevation(target.held_out.cameras, SHOWN_FROM)
         self.target = target.to(device)
         """What worlds are to look like."""
         held_out = self.target.held_out
@@ -130,7 +128,7 @@ class Morphogenesis3D:
                 f"{rule.readout_dim}: it was made for another task"
             )
         seen = copy.copy(self)
-        seen._rule = rule
+        seen._rule = rule if rule.readout_dim else None
         return seen
 
     def make_rule(self, generator: torch.Generator) -> NPARule:
@@ -255,8 +253,8 @@ class Morphogenesis3D:
         wanted = blurred(chosen.pictures.to(x), schedule.sigma)
         backgrounds = schedule.backgrounds.to(x)[:, None, None]
         found = self._draw(x, gaussians, chosen.cameras)
-        parts = {
-            **{k: v.mean() for k, v in self._compare(found, wanted, backgrounds).items()},
+        compared = self._compare(found, wanted, backgrounds)
+        parts = {name: value.mean() for name, value in compared.items()} | {
             "isotropy": gaussians.stretch.abs().mean(),
             "motion": path_length.mean(),
             "overflow": (s - s.clamp(-1.0, 1.0)).abs().mean(),
@@ -274,8 +272,8 @@ class Morphogenesis3D:
     def _metric(self, x: Tensor, gaussians: Gaussians) -> Tensor:
         held_out = self.target.held_out
         found = self._draw(x, gaussians, held_out.cameras)
-        grey = x.new_full((3,), GREY)
-        return self._weighted(self._compare(found, held_out.pictures.to(x), grey))
+        wanted = held_out.pictures.to(x)
+        return self._weighted(self._compare(found, wanted, x.new_full((3,), GREY)))
 
     def _draw(self, x: Tensor, gaussians: Gaussians, cameras: Cameras) -> Tensor:
         image, alpha = RENDERERS[self.config.renderer](x, gaussians, cameras.to(x))
@@ -302,38 +300,3 @@ class Morphogenesis3D:
         if "structure" in parts:
             total = total + self.config.ssim_weight * parts["structure"]
         return total
-
-
-def over(views: Tensor, background: Tensor) -> Tensor:
-    """Return colours before a background, shape [..., 3].
-
-    Args:
-        views: Colours times alpha, and alpha, shape [..., 4].
-        background: Red, green and blue; broadcasts to [..., 3].
-    """
-    return views[..., :3] + (1.0 - views[..., 3:]) * background
-
-
-def some_views(views: Views, index: Tensor) -> Views:
-    """Return some of the views.
-
-    Args:
-        views: All of them.
-        index: Which, on their device, shape [V].
-    """
-    cameras = views.cameras
-    intrinsics = cameras.intrinsics
-    chosen = dataclasses.replace(
-        cameras,
-        world_to_camera=cameras.world_to_camera.index_select(0, index),
-        intrinsics=intrinsics if intrinsics.ndim == 1 else intrinsics.index_select(0, index),
-    )
-    return Views(chosen, views.pictures.index_select(0, index))
-
-
-def _nearest_elevation(cameras: Cameras) -> int:
-    """Return which camera is nearest to the elevation that pictures are taken from."""
-    motions = cameras.world_to_camera.double().cpu()
-    places = -(motions[:, :3, :3].mT @ motions[:, :3, 3:])[..., 0]
-    heights = places[:, 1] / places.norm(dim=1)
-    return int((heights - math.sin(math.radians(SHOWN_FROM))).abs().argmin())

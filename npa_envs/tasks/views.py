@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -136,3 +136,43 @@ def surrounding_cameras(count: int, resolution: int, *, turn: float = 0.0) -> Ca
         width=resolution,
         height=resolution,
     )
+
+
+def over(views: Tensor, background: Tensor) -> Tensor:
+    """Return colours before a background, shape [..., 3].
+
+    Args:
+        views: Colours times alpha, and alpha, shape [..., 4].
+        background: Red, green and blue; broadcasts to [..., 3].
+    """
+    return views[..., :3] + (1.0 - views[..., 3:]) * background
+
+
+def some_views(views: Views, index: Tensor) -> Views:
+    """Return some of the views.
+
+    Args:
+        views: All of them.
+        index: Which, on their device, shape [V].
+    """
+    cameras = views.cameras
+    intrinsics = cameras.intrinsics
+    chosen = replace(
+        cameras,
+        world_to_camera=cameras.world_to_camera.index_select(0, index),
+        intrinsics=intrinsics if intrinsics.ndim == 1 else intrinsics.index_select(0, index),
+    )
+    return Views(chosen, views.pictures.index_select(0, index))
+
+
+def nearest_elevation(cameras: Cameras, elevation: float) -> int:
+    """Return which camera looks at the origin from nearest to an elevation.
+
+    Args:
+        cameras: V cameras.
+        elevation: Above the horizon [degrees].
+    """
+    motions = cameras.world_to_camera.double().cpu()
+    places = -(motions[:, :3, :3].mT @ motions[:, :3, 3:])[..., 0]
+    heights = places[:, 1] / places.norm(dim=1)
+    return int((heights - math.sin(math.radians(elevation))).abs().argmin())
