@@ -72,8 +72,7 @@ class Morphogenesis3D:
         shown = nearest_elevation(target.held_out.cameras, SHOWN_FROM)
         self.target = target.to(device)
         """What worlds are to look like."""
-        held_out = self.target.held_out
-        self._shown = some_views(held_out, torch.tensor([shown], device=held_out.pictures.device))
+        self._shown = some_views(self.target.held_out, torch.tensor([shown], device=device))
         self.target_picture = self._shown.pictures[0].flip(0)
         """The view that pictures show: red, green and blue times alpha, and alpha, dimensionless,
         shape [R, R, 4]; rows point up."""
@@ -208,8 +207,8 @@ class Morphogenesis3D:
         """Return the PSNR of colours over white, mean of the held-out views [dB], shape [B]."""
         held_out = self.target.held_out
         found = self.views(x, s, held_out.cameras)
-        white = x.new_ones(3)
-        error = over(found, white).clamp(0.0, 1.0) - over(held_out.pictures.to(x), white)
+        wanted, white = held_out.pictures.to(x), x.new_ones(3)
+        error = over(found, white).clamp(0.0, 1.0) - over(wanted, white)
         return (-10.0 * error.square().mean(dim=(2, 3, 4)).log10()).mean(dim=1)
 
     def particle_shares(self, x: Tensor, s: Tensor) -> Tensor:
@@ -253,8 +252,7 @@ class Morphogenesis3D:
         wanted = blurred(chosen.pictures.to(x), schedule.sigma)
         backgrounds = schedule.backgrounds.to(x)[:, None, None]
         found = self._draw(x, gaussians, chosen.cameras)
-        compared = self._compare(found, wanted, backgrounds)
-        parts = {name: value.mean() for name, value in compared.items()} | {
+        parts = {k: v.mean() for k, v in self._compare(found, wanted, backgrounds).items()} | {
             "isotropy": gaussians.stretch.abs().mean(),
             "motion": path_length.mean(),
             "overflow": (s - s.clamp(-1.0, 1.0)).abs().mean(),
