@@ -68,6 +68,13 @@ FILMS = {
         rule=None,
         policy=RandomPolicy,
     ),
+    "Morphogenesis3D": Film(
+        steps=(0, 1, 2, 8, 32, 64, 128),
+        rows=({},),
+        caption="An episode of `SpreadPolicy`, for which nothing was trained: particles repel each "
+        "other, while the camera goes round.",
+        rule=None,
+    ),
 }
 """By the names of the environments."""
 

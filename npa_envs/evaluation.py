@@ -16,7 +16,7 @@ from npa_envs.errors import NPAError
 from npa_envs.render.tables import table_text, tables_json
 from npa_envs.rule import NPARule
 from npa_envs.tasks.damage import cut, erase_state, random_particle
-from npa_envs.tasks.task import PictureTask, task_for_rule
+from npa_envs.tasks.task import PictureTask, ViewTask, task_for_rule
 
 __all__ = [
     "CHECKPOINTS",
@@ -55,8 +55,8 @@ class EvaluationRow:
     """The task's metric in the worst world."""
 
     psnr: float | None
-    """PSNR of the picture against the target's, four channels in [0, 1], mean [dB]; None where a
-    world is not to match the target pixel by pixel."""
+    """PSNR of the picture against the target's, four channels in [0, 1], mean [dB]; in 3D that of
+    held-out views; None where a world is not to match the target pixel by pixel."""
 
     psnr_worst: float | None
     """PSNR in the worst world [dB], likewise."""
@@ -147,7 +147,9 @@ def measure(task: PictureTask, x: Tensor, s: Tensor, step: int) -> EvaluationRow
     """
     loss = task.metric(x, s)
     ratio = None
-    if task.aligned:
+    if isinstance(task, ViewTask):
+        ratio = task.view_psnr(x, s)
+    elif task.aligned:
         ratio = psnr(task.picture(x, s), task.target_picture.to(x.device))
     overflow = (s - s.clamp(-1.0, 1.0)).abs().mean()
     extent = (x.amax(1) - x.amin(1)).amax(1).mean()

@@ -46,6 +46,7 @@ ENVIRONMENTS = (
         "PointClassification",
         64,
     ),
+    Registration("npa/Morphogenesis3D-v0", "npa_envs.envs.morphogenesis3d", "Morphogenesis3D", 128),
 )
 """All of them. A change of behaviour is a new version of the id."""
 

@@ -15,6 +15,7 @@ SMALL: dict[str, Any] = {"particle_count": 61, "eps": 0.3, "resolution": 16, "re
 SPECIAL: dict[str, dict[str, Any]] = {
     "npa/Regeneration2D-v0": {"rule": "picture"},
     "npa/PointClassification-v0": {"resolution": None},
+    "npa/Morphogenesis3D-v0": {"seed_radius": 0.2, "view_count": 2, "target": "doughnut"},
 }
 
 

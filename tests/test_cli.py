@@ -181,7 +181,7 @@ def test_a_folder_with_a_run_is_not_overwritten_unasked(
     [
         ([], "needs a task first"),
         (["--preset", "tiny"], "needs a task first"),
-        (["morphogenesis"], "unknown task 'morphogenesis': did you mean 'morphogenesis2d'"),
+        (["morphogenesis"], "unknown task 'morphogenesis': did you mean 'morphogenesis"),
         (["morphogenesis2d", "--preset", "papr"], "unknown preset 'papr'"),
         (["morphogenesis2d", "--preset"], "expected one argument"),
         (["morphogenesis2d", "--resume", "--out", "/nowhere"], "no checkpoint to resume from"),

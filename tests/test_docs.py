@@ -158,7 +158,7 @@ def test_the_example_of_a_page_runs(page):
     fields = ", ".join(f"{name}={value}" for name, value in small(page.stem).items())
     names = {}
     exec(re.sub(r'(-v\d+")', rf"\1, {fields}", example), names)
-    assert names["observation"].shape == (64, 66)
+    assert names["observation"].shape == (64, 83 if "3D" in page.stem else 66)
     assert names["envs"].num_envs == 8
 
 
@@ -223,6 +223,15 @@ def test_the_code_about_training_runs(capsys):
     (block,) = code_blocks(DOCS / "training.md")
     exec(compile(block, "training.md", "exec"), {})
     assert capsys.readouterr().out.startswith("random: ")
+
+
+def test_the_code_about_3d_morphogenesis_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (block,) = code_blocks(DOCS / "morphogenesis3d.md")
+    names = {}
+    exec(compile(block, "morphogenesis3d.md", "exec"), names)
+    assert [frame.shape for frame in names["frames"]] == [(256, 256, 3)] * 4
+    assert (tmp_path / "seed.ply").stat().st_size > 512 * 26 * 4
 
 
 def test_the_code_about_textures_runs(capsys):

@@ -40,7 +40,8 @@ def test_vector_equals_single_over_200_steps_with_autoresets(name, reward, where
     if reward == "sparse":
         keywords["episode_steps"] = 13
     if "Morphogenesis" in name:
-        keywords |= {"success_loss": 1.2}
+        # In 3D losses between 0.0887 and 0.1053 were seen, of worlds that begin 0.0933.
+        keywords |= {"success_loss": 0.0905 if "3D" in name else 1.2}
     envs = make_vec(name, 3, max_episode_steps=13, **keywords)
     singles = [make(name, max_episode_steps=13, **keywords) for _ in range(3)]
     observations, infos = envs.reset(seed=40)

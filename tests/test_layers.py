@@ -51,7 +51,9 @@ LADDER = {
     "npa_envs.control": rung(4, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
     "npa_envs.dynamics": rung(4, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
     "npa_envs.tasks": rung(
-        5, "torch numpy PIL sklearn torchvision", never=("npa_envs.kernels", "npa_envs.reference")
+        5,
+        "torch numpy PIL sklearn torchvision trimesh pytorch_msssim gsplat",
+        never=("npa_envs.kernels", "npa_envs.reference"),
     ),
     "npa_envs.render": rung(
         6,

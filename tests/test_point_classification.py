@@ -324,7 +324,10 @@ def test_a_static_rule_of_no_known_task_is_refused(task, tmp_path, capsys):
     path = tmp_path / "rule.safetensors"
     save_rule(task.make_rule(random()), path)
     assert main(["evaluate", str(path), "--no-progress"]) != 0
-    assert "static ones that were trained on point_classification" in capsys.readouterr().err
+    assert (
+        "shows moving rules in the 2D worlds of morphogenesis2d, got space_dim=2, static=True"
+        in capsys.readouterr().err
+    )
 
 
 def test_the_paper_recipe_runs_on_files_of_mnists_format(folder, tmp_path):

@@ -15,12 +15,21 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.dynamics import rollout
-from npa_envs.render import to_uint8, write_filmstrip, write_gif, write_mp4
+from npa_envs.render import (
+    to_uint8,
+    turntable_frames,
+    write_filmstrip,
+    write_gaussians,
+    write_gif,
+    write_mp4,
+    write_points,
+    write_splat,
+)
 from npa_envs.rule import NPARule
 from npa_envs.tasks.damage import DamageEvent, damage_worlds
 
 if TYPE_CHECKING:
-    from npa_envs.tasks.task import PictureTask
+    from npa_envs.tasks.task import PictureTask, ViewTask
 
 EARLY_STEPS = (0, 16, 32, 64, 128)
 """Steps that a filmstrip shows, or the frames nearest to them: most of the growth is there."""
@@ -173,4 +182,28 @@ def write_film(film: Film, folder: Path, name: str, *, fps: float = 25.0) -> lis
     write_mp4(paths[1], film.frames, fps)
     rows = math.ceil(len(strip) / 8)
     write_filmstrip(paths[2], strip, captions, columns=math.ceil(len(strip) / rows))
+    return paths
+
+
+def write_solid(task: ViewTask, x: Tensor, s: Tensor, folder: Path) -> list[Path]:
+    """Write a grown 3D world as a turntable and as files for other programs; return the files.
+
+    Args:
+        task: Draws the world.
+        x: Positions [length units], shape [1, N, 3].
+        s: States, shape [1, N, C].
+        folder: An existing folder.
+
+    Raises:
+        NPAError: A file cannot be written.
+    """
+    names = ("turntable.gif", "points.ply", "gaussians.ply", "cloud.splat")
+    paths = [folder / name for name in names]
+    with torch.no_grad():
+        frames = turntable_frames(lambda cameras: task.views(x, s, cameras), device=x.device)
+        looks = task.gaussians(s)
+    write_gif(paths[0], frames, fps=20.0)
+    write_points(paths[1], x, looks)
+    write_gaussians(paths[2], x, looks)
+    write_splat(paths[3], x, looks)
     return paths

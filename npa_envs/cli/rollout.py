@@ -22,7 +22,11 @@ FRAME_COUNT = 150
 
 @dataclass(frozen=True, kw_only=True)
 class RolloutOptions:
-    """Grow a rule from its seed, damage it on the way, and write a GIF, an MP4 and a filmstrip."""
+    """Grow a rule from its seed, damage it on the way, and write a GIF, an MP4 and a filmstrip.
+
+    Of a 3D world also a turntable GIF, and the grown cloud as points (PLY) and as Gaussians (PLY,
+    .splat).
+    """
 
     rule: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RULE")]
     """A shipped rule (`npa-envs list`), a file of ours or the authors' (.safetensors, .pth), or a
@@ -118,14 +122,14 @@ def run(options: RolloutOptions) -> int:
     """
     import torch
 
-    from npa_envs.cli.film import film_world, write_film
+    from npa_envs.cli.film import film_world, write_film, write_solid
     from npa_envs.cli.progress import StepBar
     from npa_envs.cli.worlds import make_folder, task_of_rule
     from npa_envs.evaluation import measure
     from npa_envs.rule_io import load_rule
     from npa_envs.tasks.damage import parse_damage
     from npa_envs.tasks.point_classification import PointClassification
-    from npa_envs.tasks.task import seed_worlds, task_toward
+    from npa_envs.tasks.task import ViewTask, seed_worlds, task_toward
     from npa_envs.tasks.votes import majority
     from npa_envs.training import check_device
     from npa_envs.training.interrupt import stop_flag
@@ -184,7 +188,10 @@ def run(options: RolloutOptions) -> int:
     if isinstance(task, PointClassification) and goal is not None:
         vote = int(majority(task.outputs(s)))
         print(f"most particles say {vote}; the cloud is a {int(goal)}")
-    for path in write_film(film, folder, "growth", fps=options.fps):
+    paths = write_film(film, folder, "growth", fps=options.fps)
+    if isinstance(task, ViewTask):
+        paths += write_solid(task, x, s, folder)
+    for path in paths:
         print(f"wrote {path}")
     return 0
 

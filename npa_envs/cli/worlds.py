@@ -60,11 +60,13 @@ def task_of_rule(
     path = shipped_rules().get(source, Path(source))
     metadata = rule_metadata(path) if path.suffix == ".safetensors" else {}
     task_name = metadata.get("task", "morphogenesis2d")
-    if rule.space_dim != 2 or rule.static != (task_name == "point_classification"):
+    entry = task_entry(task_name)
+    still = task_name == "point_classification"
+    if rule.space_dim != entry.space_dim or rule.static != still:
         raise NPAError(
-            f"the command line shows moving rules in 2D, and static ones that were trained on "
-            f"point_classification, got space_dim={rule.space_dim}, static={rule.static} of task "
-            f"{task_name!r}: run this one in Python with npa_envs.rollout"
+            f"the command line shows {'static' if still else 'moving'} rules in the "
+            f"{entry.space_dim}D worlds of {task_name}, got space_dim={rule.space_dim}, "
+            f"static={rule.static}: run this one in Python with npa_envs.rollout"
         )
     own: dict[str, Any] = {"state_dim": rule.state_dim, "hidden_dim": rule.hidden_dim}
     own |= {"eps": rule.eps0} | ({} if rule.static else {"alpha": rule.alpha})
@@ -73,7 +75,6 @@ def task_of_rule(
     config = override(config, **{k: v for k, v in fields.items() if v is not None})
     if particle_count is not None:
         config = override(config, task=config.task.with_particle_count(particle_count))
-    entry = task_entry(task_name)
     chosen = fields.get("target") is not None
     doubt = None if told or chosen else "its file does not say what it grows"
     try:

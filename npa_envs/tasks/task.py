@@ -9,6 +9,8 @@ from torch import Tensor
 
 from npa_envs.randomness import Randomness
 from npa_envs.rule import NPARule
+from npa_envs.sph import Cameras
+from npa_envs.tasks.appearance import Gaussians
 
 
 class Task(Protocol):
@@ -155,3 +157,38 @@ def seed_worlds(
     if isinstance(task, GoalTask):
         return task.seed_with_goals(world_count, generator=generator, device=device)
     return *task.seed(world_count, generator=generator, device=device), None
+
+
+@runtime_checkable
+class ScheduledTask(Protocol):
+    """A task whose loss changes from iteration to iteration: by a curriculum, or by draws.
+
+    It has all that `Task` has besides.
+    """
+
+    def begin(self, iteration: int) -> None:
+        """Prepare the loss of an iteration, without waiting for the device.
+
+        Recorded graphs read what is written here: always into the same tensors. What is written
+        must follow from the iteration alone, so that a resumed run goes on as it would have.
+
+        Args:
+            iteration: Iterations done so far in the run.
+        """
+
+
+@runtime_checkable
+class ViewTask(Protocol):
+    """A task of 3D worlds that cameras see as Gaussians, from several sides.
+
+    It has all that `PictureTask` has besides.
+    """
+
+    def view_psnr(self, x: Tensor, s: Tensor) -> Tensor:
+        """Return each world's mean PSNR over the views that it is measured by [dB], shape [B]."""
+
+    def views(self, x: Tensor, s: Tensor, cameras: Cameras) -> Tensor:
+        """Return what cameras see: colours times alpha, and alpha, shape [B, V, H, W, 4]."""
+
+    def gaussians(self, s: Tensor) -> Gaussians:
+        """Return how particles of states s [B, N, C] look."""

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from npa_envs.replay import Replayed
 from npa_envs.rule import NPARule
-from npa_envs.tasks.task import GoalTask, Task, seed_worlds, task_for_rule
+from npa_envs.tasks.task import GoalTask, ScheduledTask, Task, seed_worlds, task_for_rule
 from npa_envs.training.config import TrainConfig
 from npa_envs.training.graphs import EagerIteration, GraphedIteration, Rollout
 from npa_envs.training.meter import LossMeter
@@ -73,6 +73,8 @@ class TrainingCycle:
         config, batch = self._config, self.batch
         lo, hi = config.steps
         steps = int(torch.randint(lo, hi, (), generator=self.generators["schedule"]))
+        if isinstance(self.task, ScheduledTask):
+            self.task.begin(iteration)
         self._draw()
         if iteration % config.seed_interval == 0:
             self._begin_anew(config.fresh_count)

@@ -11,11 +11,13 @@ import torch
 
 from npa_envs.errors import NPAError, suggest
 from npa_envs.tasks.morphogenesis2d_config import Morphogenesis2DConfig
+from npa_envs.tasks.morphogenesis3d_config import Morphogenesis3DConfig
 from npa_envs.tasks.point_classification_config import PointClassificationConfig
 from npa_envs.tasks.task import PictureTask
 from npa_envs.tasks.texture_config import TextureConfig
 from npa_envs.training.config import Morphogenesis2DTrainConfig, TrainConfig
 from npa_envs.training.overrides import override
+from npa_envs.training.presets3d import MORPHOGENESIS3D_PRESETS
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,9 @@ class TaskEntry:
 
     targets: Callable[[], tuple[str, ...]]
     """Returns the names of its built-in targets; none where `--target` is no field of its."""
+
+    space_dim: int = 2
+    """Space dimension D of its worlds."""
 
 
 def _make_morphogenesis2d(config: Morphogenesis2DConfig, device: torch.device) -> PictureTask:
@@ -66,6 +71,18 @@ def _make_point_classification(
     from npa_envs.tasks.point_classification import PointClassification
 
     return PointClassification(config, device=device)
+
+
+def _make_morphogenesis3d(config: Morphogenesis3DConfig, device: torch.device) -> PictureTask:
+    from npa_envs.tasks.morphogenesis3d import Morphogenesis3D
+
+    return Morphogenesis3D(config, device=device)
+
+
+def _morphogenesis3d_targets() -> tuple[str, ...]:
+    from npa_envs.tasks.meshes import builtin_meshes
+
+    return builtin_meshes()
 
 
 _OUT = Path("runs/morphogenesis2d")
@@ -248,6 +265,13 @@ TASKS: Mapping[str, TaskEntry] = {
         presets=MORPHOGENESIS2D_PRESETS,
         make=_make_morphogenesis2d,
         targets=_morphogenesis2d_targets,
+    ),
+    "morphogenesis3d": TaskEntry(
+        summary="grow a thing seen from all sides from a ball of blank particles",
+        presets=MORPHOGENESIS3D_PRESETS,
+        make=_make_morphogenesis3d,
+        targets=_morphogenesis3d_targets,
+        space_dim=3,
     ),
     "texture": TaskEntry(
         summary="arrange particles all over a periodic box to a texture",

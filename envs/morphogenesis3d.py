@@ -1,0 +1,288 @@
+"""`npa/Morphogenesis3D-v0`: a ball of blank particles grows into a thing seen from all sides."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from npa_envs.envs.config import EnvConfig
+from npa_envs.envs.single import NPAEnv
+from npa_envs.envs.task import EnvTask
+from npa_envs.envs.vector import NPAVectorEnv
+from npa_envs.errors import NPAError
+from npa_envs.randomness import WorldRandom
+from npa_envs.rule import COLOUR_OFFSET, NPARule
+from npa_envs.rule_io import load_rule
+from npa_envs.tasks.checks import check_fraction, check_positive
+from npa_envs.tasks.morphogenesis3d import Morphogenesis3D
+from npa_envs.tasks.morphogenesis3d_config import Morphogenesis3DConfig
+
+PIXEL_BYTES = 200
+"""About what comparing one pixel of a view needs [bytes]."""
+
+SEEN_BYTES = 700
+"""About what one particle in one view needs [bytes]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Morphogenesis3DEnvConfig(EnvConfig):
+    """What 3D morphogenesis can be told besides."""
+
+    eps: float = 0.3
+    """Perception radius ε [length units]."""
+
+    eps0: float = 0.3
+    """Radius ε0 that perception is scaled to: that of the rules run here [length units]."""
+
+    alpha: float = 0.3
+    """Largest displacement in one step, as a fraction of ε (dimensionless)."""
+
+    target: str = "mushroom"
+    """What to grow: a built-in mesh (`npa-envs list`), a mesh file, or a folder of views."""
+
+    readout: str = ""
+    """Rule whose read-out says how particles look: a shipped one's name or a file; empty: the last
+    three channels are the colour, and particles are round."""
+
+    view_count: int = 6
+    """Views from all sides that the loss compares, at most."""
+
+    resolution: int = 48
+    """Pixels on each side of a view."""
+
+    sigma: float = 0.06
+    """Standard deviation of a round particle [length units]."""
+
+    opacity: float = 0.5
+    """Opacity of a particle, in (0, 1); with a read-out, where that is 0."""
+
+    seed_radius: float = 0.6
+    """Radius of the ball that the particles start in [length units]."""
+
+    def __post_init__(self) -> None:
+        """Check every field.
+
+        Raises:
+            NPAError: A field has the wrong type or lies outside its range.
+        """
+        super().__post_init__()
+        for name in ("target", "readout"):
+            value = getattr(self, name)
+            if not isinstance(value, str) or (name == "target" and not value):
+                raise NPAError(
+                    f"{name} must be a name or a path, got {value!r}: for example target='mushroom'"
+                )
+        check_positive(self, int, "state_dim", at_least=3)
+        check_positive(self, int, "resolution", at_least=8)
+        check_positive(self, int, "view_count")
+        check_positive(self, float, "sigma", "seed_radius")
+        check_fraction(self, "opacity")
+        if self.seed_radius >= self.position_limit:
+            raise NPAError(
+                f"seed_radius must be below position_limit = {self.position_limit:g}, got "
+                f"{self.seed_radius}: worlds would begin out of bounds"
+            )
+
+
+class SolidTask(EnvTask[Morphogenesis3DEnvConfig]):
+    """A thing to grow, compared view by view as `npa_envs.tasks.morphogenesis3d` does.
+
+    Args:
+        config: The environment's configuration.
+        device: Where the worlds live.
+
+    Raises:
+        NPAError: The target or the read-out cannot be loaded, or does not fit.
+    """
+
+    config_type = Morphogenesis3DEnvConfig
+    space_dim = 3
+
+    def __init__(self, config: Morphogenesis3DEnvConfig, device: torch.device) -> None:
+        super().__init__(config, device)
+        goal = Morphogenesis3D(
+            Morphogenesis3DConfig(
+                target=config.target,
+                particle_count=config.particle_count,
+                state_dim=config.state_dim,
+                eps=config.eps,
+                alpha=config.alpha,
+                seed_radius=config.seed_radius,
+                resolution=config.resolution,
+                training_views=1,
+                held_out_views=config.view_count,
+                sigma=config.sigma,
+                opacity=config.opacity,
+                ssim_weight=0.0,
+            ),
+            device=device,
+        )
+        self._rule = _read_out(config, device) if config.readout else None
+        self.goal = goal if self._rule is None else goal.for_rule(self._rule)
+        """The task with its target and its loss."""
+
+    @classmethod
+    def extra_bytes(cls, config: EnvConfig, world_count: int) -> int:
+        """Return about how much memory pool and views need [bytes]."""
+        assert isinstance(config, Morphogenesis3DEnvConfig), "the task's own configuration"
+        view = PIXEL_BYTES * config.resolution**2 + SEEN_BYTES * config.particle_count
+        copies = 2 if config.reward == "particle" else 1
+        views = copies * world_count * config.view_count * view
+        return super().extra_bytes(config, world_count) + views
+
+    def seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
+        """Return particles uniform in a ball around the origin, all states zero."""
+        return self.goal.seed(random.world_count, generator=random, device=self.device)
+
+    def losses(self, x: Tensor, s: Tensor) -> Mapping[str, Tensor]:
+        """Return the mean absolute difference of each world's views."""
+        return {"views": self.goal.metric(x, s)}
+
+    def particle_losses(self, x: Tensor, s: Tensor) -> Tensor:
+        """Return each particle's share of the view loss."""
+        return self.goal.particle_shares(x, s)
+
+    def draw(self, x: Tensor, s: Tensor, steps: NDArray[np.int64]) -> NDArray[np.uint8]:
+        """Return a picture of each world; colours are those that a read-out says."""
+        if self._rule is not None and self.config.render_style == "particles":
+            with torch.no_grad():
+                s = torch.cat((s[..., :-3], self._rule.colour(s) - COLOUR_OFFSET), dim=-1)
+        return super().draw(x, s, steps)
+
+
+def _read_out(config: Morphogenesis3DEnvConfig, device: torch.device) -> NPARule:
+    rule = load_rule(config.readout, device=device).float().requires_grad_(False)
+    if rule.state_dim != config.state_dim or rule.readout is None:
+        raise NPAError(
+            f"readout must be a rule that reads out states of {config.state_dim} channels, got "
+            f"state_dim={rule.state_dim}, readout_dim={rule.readout_dim}: set state_dim, or give "
+            "a rule trained by npa-envs train morphogenesis3d"
+        )
+    return rule
+
+
+class Morphogenesis3DEnv(NPAEnv):
+    """Grow a thing that is seen from all sides from a ball of blank particles.
+
+    ## Description
+
+    A world holds N particles in open 3D space. Each has a position and a state of C numbers, of
+    which the last three, plus 0.5, are its colour. An episode begins with grey particles all over a
+    ball; at its end they should be the target: a mushroom, a duck, a rocket, a doughnut, any mesh,
+    or a scene of which there are pictures. Particles are drawn as 3D Gaussians.
+
+    No particle sees the whole, nor knows where it is. As in `npa/Morphogenesis2D-v0` it perceives
+    its neighbourhood within the radius ε, and one small network, applied to every row of the
+    observation alike, is the usual policy. Rules are trained by gradient with `npa-envs train
+    morphogenesis3d`; `npa_envs.agents.RulePolicy(npa_envs.load_rule("rule.safetensors"), env)`
+    makes a policy of one. Such a rule reads out of its states how particles look: give it as
+    `readout` too.
+
+    ## Observation space
+
+    `Box(-64, 64, (N, P), float32)` with P = 5C + 3: one row for each particle, always in the same
+    order. Numbers beyond ±`observation_limit` are clipped.
+
+    | Columns | Perceived | Unit |
+    |---|---|---|
+    | `0 : C` | the particle's own state s | dimensionless |
+    | `C : 2C` | mean state of the neighbourhood, itself included | dimensionless |
+    | `2C : 5C` | gradient of the state: x, y, z of channel 0, then of channel 1, ... | 1 / length |
+    | `5C : 5C + 3` | gradient of the density over N: where it gets denser | 1 / length⁴ |
+
+    Gradients are on a logarithmic scale and scaled by powers of ε / ε0, as in
+    `npa/Morphogenesis2D-v0`: [perception](../mathematics.md#perception).
+
+    ## Action space
+
+    `Box(-1, 1, (N, A), float32)` with A = 3 + C: one row for each particle.
+
+    | Columns | Action a | An action of 1 is | Effect on an updated particle |
+    |---|---|---|---|
+    | `0 : 3` | displacement along x, y and z | α ε, a length | x ← x + dt α ε a |
+    | `3 : 3 + C` | change of the state | `state_scale`, no unit | s ← s + dt `state_scale` a |
+
+    All else is as in `npa/Morphogenesis2D-v0`: only particles that are updated act, displacements
+    longer than 1 are shortened to length 1.
+
+    ## Reward
+
+    `view_count` cameras, spread over a sphere, see the particles before grey. The loss L is the
+    mean absolute difference to what they should see, over red, green, blue and alpha; 0 is the
+    target. Formulas: [3D morphogenesis](../mathematics.md#3d-morphogenesis).
+
+    | `reward` | Reward of step t |
+    |---|---|
+    | `"dense"` | L before the step minus L after it |
+    | `"sparse"` | 0, and minus L in the last step |
+    | `"particle"` | as dense; besides, `info["particle_reward"]` has each particle's own |
+
+    Dense rewards telescope: their sum over an episode is L at its start minus L at its end. `info`
+    holds the reward as `reward_views` too. A particle's own reward comes from how much better or
+    worse, to first order, the views are for its opacity; the mean of all is the dense reward, up to
+    rounding. In a step that diverges L counts as at least its value at the start, so that it never
+    pays.
+
+    ## Starting state
+
+    Particles are uniform in a ball of radius `seed_radius`, all states are zero. `reset(seed=k)`
+    begins the sequence of episodes that belongs to k, and `reset()` goes on with the next one. With
+    `seed_pool=K` there are only K different starts.
+
+    ## Episode end
+
+    | Cause | Returned as | `info["reason"]` |
+    |---|---|---|
+    | the loss is at most `success_loss` | terminated | `"success"` |
+    | a particle has run away | terminated | `"diverged"` |
+    | `max_episode_steps` steps are done, by default 128 | truncated | `"time limit"` |
+
+    `success_loss` is None by default. A particle has run away beyond ±`position_limit`, or with a
+    state beyond ±`observation_limit`. The steps of a single environment are counted by Gymnasium,
+    which truncates without a reason; with `reward="sparse"` such an environment has to be told the
+    number of steps twice, as `max_episode_steps` and as `episode_steps`.
+
+    ## Info
+
+    | Key | In | Value |
+    |---|---|---|
+    | `loss`, `loss_views` | reset, step | L as it is now |
+    | `reward_views` | step | how much it improved in this step |
+    | `success`, `diverged` | step | whether the episode ended in this way, bool |
+    | `reason` | last step | why the episode ended, see above |
+    | `particle_reward` | step, where `reward="particle"` | each particle's own reward, shape [N] |
+
+    ## Rendering
+
+    As in `Morphogenesis2DEnv`. The camera goes round by two degrees a step.
+
+    ## Arguments
+
+    As in `Morphogenesis2DEnv`.
+
+    ## Vectorized environment
+
+    As in `Morphogenesis2DEnv`.
+
+    ## References
+
+    As in `Morphogenesis2DEnv`. Gaussians: Kerbl et al. 2023, "3D Gaussian Splatting for Real-Time
+    Radiance Field Rendering".
+
+    ## Version history
+
+    - v0: first version.
+    """
+
+    task_type = SolidTask
+
+
+class Morphogenesis3DVectorEnv(NPAVectorEnv):
+    """Worlds of `Morphogenesis3DEnv`, batched on one device; its docstring describes both."""
+
+    task_type = SolidTask

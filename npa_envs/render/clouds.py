@@ -1,0 +1,133 @@
+"""Grown 3D worlds as files for other programs: point clouds and Gaussian splats."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from npa_envs.errors import NPAError
+from npa_envs.files import write_bytes
+from npa_envs.tasks.appearance import FLAT, Gaussians
+
+Columns = dict[str, NDArray[np.generic]]
+
+LEAST_OPACITY = 1e-6
+"""Opacities are kept so far from 0 and 1 where they are written as logits."""
+
+
+def write_points(path: str | Path, x: Tensor, gaussians: Gaussians) -> None:
+    """Write a point cloud as a binary PLY file: x, y, z and red, green, blue.
+
+    Args:
+        path: The file.
+        x: Positions [length units], shape [1, N, 3].
+        gaussians: How the particles look, of one world.
+
+    Raises:
+        NPAError: There is more than one world, or the file cannot be written.
+    """
+    places = _checked(x)
+    columns: Columns = {name: places[:, k] for k, name in enumerate("xyz")}
+    colours = (255.0 * _colours(gaussians)).round().astype(np.uint8)
+    columns |= {name: colours[:, k] for k, name in enumerate(("red", "green", "blue"))}
+    write_bytes(path, _ply(columns))
+
+
+def write_gaussians(path: str | Path, x: Tensor, gaussians: Gaussians) -> None:
+    """Write Gaussians as a PLY file with the fields of 3D Gaussian splatting (Kerbl et al. 2023).
+
+    Scales are logarithms, opacities logits; `f_rest` holds degree 1, channel by channel.
+
+    Args:
+        path: The file.
+        x: Positions [length units], shape [1, N, 3].
+        gaussians: How the particles look, of one world.
+
+    Raises:
+        NPAError: There is more than one world, or the file cannot be written.
+    """
+    places = _checked(x)
+    harmonics = _numpy(gaussians.colours)
+    opacity = _numpy(gaussians.opacities).clip(LEAST_OPACITY, 1.0 - LEAST_OPACITY)
+    columns: Columns = {name: places[:, k] for k, name in enumerate("xyz")}
+    columns |= {f"n{name}": np.zeros(len(places), np.float32) for name in "xyz"}
+    columns |= {f"f_dc_{k}": harmonics[:, 0, k] for k in range(3)}
+    rest = harmonics[:, 1:].transpose(0, 2, 1).reshape(len(places), 9)
+    columns |= {f"f_rest_{k}": rest[:, k] for k in range(9)}
+    columns["opacity"] = np.log(opacity / (1.0 - opacity))
+    scales, rotations = np.log(_numpy(gaussians.scales)), _rotations(gaussians)
+    columns |= {f"scale_{k}": scales[:, k] for k in range(3)}
+    columns |= {f"rot_{k}": rotations[:, k] for k in range(4)}
+    write_bytes(path, _ply(columns))
+
+
+def write_splat(path: str | Path, x: Tensor, gaussians: Gaussians) -> None:
+    """Write Gaussians as a `.splat` file, which viewers in browsers read: 32 bytes a particle.
+
+    Position and scale as float32, red, green, blue and opacity as bytes, and the rotation (w, x, y,
+    z) as bytes around 128; the largest and most opaque first. What depends on the direction of
+    sight has no place in it.
+
+    Args:
+        path: The file.
+        x: Positions [length units], shape [1, N, 3].
+        gaussians: How the particles look, of one world.
+
+    Raises:
+        NPAError: There is more than one world, or the file cannot be written.
+    """
+    places = _checked(x)
+    scales, opacities = _numpy(gaussians.scales), _numpy(gaussians.opacities)
+    kind = np.dtype(
+        [("place", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)]
+    )
+    rows = np.zeros(len(places), kind)
+    rows["place"], rows["scale"] = places, scales
+    rgba = np.concatenate((_colours(gaussians), opacities[:, None]), axis=1)
+    rows["rgba"] = (255.0 * rgba).round()
+    rows["rotation"] = (128.0 * _rotations(gaussians) + 128.0).round().clip(0, 255)
+    order = np.argsort(-scales.prod(axis=1) * opacities, kind="stable")
+    write_bytes(path, rows[order].tobytes())
+
+
+def _ply(columns: Columns) -> bytes:
+    """Return a binary PLY file of one property for each column."""
+    kinds = {name: "u1" if c.dtype == np.uint8 else "<f4" for name, c in columns.items()}
+    words = {"u1": "uchar", "<f4": "float"}
+    rows = np.zeros(len(columns["x"]), np.dtype(list(kinds.items())))
+    for name, column in columns.items():
+        rows[name] = column
+    properties = [f"property {words[kind]} {name}" for name, kind in kinds.items()]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
+    return "\n".join((*header, *properties, "end_header\n")).encode() + rows.tobytes()
+
+
+def _checked(x: Tensor) -> NDArray[np.float32]:
+    if x.ndim != 3 or x.shape[0] != 1 or x.shape[2] != 3:
+        raise NPAError(
+            f"x must be the positions of one 3D world, [1, N, 3], got {tuple(x.shape)}: "
+            "write one world at a time, x[:1]"
+        )
+    return _numpy(x)
+
+
+def _numpy(values: Tensor) -> NDArray[np.float32]:
+    """Return the values of the one world."""
+    array: NDArray[np.float32] = values.detach()[0].float().cpu().numpy()
+    return array
+
+
+def _colours(gaussians: Gaussians) -> NDArray[np.float32]:
+    """Return red, green and blue in [0, 1], the mean over all directions of sight, [N, 3]."""
+    return (FLAT * _numpy(gaussians.colours)[:, 0] + 0.5).clip(0.0, 1.0)
+
+
+def _rotations(gaussians: Gaussians) -> NDArray[np.float32]:
+    """Return unit quaternions (w, x, y, z), [N, 4]; a zero stands for no rotation."""
+    rotations = _numpy(gaussians.quaternions).copy()
+    rotations[~rotations.any(axis=1), 0] = 1.0
+    unit: NDArray[np.float32] = rotations / np.linalg.norm(rotations, axis=1, keepdims=True)
+    return unit

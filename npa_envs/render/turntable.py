@@ -1,0 +1,56 @@
+"""Films of 3D worlds that turn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from npa_envs.render.picture import Background, to_uint8
+from npa_envs.sph import Cameras, orbit
+from npa_envs.tasks.views import ANGLE, DISTANCE
+
+
+def turntable_frames(
+    views: Callable[[Cameras], Tensor],
+    *,
+    frame_count: int = 60,
+    resolution: int = 256,
+    elevation: float = 20.0,
+    background: Background = "white",
+    device: str | torch.device = "cpu",
+) -> list[NDArray[np.uint8]]:
+    """Return pictures of a world from cameras that go once around it.
+
+    Args:
+        views: Draws the world: colours times alpha, and alpha, shape [1, V, H, W, 4].
+        frame_count: Pictures of one turn.
+        resolution: Pixels along each side.
+        elevation: How far above the horizon the cameras are [degrees].
+        background: A colour name, "#rrggbb", or red, green and blue in [0, 1].
+        device: Where the world is.
+
+    Returns:
+        Pixels, uint8, shape [R, R, 3] each; the first row is the upper one.
+
+    Raises:
+        NPAError: A number is out of its range, or the colour is unknown.
+    """
+    frames = []
+    with torch.no_grad():
+        for k in range(frame_count):
+            cameras = orbit(
+                1,
+                elevation,
+                DISTANCE,
+                ANGLE,
+                width=resolution,
+                height=resolution,
+                azimuth=360.0 * k / frame_count,
+            )
+            picture = views(cameras.to(torch.device(device)))[0, 0]
+            frames.append(to_uint8(picture.flip(0), background))
+    return frames

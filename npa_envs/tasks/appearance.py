@@ -1,0 +1,82 @@
+"""How particles look in 3D: from a rule's outputs to Gaussians."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+OUTPUTS = 20
+"""Read-out dimensions: rotation 4, log-anisotropy 3, opacity 1, colours of degree 1 9, of 0 3."""
+
+FLAT = 0.5 * math.sqrt(1.0 / math.pi)
+"""The spherical harmonic of degree 0 (dimensionless)."""
+
+
+class Gaussians(NamedTuple):
+    """What `render_gaussians` takes besides positions and cameras."""
+
+    scales: Tensor
+    """Standard deviations [length units], shape [B, N, 3]."""
+
+    quaternions: Tensor
+    """Rotations (w, x, y, z), shape [B, N, 4]."""
+
+    opacities: Tensor
+    """In [0, 1], shape [B, N]."""
+
+    colours: Tensor
+    """Spherical harmonics up to degree 1, dimensionless, shape [B, N, 4, 3]."""
+
+    stretch: Tensor
+    """log(scales / sigma), dimensionless, shape [B, N, 3]."""
+
+
+@dataclass(frozen=True)
+class Appearance:
+    """How outputs become Gaussians.
+
+    20 outputs are a read-out's: four are added to the quaternion (1, 0, 0, 0), three stretch the
+    axes, one changes the opacity, nine are colours that depend on where one looks from, and the
+    last three, plus 0.5, the colour itself. Of any other number the last three, plus 0.5, are the
+    colour, and particles are round.
+    """
+
+    sigma: float
+    """Standard deviation of a round particle [length units]."""
+
+    anisotropy: float
+    """Largest |log(scale / sigma)| (dimensionless)."""
+
+    opacity: float
+    """Opacity of a particle whose output is 0, in (0, 1)."""
+
+    def gaussians(self, outputs: Tensor) -> Gaussians:
+        """Return the Gaussians of particles.
+
+        Args:
+            outputs: A rule's outputs (`NPARule.read_out`), dimensionless, shape [B, N, K], K >= 3.
+        """
+        lead = outputs.shape[:-1]
+        # The renderer adds one half, as `NPARule.colour` does.
+        flat = outputs[..., None, -3:]
+        if outputs.shape[-1] == OUTPUTS:
+            rotation, stretch, opacity, turning = torch.split(
+                outputs[..., :17], [4, 3, 1, 9], dim=-1
+            )
+            upright = torch.ones_like(rotation[..., :1])
+            quaternions = torch.cat((rotation[..., :1] + upright, rotation[..., 1:]), dim=-1)
+            stretch = self.anisotropy * torch.tanh(stretch)
+            rest = math.log(self.opacity / (1.0 - self.opacity))
+            opacities = torch.sigmoid(opacity[..., 0] + rest)
+            degree_one = turning.reshape(*lead, 3, 3)
+        else:
+            quaternions = outputs.new_zeros(*lead, 4)
+            stretch = outputs.new_zeros(*lead, 3)
+            opacities = outputs.new_full(lead, self.opacity)
+            degree_one = outputs.new_zeros(*lead, 3, 3)
+        colours = torch.cat((flat / FLAT, degree_one), dim=-2)
+        return Gaussians(self.sigma * torch.exp(stretch), quaternions, opacities, colours, stretch)

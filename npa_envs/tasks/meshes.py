@@ -1,0 +1,300 @@
+"""Coloured triangle meshes: built-in ones, made of turned profiles, and any file by trimesh."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from npa_envs.errors import MissingDependencyError, NPAError, suggest
+
+FloatArray = NDArray[np.float64]
+
+RADIUS = 0.85
+"""Every mesh is scaled to reach just so far from the origin [length units]."""
+
+MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
+"""Files that are taken for meshes."""
+
+ROUND = 48
+"""Corners of a turned part, and of a tube."""
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Triangles with colours at their corners; y is up."""
+
+    vertices: FloatArray
+    """Corners [length units], shape [K, 3]."""
+
+    faces: NDArray[np.int64]
+    """Corners of each triangle, against the clock from outside, shape [F, 3]."""
+
+    colours: FloatArray
+    """Red, green and blue of each corner, in [0, 1], shape [K, 3]."""
+
+    def fitted(self, radius: float = RADIUS) -> Mesh:
+        """Return the mesh with its bounding box around the origin, reaching just `radius` away.
+
+        Args:
+            radius: Distance of the farthest corner [length units].
+        """
+        used = self.vertices[np.unique(self.faces)]
+        middle = 0.5 * (used.min(axis=0) + used.max(axis=0))
+        reach = np.linalg.norm(used - middle, axis=1).max()
+        return Mesh((self.vertices - middle) * (radius / reach), self.faces, self.colours)
+
+    def normals(self) -> FloatArray:
+        """Return unit normals at the corners, weighted by the triangles' areas, shape [K, 3]."""
+        a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
+        flat = np.cross(b - a, c - a)
+        sums = np.zeros_like(self.vertices)
+        for k in range(3):
+            np.add.at(sums, self.faces[:, k], flat)
+        length = np.linalg.norm(sums, axis=1, keepdims=True)
+        unit: FloatArray = np.divide(sums, length, out=np.zeros_like(sums), where=length > 0)
+        return unit
+
+
+def turned(
+    profile: Sequence[tuple[float, float]],
+    paint: Callable[[FloatArray], FloatArray],
+    corners: int = ROUND,
+) -> Mesh:
+    """Return a profile turned around the y axis.
+
+    Args:
+        profile: Points (distance from the axis, height) from the bottom to the top [length units].
+        paint: Returns colours [K, 3] of corners [K, 3].
+        corners: Corners around the axis.
+    """
+    rings = np.asarray(profile, dtype=np.float64)
+    angle = np.linspace(0.0, 2.0 * np.pi, corners, endpoint=False)
+    x = rings[:, :1] * np.sin(angle)
+    z = rings[:, :1] * np.cos(angle)
+    y = np.broadcast_to(rings[:, 1:], x.shape)
+    vertices = np.stack((x, y, z), axis=-1).reshape(-1, 3)
+    return Mesh(vertices, _grid_faces(len(rings), corners, closed=False), paint(vertices))
+
+
+def ellipsoid(
+    centre: Sequence[float], radii: Sequence[float], colour: Sequence[float], turns: int = 18
+) -> Mesh:
+    """Return an ellipsoid of one colour.
+
+    Args:
+        centre: Its middle [length units].
+        radii: Its half-axes [length units].
+        colour: Red, green and blue in [0, 1].
+        turns: Rings from pole to pole.
+    """
+    tilt = np.linspace(-0.5 * np.pi, 0.5 * np.pi, turns)
+    profile = [(float(np.cos(t)), float(np.sin(t))) for t in tilt]
+    ball = turned(profile, lambda v: np.broadcast_to(np.asarray(colour, float), v.shape).copy())
+    return Mesh(ball.vertices * np.asarray(radii) + np.asarray(centre), ball.faces, ball.colours)
+
+
+def joined(parts: Sequence[Mesh]) -> Mesh:
+    """Return several meshes as one.
+
+    Args:
+        parts: The meshes; they may reach into each other.
+    """
+    starts = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
+    return Mesh(
+        np.concatenate([part.vertices for part in parts]),
+        np.concatenate([part.faces + k for part, k in zip(parts, starts, strict=True)]),
+        np.concatenate([part.colours for part in parts]),
+    )
+
+
+def make_mushroom() -> Mesh:
+    """Return a toadstool: a red cap with pale dots on a cream stem."""
+    red, dot, cream, gill = (
+        np.array(c)
+        for c in ((0.85, 0.12, 0.10), (0.97, 0.93, 0.86), (0.93, 0.85, 0.68), (0.80, 0.62, 0.45))
+    )
+    around = np.linspace(0.0, 2.0 * np.pi, 6, endpoint=False)
+    dots = [np.array([np.sin(a) * 0.62, 0.62, np.cos(a) * 0.62]) for a in around]
+    dots += [np.array([np.sin(a + 0.5) * 0.9, 0.2, np.cos(a + 0.5) * 0.9]) for a in around]
+    dots.append(np.array([0.0, 1.0, 0.0]))
+
+    def paint_cap(vertices: FloatArray) -> FloatArray:
+        scaled = (vertices - (0.0, 0.25, 0.0)) / (0.8, 0.6, 0.8)
+        colours = np.broadcast_to(red, vertices.shape).copy()
+        for middle in dots:
+            near = np.linalg.norm(scaled - middle / np.linalg.norm(middle), axis=1) < 0.24
+            colours[near] = dot
+        colours[vertices[:, 1] < 0.245] = gill
+        return colours
+
+    under = [(r, 0.24) for r in np.linspace(0.0, 0.8, 5)]
+    tilt = np.linspace(0.0, 0.5 * np.pi, 40)
+    over = [(0.8 * float(np.cos(t)), 0.25 + 0.6 * float(np.sin(t))) for t in tilt]
+    height = np.linspace(-0.8, 0.3, 16)
+    stem = [(0.0, -0.8)]
+    stem += [(0.2 + 0.14 * float(((0.3 - h) / 1.1) ** 2), float(h)) for h in height]
+    return joined(
+        [
+            turned([*under, *over], paint_cap, corners=3 * ROUND),
+            turned(stem, lambda v: np.broadcast_to(cream, v.shape).copy()),
+        ]
+    )
+
+
+def make_rocket() -> Mesh:
+    """Return a rocket: white and red rings, a blue window, three orange fins."""
+    white, red, steel = (
+        np.array(c) for c in ((0.94, 0.94, 0.96), (0.80, 0.10, 0.14), (0.35, 0.37, 0.42))
+    )
+
+    def paint(vertices: FloatArray) -> FloatArray:
+        y = vertices[:, 1]
+        colours = np.broadcast_to(white, vertices.shape).copy()
+        colours[(y > 0.52) | ((y > -0.30) & (y < -0.12))] = red
+        colours[y < -0.60] = steel
+        return colours
+
+    height = np.linspace(-0.6, 1.0, 60)
+    body = [(0.0, -0.78), (0.22, -0.78), (0.17, -0.62)]
+    body += [(0.30 * float(np.sqrt(max(0.0, 1.0 - ((h + 0.1) / 1.1) ** 2))), h) for h in height]
+    parts = [turned(body, paint), ellipsoid((0.0, 0.28, 0.25), (0.13, 0.13, 0.08), (0.2, 0.5, 0.9))]
+    outline = np.array([(0.20, -0.15), (0.58, -0.62), (0.58, -0.92), (0.20, -0.62)])
+    for turn in np.arange(3) * 2.0 * np.pi / 3.0 + np.pi:
+        parts.append(_fin(outline, float(turn), 0.05, np.array([0.95, 0.55, 0.12])))
+    return joined(parts)
+
+
+def make_duck() -> Mesh:
+    """Return a bath duck: yellow, with an orange bill and dark eyes."""
+    yellow, bill, eye = (0.98, 0.82, 0.14), (0.95, 0.45, 0.08), (0.08, 0.08, 0.12)
+    parts = [
+        ellipsoid((0.0, -0.30, 0.0), (0.52, 0.40, 0.70), yellow),
+        ellipsoid((0.0, 0.35, 0.35), (0.36, 0.36, 0.36), yellow),
+        ellipsoid((0.0, -0.05, -0.66), (0.22, 0.16, 0.26), yellow),
+        ellipsoid((0.0, 0.28, 0.74), (0.20, 0.07, 0.20), bill),
+    ]
+    for side in (-1.0, 1.0):
+        parts.append(ellipsoid((0.19 * side, 0.48, 0.62), (0.07, 0.07, 0.07), eye))
+        parts.append(ellipsoid((0.50 * side, -0.22, -0.08), (0.12, 0.24, 0.40), (0.90, 0.66, 0.08)))
+    return joined(parts)
+
+
+def make_doughnut() -> Mesh:
+    """Return a doughnut: dough below, pink icing with sprinkles above."""
+    along = np.linspace(0.0, 2.0 * np.pi, 2 * ROUND, endpoint=False)
+    around = np.linspace(0.0, 2.0 * np.pi, ROUND, endpoint=False)
+    u, v = np.meshgrid(along, around, indexing="ij")
+    reach = 0.6 + 0.27 * np.cos(v)
+    vertices = np.stack((reach * np.sin(u), 0.27 * np.sin(v), reach * np.cos(u)), axis=-1)
+    icing = np.sin(v) > 0.05 + 0.18 * np.sin(5.0 * u)
+    colours = np.where(icing[..., None], (0.94, 0.45, 0.62), (0.80, 0.55, 0.28))
+    hues = np.array([(0.2, 0.75, 0.9), (0.98, 0.9, 0.25), (0.98, 0.98, 0.98), (0.35, 0.8, 0.35)])
+    for k in range(18):
+        row, column = (11 * k) % (2 * ROUND), ROUND // 4 + (7 * k) % 15 - 7
+        colours[row : row + 3, column - 1 : column + 1] = hues[k % 4]
+    faces = _grid_faces(2 * ROUND, ROUND, closed=True)
+    return Mesh(vertices.reshape(-1, 3), faces[:, ::-1].copy(), colours.reshape(-1, 3))
+
+
+MESHES: Mapping[str, Callable[[], Mesh]] = {
+    "doughnut": make_doughnut,
+    "duck": make_duck,
+    "mushroom": make_mushroom,
+    "rocket": make_rocket,
+}
+"""The built-in meshes by name."""
+
+
+def builtin_meshes() -> tuple[str, ...]:
+    """Return the names of the meshes that come with the package, in alphabetical order."""
+    return tuple(sorted(MESHES))
+
+
+def load_mesh(source: str | Path) -> Mesh:
+    """Return a mesh, fitted into the ball of radius 0.85 around the origin.
+
+    Args:
+        source: A built-in name, or the path of a mesh file that trimesh reads.
+
+    Raises:
+        NPAError: The name is unknown, or the file is missing, damaged, or holds no triangles.
+        MissingDependencyError: It is a file and trimesh is not installed.
+    """
+    if isinstance(source, str) and source in MESHES:
+        return MESHES[source]().fitted()
+    path = Path(os.path.expanduser(source))
+    if path.suffix.lower() not in MESH_SUFFIXES:
+        raise NPAError(
+            f"target must be a built-in mesh, the path of a mesh file ({', '.join(MESH_SUFFIXES)}) "
+            f"or a folder of views, got {str(source)!r}: {suggest(str(source), MESHES)}"
+        )
+    if not path.is_file():
+        raise NPAError(f"target {str(path)!r} does not exist or is no file: check the path")
+    return _read_mesh(path).fitted()
+
+
+def _read_mesh(path: Path) -> Mesh:
+    try:
+        import trimesh
+    except ImportError as error:
+        raise MissingDependencyError(
+            f"reading the mesh {str(path)!r} needs trimesh, which is not installed: "
+            "pip install 'npa-envs[meshes]', or take a built-in mesh"
+        ) from error
+    try:
+        read = trimesh.load(path, force="mesh", process=False)
+        vertices = np.asarray(read.vertices, dtype=np.float64)
+        faces = np.asarray(read.faces, dtype=np.int64)
+        visual = read.visual.to_color() if hasattr(read.visual, "to_color") else read.visual
+        colours = np.asarray(visual.vertex_colors, dtype=np.float64)[:, :3] / 255.0
+    except Exception as error:
+        # Its readers report damaged files by exceptions of many kinds.
+        raise NPAError(
+            f"target {str(path)!r} cannot be read as a mesh ({type(error).__name__}: {error}): "
+            "save it anew, for example as .ply or .glb"
+        ) from error
+    if len(faces) == 0 or not np.isfinite(vertices).all() or np.ptp(vertices, axis=0).max() == 0:
+        raise NPAError(
+            f"target {str(path)!r} must hold triangles with finite corners, got {len(faces)} "
+            f"triangles and {len(vertices)} corners: give a surface, not a point cloud"
+        )
+    if colours.shape != vertices.shape:
+        colours = np.full(vertices.shape, 0.6)
+    return Mesh(vertices, faces, colours)
+
+
+def _grid_faces(rows: int, columns: int, *, closed: bool) -> NDArray[np.int64]:
+    """Return the triangles of a grid whose columns, and rows where `closed`, join up; [F, 3]."""
+    row, column = np.meshgrid(
+        np.arange(rows if closed else rows - 1), np.arange(columns), indexing="ij"
+    )
+    below, beside = (row + 1) % rows, (column + 1) % columns
+    a, b = row * columns + column, row * columns + beside
+    c, d = below * columns + column, below * columns + beside
+    halves = (np.stack((a, b, d), axis=-1), np.stack((a, d, c), axis=-1))
+    return np.concatenate([half.reshape(-1, 3) for half in halves])
+
+
+def _fin(outline: FloatArray, turn: float, thickness: float, colour: FloatArray) -> Mesh:
+    """Return a plate whose outline (outward, up) stands off the y axis, turned around it."""
+    outward = np.array([np.sin(turn), 0.0, np.cos(turn)])
+    across = np.array([np.cos(turn), 0.0, -np.sin(turn)])
+    flat = outline[:, :1] * outward + outline[:, 1:] * np.array([0.0, 1.0, 0.0])
+    half = 0.5 * thickness * across
+    # Corners of each side of their own, so that edges stay sharp.
+    sides = [flat + half, flat - half]
+    faces = [(0, 1, 2), (0, 2, 3), (4, 6, 5), (4, 7, 6)]
+    vertices = [*sides]
+    for k in range(4):
+        near, far = flat[k], flat[(k + 1) % 4]
+        start = 8 + 4 * k
+        vertices.append(np.stack((near + half, near - half, far - half, far + half)))
+        faces += [(start, start + 1, start + 2), (start, start + 2, start + 3)]
+    corners = np.concatenate(vertices)
+    colours = np.broadcast_to(colour, corners.shape).copy()
+    return Mesh(corners, np.array(faces, dtype=np.int64), colours)

@@ -1,0 +1,595 @@
+"""3D morphogenesis: worlds, how particles look, the loss, training, commands, exported clouds."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import sys
+import types
+
+import numpy as np
+import pytest
+import torch
+
+from npa_envs.cli import main
+from npa_envs.errors import MissingDependencyError, NPAError
+from npa_envs.evaluation import evaluate, measure
+from npa_envs.randomness import WorldRandom
+from npa_envs.render import turntable_frames, write_gaussians, write_points, write_splat
+from npa_envs.rule import NPARule
+from npa_envs.rule_io import load_rule
+from npa_envs.sph import orbit
+from npa_envs.tasks.appearance import FLAT, OUTPUTS, Appearance
+from npa_envs.tasks.meshes import load_mesh
+from npa_envs.tasks.morphogenesis3d import Morphogenesis3D
+from npa_envs.tasks.morphogenesis3d_config import Morphogenesis3DConfig
+from npa_envs.tasks.raster import AMBIENT, LIGHT
+from npa_envs.tasks.renderers import gsplat_renderer, own_renderer
+from npa_envs.tasks.task import ReadOutTask, ScheduledTask, ViewTask
+from npa_envs.tasks.views import ANGLE, DISTANCE, load_views, over, some_views
+from npa_envs.training import JsonlLog, Trainer, preset, train
+
+needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+SMALL = Morphogenesis3DConfig(
+    target="doughnut",
+    particle_count=150,
+    hidden_dim=16,
+    readout_hidden_dim=8,
+    resolution=24,
+    training_views=6,
+    held_out_views=3,
+    views_per_iteration=2,
+    sigma=0.1,
+    opacity=0.5,
+    blur_sigma=2.0,
+    blur_iterations=10,
+    eps=0.3,
+    ssim_weight=0.0,
+)
+
+
+@pytest.fixture(scope="module")
+def target():
+    return load_views("doughnut", resolution=24, training_count=6, held_out_count=3)
+
+
+@pytest.fixture
+def task(target):
+    return Morphogenesis3D(SMALL, target=target)
+
+
+def worlds(task, world_count, dtype=torch.float32, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    x, s = task.seed(world_count, generator=generator)
+    return 0.6 * x.to(dtype), 0.3 * torch.randn(s.shape, generator=generator, dtype=dtype)
+
+
+def lively_rule(task, dtype=torch.float32):
+    """A rule whose read-out says something other than nothing."""
+    rule = task.make_rule(torch.Generator().manual_seed(1)).to(dtype)
+    with torch.no_grad():
+        for parameter in rule.readout.parameters():
+            parameter.normal_(std=0.5, generator=torch.Generator().manual_seed(2))
+    return rule
+
+
+def test_seeds_fill_a_ball_evenly(target):
+    task = Morphogenesis3D(dataclasses.replace(SMALL, particle_count=4000), target=target)
+    x, s = task.seed(2, generator=torch.Generator().manual_seed(0))
+    distance = x.norm(dim=-1)
+    assert 0.99 < float(distance.max()) <= 1.0
+    # Half of a ball's volume is within 0.794 of its middle; five standard deviations are 0.04.
+    assert float((distance[0] < 0.5 ** (1 / 3)).float().mean()) == pytest.approx(0.5, abs=0.04)
+    assert float(s.abs().max()) == 0.0
+    together, _ = task.seed(3, generator=WorldRandom([5, 6, 7]))
+    alone, _ = task.seed(1, generator=WorldRandom([6]))
+    assert torch.equal(together[1:2], alone)
+
+
+def test_a_task_says_what_it_has_besides(task):
+    assert isinstance(task, ReadOutTask)
+    assert isinstance(task, ScheduledTask)
+    assert isinstance(task, ViewTask)
+    rule = task.make_rule(torch.Generator().manual_seed(0))
+    assert (rule.space_dim, rule.readout_dim, rule.alpha) == (3, OUTPUTS, 1.0)
+    with pytest.raises(NPAError, match="must read out 20 numbers of a state, or none"):
+        task.for_rule(NPARule(3, 16, 8, readout_dim=10, readout_hidden_dim=4))
+
+
+def test_outputs_of_zero_are_round_grey_particles():
+    look = Appearance(sigma=0.05, anisotropy=0.1, opacity=0.15).gaussians(torch.zeros(1, 2, 20))
+    assert torch.equal(look.quaternions, torch.tensor([1.0, 0, 0, 0]).expand(1, 2, 4))
+    torch.testing.assert_close(look.scales, torch.full((1, 2, 3), 0.05))
+    torch.testing.assert_close(look.opacities, torch.full((1, 2), 0.15))
+    assert torch.equal(look.colours, torch.zeros(1, 2, 4, 3))
+
+
+def test_outputs_stretch_within_the_bound_and_colour_as_the_rule_says(task):
+    rule = lively_rule(task)
+    _, s = worlds(task, 1)
+    look = task.for_rule(rule).gaussians(20.0 * s)
+    assert 0.09 < float(look.stretch.detach().abs().max()) <= 0.1 + 1e-7
+    torch.testing.assert_close(look.scales, 0.1 * look.stretch.exp())
+    torch.testing.assert_close(FLAT * look.colours[..., 0, :] + 0.5, rule.colour(20.0 * s))
+    opacities = look.opacities.detach()
+    assert 0.0 < float(opacities.min()) < 0.4 < 0.6 < float(opacities.max()) < 1.0
+    assert float(look.colours[..., 1:, :].detach().abs().max()) > 0.5
+
+
+def test_states_are_colours_where_there_is_no_read_out(task):
+    x, s = worlds(task, 1)
+    silent = task.for_rule(NPARule(3, 16, 8))
+    assert torch.equal(task.picture(x, s), silent.picture(x, s))
+    # As many channels as a read-out has outputs are no read-out.
+    wide = torch.cat((torch.ones(1, 150, 4), s), dim=-1)
+    broad = task.for_rule(NPARule(3, 20, 8))
+    assert torch.equal(broad.picture(x, wide), task.picture(x, s))
+    look = task.gaussians(s)
+    torch.testing.assert_close(FLAT * look.colours[..., 0, :], s[..., -3:])
+    assert not torch.equal(task.for_rule(lively_rule(task)).picture(x, s), task.picture(x, s))
+
+
+def under_the_surface(count, depth):
+    """Points below the doughnut's surface, coloured as it is lit: [1, N, 3] both."""
+    mesh, random = load_mesh("doughnut"), np.random.default_rng(0)
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    outward = np.cross(b - a, c - a)
+    area = np.linalg.norm(outward, axis=1, keepdims=True)
+    chosen = random.choice(len(area), count, p=area[:, 0] / area.sum())
+    u, v = random.random((2, count, 1))
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    x = a[chosen] + u * (b - a)[chosen] + v * (c - a)[chosen]
+    x -= depth * (outward / area)[chosen]
+    light = (mesh.normals() @ (np.array(LIGHT) / np.linalg.norm(LIGHT))).clip(0)
+    lit = mesh.colours * (AMBIENT + (1 - AMBIENT) * light)[:, None]
+    colours = lit[mesh.faces[chosen, 0]]
+    return [torch.tensor(t, dtype=torch.float32)[None] for t in (x, colours)]
+
+
+def test_particles_under_the_target_s_surface_look_like_it():
+    """A world made by hand: held-out views by our Gaussians against those of the mesh."""
+    config = dataclasses.replace(
+        SMALL, particle_count=6000, resolution=48, sigma=0.02, opacity=0.7, training_views=1
+    )
+    task = Morphogenesis3D(config)
+    # A pixel is 0.05 wide, and Gaussians reach beyond their middle.
+    x, colours = under_the_surface(6000, depth=0.07)
+    s = torch.zeros(1, 6000, 16)
+    s[..., -3:] = colours - 0.5
+    shuffled = s[:, torch.randperm(6000, generator=torch.Generator().manual_seed(0))]
+    upside_down = x * torch.tensor([1.0, -1.0, 1.0])
+    made = ((x, s), (x, shuffled), (upside_down, s))
+    ratios = [float(task.view_psnr(*world)) for world in made]
+    losses = [float(task.metric(*world)) for world in made]
+    # Seen: 30.2, 21.8 and 17.6 dB, and losses of 0.006, 0.027 and 0.044.
+    assert ratios[0] > 28.0
+    assert max(ratios[1:]) < ratios[0] - 6.0
+    assert losses[0] < 0.4 * min(losses[1:])
+
+
+def test_psnr_is_that_of_colours_over_white(task):
+    x, s = worlds(task, 2)
+    held_out = task.target.held_out
+    found = task.views(x, s, held_out.cameras)
+    by_hand = []
+    for world in range(2):
+        ratios = []
+        for view in range(3):
+            pictures = (found[world, view], held_out.pictures[view])
+            shown = [(p[..., :3] + 1 - p[..., 3:]).clamp(0, 1).double() for p in pictures]
+            ratios.append(-10 * math.log10(float((shown[0] - shown[1]).square().mean())))
+        by_hand.append(sum(ratios) / 3)
+    assert task.view_psnr(x, s).tolist() == pytest.approx(by_hand, rel=1e-5)
+    row = measure(task, x, s, 0)
+    assert row.psnr == pytest.approx(sum(by_hand) / 2, rel=1e-5)
+    assert row.psnr_worst == pytest.approx(min(by_hand), rel=1e-5)
+
+
+def test_pictures_show_a_held_out_view_with_rows_up(task):
+    x, s = worlds(task, 2)
+    picture = task.picture(x, s)
+    assert picture.shape == (2, 24, 24, 4)
+    pictures = task.target.held_out.pictures
+    assert any(torch.equal(task.target_picture.flip(0), p) for p in pictures)
+    high = torch.zeros(1, 1, 3)
+    high[..., 1] = 0.6
+    rows = task.picture(high, torch.zeros(1, 1, 16))[0, ..., 3].sum(1)
+    assert float((rows * torch.arange(24)).sum() / rows.sum()) > 14.0
+
+
+def test_loss_sees_the_views_of_its_iteration_before_their_backgrounds(task):
+    x, s = worlds(task, 2)
+    far = torch.zeros(2, 150)
+    first, _ = task.loss(x, s, far)
+    task.begin(37)
+    later, parts = task.loss(x, s, far)
+    assert float(first) != float(later)
+    # No blur is left: by hand, over the training views that the schedule says.
+    schedule = task._schedule
+    assert float(schedule.sigma) == 0.0
+    chosen = some_views(task.target.training, schedule.index)
+    found = task.views(x, s, chosen.cameras)
+    error = 0.0
+    for view in range(2):
+        back = schedule.backgrounds[view]
+        colours = over(found[:, view], back) - over(chosen.pictures[view], back)
+        alpha = found[:, view, ..., 3:] - chosen.pictures[view, ..., 3:]
+        error += float(torch.cat((colours, alpha), dim=-1).abs().mean()) / 2
+    assert float(parts["views"]) == pytest.approx(error, rel=1e-5)
+    task.begin(0)
+    assert float(task.loss(x, s, far)[0]) == float(first)
+
+
+def test_loss_is_the_weighted_sum_of_its_parts(target):
+    pytest.importorskip("pytorch_msssim")
+    weights = {"view_weight": 3.0, "ssim_weight": 0.5, "isotropy_weight": 7.0}
+    weights |= {"motion_weight": 0.5, "overflow_weight": 11.0, "bound_weight": 13.0}
+    task = Morphogenesis3D(dataclasses.replace(SMALL, **weights), target=target)
+    seen = task.for_rule(lively_rule(task))
+    x, s = worlds(task, 2)
+    x, s = 3.0 * x, 4.0 * s
+    total, parts = seen.loss(x, s, torch.full((2, 150), 0.4))
+    assert float(parts["motion"]) == pytest.approx(0.4)
+    assert float(parts["overflow"]) == pytest.approx(float((s.abs() - 1).clamp_min(0).mean()))
+    assert float(parts["bound"]) == pytest.approx(float((x.abs() - 1).clamp_min(0).mean()))
+    assert float(parts["isotropy"]) == pytest.approx(
+        float(seen.gaussians(s.detach()).stretch.detach().abs().mean())
+    )
+    expected = (
+        3.0 * (parts["views"] + 0.5 * parts["structure"])
+        + 7.0 * parts["isotropy"]
+        + 0.5 * parts["motion"]
+        + 11.0 * parts["overflow"]
+        + 13.0 * parts["bound"]
+    )
+    torch.testing.assert_close(total, expected)
+    assert min(float(value) for value in parts.values()) > 0.0
+
+
+def test_gradients_equal_finite_differences(target):
+    """By positions, by states, and by the read-out's own weights."""
+    pytest.importorskip("pytorch_msssim")
+    task = Morphogenesis3D(dataclasses.replace(SMALL, ssim_weight=0.2), target=target)
+    rule = lively_rule(task, torch.float64)
+    seen = task.for_rule(rule)
+    x, s = worlds(task, 1, torch.float64)
+    weight = rule.readout[2].weight
+    weight.requires_grad_(False)
+    generator = torch.Generator().manual_seed(1)
+    for moved in (x, s, weight):
+        way = torch.randn(moved.shape, dtype=torch.float64, generator=generator)
+        moved.requires_grad_()
+        total, _ = seen.loss(x, s, torch.zeros(1, 150, dtype=torch.float64))
+        (gradient,) = torch.autograd.grad(total, moved)
+        moved.requires_grad_(False)
+        values = []
+        start = moved.clone()
+        for sign in (1.0, -1.0):
+            moved.copy_(start + sign * 1e-8 * way)
+            values.append(float(seen.loss(x, s, torch.zeros(1, 150, dtype=torch.float64))[0]))
+        moved.copy_(start)
+        slope = (values[0] - values[1]) / 2e-8
+        assert float((gradient * way).sum()) == pytest.approx(slope, rel=1e-4)
+
+
+def test_metric_is_the_same_in_every_batch(task):
+    x, s = worlds(task, 4)
+    alone = torch.cat([task.metric(x[k : k + 1], s[k : k + 1]) for k in range(4)])
+    assert torch.equal(task.metric(x, s), alone)
+
+
+def test_shares_average_to_the_loss_and_tell_what_opacity_changes(task):
+    x, s = worlds(task, 2, torch.float64)
+    shares = task.particle_shares(x, s)
+    torch.testing.assert_close(shares.mean(1), task.metric(x, s), rtol=1e-9, atol=0.0)
+    look = task.gaussians(s[:1])
+    slopes = []
+    for k in (3, 40, 41):
+        change = torch.zeros_like(look.opacities)
+        change[0, k] = 1e-7 * look.opacities[0, k]
+        ahead, behind = (
+            task._metric(x[:1], look._replace(opacities=look.opacities + sign * change))
+            for sign in (1.0, -1.0)
+        )
+        slopes.append(float(ahead - behind) / 2e-7)
+    found = shares[0, [3, 40, 41]]
+    assert float(found[0] - found[1]) == pytest.approx(150 * (slopes[0] - slopes[1]), rel=1e-4)
+    assert float(found[2] - found[1]) == pytest.approx(150 * (slopes[2] - slopes[1]), rel=1e-4)
+
+
+def test_damage_erases_a_ball(target):
+    x, s = torch.rand(1, 400, 3) - 0.5, torch.ones(1, 400, 16)
+    task = Morphogenesis3D(dataclasses.replace(SMALL, damage_radius=0.3), target=target)
+    places, states = task.damage(x, s, torch.Generator().manual_seed(0))
+    assert torch.equal(places, x)
+    erased = x[states[..., 0] == 0.0]
+    assert 3 < len(erased) < 150
+    assert float(torch.cdist(erased, erased).max()) <= 0.6
+    unhurt = Morphogenesis3D(SMALL, target=target)
+    assert unhurt.damage(x, s, torch.Generator())[1] is s
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"target": ""}, "target must be a built-in mesh"),
+        ({"state_dim": 2}, "state_dim must be a whole number of at least 3"),
+        ({"resolution": 4}, "resolution must be a whole number of at least 8"),
+        ({"views_per_iteration": 0}, "views_per_iteration must be a whole number"),
+        ({"opacity": 1.0}, "opacity must lie below 1"),
+        ({"opacity": 0.0}, r"opacity must lie in \(0, 1\]"),
+        ({"sigma": 0.0}, "sigma must be a finite number greater than 0"),
+        ({"blur_sigma": -1.0}, "blur_sigma must be a finite number of at least 0"),
+        ({"view_seed": -1}, "view_seed must be a whole number"),
+        ({"renderer": "opengl"}, "renderer must be 'own' or 'gsplat'"),
+    ],
+)
+def test_bad_fields_are_refused(fields, message):
+    with pytest.raises(NPAError, match=message):
+        Morphogenesis3DConfig(**fields)
+
+
+def test_what_does_not_fit_is_refused(target, task):
+    with pytest.raises(NPAError, match="views must have 32 x 32 pixels"):
+        Morphogenesis3D(dataclasses.replace(SMALL, resolution=32), target=target)
+    with pytest.raises(NPAError, match="path_length must have shape"):
+        task.loss(*worlds(task, 2), torch.zeros(1, 150))
+    pytest.importorskip("pytorch_msssim")
+    with pytest.raises(NPAError, match="at least 16 pixels for MS-SSIM"):
+        Morphogenesis3D(dataclasses.replace(SMALL, resolution=12, ssim_weight=0.2))
+
+
+def test_gsplat_is_called_with_what_it_takes(task, monkeypatch):
+    """gsplat itself needs CUDA; a stand-in for it draws what it is given with our own kernels."""
+    x, s = worlds(task, 2)
+    look = task.gaussians(s)
+    cameras = orbit(2, 20.0, 3.0, 45.0, width=20, height=24)
+    monkeypatch.setitem(sys.modules, "gsplat", None)
+    with pytest.raises(MissingDependencyError, match="pip install gsplat"):
+        gsplat_renderer(x, look, cameras)
+
+    def rasterization(
+        means, quats, scales, opacities, colors, viewmats, Ks, width, height, **options
+    ):
+        assert options == {"near_plane": 0.01, "sh_degree": 1, "packed": False}
+        assert torch.allclose(quats.norm(dim=-1), torch.ones(150))
+        lens = torch.stack((Ks[:, 0, 0], Ks[:, 1, 1], Ks[:, 0, 2], Ks[:, 1, 2]), dim=-1)
+        assert torch.equal(Ks[:, 2], torch.tensor([[0.0, 0.0, 1.0]]).expand(2, 3))
+        seen = dataclasses.replace(
+            cameras, world_to_camera=viewmats, intrinsics=lens, width=width, height=height
+        )
+        given = look._replace(
+            scales=scales[None],
+            quaternions=quats[None],
+            opacities=opacities[None],
+            colours=colors[None],
+        )
+        image, alpha = own_renderer(means[None], given, seen)
+        return image[0], alpha[0, ..., None], {}
+
+    monkeypatch.setitem(sys.modules, "gsplat", types.SimpleNamespace(rasterization=rasterization))
+    with pytest.raises(NPAError, match="draws worlds on CUDA, got cpu"):
+        gsplat_renderer(x, look, cameras)
+    monkeypatch.setattr(torch.Tensor, "is_cuda", True, raising=False)
+    drawn = gsplat_renderer(x, look, cameras)
+    monkeypatch.undo()
+    expected = own_renderer(x, look, cameras)
+    assert drawn[0].shape == (2, 2, 24, 20, 3)
+    assert all(torch.equal(a, b) for a, b in zip(drawn, expected, strict=True))
+
+
+def log_of(folder):
+    records = JsonlLog(folder / "log.jsonl").records()
+    return [{k: v for k, v in record.items() if k != "seconds"} for record in records]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run of the tiny preset."""
+    config = preset("tiny", "morphogenesis3d", out=tmp_path_factory.mktemp("runs") / "tiny")
+    return config, train(config, "morphogenesis3d", progress=False)
+
+
+def test_tiny_preset_learns(run):
+    config, result = run
+    log = log_of(result.folder)
+
+    def mean(records, name):
+        return sum(record[name] for record in records) / len(records)
+
+    assert result.finished
+    assert mean(log[-10:], "views") < 0.75 * mean(log[:10], "views")
+    assert len(list(result.folder.glob("pictures/*.png"))) == 3
+    rule = load_rule(result.folder / "rule.safetensors")
+    task = Morphogenesis3D(config.task)
+    fresh = task.make_rule(torch.Generator().manual_seed(0))
+    trained, untrained = (
+        evaluate(r, task, checkpoints=[12], seeds=[101, 102])[0] for r in (rule, fresh)
+    )
+    assert trained.loss < 0.8 * untrained.loss
+    assert trained.psnr > untrained.psnr + 1.5
+
+
+def test_resumed_run_is_bit_identical(tmp_path):
+    fields = {"iterations": 4, "checkpoint_interval": 2, "picture_interval": 0, "milestones": ()}
+    whole = preset("tiny", "morphogenesis3d", out=tmp_path / "whole", **fields)
+    train(whole, "morphogenesis3d", progress=False)
+    broken = preset("tiny", "morphogenesis3d", out=tmp_path / "broken", **fields)
+    trainer = Trainer(Morphogenesis3D(broken.task), broken, task_name="morphogenesis3d")
+    stopped = trainer.run(progress=False, max_seconds=1e-9)
+    assert stopped.iteration == 0
+    for _ in range(2):
+        trainer._iterate()
+        trainer._begin_record()
+    trainer.save()
+    resumed = train(broken, "morphogenesis3d", resume=True, progress=False)
+    assert resumed.finished
+    assert log_of(tmp_path / "broken")[-2:] == log_of(tmp_path / "whole")[-2:]
+
+
+def test_training_runs_in_double_precision(tmp_path):
+    fields = {"iterations": 2, "milestones": (), "dtype": "float64"}
+    result = train(
+        preset("tiny", "morphogenesis3d", out=tmp_path / "run", **fields),
+        "morphogenesis3d",
+        progress=False,
+    )
+    assert {p.dtype for p in result.rule.parameters()} == {torch.float64}
+    assert result.record["loss"] > 0
+
+
+def test_commands_take_a_3d_rule(run, tmp_path, capsys):
+    rule = str(run[1].folder / "rule.safetensors")
+    table = tmp_path / "table.json"
+    options = ["--checkpoints", "4", "8", "--seed-count", "2", "--no-progress"]
+    assert main(["evaluate", rule, *options, "--json", str(table)]) == 0
+    assert "loss: view loss" in capsys.readouterr().out
+    rows = json.loads(table.read_text())["growth"]
+    assert [row["step"] for row in rows] == [4, 8]
+    assert all(10.0 < row["psnr"] < 40.0 for row in rows)
+    options = ["--steps", "6", "--every", "3", "--damage", "3:erase", "--no-progress"]
+    words = ["--target", "rocket", "--resolution", "32"]
+    assert main(["rollout", rule, *options, *words, "--out", str(tmp_path)]) == 0
+    assert "PSNR" in capsys.readouterr().out
+    for name in ("growth.gif", "turntable.gif", "points.ply", "gaussians.ply", "cloud.splat"):
+        assert (tmp_path / name).stat().st_size > 1000, name
+    assert main(["list"]) == 0
+    assert "morphogenesis3d: doughnut, duck, mushroom, rocket" in capsys.readouterr().out
+
+
+def read_ply(path):
+    """Return the columns of a binary PLY file, read by its own header."""
+    header, _, body = path.read_bytes().partition(b"end_header\n")
+    lines = header.decode().split("\n")
+    kinds = {"float": "<f4", "uchar": "u1"}
+    fields = [line.split()[1:] for line in lines if line.startswith("property")]
+    assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
+    return np.frombuffer(body, np.dtype([(name, kinds[kind]) for kind, name in fields]))
+
+
+@pytest.fixture
+def cloud(task):
+    rule = lively_rule(task)
+    x, s = worlds(task, 1)
+    return x, task.for_rule(rule).gaussians(s), rule.colour(s)[0].clamp(0, 1).detach().numpy()
+
+
+def test_points_are_written_with_their_colours(cloud, tmp_path):
+    x, look, colours = cloud
+    write_points(tmp_path / "a.ply", x, look)
+    rows = read_ply(tmp_path / "a.ply")
+    assert np.array_equal(np.stack([rows[n] for n in "xyz"], axis=1), x[0].numpy())
+    written = np.stack([rows[n] for n in ("red", "green", "blue")], axis=1)
+    assert np.abs(written / 255.0 - colours).max() < 0.51 / 255.0
+    trimesh = pytest.importorskip("trimesh")
+    assert np.allclose(trimesh.load(tmp_path / "a.ply").vertices, x[0].numpy())
+
+
+def test_gaussians_are_written_as_others_read_them(cloud, tmp_path):
+    x, look, colours = cloud
+    write_gaussians(tmp_path / "a.ply", x, look)
+    rows = read_ply(tmp_path / "a.ply")
+    assert np.allclose(
+        np.exp([rows[f"scale_{k}"] for k in range(3)]).T, look.scales[0].detach(), rtol=1e-5
+    )
+    assert np.allclose(1 / (1 + np.exp(-rows["opacity"])), look.opacities[0].detach(), atol=1e-6)
+    flat = np.stack([rows[f"f_dc_{k}"] for k in range(3)], axis=1)
+    assert np.allclose((0.28209479 * flat + 0.5).clip(0, 1), colours, atol=1e-5)
+    # Red's three coefficients of degree 1 come first.
+    first = np.stack([rows[f"f_rest_{k}"] for k in range(3)], axis=1)
+    assert np.allclose(first, look.colours[0, :, 1:, 0].detach())
+    turns = np.stack([rows[f"rot_{k}"] for k in range(4)], axis=1)
+    assert np.allclose(np.linalg.norm(turns, axis=1), 1.0, atol=1e-6)
+    assert np.allclose(
+        turns, torch.nn.functional.normalize(look.quaternions[0], dim=-1).detach(), atol=1e-6
+    )
+    assert (rows["nx"] == 0.0).all()
+
+
+def test_splats_are_32_bytes_each_the_largest_first(cloud, task, tmp_path):
+    x, look, colours = cloud
+    write_splat(tmp_path / "a.splat", x, look)
+    content = (tmp_path / "a.splat").read_bytes()
+    assert len(content) == 32 * 150
+    numbers = np.frombuffer(content, "<f4").reshape(150, 8)
+    bytes_ = np.frombuffer(content, np.uint8).reshape(150, 32)
+    size = numbers[:, 3:6].prod(axis=1) * bytes_[:, 27]
+    assert (np.diff(size) <= 0.01 * size[0]).all()
+    places = x[0].numpy()
+    order = [int(np.abs(places - row[:3]).sum(axis=1).argmin()) for row in numbers]
+    assert sorted(order) == list(range(150))
+    assert np.array_equal(numbers[:, 3:6], look.scales[0, order].detach().numpy())
+    assert np.abs(bytes_[:, 24:27] / 255.0 - colours[order]).max() < 0.51 / 255.0
+    turns = torch.nn.functional.normalize(look.quaternions[0, order], dim=-1).detach().numpy()
+    assert np.abs((bytes_[:, 28:] - 128.0) / 128.0 - turns).max() < 1.01 / 128.0
+    # Round particles have no rotation.
+    write_splat(tmp_path / "b.splat", x, task.gaussians(torch.zeros(1, 150, 16)))
+    plain = np.frombuffer((tmp_path / "b.splat").read_bytes(), np.uint8).reshape(150, 32)
+    assert (plain[:, 28:] == (255, 128, 128, 128)).all()
+    with pytest.raises(NPAError, match="positions of one 3D world"):
+        write_splat(tmp_path / "c.splat", x[0], look)
+
+
+def test_turntables_go_once_around(task):
+    """A particle to the right of the middle is behind it a quarter of a turn on."""
+    x = torch.tensor([[[0.6, 0.0, 0.0]]])
+    s = torch.full((1, 1, 16), -0.5)
+    frames = turntable_frames(
+        lambda cameras: task.views(x, s, cameras), frame_count=4, resolution=32, elevation=0.0
+    )
+    pixel = DISTANCE * math.tan(math.radians(0.5 * ANGLE)) / 16.0
+    columns = [float((np.nonzero(255 - f[..., 0])[1]).mean()) for f in frames]
+    assert columns[0] == pytest.approx(15.5 + 0.6 / pixel, abs=0.5)
+    assert columns[1] == pytest.approx(15.5, abs=0.5)
+    assert columns[2] == pytest.approx(15.5 - 0.6 / pixel, abs=0.5)
+    assert frames[0].shape == (32, 32, 3)
+    assert tuple(frames[0][0, 0]) == (255, 255, 255)
+
+
+@pytest.mark.gpu
+@needs_cuda
+def test_graphs_train_the_same_rule_as_eager_launches(tmp_path):
+    pytest.importorskip("pytorch_msssim")
+    logs = []
+    for name, graphed in (("graph", True), ("eager", False)):
+        fields = {"iterations": 12, "device": "cuda", "cuda_graph": graphed, "ssim_weight": 0.2}
+        config = preset("tiny", "morphogenesis3d", out=tmp_path / name, milestones=(), **fields)
+        train(config, "morphogenesis3d", progress=False)
+        logs.append(log_of(tmp_path / name))
+    for replayed, launched in zip(*logs, strict=True):
+        assert replayed == pytest.approx(launched, rel=1e-3)
+
+
+@pytest.mark.gpu
+@needs_cuda
+def test_iterations_never_wait_for_the_device(tmp_path):
+    pytest.importorskip("pytorch_msssim")
+    fields = {"device": "cuda", "steps": (8, 9), "ssim_weight": 0.2}
+    config = preset("tiny", "morphogenesis3d", out=tmp_path / "run", **fields)
+    task = Morphogenesis3D(config.task, device="cuda")
+    trainer = Trainer(task, config, task_name="morphogenesis3d")
+    trainer._iterate()  # Captures the only graph, which does wait.
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        for _ in range(5):
+            trainer._iterate()
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert trainer.iteration == 6
+
+
+@pytest.mark.gpu
+@needs_cuda
+def test_losses_and_gradients_on_cuda_are_those_on_the_cpu():
+    pytest.importorskip("pytorch_msssim")
+    config = dataclasses.replace(SMALL, ssim_weight=0.2, particle_count=2000)
+    found = []
+    for device in ("cpu", "cuda"):
+        task = Morphogenesis3D(config, device=device)
+        x, s = (t.to(device).requires_grad_() for t in worlds(task, 2, torch.float64))
+        value, _ = task.loss(x, s, torch.zeros_like(x[..., 0]))
+        gradients = torch.autograd.grad(value, (x, s))
+        found.append([t.detach().cpu() for t in (value, *gradients)])
+    for on_cpu, on_cuda in zip(*found, strict=True):
+        assert float((on_cpu - on_cuda).norm() / on_cpu.norm()) < 1e-6
