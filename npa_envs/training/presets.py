@@ -18,6 +18,8 @@ from npa_envs.tasks.texture_config import TextureConfig
 from npa_envs.training.config import Morphogenesis2DTrainConfig, TrainConfig
 from npa_envs.training.overrides import override
 from npa_envs.training.presets3d import MORPHOGENESIS3D_PRESETS
+from npa_envs.training.presets_points import POINT_CLASSIFICATION_PRESETS
+from npa_envs.training.presets_texture import TEXTURE_PRESETS
 
 
 @dataclass(frozen=True)
@@ -86,8 +88,6 @@ def _morphogenesis3d_targets() -> tuple[str, ...]:
 
 
 _OUT = Path("runs/morphogenesis2d")
-_TEXTURE_OUT = Path("runs/texture")
-_POINTS_OUT = Path("runs/point_classification")
 
 MORPHOGENESIS2D_PRESETS: Mapping[str, Morphogenesis2DTrainConfig] = {
     "paper": TrainConfig(task=Morphogenesis2DConfig(), out=_OUT),
@@ -140,124 +140,6 @@ MORPHOGENESIS2D_PRESETS: Mapping[str, Morphogenesis2DTrainConfig] = {
     ),
 }
 """2D morphogenesis: `paper` (arXiv 2601.16096), `fast` (minutes on one core), `tiny` (tests)."""
-
-_PAPER_TEXTURE: TrainConfig[TextureConfig] = TrainConfig(
-    task=TextureConfig(loss="vgg_ot"),
-    iterations=12_000,
-    repeats=1,
-    steps=(16, 32),
-    learning_rate=1e-4,
-    weight_decay=0.1,
-    milestones=(3_000, 6_000, 9_000),
-    out=_TEXTURE_OUT,
-)
-
-TEXTURE_PRESETS: Mapping[str, TrainConfig[TextureConfig]] = {
-    "paper": _PAPER_TEXTURE,
-    # Dots of both colours after some three minutes on one core.
-    "fast": TrainConfig(
-        task=TextureConfig(
-            target="dots", particle_count=1024, hidden_dim=64, resolution=64, damage_radius=0.2
-        ),
-        iterations=1200,
-        repeats=1,
-        world_count=2,
-        pool_size=32,
-        steps=(12, 24),
-        learning_rate=2e-3,
-        milestones=(800, 1050),
-        seed_interval=4,
-        out=_TEXTURE_OUT,
-        picture_interval=100,
-        checkpoint_interval=200,
-        tensorboard=False,
-    ),
-    "tiny": TrainConfig(
-        task=TextureConfig(
-            target="dots", particle_count=256, hidden_dim=32, eps=0.3, resolution=24
-        ),
-        iterations=60,
-        repeats=1,
-        world_count=2,
-        pool_size=8,
-        steps=(8, 16),
-        learning_rate=5e-3,
-        milestones=(45,),
-        seed_interval=4,
-        out=_TEXTURE_OUT,
-        log_interval=1,
-        picture_interval=20,
-        checkpoint_interval=20,
-        tensorboard=False,
-    ),
-}
-"""Textures: `paper` (arXiv 2601.16096, needs VGG16's weights), `fast` (on one core), `tiny`."""
-
-POINT_CLASSIFICATION_PRESETS: Mapping[str, TrainConfig[PointClassificationConfig]] = {
-    "paper": TrainConfig(
-        task=PointClassificationConfig(),
-        iterations=50_000,
-        repeats=1,
-        world_count=64,
-        pool_size=1024,
-        steps=(12, 24),
-        learning_rate=1e-3,
-        weight_decay=0.1,
-        milestones=(20_000, 40_000),
-        seed_interval=1,
-        fresh_share=0.5,
-        out=_POINTS_OUT,
-    ),
-    # Of clouds never seen 91 % are classified rightly, after some four minutes on one core.
-    "fast": TrainConfig(
-        task=PointClassificationConfig(
-            stretch=0.1,
-            mutated_share=0.25,
-            particle_count=128,
-            hidden_dim=128,
-            readout_hidden_dim=64,
-            eps=0.2,
-            resolution=64,
-        ),
-        iterations=1500,
-        repeats=1,
-        world_count=32,
-        pool_size=256,
-        steps=(12, 20),
-        learning_rate=2e-3,
-        milestones=(1100, 1400),
-        seed_interval=1,
-        fresh_share=0.5,
-        out=_POINTS_OUT,
-        picture_interval=500,
-        checkpoint_interval=300,
-        tensorboard=False,
-    ),
-    "tiny": TrainConfig(
-        task=PointClassificationConfig(
-            particle_count=64,
-            hidden_dim=32,
-            readout_hidden_dim=32,
-            eps=0.25,
-            resolution=32,
-        ),
-        iterations=60,
-        repeats=1,
-        world_count=8,
-        pool_size=32,
-        steps=(6, 10),
-        learning_rate=5e-3,
-        milestones=(45,),
-        seed_interval=1,
-        fresh_share=0.5,
-        out=_POINTS_OUT,
-        log_interval=1,
-        picture_interval=20,
-        checkpoint_interval=20,
-        tensorboard=False,
-    ),
-}
-"""Classification of point clouds: `paper` (arXiv 2601.16096), `fast` (on one core), `tiny`."""
 
 TASKS: Mapping[str, TaskEntry] = {
     "morphogenesis2d": TaskEntry(
