@@ -328,7 +328,7 @@ def test_warmup_leaves_nothing_to_compile(device):
     warm = set(bridge._launched)
     for update_prob in (0.5, 1.0):
         outcome(rule, x, s, update_prob=update_prob)
-    assert bridge._launched == warm
+    assert not {(kernel.module.name, kernel.key) for kernel, _ in bridge._launched - warm}
 
 
 def test_other_streams_and_recorded_graphs_give_the_same(device):

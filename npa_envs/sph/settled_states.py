@@ -42,24 +42,33 @@ def padded_channels(like: Tensor, state_dim: int) -> int:
     return -(-state_dim // width) * width
 
 
+@torch.library.custom_op("npa::reorder", mutates_args=())
+def _reorder(values: Tensor, order: Tensor, columns: int) -> Tensor:
+    moved = values.index_select(0, order)
+    return torch.nn.functional.pad(moved, (0, columns - values.shape[1])).contiguous()
+
+
+@_reorder.register_fake
+def _(values: Tensor, order: Tensor, columns: int) -> Tensor:
+    return values.new_empty(order.shape[0], columns)
+
+
 class _Reordered(torch.autograd.Function):
     """Rows in another order, their columns cut off or padded with zeros."""
 
     @staticmethod
     def forward(ctx: Any, values: Tensor, order: Tensor, inverse: Tensor, columns: int) -> Tensor:
-        ctx.save_for_backward(order, inverse)
+        ctx.save_for_backward(inverse)
         ctx.columns = values.shape[1]
-        return _reordered(values, order, columns)
+        # An opaque operator: of plain ones in here, torch.compile of torch 2.11 loses the gradient.
+        result: Tensor = _reorder(values, order, columns)
+        return result
 
     @staticmethod
+    @torch.autograd.function.once_differentiable
     def backward(ctx: Any, bar: Tensor) -> tuple[Tensor | None, ...]:
-        _, inverse = ctx.saved_tensors
-        return _reordered(bar, inverse, ctx.columns), None, None, None
-
-
-def _reordered(values: Tensor, order: Tensor, columns: int) -> Tensor:
-    moved = values.index_select(0, order)
-    return torch.nn.functional.pad(moved, (0, columns - values.shape[1])).contiguous()
+        (inverse,) = ctx.saved_tensors
+        return _reorder(bar, inverse, ctx.columns), None, None, None
 
 
 def settled_states(worlds: SettledWorlds, s: Tensor) -> Tensor:

@@ -97,10 +97,14 @@ def _warm_settled(x: torch.Tensor, s: torch.Tensor) -> None:
 
 
 def _warm_network(x: torch.Tensor, s: torch.Tensor) -> None:
-    """A rule's products, where they have kernels of their own."""
-    width = Terms().perception_dim(x.shape[2], s.shape[2]) + 1
-    out = x.shape[2] + s.shape[2]
-    width, out = width + -width % 4, out + -out % 4
+    """A rule's products, where they have kernels of their own: with displacements and without."""
+    space_dim, state_dim = x.shape[2], s.shape[2]
+    width = Terms().perception_dim(space_dim, state_dim) + 1
+    for out in (space_dim + state_dim, state_dim):
+        _warm_products(x, width + -width % 4, out + -out % 4)
+
+
+def _warm_products(x: torch.Tensor, width: int, out: int) -> None:
     rows, hidden, update = (
         torch.zeros(*shape, dtype=x.dtype, device=x.device, requires_grad=True)
         for shape in ((1, width), (128, width), (out, 128))

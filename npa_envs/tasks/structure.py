@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
+from torch.nn.functional import avg_pool2d, pad
 
 from npa_envs.errors import MissingDependencyError, NPAError
 
@@ -21,6 +21,16 @@ SPREAD = 1.5
 
 FLOOR = 1e-4
 """Least similarity of a size: below it, where the power is steep, nothing is learned from it."""
+
+
+def _halved(pictures: Tensor) -> Tensor:
+    """Return pictures of half the size, an odd side rounded up, means of 2 x 2 pixels.
+
+    Zeros are put before the first row or column of an odd side; with the padding of `avg_pool2d`
+    itself gradients are wrong on CUDA where channels lie innermost (torch 2.11).
+    """
+    odd_rows, odd_columns = (side % 2 for side in pictures.shape[2:])
+    return avg_pool2d(pad(pictures, (odd_columns, 0, odd_rows, 0)), kernel_size=2)
 
 
 class MultiScaleSimilarity:
@@ -82,9 +92,5 @@ class MultiScaleSimilarity:
             share = whole if size == last else contrast
             total = total + weight * share.clamp_min(FLOOR).log()
             if size < last:
-                padding = [side % 2 for side in found.shape[2:]]
-                found, wanted = (
-                    avg_pool2d(picture, kernel_size=2, padding=padding)
-                    for picture in (found, wanted)
-                )
+                found, wanted = _halved(found), _halved(wanted)
         return total.exp().mean(dim=1)
