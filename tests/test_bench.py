@@ -11,6 +11,7 @@ import torch
 
 from npa_envs import reference
 from npa_envs.bench import ratios, scaling, suites
+from npa_envs.bench.drift import drift_rows
 from npa_envs.bench.explain import Question, explain
 from npa_envs.bench.hash_grid import grid_fields
 from npa_envs.bench.launches import recorded_launches
@@ -196,6 +197,18 @@ def test_perception_in_float32_errs_little_and_the_reference_not_at_all():
     assert {"tf32", "perception in mixed", "plain, float32, 2D (2, 150)"} <= left
 
 
+def test_float32_drifts_little_from_float64_over_a_rollout(device):
+    rows = drift_rows(Session(device, repeats=1), [Workload(2, 2, 300, 8), Workload(3, 1, 300, 8)])
+    assert [row.workload for row in rows] == ["2D (2, 300, 8)", "3D (1, 300, 8)"]
+    for row in rows:
+        assert 0.0 < row.positions < FORWARD
+        assert 0.0 < row.states < FORWARD
+        # A hidden unit may be on in one precision alone.
+        assert 0.0 < row.state_gradient < 1e-3
+        assert 0.0 < row.state_gradient_median < 1e-5
+        assert 0.0 < row.weight_gradient < 1e-3
+
+
 def test_rollouts_err_more_in_shorter_precisions():
     chosen = [PRECISIONS[name] for name in ("float64", "float32", "bf16_storage", "mixed")]
     here = session(strategies=[STRATEGIES["library"], STRATEGIES["dense"]], precisions=chosen)
@@ -304,10 +317,10 @@ def test_kernels_are_cudas(device):
 def test_the_suites_measure_all_their_tables():
     here = session(strategies=[STRATEGIES["library"]], precisions=[PRECISIONS["float32"]])
     tables = suites.quick(here)
-    assert list(tables) == ["perception", "rollouts", "peers", "throughput"]
+    assert list(tables) == ["perception", "rollouts", "peers", "throughput", "drift"]
     assert all(tables.values())
     assert here.small
-    assert list(suites.paper(here)) == ["throughput"]
+    assert list(suites.paper(here)) == ["throughput", "drift"]
 
 
 # Plots, report

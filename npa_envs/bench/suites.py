@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from npa_envs.bench import ratios as guard
+from npa_envs.bench.drift import drift_rows
 from npa_envs.bench.kernels import kernel_rows
 from npa_envs.bench.peers import peer_rows
 from npa_envs.bench.perception import perception_rows
@@ -15,6 +16,7 @@ from npa_envs.bench.session import Session, Tables
 from npa_envs.bench.skips import skip_rows
 from npa_envs.bench.throughput import (
     CPU,
+    ONE_WORLD,
     PAPER,
     PROFILED,
     SMALL,
@@ -68,10 +70,11 @@ def peers(session: Session) -> list[object]:
 
 
 def paper(session: Session) -> Tables:
-    """Return the paper's table: inference, training and memory."""
+    """Return the paper's table: inference, training and memory; and float32's errors there."""
     workloads = SMALL if session.small else PAPER if session.cuda else CPU
+    drifting = SMALL if session.small else PROFILED if session.cuda else (ONE_WORLD,)
     rows = throughput_rows(session, workloads)
-    tables: Tables = {"throughput": rows}
+    tables: Tables = {"throughput": rows, "drift": drift_rows(session, drifting)}
     if session.cuda and not session.small:
         tables["aims"] = aim_rows(rows)
     return tables
@@ -101,7 +104,7 @@ def kernels(session: Session) -> Tables:
 
 SUITES = {
     "quick": Suite("small worlds; about a minute on a CPU", quick, guarded=True),
-    "paper": Suite("inference, training and memory of the paper's workloads", paper),
+    "paper": Suite("the paper's workloads: inference, training, memory, errors", paper),
     "accuracy": Suite("run time against error, by strategy and precision; peers", accuracy),
     "scaling": Suite("time and memory against N, neighbours, B and C", scaling),
     "skips": Suite("what it saves to leave out what a scene does not need", skipped),
