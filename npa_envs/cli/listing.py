@@ -10,7 +10,7 @@ import tyro
 
 @dataclass(frozen=True)
 class ListOptions:
-    """Tasks and presets, environments, targets, texture losses, data sets, shipped rules."""
+    """Tasks and presets, environments, targets, texture losses, data sets, rules with scores."""
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -24,7 +24,8 @@ def main(arguments: Sequence[str]) -> int:
     """
     tyro.cli(ListOptions, prog="npa-envs list", args=arguments)
     from npa_envs.registration import ENVIRONMENTS
-    from npa_envs.rule_io import load_rule, shipped_rules
+    from npa_envs.rule_io import load_rule, rule_metadata, shipped_rules
+    from npa_envs.scores import score_line, scores
     from npa_envs.tasks.digits import BUILT_IN
     from npa_envs.tasks.texture_losses import TEXTURE_LOSSES
     from npa_envs.training import TASKS
@@ -49,10 +50,9 @@ def main(arguments: Sequence[str]) -> int:
     print("data sets of point clouds (--data NAME, or the path of a folder with MNIST's IDX files)")
     print(f"  point_classification: {', '.join(BUILT_IN)}")
     print("rules (npa-envs rollout NAME)")
-    for name in shipped_rules():
-        rule = load_rule(name)
-        shape = f"{rule.space_dim}D, {rule.state_dim} channels, {rule.hidden_dim} hidden units"
-        print(f"  {name}: {shape}, {rule.weight_count} weights, eps0 {rule.eps0:g}")
-    if not shipped_rules():
-        print("  none")
+    for task_name in TASKS:
+        for name, path in shipped_rules().items():
+            if rule_metadata(path)["task"] == task_name:
+                weights = load_rule(name).weight_count
+                print(f"  {name}: {task_name}, {weights} weights; {score_line(scores(name))}")
     return 0

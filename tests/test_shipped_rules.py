@@ -1,0 +1,130 @@
+"""The shipped rules do what their cards and scores say."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+import npa_envs
+from npa_envs.classification import accuracies
+from npa_envs.cli import main
+from npa_envs.cli.worlds import task_of_rule
+from npa_envs.errors import NPAError
+from npa_envs.evaluation import evaluate
+from npa_envs.rule_io import rule_metadata, shipped_rules
+from npa_envs.scores import score_line, scores
+
+UNSEEN = range(1_000_000, 1_000_001)
+RULES = shipped_rules()
+TASK_OF = {name: rule_metadata(path)["task"] for name, path in RULES.items()}
+
+GROWING = [name for name, task in TASK_OF.items() if task != "point_classification"]
+
+
+def named(task):
+    return [name for name, of in TASK_OF.items() if of == task]
+
+
+def growth(name):
+    return {row["step"]: row for row in scores(name)["growth"]}
+
+
+def test_there_are_rules_for_every_task():
+    counts = {task: len(named(task)) for task in set(TASK_OF.values())}
+    assert counts["morphogenesis2d"] >= 6
+    assert counts["texture"] >= 4
+    assert counts["morphogenesis3d"] >= 2
+    assert counts["point_classification"] >= 1
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_a_card_says_what_was_measured(name):
+    card = RULES[name].with_suffix(".md").read_text("utf-8")
+    assert card.startswith(f"# {name}\n")
+    assert "npa-envs train" in card
+    measured = scores(name)
+    assert re.fullmatch(r"[0-9a-f]{7}", measured["commit"])
+    assert measured["machine"] in card
+    rows = measured.get("growth") or measured["accuracy"]
+    for row in rows:
+        (line,) = re.findall(rf"^\| {row['step']} \| .*$", card, re.MULTILINE)
+        told = line.split(" | ")[1]
+        if "accuracy" in measured:
+            assert told == f"{100 * row['majority']:.1f} %"
+        else:
+            digits = len(told.partition(".")[2])
+            assert told == f"{row['loss']:.{digits}f}"
+
+
+@pytest.mark.parametrize("name", named("morphogenesis2d"))
+def test_pictures_grow_and_last(name):
+    measured = growth(name)
+    assert measured[512]["loss"] <= 0.18
+    assert measured[4096]["loss"] <= 0.18
+
+
+@pytest.mark.parametrize("name", named("morphogenesis3d"))
+def test_things_last(name):
+    measured = growth(name)
+    assert measured[512]["psnr"] > measured[128]["psnr"] - 2.0
+
+
+def test_the_classifier_is_right():
+    (name,) = named("point_classification")
+    (row,) = (row for row in scores(name)["accuracy"] if row["step"] == 32)
+    assert row["majority"] >= 0.975
+    assert row["particle"] >= 0.96
+
+
+@pytest.mark.parametrize(
+    "name", [name for name in RULES if TASK_OF[name] != "point_classification"]
+)
+def test_a_world_grows_as_measured(name, device):
+    rule = npa_envs.load_rule(name, device=device)
+    trained = task_of_rule(name, rule, device)
+    assert trained.doubt is None
+    first, *_ = (row for row in scores(name)["growth"])
+    rows = evaluate(rule, trained.task, checkpoints=(first["step"],), seeds=UNSEEN, device=device)
+    # One world's loss lies about the mean of all as the worst one does.
+    spread = first["loss_worst"] - first["loss"]
+    assert abs(rows[0].loss - first["loss"]) < 2.0 * spread + 0.02 * first["loss"]
+
+
+def test_clouds_say_what_they_are_as_measured(device):
+    (name,) = named("point_classification")
+    rule = npa_envs.load_rule(name, device=device)
+    task = task_of_rule(name, rule, device).task
+    (row,) = accuracies(rule, task, checkpoints=(32,))
+    (measured,) = (row for row in scores(name)["accuracy"] if row["step"] == 32)
+    assert row.majority == pytest.approx(measured["majority"], abs=0.012)
+    assert row.particle == pytest.approx(measured["particle"], abs=0.012)
+
+
+def test_the_list_tells_every_score(capsys):
+    assert main(["list"]) == 0
+    text = capsys.readouterr().out
+    for name in RULES:
+        assert score_line(scores(name)) in text
+    assert "gecko: morphogenesis2d, 10880 weights; splat loss 0.158 at 128, 0.127 at 256" in text
+    assert "98.1% of clouds by majority, 96.7% of particles at step 32" in text
+
+
+def test_scores_of_an_unknown_rule_are_refused():
+    with pytest.raises(NPAError, match=r"unknown rule 'geko'.*gecko"):
+        scores("geko")
+
+
+def test_scores_are_json_without_nan():
+    def refuse(word):
+        raise AssertionError(word)
+
+    for path in RULES.values():
+        text = Path(path.with_suffix(".json")).read_text("utf-8")
+        json.loads(text, parse_constant=refuse)
+
+
+def test_rules_know_nothing_of_the_machine_they_come_from():
+    for path in RULES.values():
+        config = json.loads(rule_metadata(path)["config"])
+        assert not {"out", "device", "initial_rule"} & set(config)
