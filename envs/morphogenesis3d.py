@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -12,11 +13,12 @@ from torch import Tensor
 
 from npa_envs.envs.config import EnvConfig
 from npa_envs.envs.single import NPAEnv
-from npa_envs.envs.task import EnvTask
+from npa_envs.envs.task import TURN, EnvTask
 from npa_envs.envs.vector import NPAVectorEnv
 from npa_envs.errors import NPAError
 from npa_envs.randomness import WorldRandom
-from npa_envs.rule import COLOUR_OFFSET, NPARule
+from npa_envs.render import turntable_frames
+from npa_envs.rule import NPARule
 from npa_envs.rule_io import load_rule
 from npa_envs.tasks.checks import check_fraction, check_positive
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D
@@ -148,11 +150,20 @@ class SolidTask(EnvTask[Morphogenesis3DEnvConfig]):
         return self.goal.particle_shares(x, s)
 
     def draw(self, x: Tensor, s: Tensor, steps: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Return a picture of each world; colours are those that a read-out says."""
-        if self._rule is not None and self.config.render_style == "particles":
-            with torch.no_grad():
-                s = torch.cat((s[..., :-3], self._rule.colour(s) - COLOUR_OFFSET), dim=-1)
-        return super().draw(x, s, steps)
+        """Return a picture of each world; with a read-out, of the Gaussians that it says."""
+        if self._rule is None or self.config.render_style != "particles":
+            return super().draw(x, s, steps)
+        frames = []
+        for k, step in enumerate(steps):
+            seen = partial(self.goal.views, x[k : k + 1], s[k : k + 1])
+            frames += turntable_frames(
+                seen,
+                frame_count=1,
+                resolution=self.config.render_size,
+                azimuth=TURN * float(step),
+                device=self.device,
+            )
+        return np.stack(frames)
 
 
 def _read_out(config: Morphogenesis3DEnvConfig, device: torch.device) -> NPARule:
@@ -181,7 +192,8 @@ class Morphogenesis3DEnv(NPAEnv):
     observation alike, is the usual policy. Rules are trained by gradient with `npa-envs train
     morphogenesis3d`; `npa_envs.agents.RulePolicy(npa_envs.load_rule("rule.safetensors"), env)`
     makes a policy of one. Such a rule reads out of its states how particles look: give it as
-    `readout` too.
+    `readout` too. Shipped ones want the worlds that they were trained in: `particle_count=16384`,
+    `eps` and `eps0` 0.1, `alpha` and `seed_radius` 1, `sigma=0.02`, `opacity=0.15`.
 
     ## Observation space
 
@@ -259,7 +271,8 @@ class Morphogenesis3DEnv(NPAEnv):
 
     ## Rendering
 
-    As in `Morphogenesis2DEnv`. The camera goes round by two degrees a step.
+    As in `Morphogenesis2DEnv`. The camera goes round by two degrees a step. With a `readout` the
+    style `"particles"` draws the Gaussians that it says.
 
     ## Arguments
 

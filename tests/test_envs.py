@@ -578,6 +578,27 @@ def test_bad_keyword_of_regeneration_is_a_clear_error(keywords, message):
         gymnasium.make("npa/Regeneration2D-v0", **keywords)
 
 
+def test_pictures_with_a_read_out_show_what_it_says():
+    shades = []
+    for readout in ("", "duck"):
+        env = gymnasium.make(
+            "npa/Morphogenesis3D-v0",
+            particle_count=256,
+            target="duck",
+            readout=readout,
+            render_mode="rgb_array",
+            render_size=32,
+        )
+        env.reset(seed=0)
+        red, green, blue = np.asarray(env.render()).reshape(-1, 3).min(axis=0).astype(float)
+        shades.append((red - blue, green - blue))
+        env.close()
+    (grey, _), (yellow, also_green) = shades
+    assert abs(grey) < 2
+    assert yellow > 40
+    assert also_green > 40
+
+
 @every_id
 @pytest.mark.parametrize("style", ["particles", "density", "states"])
 def test_pictures_show_the_world(name, style):

@@ -20,6 +20,7 @@ def turntable_frames(
     frame_count: int = 60,
     resolution: int = 256,
     elevation: float = 20.0,
+    azimuth: float = 0.0,
     background: Background = "white",
     device: str | torch.device = "cpu",
 ) -> list[NDArray[np.uint8]]:
@@ -30,6 +31,7 @@ def turntable_frames(
         frame_count: Pictures of one turn.
         resolution: Pixels along each side.
         elevation: How far above the horizon the cameras are [degrees].
+        azimuth: How far the first camera has gone round [degrees].
         background: A colour name, "#rrggbb", or red, green and blue in [0, 1].
         device: Where the world is.
 
@@ -49,7 +51,7 @@ def turntable_frames(
                 ANGLE,
                 width=resolution,
                 height=resolution,
-                azimuth=360.0 * k / frame_count,
+                azimuth=azimuth + 360.0 * k / frame_count,
             )
             picture = views(cameras.to(torch.device(device)))[0, 0]
             frames.append(to_uint8(picture.flip(0), background))

@@ -1,0 +1,108 @@
+"""Draw what the shipped rules grow, `docs/images/rules_*.png`, each beside its target.
+
+    python docs/draw_rules.py
+
+It takes some minutes on a CPU. Draw anew when a rule changes.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+import npa_envs
+from npa_envs.cli.worlds import task_of_rule
+from npa_envs.render import to_uint8, write_filmstrip
+from npa_envs.rule_io import rule_metadata, shipped_rules
+from npa_envs.tasks.views import over
+
+IMAGES = Path(__file__).resolve().parent / "images"
+SEED = 1_000_000
+CPU = torch.device("cpu")
+
+Shots = list[tuple[str, NDArray[np.uint8]]]
+
+
+def rules_of(task_name: str) -> list[str]:
+    """Return the names of a task's shipped rules."""
+    return [n for n, path in shipped_rules().items() if rule_metadata(path)["task"] == task_name]
+
+
+@torch.no_grad()
+def grown(name: str, steps: tuple[int, ...]) -> tuple[Any, list[tuple[Tensor, Tensor]]]:
+    """Return a rule's task, and an unseen world after each number of steps."""
+    rule = npa_envs.load_rule(name)
+    task = task_of_rule(name, rule, CPU).task
+    generator = torch.Generator().manual_seed(SEED)
+    x, s = task.seed(1, generator=generator)
+    worlds, before = [], 0
+    for mark in steps:
+        x, s = npa_envs.rollout(
+            rule,
+            x,
+            s,
+            mark - before,
+            update_prob=task.update_prob,
+            box=task.box,
+            generator=generator,
+        )
+        worlds.append((x, s))
+        before = mark
+    return task, worlds
+
+
+def pictures() -> Shots:
+    """Return the target and four moments of each rule of 2D morphogenesis."""
+    steps = (16, 64, 512, 2048)
+    shots: Shots = []
+    for name in rules_of("morphogenesis2d"):
+        task, worlds = grown(name, steps)
+        shots.append((name, to_uint8(task.target_picture)))
+        frames = [to_uint8(task.picture(x, s)[0]) for x, s in worlds]
+        shots += [(f"step {step}", frame) for step, frame in zip(steps, frames, strict=True)]
+    return shots
+
+
+def textures() -> Shots:
+    """Return the target, three moments, and the last one as two by two tiles of each texture."""
+    steps = (64, 256, 1024)
+    shots: Shots = []
+    for name in rules_of("texture"):
+        task, worlds = grown(name, steps)
+        shots.append((name, to_uint8(task.target_picture)))
+        frames = [to_uint8(task.picture(x, s)[0]) for x, s in worlds]
+        shots += [(f"step {step}", frame) for step, frame in zip(steps, frames, strict=True)]
+        shots.append(("step 1024, 2 x 2", np.tile(frames[-1], (2, 2, 1))[::2, ::2]))
+    return shots
+
+
+@torch.no_grad()
+def things() -> Shots:
+    """Return held-out views of each target above what its rule has grown at step 128."""
+    shots: Shots = []
+    for name in rules_of("morphogenesis3d"):
+        task, ((x, s),) = grown(name, (128,))
+        held_out = task.target.held_out
+        for what, views in (
+            (name, held_out.pictures),
+            ("step 128", task.views(x, s, held_out.cameras)[0]),
+        ):
+            white = over(views, torch.ones(3)).clamp(0.0, 1.0)
+            shots += [(what, (255.0 * view).byte().numpy()) for view in white[1:11:2]]
+    return shots
+
+
+def main() -> None:
+    """Draw all pictures."""
+    for name, draw in (("2d", pictures), ("textures", textures), ("3d", things)):
+        captions, frames = zip(*draw(), strict=True)
+        write_filmstrip(IMAGES / f"rules_{name}.png", frames, captions, columns=5)
+
+
+if __name__ == "__main__":
+    main()
