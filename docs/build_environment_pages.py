@@ -12,21 +12,17 @@ of the other environment, so that nothing is written twice.
 from __future__ import annotations
 
 import argparse
-import ast
 import importlib
 import inspect
-import json
 import re
 import sys
-import textwrap
 import typing
-from collections.abc import Sequence
 from dataclasses import MISSING, fields
-from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal
 
+import species_pages
 from draw_environment_pictures import FILMS, picture_path
+from page_parts import NOTE, default_text, field_meanings, kind_text, sections, table
 
 from npa_envs.envs.config import EnvConfig
 from npa_envs.envs.single import NPAEnv
@@ -49,7 +45,6 @@ observation, reward, terminated, truncated, info = env.step(env.action_space.sam
 # Eight worlds as one batch; device="cuda" puts it on a GPU.
 envs = gym.make_vec("{id}", num_envs=8)
 ```"""
-NOTE = "<!-- Made by docs/build_environment_pages.py from the docstrings: edit those. -->"
 SAME_AS = re.compile(r"As in `(\w+)`\.\s*")
 COLUMNS = re.compile(r"\| `([^`]+) : ([^`]+)` \|")
 
@@ -62,14 +57,6 @@ def environment_class(registration: Registration) -> type[NPAEnv]:
     return found
 
 
-def sections(env_class: type) -> dict[str, str]:
-    """Return the sections of a class's docstring by their headings; the first has none."""
-    parts = re.split(r"^## (.+)\n", inspect.cleandoc(env_class.__doc__ or ""), flags=re.MULTILINE)
-    return {"": parts[0].strip()} | {
-        heading: text.strip() for heading, text in zip(parts[1::2], parts[2::2], strict=True)
-    }
-
-
 def resolved_sections(env_class: type) -> dict[str, str]:
     """Return the sections with those of other environments put where they are meant."""
     classes = {cls.__name__: cls for cls in map(environment_class, ENVIRONMENTS)}
@@ -79,41 +66,6 @@ def resolved_sections(env_class: type) -> dict[str, str]:
             other = resolved_sections(classes[same[1]])[heading]
             found[heading] = "\n\n".join(filter(None, (other, text[same.end() :])))
     return found
-
-
-def field_meanings(config_type: type) -> dict[str, str]:
-    """Return the docstring of each field of a configuration, as its source has it.
-
-    Args:
-        config_type: A dataclass; what a subclass says goes before what its bases say.
-    """
-    meanings: dict[str, str] = {}
-    for cls in reversed(config_type.__mro__[:-1]):
-        body = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0].body
-        for field, text in pairwise(body):
-            if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
-                meanings[field.target.id] = inspect.cleandoc(text.value.value)
-    return meanings
-
-
-def kind_text(annotation: Any) -> str:
-    """Return a type in words: Literals are the strings that they hold."""
-    if typing.get_origin(annotation) is Literal:
-        return "str"
-    parts = typing.get_args(annotation) or (annotation,)
-    return " or ".join("None" if part is type(None) else part.__name__ for part in parts)
-
-
-def default_text(default: Any) -> str:
-    """Return a default as code; strings in double quotes."""
-    return f"`{json.dumps(default) if isinstance(default, str) else default}`"
-
-
-def table(heading: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
-    """Return a Markdown table."""
-    lines = [heading, ("---",) * len(heading), *rows]
-    cells = ((re.sub(r"\s+", " ", cell).replace("|", "\\|") for cell in line) for line in lines)
-    return "\n".join(f"| {' | '.join(line)} |" for line in cells)
 
 
 def argument_tables(config_type: type[EnvConfig]) -> str:
@@ -222,7 +174,7 @@ def picture(registration: Registration) -> str:
 
 def index() -> str:
     """Return the list of the pages, Markdown."""
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for registration in ENVIRONMENTS:
         text = sections(environment_class(registration))[""]
         rows.append((f"[`{registration.id}`]({registration.name}.md)", text))
@@ -231,14 +183,14 @@ def index() -> str:
         "explained in [the mathematics](../mathematics.md#glossary). To make one of your own: "
         "[your own task as an environment](../own_environment.md)."
     )
-    listing = table(("Environment", "Task"), rows)
+    listing = table(("Environment", "Task"), [*rows, *species_pages.index_rows()])
     return "\n\n".join((NOTE, "# Environments", opening, listing)) + "\n"
 
 
 def pages() -> dict[str, str]:
     """Return all pages by their file names."""
     made = {f"{registration.name}.md": page(registration) for registration in ENVIRONMENTS}
-    return made | {"README.md": index()}
+    return made | species_pages.pages() | {"README.md": index()}
 
 
 def stale_pages(folder: Path = PAGES) -> list[str]:

@@ -1,0 +1,60 @@
+"""What pages of environments are put together from: sections of docstrings, tables of arguments."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import json
+import re
+import textwrap
+import typing
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any, Literal
+
+NOTE = "<!-- Made by docs/build_environment_pages.py from the docstrings: edit those. -->"
+
+
+def sections(env_class: type) -> dict[str, str]:
+    """Return the sections of a class's docstring by their headings; the first has none."""
+    parts = re.split(r"^## (.+)\n", inspect.cleandoc(env_class.__doc__ or ""), flags=re.MULTILINE)
+    return {"": parts[0].strip()} | {
+        heading: text.strip() for heading, text in zip(parts[1::2], parts[2::2], strict=True)
+    }
+
+
+def field_meanings(config_type: type) -> dict[str, str]:
+    """Return the docstring of each field of a configuration, as its source has it.
+
+    Args:
+        config_type: A dataclass; what a subclass says goes before what its bases say.
+    """
+    meanings: dict[str, str] = {}
+    for cls in reversed(config_type.__mro__[:-1]):
+        body = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0].body
+        for field, text in pairwise(body):
+            if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
+                meanings[field.target.id] = inspect.cleandoc(text.value.value)
+    return meanings
+
+
+def kind_text(annotation: Any) -> str:
+    """Return a type in words: Literals are the strings that they hold."""
+    if typing.get_origin(annotation) is Literal:
+        return "str"
+    if typing.get_origin(annotation) is tuple:
+        return str(annotation)
+    parts = typing.get_args(annotation) or (annotation,)
+    return " or ".join("None" if part is type(None) else part.__name__ for part in parts)
+
+
+def default_text(default: Any) -> str:
+    """Return a default as code; strings in double quotes."""
+    return f"`{json.dumps(default) if isinstance(default, str) else default}`"
+
+
+def table(heading: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
+    """Return a Markdown table."""
+    lines = [heading, ("---",) * len(heading), *rows]
+    cells = ((re.sub(r"\s+", " ", cell).replace("|", "\\|") for cell in line) for line in lines)
+    return "\n".join(f"| {' | '.join(line)} |" for line in cells)

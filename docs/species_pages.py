@@ -1,0 +1,120 @@
+"""The pages of PettingZoo's environments; `build_environment_pages.py` writes them."""
+
+from __future__ import annotations
+
+import typing
+from dataclasses import fields
+
+from draw_species_pictures import CAPTION, IMAGE
+from page_parts import NOTE, default_text, field_meanings, kind_text, sections, table
+
+from npa_envs.envs import multispecies_v0, particles_v0
+from npa_envs.envs.species import TASKS, SpeciesConfig
+from npa_envs.envs.species.crowd import CrowdEnv
+
+MODULES = {"MultiSpecies": multispecies_v0, "Particles": particles_v0}
+"""Modules by the names of their pages."""
+
+EXAMPLE = """\
+```python
+from npa_envs.envs import {module}
+
+env = {module}.parallel_env("mixing", species_count=2)
+observations, infos = env.reset(seed=0)
+while env.agents:
+    actions = {{agent: env.action_space(agent).sample() for agent in env.agents}}
+    observations, rewards, terminations, truncations, infos = env.step(actions)
+```"""
+RULES = """
+
+Two geckos grow side by side, each by the shipped rule:
+
+```python
+import npa_envs
+from npa_envs.agents import RulePolicy
+
+policy = RulePolicy(npa_envs.load_rule("gecko"))
+env = multispecies_v0.parallel_env("co_morphogenesis", targets=("gecko", "gecko"), max_cycles=200)
+observations, infos = env.reset(seed=0)
+while env.agents:
+    actions = {agent: policy(observation) for agent, observation in observations.items()}
+    observations, rewards, terminations, truncations, infos = env.step(actions)
+print({agent: round(info["loss"], 2) for agent, info in infos.items()})
+```"""
+
+
+def env_class(name: str) -> type[CrowdEnv]:
+    """Return the class that a page is about."""
+    found: type[CrowdEnv] = typing.get_type_hints(MODULES[name].parallel_env)["return"]
+    return found
+
+
+def argument_tables() -> str:
+    """Return the fields that all tasks have, and of each task those that are its own or differ."""
+    shared = rows(SpeciesConfig, {})
+    tables = [("Of every task", shared)]
+    usual = {field.name: field.default for field in fields(SpeciesConfig)}
+    for task, task_type in TASKS.items():
+        if own := rows(task_type.config_type, usual):
+            tables.append((f'Of `"{task}"`, besides or instead', own))
+    heading = ("Name", "Type", "Default", "Meaning")
+    return "\n\n".join(f"{title}:\n\n{table(heading, own)}" for title, own in tables)
+
+
+def rows(
+    config_type: type[SpeciesConfig], usual: dict[str, typing.Any]
+) -> list[tuple[str, str, str, str]]:
+    """Return rows for the fields of a configuration that `usual` does not hold as they are."""
+    meanings, kinds = field_meanings(config_type), typing.get_type_hints(config_type)
+    return [
+        (
+            f"`{field.name}`",
+            kind_text(kinds[field.name]),
+            default_text(field.default),
+            meanings[field.name],
+        )
+        for field in fields(config_type)
+        if field.name not in usual or usual[field.name] != field.default
+    ]
+
+
+def page(name: str) -> str:
+    """Return a page, Markdown."""
+    module = MODULES[name]
+    text = sections(env_class(name))
+    text["Version history"] = text["Version history"].partition("\n\nArgs:")[0]
+    if name == "MultiSpecies":
+        text["Arguments"] += "\n\n" + argument_tables()
+    env = module.parallel_env()
+    agent = env.possible_agents[0]
+    facts = table(
+        ("", "By default"),
+        [
+            ("Agents", f"`{agent}` to `{env.possible_agents[-1]}`"),
+            ("Observation space", f"`{env.observation_space(agent)}`"),
+            ("Action space", f"`{env.action_space(agent)}`"),
+            ("State space", f"float32, shape {env.state_space.shape}"),
+            ("Steps of an episode", str(env.max_cycles)),
+            ("Functions", "`parallel_env`, `env`, `raw_env`"),
+        ],
+    )
+    short = module.__name__.rpartition(".")[2]
+    example = EXAMPLE.format(module=short) + (RULES if name == "MultiSpecies" else "")
+    picture = f"![{CAPTION}](../images/{IMAGE.name})\n\n*{CAPTION}*"
+    shown = [picture] if name == "MultiSpecies" else []
+    opening = (f"# npa_envs.envs.{short}", text.pop(""), *shown, facts, example)
+    body = [f"## {heading}\n\n{content}" for heading, content in text.items()]
+    return "\n\n".join((NOTE, *opening, *body)) + "\n"
+
+
+def pages() -> dict[str, str]:
+    """Return the pages by their file names."""
+    return {f"{name}.md": page(name) for name in MODULES}
+
+
+def index_rows() -> list[tuple[str, str]]:
+    """Return rows for the list of all pages."""
+    return [
+        (f"[`{module.__name__}`]({name}.md)", sections(env_class(name))[""])
+        for name, module in MODULES.items()
+    ]

@@ -1,0 +1,66 @@
+"""Species as agents, the way PettingZoo has it: `parallel_env`, `env` and `raw_env`.
+
+Importing this module registers `npa/Mixing-v0` and its like with PettingZoo (1.27 or newer).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from npa_envs.envs.species.agents import MultiSpeciesEnv
+from npa_envs.envs.species.zoo import aec_env, clipped, register
+
+ENVIRONMENTS = {
+    "npa/Mixing-v0": "mixing",
+    "npa/Segregation-v0": "segregation",
+    "npa/CoMorphogenesis-v0": "co_morphogenesis",
+    "npa/Invasion-v0": "invasion",
+    "npa/Symbiosis-v0": "symbiosis",
+}
+"""Tasks by the ids that `pettingzoo.make` takes."""
+
+
+def parallel_env(task: str = "mixing", species_count: int = 2, **config: Any) -> MultiSpeciesEnv:
+    """Return an environment in which all species act at once.
+
+    Args:
+        task: "mixing", "segregation", "co_morphogenesis", "invasion" or "symbiosis".
+        species_count: Species K: agents `species_0` to `species_{K-1}`.
+        config: Fields of the task's configuration; docs/environments/MultiSpecies.md lists them.
+
+    Raises:
+        NPAError: A name is unknown, or a value wrong.
+    """
+    return MultiSpeciesEnv(task, species_count=species_count, **config)
+
+
+def raw_env(task: str = "mixing", species_count: int = 2, **config: Any) -> Any:
+    """Return an environment in which species act in turn, and the world after the last of them.
+
+    Args:
+        task: As for `parallel_env`.
+        species_count: As for `parallel_env`.
+        config: As for `parallel_env`.
+
+    Raises:
+        NPAError: As `parallel_env`.
+    """
+    return aec_env(parallel_env(task, species_count, **config))
+
+
+def env(task: str = "mixing", species_count: int = 2, **config: Any) -> Any:
+    """Return `raw_env` with actions clipped into their spaces.
+
+    Args:
+        task: As for `parallel_env`.
+        species_count: As for `parallel_env`.
+        config: As for `parallel_env`.
+
+    Raises:
+        NPAError: As `parallel_env`.
+    """
+    return clipped(raw_env(task, species_count, **config))
+
+
+for _id, _task in ENVIRONMENTS.items():
+    register(_id, __name__, {"task": _task})

@@ -1,0 +1,12 @@
+"""Worlds that several species share: tasks, and what PettingZoo's environments are made of.
+
+`npa_envs.envs.multispecies_v0` and `npa_envs.envs.particles_v0` are the way in. A task says where
+species begin and how far each of them is from its goal; `npa_envs.control` moves the particles.
+Nothing but `crowd` needs PettingZoo.
+"""
+
+from npa_envs.envs.species.config import SpeciesConfig
+from npa_envs.envs.species.tables import TASKS, task_type
+from npa_envs.envs.species.task import Population, SpeciesTask
+
+__all__ = ["TASKS", "Population", "SpeciesConfig", "SpeciesTask", "task_type"]

@@ -1,0 +1,87 @@
+"""Actions of several agents, checked and laid one after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from npa_envs.errors import NPAError
+
+
+def joined_actions(
+    actions: Any, agents: Sequence[str], shapes: Sequence[tuple[int, ...]], device: torch.device
+) -> Tensor:
+    """Return the actions of all live agents as rows, float32, shape [N, A].
+
+    Args:
+        actions: An array or tensor for each live agent.
+        agents: Live agents, in the order of their particles.
+        shapes: Shape of each one's action, [N_k, A] or [A].
+        device: Where the world lives.
+
+    Raises:
+        NPAError: There is an action too few or too many, or one has another shape or is no array
+            of finite numbers.
+    """
+    if not isinstance(actions, Mapping):
+        raise NPAError(
+            f"actions must be a dict with an action for each live agent, got "
+            f"{type(actions).__name__}: see env.agents"
+        )
+    missing = [agent for agent in agents if agent not in actions]
+    if missing:
+        raise NPAError(
+            f"actions must have one for each live agent, got none for {_names(missing)}: "
+            "zeros leave an agent's particles as they are"
+        )
+    live = set(agents)
+    extra = [str(agent) for agent in actions if agent not in live]
+    if extra:
+        raise NPAError(
+            f"actions must be of live agents only, got one for {_names(extra)}: agents that ended "
+            "get no more actions until reset; see env.agents"
+        )
+    rows = [
+        _checked(agent, actions[agent], shape).view(-1, shape[-1])
+        for agent, shape in zip(agents, shapes, strict=True)
+    ]
+    joined = torch.cat([row.to(device) for row in rows])
+    if not bool(torch.isfinite(joined).all()):
+        bad = next(k for k, row in enumerate(rows) if not bool(torch.isfinite(row).all()))
+        wrong = rows[bad][~torch.isfinite(rows[bad])]
+        raise NPAError(
+            f"actions[{agents[bad]!r}] must be finite, got {wrong[0].item()} ({wrong.numel()} such "
+            "numbers): check the policy; the world is as it was"
+        )
+    return joined
+
+
+def _checked(agent: str, action: Any, wanted: tuple[int, ...]) -> Tensor:
+    try:
+        if not isinstance(action, Tensor):
+            if np.iscomplexobj(action):
+                raise TypeError("complex numbers")
+            # Torch cannot read what may not be written.
+            action = torch.from_numpy(np.require(action, np.float32, ("C", "W")))
+    except (TypeError, ValueError) as error:
+        raise NPAError(_rule(agent, wanted, type(action).__name__)) from error
+    if tuple(action.shape) != wanted or action.dtype.is_complex:
+        raise NPAError(_rule(agent, wanted, f"{tuple(action.shape)} of {action.dtype}"))
+    checked: Tensor = action.detach().to(torch.float32)
+    return checked
+
+
+def _rule(agent: str, wanted: tuple[int, ...], came: str) -> str:
+    return (
+        f"actions[{agent!r}] must be real numbers of shape {wanted}, got {came}: "
+        f"see env.action_space({agent!r})"
+    )
+
+
+def _names(agents: Sequence[str]) -> str:
+    shown = ", ".join(agents[:3])
+    return shown if len(agents) <= 3 else f"{shown} and {len(agents) - 3} more"

@@ -1,0 +1,282 @@
+"""Who the agents are: species, or particles."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from npa_envs.envs.species.account import Losses
+from npa_envs.envs.species.crowd import CrowdEnv
+from npa_envs.envs.species.tables import task_type
+from npa_envs.envs.species.world import SpeciesWorld
+from npa_envs.errors import NPAError
+
+LARGEST_CROWD = 512
+"""No more agents than this: each costs a place in five dicts a step."""
+
+
+class MultiSpeciesEnv(CrowdEnv):
+    """Species that share one world, each an agent that controls all of its particles.
+
+    ## Description
+
+    A world holds particles of K species in the plane, those of each one after the other. Each
+    particle has a position and a state of C numbers, of which the last three, plus 0.5, are its
+    colour. In every step each agent tells all of its particles where to move and how to change
+    their states.
+
+    Particles perceive each other whatever their species, as in the paper: states and densities
+    around a particle are those of all. So species influence each other only by what they let others
+    perceive, and a species that wants to be told apart has to mark its particles by their states.
+    All of them perceive in one pass over the world.
+
+    | `task` | Id | What it is about |
+    |---|---|---|
+    | `"mixing"` | `npa/Mixing-v0` | species that start side by side are to mix |
+    | `"segregation"` | `npa/Segregation-v0` | species that start all mixed are to part |
+    | `"co_morphogenesis"` | `npa/CoMorphogenesis-v0` | each grows a picture of its own |
+    | `"invasion"` | `npa/Invasion-v0` | species 0 grows a picture, the others keep it from it |
+    | `"symbiosis"` | `npa/Symbiosis-v0` | all grow one picture that takes all particles |
+
+    `parallel_env` has all agents act at once. `env` and `raw_env` have them act in turn, by
+    PettingZoo's own conversion: the world moves on after the last one; `env` also clips actions
+    into their space. The ids are for `pettingzoo.make`, of PettingZoo 1.27 or newer, once
+    `npa_envs.envs.multispecies_v0` is imported: both `"parallel"` and `"aec"` are there.
+
+    A trained rule is a policy for one species:
+    `npa_envs.agents.RulePolicy(npa_envs.load_rule("gecko"))`. Where all species follow the same
+    rule, the episode is its rollout. That species disturb each other can be seen in an invasion by
+    the defaults: after 150 steps of this rule the loss of species 0 was 0.66 beside invaders that
+    did nothing, 0.85 beside some that followed the same rule, and 0.94 beside some that acted at
+    random (means of three seeds).
+
+    ## Observation space
+
+    `Box(-64, 64, (N_k, P), float32)` with P = 4C + 2, for species k: a row for each of its
+    particles, always in the same order. The columns are those of
+    [`npa/Morphogenesis2D-v0`](Morphogenesis2D.md#observation-space). Nothing tells a particle's
+    species.
+
+    ## Action space
+
+    `Box(-1, 1, (N_k, A), float32)` with A = 2 + C, for species k. The columns, and what they do,
+    are those of [`npa/Morphogenesis2D-v0`](Morphogenesis2D.md#action-space). Every live agent has
+    to give an action, and no other may: see `agents`. What is missing, unwanted, of another shape
+    or not finite raises `NPAError` and leaves the world as it was.
+
+    ## Reward
+
+    Each species k has a loss L_k, and its reward is L_k before the step minus L_k after it.
+
+    | Task | L_k | Parts |
+    |---|---|---|
+    | mixing | 1 less the mean entropy around its particles | `separation` |
+    | segregation | the mean entropy around its particles | `mixture` |
+    | co_morphogenesis | its particles' splat loss against `targets[k]` | `density`, `colour` |
+    | invasion | L_0: the splat loss of species 0; L_k: -L_0 / (K - 1) | `density`, `colour` |
+    | symbiosis | for all: the splat loss of all particles | `density`, `colour` |
+
+    The entropy around a particle is -Σ f_k ln f_k / ln K, where f_k is the share of species k among
+    the SPH-weighted neighbours within ε, itself included: 0 where it sees its own species alone, 1
+    where it sees all in equal parts. K counts the species that there were at the start. The splat
+    loss is that of [`npa/Morphogenesis2D-v0`](Morphogenesis2D.md#reward); it moves a picture's
+    middle onto the target's, so where the whole thing lies does not count.
+
+    With `reward="team"` every live agent is paid the mean of all; the parts in `info` stay its own.
+    In an invasion rewards sum to zero: what species 0 gains, the live invaders lose in equal parts,
+    and "team" is refused.
+
+    Rewards telescope but for deaths: particles that are taken out change the others' losses, which
+    is nobody's merit and not paid. In the step in which a species leaves the world L_k counts as at
+    least its value at the start, so that leaving never pays; the parts in `info` are as they are.
+
+    ## Starting state
+
+    Each species is uniform in a disk of radius `seed_radius`, all states are zero. The disks'
+    centres lie in a row along x, `seed_distance` apart, their middle at the origin.
+    `reset(seed=k)` begins the sequence of episodes that belongs to k, and `reset()` goes on with
+    the next one.
+
+    ## Episode end
+
+    | Cause | Ends | Returned as | `info["reason"]` |
+    |---|---|---|---|
+    | a pair of `deaths` names the species and this step | the species | terminated | `"removed"` |
+    | all its particles are out of bounds | the species | terminated | `"left the world"` |
+    | one side of an invasion is gone | all | terminated | `"no opponent"` |
+    | `max_cycles` steps are done | all | truncated | `"time limit"` |
+
+    A particle is out of bounds where a coordinate is held at ±`position_limit` or a state at
+    ±`observation_limit`; while others of its species are not, it stays and may come back. A species
+    that ends is taken out of `agents` and, but for the survivors of an invasion, out of the world:
+    the observations that the others get in that step are already without it, its own last one is
+    with it. No species comes back before `reset`.
+
+    ## Info
+
+    One dict for each agent that acted.
+
+    | Key | In | Value |
+    |---|---|---|
+    | `species` | reset, step | the agent's species, from 0 on |
+    | `loss` | reset, step | L_k as it is now |
+    | `loss_separation`, ... | reset, step | its parts, by their names above |
+    | `reward_separation`, ... | step | how much each part fell in this step |
+    | `reason` | last step | why the agent's episode ended, see above |
+
+    ## State
+
+    `state()` is for central critics: float32, shape [N, 2 + C + 1], a row [position; state; 1] for
+    each particle that the episode began with, zeros for those that are gone. `state_space` is its
+    space. `particles()` returns positions and states of those that are there, and
+    `place_particles(x, s)` replaces them, at no reward.
+
+    ## Rendering
+
+    `render_mode="rgb_array"` makes uint8 pictures of shape [R, R, 3], R = `render_size`, with y up.
+    `render_mode="human"` shows them in a window; it needs `pip install 'npa-envs[human]'` and a
+    screen: without one, it warns once and goes on. With `render_style="species"` each species has a
+    colour of its own; the other styles are those of the single environments.
+
+    ## Arguments
+
+    `task` and `species_count` come first, all else is by keyword, in `parallel_env`, `env`,
+    `raw_env` and `pettingzoo.make` alike. An unknown name, or a value out of range, raises an
+    `NPAError` that says what would be right.
+
+    ## Version history
+
+    - v0: first version.
+
+    Args:
+        task: A name from `npa_envs.envs.species.TASKS`.
+        config: Fields of the task's configuration.
+
+    Raises:
+        NPAError: A name is unknown, or a value wrong.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = CrowdEnv.metadata | {"name": "npa_multispecies_v0"}
+    agent_word = "species"
+    rows = True
+
+    def __init__(self, task: str = "mixing", **config: Any) -> None:
+        super().__init__(task, config)
+
+    def owners(self, world: SpeciesWorld) -> NDArray[np.int64]:
+        """Return the species of each particle."""
+        return world.species
+
+    @torch.no_grad()
+    def measured(self) -> Losses:
+        """Return the parts of each species' loss."""
+        losses = self.world.task.losses(self.world.population)
+        return {name: loss.cpu().numpy().astype(np.float64) for name, loss in losses.items()}
+
+
+class ParticlesEnv(CrowdEnv):
+    """Few particles that share one world, each an agent.
+
+    ## Description
+
+    The worlds and tasks of [several species](MultiSpecies.md), with the same seeds and the same
+    physics, but every particle is an agent: `particle_0`, `particle_1`, ... in the order of their
+    species. `info["species"]` tells which one it is of. Each agent costs places in five dicts a
+    step, so there are at most 512; beyond, let species be the agents.
+
+    ## Observation space
+
+    `Box(-64, 64, (P,), float32)` with P = 4C + 2: one row of what a species would observe.
+
+    ## Action space
+
+    `Box(-1, 1, (A,), float32)` with A = 2 + C: one row of what a species would do.
+
+    ## Reward
+
+    Each particle has a loss of its own, and its reward is how much it fell in the step.
+
+    | Task | Loss of a particle | Part |
+    |---|---|---|
+    | mixing | 1 less the entropy around it | `separation` |
+    | segregation | the entropy around it | `mixture` |
+    | co_morphogenesis | its share of its species' splat loss | `picture` |
+    | invasion | species 0: its share of the splat loss; others: -Σ / their number | `picture` |
+    | symbiosis | its share of the splat loss of all particles | `picture` |
+
+    A share comes from the errors of the pixels that a particle covers; what nobody covers is shared
+    by all alike. The mean of all shares is the splat loss, up to rounding, and Σ is their sum. With
+    `reward="team"` every particle is paid the mean of all. In an invasion rewards sum to zero.
+
+    ## Starting state
+
+    As for [several species](MultiSpecies.md#starting-state).
+
+    ## Episode end
+
+    As for [several species](MultiSpecies.md#episode-end), particle by particle: one that is out of
+    bounds leaves the world alone, and all those of a species that `deaths` names end together.
+
+    ## Info
+
+    | Key | In | Value |
+    |---|---|---|
+    | `species` | reset, step | the particle's species, from 0 on |
+    | `loss` | reset, step | its loss as it is now |
+    | `loss_separation`, ... | reset, step | the same by the name of its part, see above |
+    | `reward_separation`, ... | step | how much that fell in this step |
+    | `reason` | last step | why the particle's episode ended |
+
+    ## State
+
+    As for [several species](MultiSpecies.md#state).
+
+    ## Rendering
+
+    As for [several species](MultiSpecies.md#rendering).
+
+    ## Arguments
+
+    Those of [several species](MultiSpecies.md#arguments), of `npa_envs.envs.particles_v0` instead;
+    `particle_count` is 64 by default and 512 at most.
+
+    ## Version history
+
+    - v0: first version.
+
+    Args:
+        task: A name from `npa_envs.envs.species.TASKS`.
+        config: Fields of the task's configuration.
+
+    Raises:
+        NPAError: A name is unknown, a value wrong, or there are more than 512 particles.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = CrowdEnv.metadata | {"name": "npa_particles_v0"}
+    agent_word = "particle"
+    rows = False
+
+    def __init__(self, task: str = "mixing", **config: Any) -> None:
+        count = sum(task_type(task).config_type.from_keywords(config).counts)
+        if count > LARGEST_CROWD:
+            raise NPAError(
+                f"particle_count must be at most {LARGEST_CROWD} where every particle is an agent, "
+                f"got {count}: make species the agents with npa_envs.envs.multispecies_v0"
+            )
+        super().__init__(task, config)
+
+    def owners(self, world: SpeciesWorld) -> NDArray[np.int64]:
+        """Return a number of its own for each particle."""
+        return np.arange(world.particle_count)
+
+    @torch.no_grad()
+    def measured(self) -> Losses:
+        """Return the parts of each particle's loss; zeros for those that are gone."""
+        measured = {}
+        for name, loss in self.world.task.particle_losses(self.world.population).items():
+            measured[name] = np.zeros(self.world.particle_count)
+            measured[name][self.world.present] = loss.cpu().numpy()
+        return measured

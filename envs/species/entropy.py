@@ -1,0 +1,40 @@
+"""How well species are mixed around every particle."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from npa_envs import perceive
+from npa_envs.envs.species.task import Population
+
+
+def local_entropy(population: Population, *, eps: float, box: float | None) -> Tensor:
+    """Return the entropy of species around each particle, in [0, 1], dimensionless, shape [N].
+
+    The share of species k around particle i is f_k = b_k / Σ b, where b are the SPH-smoothed tags
+    (1 for a particle of species k, else 0). The entropy is −Σ f_k ln f_k / ln K: 0 where a particle
+    sees its own species alone, 1 where all K are there in equal parts.
+
+    Args:
+        population: The particles; K is the number of species that there were at the start.
+        eps: Perception radius [length units].
+        box: Side of the periodic box [length units], or None in open space.
+    """
+    species_count = len(population.counts)
+    tags = torch.nn.functional.one_hot(population.species, species_count).to(population.x)
+    seen = perceive(
+        population.x,
+        tags[None],
+        eps,
+        box=box,
+        state_gradient=False,
+        moment_correction=False,
+        density_gradient=False,
+    )
+    blur = seen[0, :, species_count:]
+    shares = blur / blur.sum(dim=1, keepdim=True)
+    entropy: Tensor = torch.special.entr(shares).sum(dim=1)
+    return entropy / math.log(species_count)

@@ -1,0 +1,94 @@
+"""`npa/Invasion-v0`: species 0 grows a picture, the others keep it from doing so."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from npa_envs.envs.species.growth import make_goal, picture_parts
+from npa_envs.envs.species.symbiosis import OneTargetConfig
+from npa_envs.envs.species.task import Population, SpeciesTask
+from npa_envs.errors import NPAError
+
+
+@dataclass(frozen=True, kw_only=True)
+class InvasionConfig(OneTargetConfig):
+    """What invasion can be told besides: species start beside each other."""
+
+    def __post_init__(self) -> None:
+        """Check every field.
+
+        Raises:
+            NPAError: A field has the wrong type or lies outside its range.
+        """
+        super().__post_init__()
+        if self.reward != "individual":
+            raise NPAError(
+                f"reward must be 'individual' in invasion, got {self.reward!r}: the sum of all "
+                "rewards is zero, so there is nothing to share"
+            )
+
+
+class InvasionTask(SpeciesTask):
+    """The splat loss of species 0; what it gains, the others lose together.
+
+    Args:
+        config: The environment's configuration.
+        device: Where the world lives.
+
+    Raises:
+        NPAError: The target cannot be loaded.
+    """
+
+    config_type = InvasionConfig
+
+    def __init__(self, config: InvasionConfig, device: torch.device) -> None:
+        super().__init__(config, device)
+        self.goal = make_goal(config, config.target, config.counts[0], device)
+        """The task of species 0 with its target and its loss."""
+
+    def losses(self, population: Population) -> Mapping[str, Tensor]:
+        """Return the parts of species 0's splat loss, and minus an equal share for each other."""
+        return {
+            name: torch.cat(
+                (loss, (-loss / _others(population.counts)).expand(len(population.counts) - 1))
+            )
+            for name, loss in picture_parts(self.goal, *population.of(0)).items()
+        }
+
+    def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
+        """Return shares of species 0's splat loss, and minus an equal share for each other one."""
+        own = self.goal.particle_shares(*population.of(0))[0]
+        other_count = sum(population.counts[1:])
+        others = (-own.sum() / max(other_count, 1)).expand(other_count)
+        return {"picture": torch.cat((own, others))}
+
+    def settle(
+        self, rewards: NDArray[np.float64], species: NDArray[np.int64]
+    ) -> NDArray[np.float64]:
+        """Return rewards of which the sum is zero: invaders pay in equal parts for species 0."""
+        invading = species > 0
+        return np.where(invading, -rewards[~invading].sum() / max(invading.sum(), 1), rewards)
+
+    def is_over(self, counts: tuple[int, ...]) -> bool:
+        """Return whether one side is gone."""
+        return counts[0] == 0 or sum(counts[1:]) == 0
+
+    @property
+    def pixel_size(self) -> float:
+        """Size of a particle in pictures: the distance of the target's points."""
+        return self.goal.target.pixel_size
+
+    @property
+    def half_width(self) -> float:
+        """Half of a picture [length units]: the target fits where the seed was."""
+        return float(1.0 + 0.5 * (self.config.species_count - 1) * self.config.seed_distance)
+
+
+def _others(counts: tuple[int, ...]) -> int:
+    return max(sum(count > 0 for count in counts[1:]), 1)

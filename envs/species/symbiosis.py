@@ -1,0 +1,76 @@
+"""`npa/Symbiosis-v0`: species grow one picture that none of them can grow alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from npa_envs.envs.species.growth import GrowthConfig, make_goal, picture_parts
+from npa_envs.envs.species.task import Population, SpeciesTask
+from npa_envs.errors import NPAError
+
+
+@dataclass(frozen=True, kw_only=True)
+class OneTargetConfig(GrowthConfig):
+    """What tasks with one picture can be told besides."""
+
+    target: str = "gecko"
+    """What to grow: a built-in name (`npa-envs list`), an emoji, or the path of a picture."""
+
+    def __post_init__(self) -> None:
+        """Check every field.
+
+        Raises:
+            NPAError: A field has the wrong type or lies outside its range.
+        """
+        super().__post_init__()
+        if not isinstance(self.target, str) or not self.target:
+            raise NPAError(
+                f"target must be a built-in name, an emoji or a path, got {self.target!r}: "
+                "for example target='gecko'"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SymbiosisConfig(OneTargetConfig):
+    """What symbiosis can be told besides: species start in one disk."""
+
+    seed_distance: float = 0.0
+    """Distance between the centres of neighbouring disks, which lie in a row [length units]."""
+
+
+class SymbiosisTask(SpeciesTask):
+    """The splat loss of all particles' picture, against a target of as many points.
+
+    Args:
+        config: The environment's configuration.
+        device: Where the world lives.
+
+    Raises:
+        NPAError: The target cannot be loaded.
+    """
+
+    config_type = SymbiosisConfig
+    least_species = 1
+
+    def __init__(self, config: SymbiosisConfig, device: torch.device) -> None:
+        super().__init__(config, device)
+        self.goal = make_goal(config, config.target, sum(config.counts), device)
+        """The task with its target and its loss."""
+
+    def losses(self, population: Population) -> Mapping[str, Tensor]:
+        """Return the density error and the weighted colour error, the same for every species."""
+        parts = picture_parts(self.goal, population.x, population.s)
+        return {name: loss.expand(len(population.counts)) for name, loss in parts.items()}
+
+    def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
+        """Return each particle's share of the splat loss."""
+        return {"picture": self.goal.particle_shares(population.x, population.s)[0]}
+
+    @property
+    def pixel_size(self) -> float:
+        """Size of a particle in pictures: the distance of the target's points."""
+        return self.goal.target.pixel_size

@@ -1,0 +1,34 @@
+"""The one table of tasks for several species."""
+
+from __future__ import annotations
+
+from npa_envs.envs.species.co_morphogenesis import CoMorphogenesisTask
+from npa_envs.envs.species.invasion import InvasionTask
+from npa_envs.envs.species.mixing import MixingTask
+from npa_envs.envs.species.segregation import SegregationTask
+from npa_envs.envs.species.symbiosis import SymbiosisTask
+from npa_envs.envs.species.task import SpeciesTask
+from npa_envs.errors import NPAError, suggest
+
+TASKS: dict[str, type[SpeciesTask]] = {
+    "mixing": MixingTask,
+    "segregation": SegregationTask,
+    "co_morphogenesis": CoMorphogenesisTask,
+    "invasion": InvasionTask,
+    "symbiosis": SymbiosisTask,
+}
+"""Tasks by the names that environments take."""
+
+
+def task_type(name: str) -> type[SpeciesTask]:
+    """Return a task's class.
+
+    Args:
+        name: One of `TASKS`.
+
+    Raises:
+        NPAError: There is no such task.
+    """
+    if not isinstance(name, str) or name not in TASKS:
+        raise NPAError(f"task must be a known word, got {name!r}: {suggest(str(name), TASKS)}")
+    return TASKS[name]

@@ -1,0 +1,154 @@
+"""What an environment of several species asks of its task."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from itertools import accumulate
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from npa_envs.envs.species.config import SpeciesConfig
+from npa_envs.errors import NPAError
+from npa_envs.randomness import WorldRandom
+from npa_envs.tasks.seeds import uniform_ball
+
+
+class Population(NamedTuple):
+    """The particles of a world, those of each species one after the other."""
+
+    x: Tensor
+    """Positions [length units], shape [1, N, 2]."""
+
+    s: Tensor
+    """States, dimensionless, shape [1, N, C]."""
+
+    counts: tuple[int, ...]
+    """Particles of each species; 0 where it is gone. Known to the host."""
+
+    @property
+    def spans(self) -> list[slice]:
+        """Where each species' particles stand."""
+        ends = list(accumulate(self.counts))
+        return [slice(end - count, end) for end, count in zip(ends, self.counts, strict=True)]
+
+    @property
+    def species(self) -> Tensor:
+        """Species of each particle, int64, shape [N]."""
+        counts = torch.tensor(self.counts)
+        return torch.arange(len(self.counts)).repeat_interleave(counts).to(self.x.device)
+
+    def of(self, species: int) -> tuple[Tensor, Tensor]:
+        """Return positions and states of one species, shapes [1, N_k, 2] and [1, N_k, C]."""
+        span = self.spans[species]
+        return self.x[:, span], self.s[:, span]
+
+
+class SpeciesTask:
+    """One task of several species; a loss for each, and one for each particle.
+
+    An agent's reward is how much its loss falls in a step, so losses go down where it does well.
+
+    Args:
+        config: The environment's configuration.
+        device: Where the world lives.
+
+    Raises:
+        NPAError: There are too few species.
+    """
+
+    config_type: ClassVar[type[SpeciesConfig]] = SpeciesConfig
+    """The configuration's class: its fields are the environment's keywords."""
+
+    least_species: ClassVar[int] = 2
+    """The task makes no sense with fewer."""
+
+    def __init__(self, config: Any, device: torch.device) -> None:
+        if config.species_count < self.least_species:
+            raise NPAError(
+                f"species_count must be at least {self.least_species} in this task, got "
+                f"{config.species_count}: with one species there is nobody to meet"
+            )
+        self.config = config
+        self.device = device
+
+    def start(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
+        """Return a fresh world: each species uniform in a disk of its own, all states zero.
+
+        Args:
+            random: Where positions come from, one stream.
+
+        Returns:
+            Positions [length units], shape [1, N, 2]; states, dimensionless, shape [1, N, C].
+        """
+        config = self.config
+        count = sum(config.counts)
+        x = uniform_ball(1, count, 2, config.seed_radius, generator=random, device=self.device)
+        middle = 0.5 * (config.species_count - 1)
+        places = [config.seed_distance * (k - middle) for k in range(config.species_count)]
+        shift = torch.tensor(places).repeat_interleave(torch.tensor(config.counts))
+        x[..., 0] += shift.to(self.device)
+        return x, x.new_zeros(1, count, config.state_dim)
+
+    def losses(self, population: Population) -> Mapping[str, Tensor]:
+        """Return the named parts of each species' loss, shape [K] each; their sum is its loss.
+
+        Args:
+            population: At least one particle; the loss of a species that is gone is never read.
+        """
+        raise NotImplementedError
+
+    def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
+        """Return the named parts of each particle's loss, shape [N] each; their sum is its loss.
+
+        Args:
+            population: At least one particle.
+        """
+        raise NotImplementedError
+
+    def settle(
+        self, rewards: NDArray[np.float64], species: NDArray[np.int64]
+    ) -> NDArray[np.float64]:
+        """Return what agents are paid; by default what each has earned.
+
+        Args:
+            rewards: How much each agent's loss fell in the step, shape [agents].
+            species: Species of each agent, shape [agents].
+        """
+        return rewards
+
+    def is_over(self, counts: tuple[int, ...]) -> bool:
+        """Return whether the episode ends for all, where species are gone; by default it goes on.
+
+        Args:
+            counts: Particles of each species.
+        """
+        return False
+
+    @property
+    def pixel_size(self) -> float:
+        """Size of a particle in pictures: their distance where all fill the unit disk."""
+        return math.sqrt(math.pi / sum(self.config.counts))
+
+    @property
+    def half_width(self) -> float:
+        """From the middle of a picture to its edge [length units]."""
+        if self.config.boundary == "periodic":
+            return max(1.0, 0.5 * float(self.config.box_size))
+        return max(1.0, 1.25 * float(self.config.seed_span))
+
+
+def by_species(losses: list[Tensor], population: Population) -> Tensor:
+    """Return losses of the species that are there as one tensor, shape [K], 0 for the others.
+
+    Args:
+        losses: One for each species with particles, shape [1] each, in order.
+        population: Who is there.
+    """
+    remaining = iter(losses)
+    nothing = population.x.new_zeros(1)
+    return torch.cat([next(remaining) if count else nothing for count in population.counts])

@@ -1,0 +1,79 @@
+"""Small worlds of several species, and how to act in them."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from npa_envs.envs import multispecies_v0
+from npa_envs.envs.species.agents import MultiSpeciesEnv
+from npa_envs.tasks import morphogenesis2d
+
+TASKS = ("mixing", "segregation", "co_morphogenesis", "invasion", "symbiosis")
+PICTURES = ("co_morphogenesis", "invasion", "symbiosis")
+
+
+def small(task: str, **keywords: Any) -> dict[str, Any]:
+    """Keywords of a small world."""
+    fields: dict[str, Any] = {"eps": 0.3, "max_cycles": 6, "render_size": 24}
+    if "particle_counts" not in keywords:
+        fields["particle_count"] = 41
+    if task in PICTURES:
+        fields["resolution"] = 16
+    return {"task": task} | fields | keywords
+
+
+def targets_made_once() -> Iterator[None]:
+    """Keep targets: to draw and resample one takes longer than what is tested with it."""
+    with pytest.MonkeyPatch.context() as patch:
+        made_once = functools.cache(morphogenesis2d.load_target)
+        patch.setattr(morphogenesis2d, "load_target", made_once)
+        yield
+
+
+def still(env: Any) -> dict[str, Any]:
+    """Actions that change nothing."""
+    return {a: np.zeros(env.action_space(a).shape, np.float32) for a in env.agents}
+
+
+def drawn(env: Any, generator: np.random.Generator) -> dict[str, Any]:
+    """Random actions."""
+    return {
+        a: generator.uniform(-1, 1, env.action_space(a).shape).astype(np.float32)
+        for a in env.agents
+    }
+
+
+def make(task: str = "mixing", **keywords: Any) -> MultiSpeciesEnv:
+    """A small world of several species."""
+    return multispecies_v0.parallel_env(**small(task, **keywords))
+
+
+def pair(task: str = "mixing", **keywords: Any) -> MultiSpeciesEnv:
+    """One particle of each of two species, half a radius apart; every action takes effect."""
+    env = make(task, particle_counts=(1, 1), update_prob=1.0, **keywords)
+    env.reset(seed=0)
+    env.place_particles([[0.0, 0.0], [0.15, 0.0]], np.zeros((2, 16)))
+    return env
+
+
+def apart(env: MultiSpeciesEnv) -> dict[str, Any]:
+    """Actions by which species 1 goes half a radius to the right."""
+    actions = still(env)
+    actions["species_1"][:, 0] = 1.0
+    return actions
+
+
+def pair_entropy(share: float) -> float:
+    """Entropy of two species with shares `share` and the rest, in units of ln 2."""
+    rest = 1.0 - share
+    return -(share * math.log(share) + rest * math.log(rest)) / math.log(2.0)
+
+
+# A neighbour at half the radius weighs (1 − 1/4)³ of what a particle weighs for itself.
+HALF_WAY = pair_entropy(1.0 / (1.0 + 0.75**3))

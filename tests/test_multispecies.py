@@ -1,0 +1,451 @@
+"""Species as agents: PettingZoo's own tests, seeds, deaths, pictures, errors."""
+
+from __future__ import annotations
+
+import pickle
+import subprocess
+import sys
+
+import numpy as np
+import pettingzoo
+import pytest
+import torch
+from crowds import TASKS, apart, drawn, make, pair, small, still, targets_made_once
+from pettingzoo.test import api_test, parallel_api_test, render_test, seed_test
+from pettingzoo.test.max_cycles_test import max_cycles_test
+from pettingzoo.test.seed_test import parallel_seed_test
+from pettingzoo.test.state_test import state_test
+
+import npa_envs
+from npa_envs.agents import RulePolicy
+from npa_envs.envs import multispecies_v0
+from npa_envs.envs.species import TASKS as TABLE
+from npa_envs.envs.species import world as world_module
+from npa_envs.errors import NPAError
+
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:pettingzoo")
+quick_targets = pytest.fixture(scope="module", autouse=True)(targets_made_once)
+
+
+def test_the_tests_know_all_tasks():
+    assert TASKS == tuple(TABLE) == tuple(multispecies_v0.ENVIRONMENTS.values())
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_passes_the_parallel_api_test(task, capsys):
+    parallel_api_test(make(task, deaths=((1, 3),)), num_cycles=8)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_passes_the_api_test(task, capsys):
+    api_test(multispecies_v0.env(**small(task, deaths=((1, 3),))), num_cycles=8)
+    api_test(multispecies_v0.raw_env(**small(task)), num_cycles=8)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_passes_the_seed_tests(task):
+    parallel_seed_test(lambda: make(task), num_cycles=5)
+    seed_test(lambda: multispecies_v0.env(**small(task)), num_cycles=5)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_passes_the_render_and_state_tests(task, monkeypatch, recwarn):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    render_test(lambda **mode: multispecies_v0.env(**small(task), **mode))
+    state_test(multispecies_v0.env(**small(task)), make(task), num_cycles=3)
+
+
+def test_a_window_without_a_screen_warns_and_goes_on(monkeypatch):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "not a driver")
+    env = make(render_mode="human")
+    with pytest.warns(UserWarning, match="there is no screen"):
+        env.reset(seed=0)
+    _, rewards, *_ = env.step(drawn(env, np.random.default_rng(0)))
+    assert rewards["species_0"] != 0.0
+    assert env.render() is None
+    env.close()
+
+
+def test_passes_the_test_of_max_cycles():
+    max_cycles_test(multispecies_v0)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_thirty_steps_are_equal_for_equal_seeds_and_differ_for_others(task):
+    keywords = {"max_cycles": 99, "position_noise": 0.01, "deaths": ((1, 20),)}
+    envs = [make(task, **keywords) for _ in range(3)]
+    first, again, other = (env.reset(seed=s)[0] for env, s in zip(envs, (4, 4, 5), strict=True))
+    assert np.array_equal(first["species_0"], again["species_0"])
+    assert not np.array_equal(first["species_0"], other["species_0"])
+    generators = [np.random.default_rng(0) for _ in envs]
+    for _ in range(30):
+        first, again, other = (
+            env.step(drawn(env, generator)) for env, generator in zip(envs, generators, strict=True)
+        )
+        assert first[1:] == again[1:]
+        for agent in first[0]:
+            assert np.array_equal(first[0][agent], again[0][agent])
+        assert not np.array_equal(first[0]["species_0"], other[0]["species_0"])
+        if not envs[0].agents:
+            break
+    assert envs[0].agents == ([] if task == "invasion" else ["species_0"])
+
+
+def test_episodes_go_on_in_a_sequence_that_a_seed_begins():
+    env, longer = make(max_cycles=9), make(max_cycles=9)
+    first, _ = env.reset(seed=4)
+    longer.reset(seed=4)
+    for steps, e in ((1, env), (5, longer)):
+        for _ in range(steps):
+            e.step(still(e))
+    second, _ = env.reset()
+    assert np.array_equal(second["species_1"], longer.reset()[0]["species_1"])
+    assert not np.array_equal(second["species_1"], first["species_1"])
+    again, _ = env.reset(seed=4)
+    assert np.array_equal(again["species_1"], first["species_1"])
+    steps = 0
+    while env.agents:
+        env.step(still(env))
+        steps += 1
+    assert steps == env.max_cycles == 9
+    unseeded = [make().reset()[0]["species_0"] for _ in range(2)]
+    assert not np.array_equal(*unseeded)
+
+
+def test_turns_lead_to_the_same_world_as_acting_at_once():
+    together, turns = make(), multispecies_v0.env(**small("mixing"))
+    together.reset(seed=3)
+    turns.reset(seed=3)
+    generator = np.random.default_rng(1)
+    for _ in range(6):
+        actions = drawn(together, generator)
+        observations, rewards, *_ = together.step(actions)
+        for agent, action in actions.items():
+            assert turns.agent_selection == agent
+            turns.step(action)
+        for agent in actions:
+            assert np.array_equal(turns.observe(agent), observations[agent])
+            assert turns.rewards[agent] == rewards[agent]
+    assert turns.truncations == {"species_0": True, "species_1": True}
+
+
+def test_turns_clip_actions_that_are_too_large(recwarn):
+    large, right = (multispecies_v0.env(**small("mixing", update_prob=1.0)) for _ in range(2))
+    for env, size in ((large, 3.0), (right, 1.0)):
+        env.reset(seed=0)
+        for agent in env.agents:
+            env.step(np.full(env.action_space(agent).shape, size, np.float32))
+    assert np.array_equal(large.state(), right.state())
+
+
+def test_one_pass_perceives_for_all_species(monkeypatch):
+    env = make(species_count=3)
+    env.reset(seed=0)
+    calls = []
+
+    def survey(*worlds):
+        calls.append(worlds[0].shape)
+        return survey_worlds(*worlds)
+
+    survey_worlds = world_module.survey_worlds
+    monkeypatch.setattr(world_module, "survey_worlds", survey)
+    observations, *_ = env.step(still(env))
+    assert calls == [(1, 41, 2)]
+    x, s = env.particles()
+    z = npa_envs.perceive(x[None], s[None], 0.3, 0.1)[0].numpy()
+    seen = np.concatenate([observations[f"species_{k}"] for k in range(3)])
+    np.testing.assert_allclose(seen, z, rtol=1e-5, atol=1e-6)
+    assert [len(rows) for rows in observations.values()] == [14, 14, 13]
+
+
+def test_species_have_spaces_of_their_own_sizes_and_the_state_shows_all():
+    env = make(species_count=2, particle_counts=[3, 5])
+    observations, _ = env.reset(seed=0)
+    assert env.observation_space("species_1").shape == (5, 66)
+    assert env.action_space("species_0").shape == (3, 18)
+    assert observations["species_1"].dtype == np.float32
+    x, s = env.particles()
+    wanted = np.concatenate((x, s, np.ones((8, 1))), axis=1).astype(np.float32)
+    assert np.array_equal(env.state(), wanted)
+    assert env.state_space.contains(env.state())
+
+
+def test_species_start_in_disks_in_a_row():
+    env = make(species_count=3, particle_counts=(40, 40, 40), seed_distance=1.0, seed_radius=0.2)
+    env.reset(seed=0)
+    x, s = env.particles()
+    for k, middle in enumerate((-1.0, 0.0, 1.0)):
+        offset = x[40 * k : 40 * (k + 1)] - torch.tensor([middle, 0.0])
+        assert 0.15 < float(offset.norm(dim=1).max()) <= 0.2 + 1e-6
+    assert float(s.abs().max()) == 0.0
+
+
+def test_an_action_moves_particles_and_changes_states_as_far_as_it_says():
+    env = pair()
+    actions = apart(env)
+    actions["species_0"][:, 2:] = 0.25
+    env.step(actions)
+    x, s = env.particles()
+    torch.testing.assert_close(x, torch.tensor([[0.0, 0.0], [0.3, 0.0]]))
+    assert s.unique(dim=1).flatten().tolist() == [0.25, 0.0]
+
+
+@pytest.mark.parametrize("update_prob", [0.5, 1.0])
+def test_species_that_follow_one_rule_live_as_its_rollout(update_prob):
+    rule = npa_envs.load_rule("gecko")
+    policy = RulePolicy(rule)
+    keywords = {"eps": 0.1, "update_prob": update_prob, "species_count": 3}
+    env = make("co_morphogenesis", particle_count=150, **keywords)
+    observations, _ = env.reset(seed=7)
+    x, s = (tensor[None] for tensor in env.particles())
+    random = npa_envs.WorldRandom(7)
+    with torch.no_grad():
+        x, s = npa_envs.rollout(rule, x, s, steps=6, update_prob=update_prob, generator=random)
+    while env.agents:
+        actions = {agent: policy(seen) for agent, seen in observations.items()}
+        observations, *_ = env.step(actions)
+    torch.testing.assert_close(env.particles()[0], x[0], rtol=0.0, atol=2e-5)
+    torch.testing.assert_close(env.particles()[1], s[0], rtol=0.0, atol=2e-4)
+
+
+def test_a_species_that_is_removed_is_gone():
+    env = make(species_count=3, deaths=((1, 2),), update_prob=1.0)
+    env.reset(seed=0)
+    _, _, terminations, _, _ = env.step(still(env))
+    assert not any(terminations.values())
+    observations, rewards, terminations, truncations, infos = env.step(still(env))
+    assert terminations == {"species_0": False, "species_1": True, "species_2": False}
+    assert not any(truncations.values())
+    assert infos["species_1"]["reason"] == "removed"
+    assert "reason" not in infos["species_0"]
+    assert rewards == dict.fromkeys(terminations, 0.0)
+    assert env.agents == ["species_0", "species_2"]
+    x, s = env.particles()
+    assert x.shape == (27, 2)
+    state = env.state()
+    assert state[:, -1].tolist() == [1.0] * 14 + [0.0] * 14 + [1.0] * 13
+    assert not state[14:28].any()
+    z = npa_envs.perceive(x[None], s[None], 0.3, 0.1)[0].numpy()
+    seen = np.concatenate([observations["species_0"], observations["species_2"]])
+    np.testing.assert_allclose(seen, z, rtol=1e-5, atol=1e-6)
+    observations, rewards, *_ = env.step(still(env))
+    assert list(observations) == ["species_0", "species_2"]
+    # That neighbours vanished is no merit and no fault.
+    assert rewards == {"species_0": 0.0, "species_2": 0.0}
+    with pytest.raises(NPAError, match="got one for species_1: agents that ended"):
+        env.step(dict.fromkeys(("species_0", "species_1", "species_2"), np.zeros((14, 18))))
+    env.reset()
+    assert env.agents == ["species_0", "species_1", "species_2"]
+    assert env.particles()[0].shape == (41, 2)
+
+
+def test_the_last_observation_of_a_species_is_of_the_world_with_it():
+    env = make(particle_counts=(1, 1), deaths=((1, 1),))
+    env.reset(seed=0)
+    s = np.zeros((2, 16))
+    s[0, 0] = 1.0
+    env.place_particles([[0.0, 0.0], [0.15, 0.0]], s)
+    observations, *_ = env.step(still(env))
+    share = 0.75**3 / (1.0 + 0.75**3)
+    assert observations["species_1"][0, 16] == pytest.approx(share, abs=1e-6)
+    assert observations["species_0"][0, 16] == pytest.approx(1.0, abs=1e-6)
+
+
+def test_a_species_ends_when_all_of_its_particles_have_left():
+    env = make(particle_counts=(2, 2), position_limit=0.7, update_prob=1.0)
+    env.reset(seed=0)
+    env.place_particles([[0.65, 0], [0.0, 0.0], [0.65, 0.3], [0.6, 0.6]], np.zeros((4, 16)))
+    actions = still(env)
+    for action in actions.values():
+        action[:, 0] = 1.0
+    _, _, terminations, _, infos = env.step(actions)
+    assert terminations == {"species_0": False, "species_1": True}
+    assert infos["species_1"]["reason"] == "left the world"
+    x, _ = env.particles()
+    torch.testing.assert_close(x, torch.tensor([[0.7, 0.0], [0.15, 0.0]]))
+
+
+def test_states_that_run_away_end_a_species():
+    env = make(particle_counts=(1, 1), observation_limit=1.0, update_prob=1.0)
+    env.reset(seed=0)
+    actions = still(env)
+    actions["species_0"][0, 5] = 1.0
+    _, _, terminations, _, _ = env.step(actions)
+    assert terminations == {"species_0": True, "species_1": False}
+
+
+@pytest.mark.parametrize("dead", [0, 1])
+def test_an_invasion_is_over_when_one_side_is_gone(dead):
+    env = make("invasion", deaths=((dead, 2),))
+    env.reset(seed=0)
+    env.step(still(env))
+    _, rewards, terminations, _, infos = env.step(drawn(env, np.random.default_rng(0)))
+    assert terminations == {"species_0": True, "species_1": True}
+    assert infos[f"species_{dead}"]["reason"] == "removed"
+    assert infos[f"species_{1 - dead}"]["reason"] == "no opponent"
+    assert rewards["species_0"] == -rewards["species_1"] != 0.0
+    assert env.agents == []
+
+
+def test_a_world_without_particles_can_be_drawn_and_described():
+    env = make(deaths=((0, 1), (1, 1)), render_mode="rgb_array")
+    env.reset(seed=0)
+    env.step(still(env))
+    assert env.agents == []
+    assert env.render().min() == 255
+    assert not env.state().any()
+    with pytest.raises(NPAError, match="there is none: call reset first"):
+        env.step({})
+
+
+def test_pictures_tell_species_apart():
+    env = make(particle_counts=(50, 50), render_mode="rgb_array", render_size=33)
+    env.reset(seed=0)
+    env.place_particles([[-0.5, 0.0]] * 50 + [[0.5, 0.0]] * 50, np.zeros((100, 16)))
+    picture = env.render().astype(int)
+    left, right = picture[16, 8], picture[16, 24]
+    assert left[0] > left[1] + 50
+    assert right[1] > right[0] + 50
+    grey = make(particle_counts=(1, 1), render_mode="rgb_array", render_style="particles")
+    grey.reset(seed=0)
+    assert np.ptp(grey.render().astype(int), axis=2).max() <= 1
+
+
+def test_a_copy_by_pickle_goes_on_alike():
+    env = make(deaths=((1, 3),))
+    env.reset(seed=0)
+    generator = np.random.default_rng(0)
+    env.step(drawn(env, generator))
+    copy = pickle.loads(pickle.dumps(env))
+    while env.agents:
+        actions = drawn(env, generator)
+        assert env.step(actions)[1:] == copy.step(actions)[1:]
+    assert np.array_equal(env.state(), copy.state())
+    assert np.array_equal(env.reset()[0]["species_1"], copy.reset()[0]["species_1"])
+
+
+def test_torch_tensors_come_out_where_asked_for():
+    arrays, tensors = make(), make(output="torch")
+    seen, _ = arrays.reset(seed=1)
+    same, _ = tensors.reset(seed=1)
+    assert torch.equal(torch.from_numpy(seen["species_1"]), same["species_1"])
+    generator = np.random.default_rng(0)
+    actions = drawn(arrays, generator)
+    seen, *_ = arrays.step(actions)
+    same, *_ = tensors.step({agent: torch.from_numpy(a) for agent, a in actions.items()})
+    assert torch.equal(torch.from_numpy(seen["species_0"]), same["species_0"])
+    assert torch.equal(torch.from_numpy(arrays.state()), tensors.state())
+
+
+@pytest.mark.parametrize("kind", ["parallel", "aec"])
+@pytest.mark.parametrize("name", multispecies_v0.ENVIRONMENTS)
+def test_the_registry_of_pettingzoo_makes_every_task(kind, name):
+    task = multispecies_v0.ENVIRONMENTS[name]
+    keywords = small(task)
+    del keywords["task"]
+    env = pettingzoo.make(kind, name, **keywords)
+    env.reset(seed=0)
+    assert type(env.unwrapped.world.task) is TABLE[task]
+    assert env.possible_agents == ["species_0", "species_1"]
+    assert pettingzoo.spec(kind, name).id == name
+
+
+def test_the_package_is_imported_without_pettingzoo_which_is_asked_for_by_name():
+    program = (
+        "import sys\n"
+        "import npa_envs, npa_envs.envs, npa_envs.envs.species\n"
+        "print('pettingzoo' in sys.modules)\n"
+        "sys.modules['pettingzoo'] = None\n"
+        "try:\n"
+        "    import npa_envs.envs.multispecies_v0\n"
+        "except npa_envs.MissingDependencyError as error:\n"
+        "    print(error)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    first, second = done.stdout.splitlines()
+    assert first == "False"
+    assert "pip install 'npa-envs[envs]'" in second
+
+
+@pytest.mark.parametrize(
+    ("keywords", "message"),
+    [
+        ({"task": "mixin"}, "task must be a known word, got 'mixin': did you mean 'mixing'"),
+        ({"task": 3}, "task must be a known word, got 3"),
+        ({"species_count": 0}, "species_count must be a whole number of at least 1, got 0"),
+        ({"species_count": 1}, "species_count must be at least 2 in this task, got 1"),
+        ({"species_count": 65}, "species_count must be at most 64, got 65"),
+        ({"particle_count": 1}, "particle_count must be at least species_count = 2, got 1"),
+        ({"particle_counts": (3,)}, r"particle_counts must be 2 whole numbers .* got \(3,\)"),
+        ({"particle_counts": (3, 0)}, "particle_counts must be 2 whole numbers of at least 1"),
+        ({"particle_count": 9, "particle_counts": (3, 6)}, "exclude each other"),
+        ({"seed_radius": 4.0}, "seed_radius and seed_distance must keep all disks within 4"),
+        ({"seed_distance": -1.0}, "seed_distance must be a finite number of at least 0"),
+        ({"deaths": ((2, 5),)}, "each species from 0 to 1 at most once, each step at least 1"),
+        ({"deaths": ((1, 0),)}, r"deaths must be pairs .* got \(\(1, 0\),\)"),
+        ({"deaths": ((1, 5), (1, 6))}, "deaths must be pairs"),
+        ({"deaths": (1, 5)}, "deaths must be pairs"),
+        ({"reward": "dense"}, "reward must be a known word, got 'dense'"),
+        ({"task": "invasion", "reward": "team"}, "reward must be 'individual' in invasion"),
+        ({"task": "co_morphogenesis", "targets": ("heart",)}, "targets must be 2 names"),
+        ({"task": "symbiosis", "target": "hart"}, "did you mean 'heart'"),
+        ({"task": "symbiosis", "state_dim": 2}, "state_dim must be a whole number of at least 3"),
+        ({"render_style": "art"}, "render_style must be a known word"),
+        ({"render_mode": "ansi"}, "render_mode must be a known word"),
+        ({"max_cycles": 0}, "max_cycles must be a whole number of at least 1"),
+        ({"epsilon": 0.2}, "unknown keyword 'epsilon': did you mean 'eps'"),
+        ({"seed": 1}, r"unknown keyword 'seed': give it to reset\(seed=...\)"),
+        ({"eps": -0.1}, "eps must be a finite number greater than 0"),
+    ],
+)
+def test_a_wrong_configuration_is_refused(keywords, message):
+    with pytest.raises(NPAError, match=message):
+        multispecies_v0.parallel_env(**keywords)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda a: a.pop("species_1"), "got none for species_1"),
+        (lambda a: a.update(species_2=a["species_0"]), "got one for species_2"),
+        (
+            lambda a: a.update(species_1=np.zeros((3, 18))),
+            r"actions\['species_1'\] must be real numbers of shape \(20, 18\), got \(3, 18\)",
+        ),
+        (lambda a: a.update(species_0="left"), r"actions\['species_0'\] must be real numbers"),
+        (lambda a: a.update(species_0=None), r"actions\['species_0'\] must be real numbers"),
+        (lambda a: a.update(species_0=a["species_0"] + 1j), "must be real numbers"),
+        (
+            lambda a: a["species_1"].__setitem__((4, 7), np.nan),
+            r"actions\['species_1'\] must be finite, got nan \(1 such",
+        ),
+        (lambda a: a["species_1"].fill(np.inf), "must be finite, got inf"),
+    ],
+)
+def test_a_wrong_action_is_refused_and_leaves_the_world_as_it_was(change, message):
+    env, untouched = make(), make()
+    for e in (env, untouched):
+        e.reset(seed=0)
+    actions = still(env)
+    change(actions)
+    before = env.state()
+    with pytest.raises(NPAError, match=message):
+        env.step(actions)
+    assert np.array_equal(env.state(), before)
+    actions = drawn(env, np.random.default_rng(0))
+    assert env.step(actions)[1] == untouched.step(actions)[1]
+
+
+def test_what_needs_a_world_says_so():
+    env = make()
+    for call in (env.state, env.render, lambda: env.step({}), lambda: env.place_particles(0, 0)):
+        with pytest.raises(NPAError, match="call reset first"):
+            call()
+    env.reset()
+    with pytest.raises(NPAError, match=r"actions must be a dict .* got list"):
+        env.step([])
+    with pytest.raises(NPAError, match="agent must be one that exists, got 'species_9'"):
+        env.action_space("species_9")
+    env.close()
+    env.close()

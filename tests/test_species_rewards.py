@@ -1,0 +1,220 @@
+"""What species are paid, by numbers computed by hand or by the tasks of single worlds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from crowds import (
+    HALF_WAY,
+    apart,
+    drawn,
+    make,
+    pair,
+    pair_entropy,
+    still,
+    targets_made_once,
+)
+
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
+from npa_envs.tasks.morphogenesis2d_config import Morphogenesis2DConfig
+from npa_envs.tasks.targets import load_target
+
+quick_targets = pytest.fixture(scope="module", autouse=True)(targets_made_once)
+
+
+def splat_loss(target, x, s, count):
+    """The loss of `npa_envs.tasks.morphogenesis2d` by itself."""
+    config = Morphogenesis2DConfig(
+        target=target, target_point_count=count, particle_count=count, resolution=16
+    )
+    return float(Morphogenesis2D(config).metric(x[None], s[None])[0])
+
+
+@pytest.mark.parametrize(("task", "sign"), [("mixing", -1.0), ("segregation", 1.0)])
+def test_parting_two_neighbours_costs_or_pays_their_entropy(task, sign):
+    env = pair(task)
+    _, rewards, _, _, infos = env.step(still(env))
+    assert rewards == {"species_0": 0.0, "species_1": 0.0}
+    loss = HALF_WAY if task == "segregation" else 1.0 - HALF_WAY
+    assert infos["species_0"]["loss"] == pytest.approx(loss, abs=1e-6)
+    _, rewards, _, _, infos = env.step(apart(env))
+    # The smoothing weight is zero at a whole radius.
+    name = "mixture" if task == "segregation" else "separation"
+    for agent in ("species_0", "species_1"):
+        assert rewards[agent] == pytest.approx(sign * HALF_WAY, abs=1e-6)
+        assert infos[agent][f"reward_{name}"] == rewards[agent]
+        assert infos[agent][f"loss_{name}"] == infos[agent]["loss"]
+
+
+@pytest.mark.parametrize("reward", ["individual", "team"])
+def test_a_species_is_paid_for_the_mean_of_its_particles_and_a_team_for_that_of_species(reward):
+    env = make(particle_counts=(1, 2), update_prob=1.0, reward=reward)
+    env.reset(seed=0)
+    env.place_particles([[0.0, 0.0], [0.15, 0.0], [2.0, 2.0]], np.zeros((3, 16)))
+    _, _, _, _, infos = env.step(still(env))
+    assert infos["species_0"]["loss"] == pytest.approx(1.0 - HALF_WAY, abs=1e-6)
+    assert infos["species_1"]["loss"] == pytest.approx(1.0 - 0.5 * HALF_WAY, abs=1e-6)
+    _, rewards, *_ = env.step(apart(env))
+    own = {"species_0": -HALF_WAY, "species_1": -0.5 * HALF_WAY}
+    team = dict.fromkeys(own, -0.75 * HALF_WAY)
+    assert rewards == pytest.approx(own if reward == "individual" else team, abs=1e-6)
+
+
+def test_species_that_walk_through_each_other_mix_and_part_again():
+    env = make(particle_count=200, eps=0.1, update_prob=1.0, max_cycles=16)
+    _, infos = env.reset(seed=0)
+    assert min(info["loss"] for info in infos.values()) > 0.9
+    actions = still(env)
+    actions["species_0"][:, 0], actions["species_1"][:, 0] = 0.5, -0.5
+    losses = [np.mean([info["loss"] for info in env.step(actions)[-1].values()]) for _ in range(16)]
+    # The disks are 0.4 apart, and come 0.05 nearer in a step.
+    assert losses[7] == min(losses) < 0.25
+    assert losses[-1] > 0.9
+
+
+def test_entropy_weighs_neighbours_by_their_volumes():
+    env = make(particle_counts=(1, 2))
+    env.reset(seed=0)
+    env.place_particles([[0.0, 0.0], [0.15, 0.0], [0.3, 0.0]], np.zeros((3, 16)))
+    _, _, _, _, infos = env.step(still(env))
+    # Volumes of the outer two and of the middle one, in units of the weight at no distance.
+    weight = 0.75**3
+    outer, middle = 1.0 / (1.0 + weight), 1.0 / (1.0 + 2.0 * weight)
+    first = pair_entropy(outer / (outer + weight * middle))
+    second = pair_entropy(weight * outer / (2.0 * weight * outer + middle))
+    assert infos["species_0"]["loss"] == pytest.approx(1.0 - first, abs=1e-6)
+    assert infos["species_1"]["loss"] == pytest.approx(1.0 - 0.5 * second, abs=1e-6)
+
+
+def test_entropy_reaches_across_the_edge_of_a_periodic_box():
+    env = make(particle_counts=(1, 1), boundary="periodic", box_size=2.0)
+    env.reset(seed=0)
+    env.place_particles([[-0.95, 0.0], [0.9, 0.0]], np.zeros((2, 16)))
+    _, _, _, _, infos = env.step(still(env))
+    assert infos["species_0"]["loss"] == pytest.approx(1.0 - HALF_WAY, abs=1e-5)
+
+
+def test_each_species_of_co_morphogenesis_is_paid_for_its_own_picture():
+    env = make("co_morphogenesis", targets=("heart", "ring"), particle_counts=(40, 30))
+    env.reset(seed=0)
+    x0, s0 = env.particles()
+    actions = drawn(env, np.random.default_rng(0))
+    _, rewards, _, _, infos = env.step(actions)
+    x1, s1 = env.particles()
+    spans = {"species_0": ("heart", slice(0, 40)), "species_1": ("ring", slice(40, 70))}
+    for agent, (target, span) in spans.items():
+        before, after = (
+            splat_loss(target, x[span], s[span], span.stop - span.start)
+            for x, s in ((x0, s0), (x1, s1))
+        )
+        assert infos[agent]["loss"] == pytest.approx(after, rel=1e-5)
+        assert rewards[agent] == pytest.approx(before - after, abs=1e-6)
+        assert rewards[agent] != 0.0
+        parts = infos[agent]["reward_density"] + infos[agent]["reward_colour"]
+        assert parts == pytest.approx(rewards[agent], abs=1e-6)
+    actions = still(env)
+    actions["species_1"][:] = 1.0
+    _, rewards, *_ = env.step(actions)
+    assert rewards["species_0"] == 0.0
+    assert rewards["species_1"] != 0.0
+
+
+@pytest.mark.parametrize("species_count", [2, 4])
+def test_what_the_invaded_gain_the_invaders_lose(species_count):
+    env = make("invasion", species_count=species_count, target="heart")
+    env.reset(seed=0)
+    count = env.action_space("species_0").shape[0]
+    generator = np.random.default_rng(0)
+    for _ in range(5):
+        x0, s0 = env.particles()
+        _, rewards, *_ = env.step(drawn(env, generator))
+        x1, s1 = env.particles()
+        gain = splat_loss("heart", x0[:count], s0[:count], count)
+        gain -= splat_loss("heart", x1[:count], s1[:count], count)
+        assert rewards["species_0"] == pytest.approx(gain, abs=1e-6)
+        assert rewards["species_0"] != 0.0
+        invaders = [rewards[f"species_{k}"] for k in range(1, species_count)]
+        assert invaders == [-rewards["species_0"] / (species_count - 1)] * (species_count - 1)
+        assert sum(rewards.values()) == pytest.approx(0.0, abs=1e-15)
+
+
+def test_symbiosis_reaches_its_target_together_only():
+    count = load_target("heart", point_count=64).point_count
+    env = make("symbiosis", target="heart", particle_count=count)
+    env.reset(seed=0)
+    goal = env.world.task.goal.target
+    s = torch.zeros(count, 16)
+    s[:, -3:] = goal.colours - 0.5
+    env.place_particles(goal.points, s)
+    _, _, _, _, infos = env.step(still(env))
+    assert infos["species_0"]["loss"] == pytest.approx(0.0, abs=1e-6)
+    half = env.action_space("species_0").shape[0]
+    x = goal.points.clone()
+    x[half:] = 3.0
+    env.place_particles(x, s)
+    _, _, _, _, infos = env.step(still(env))
+    assert infos["species_0"]["loss"] > 0.1
+
+
+def test_all_of_a_symbiosis_are_paid_alike():
+    env = make("symbiosis", target="heart", species_count=3)
+    env.reset(seed=0)
+    x0, s0 = env.particles()
+    _, rewards, *_ = env.step(drawn(env, np.random.default_rng(0)))
+    gain = splat_loss("heart", x0, s0, 41) - splat_loss("heart", *env.particles(), 41)
+    assert list(rewards.values()) == pytest.approx([gain] * 3, abs=1e-6)
+    assert gain != 0.0
+
+
+@pytest.mark.parametrize("task", ["mixing", "segregation"])
+def test_swapping_species_and_their_actions_swaps_all_that_comes_out(task):
+    env, swapped = (make(task, particle_count=40, update_prob=1.0) for _ in range(2))
+    other = {"species_0": "species_1", "species_1": "species_0"}
+    for e in (env, swapped):
+        e.reset(seed=0)
+    x, s = env.particles()
+    swapped.place_particles(x.roll(20, 0), s.roll(20, 0))
+    generator = np.random.default_rng(0)
+    for _ in range(5):
+        actions = drawn(env, generator)
+        outcome = env.step(actions)
+        mirrored = swapped.step({other[agent]: action for agent, action in actions.items()})
+        for mine, theirs in zip(env.particles(), swapped.particles(), strict=True):
+            assert torch.equal(mine.roll(20, 0), theirs)
+        for agent in actions:
+            seen, there = outcome[0][agent], mirrored[0][other[agent]]
+            # Sums over neighbours run by their indices, which are others.
+            np.testing.assert_allclose(seen, there, rtol=1e-4, atol=1e-5)
+            assert outcome[1][agent] == pytest.approx(mirrored[1][other[agent]], abs=1e-6)
+    assert outcome[1]["species_0"] != outcome[1]["species_1"]
+
+
+def test_swapping_species_with_their_targets_swaps_their_rewards_exactly():
+    env, swapped = (
+        make("co_morphogenesis", targets=targets, update_prob=1.0, particle_counts=(20, 20))
+        for targets in (("heart", "ring"), ("ring", "heart"))
+    )
+    for e in (env, swapped):
+        e.reset(seed=0)
+    x, s = env.particles()
+    swapped.place_particles(x.roll(20, 0), s.roll(20, 0))
+    actions = drawn(env, np.random.default_rng(2))
+    _, rewards, *_ = env.step(actions)
+    mirrored = {"species_0": actions["species_1"], "species_1": actions["species_0"]}
+    _, there, *_ = swapped.step(mirrored)
+    assert rewards == {"species_0": there["species_1"], "species_1": there["species_0"]}
+
+
+def test_leaving_the_world_never_pays():
+    # Alone at the bound, it would see nobody else: an entropy of almost 0.
+    env = pair("segregation", position_limit=0.29, seed_radius=0.01)
+    at_start = env.reset(seed=0)[1]["species_1"]["loss"]
+    assert at_start > 0.99
+    env.place_particles([[0.0, 0.0], [0.15, 0.0]], np.zeros((2, 16)))
+    _, rewards, terminations, _, infos = env.step(apart(env))
+    assert terminations == {"species_0": False, "species_1": True}
+    assert infos["species_1"]["loss"] == at_start
+    assert infos["species_1"]["loss_mixture"] < 0.01
+    assert rewards["species_1"] == pytest.approx(HALF_WAY - at_start, abs=1e-6)
+    assert rewards["species_0"] == pytest.approx(HALF_WAY, abs=0.01)
