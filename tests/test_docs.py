@@ -160,6 +160,9 @@ def test_the_example_of_a_page_runs(page):
     exec(re.sub(r'(-v\d+")', rf"\1, {fields}", example), names)
     assert names["observation"].shape == (64, 83 if "3D" in page.stem else 66)
     assert names["envs"].num_envs == 8
+    exec(species, names)
+    assert set(names["infos"]) == {"species_0", "species_1"}
+    assert all(info["loss"] < 1.0 for info in names["infos"].values())
 
 
 def test_an_own_environment_takes_at_most_40_lines():
@@ -249,7 +252,7 @@ def test_the_code_about_point_clouds_runs(capsys):
 
 
 def test_the_code_of_the_readme_runs():
-    operators, environments = code_blocks(ROOT / "README.md")
+    operators, environments, species = code_blocks(ROOT / "README.md")
     names = {}
     exec(operators.replace("4096", "256").replace("steps=512", "steps=8"), names)
     assert names["colours"].shape == (1, 256, 3)
