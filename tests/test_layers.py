@@ -50,6 +50,8 @@ LADDER = {
     "npa_envs.rule_io": rung(4, "torch safetensors", never=INSIDES),
     "npa_envs.control": rung(4, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
     "npa_envs.dynamics": rung(4, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
+    "npa_envs.species_steps": rung(5, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
+    "npa_envs.species": rung(6, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
     "npa_envs.tasks": rung(
         5,
         "torch numpy PIL sklearn torchvision trimesh pytorch_msssim gsplat",
