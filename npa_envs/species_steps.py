@@ -85,8 +85,12 @@ def make_community(
     highest = max(probabilities)
     keep = None
     if min(probabilities) < highest:
-        shares = torch.tensor([chance / highest for chance in probabilities], dtype=torch.float64)
-        keep = shares.repeat_interleave(torch.tensor(counts)).to(x.device, torch.float32)
+        keep = torch.cat(
+            [
+                torch.full((count,), chance / highest, device=x.device)
+                for count, chance in zip(counts, probabilities, strict=True)
+            ]
+        )
     return Community(species, counts, options[0]._replace(update_prob=highest), keep, told_apart)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
@@ -80,10 +81,11 @@ def _gather_species(
     world_count, particle_count, space_dim = x.shape
     plan = make_plan(x, x.shape, 1, world_count * particle_count, False, eps, box)
     ordered = sort_worlds(plan, x, None, None, with_rows=False)
-    ends = torch.tensor(counts, dtype=torch.int32).cumsum(0)[:-1].to(x.device, torch.int32)
-    sorted_species = torch.bucketize(
-        ordered.source % particle_count, ends, right=True, out_int32=True
-    )
+    place = ordered.source % particle_count
+    sorted_species = torch.zeros_like(place)
+    # Numbers of the host's, not a tensor of them: a CUDA graph must not copy from the host.
+    for end in itertools.accumulate(counts[:-1]):
+        sorted_species += place >= end
     density = x.new_empty(plan.total, len(counts))
     gradient = x.new_empty(plan.total, len(counts), space_dim)
     launch(
