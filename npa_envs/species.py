@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, overload
 
 import torch
 from torch import Tensor
+from torch.utils.checkpoint import checkpoint
 
-from npa_envs.dynamics import checked_options, rollout
+from npa_envs.dynamics import STORED_INTERVAL, Memory, checked_options, rollout
 from npa_envs.errors import NPAError
 from npa_envs.randomness import Randomness, check_generator
 from npa_envs.rule import NPARule
@@ -34,6 +35,50 @@ AGREEMENTS = (
 """What rules must have in common to read one perception pass."""
 
 
+@overload
+def rollout_species(
+    rules: Sequence[NPARule],
+    x: Tensor,
+    s: Tensor,
+    steps: int,
+    *,
+    counts: Sequence[int],
+    eps: float | None = ...,
+    update_prob: float | Sequence[float] = ...,
+    box: Box = ...,
+    dt: float = ...,
+    position_noise: float = ...,
+    generator: Randomness | None = ...,
+    detach_positions: bool = ...,
+    perception: SpeciesPerception = ...,
+    density_counts: Sequence[float] | None = ...,
+    memory: Memory = ...,
+    return_path_length: Literal[False] = ...,
+) -> tuple[Tensor, Tensor]: ...
+
+
+@overload
+def rollout_species(
+    rules: Sequence[NPARule],
+    x: Tensor,
+    s: Tensor,
+    steps: int,
+    *,
+    counts: Sequence[int],
+    eps: float | None = ...,
+    update_prob: float | Sequence[float] = ...,
+    box: Box = ...,
+    dt: float = ...,
+    position_noise: float = ...,
+    generator: Randomness | None = ...,
+    detach_positions: bool = ...,
+    perception: SpeciesPerception = ...,
+    density_counts: Sequence[float] | None = ...,
+    memory: Memory = ...,
+    return_path_length: Literal[True],
+) -> tuple[Tensor, Tensor, Tensor]: ...
+
+
 def rollout_species(
     rules: Sequence[NPARule],
     x: Tensor,
@@ -50,7 +95,9 @@ def rollout_species(
     detach_positions: bool = True,
     perception: SpeciesPerception = "shared",
     density_counts: Sequence[float] | None = None,
-) -> tuple[Tensor, Tensor]:
+    memory: Memory = "store",
+    return_path_length: bool = False,
+) -> tuple[Tensor, Tensor] | tuple[Tensor, Tensor, Tensor]:
     """Run several rules in one world; differentiable, and particle i stays particle i.
 
     Each step is that of `rollout`, with one perception pass for the particles of all species; then
@@ -86,9 +133,12 @@ def rollout_species(
             gives them.
         density_counts: What each species divides densities and their gradients by, positive;
             default: N, the particles of the world, for all.
+        memory: What the backward pass reads is stored or recomputed, as in `rollout`.
+        return_path_length: Also return how far each particle travelled.
 
     Returns:
-        Positions [length units], shape [B, N, D], and states, dimensionless, shape [B, N, C].
+        Positions [length units], shape [B, N, D]; states, dimensionless, shape [B, N, C]; and where
+        asked the length of each particle's path [length units], shape [B, N].
 
     Raises:
         NPAError: Rules do not agree, counts do not fit, or as for `rollout`.
@@ -99,10 +149,11 @@ def rollout_species(
     sizes = checked_counts(counts, x.shape[1])
     _check_agreement(species_rules, len(sizes), perception)
     probabilities = _checked_probabilities(update_prob, len(sizes))
-    common = (dt, position_noise, detach_positions)
     divisors = _checked_divisors(density_counts, sizes)
+    if memory not in STORED_INTERVAL:
+        raise NPAError(f"memory must be 'store', 'recompute' or 'minimal', got {memory!r}")
     if perception == "shared" and divisors == (float(x.shape[1]),):
-        return rollout(
+        *after, travelled = rollout(
             species_rules[0],
             x,
             s,
@@ -113,22 +164,32 @@ def rollout_species(
             dt=dt,
             position_noise=position_noise,
             detach_positions=detach_positions,
+            memory=memory,
             generator=generator,
+            return_path_length=True,
         )
+        return (after[0], after[1], travelled) if return_path_length else (after[0], after[1])
     options = [
-        checked_options(rule, x, s, eps, box, chance, *common)
+        checked_options(rule, x, s, eps, box, chance, dt, position_noise, detach_positions)
         for rule, chance in zip(species_rules, probabilities, strict=True)
     ]
     check_generator(generator, x.device, x.shape[0])
     told_apart = perception == "per_species"
     community = make_community(species_rules, sizes, options, divisors, x, told_apart=told_apart)
-    path_length = x.new_zeros(x.shape[:2])
+    interval = STORED_INTERVAL[memory] if torch.is_grad_enabled() else 1
+    worlds = x, s, x.new_zeros(x.shape[:2])
     # Worlds keep their dtype under autocast: the kernels read what the rules write.
     with torch.autocast(x.device.type, enabled=False):
-        for _ in range(steps):
-            mask, noise = draw(x, community, generator)
-            x, s, path_length = advance(community, x, s, path_length, mask, noise)
-    return x, s
+        for number in range(steps):
+            drawn = draw(x, community, generator)
+            if (steps - 1 - number) % interval > 0:
+                worlds = checkpoint(
+                    advance, community, *worlds, *drawn,
+                    use_reentrant=False, preserve_rng_state=False,
+                )  # fmt: skip
+            else:
+                worlds = advance(community, *worlds, *drawn)
+    return worlds if return_path_length else worlds[:2]
 
 
 def _checked_rules(rules: Any) -> list[NPARule]:

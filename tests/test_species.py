@@ -236,6 +236,37 @@ def test_gradients_of_many_steps_with_one_rule_are_those_of_a_rollout(device):
         assert relative_error(value, answer) < 1e-11
 
 
+def test_recomputing_gives_the_gradients_of_storing_and_paths_are_those_of_a_rollout(device):
+    rules = [make_rule(device), make_rule(device, seed=1)]
+    x, s = make_world(device)
+    results = []
+    for memory in ("store", "recompute", "minimal"):
+        out = npa_envs.rollout_species(
+            rules,
+            x,
+            s,
+            5,
+            counts=[20, 40],
+            generator=seeded(device),
+            memory=memory,
+            return_path_length=True,
+        )
+        loss = sum(value.square().sum() for value in out)
+        parameters = [*rules[0].parameters(), *rules[1].parameters()]
+        results.append([*out, *torch.autograd.grad(loss, parameters)])
+    for stored, *others in zip(*results, strict=True):
+        assert all(torch.equal(stored, other) for other in others)
+    for counts in ([60], [25, 35]):
+        options = {"generator": seeded(device), "return_path_length": True}
+        *_, path = npa_envs.rollout_species(
+            rules[:1] * len(counts), x, s, 5, counts=counts, **options
+        )
+        options = {"generator": seeded(device), "return_path_length": True}
+        *_, expected = npa_envs.rollout(rules[0], x, s, 5, **options)
+        assert path.shape == (2, 60)
+        assert (path - expected).abs().max() < 1e-12
+
+
 @pytest.mark.parametrize("dtype", FIELD_ERRORS, ids=("float64", "float32"))
 @pytest.mark.parametrize("space_dim", [2, 3])
 @pytest.mark.parametrize("periodic", [False, True])
@@ -394,6 +425,7 @@ class TestErrors:
             (None, {"counts": []}, "1 to 64 species, got 0"),
             (None, {"density_counts": [60]}, r"each of 2 species, got \[60\]: .*=\(20, 40\)"),
             (None, {"density_counts": [20, 0]}, "one positive number for each of 2 species"),
+            (None, {"memory": "little"}, "'store', 'recompute' or 'minimal', got 'little'"),
             (None, {"update_prob": [0.5]}, "one for each of 2 species, got 1"),
             (None, {"update_prob": [0.5, 1.5]}, r"lie in \(0, 1\], got 1\.5"),
             (None, {"update_prob": "half"}, "must be a number, got 'half'"),
