@@ -1,5 +1,8 @@
 """Several rules in one world: what they see of each other, and that physics exists once."""
 
+import re
+from pathlib import Path
+
 import pytest
 import torch
 from worlds import degenerate_world, random_world, relative_error
@@ -296,6 +299,16 @@ def test_fields_are_right_where_particles_coincide_or_are_alone(device):
     assert not found.drho[0, -1].any()
 
 
+def test_fields_of_species_can_be_compiled(device):
+    x, _ = make_world(device)
+
+    def density_of_the_second(x):
+        return npa_envs.species_fields(x, [20, 40], eps=0.3).rho[..., 1] * 2.0
+
+    compiled = torch.compile(density_of_the_second, backend="aot_eager", fullgraph=True)
+    assert torch.equal(compiled(x), density_of_the_second(x))
+
+
 def test_every_species_is_perceived_with_the_logarithm_of_its_gradient(device):
     counts = [20, 40]
     x, s = make_world(device)
@@ -375,6 +388,17 @@ def test_devices_agree_and_a_rollout_can_be_captured(perception):
     graph.replay()
     for value, answer in zip(captured, results[0], strict=True):
         assert (value.cpu() - answer).abs().max() < 1e-10
+
+
+def test_the_code_about_species_runs():
+    page = Path(__file__).resolve().parent.parent / "docs" / "species.md"
+    rolled, trained = re.findall(r"^```python\n(.*?)^```", page.read_text(), re.M | re.S)
+    names = {}
+    exec(rolled, names)
+    assert names["x"].shape == (1, 256, 2)
+    assert names["x"].isfinite().all()
+    exec(trained, names)
+    assert names["config"].task.counts == (4096, 4096)
 
 
 class TestErrors:
