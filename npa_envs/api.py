@@ -5,20 +5,33 @@ from npa_envs.errors import MissingDependencyError, NPAError
 from npa_envs.randomness import WorldRandom
 from npa_envs.rule import NPARule
 from npa_envs.rule_io import load_rule, save_rule, shipped_rules
-from npa_envs.sph import PerceptionFields, perceive, perception_fields, world_mean
+from npa_envs.species import rollout_species
+from npa_envs.sph import (
+    PerceptionFields,
+    SpeciesFields,
+    perceive,
+    perceive_species,
+    perception_fields,
+    species_fields,
+    world_mean,
+)
 
 __all__ = [
     "MissingDependencyError",
     "NPAError",
     "NPARule",
     "PerceptionFields",
+    "SpeciesFields",
     "WorldRandom",
     "load_rule",
     "perceive",
+    "perceive_species",
     "perception_fields",
     "rollout",
+    "rollout_species",
     "save_rule",
     "shipped_rules",
+    "species_fields",
     "step",
     "world_mean",
 ]

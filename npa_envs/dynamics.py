@@ -69,7 +69,7 @@ def row_capacity(particle_total: int, update_prob: float) -> int:
     return min(particle_total, math.ceil(mean + margin))
 
 
-def _checked_options(
+def checked_options(
     rule: NPARule,
     x: Tensor,
     s: Tensor,
@@ -80,6 +80,7 @@ def _checked_options(
     position_noise: float,
     detach_positions: bool,
 ) -> StepOptions:
+    """Check what `rollout` was given, and return what stays the same over it; its errors."""
     check_world(x, s)
     if (x.shape[2], s.shape[2]) != (rule.space_dim, rule.state_dim):
         raise NPAError(
@@ -108,7 +109,7 @@ def _checked_options(
     return StepOptions(radius, sides, update_prob, dt, position_noise, detach_positions)
 
 
-def _draw(
+def draw_step(
     x: Tensor, options: StepOptions, generator: Randomness | None
 ) -> tuple[Tensor | None, Tensor | None]:
     """Draw a step's update mask (uint8, [B, N], None for all) and position noise, in this order."""
@@ -130,7 +131,8 @@ def _draw(
     return mask, noise
 
 
-def _terms(rule: NPARule) -> Terms:
+def rule_terms(rule: NPARule) -> Terms:
+    """Return the groups of the perception vector that a rule reads."""
     return Terms(rule.state_gradient, rule.moment_correction, rule.density_gradient)
 
 
@@ -161,7 +163,7 @@ def _advance(
         eps=options.eps,
         eps0=rule.eps0,
         box=options.box,
-        terms=_terms(rule),
+        terms=rule_terms(rule),
     )
     return update_particles(
         rule(perception) if folded is None else folded(perception),
@@ -182,7 +184,7 @@ def _settle(rule: NPARule, x: Tensor, steps: int, options: StepOptions) -> Settl
     if moving or steps < FEWEST_SETTLED:
         return None
     return settle(
-        x, rule.state_dim, eps=options.eps, eps0=rule.eps0, box=options.box, terms=_terms(rule)
+        x, rule.state_dim, eps=options.eps, eps0=rule.eps0, box=options.box, terms=rule_terms(rule)
     )
 
 
@@ -311,7 +313,12 @@ def rollout(
     steps = checked_count("steps", steps)
     if memory not in STORED_INTERVAL:
         raise NPAError(f"memory must be 'store', 'recompute' or 'minimal', got {memory!r}")
-    options = _checked_options(
+    if rule.species_count:
+        raise NPAError(
+            f"the rule must not perceive species by themselves, got species_count="
+            f"{rule.species_count}: run it with npa_envs.rollout_species"
+        )
+    options = checked_options(
         rule, x, s, eps, box, update_prob, dt, position_noise, detach_positions
     )
     check_generator(generator, x.device, x.shape[0])
@@ -323,13 +330,15 @@ def rollout(
     with torch.autocast(x.device.type, enabled=False):
         settled = _settle(rule, x, steps, options)
         worlds: tuple[Tensor, ...] = x, s, path_length
-        draws: Iterable[tuple[Any, ...]] = (_draw(x, options, generator) for _ in range(steps))
+        draws: Iterable[tuple[Any, ...]] = (draw_step(x, options, generator) for _ in range(steps))
         advance: Callable[..., tuple[Tensor, ...]] = _advance
         fixed: tuple[Any, ...] = rule, folded, options
         if settled is not None:
             worlds = (settled_states(settled, s),)
             capacity = row_capacity(settled.total, options.update_prob)
-            draws = drawn_rows(settled, lambda: _draw(x, options, generator)[0], steps, capacity)
+            draws = drawn_rows(
+                settled, lambda: draw_step(x, options, generator)[0], steps, capacity
+            )
             advance = advance_settled
             fixed = (
                 rule if folded is None else folded,

@@ -26,8 +26,8 @@ OUTPUT_BLOCKS = 4
 """The sum over hidden units is taken in this many blocks."""
 
 
-class RuleHyperParameters(TypedDict):
-    """Everything besides its weights that makes an `NPARule`."""
+class NamedAlways(TypedDict):
+    """What every rule's file says."""
 
     space_dim: int
     state_dim: int
@@ -40,6 +40,12 @@ class RuleHyperParameters(TypedDict):
     moment_correction: bool
     state_gradient: bool
     density_gradient: bool
+
+
+class RuleHyperParameters(NamedAlways, total=False):
+    """Everything besides its weights that makes an `NPARule`."""
+
+    species_count: int
 
 
 class _BlockedProduct(torch.autograd.Function):
@@ -128,6 +134,8 @@ class NPARule(nn.Module):
         moment_correction: The perceived state gradient is corrected by the moment matrix.
         state_gradient: The rule perceives the state gradient.
         density_gradient: The rule perceives the density gradient.
+        species_count: Species whose densities and density gradients the rule perceives one by one,
+            besides; 0: it does not tell them apart. Others are run by `npa_envs.rollout_species`.
 
     Raises:
         NPAError: A dimension or a length is out of range.
@@ -147,9 +155,10 @@ class NPARule(nn.Module):
         moment_correction: bool = True,
         state_gradient: bool = True,
         density_gradient: bool = True,
+        species_count: int = 0,
     ) -> None:
         super().__init__()
-        sizes = (space_dim, state_dim, hidden_dim, readout_dim, readout_hidden_dim)
+        sizes = (space_dim, state_dim, hidden_dim, readout_dim, readout_hidden_dim, species_count)
         if any(isinstance(size, bool) or not isinstance(size, int) for size in sizes):
             raise NPAError(f"dimensions of a rule must be integers, got {sizes}")
         if space_dim not in (2, 3):
@@ -165,6 +174,8 @@ class NPARule(nn.Module):
                 f"readout_dim must be 0, or positive with readout_hidden_dim at least 1, "
                 f"got {readout_dim} and {readout_hidden_dim}"
             )
+        if species_count < 0:
+            raise NPAError(f"species_count must be at least 0, got {species_count}")
         self.space_dim = space_dim
         self.state_dim = state_dim
         self.hidden_dim = hidden_dim
@@ -176,6 +187,7 @@ class NPARule(nn.Module):
         self.moment_correction = moment_correction
         self.state_gradient = state_gradient
         self.density_gradient = density_gradient
+        self.species_count = species_count
 
         self.hidden = nn.Linear(self.perception_dim, hidden_dim)
         self.output = nn.Linear(hidden_dim, self.update_dim, bias=False)
@@ -194,9 +206,10 @@ class NPARule(nn.Module):
 
     @property
     def perception_dim(self) -> int:
-        """Length P of the perception vector: C(2+D)+D with every group perceived."""
+        """Length P of the perception vector: C(2+D)+D, and (1+D) for each species told apart."""
         gradients = self.state_dim * self.space_dim * self.state_gradient
-        return 2 * self.state_dim + gradients + self.space_dim * self.density_gradient
+        shared = 2 * self.state_dim + gradients + self.space_dim * self.density_gradient
+        return shared + self.species_count * (1 + self.space_dim)
 
     @property
     def update_dim(self) -> int:
@@ -265,7 +278,7 @@ class NPARule(nn.Module):
 
     def hyper_parameters(self) -> RuleHyperParameters:
         """Return all that `NPARule` takes: `NPARule(**rule.hyper_parameters())` has this shape."""
-        return RuleHyperParameters(
+        made = RuleHyperParameters(
             space_dim=self.space_dim,
             state_dim=self.state_dim,
             hidden_dim=self.hidden_dim,
@@ -278,3 +291,7 @@ class NPARule(nn.Module):
             state_gradient=self.state_gradient,
             density_gradient=self.density_gradient,
         )
+        # Left out where it says nothing: files and checkpoints stay those of all versions.
+        if self.species_count:
+            made["species_count"] = self.species_count
+        return made

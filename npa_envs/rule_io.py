@@ -194,7 +194,11 @@ def _check_format(header: Mapping[str, str]) -> None:
 
 def _read_ours(path: Path) -> RuleParts:
     header = _read_header(path)
-    hyper_parameters = {name: _parse(header, name, kind) for name, kind in _FIELDS.items()}
+    hyper_parameters = {
+        name: _parse(header, name, kind)
+        for name, kind in _FIELDS.items()
+        if name in header or name in RuleHyperParameters.__required_keys__
+    }
     try:
         with safe_open(path, framework="pt") as file:
             weights = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118

@@ -51,6 +51,8 @@ LADDER = {
     "npa_envs.scores": rung(5, "", never=INSIDES),
     "npa_envs.control": rung(4, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
     "npa_envs.dynamics": rung(4, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
+    "npa_envs.species_steps": rung(5, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
+    "npa_envs.species": rung(6, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
     "npa_envs.tasks": rung(
         5,
         "torch numpy PIL sklearn torchvision trimesh pytorch_msssim gsplat",
@@ -63,6 +65,9 @@ LADDER = {
     ),
     "npa_envs.classification": rung(8, "torch", never=INSIDES),
     "npa_envs.evaluation": rung(7, "torch numpy tqdm", never=INSIDES),
+    "npa_envs.interaction": rung(7, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
+    "npa_envs.encounters": rung(8, "torch numpy", never=INSIDES),
+    "npa_envs.interaction_plots": rung(8, "matplotlib", never=INSIDES),
     "npa_envs.bench.grid_kernels": rung(2, "warp"),
     "npa_envs.bench.hash_grid": rung(3, "warp torch", never=("npa_envs.reference",)),
     "npa_envs.bench.launches": rung(3, "warp"),

@@ -13,6 +13,7 @@ COMMANDS = {
     "train": "train a rule on a task",
     "rollout": "grow a rule from its seed, with damage on the way; writes GIF, MP4 and a filmstrip",
     "evaluate": "measure a rule: loss, PSNR, overflow and extent over thousands of steps",
+    "interact": "grow rules beside each other: what each does to the other",
     "bench": "run time against error, the paper's table, scaling; a call explained",
     "list": "tasks, presets, environments, built-in targets, losses, shipped rules",
     "warmup": "compile the kernels ahead of time",
@@ -85,6 +86,10 @@ def _dispatch(words: list[str]) -> int:
             from npa_envs.cli import evaluate
 
             return evaluate.main(rest)
+        case "interact":
+            from npa_envs.cli import interact
+
+            return interact.main(rest)
         case "bench":
             from npa_envs.cli import bench
 

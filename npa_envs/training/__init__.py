@@ -9,6 +9,7 @@ from npa_envs.tasks.task import PictureTask, Task
 from npa_envs.training.config import Morphogenesis2DTrainConfig, TrainConfig
 from npa_envs.training.divergence import DivergedError
 from npa_envs.training.folder import JsonlLog, RunFolder
+from npa_envs.training.joint import JointRules, train_together
 from npa_envs.training.overrides import config_to_dict, load_config, override
 from npa_envs.training.presets import TASKS, TaskEntry, preset, task_entry
 from npa_envs.training.trainer import Trainer, TrainResult
@@ -16,6 +17,7 @@ from npa_envs.training.trainer import Trainer, TrainResult
 __all__ = [
     "TASKS",
     "DivergedError",
+    "JointRules",
     "JsonlLog",
     "Morphogenesis2DTrainConfig",
     "PictureTask",
@@ -32,6 +34,7 @@ __all__ = [
     "preset",
     "task_entry",
     "train",
+    "train_together",
 ]
 
 

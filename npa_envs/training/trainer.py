@@ -60,7 +60,7 @@ class Trainer:
         task_name: The task's name, which checkpoints hold.
         resume: Go on from the checkpoint in `config.out`.
         overwrite: Start anew although `config.out` holds a run; its files are removed.
-        rollout: The rollout to train through; another one than the engine's only in tests.
+        rollout: The rollout to train through; None is the engine's for one rule.
 
     Raises:
         NPAError: There is no such device; the folder cannot be written to, holds a run already
@@ -186,11 +186,11 @@ class Trainer:
         # A rule is passed on: where and on what it was trained is nobody's business.
         told = config_to_dict(self.config)
         told = {name: told[name] for name in told if name not in ("out", "device", "initial_rule")}
-        metadata = {
-            "task": self.task_name,
-            "config": json.dumps(told),
-            "iteration": str(self.iteration),
-        }
+        self._save_rule(told)
+
+    def _save_rule(self, told: dict[str, Any]) -> None:
+        metadata = {"task": self.task_name, "config": json.dumps(told)}
+        metadata["iteration"] = str(self.iteration)
         save_rule(self.rule, self.folder.rule, metadata=metadata)
 
     def _iterate(self) -> None:

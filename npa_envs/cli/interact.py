@@ -1,0 +1,271 @@
+"""`npa-envs interact`: what trained rules do to each other in one world."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from npa_envs.errors import MissingDependencyError, NPAError
+
+if TYPE_CHECKING:
+    import torch
+
+    from npa_envs.encounters import Organism
+    from npa_envs.interaction import InteractionRow, InteractionSettings
+    from npa_envs.rule import NPARule
+
+RESULTS = "interactions.json"
+"""The file that says everything, and that a stopped run goes on from."""
+
+TASK = "morphogenesis2d"
+"""The task of the rules that are brought together."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class InteractOptions:
+    """Grow every rule beside every other one, and measure what that does to it.
+
+    Every ordered pair of rules, also of a rule with itself, at every distance and ratio: the first
+    one's task loss on its own particles together and alone, how much both mix, and how far its
+    centroid is moved. "cooperates": the loss falls by more than the margin; "disrupted": it rises
+    by more; "mixes": the mixing index is 0.25 or more. Each rule sees densities as it does alone:
+    divided by its own particles. The folder gets a JSON file, a heat map and a filmstrip of each
+    pair; a run that was stopped goes on where it was.
+    """
+
+    rules: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RULE")] = ()
+    """Rules of 2D morphogenesis: shipped ones (`npa-envs list`) or files; default: all shipped."""
+
+    seed_count: int = 8
+    """Worlds of each encounter, each from seeds of its own."""
+
+    first_seed: int = 1_000_000
+    """The first world's number; training uses others."""
+
+    distances: tuple[float, ...] = (0.0, 0.5, 1.0)
+    """Distances between the centres of the two seeds [length units]."""
+
+    ratios: tuple[float, ...] = (0.5,)
+    """Shares of the particles that are the measured rule's."""
+
+    steps: int = 512
+    """Steps from the seeds."""
+
+    particle_count: int | None = None
+    """Particles of both together; default: the most that one of the rules was trained with."""
+
+    update_prob: float | None = None
+    """Probability of each particle's update in a step; default: of each rule as trained."""
+
+    margin: float = 0.2
+    """Share by which a loss must change to count as changed."""
+
+    out: Path = Path("runs/interact")
+    """Folder to write to; created where missing."""
+
+    device: str = "cpu"
+    """Where to run: cpu, cuda, cuda:1."""
+
+    progress: bool = True
+    """Show a progress bar."""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run the command.
+
+    Args:
+        arguments: The words after `npa-envs interact`.
+
+    Returns:
+        0.
+
+    Raises:
+        NPAError: A rule or a value is wrong, rules cannot share a world, or the folder cannot be
+            written to or holds results of other settings.
+    """
+    return run(tyro.cli(InteractOptions, prog="npa-envs interact", args=arguments))
+
+
+def run(options: InteractOptions) -> int:
+    """Bring together, measure, write.
+
+    Args:
+        options: What the command line said.
+
+    Raises:
+        NPAError: As for `main`.
+    """
+    from npa_envs.cli.progress import StepBar
+    from npa_envs.cli.rollout import check_writable
+    from npa_envs.cli.worlds import make_folder
+    from npa_envs.encounters import Encounters
+    from npa_envs.render import write_filmstrip
+    from npa_envs.render.tables import table_text
+    from npa_envs.training import check_device
+
+    if options.seed_count < 1:
+        raise NPAError(f"seed_count must be at least 1, got {options.seed_count}")
+    device = check_device(options.device)
+    organisms, settings = _organisms(options, device)
+    folder = make_folder(options.out)
+    check_writable(folder)
+    told = _told(organisms, settings)
+    rows = _finished(folder / RESULTS, told)
+    pairs = [(first, second) for first in organisms for second in organisms]
+    done = {(row.rule, row.beside) for row in rows}
+    missing = [pair for pair in pairs if (pair[0].name, pair[1].name) not in done]
+    if done:
+        print(f"{len(pairs) - len(missing)} of {len(pairs)} pairs were measured before")
+    # What is grown alone comes once for each ratio and measured rule.
+    runs = len(missing) * len(settings.distances) + len({pair[0].name for pair in missing})
+    total = runs * len(settings.ratios) * settings.steps
+    with StepBar(total, show=options.progress) as bar:
+        encounters = Encounters(settings, device=device, progress=bar.advance)
+        encounters.check(organisms)
+        for first, second in missing:
+            fresh, scenes = encounters.meet(first, second)
+            path = folder / f"{first.name}-{second.name}.png"
+            columns = len(scenes.frames) // len(fresh)
+            write_filmstrip(path, scenes.frames, scenes.captions, columns=columns)
+            rows += fresh
+            _write(folder / RESULTS, told, rows)
+    print(table_text(rows))
+    print(f"wrote {folder / RESULTS} and a filmstrip of each pair")
+    _draw(folder / "interactions.png", rows)
+    return 0
+
+
+def _organisms(
+    options: InteractOptions, device: torch.device
+) -> tuple[list[Organism], InteractionSettings]:
+    """Load the rules, with what each grows, and settle how they meet."""
+    from npa_envs.cli.worlds import task_of_rule
+    from npa_envs.encounters import Organism
+    from npa_envs.interaction import InteractionSettings
+    from npa_envs.rule_io import load_rule, rule_metadata, shipped_rules
+    from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
+
+    sources = list(dict.fromkeys(options.rules)) or [
+        name
+        for name, path in shipped_rules().items()
+        if rule_metadata(path).get("task", TASK) == TASK
+    ]
+    organisms: list[Organism] = []
+    counts = []
+    for source in sources:
+        rule = load_rule(source, device=device).float().requires_grad_(False)
+        trained = task_of_rule(source, rule, device)
+        if not isinstance(trained.task, Morphogenesis2D):
+            raise NPAError(f"rules must be of the task {TASK}, got {source!r}: leave it out")
+        if trained.doubt is not None:
+            raise NPAError(f"cannot measure {source!r}: {trained.doubt}: leave it out")
+        name = source.rpartition("#")[2] if "#" in source else Path(source).stem
+        if name in {organism.name for organism in organisms}:
+            name = f"{name}-{len(organisms) + 1}"
+        counts.append(trained.task.config.particle_count)
+        task_of = functools.partial(_task_of, source, rule, device)
+        organisms.append(Organism(name, rule, functools.cache(task_of), trained.task.update_prob))
+    settings = InteractionSettings(
+        particle_count=options.particle_count or max(counts),
+        distances=options.distances,
+        ratios=options.ratios,
+        steps=options.steps,
+        seeds=tuple(range(options.first_seed, options.first_seed + options.seed_count)),
+        update_prob=options.update_prob,
+        margin=options.margin,
+    )
+    return organisms, settings
+
+
+def _task_of(source: str, rule: NPARule, device: torch.device, count: int) -> Any:
+    from npa_envs.cli.worlds import task_of_rule
+
+    return task_of_rule(source, rule, device, particle_count=count).task
+
+
+def _told(organisms: Sequence[Organism], settings: InteractionSettings) -> dict[str, Any]:
+    """Return what rows follow from, as JSON can hold it."""
+    weights = {}
+    for organism in organisms:
+        digest = hashlib.sha256()
+        for parameter in organism.rule.state_dict().values():
+            digest.update(parameter.cpu().numpy().tobytes())
+        weights[organism.name] = digest.hexdigest()[:16]
+    told: dict[str, Any] = json.loads(json.dumps(asdict(settings)))
+    return {**told, "rules": weights}
+
+
+def _finished(path: Path, told: dict[str, Any]) -> list[InteractionRow]:
+    """Return the rows that an earlier run left, if it ran alike."""
+    from npa_envs.interaction import InteractionRow
+
+    if not path.exists():
+        return []
+    try:
+        held = json.loads(path.read_text("utf-8"))
+        before = held["settings"]
+        rows = []
+        for row in held["rows"]:
+            fields: dict[str, Any] = {k: math.inf if v is None else v for k, v in row.items()}
+            rows.append(InteractionRow(**fields))
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise NPAError(
+            f"{str(path)!r} must hold results of npa-envs interact, but cannot be read "
+            f"({error}): remove it, or choose another folder with --out"
+        ) from error
+    other = [name for name in told if before.get(name) != told[name]]
+    if other:
+        raise NPAError(
+            f"{str(path)!r} holds results of other settings: {other[0]} was "
+            f"{before.get(other[0])}, now {told[other[0]]}: choose another folder with --out"
+        )
+    return rows
+
+
+def _write(path: Path, told: dict[str, Any], rows: Sequence[InteractionRow]) -> None:
+    """Write settings, rows, and each number of them as matrices."""
+    from npa_envs.files import write_text
+
+    def plain(value: Any) -> Any:
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    names = list(told["rules"])
+    matrices = []
+    for ratio, distance in dict.fromkeys((row.ratio, row.distance) for row in rows):
+        found = {
+            (row.rule, row.beside): row
+            for row in rows
+            if (row.ratio, row.distance) == (ratio, distance)
+        }
+        matrix: dict[str, Any] = {"ratio": ratio, "distance": distance}
+        for what in ("change", "mixing", "displacement", "verdict"):
+            matrix[what] = [
+                [plain(getattr(found.get((down, across)), what, None)) for across in names]
+                for down in names
+            ]
+        matrices.append(matrix)
+    objects = [{k: plain(v) for k, v in asdict(row).items()} for row in rows]
+    held = {"settings": told, "rows": objects, "matrices": matrices}
+    write_text(path, json.dumps(held, indent=2, allow_nan=False) + "\n")
+
+
+def _draw(path: Path, rows: Sequence[InteractionRow]) -> None:
+    from npa_envs.bench.plots import check_matplotlib
+    from npa_envs.files import write_bytes
+    from npa_envs.interaction_plots import heat_map
+
+    try:
+        check_matplotlib()
+    except MissingDependencyError as error:
+        print(f"no heat map: {error}")
+        return
+    write_bytes(path, heat_map(rows))
+    print(f"wrote {path}")

@@ -1,0 +1,107 @@
+"""Densities and density gradients by species: what each kind of particle adds to the field.
+
+One thread of a particle goes through its neighbourhood once, whatever the number of species; sums
+run over sorted particles, run by run of cells. Both are summed in float64: gradients cancel almost
+fully where particles are dense.
+
+Sources: kernels of arXiv 2601.16096, section 3, summed over the particles of one species.
+"""
+
+import functools
+
+import warp as wp
+
+from npa_envs.kernels.domain import (
+    domain_types,
+    kernel_module,
+    log_scale_factor,
+    smoothing,
+    spiky_factor,
+)
+from npa_envs.kernels.ranges import PAIRS, in_ranges
+
+
+@functools.cache
+def species_kernel(space_dim: int, scalar: type, species_count: int) -> wp.Kernel:
+    """Return the kernel of one variant.
+
+    Args:
+        space_dim: Space dimension D, 2 or 3.
+        scalar: `wp.float32` or `wp.float64`.
+        species_count: Species K.
+    """
+    types = domain_types(space_dim, scalar)
+    vector, Domain = types.vector, types.Domain
+    cell_of, segment_count, segment_cells = (
+        types.cell_of,
+        types.segment_count,
+        types.segment_cells,
+    )
+    minimum_image = types.minimum_image
+    wide = wp.types.vector(space_dim, wp.float64)
+    densities_type = wp.types.vector(species_count, wp.float64)
+    gradients_type = wp.types.matrix((species_count, space_dim), wp.float64)
+    module = kernel_module(f"species_{species_count}", space_dim, scalar)
+
+    @in_ranges(PAIRS)
+    @wp.kernel(enable_backward=False, module=module)
+    def gather_species(
+        range_start: wp.int32,
+        domain: Domain,
+        particle_count: wp.int32,
+        density_scale: wp.float64,
+        gradient_scale: wp.float64,
+        logarithmic: wp.int32,
+        starts: wp.array(dtype=wp.int32),
+        source: wp.array(dtype=wp.int32),
+        sorted_species: wp.array(dtype=wp.int32),
+        sorted_positions: wp.array(dtype=vector),
+        # outputs
+        density: wp.array(dtype=scalar, ndim=2),
+        gradient: wp.array(dtype=scalar, ndim=3),
+    ):
+        """Write each particle's scaled densities and density gradients, in the caller's order."""
+        k = wp.tid()
+        k += range_start
+        position = sorted_positions[k]
+        base = (k / particle_count) * domain.cell_count
+        cell = cell_of(domain, position)
+        densities = densities_type()
+        gradients = gradients_type()
+        for segment in range(segment_count(domain, cell)):
+            first, last = segment_cells(domain, cell, segment)
+            for j in range(starts[base + first], starts[base + last]):
+                neighbour = sorted_positions[j]
+                offset = minimum_image(domain, neighbour - position)
+                squared = wp.dot(offset, offset)
+                if squared < domain.squared_eps and j != k:
+                    own = sorted_species[j]
+                    weight = smoothing(squared, domain.inverse_squared_eps, domain.smoothing_norm)
+                    densities[own] += wp.float64(weight)
+                    away = wide()
+                    for d in range(wp.static(space_dim)):
+                        away[d] = wp.float64(neighbour[d]) - wp.float64(position[d])
+                        if domain.periodic != 0:
+                            images = wp.round((neighbour[d] - position[d]) * domain.inverse_box[d])
+                            away[d] -= wp.float64(images) * wp.float64(domain.box[d])
+                    factor = spiky_factor(
+                        wp.length(away),
+                        wp.float64(domain.inverse_eps),
+                        wp.float64(domain.spiky_norm),
+                    )
+                    for d in range(wp.static(space_dim)):
+                        gradients[own, d] += factor * away[d]
+        # A particle always sees itself.
+        densities[sorted_species[k]] += wp.float64(domain.smoothing_norm)
+        i = source[k]
+        for q in range(wp.static(species_count)):
+            density[i, q] = scalar(density_scale * densities[q])
+            sum = wide()
+            for d in range(wp.static(space_dim)):
+                sum[d] = gradient_scale * gradients[q, d]
+            if logarithmic != 0:
+                sum *= log_scale_factor(wp.length(sum))
+            for d in range(wp.static(space_dim)):
+                gradient[i, q, d] = scalar(sum[d])
+
+    return gather_species

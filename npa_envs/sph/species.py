@@ -1,0 +1,226 @@
+"""What particles perceive of each species by itself: its density and its density gradient."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from npa_envs.errors import NPAError
+from npa_envs.kernels.species import species_kernel
+from npa_envs.sph.bridge import launch, scalar_type
+from npa_envs.sph.cells import density_scale, make_plan, sort_worlds
+from npa_envs.sph.checks import (
+    Box,
+    check_finite_positions,
+    check_scale,
+    check_world,
+    checked_box,
+    checked_count,
+    checked_eps,
+)
+from npa_envs.sph.fields import perceive
+
+MOST_SPECIES = 64
+"""Species of a world: a thread keeps one sum for each."""
+
+
+class SpeciesFields(NamedTuple):
+    """The unscaled fields of each species at every particle."""
+
+    rho: Tensor
+    """Density of each species [1 / length^D], shape [B, N, K]; they sum to the density."""
+    drho: Tensor
+    """Density gradient of each species [1 / length^(D+1)], shape [B, N, K, D]."""
+
+
+def checked_counts(counts: Sequence[int], particle_count: int) -> tuple[int, ...]:
+    """Return how many particles each species has, as a tuple of ints.
+
+    Args:
+        counts: Particles of each species, in the order in which they lie in a world.
+        particle_count: Particles in each world N, which they must sum to.
+
+    Raises:
+        NPAError: They are no integers of at least 1, too many, or do not sum to N.
+    """
+    given: Any = counts
+    if isinstance(given, str) or not isinstance(given, Iterable):
+        raise NPAError(
+            f"counts must hold one number of particles for each species, got {counts!r}: "
+            f"for example counts=({particle_count},)"
+        )
+    checked = tuple(checked_count("an entry of counts", count) for count in given)
+    if not 1 <= len(checked) <= MOST_SPECIES:
+        raise NPAError(f"counts must name 1 to {MOST_SPECIES} species, got {len(checked)}")
+    if min(checked) < 1:
+        raise NPAError(
+            f"counts must be at least 1 for every species, got {checked}: leave the empty one out"
+        )
+    if sum(checked) != particle_count:
+        raise NPAError(
+            f"counts must sum to the {particle_count} particles of a world, got {checked}, "
+            f"which sum to {sum(checked)}"
+        )
+    return checked
+
+
+@torch.library.custom_op("npa::gather_species", mutates_args=())
+def _gather_species(
+    x: Tensor,
+    counts: list[int],
+    eps: float,
+    box: list[float] | None,
+    density_factor: float,
+    gradient_factor: float,
+    logarithmic: bool,
+) -> tuple[Tensor, Tensor]:
+    world_count, particle_count, space_dim = x.shape
+    plan = make_plan(x, x.shape, 1, world_count * particle_count, False, eps, box)
+    ordered = sort_worlds(plan, x, None, None, with_rows=False)
+    place = ordered.source % particle_count
+    sorted_species = torch.zeros_like(place)
+    # Numbers of the host's, not a tensor of them: a CUDA graph must not copy from the host.
+    for end in itertools.accumulate(counts[:-1]):
+        sorted_species += place >= end
+    density = x.new_empty(plan.total, len(counts))
+    gradient = x.new_empty(plan.total, len(counts), space_dim)
+    launch(
+        species_kernel(space_dim, scalar_type(x.dtype), len(counts)),
+        plan.total,
+        x.device,
+        plan.domain,
+        particle_count,
+        density_factor,
+        gradient_factor,
+        int(logarithmic),
+        ordered.starts,
+        ordered.source,
+        sorted_species,
+        ordered.positions,
+        density,
+        gradient,
+    )
+    shape = (world_count, particle_count, len(counts))
+    return density.view(shape), gradient.view(*shape, space_dim)
+
+
+@_gather_species.register_fake
+def _(x: Tensor, counts: list[int], *rest: Any) -> tuple[Tensor, Tensor]:
+    shape = (*x.shape[:2], len(counts))
+    return x.new_empty(shape), x.new_empty(*shape, x.shape[2])
+
+
+def perceive_by_species(
+    x: Tensor,
+    counts: tuple[int, ...],
+    *,
+    eps: float,
+    eps0: float,
+    box: tuple[float, ...] | None,
+) -> Tensor:
+    """Return what checked worlds perceive of each species, scaled, shape [B, N, K (1 + D)].
+
+    Args:
+        x: Positions [length units], shape [B, N, D]; no gradient flows into them.
+        counts: Particles of each species.
+        eps: Perception radius [length units].
+        eps0: Radius at which the rules were trained [length units].
+        box: Sides of the periodic box [length units], or None in open space.
+
+    Returns:
+        c^D ρ_k / N of each species, then L(c^(1+D) ∇ρ_k / N) of each, species by species.
+    """
+    scale = eps / eps0
+    particle_count, space_dim = x.shape[1:]
+    density, gradient = _gather_species(
+        x.detach().contiguous(),
+        list(counts),
+        eps,
+        None if box is None else list(box),
+        scale**space_dim / particle_count,
+        density_scale(scale, space_dim, particle_count),
+        True,
+    )
+    return torch.cat((density, gradient.flatten(2)), dim=-1)
+
+
+def species_fields(
+    x: Tensor, counts: Sequence[int], *, eps: float, box: Box = None
+) -> SpeciesFields:
+    """Return each species' density and density gradient at every particle; not differentiable.
+
+    A particle counts itself to its own species' density, so that the densities sum to that of
+    `perception_fields`, and the gradients likewise.
+
+    Args:
+        x: Particle positions [length units], shape [B, N, D], species after species.
+        counts: Particles of each species, K numbers that sum to N: species k owns `counts[k]`
+            consecutive ones.
+        eps: Perception radius [length units].
+        box: Sides of a periodic box centred on the origin [length units], or None for open space.
+
+    Raises:
+        NPAError: Positions or counts do not fit, a position is not finite, eps is not positive and
+            finite, or a box side is below 2 eps.
+    """
+    check_world(x, x)
+    checked = checked_counts(counts, x.shape[1])
+    radius = checked_eps("eps", eps, x.dtype)
+    sides = checked_box(box, x.shape[2], radius)
+    check_finite_positions(x)
+    return SpeciesFields(
+        *_gather_species(
+            x.detach().contiguous(),
+            list(checked),
+            radius,
+            None if sides is None else list(sides),
+            1.0,
+            1.0,
+            False,
+        )
+    )
+
+
+def perceive_species(
+    x: Tensor,
+    s: Tensor,
+    counts: Sequence[int],
+    eps: float,
+    eps0: float | None = None,
+    box: Box = None,
+    detach_positions: bool = True,
+) -> Tensor:
+    """Perceive neighbourhoods as `perceive`, and of each species its own density and gradient.
+
+    z = [what `perceive` returns ; c^D ρ_k / N (K) ; L(c^(1+D) ∇ρ_k / N) (K x D, species-major)].
+    Through what is appended no gradient flows.
+
+    Args:
+        x: Particle positions [length units], shape [B, N, D], species after species.
+        s: Particle states, dimensionless, shape [B, N, C].
+        counts: Particles of each species, K numbers that sum to N.
+        eps: Perception radius [length units].
+        eps0: Radius at which the rules were trained [length units]; default: eps.
+        box: Sides of a periodic box centred on the origin [length units], a number for equal
+            sides, or None for open space.
+        detach_positions: Do not back-propagate into x.
+
+    Returns:
+        Perception vectors, dimensionless, shape [B, N, P + K (1 + D)].
+
+    Raises:
+        NPAError: As `perceive`, or the counts do not fit.
+    """
+    check_world(x, s)
+    checked = checked_counts(counts, x.shape[1])
+    radius = checked_eps("eps", eps, x.dtype)
+    radius0 = radius if eps0 is None else checked_eps("eps0", eps0, x.dtype)
+    check_scale(radius, radius0, x.shape[2], x.dtype)
+    sides = checked_box(box, x.shape[2], radius)
+    shared = perceive(x, s, radius, radius0, sides, detach_positions)
+    appended = perceive_by_species(x, checked, eps=radius, eps0=radius0, box=sides)
+    return torch.cat((shared, appended), dim=-1)

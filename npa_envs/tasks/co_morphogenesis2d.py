@@ -1,0 +1,133 @@
+"""2D morphogenesis of several species in one world, each beside the others."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from npa_envs.errors import NPAError
+from npa_envs.randomness import Randomness
+from npa_envs.rule import NPARule
+from npa_envs.tasks.co_morphogenesis2d_config import CoMorphogenesis2DConfig
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
+
+
+class CoMorphogenesis2D:
+    """`Morphogenesis2D` of every species, each on its own particles; satisfies `Task`.
+
+    Worlds hold the particles of all species, one species after the other.
+
+    Args:
+        config: What each species grows, and where.
+        device: Where the targets' pictures are kept and worlds are compared with them.
+
+    Raises:
+        NPAError: A target cannot be loaded.
+    """
+
+    def __init__(
+        self,
+        config: CoMorphogenesis2DConfig | None = None,
+        *,
+        device: str | torch.device = "cpu",
+    ) -> None:
+        self.config = config or CoMorphogenesis2DConfig()
+        self.tasks = [Morphogenesis2D(own, device=device) for own in self.config.species]
+        """The task of each species."""
+
+    @property
+    def eps(self) -> float:
+        """Perception radius [length units]."""
+        return self.tasks[0].eps
+
+    @property
+    def box(self) -> None:
+        """Open space."""
+        return None
+
+    @property
+    def update_prob(self) -> float:
+        """Probability of a particle's update in a step, dimensionless."""
+        return self.tasks[0].update_prob
+
+    def make_rules(self, generator: torch.Generator) -> list[NPARule]:
+        """Return an untrained rule for each species, on the CPU."""
+        return [task.make_rule(generator) for task in self.tasks]
+
+    def make_rule(self, generator: torch.Generator) -> NPARule:
+        """Refuse: there is a rule for each species.
+
+        Raises:
+            NPAError: Always.
+        """
+        raise NPAError(
+            f"{len(self.tasks)} species need as many rules, not one: "
+            "train them with npa_envs.training.train_together"
+        )
+
+    def seed(
+        self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
+    ) -> tuple[Tensor, Tensor]:
+        """Return fresh worlds: each species uniform in a disk of its own, all states zero.
+
+        Args:
+            world_count: Worlds B.
+            generator: Source of the positions, on `device`.
+            device: Where the worlds are made.
+
+        Returns:
+            Positions [length units], shape [B, N, 2]; states, dimensionless, shape [B, N, C].
+        """
+        seeds = [task.seed(world_count, generator=generator, device=device) for task in self.tasks]
+        positions = [
+            torch.stack((x[..., 0] + centre, x[..., 1]), dim=-1)
+            for (x, _), centre in zip(seeds, self.config.centres, strict=True)
+        ]
+        return torch.cat(positions, dim=1), torch.cat([s for _, s in seeds], dim=1)
+
+    def damage(self, x: Tensor, s: Tensor, generator: Randomness) -> tuple[Tensor, Tensor]:
+        """Return the worlds with each species damaged as it is alone."""
+        hurt = [
+            task.damage(own_x, own_s, generator)
+            for task, own_x, own_s in zip(self.tasks, *self._split(x, s), strict=True)
+        ]
+        return torch.cat([x for x, _ in hurt], dim=1), torch.cat([s for _, s in hurt], dim=1)
+
+    def loss(self, x: Tensor, s: Tensor, path_length: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the sum of the species' training losses and its parts, named "k.part".
+
+        Args:
+            x: Positions [length units], shape [B, N, 2].
+            s: States, dimensionless, shape [B, N, C].
+            path_length: How far each particle travelled in the rollout [length units], [B, N].
+        """
+        total = x.new_zeros(())
+        parts: dict[str, Tensor] = {}
+        split = zip(self.tasks, self.config.centres, *self._split(x, s, path_length), strict=True)
+        for number, (task, centre, own_x, own_s, own_path) in enumerate(split):
+            # What must stay within bounds is each species around its own seed.
+            place = torch.stack((own_x[..., 0] - centre, own_x[..., 1]), dim=-1)
+            loss, own_parts = task.loss(place, own_s, own_path)
+            total = total + loss
+            parts |= {f"{number}.{name}": value for name, value in own_parts.items()}
+        return total, parts
+
+    def picture(self, x: Tensor, s: Tensor) -> Tensor:
+        """Return each world's picture with all species, shape [B, R, R, 4]; arguments as `loss`.
+
+        It spans [-1, 1] x [-1, 1]; its resolution is the first species' own.
+        """
+        return self.tasks[0].picture(x, s, centred=False)
+
+    def metrics(self, x: Tensor, s: Tensor) -> Tensor:
+        """Return each species' splat loss in each world, shape [B, K]; arguments as `loss`."""
+        split = zip(self.tasks, *self._split(x, s), strict=True)
+        return torch.stack([task.metric(own_x, own_s) for task, own_x, own_s in split], dim=1)
+
+    def metric(self, x: Tensor, s: Tensor) -> Tensor:
+        """Return each world's mean splat loss of its species, shape [B]; arguments as `loss`."""
+        return self.metrics(x, s).mean(dim=1)
+
+    def _split(self, *tensors: Tensor) -> list[tuple[Tensor, ...]]:
+        """Return each tensor's parts, species by species."""
+        return [torch.split(tensor, list(self.config.counts), dim=1) for tensor in tensors]

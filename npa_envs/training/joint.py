@@ -1,0 +1,166 @@
+"""Training several rules together, in one world that they share."""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Sequence
+from typing import Any, Literal, cast
+
+import torch
+from torch import Tensor, nn
+
+from npa_envs.devices import check_device
+from npa_envs.dynamics import Memory
+from npa_envs.errors import NPAError
+from npa_envs.rule import NPARule
+from npa_envs.rule_io import save_rule
+from npa_envs.species import rollout_species
+from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2D
+from npa_envs.tasks.co_morphogenesis2d_config import CoMorphogenesis2DConfig
+from npa_envs.training.config import TrainConfig
+from npa_envs.training.trainer import Trainer, TrainResult
+
+TASK_NAME = "co_morphogenesis2d"
+"""What checkpoints call it."""
+
+
+class JointRules(nn.Module):
+    """The rules of one world, one for each species: what the trainer takes for its rule.
+
+    Args:
+        rules: The rules, species by species.
+    """
+
+    def __init__(self, rules: Sequence[NPARule]) -> None:
+        super().__init__()
+        self.rules = nn.ModuleList(rules)
+
+    def __iter__(self) -> Any:
+        return iter(self.rules)
+
+    def hyper_parameters(self) -> dict[str, Any]:
+        """Return all that the rules are made with, for checkpoints."""
+        return {"rules": [dict(rule.hyper_parameters()) for rule in self]}
+
+
+class _JointTrainer(Trainer):
+    """`Trainer` of several rules, each of which leaves a file as if it had been trained alone."""
+
+    def __init__(
+        self,
+        task: CoMorphogenesis2D,
+        config: TrainConfig[CoMorphogenesis2DConfig],
+        rules: Sequence[NPARule] | None,
+        *,
+        resume: bool,
+        overwrite: bool,
+    ) -> None:
+        self._species = task
+        self._given = rules
+        super().__init__(
+            task,
+            config,
+            task_name=TASK_NAME,
+            resume=resume,
+            overwrite=overwrite,
+            rollout=self._rollout_together,
+        )
+
+    def _rollout_together(
+        self,
+        rule: NPARule,
+        x: Tensor,
+        s: Tensor,
+        steps: int,
+        /,
+        *,
+        eps: float,
+        box: tuple[float, ...] | None,
+        update_prob: float,
+        memory: Memory,
+        generator: torch.Generator,
+        return_path_length: Literal[True],
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        counts = self._species.config.counts
+        return rollout_species(
+            list(cast(JointRules, rule)),
+            x,
+            s,
+            steps,
+            counts=counts,
+            density_counts=counts,
+            eps=eps,
+            box=box,
+            update_prob=update_prob,
+            memory=memory,
+            generator=generator,
+            return_path_length=return_path_length,
+        )
+
+    def _make_rule(self, generator: torch.Generator) -> NPARule:
+        # The trainer asks of its rule what any module has, and for its hyper-parameters.
+        made = self._species.make_rules(generator)
+        if self._given is None:
+            return cast(NPARule, JointRules(made))
+        if len(self._given) != len(made):
+            raise NPAError(
+                f"rules must be one for each of {len(made)} species, got {len(self._given)}"
+            )
+        for number, (rule, own) in enumerate(zip(self._given, made, strict=True)):
+            wanted, given = own.hyper_parameters(), rule.hyper_parameters()
+            wrong = [name for name, value in given.items() if value != wanted.get(name)]
+            if wrong:
+                raise NPAError(
+                    f"rules must have the shape of their species, but rule {number} differs in "
+                    f"{', '.join(wrong)}: change those fields of species {number}"
+                )
+        return cast(NPARule, JointRules(copy.deepcopy(list(self._given))))
+
+    def _save_rule(self, told: dict[str, Any]) -> None:
+        for number, rule in enumerate(cast(JointRules, self.rule)):
+            own = {**told, "task": told["task"]["species"][number]}
+            metadata = {"task": "morphogenesis2d", "config": json.dumps(own)}
+            metadata |= {"iteration": str(self.iteration), "trained_in": TASK_NAME}
+            path = self.folder.rule.with_name(f"rule-{number}.safetensors")
+            save_rule(rule, path, metadata=metadata)
+
+
+def train_together(
+    config: TrainConfig[CoMorphogenesis2DConfig],
+    rules: Sequence[NPARule] | None = None,
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+    progress: bool = True,
+    max_seconds: float | None = None,
+) -> TrainResult:
+    """Train one rule for each species of a world that all of them share.
+
+    Each rule sees densities divided by its own particles, as it would alone. A rule whose
+    parameters do not require gradients stays as it is: the others learn to live beside it.
+
+    Args:
+        config: The run's configuration, for example `TrainConfig(task=CoMorphogenesis2DConfig())`.
+        rules: What to start from, one rule for each species; copied. None: untrained ones.
+        resume: Go on from the checkpoint in `config.out`; give the same `rules` again.
+        overwrite: Start anew although `config.out` holds a run; its files are removed.
+        progress: Show a progress bar.
+        max_seconds: Stop after this time [s]; the run can be resumed.
+
+    Returns:
+        What the run came to; its `rule` holds the rules, in the order of the species. Their files
+        are `rule-0.safetensors`, `rule-1.safetensors`, ... in `config.out`.
+
+    Raises:
+        NPAError: Rules do not fit the species, a target cannot be loaded, or as for `Trainer`.
+        DivergedError: The loss is not finite.
+    """
+    if config.initial_rule:
+        raise NPAError(
+            f"initial_rule is for one rule, got {config.initial_rule!r}: give one for each species "
+            "as rules"
+        )
+    task = CoMorphogenesis2D(config.task, device=check_device(config.device))
+    trainer = _JointTrainer(task, config, rules, resume=resume, overwrite=overwrite)
+    return trainer.run(progress=progress, max_seconds=max_seconds)

@@ -1,0 +1,307 @@
+"""What rules do to each other, in numbers that can be checked."""
+
+import functools
+import json
+import math
+import sys
+
+import pytest
+import torch
+from PIL import Image, ImageDraw
+
+from npa_envs.cli import main
+from npa_envs.encounters import FRAME_SHARES, Encounters, Organism
+from npa_envs.errors import NPAError
+from npa_envs.interaction import MIXED, InteractionRow, InteractionSettings, mixing_index, verdict
+from npa_envs.interaction_plots import heat_map
+from npa_envs.randomness import WorldRandom
+from npa_envs.rule import NPARule
+from npa_envs.rule_io import save_rule
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
+
+CPU = torch.device("cpu")
+COUNT = 40
+
+
+@functools.cache
+def task_of(count):
+    config = Morphogenesis2DConfig(
+        target="ring",
+        particle_count=count,
+        target_point_count=count,
+        state_dim=4,
+        eps=0.15,
+        resolution=24,
+    )
+    return Morphogenesis2D(config)
+
+
+def make_rule(seed=0, scale=0.3, eps0=0.15):
+    rule = NPARule(2, 4, 16, eps0=eps0).requires_grad_(False)
+    generator = torch.Generator().manual_seed(seed)
+    for parameter in rule.parameters():
+        parameter.uniform_(-scale, scale, generator=generator)
+    return rule
+
+
+def organism(name="a", update_prob=0.5, **options):
+    return Organism(name, make_rule(**options), task_of, update_prob)
+
+
+def settings(**options):
+    usual = {"particle_count": COUNT, "distances": (0.0,), "steps": 12, "seeds": (1, 2, 3)}
+    return InteractionSettings(**usual | options)
+
+
+def row(rule="a", beside="b", **fields):
+    usual = {"distance": 0.0, "ratio": 0.5, "alone": 0.1, "together": 0.2, "change": 2.0}
+    usual |= {"mixing": 0.1, "displacement": 0.0, "verdict": "disrupted"}
+    return InteractionRow(rule=rule, beside=beside, **usual | fields)
+
+
+@pytest.mark.parametrize(
+    ("change", "mixing", "expected"),
+    [
+        (0.79, 0.0, "cooperates"),
+        (0.81, 0.0, "undisturbed"),
+        (1.19, MIXED - 1e-9, "undisturbed"),
+        (1.21, MIXED, "disrupted, mixes"),
+        (0.5, 1.0, "cooperates, mixes"),
+        (math.inf, 0.0, "disrupted"),
+        (math.nan, 0.0, "disrupted"),
+    ],
+)
+def test_a_verdict_follows_from_the_change_and_the_mixing(change, mixing, expected):
+    assert verdict(change, mixing) == expected
+
+
+def test_a_verdict_takes_its_margin():
+    assert verdict(1.19, 0.0, margin=0.1) == "disrupted"
+    assert verdict(0.81, 0.0, margin=0.1) == "cooperates"
+
+
+def test_the_mixing_index_of_known_worlds():
+    pair = torch.zeros(1, 2, 2)
+    assert mixing_index(pair, [1, 1], eps=0.1).item() == pytest.approx(1.0)
+    apart = torch.tensor([[[0.0, 0.0], [5.0, 0.0]]])
+    assert mixing_index(apart, [1, 1], eps=0.1).item() == 0.0
+    # Three of one species and one of another at one place: the entropy of 3/4 and 1/4.
+    heap = torch.zeros(1, 4, 2)
+    entropy = -(0.75 * math.log(0.75) + 0.25 * math.log(0.25)) / math.log(2.0)
+    assert mixing_index(heap, [3, 1], eps=0.1).item() == pytest.approx(entropy, rel=1e-6)
+    # Of three species one is far away: two mix, the third does not.
+    three = torch.tensor([[[0.0, 0.0], [0.0, 0.0], [5.0, 0.0]]])
+    expected = 2.0 / 3.0 * math.log(2.0) / math.log(3.0)
+    assert mixing_index(three, [1, 1, 1], eps=0.1).item() == pytest.approx(expected, rel=1e-6)
+    with pytest.raises(NPAError, match="at least two species"):
+        mixing_index(pair, [2], eps=0.1)
+
+
+def test_a_rule_out_of_reach_of_the_other_is_what_it_is_alone():
+    """Its densities are divided by its own particles, and it draws what it draws alone."""
+    encounters = Encounters(settings(distances=(30.0,), ratios=(0.5, 0.25)), device=CPU)
+    rows, _ = encounters.meet(organism(), organism("b", seed=1))
+    assert [found.ratio for found in rows] == [0.5, 0.25]
+    for found in rows:
+        assert found.together == pytest.approx(found.alone, rel=1e-4)
+        assert found.change == pytest.approx(1.0, rel=1e-4)
+        assert found.displacement < 1e-4
+        assert found.mixing == 0.0
+        assert found.verdict == "undisturbed"
+
+
+def test_a_rule_within_reach_is_measured_by_its_own_particles():
+    encounters = Encounters(settings(distances=(0.0, 0.3)), device=CPU)
+    rows, _ = encounters.meet(organism(), organism("b", seed=1))
+    alone = {found.alone for found in rows}
+    assert len(alone) == 1
+    assert rows[0].mixing > 0.3 > rows[1].mixing > 0.0
+    for found in rows:
+        assert found.together != found.alone
+        assert found.change == pytest.approx(found.together / found.alone, rel=1e-12)
+        assert found.displacement > 1e-3
+        assert found.verdict == verdict(found.change, found.mixing)
+
+
+def test_still_rules_leave_their_seeds_and_the_metric_is_the_tasks():
+    still = [organism(name, scale=0.0) for name in "ab"]
+    rows, _ = Encounters(settings(distances=(0.2,)), device=CPU).meet(*still)
+    (found,) = rows
+    assert found.change == 1.0
+    assert found.displacement == 0.0
+    task = task_of(COUNT // 2)
+    x, s = task.seed(3, generator=WorldRandom([1, 2, 3]))
+    assert found.alone == pytest.approx(task.metric(x, s).mean().item(), rel=1e-6)
+
+
+def test_a_rule_beside_itself_has_seeds_of_its_own():
+    still = organism(scale=0.0)
+    rows, _ = Encounters(settings(), device=CPU).meet(still, still)
+    # Were both seeds one, every particle would see both species alike.
+    assert 0.5 < rows[0].mixing < 0.99
+
+
+def test_the_same_settings_give_the_same_rows_and_count_their_steps():
+    done = []
+    tables = []
+    for _ in range(2):
+        encounters = Encounters(settings(steps=40), device=CPU, progress=done.append)
+        tables.append(encounters.meet(organism(), organism("b", seed=1))[0])
+    assert tables[0] == tables[1]
+    assert sum(done) == 2 * (40 + 40)
+
+
+def test_pictures_are_taken_along_the_way():
+    encounters = Encounters(settings(steps=16, distances=(0.0, 1.0)), device=CPU)
+    _, scenes = encounters.meet(organism(), organism("b", seed=1))
+    steps = [round(16 * share) for share in FRAME_SHARES]
+    expected = [f"d {d}, r 0.5, step {step}" for d in (0, 1) for step in steps]
+    assert scenes.captions == expected
+    assert len(scenes.frames) == len(expected)
+    # Two disks side by side, one at first.
+    wide = [(frame < 250).any(axis=(0, 2)).sum() for frame in (scenes.frames[0], scenes.frames[5])]
+    assert wide[1] > wide[0]
+
+
+def test_a_world_that_blows_up_is_disrupted_and_the_study_goes_on():
+    bomb = organism("b", seed=1)
+    bomb.rule.output.weight.mul_(1e38)
+    rows, _ = Encounters(settings(), device=CPU).meet(organism(), bomb)
+    assert rows[0].together == math.inf
+    assert rows[0].verdict.startswith("disrupted")
+    assert math.isfinite(rows[0].alone)
+
+
+def test_rules_that_cannot_share_a_world_are_named():
+    encounters = Encounters(settings(), device=CPU)
+    with pytest.raises(NPAError, match=r"a and b cannot share a world: .*eps0, got 0\.15 .* 0\.2"):
+        encounters.check([organism(), organism("b", eps0=0.2)])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"particle_count": 1}, "particle_count must be at least 2, got 1"),
+        ({"steps": 0}, "steps must be at least 1, got 0"),
+        ({"seeds": ()}, "seed count must be at least 1, got 0"),
+        ({"distances": (-1.0,)}, r"finite and not negative, got \(-1\.0,\)"),
+        ({"ratios": (0.5, 1.0)}, r"ratios must lie in \(0, 1\), got \(0\.5, 1\.0\)"),
+        ({"margin": 0.0}, r"margin must lie in \(0, 1\)"),
+        ({"update_prob": 1.5}, r"update_prob must lie in \(0, 1\], got 1\.5"),
+    ],
+)
+def test_wrong_settings_are_clear_errors(options, message):
+    with pytest.raises(NPAError, match=message):
+        settings(**options)
+
+
+def test_a_share_leaves_a_particle_for_either_species():
+    assert settings().counts(0.5) == (20, 20)
+    assert settings().counts(0.001) == (1, 39)
+    assert settings().counts(0.999) == (39, 1)
+
+
+def test_a_heat_map_is_drawn_of_rows_with_gaps_and_infinities():
+    pytest.importorskip("matplotlib")
+    drawn = heat_map([row(), row("b", "a", change=math.inf), row(distance=1.0)])
+    assert drawn.startswith(b"\x89PNG")
+
+
+def rules_metadata(folder):
+    """What rules that grow the picture in `folder` say in their files."""
+    config = {"target": str(folder / "disk.png"), "particle_count": COUNT, "hidden_dim": 16}
+    config |= {"state_dim": 4, "eps": 0.15, "resolution": 24}
+    return {"task": "morphogenesis2d", "config": json.dumps(config)}
+
+
+class TestCommand:
+    """`npa-envs interact`."""
+
+    @pytest.fixture
+    def rules(self, tmp_path_factory):
+        folder = tmp_path_factory.mktemp("rules")
+        picture = Image.new("RGBA", (16, 16))
+        ImageDraw.Draw(picture).ellipse((3, 3, 12, 12), fill="#30a050")
+        picture.save(folder / "disk.png")
+        for number, name in enumerate(("one", "two")):
+            path = folder / f"{name}.safetensors"
+            save_rule(make_rule(number), path, metadata=rules_metadata(folder))
+        return folder
+
+    @staticmethod
+    def words(rules, out, *more):
+        paths = [str(rules / f"{name}.safetensors") for name in ("one", "two")]
+        usual = ["--seed-count", "2", "--steps", "6", "--distances", "0", "2"]
+        return ["interact", *paths, *usual, "--out", str(out), "--no-progress", *more]
+
+    def test_every_pair_is_measured_written_and_drawn(self, rules, tmp_path, capsys):
+        assert main(self.words(rules, tmp_path)) == 0
+        held = json.loads((tmp_path / "interactions.json").read_text())
+        pairs = [(found["rule"], found["beside"]) for found in held["rows"]]
+        names = ["one", "two"]
+        assert pairs == [(a, b) for a in names for b in names for _ in range(2)]
+        assert [(m["ratio"], m["distance"]) for m in held["matrices"]] == [(0.5, 0.0), (0.5, 2.0)]
+        for matrix in held["matrices"]:
+            changes = [
+                found["change"] for found in held["rows"] if found["distance"] == matrix["distance"]
+            ]
+            assert matrix["change"] == [changes[:2], changes[2:]]
+        assert held["settings"]["particle_count"] == COUNT
+        for a, b in {*pairs}:
+            with Image.open(tmp_path / f"{a}-{b}.png") as strip:
+                assert strip.width > strip.height
+        printed = capsys.readouterr().out
+        assert printed.count("\n") >= 9
+        assert "undisturbed" in printed
+
+    def test_a_stopped_run_goes_on_and_ends_as_one_that_was_not(
+        self, rules, tmp_path, capsys, monkeypatch
+    ):
+        whole, parts = tmp_path / "whole", tmp_path / "parts"
+        assert main(self.words(rules, whole)) == 0
+        meet, met = Encounters.meet, []
+
+        def stopped(self, first, second):
+            met.append((first.name, second.name))
+            if len(met) == 3:
+                raise KeyboardInterrupt
+            return meet(self, first, second)
+
+        monkeypatch.setattr(Encounters, "meet", stopped)
+        assert main(self.words(rules, parts)) == 130
+        assert len(json.loads((parts / "interactions.json").read_text())["rows"]) == 4
+        capsys.readouterr()
+        assert main(self.words(rules, parts)) == 0
+        assert "2 of 4 pairs were measured before" in capsys.readouterr().out
+        assert met[3:] == [("two", "one"), ("two", "two")]
+        texts = [(folder / "interactions.json").read_text() for folder in (whole, parts)]
+        assert texts[0] == texts[1]
+
+    def test_results_of_other_settings_are_not_mixed_with_these(self, rules, tmp_path, capsys):
+        assert main(self.words(rules, tmp_path)) == 0
+        assert main(self.words(rules, tmp_path, "--update-prob", "0.9")) == 2
+        error = capsys.readouterr().err
+        assert "update_prob was None, now 0.9: choose another folder with --out" in error
+        save_rule(make_rule(5), rules / "two.safetensors", metadata=rules_metadata(rules))
+        assert main(self.words(rules, tmp_path)) == 2
+        assert "holds results of other settings: rules was" in capsys.readouterr().err
+        (tmp_path / "interactions.json").write_text("{}")
+        assert main(self.words(rules, tmp_path)) == 2
+        assert "must hold results of npa-envs interact" in capsys.readouterr().err
+
+    def test_without_matplotlib_only_the_heat_map_is_missing(
+        self, rules, tmp_path, capsys, monkeypatch
+    ):
+        monkeypatch.setitem(sys.modules, "matplotlib", None)
+        assert main(self.words(rules, tmp_path)) == 0
+        assert "no heat map: " in (printed := capsys.readouterr().out)
+        assert "pip install 'npa-envs[bench]'" in printed
+        assert not (tmp_path / "interactions.png").exists()
+        assert (tmp_path / "one-two.png").exists()
+
+    def test_rules_of_other_tasks_and_of_none_are_refused(self, rules, tmp_path, capsys):
+        unknown = tmp_path / "unknown.safetensors"
+        save_rule(make_rule(), unknown)
+        assert main(["interact", str(unknown), "--out", str(tmp_path / "out")]) == 2
+        assert "does not say what it grows: leave it out" in capsys.readouterr().err
+        assert not (tmp_path / "out").exists()

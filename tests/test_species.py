@@ -1,0 +1,484 @@
+"""Several rules in one world: what they see of each other, and that physics exists once."""
+
+import re
+from pathlib import Path
+
+import pytest
+import torch
+from worlds import degenerate_world, random_world, relative_error
+
+import npa_envs
+from npa_envs import reference as oracle
+from npa_envs.errors import NPAError
+
+FIELD_ERRORS = {torch.float64: 1e-13, torch.float32: 2e-6}
+"""Largest relative error of fields by species (worst seen 2e-15 and 2e-7)."""
+
+
+def make_rule(device="cpu", *, seed=0, space_dim=2, hidden_dim=12, gain=8.0, **options):
+    """A rule in float64 whose updates are large enough to matter."""
+    torch.manual_seed(seed)
+    rule = npa_envs.NPARule(space_dim, 5, hidden_dim, eps0=0.3, **options).to(device, torch.float64)
+    with torch.no_grad():
+        rule.output.weight *= gain
+    return rule
+
+
+def make_world(device, particle_count=60, space_dim=2, world_count=2):
+    return random_world(
+        world_count, particle_count, space_dim, 5, dtype=torch.float64, device=device
+    )
+
+
+def seeded(device, seed=4):
+    return torch.Generator(device).manual_seed(seed)
+
+
+def fields_by_species(x, counts, eps, box):
+    """The fields of each species by pairs: the smoothing and the spiky kernel summed over it."""
+    r = oracle.differences(x, box)
+    weight = oracle.smoothing_kernel((r * r).sum(dim=-1), eps, x.shape[2])
+    kernel = oracle.spiky_gradient(r, eps)
+    rho = [part.sum(dim=2) for part in weight.split(counts, dim=2)]
+    drho = [part.sum(dim=2) for part in kernel.split(counts, dim=2)]
+    return torch.stack(rho, dim=2), torch.stack(drho, dim=2)
+
+
+@pytest.mark.parametrize(
+    ("space_dim", "box"), [(2, None), (2, (1.4, 1.8)), (3, None), (3, (1.4, 1.5, 1.6))]
+)
+@pytest.mark.parametrize("static", [False, True])
+def test_species_with_one_rule_are_one_species(space_dim, box, static, device):
+    rule = make_rule(device, space_dim=space_dim, static=static)
+    x, s = make_world(device, 50, space_dim)
+    expected = npa_envs.rollout(rule, x, s, 20, box=box, generator=seeded(device))
+    found = npa_envs.rollout_species(
+        [rule, rule, rule], x, s, 20, counts=(13, 30, 7), box=box, generator=seeded(device)
+    )
+    assert (expected[1] - s).abs().max() > 0.1
+    for value, answer in zip(found, expected, strict=True):
+        assert (value - answer).abs().max() < 1e-12
+
+
+def test_one_species_draws_and_does_what_a_rollout_does(device):
+    rule = make_rule(device)
+    x, s = make_world(device)
+    options = {"update_prob": 0.4, "dt": 0.5, "position_noise": 0.01, "eps": 0.25}
+    expected = npa_envs.rollout(rule, x, s, 6, generator=seeded(device), **options)
+    for split in ([60], [1, 59]):
+        found = npa_envs.rollout_species(
+            [rule] * len(split), x, s, 6, counts=split, generator=seeded(device), **options
+        )
+        for value, answer in zip(found, expected, strict=True):
+            assert (value - answer).abs().max() < 1e-12
+
+
+def test_swapping_species_with_their_particles_swaps_what_comes_out(device):
+    first, second = make_rule(device), make_rule(device, seed=1, hidden_dim=20, alpha=0.2)
+    x, s = make_world(device)
+    x1, s1 = npa_envs.rollout_species([first, second], x, s, 8, counts=[20, 40], update_prob=1.0)
+    x2, s2 = npa_envs.rollout_species(
+        [second, first], x.roll(40, 1), s.roll(40, 1), 8, counts=[40, 20], update_prob=1.0
+    )
+    assert (x1 - x).abs().max() > 0.05
+    assert (x2.roll(-40, 1) - x1).abs().max() < 1e-12
+    assert (s2.roll(-40, 1) - s1).abs().max() < 1e-12
+
+
+def test_each_species_follows_its_own_rule(device):
+    """One step at p = 1: particle by particle what its own rule makes of the common perception."""
+    rules = [make_rule(device, alpha=0.5), make_rule(device, seed=1, hidden_dim=20, alpha=0.2)]
+    counts = [25, 35]
+    x, s = make_world(device)
+    after = npa_envs.rollout_species(rules, x, s, 1, counts=counts, update_prob=1.0)
+    alone = [npa_envs.step(rule, x, s, update_prob=1.0) for rule in rules]
+    for value, *own in zip(after, *alone, strict=True):
+        expected = torch.cat((own[0][:, :25], own[1][:, 25:]), dim=1)
+        assert (value - expected).abs().max() < 1e-13
+
+
+def test_rules_that_are_no_plain_networks_run_as_they_are(device):
+    class Doubled(npa_envs.NPARule):
+        def forward(self, perception):
+            return 2.0 * super().forward(perception)
+
+    plain = make_rule(device)
+    doubled = Doubled(**plain.hyper_parameters()).to(plain.hidden.weight)
+    doubled.load_state_dict(plain.state_dict())
+    with torch.no_grad():
+        doubled.output.weight *= 0.5
+    x, s = make_world(device)
+    expected = npa_envs.rollout(plain, x, s, 5, generator=seeded(device))
+    for rules in ([doubled, plain], [doubled, doubled]):
+        found = npa_envs.rollout_species(rules, x, s, 5, counts=[20, 40], generator=seeded(device))
+        assert (found[0] - expected[0]).abs().max() < 1e-12
+        assert (found[1] - expected[1]).abs().max() < 1e-12
+
+
+@pytest.mark.parametrize("told_apart", [False, True])
+def test_species_out_of_reach_see_themselves_as_alone(told_apart, device):
+    perception = "per_species" if told_apart else "shared"
+    rules = [make_rule(device, seed=k, species_count=told_apart * 2) for k in range(2)]
+    x, s = make_world(device)
+    x = torch.cat((x[:, :20], x[:, 20:] + 50.0), dim=1)
+    options = {"update_prob": 1.0, "counts": [20, 40], "perception": perception}
+    shared = npa_envs.rollout_species(rules, x, s, 5, **options)
+    own = npa_envs.rollout_species(rules, x, s, 5, density_counts=[20, 40], **options)
+    if told_apart:
+        # Alone, with a species of nobody's: particles far away of which each sees none.
+        z = npa_envs.perceive_species(x[:, :20], s[:, :20], [20], 0.3)
+        blank = z.new_zeros(*z.shape[:2], 3)
+        z = torch.cat((z[..., :23], blank[..., :1], z[..., 23:], blank[..., 1:]), dim=-1)
+        update = rules[0](z)
+        delta = update[..., :2]
+        step = 0.5 * 0.3 * delta / (1.0 + delta.norm(dim=-1, keepdim=True))
+        first = npa_envs.rollout_species(rules, x, s, 1, density_counts=[20, 40], **options)
+        assert (first[0][:, :20] - x[:, :20] - step).abs().max() < 1e-12
+    else:
+        alone = npa_envs.rollout(rules[0], x[:, :20], s[:, :20], 5, update_prob=1.0)
+        assert (own[0][:, :20] - alone[0]).abs().max() < 1e-11
+        assert (own[1][:, :20] - alone[1]).abs().max() < 1e-11
+    assert (own[0] - shared[0]).abs().max() > 1e-4
+
+
+@pytest.mark.parametrize("worldwise", [False, True])
+def test_each_species_has_its_own_update_probability(worldwise, device):
+    rules = [make_rule(device, seed=k, static=True) for k in range(3)]
+    x, s = make_world(device, 1500)
+    generator = npa_envs.WorldRandom([1, 2], device=device) if worldwise else seeded(device)
+    _, after = npa_envs.rollout_species(
+        rules, x, s, 1, counts=[500] * 3, update_prob=(0.2, 0.8, 1.0), generator=generator
+    )
+    shares = [float(part.any(dim=-1).double().mean()) for part in (after != s).split(500, dim=1)]
+    assert shares[0] == pytest.approx(0.2, abs=0.05)
+    assert shares[1] == pytest.approx(0.8, abs=0.05)
+    assert shares[2] == 1.0
+
+
+def test_a_species_that_sleeps_stays_where_it_is_and_leaves_others_their_updates(device):
+    rules = [make_rule(device), make_rule(device, seed=1)]
+    x, s = make_world(device)
+    awake_x, awake_s = npa_envs.rollout_species(rules, x, s, 1, counts=[30, 30], update_prob=1.0)
+    for chances, asleep in (((1e-12, 1.0), slice(0, 30)), ((1.0, 1e-12), slice(30, 60))):
+        after_x, after_s = npa_envs.rollout_species(
+            rules, x, s, 1, counts=[30, 30], update_prob=chances, generator=seeded(device)
+        )
+        expected_x, expected_s = awake_x.clone(), awake_s.clone()
+        expected_x[:, asleep], expected_s[:, asleep] = x[:, asleep], s[:, asleep]
+        assert (after_x - expected_x).abs().max() < 1e-13
+        assert (after_s - expected_s).abs().max() < 1e-13
+
+
+def test_equal_probabilities_of_each_draw_what_one_does(device):
+    rules = [make_rule(device), make_rule(device, seed=1)]
+    x, s = make_world(device)
+    runs = [
+        npa_envs.rollout_species(
+            rules, x, s, 4, counts=[30, 30], update_prob=chance, generator=seeded(device)
+        )
+        for chance in (0.5, [0.5, 0.5], torch.tensor(0.5))
+    ]
+    assert torch.equal(runs[0][0], runs[1][0])
+    assert torch.equal(runs[0][1], runs[2][1])
+
+
+@pytest.mark.parametrize("perception", ["shared", "per_species"])
+def test_gradients_of_every_rule_and_state_equal_finite_differences(perception, device):
+    told = 0 if perception == "shared" else 2
+    # The moment correction is a stopped gradient: finite differences would see it.
+    options = {"species_count": told, "moment_correction": False}
+    rules = [
+        make_rule(device, **options),
+        make_rule(device, seed=1, hidden_dim=7, alpha=0.3, **options),
+    ]
+    x, s = make_world(device, 30, world_count=1)
+    s.requires_grad_()
+
+    def loss():
+        # No noise from what is detached: positions that others see are not differentiated.
+        after_x, after_s = npa_envs.rollout_species(
+            rules, x, s, 1, counts=[12, 18], generator=seeded(device), perception=perception
+        )
+        return (after_x.sin() * 3.0).sum() + after_s.square().sum()
+
+    tensors = [s, *rules[0].parameters(), *rules[1].parameters()]
+    gradients = torch.autograd.grad(loss(), tensors)
+    torch.manual_seed(3)
+    for tensor, gradient in zip(tensors, gradients, strict=True):
+        direction = torch.randn_like(tensor)
+        with torch.no_grad():
+            tensor += 1e-6 * direction
+            above = loss()
+            tensor -= 2e-6 * direction
+            below = loss()
+            tensor += 1e-6 * direction
+        slope = float((above - below) / 2e-6)
+        assert gradient.norm() > 1e-3
+        assert float((gradient * direction).sum()) == pytest.approx(slope, rel=1e-6, abs=1e-7)
+
+
+def test_gradients_of_many_steps_with_one_rule_are_those_of_a_rollout(device):
+    x, s = make_world(device)
+    results = []
+    for counts in ([60], [25, 35]):
+        rule = make_rule(device)
+        start = s.clone().requires_grad_()
+        place = x.clone().requires_grad_()
+        out = npa_envs.rollout_species(
+            [rule] * len(counts),
+            place,
+            start,
+            6,
+            counts=counts,
+            detach_positions=False,
+            generator=seeded(device),
+        )
+        loss = out[0].square().sum() + out[1].square().sum()
+        results.append(torch.autograd.grad(loss, [start, place, *rule.parameters()]))
+    for value, answer in zip(*results, strict=True):
+        assert relative_error(value, answer) < 1e-11
+
+
+def test_recomputing_gives_the_gradients_of_storing_and_paths_are_those_of_a_rollout(device):
+    rules = [make_rule(device), make_rule(device, seed=1)]
+    x, s = make_world(device)
+    results = []
+    for memory in ("store", "recompute", "minimal"):
+        out = npa_envs.rollout_species(
+            rules,
+            x,
+            s,
+            5,
+            counts=[20, 40],
+            generator=seeded(device),
+            memory=memory,
+            return_path_length=True,
+        )
+        loss = sum(value.square().sum() for value in out)
+        parameters = [*rules[0].parameters(), *rules[1].parameters()]
+        results.append([*out, *torch.autograd.grad(loss, parameters)])
+    for stored, *others in zip(*results, strict=True):
+        assert all(torch.equal(stored, other) for other in others)
+    for counts in ([60], [25, 35]):
+        options = {"generator": seeded(device), "return_path_length": True}
+        *_, path = npa_envs.rollout_species(
+            rules[:1] * len(counts), x, s, 5, counts=counts, **options
+        )
+        options = {"generator": seeded(device), "return_path_length": True}
+        *_, expected = npa_envs.rollout(rules[0], x, s, 5, **options)
+        assert path.shape == (2, 60)
+        assert (path - expected).abs().max() < 1e-12
+
+
+@pytest.mark.parametrize("dtype", FIELD_ERRORS, ids=("float64", "float32"))
+@pytest.mark.parametrize("space_dim", [2, 3])
+@pytest.mark.parametrize("periodic", [False, True])
+def test_fields_of_each_species_are_sums_over_it(dtype, space_dim, periodic, device):
+    counts = [70, 1, 130]
+    box = (1.4, 1.7, 1.5)[:space_dim] if periodic else None
+    x, s = random_world(3, 201, space_dim, 4, dtype=dtype, device=device)
+    found = npa_envs.species_fields(x, counts, eps=0.3, box=box)
+    expected = fields_by_species(x.cpu().double(), counts, 0.3, box)
+    total = npa_envs.perception_fields(x, s, 0.3, box)
+    for value, answer in zip(found, expected, strict=True):
+        assert relative_error(value, answer) < FIELD_ERRORS[dtype]
+    assert relative_error(found.rho.sum(2), total.rho) < FIELD_ERRORS[dtype]
+    assert relative_error(found.drho.sum(2), total.drho) < FIELD_ERRORS[dtype]
+
+
+def test_fields_are_right_where_particles_coincide_or_are_alone(device):
+    x, _ = degenerate_world(2, 3, dtype=torch.float64, device=device)
+    counts = [30, 45, 5]
+    found = npa_envs.species_fields(x, counts, eps=0.3)
+    expected = fields_by_species(x.cpu(), counts, 0.3, None)
+    for value, answer in zip(found, expected, strict=True):
+        assert relative_error(value, answer) < 1e-13
+    # The last particle is alone: its own species sees it, nobody else.
+    own = float(oracle.smoothing_kernel(torch.zeros((), dtype=torch.float64), 0.3, 2))
+    assert found.rho[0, -1].tolist() == [0.0, 0.0, pytest.approx(own)]
+    assert not found.drho[0, -1].any()
+
+
+def test_fields_of_species_can_be_compiled(device):
+    x, _ = make_world(device)
+
+    def density_of_the_second(x):
+        return npa_envs.species_fields(x, [20, 40], eps=0.3).rho[..., 1] * 2.0
+
+    compiled = torch.compile(density_of_the_second, backend="aot_eager", fullgraph=True)
+    assert torch.equal(compiled(x), density_of_the_second(x))
+
+
+def test_every_species_is_perceived_with_the_logarithm_of_its_gradient(device):
+    counts = [20, 40]
+    x, s = make_world(device)
+    z = npa_envs.perceive_species(x, s, counts, 0.3, 0.2)
+    shared = npa_envs.perceive(x, s, 0.3, 0.2)
+    rho, drho = fields_by_species(x.cpu(), counts, 0.3, None)
+    scale = 0.3 / 0.2
+    density = scale**2 * rho / 60
+    gradient = oracle.log_scale(scale**3 * drho / 60).flatten(2)
+    assert torch.equal(z[..., :22], shared)
+    assert relative_error(z[..., 22:24], density) < 1e-13
+    assert relative_error(z[..., 24:], gradient) < 1e-13
+
+
+@pytest.mark.parametrize("update_prob", [1.0, 0.5])
+def test_rules_of_species_read_what_is_perceived_of_each(update_prob, device):
+    rules = [make_rule(device, seed=k, species_count=2) for k in range(2)]
+    counts = [20, 40]
+    x, s = make_world(device)
+    found = npa_envs.rollout_species(
+        rules,
+        x,
+        s,
+        1,
+        counts=counts,
+        eps=0.25,
+        update_prob=update_prob,
+        generator=seeded(device),
+        perception="per_species",
+    )
+    mask = torch.ones(2, 60, dtype=torch.uint8, device=device)
+    if update_prob < 1.0:
+        mask.bernoulli_(update_prob, generator=seeded(device))
+    z = npa_envs.perceive_species(x, s, counts, 0.25, 0.3)
+    update = torch.cat((rules[0](z[:, :20]), rules[1](z[:, 20:])), dim=1) * mask[..., None]
+    delta = update[..., :2]
+    moved = x + 0.5 * 0.25 * delta / (1.0 + delta.norm(dim=-1, keepdim=True))
+    assert (found[0] - moved).abs().max() < 1e-13
+    assert (found[1] - s - update[..., 2:]).abs().max() < 1e-12
+
+
+def test_a_rule_that_tells_species_apart_survives_its_file(tmp_path):
+    rule = make_rule(species_count=3)
+    assert rule.perception_dim == npa_envs.NPARule(2, 5, 12).perception_dim + 9
+    npa_envs.save_rule(rule, tmp_path / "rule.safetensors")
+    loaded = npa_envs.load_rule(tmp_path / "rule.safetensors")
+    assert loaded.hyper_parameters() == rule.hyper_parameters()
+    assert loaded.species_count == 3
+    assert torch.equal(loaded.hidden.weight, rule.hidden.weight)
+    assert "species_count" not in make_rule().hyper_parameters()
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("perception", ["shared", "per_species"])
+def test_devices_agree_and_a_rollout_can_be_captured(perception):
+    told = 0 if perception == "shared" else 2
+    options = {"counts": [1000, 500], "perception": perception, "update_prob": (0.5, 0.3)}
+    x, s = make_world("cpu", 1500)
+    results = []
+    for device in ("cpu", "cuda"):
+        rules = [make_rule(device, seed=k, species_count=told, gain=2.0) for k in range(2)]
+        random = npa_envs.WorldRandom([1, 2], device=device)
+        with torch.no_grad():
+            results.append(
+                npa_envs.rollout_species(
+                    rules, x.to(device), s.to(device), 4, generator=random, **options
+                )
+            )
+    for value, answer in zip(*results, strict=True):
+        assert (value - answer.cpu()).abs().max() < 1e-10
+    random = npa_envs.WorldRandom([1, 2], device="cuda")
+    x, s = x.cuda(), s.cuda()
+    graph = torch.cuda.CUDAGraph()
+    with torch.no_grad(), torch.cuda.graph(graph):
+        captured = npa_envs.rollout_species(rules, x, s, 4, generator=random, **options)
+    graph.replay()
+    for value, answer in zip(captured, results[0], strict=True):
+        assert (value.cpu() - answer).abs().max() < 1e-10
+
+
+def test_the_code_about_species_runs():
+    page = Path(__file__).resolve().parent.parent / "docs" / "species.md"
+    rolled, trained = re.findall(r"^```python\n(.*?)^```", page.read_text(), re.M | re.S)
+    names = {}
+    exec(rolled, names)
+    assert names["x"].shape == (1, 256, 2)
+    assert names["x"].isfinite().all()
+    exec(trained, names)
+    assert names["config"].task.counts == (4096, 4096)
+
+
+class TestErrors:
+    """Every mistake is named, with what came."""
+
+    @pytest.mark.parametrize(
+        ("rules", "options", "message"),
+        [
+            (make_rule(), {}, r"one rule for each species, got NPARule: give \(rule,\)"),
+            ([make_rule(), "gecko"], {}, "NPARule each, got str as rule 1"),
+            ([make_rule()], {}, "one for each species, got 1 rules and 2 counts"),
+            (
+                [make_rule(), npa_envs.NPARule(2, 6, 8, eps0=0.3)],
+                {},
+                "agree in state_dim, got 5 for rule 0 and 6 for rule 1",
+            ),
+            (
+                [make_rule(), make_rule(space_dim=3)],
+                {},
+                "agree in space_dim, got 2 for rule 0 and 3",
+            ),
+            (
+                [make_rule(), npa_envs.NPARule(2, 5, 8, eps0=0.2)],
+                {},
+                r"agree in eps0, got 0\.3 for rule 0 and 0\.2",
+            ),
+            ([make_rule(), make_rule(static=True)], {}, "agree in static, got False for rule 0"),
+            (
+                [make_rule(), make_rule(density_gradient=False)],
+                {},
+                "agree in density_gradient, got True for rule 0 and False for rule 1",
+            ),
+            (
+                [make_rule(), make_rule(species_count=2)],
+                {},
+                "'shared' of 2 species needs rules with species_count=0, got 2 for rule 1",
+            ),
+            (
+                [make_rule(), make_rule()],
+                {"perception": "per_species"},
+                "needs rules with species_count=2, got 0 for rule 0",
+            ),
+            (None, {"perception": "own"}, "'shared' or 'per_species', got 'own'"),
+            (None, {"counts": [20, 41]}, r"sum to the 60 particles .* \(20, 41\), .* to 61"),
+            (None, {"counts": [60, 0]}, r"at least 1 for every species, got \(60, 0\)"),
+            (None, {"counts": 60}, r"one number of particles for each species, got 60"),
+            (None, {"counts": [20.5, 39.5]}, "an entry of counts must be an integer"),
+            (None, {"counts": []}, "1 to 64 species, got 0"),
+            (None, {"density_counts": [60]}, r"each of 2 species, got \[60\]: .*=\(20, 40\)"),
+            (None, {"density_counts": [20, 0]}, "one positive number for each of 2 species"),
+            (None, {"memory": "little"}, "'store', 'recompute' or 'minimal', got 'little'"),
+            (None, {"update_prob": [0.5]}, "one for each of 2 species, got 1"),
+            (None, {"update_prob": [0.5, 1.5]}, r"lie in \(0, 1\], got 1\.5"),
+            (None, {"update_prob": "half"}, "must be a number, got 'half'"),
+            (None, {"box": 0.1}, "at least 2 eps"),
+            (None, {"steps": -1}, "steps must be an integer of at least 0"),
+        ],
+    )
+    def test_rollouts_refuse_what_does_not_fit(self, rules, options, message):
+        x, s = make_world("cpu")
+        rules = [make_rule(), make_rule(seed=1)] if rules is None else rules
+        arguments = {"counts": [20, 40], "steps": 1} | options
+        with pytest.raises(NPAError, match=message):
+            npa_envs.rollout_species(rules, x, s, **arguments)
+
+    def test_a_plain_rollout_refuses_rules_that_tell_species_apart(self):
+        x, s = make_world("cpu")
+        with pytest.raises(NPAError, match=r"species_count=2: run it with npa_envs\.rollout_spec"):
+            npa_envs.rollout(make_rule(species_count=2), x, s, 1)
+
+    def test_a_number_of_species_is_checked(self):
+        with pytest.raises(NPAError, match="species_count must be at least 0, got -1"):
+            npa_envs.NPARule(2, 5, 12, species_count=-1)
+
+    def test_fields_refuse_what_does_not_fit(self):
+        x, s = make_world("cpu")
+        with pytest.raises(NPAError, match=r"x must have shape \[B, N, D\]"):
+            npa_envs.species_fields(x[0], [60], eps=0.3)
+        with pytest.raises(NPAError, match="sum to the 60 particles"):
+            npa_envs.perceive_species(x, s, [50], 0.3)
+        x[1, 3] = torch.nan
+        with pytest.raises(NPAError, match="world 1, particle 3"):
+            npa_envs.species_fields(x, [60], eps=0.3)
