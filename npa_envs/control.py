@@ -6,6 +6,7 @@ bounded output stands. Nothing here waits for the device.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -15,8 +16,9 @@ from npa_envs.randomness import WorldRandom
 from npa_envs.sph.actions import ActionRules, RepeatedActions
 from npa_envs.sph.passes import Terms
 from npa_envs.sph.rows import SurveyedWorlds, survey
+from npa_envs.sph.species import perceive_by_species
 
-__all__ = ["Actions", "Physics", "SurveyedWorlds", "survey_worlds"]
+__all__ = ["Actions", "Physics", "SurveyedWorlds", "perceive_each_species", "survey_worlds"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,6 +100,37 @@ def survey_worlds(
         limit=physics.perception_limit,
         places=places,
     )
+
+
+def perceive_each_species(x: Tensor, counts: Sequence[int], physics: Physics) -> Tensor:
+    """Return what particles perceive of each species besides `survey_worlds`, clipped.
+
+    Args:
+        x: Positions [length units], shape [B, N, D], finite, species after species.
+        counts: Particles of each species, which sum to N; zeros for species that are gone.
+        physics: The worlds' constants.
+
+    Returns:
+        c^D ρ_k / N of each species, then L(c^(1+D) ∇ρ_k / N) of each, species by species, zeros for
+        those that are gone, dimensionless, shape [B, N, K (1 + D)].
+    """
+    there = [k for k, count in enumerate(counts) if count]
+    found = perceive_by_species(
+        x,
+        tuple(counts[k] for k in there),
+        eps=physics.eps,
+        eps0=physics.eps0,
+        box=physics.box,
+    )
+    sizes = [len(there), len(there) * physics.space_dim]
+    density, gradient = found.clamp(-physics.perception_limit, physics.perception_limit).split(
+        sizes, dim=-1
+    )
+    densities = x.new_zeros(*x.shape[:2], len(counts))
+    gradients = x.new_zeros(*densities.shape, physics.space_dim)
+    densities[..., there] = density
+    gradients[..., there, :] = gradient.unflatten(-1, (len(there), physics.space_dim))
+    return torch.cat((densities, gradients.flatten(2)), dim=-1)
 
 
 class Actions:

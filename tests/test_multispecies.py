@@ -449,3 +449,46 @@ def test_what_needs_a_world_says_so():
         env.action_space("species_9")
     env.close()
     env.close()
+
+
+def test_species_are_told_apart_where_asked_for():
+    keywords = {"particle_counts": (40, 24), "seed_distance": 0.1}
+    shared = multispecies_v0.parallel_env("mixing", **keywords)
+    telling = multispecies_v0.parallel_env("mixing", perception="per_species", **keywords)
+    width = shared.observation_space("species_0").shape[1]
+    assert telling.observation_space("species_0").shape == (40, width + 2 * 3)
+    seen, _ = shared.reset(seed=3)
+    told, _ = telling.reset(seed=3)
+    x = telling.particles()[0][None]
+    fields = npa_envs.species_fields(x, (40, 24), eps=0.1)
+    for agent, rows in (("species_0", slice(0, 40)), ("species_1", slice(40, 64))):
+        assert telling.observation_space(agent).contains(told[agent])
+        np.testing.assert_array_equal(told[agent][:, :width], seen[agent])
+        densities = told[agent][:, width : width + 2]
+        np.testing.assert_allclose(densities, fields.rho[0, rows] / 64, rtol=1e-5)
+        gradient = fields.drho[0, rows] / 64
+        length = gradient.norm(dim=-1, keepdim=True).clamp_min(1e-30)
+        scaled = (torch.log1p(length) * gradient / length).flatten(1)
+        np.testing.assert_allclose(told[agent][:, width + 2 :], scaled, rtol=1e-4, atol=1e-5)
+
+
+def test_a_species_that_is_gone_leaves_nothing_to_perceive():
+    env = multispecies_v0.parallel_env(
+        "mixing", species_count=3, particle_count=48, deaths=((1, 1),), perception="per_species"
+    )
+    first, _ = env.reset(seed=0)
+    actions = {agent: np.zeros(env.action_space(agent).shape, np.float32) for agent in env.agents}
+    env.step(actions)
+    del actions["species_1"]
+    observations, *_ = env.step(actions)
+    width = first["species_0"].shape[1] - 9
+    own = observations["species_0"][:, width:]
+    assert np.all(own[:, 0] > 0.0)
+    assert np.all(own[:, 1] == 0.0)
+    assert np.all(own[:, 5:7] == 0.0)
+    assert np.any(own[:, 3:5] != 0.0)
+
+
+def test_an_unknown_perception_is_refused():
+    with pytest.raises(NPAError, match=r"perception must be a known word, got 'own'"):
+        multispecies_v0.parallel_env("mixing", perception="own")

@@ -60,6 +60,11 @@ class MultiSpeciesEnv(CrowdEnv):
     [`npa/Morphogenesis2D-v0`](Morphogenesis2D.md#observation-space). Nothing tells a particle's
     species.
 
+    With `perception="per_species"` K (1 + D) columns follow: what particles perceive of each species,
+    its density c² ρ_k / N for k = 0, 1, ..., and then, species after species, its density gradient,
+    scaled as that of all is. A species that is gone has zeros there. It takes a second pass over the
+    world. See [several rules in one world](../species.md#telling-species-apart).
+
     ## Action space
 
     `Box(-1, 1, (N_k, A), float32)` with A = 2 + C, for species k. The columns, and what they do,

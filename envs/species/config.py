@@ -16,6 +16,11 @@ from npa_envs.tasks.checks import check_non_negative, check_positive, is_whole
 
 Reward = Literal["individual", "team"]
 
+Perception = Literal["shared", "per_species"]
+
+PERCEPTIONS = ("shared", "per_species")
+"""Whether particles perceive species one by one besides all of them."""
+
 REWARDS = ("individual", "team")
 """Whose improvement an agent is paid for."""
 
@@ -68,6 +73,10 @@ class SpeciesConfig:
 
     position_noise: float = 0.0
     """Standard deviation of the noise added to every position in a step [length units]."""
+
+    perception: Perception = "shared"
+    """"shared": particles perceive each other whatever their species; "per_species": they also
+    perceive the density and the density gradient of each species."""
 
     boundary: Boundary = "open"
     """"open" space, or a "periodic" box into which positions are wrapped."""
@@ -129,6 +138,9 @@ class SpeciesConfig:
         check_positive(self, float, "seed_radius")
         check_non_negative(self, "seed_distance")
         self._check_deaths()
+        if self.perception not in PERCEPTIONS:
+            hint = suggest(str(self.perception), PERCEPTIONS)
+            raise NPAError(f"perception must be a known word, got {self.perception!r}: {hint}")
         if self.reward not in REWARDS:
             hint = suggest(str(self.reward), REWARDS)
             raise NPAError(f"reward must be a known word, got {self.reward!r}: {hint}")

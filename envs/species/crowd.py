@@ -72,7 +72,7 @@ class CrowdEnv(ParallelEnv):  # type: ignore[misc]
         rows = [(int(n),) if self.rows else () for n in sizes]
         physics = self.world.physics
         self.observation_spaces, self.action_spaces = agent_spaces(
-            physics, self.possible_agents, rows
+            physics, self.world.perception_dim, self.possible_agents, rows
         )
         self.state_space = state_space(physics, self.world.particle_count)
         """Space of `state`: float32, shape [N, 2 + C + 1]."""

@@ -11,12 +11,13 @@ from npa_envs.control import Physics
 
 
 def agent_spaces(
-    physics: Physics, agents: Sequence[str], rows: Sequence[tuple[int, ...]]
+    physics: Physics, perception_dim: int, agents: Sequence[str], rows: Sequence[tuple[int, ...]]
 ) -> tuple[dict[str, Box], dict[str, Box]]:
     """Return the spaces of agents' observations and actions, float32.
 
     Args:
         physics: The world's constants.
+        perception_dim: Numbers that a particle perceives.
         agents: Their names.
         rows: What comes before the last dimension of each one's arrays: [N_k], or nothing.
     """
@@ -24,7 +25,7 @@ def agent_spaces(
     observations: dict[str, Box] = {}
     actions: dict[str, Box] = {}
     for agent, ahead in zip(agents, rows, strict=True):
-        seen, done = (*ahead, physics.perception_dim), (*ahead, physics.action_dim)
+        seen, done = (*ahead, perception_dim), (*ahead, physics.action_dim)
         observations[agent] = Box(-limit, limit, seen, np.float32)
         actions[agent] = Box(-1.0, 1.0, done, np.float32)
     return observations, actions

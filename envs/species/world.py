@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.control import Actions, survey_worlds
+from npa_envs.control import Actions, perceive_each_species, survey_worlds
 from npa_envs.envs.arrays import checked_particles
 from npa_envs.envs.memory import check_memory
 from npa_envs.envs.species.task import Population, SpeciesTask
@@ -56,6 +56,13 @@ class SpeciesWorld:
         self._diverged = torch.zeros(1, dtype=torch.uint8, device=self.device)
 
     @property
+    def perception_dim(self) -> int:
+        """Numbers that a particle perceives: P, and K (1 + D) more where species are told apart."""
+        told_apart = self.config.perception == "per_species"
+        appended = len(self.counts) * (1 + self.physics.space_dim) if told_apart else 0
+        return self.physics.perception_dim + appended
+
+    @property
     def population(self) -> Population:
         """The particles that are there."""
         counts = np.bincount(self.species[self.present], minlength=len(self.counts))
@@ -94,8 +101,15 @@ class SpeciesWorld:
 
     @torch.no_grad()
     def perceive(self) -> Tensor:
-        """Return what all particles perceive, by one pass over the world, shape [N now, P]."""
-        return survey_worlds(self.x, self.s, self.physics).perceive()[0]
+        """Return what all particles perceive, by one pass for all species, [N now, perception_dim].
+
+        Telling species apart takes another one, again for all of them.
+        """
+        seen = survey_worlds(self.x, self.s, self.physics).perceive()
+        if self.config.perception == "per_species":
+            apart = perceive_each_species(self.x, self.population.counts, self.physics)
+            seen = torch.cat((seen, apart), dim=-1)
+        return seen[0]
 
     @torch.no_grad()
     def act(self, action: Tensor) -> None:
