@@ -60,10 +60,10 @@ class MultiSpeciesEnv(CrowdEnv):
     [`npa/Morphogenesis2D-v0`](Morphogenesis2D.md#observation-space). Nothing tells a particle's
     species.
 
-    With `perception="per_species"` K (1 + D) columns follow: what particles perceive of each species,
-    its density c² ρ_k / N for k = 0, 1, ..., and then, species after species, its density gradient,
-    scaled as that of all is. A species that is gone has zeros there. It takes a second pass over the
-    world. See [several rules in one world](../species.md#telling-species-apart).
+    With `perception="per_species"` K (1 + D) columns follow: what particles perceive of each
+    species, its density c² ρ_k / N for k = 0, 1, ..., and then, species after species, its density
+    gradient, scaled as that of all is. A species that is gone has zeros there. It takes a second
+    pass over the world. See [several rules in one world](../species.md#telling-species-apart).
 
     ## Action space
 
