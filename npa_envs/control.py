@@ -122,10 +122,8 @@ def perceive_each_species(x: Tensor, counts: Sequence[int], physics: Physics) ->
         eps0=physics.eps0,
         box=physics.box,
     )
-    sizes = [len(there), len(there) * physics.space_dim]
-    density, gradient = found.clamp(-physics.perception_limit, physics.perception_limit).split(
-        sizes, dim=-1
-    )
+    found = found.clamp(-physics.perception_limit, physics.perception_limit)
+    density, gradient = found[..., : len(there)], found[..., len(there) :]
     densities = x.new_zeros(*x.shape[:2], len(counts))
     gradients = x.new_zeros(*densities.shape, physics.space_dim)
     densities[..., there] = density
