@@ -127,7 +127,7 @@ def perceive_each_species(x: Tensor, counts: Sequence[int], physics: Physics) ->
     densities = x.new_zeros(*x.shape[:2], len(counts))
     gradients = x.new_zeros(*densities.shape, physics.space_dim)
     densities[..., there] = density
-    gradients[..., there, :] = gradient.unflatten(-1, (len(there), physics.space_dim))
+    gradients[..., there, :] = gradient.view(*x.shape[:2], len(there), physics.space_dim)
     return torch.cat((densities, gradients.flatten(2)), dim=-1)
 
 
