@@ -77,7 +77,7 @@ class Morphogenesis3DEnvConfig(EnvConfig):
             value = getattr(self, name)
             if not isinstance(value, str) or (name == "target" and not value):
                 raise NPAError(
-                    f"{name} must be a name or a path, got {value!r}: for example target='mushroom'"
+                    f"{name} must be a name or a path, got {value!r}: for example {name}='mushroom'"
                 )
         check_positive(self, int, "state_dim", at_least=3)
         check_positive(self, int, "resolution", at_least=8)

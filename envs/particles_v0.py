@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from npa_envs.envs.species.agents import ParticlesEnv
+from npa_envs.envs.species.config import plain
 from npa_envs.envs.species.zoo import aec_env, clipped
 
 PARTICLE_COUNT = 64
@@ -23,7 +24,7 @@ def parallel_env(task: str = "mixing", species_count: int = 2, **config: Any) ->
     Raises:
         NPAError: A name is unknown, or a value wrong.
     """
-    if not config.get("particle_counts"):
+    if not plain(config.get("particle_counts")):
         config.setdefault("particle_count", PARTICLE_COUNT)
     return ParticlesEnv(task, species_count=species_count, **config)
 

@@ -32,7 +32,7 @@ def scores(name: str) -> dict[str, Any]:
     """
     rules = shipped_rules()
     if name not in rules:
-        raise NPAError(f"unknown rule {name!r}: {suggest(name, rules)}")
+        raise NPAError(f"unknown rule {name!r}: {suggest(str(name), rules)}")
     found: dict[str, Any] = json.loads(rules[name].with_suffix(".json").read_text("utf-8"))
     return found
 

@@ -311,6 +311,31 @@ def test_pictures_tell_species_apart():
     assert np.ptp(grey.render().astype(int), axis=2).max() <= 1
 
 
+@pytest.mark.parametrize("task", TASKS)
+def test_pictures_of_a_periodic_box_show_the_box_and_nothing_more(task):
+    keywords = {"boundary": "periodic", "box_size": 4.0, "seed_distance": 2.4}
+    env = make(task, particle_counts=(30, 30), render_mode="rgb_array", **keywords)
+    env.reset(seed=0)
+    # On a corner, a quarter of a particle is seen in each of them.
+    env.place_particles(np.full((60, 2), -2.0), np.zeros((60, 16)))
+    picture = env.render().astype(int)
+    assert picture[0, 0].max() < 200
+    assert picture[12, 12].min() > 250
+    for mirrored in (picture[::-1], picture[:, ::-1]):
+        assert np.abs(picture - mirrored).max() < 9
+
+
+def test_arrays_and_tensors_are_taken_for_tuples():
+    for counts in ([30, 20], np.array([30, 20]), torch.tensor([30, 20])):
+        config = make(particle_counts=counts, deaths=np.array([[1, 5]])).config
+        assert config.counts == (30, 20)
+        assert config.deaths == ((1, 5),)
+        with pytest.raises(NPAError, match="exclude each other"):
+            make(particle_counts=counts, particle_count=50)
+    named = make("co_morphogenesis", targets=np.array(["heart", "ring"])).config
+    assert named.targets == ("heart", "ring")
+
+
 def test_a_copy_by_pickle_goes_on_alike():
     env = make(deaths=((1, 3),))
     env.reset(seed=0)
@@ -393,6 +418,9 @@ def test_the_package_is_imported_without_pettingzoo_which_is_asked_for_by_name()
         ({"task": "symbiosis", "state_dim": 2}, "state_dim must be a whole number of at least 3"),
         ({"render_style": "art"}, "render_style must be a known word"),
         ({"render_mode": "ansi"}, "render_mode must be a known word"),
+        ({"boundary": "periodic", "box_size": "2"}, "box_size must be a finite number greater"),
+        ({"task": "symbiosis", "sigma": 1e20}, r"sigma must be at most 1e\+09, got 1e\+20"),
+        ({"task": "invasion", "colour_weight": 1e38}, "colour_weight must be at most"),
         ({"max_cycles": 0}, "max_cycles must be a whole number of at least 1"),
         ({"epsilon": 0.2}, "unknown keyword 'epsilon': did you mean 'eps'"),
         ({"seed": 1}, r"unknown keyword 'seed': give it to reset\(seed=...\)"),
@@ -443,6 +471,9 @@ def test_what_needs_a_world_says_so():
         with pytest.raises(NPAError, match="call reset first"):
             call()
     env.reset()
+    for x in ([[0.0, 0.0], [1.0]], "left", None, {}):
+        with pytest.raises(NPAError, match="x must be an array of numbers, got"):
+            env.place_particles(x, np.zeros((41, 16)))
     with pytest.raises(NPAError, match=r"actions must be a dict .* got list"):
         env.step([])
     with pytest.raises(NPAError, match="agent must be one that exists, got 'species_9'"):

@@ -80,6 +80,7 @@ def test_every_particle_is_an_agent_and_is_told_its_species():
     assert env.action_space("particle_4") is not env.action_space("particle_3")
     assert observations["particle_4"].shape == (66,)
     assert len(particles_v0.parallel_env().possible_agents) == 64
+    assert len(make(particle_counts=np.array([2, 3])).possible_agents) == 5
 
 
 @pytest.mark.parametrize("task", TASKS)

@@ -113,6 +113,8 @@ def test_the_list_tells_every_score(capsys):
 def test_scores_of_an_unknown_rule_are_refused():
     with pytest.raises(NPAError, match=r"unknown rule 'geko'.*gecko"):
         scores("geko")
+    with pytest.raises(NPAError, match="unknown rule 3: known: bubbles"):
+        scores(3)
 
 
 def test_scores_are_json_without_nan():

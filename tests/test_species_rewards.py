@@ -16,6 +16,7 @@ from crowds import (
     targets_made_once,
 )
 
+from npa_envs.envs.species.account import Account
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
 from npa_envs.tasks.morphogenesis2d_config import Morphogenesis2DConfig
 from npa_envs.tasks.targets import load_target
@@ -218,3 +219,31 @@ def test_leaving_the_world_never_pays():
     assert infos["species_1"]["loss_mixture"] < 0.01
     assert rewards["species_1"] == pytest.approx(HALF_WAY - at_start, abs=1e-6)
     assert rewards["species_0"] == pytest.approx(HALF_WAY, abs=0.01)
+
+
+def test_leaving_does_not_give_back_what_came_at_no_charge():
+    # A radius apart at the start: each sees itself alone, and the least loss is reached.
+    env = pair("segregation", position_limit=0.29, seed_radius=0.01, seed_distance=0.5)
+    assert env.reset(seed=0)[1]["species_1"]["loss"] == 0.0
+    env.place_particles([[0.0, 0.0], [0.15, 0.0]], np.zeros((2, 16)))
+    _, rewards, terminations, _, infos = env.step(apart(env))
+    assert terminations == {"species_0": False, "species_1": True}
+    assert infos["species_1"]["loss"] == pytest.approx(HALF_WAY, abs=1e-6)
+    assert rewards["species_1"] == 0.0
+    assert rewards["species_0"] == pytest.approx(HALF_WAY, abs=0.01)
+
+
+@pytest.mark.parametrize("carried", [3.0, 0.5, 1.0])
+def test_rewards_of_an_agent_that_left_never_add_up_to_more_than_zero(carried):
+    env = make("mixing")
+    account = Account(env.world.task, np.array([0, 1]), team=False)
+    everyone = np.array([0, 1])
+    account.open({"loss": np.array([1.0, 1.0])})
+    paid = account.pay({"loss": np.array([0.8, 1.0])}, everyone, [])
+    account.carry_over({"loss": np.array([carried, 1.0])})
+    paid = paid + account.pay({"loss": np.array([0.0, 0.0])}, everyone, [0])
+    assert paid[0] == pytest.approx(min(0.0, carried - 0.8), abs=1e-12)
+    assert paid[1] == 1.0
+    # What an episode left behind is forgotten in the next one.
+    account.open({"loss": np.array([1.0, 1.0])})
+    assert account.pay({"loss": np.array([0.0, 1.0])}, everyone, [0])[0] == 0.0

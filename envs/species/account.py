@@ -28,7 +28,7 @@ class Account:
         self._team = team
         self._parts: Losses = {}
         self._before: Losses = {}
-        self._total = self._at_start = np.zeros(len(species))
+        self._total = self._at_start = self._carried = np.zeros(len(species))
 
     def open(self, losses: Losses) -> None:
         """Begin an episode.
@@ -38,6 +38,7 @@ class Account:
         """
         self.carry_over(losses)
         self._at_start = self._total
+        self._carried = np.zeros(len(self._total))
 
     def carry_over(self, losses: Losses) -> None:
         """Count from other losses on, at no reward.
@@ -46,7 +47,9 @@ class Account:
             losses: Of all agents; of those that ended nobody asks.
         """
         self._parts = self._before = losses
-        self._total = _sum(losses)
+        total = _sum(losses)
+        self._carried = self._carried + (total - self._total)
+        self._total = total
 
     def pay(self, losses: Losses, live: NDArray[np.int64], fled: list[int]) -> NDArray[np.float64]:
         """Take down the losses after a step, and return rewards of the live agents.
@@ -57,8 +60,10 @@ class Account:
             fled: Numbers of those that left the world in this step.
         """
         total = _sum(losses)
-        # Leaving the world must not pay, even where an empty picture is better than the start.
-        total[fled] = np.maximum(total, self._at_start)[fled]
+        # Leaving the world must not pay, even where an empty picture is better than the start, nor
+        # give back what a death added at no charge.
+        least = self._at_start + np.maximum(self._carried, 0.0)
+        total[fled] = np.maximum(total, least)[fled]
         earned = (self._total - total)[live]
         if self._team:
             earned[:] = earned.mean()

@@ -96,7 +96,8 @@ class MultiSpeciesEnv(CrowdEnv):
 
     Rewards telescope but for deaths: particles that are taken out change the others' losses, which
     is nobody's merit and not paid. In the step in which a species leaves the world L_k counts as at
-    least its value at the start, so that leaving never pays; the parts in `info` are as they are.
+    least its value at the start and what deaths added to it, so that leaving never pays; the parts
+    in `info` are as they are.
 
     ## Starting state
 

@@ -92,7 +92,7 @@ class CoMorphogenesisTask(SpeciesTask):
         return self.goals[0].target.pixel_size
 
     @property
-    def half_width(self) -> float:
+    def open_half_width(self) -> float:
         """Half of a picture [length units]: all targets fit where their seeds were."""
         return float(1.0 + 0.5 * (self.config.species_count - 1) * self.config.seed_distance)
 

@@ -8,8 +8,9 @@ from functools import cached_property
 from typing import Any, Literal, Self
 
 import numpy as np
+from torch import Tensor
 
-from npa_envs.envs.config import Boundary, EnvConfig, Output
+from npa_envs.envs.config import LARGEST, Boundary, EnvConfig, Output
 from npa_envs.errors import NPAError, suggest
 from npa_envs.render import STYLES
 from npa_envs.tasks.checks import check_non_negative, check_positive, is_whole
@@ -148,9 +149,13 @@ class SpeciesConfig:
         if self.render_style not in styles:
             hint = suggest(str(self.render_style), styles)
             raise NPAError(f"render_style must be a known word, got {self.render_style!r}: {hint}")
-        half = 0.5 * self.box_size if self.boundary == "periodic" else self.position_limit
-        # The world's own fields; it knows no pictures of species.
-        assert self.world.particle_count == sum(self.counts), "shares make up the whole"
+        # The world checks its own fields; it knows no pictures of species.
+        box = self.world.box
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, int | float) and value > LARGEST:
+                raise NPAError(f"{field.name} must be at most {LARGEST:g}, got {value}")
+        half = self.position_limit if box is None else 0.5 * box
         if self.seed_span >= half:
             raise NPAError(
                 f"seed_radius and seed_distance must keep all disks within {half:g}, got disks up "
@@ -184,7 +189,7 @@ class SpeciesConfig:
         """Return the configuration with some fields changed.
 
         Args:
-            keywords: Fields by name; lists are taken for tuples.
+            keywords: Fields by name; lists and arrays are taken for tuples.
 
         Raises:
             NPAError: There is no field of that name, or a field is wrong.
@@ -196,12 +201,13 @@ class SpeciesConfig:
                 raise NPAError(
                     f"unknown keyword {name!r}: {elsewhere.get(name, suggest(name, known))}"
                 )
-        if "particle_count" in keywords and keywords.get("particle_counts"):
+        changes = {name: plain(value) for name, value in keywords.items()}
+        if "particle_count" in changes and changes.get("particle_counts"):
             raise NPAError(
                 "particle_count and particle_counts exclude each other: "
                 "particle_counts gives the number of each species"
             )
-        return replace(cls(), **{name: _plain(value) for name, value in keywords.items()})
+        return replace(cls(), **changes)
 
     def _check_counts(self) -> None:
         given = self.particle_counts
@@ -233,10 +239,14 @@ class SpeciesConfig:
             raise NPAError(f"{rule}, got {given!r}: for example deaths=((1, 50),)")
 
 
-def _plain(value: Any) -> Any:
-    """Return a value as fields have it: NumPy's numbers as Python's, lists as tuples."""
-    if isinstance(value, np.generic):
-        return value.item()
+def plain(value: Any) -> Any:
+    """Return a value as fields have it: NumPy's numbers as Python's, lists and arrays as tuples.
+
+    Args:
+        value: Of any type; others are left as they are.
+    """
+    if isinstance(value, np.generic | np.ndarray | Tensor):
+        value = value.tolist()
     if isinstance(value, Sequence) and not isinstance(value, str):
-        return tuple(_plain(entry) for entry in value)
+        return tuple(plain(entry) for entry in value)
     return value

@@ -85,7 +85,7 @@ class InvasionTask(SpeciesTask):
         return self.goal.target.pixel_size
 
     @property
-    def half_width(self) -> float:
+    def open_half_width(self) -> float:
         """Half of a picture [length units]: the target fits where the seed was."""
         return float(1.0 + 0.5 * (self.config.species_count - 1) * self.config.seed_distance)
 

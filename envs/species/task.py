@@ -139,7 +139,12 @@ class SpeciesTask:
         """From the middle of a picture to its edge [length units]."""
         if self.config.boundary == "periodic":
             return max(1.0, 0.5 * float(self.config.box_size))
-        return max(1.0, 1.25 * float(self.config.seed_span))
+        return max(1.0, self.open_half_width)
+
+    @property
+    def open_half_width(self) -> float:
+        """The same in open space, where it is 1 at least [length units]."""
+        return 1.25 * float(self.config.seed_span)
 
 
 def by_species(losses: list[Tensor], population: Population) -> Tensor:

@@ -15,6 +15,7 @@ from npa_envs.envs.memory import check_memory
 from npa_envs.envs.species.task import Population, SpeciesTask
 from npa_envs.envs.task import EnvTask
 from npa_envs.envs.worlds import make_physics
+from npa_envs.errors import NPAError
 from npa_envs.randomness import WorldRandom
 
 
@@ -93,10 +94,12 @@ class SpeciesWorld:
             s: States, dimensionless, shape [N now, C].
 
         Raises:
-            NPAError: A shape is another one, or a number is not finite or beyond its limit.
+            NPAError: There is no array of numbers, a shape is another one, or a number is not
+                finite or beyond its limit.
         """
-        x, s = (torch.as_tensor(value)[None] for value in (x, s))
-        placed = checked_particles(x, s, 1, len(self.present), self.physics, self.device)
+        placed = checked_particles(
+            _one_world("x", x), _one_world("s", s), 1, len(self.present), self.physics, self.device
+        )
         self._put(placed.x.clone(), placed.s.clone(), self.present)
 
     @torch.no_grad()
@@ -165,3 +168,12 @@ class SpeciesWorld:
                 enabled=self._enabled,
                 diverged=self._diverged,
             )
+
+
+def _one_world(name: str, value: Any) -> Tensor:
+    try:
+        return torch.as_tensor(value)[None]
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise NPAError(
+            f"{name} must be an array of numbers, got {type(value).__name__}: see env.particles()"
+        ) from error
