@@ -18,7 +18,7 @@ from torch import Tensor
 import npa_envs
 from npa_envs.cli.worlds import task_of_rule
 from npa_envs.render import to_uint8, write_filmstrip
-from npa_envs.rule_io import rule_metadata, shipped_rules
+from npa_envs.rule_io import shipped_rules
 from npa_envs.tasks.views import over
 
 IMAGES = Path(__file__).resolve().parent / "images"
@@ -26,11 +26,6 @@ SEED = 1_000_000
 CPU = torch.device("cpu")
 
 Shots = list[tuple[str, NDArray[np.uint8]]]
-
-
-def rules_of(task_name: str) -> list[str]:
-    """Return the names of a task's shipped rules."""
-    return [n for n, path in shipped_rules().items() if rule_metadata(path)["task"] == task_name]
 
 
 @torch.no_grad()
@@ -60,7 +55,7 @@ def pictures() -> Shots:
     """Return the target and four moments of each rule of 2D morphogenesis."""
     steps = (16, 64, 512, 2048)
     shots: Shots = []
-    for name in rules_of("morphogenesis2d"):
+    for name in shipped_rules("morphogenesis2d"):
         task, worlds = grown(name, steps)
         shots.append((name, to_uint8(task.target_picture)))
         frames = [to_uint8(task.picture(x, s)[0]) for x, s in worlds]
@@ -72,7 +67,7 @@ def textures() -> Shots:
     """Return the target, three moments, and the last one as two by two tiles of each texture."""
     steps = (64, 256, 1024)
     shots: Shots = []
-    for name in rules_of("texture"):
+    for name in shipped_rules("texture"):
         task, worlds = grown(name, steps)
         shots.append((name, to_uint8(task.target_picture)))
         frames = [to_uint8(task.picture(x, s)[0]) for x, s in worlds]
@@ -85,7 +80,7 @@ def textures() -> Shots:
 def things() -> Shots:
     """Return held-out views of each target above what its rule has grown at step 128."""
     shots: Shots = []
-    for name in rules_of("morphogenesis3d"):
+    for name in shipped_rules("morphogenesis3d"):
         task, ((x, s),) = grown(name, (128,))
         held_out = task.target.held_out
         for what, views in (

@@ -161,10 +161,11 @@ class RegenerationTask(PictureTask[Regeneration2DEnvConfig]):
 
     def _load_rule(self) -> NPARule:
         config = self.config
-        if config.rule is None and config.target not in shipped_rules():
+        shipped = shipped_rules("morphogenesis2d")
+        if config.rule is None and config.target not in shipped:
             raise NPAError(
                 f"rule must say what grows the worlds, as no shipped rule grows {config.target!r} "
-                f"({', '.join(shipped_rules())}): give rule='PATH', or rule={PICTURE!r} to start "
+                f"({', '.join(shipped)}): give rule='PATH', or rule={PICTURE!r} to start "
                 "from the target's own points"
             )
         rule = load_rule(config.rule or config.target, device=self.device)

@@ -31,10 +31,17 @@ _RESERVED = {"format", "version", *_FIELDS}
 _SUFFIXES = (".safetensors", ".pth", ".pt", ".json")
 
 
-def shipped_rules() -> dict[str, Path]:
-    """Return the rules that come with the package: name -> file, sorted by name."""
+def shipped_rules(task: str | None = None) -> dict[str, Path]:
+    """Return the rules that come with the package: name -> file, sorted by name.
+
+    Args:
+        task: Only those that were trained on this task, for example "morphogenesis2d".
+    """
     folder = Path(__file__).resolve().parent / "rules"
-    return {path.stem: path for path in sorted(folder.glob("*.safetensors"))}
+    rules = {path.stem: path for path in sorted(folder.glob("*.safetensors"))}
+    if task is None:
+        return rules
+    return {name: path for name, path in rules.items() if rule_metadata(path).get("task") == task}
 
 
 def load_rule(source: str | Path, *, device: str | torch.device = "cpu") -> NPARule:

@@ -150,14 +150,10 @@ def _organisms(
     from npa_envs.cli.worlds import task_of_rule
     from npa_envs.encounters import Organism
     from npa_envs.interaction import InteractionSettings
-    from npa_envs.rule_io import load_rule, rule_metadata, shipped_rules
+    from npa_envs.rule_io import load_rule, shipped_rules
     from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
 
-    sources = list(dict.fromkeys(options.rules)) or [
-        name
-        for name, path in shipped_rules().items()
-        if rule_metadata(path).get("task", TASK) == TASK
-    ]
+    sources = list(dict.fromkeys(options.rules)) or list(shipped_rules(TASK))
     organisms: list[Organism] = []
     counts = []
     for source in sources:

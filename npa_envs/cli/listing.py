@@ -24,7 +24,7 @@ def main(arguments: Sequence[str]) -> int:
     """
     tyro.cli(ListOptions, prog="npa-envs list", args=arguments)
     from npa_envs.registration import ENVIRONMENTS
-    from npa_envs.rule_io import load_rule, rule_metadata, shipped_rules
+    from npa_envs.rule_io import load_rule, shipped_rules
     from npa_envs.scores import score_line, scores
     from npa_envs.tasks.digits import BUILT_IN
     from npa_envs.tasks.texture_losses import TEXTURE_LOSSES
@@ -51,8 +51,7 @@ def main(arguments: Sequence[str]) -> int:
     print(f"  point_classification: {', '.join(BUILT_IN)}")
     print("rules (npa-envs rollout NAME)")
     for task_name in TASKS:
-        for name, path in shipped_rules().items():
-            if rule_metadata(path)["task"] == task_name:
-                weights = load_rule(name).weight_count
-                print(f"  {name}: {task_name}, {weights} weights; {score_line(scores(name))}")
+        for name in shipped_rules(task_name):
+            weights = load_rule(name).weight_count
+            print(f"  {name}: {task_name}, {weights} weights; {score_line(scores(name))}")
     return 0
