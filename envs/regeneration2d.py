@@ -161,11 +161,10 @@ class RegenerationTask(PictureTask[Regeneration2DEnvConfig]):
 
     def _load_rule(self) -> NPARule:
         config = self.config
-        shipped = shipped_rules("morphogenesis2d")
-        if config.rule is None and config.target not in shipped:
+        if config.rule is None and config.target not in (known := shipped_rules("morphogenesis2d")):
             raise NPAError(
                 f"rule must say what grows the worlds, as no shipped rule grows {config.target!r} "
-                f"({', '.join(shipped)}): give rule='PATH', or rule={PICTURE!r} to start "
+                f"({', '.join(known)}): give rule='PATH', or rule={PICTURE!r} to start "
                 "from the target's own points"
             )
         rule = load_rule(config.rule or config.target, device=self.device)

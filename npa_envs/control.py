@@ -114,21 +114,14 @@ def perceive_each_species(x: Tensor, counts: Sequence[int], physics: Physics) ->
         c^D ρ_k / N of each species, then L(c^(1+D) ∇ρ_k / N) of each, species by species, zeros for
         those that are gone, dimensionless, shape [B, N, K (1 + D)].
     """
-    there = [k for k, count in enumerate(counts) if count]
     found = perceive_by_species(
         x,
-        tuple(counts[k] for k in there),
+        tuple(counts),
         eps=physics.eps,
         eps0=physics.eps0,
         box=physics.box,
     )
-    found = found.clamp(-physics.perception_limit, physics.perception_limit)
-    density, gradient = found[..., : len(there)], found[..., len(there) :]
-    densities = x.new_zeros(*x.shape[:2], len(counts))
-    gradients = x.new_zeros(*densities.shape, physics.space_dim)
-    densities[..., there] = density
-    gradients[..., there, :] = gradient.view(*x.shape[:2], len(there), physics.space_dim)
-    return torch.cat((densities, gradients.flatten(2)), dim=-1)
+    return found.clamp(-physics.perception_limit, physics.perception_limit)
 
 
 class Actions:

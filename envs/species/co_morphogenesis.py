@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from npa_envs.envs.species.growth import GrowthConfig, make_goal, picture_parts
+from npa_envs.envs.species.growth import GrowthConfig, make_goal, picture_parts, row_half_width
 from npa_envs.envs.species.task import Population, SpeciesTask, by_species
 from npa_envs.errors import NPAError
 
@@ -94,7 +94,7 @@ class CoMorphogenesisTask(SpeciesTask):
     @property
     def open_half_width(self) -> float:
         """Half of a picture [length units]: all targets fit where their seeds were."""
-        return float(1.0 + 0.5 * (self.config.species_count - 1) * self.config.seed_distance)
+        return row_half_width(self.config)
 
 
 def present(population: Population) -> list[int]:

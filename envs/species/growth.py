@@ -74,6 +74,15 @@ def make_goal(
     )
 
 
+def row_half_width(config: GrowthConfig) -> float:
+    """Return half of a picture that shows a target in the place of every seed [length units].
+
+    Args:
+        config: The environment's configuration.
+    """
+    return float(1.0 + 0.5 * (config.species_count - 1) * config.seed_distance)
+
+
 def picture_parts(goal: Morphogenesis2D, x: Tensor, s: Tensor) -> dict[str, Tensor]:
     """Return the density error and the weighted colour error of worlds, shape [B] each."""
     density, colour = goal.splat_losses(x, s)

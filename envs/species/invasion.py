@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.envs.species.growth import make_goal, picture_parts
+from npa_envs.envs.species.growth import make_goal, picture_parts, row_half_width
 from npa_envs.envs.species.symbiosis import OneTargetConfig
 from npa_envs.envs.species.task import Population, SpeciesTask
 from npa_envs.errors import NPAError
@@ -87,7 +87,7 @@ class InvasionTask(SpeciesTask):
     @property
     def open_half_width(self) -> float:
         """Half of a picture [length units]: the target fits where the seed was."""
-        return float(1.0 + 0.5 * (self.config.species_count - 1) * self.config.seed_distance)
+        return row_half_width(self.config)
 
 
 def _others(counts: tuple[int, ...]) -> int:

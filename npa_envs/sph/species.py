@@ -126,7 +126,7 @@ def perceive_by_species(
 
     Args:
         x: Positions [length units], shape [B, N, D]; no gradient flows into them.
-        counts: Particles of each species.
+        counts: Particles of each species; one may have none.
         eps: Perception radius [length units].
         eps0: Radius at which the rules were trained [length units].
         box: Sides of the periodic box [length units], or None in open space.

@@ -1,4 +1,4 @@
-"""Untrained rules for tasks."""
+"""Rules of tasks: untrained ones, and whether others have their shape."""
 
 from __future__ import annotations
 
@@ -44,3 +44,14 @@ def untrained_rule(
             readout_dim=readout_dim,
             readout_hidden_dim=readout_hidden_dim,
         )
+
+
+def differing_fields(given: NPARule, wanted: NPARule) -> list[str]:
+    """Return the names of the hyper-parameters in which a rule differs from one of a task.
+
+    Args:
+        given: The rule.
+        wanted: A rule that the task has made.
+    """
+    own = wanted.hyper_parameters()
+    return [name for name, value in given.hyper_parameters().items() if value != own.get(name)]

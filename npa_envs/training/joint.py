@@ -18,6 +18,7 @@ from npa_envs.rule_io import save_rule
 from npa_envs.species import rollout_species
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2D
 from npa_envs.tasks.co_morphogenesis2d_config import CoMorphogenesis2DConfig
+from npa_envs.tasks.rules import differing_fields
 from npa_envs.training.config import TrainConfig
 from npa_envs.training.trainer import Trainer, TrainResult
 
@@ -108,8 +109,7 @@ class _JointTrainer(Trainer):
                 f"rules must be one for each of {len(made)} species, got {len(self._given)}"
             )
         for number, (rule, own) in enumerate(zip(self._given, made, strict=True)):
-            wanted, given = own.hyper_parameters(), rule.hyper_parameters()
-            wrong = [name for name, value in given.items() if value != wanted.get(name)]
+            wrong = differing_fields(rule, own)
             if wrong:
                 raise NPAError(
                     f"rules must have the shape of their species, but rule {number} differs in "

@@ -16,6 +16,7 @@ from npa_envs.errors import NPAError
 from npa_envs.files import write_text
 from npa_envs.rule import NPARule
 from npa_envs.rule_io import load_rule, save_rule
+from npa_envs.tasks.rules import differing_fields
 from npa_envs.tasks.task import Task
 from npa_envs.training.checkpoint import check_same_run, load_checkpoint, save_checkpoint
 from npa_envs.training.config import TrainConfig
@@ -203,8 +204,7 @@ class Trainer:
             return rule
         source = self.config.initial_rule
         initial = load_rule(source)
-        wanted, given = rule.hyper_parameters(), initial.hyper_parameters()
-        wrong = [name for name, value in given.items() if value != wanted.get(name)]
+        wrong = differing_fields(initial, rule)
         if wrong:
             raise NPAError(
                 f"initial_rule must be a rule of the task's shape, but {source!r} differs in "
