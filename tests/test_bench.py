@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from itertools import product
 from pathlib import Path
 
 import pytest
@@ -20,7 +21,7 @@ from npa_envs.bench.perception import perception_rows
 from npa_envs.bench.plots import Point, front, pictures
 from npa_envs.bench.precisions import PRECISIONS, MixedRule
 from npa_envs.bench.report import Report
-from npa_envs.bench.rollouts import RolloutRow, composed_step, mask_source, rollout_rows
+from npa_envs.bench.rollouts import RolloutRow, composed_step, drawn_mask, mask_source, rollout_rows
 from npa_envs.bench.scaling import scaling_rows, slope_rows, varied
 from npa_envs.bench.session import LeftOut, Session
 from npa_envs.bench.strategies import NEIGHBOUR_CAP, STRATEGIES, nearest
@@ -98,7 +99,8 @@ def test_the_hash_grid_keeps_worlds_apart():
 def test_a_step_composed_in_torch_is_that_of_the_library():
     start = gecko(1, 300, torch.device("cpu")).grown(3)
     rule, x, s = start.rule.double(), start.x.double(), start.s.double()
-    composed = composed_step(STRATEGIES["dense"], rule, x, s, 0.5, mask_source(x))
+    mask = drawn_mask(x, 0.5, mask_source(x))
+    composed = composed_step(STRATEGIES["dense"], rule, x, s, mask)
     own = step(rule, x, s, update_prob=0.5, generator=mask_source(x))
     for value, expected in zip(composed, own, strict=True):
         torch.testing.assert_close(value, expected, rtol=1e-12, atol=1e-12)
@@ -199,7 +201,8 @@ def test_perception_in_float32_errs_little_and_the_reference_not_at_all():
 
 def test_float32_drifts_little_from_float64_over_a_rollout(device):
     rows = drift_rows(Session(device, repeats=1), [Workload(2, 2, 300, 8), Workload(3, 1, 300, 8)])
-    assert [row.workload for row in rows] == ["2D (2, 300, 8)", "3D (1, 300, 8)"]
+    named = [(row.workload, row.strategy) for row in rows]
+    assert named == list(product(["2D (2, 300, 8)", "3D (1, 300, 8)"], ["library", "dense"]))
     for row in rows:
         assert 0.0 < row.positions < FORWARD
         assert 0.0 < row.states < FORWARD
@@ -516,5 +519,6 @@ def test_the_masks_of_a_composed_rollout_are_those_of_the_library():
     own = rollout(start.rule, start.x, start.s, 3, update_prob=0.5, generator=mask_source(start.x))
     x, s, generator = start.x, start.s, mask_source(start.x)
     for _ in range(3):
-        x, s = composed_step(STRATEGIES["dense"], start.rule, x, s, 0.5, generator)
+        mask = drawn_mask(x, 0.5, generator)
+        x, s = composed_step(STRATEGIES["dense"], start.rule, x, s, mask)
     torch.testing.assert_close(x, own[0], rtol=1e-4, atol=1e-5)

@@ -33,7 +33,7 @@ def test_patterns_are_the_same_at_every_resolution(name):
 
 
 @pytest.mark.parametrize(
-    ("name", "scattered"), [("cells", True), ("bubbles", True), ("grid", False)]
+    ("name", "scattered"), [("cells", True), ("bubbles", True), ("maze", True), ("grid", False)]
 )
 def test_seeds_move_what_is_scattered(name, scattered):
     same = np.array_equal(draw_pattern(name, 16, seed=3), draw_pattern(name, 16, seed=4))
@@ -124,4 +124,4 @@ def test_unknown_patterns_are_refused():
 
 
 def test_names_are_sorted():
-    assert builtin_textures() == ("bubbles", "cells", "dots", "grid", "stripes")
+    assert builtin_textures() == ("bubbles", "cells", "dots", "grid", "maze", "stripes")

@@ -8,11 +8,17 @@ from functools import partial
 
 import torch
 from torch import Tensor
+from torch.utils.checkpoint import checkpoint
 
 from npa_envs.bench.perception import functional_weights
+from npa_envs.bench.rollouts import composed_step, drawn_mask
 from npa_envs.bench.session import Session, relative_error
+from npa_envs.bench.strategies import STRATEGIES, Strategy
 from npa_envs.bench.workloads import Workload
 from npa_envs.dynamics import rollout
+
+PEER = STRATEGIES["dense"]
+"""What any float32 errs by: no approximation, one torch operator after the other."""
 
 
 @dataclass(frozen=True)
@@ -24,6 +30,8 @@ class DriftRow:
     """
 
     workload: str
+    strategy: str
+    """`library`, or `dense` where all pairs of its particles fit."""
     positions: float
     """Of the positions."""
     states: float
@@ -37,40 +45,58 @@ class DriftRow:
 
 
 def drift_rows(session: Session, workloads: Iterable[Workload]) -> list[DriftRow]:
-    """Return a row for each workload."""
+    """Return a row for each workload, and one of dense torch where it can be."""
     rows: list[DriftRow] = []
     for workload in workloads:
         what = f"drift of {workload.name}"
-        rows += session.attempt(what, partial(_row, workload, session.device))
+        for exact in session.attempt(what, partial(_outcome, workload, session, torch.float64)):
+            rows += session.attempt(what, partial(_row, workload, session, exact))
+            why = PEER.obstacle(workload.worlds(session.device)[0])
+            if session.small or why is not None:
+                session.leave_out(f"{what}, dense", why or "its steps take too long")
+            else:
+                rows += session.attempt(what, partial(_row, workload, session, exact, PEER))
     return rows
 
 
-def _row(workload: Workload, device: torch.device) -> DriftRow:
-    found = _outcome(workload, device, torch.float32)
-    exact = _outcome(workload, device, torch.float64)
+def _row(
+    workload: Workload, session: Session, exact: list[Tensor], peer: Strategy | None = None
+) -> DriftRow:
+    found = _outcome(workload, session, torch.float32, peer)
     positions, states, by_states, by_weights = (
         relative_error(a, b) for a, b in zip(found, exact, strict=True)
     )
     distance = (found[2].double() - exact[2]).norm(dim=-1)
     median = float((distance / exact[2].norm(dim=-1)).median())
-    return DriftRow(workload.name, positions, states, by_states, median, by_weights)
+    name = "library" if peer is None else peer.name
+    return DriftRow(workload.name, name, positions, states, by_states, median, by_weights)
 
 
-def _outcome(workload: Workload, device: torch.device, dtype: torch.dtype) -> list[Tensor]:
+def _outcome(
+    workload: Workload, session: Session, dtype: torch.dtype, peer: Strategy | None = None
+) -> list[Tensor]:
     """Return positions and states at the end, and gradients by states and by weights."""
+    device = session.device
     rule = workload.rule(device).to(dtype)
     start, states = (tensor.to(dtype) for tensor in workload.worlds(device))
     states.requires_grad_()
-    x, s = rollout(
-        rule,
-        start,
-        states,
-        workload.steps,
-        eps=workload.eps,
-        update_prob=workload.update_prob,
-        generator=torch.Generator(device).manual_seed(1),
-        memory="recompute",
-    )
+    generator = torch.Generator(device).manual_seed(1)
+    if peer is None:
+        x, s = rollout(
+            rule,
+            start,
+            states,
+            workload.steps,
+            eps=workload.eps,
+            update_prob=workload.update_prob,
+            generator=generator,
+            memory="recompute",
+        )
+    else:
+        x, s = start, states
+        for _ in range(workload.steps):
+            mask = drawn_mask(x, workload.update_prob, generator)
+            x, s = checkpoint(composed_step, peer, rule, x, s, mask, use_reentrant=False)
     loss = (x * functional_weights(x)).sum() + (s * functional_weights(s)).sum()
     by_states, *by_weights = torch.autograd.grad(loss, [states, *rule.parameters()])
     weights = torch.cat([gradient.flatten() for gradient in by_weights])

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from npa_envs.bench.rollouts import composed_step
+from npa_envs.bench.rollouts import composed_step, drawn_mask
 from npa_envs.bench.session import Session
 from npa_envs.bench.strategies import STRATEGIES
 from npa_envs.bench.workloads import Workload
@@ -47,7 +47,8 @@ def ratios(session: Session) -> dict[str, float]:
 
     @torch.no_grad()
     def composed() -> None:
-        composed_step(STRATEGIES["library"], rule, x, s, WORKLOAD.update_prob, generator)
+        mask = drawn_mask(x, WORKLOAD.update_prob, generator)
+        composed_step(STRATEGIES["library"], rule, x, s, mask)
 
     @torch.no_grad()
     def fused() -> None:

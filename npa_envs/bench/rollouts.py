@@ -111,9 +111,8 @@ class Runner:
                 if own:
                     x, s = self._library_steps(x, s, at_once, generator)
                 else:
-                    x, s = composed_step(
-                        self.strategy, self.rule, x, s, self.task.update_prob, generator
-                    )
+                    mask = drawn_mask(x, self.task.update_prob, generator)
+                    x, s = composed_step(self.strategy, self.rule, x, s, mask)
                 s = self.precision.kept(s)
         return x, s
 
@@ -166,8 +165,7 @@ def composed_step(
     rule: NPARule,
     x: Tensor,
     s: Tensor,
-    update_prob: float,
-    generator: torch.Generator,
+    mask: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Return worlds one step later, composed in torch: every particle perceives, some update.
 
@@ -176,11 +174,9 @@ def composed_step(
         rule: The rule.
         x: Positions [length units], shape [B, N, D].
         s: States, dimensionless, shape [B, N, C].
-        update_prob: Probability of each particle's update (dimensionless).
-        generator: Source of the mask, drawn as `npa_envs.rollout` draws it.
+        mask: Which particles are updated, uint8, shape [B, N].
     """
-    mask = torch.empty(x.shape[:2], dtype=torch.uint8, device=x.device)
-    active = mask.bernoulli_(update_prob, generator=generator)[..., None].to(x.dtype)
+    active = mask[..., None].to(x.dtype)
     update = rule(strategy.perceive(x.detach(), s, rule.eps0))
     delta = update[..., : rule.space_dim]
     length = torch.linalg.vector_norm(delta, dim=-1, keepdim=True)
@@ -207,6 +203,18 @@ def rollout_rows(session: Session, particle_count: int) -> list[RolloutRow]:
                 partial(_row, session, runner, expected, task),
             )
     return rows
+
+
+def drawn_mask(x: Tensor, update_prob: float, generator: torch.Generator) -> Tensor:
+    """Return a step's update mask, drawn as `npa_envs.rollout` draws it, uint8, shape [B, N].
+
+    Args:
+        x: Positions [length units], shape [B, N, D].
+        update_prob: Probability of each particle's update (dimensionless).
+        generator: Source of the mask, on the device of `x`.
+    """
+    mask = torch.empty(x.shape[:2], dtype=torch.uint8, device=x.device)
+    return mask.bernoulli_(update_prob, generator=generator)
 
 
 def mask_source(like: Tensor) -> torch.Generator:

@@ -127,11 +127,26 @@ def grid(u: Array, v: Array, _: np.random.Generator) -> Array:
     return _with_alpha(np.where(shown[..., None], first, second), upright | level)
 
 
+def maze(u: Array, v: Array, random: np.random.Generator) -> Array:
+    """Winding paths of one width, rimmed: where waves of one length and all directions sum up."""
+    vectors = [(k, m) for k in range(6) for m in range(-5, 6) if (k, m) > (0, 0)]
+    waves = [(k, m) for k, m in vectors if 4.5 <= math.hypot(k, m) <= 5.5]
+    shifts = random.random(len(waves))
+    height = sum(
+        np.cos(2.0 * math.pi * (k * u + m * v + shift))
+        for (k, m), shift in zip(waves, shifts, strict=True)
+    ) / math.sqrt(0.5 * len(waves))
+    ground, rim, path = _colours("#264653", "#7f2f1d", "#e9c46a")
+    inside = np.where((height > 0.2)[..., None], path, rim)
+    return _opaque(np.where((height > -0.2)[..., None], inside, ground))
+
+
 PATTERNS: dict[str, Pattern] = {
     "bubbles": bubbles,
     "cells": cells,
     "dots": dots,
     "grid": grid,
+    "maze": maze,
     "stripes": stripes,
 }
 """Every built-in texture by name."""
