@@ -162,3 +162,51 @@ def test_a_configuration_survives_being_written_as_json(name):
     config = preset(name, seed=3, target="heart")
     plain = json.loads(json.dumps(config_to_dict(config)))
     assert override(PAPER, **plain) == config
+
+
+@pytest.mark.parametrize("name", TASKS["co_morphogenesis2d"].presets)
+def test_a_configuration_of_several_species_survives_being_written_as_json(name):
+    config = preset(name, "co_morphogenesis2d", species=[{}, {"alpha": 0.25}, {"target": "ring"}])
+    plain = json.loads(json.dumps(config_to_dict(config)))
+    assert override(preset("paper", "co_morphogenesis2d"), **plain) == config
+
+
+@pytest.mark.parametrize("name", TASKS["co_morphogenesis2d"].presets)
+def test_presets_of_two_species_have_the_schedule_of_one(name):
+    alone, together = preset(name), preset(name, "co_morphogenesis2d")
+    assert together.task.counts == (alone.task.particle_count,) * 2
+    assert together.task.species[0] == alone.task
+    assert together.task.distance == 0.8
+    for field in dataclasses.fields(TrainConfig):
+        if field.name not in ("task", "out"):
+            assert getattr(together, field.name) == getattr(alone, field.name)
+
+
+def test_mappings_are_laid_over_the_species_that_are_there_and_more_over_the_last():
+    base = preset("tiny", "co_morphogenesis2d")
+    config = override(base, species=[{"target": "gecko"}, {"alpha": "0.25"}, {"target": "flower"}])
+    first, second = base.task.species
+    assert config.task.species == (
+        dataclasses.replace(first, target="gecko"),
+        dataclasses.replace(second, alpha=0.25),
+        dataclasses.replace(second, target="flower"),
+    )
+    with pytest.raises(NPAError, match=r"unknown field 'species\[1\].alpa': did you mean 'alpha'"):
+        override(base, species=[{}, {"alpa": 1.0}])
+    with pytest.raises(
+        NPAError, match=r"species\[0\] must be of type Morphogenesis2DConfig, got 3"
+    ):
+        override(base, species=[3, {}])
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"initial_rule": "gecko"}, "initial_rule is for one rule, got 'gecko'"),
+        ({"initial_rules": ["gecko", ""]}, "initial_rules must be a tuple of names or files"),
+        ({"frozen": [-1]}, r"frozen must be a tuple of species' numbers from 0, got \(-1,\)"),
+    ],
+)
+def test_what_several_rules_start_from_is_checked(fields, message):
+    with pytest.raises(NPAError, match=message):
+        preset("tiny", "co_morphogenesis2d", **fields)

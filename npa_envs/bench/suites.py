@@ -14,6 +14,7 @@ from npa_envs.bench.rollouts import rollout_rows
 from npa_envs.bench.scaling import scaling_rows, slope_rows
 from npa_envs.bench.session import Session, Tables
 from npa_envs.bench.skips import skip_rows
+from npa_envs.bench.species import one_species_rows
 from npa_envs.bench.throughput import (
     CPU,
     ONE_WORLD,
@@ -97,6 +98,11 @@ def skipped(session: Session) -> Tables:
     return {"skips": skip_rows(session)}
 
 
+def species(session: Session) -> Tables:
+    """Return what one species costs where there could be several."""
+    return {"one_species": one_species_rows(session)}
+
+
 def kernels(session: Session) -> Tables:
     """Return the kernels of the paper's workloads."""
     return {"kernels": kernel_rows(session, SMALL if session.small else PROFILED)}
@@ -108,6 +114,7 @@ SUITES = {
     "accuracy": Suite("run time against error, by strategy and precision; peers", accuracy),
     "scaling": Suite("time and memory against N, neighbours, B and C", scaling),
     "skips": Suite("what it saves to leave out what a scene does not need", skipped),
+    "species": Suite("what a world of one species pays for others: rollouts in turn", species),
     "kernels": Suite("which CUDA kernels a step takes, and how long each", kernels),
 }
 """Every suite by its name."""

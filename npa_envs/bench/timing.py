@@ -6,12 +6,15 @@ import gc
 import math
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
 
 from npa_envs.replay import capture
+
+Sampled = tuple[Callable[[], object], torch.Generator]
+"""A call, and the generator that it draws from."""
 
 LEAST_SECONDS = {"cpu": 2e-3, "cuda": 1e-2}
 """Short calls are made so many times in a row that one reading takes at least this long [s]."""
@@ -51,6 +54,19 @@ class Cost:
     """Peak of memory allocated by torch, above what was there before [MiB]; None on a CPU."""
 
 
+@dataclass(frozen=True)
+class Comparison:
+    """What two calls cost that were timed in turn."""
+
+    first: Timing
+    """Time of the first call."""
+    second: Timing
+    """Time of the second call."""
+    ratio: float
+    """Median over pairs of readings, one right after the other, of the second's time over the
+    first's (dimensionless)."""
+
+
 def synchronize(device: torch.device) -> None:
     """Wait until a device has done all its work."""
     if device.type == "cuda":
@@ -87,13 +103,46 @@ def measure(
     return Cost(timing, (torch.cuda.max_memory_allocated(device) - before) / 2**20)
 
 
+def compare(
+    first: Sampled, second: Sampled, device: torch.device, *, repeats: int, graph: bool = True
+) -> Comparison:
+    """Return what two calls cost, timed in turn, so that both see the same machine.
+
+    Args:
+        first: A call, and the generator that it draws from.
+        second: Another one.
+        device: Where they work.
+        repeats: Pairs of readings, at least 1; whoever is second is first in the next pair.
+        graph: On CUDA, capture the calls in graphs and time their replays.
+    """
+    runs: list[Callable[[], object]] = []
+    for run, generator in (first, second):
+        run()
+        captured = graph and device.type == "cuda"
+        runs.append(
+            capture(run, device, generator=generator, warm_up=run).replay if captured else run
+        )
+    longest = max(_reading(run, device, 1) for run in runs)
+    calls = max(1, math.ceil(LEAST_SECONDS[device.type] / longest))
+    readings: list[list[float]] = [[], []]
+    for number in range(repeats):
+        for which in (0, 1) if number % 2 == 0 else (1, 0):
+            readings[which].append(_reading(runs[which], device, calls) * 1e6)
+    ratio = statistics.median(b / a for a, b in zip(*readings, strict=True))
+    return Comparison(_summary(readings[0]), _summary(readings[1]), ratio)
+
+
+def _summary(readings: Sequence[float]) -> Timing:
+    return Timing(statistics.median(readings), min(readings), max(readings))
+
+
 def _timing(run: Callable[[], object], device: torch.device, repeats: int) -> Timing:
     first = _reading(run, device, 1)
     calls = max(1, math.ceil(LEAST_SECONDS[device.type] / first))
     readings = [_reading(run, device, calls) * 1e6]
     while len(readings) < repeats and (len(readings) < 3 or sum(readings) * calls < ENOUGH):
         readings.append(_reading(run, device, calls) * 1e6)
-    return Timing(statistics.median(readings), min(readings), max(readings))
+    return _summary(readings)
 
 
 def _reading(run: Callable[[], object], device: torch.device, calls: int) -> float:

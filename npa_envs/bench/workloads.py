@@ -94,6 +94,7 @@ def rollout_call(
     train: bool = False,
     gradients: bool = False,
     rule: Mapping[str, bool] | None = None,
+    roll: Callable[..., Any] = rollout,
     **options: Any,
 ) -> tuple[Callable[[], None], torch.Generator]:
     """Return a call that rolls worlds out, and the source of its update masks.
@@ -105,7 +106,8 @@ def rollout_call(
         train: Also take the gradient of a random linear functional by the rule's weights.
         gradients: Without that, let autograd store what it would read.
         rule: Options of the rule.
-        options: Options of `rollout`, instead of the workload's.
+        roll: What rolls worlds out.
+        options: Its options, instead of the workload's.
     """
     network = workload.rule(x.device, **(rule or {}))
     generator = torch.Generator(x.device).manual_seed(1)
@@ -118,7 +120,7 @@ def rollout_call(
 
     def run() -> None:
         with torch.set_grad_enabled(train or gradients):
-            worlds = rollout(network, x, s, workload.steps, generator=generator, **given)
+            worlds = roll(network, x, s, workload.steps, generator=generator, **given)
             if train:
                 terms = [(a * b).sum() for a, b in zip(worlds, weights, strict=True)]
                 torch.autograd.grad(terms[0] + terms[1], list(network.parameters()))

@@ -29,7 +29,7 @@ class BenchOptions:
     """Measure run time against error, the paper's table or scaling; or explain what a step runs."""
 
     suite: str | None = None
-    """quick (the default), paper, accuracy or scaling."""
+    """quick (the default), paper, accuracy, scaling, skips, species or kernels."""
 
     quick: bool = False
     """Small worlds only: about a minute on a CPU."""

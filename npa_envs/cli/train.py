@@ -7,6 +7,7 @@ import math
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, make_dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -117,21 +118,26 @@ def parse(
         base: The defaults.
         arguments: The words after the task.
     """
-    from npa_envs.training import TrainConfig
+    from npa_envs.cli.joint_options import JointOptions, parse_joint
+    from npa_envs.training import JointTrainConfig, TrainConfig
 
+    def read(kind: Any, defaults: Any) -> tuple[TrainOptions, Any]:
+        fields = [("launch", TrainOptions), ("run", kind)]
+        command = make_dataclass("Command", fields, frozen=True)
+        parsed: Any = tyro.cli(
+            command,
+            prog=f"npa-envs train {task_name}",
+            description=f"Train on {task_name}. Defaults shown are those of the preset.",
+            args=arguments,
+            default=command(TrainOptions(), defaults),
+            config=(tyro.conf.OmitArgPrefixes,),
+        )
+        return parsed.launch, parsed.run
+
+    if isinstance(base, JointTrainConfig):
+        return parse_joint(base, partial(read, JointOptions))
     generic: Any = TrainConfig
-    fields = [("launch", TrainOptions), ("run", generic[type(base.task)])]
-    command = make_dataclass("Command", fields, frozen=True)
-    prog = f"npa-envs train {task_name}"
-    parsed: Any = tyro.cli(
-        command,
-        prog=prog,
-        description=f"Train a rule on {task_name}. Defaults shown are those of the preset.",
-        args=arguments,
-        default=command(TrainOptions(), base),
-        config=(tyro.conf.OmitArgPrefixes,),
-    )
-    return parsed.launch, parsed.run
+    return read(generic[type(base.task)], base)
 
 
 def run(task_name: str, options: TrainOptions, config: TrainConfig[Any]) -> int:
@@ -145,7 +151,7 @@ def run(task_name: str, options: TrainOptions, config: TrainConfig[Any]) -> int:
     Raises:
         NPAError: As for `npa_envs.training.train`.
     """
-    from npa_envs.training import RunFolder, train
+    from npa_envs.training import JointTrainConfig, RunFolder, train
 
     if options.max_seconds is not None and not 0 < options.max_seconds < math.inf:
         raise NPAError(f"max_seconds must be positive and finite, got {options.max_seconds}")
@@ -165,11 +171,18 @@ def run(task_name: str, options: TrainOptions, config: TrainConfig[Any]) -> int:
     except KeyboardInterrupt:
         print(f"interrupted; the last checkpoint is {folder.checkpoint}\ngo on: {resume_command}")
         raise
-    _report(result, folder.checkpoint, resume_command)
+    rules = [folder.rule]
+    look = f"npa-envs rollout {shlex.quote(str(folder.rule))}"
+    if isinstance(config, JointTrainConfig):
+        rules = [folder.rule_of(number) for number in range(len(config.task.species))]
+        look = f"npa-envs interact {shlex.join(map(str, rules))}"
+        look += f" --distances {config.task.distance:g}"
+        look += f" --particle-count {sum(config.task.counts[:2])}"
+    _report(result, rules, look, resume_command)
     return INTERRUPTED if result.interrupted else 0
 
 
-def _report(result: TrainResult, checkpoint: Path, resume_command: str) -> None:
+def _report(result: TrainResult, rules: Sequence[Path], look: str, resume_command: str) -> None:
     from npa_envs.training import RunFolder
 
     folder = RunFolder(result.folder)
@@ -179,9 +192,10 @@ def _report(result: TrainResult, checkpoint: Path, resume_command: str) -> None:
         print(f"finished: {result.iteration} iterations{figures}")
     else:
         print(f"stopped at iteration {result.iteration}{figures}")
-        print(f"  checkpoint  {checkpoint}")
+        print(f"  checkpoint  {folder.checkpoint}")
         print(f"  go on       {resume_command}")
-    print(f"  rule        {folder.rule}")
+    for rule in rules:
+        print(f"  rule        {rule}")
     print(f"  log         {folder.log}")
     print(f"  pictures    {folder.pictures}/")
-    print(f"  look at it  npa-envs rollout {shlex.quote(str(folder.rule))}")
+    print(f"  look at it  {look}")

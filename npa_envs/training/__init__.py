@@ -10,6 +10,7 @@ from npa_envs.training.config import Morphogenesis2DTrainConfig, TrainConfig
 from npa_envs.training.divergence import DivergedError
 from npa_envs.training.folder import JsonlLog, RunFolder
 from npa_envs.training.joint import JointRules, train_together
+from npa_envs.training.joint_config import JointTrainConfig
 from npa_envs.training.overrides import config_to_dict, load_config, override
 from npa_envs.training.presets import TASKS, TaskEntry, preset, task_entry
 from npa_envs.training.trainer import Trainer, TrainResult
@@ -18,6 +19,7 @@ __all__ = [
     "TASKS",
     "DivergedError",
     "JointRules",
+    "JointTrainConfig",
     "JsonlLog",
     "Morphogenesis2DTrainConfig",
     "PictureTask",
@@ -47,7 +49,7 @@ def train(
     progress: bool = True,
     max_seconds: float | None = None,
 ) -> TrainResult:
-    """Train a rule on a task of the table `TASKS`.
+    """Train a rule on a task of the table `TASKS`, or a rule for each species of a joint task.
 
     Args:
         config: The run's configuration, for example `preset("fast", target="heart")`.
@@ -61,6 +63,11 @@ def train(
         NPAError: The task is unknown, its target cannot be loaded, or as for `Trainer`.
         DivergedError: The loss is not finite.
     """
-    task = task_entry(task_name).make(config.task, check_device(config.device))
+    entry = task_entry(task_name)
+    if entry.joint:
+        return train_together(
+            config, resume=resume, overwrite=overwrite, progress=progress, max_seconds=max_seconds
+        )
+    task = entry.make(config.task, check_device(config.device))
     trainer = Trainer(task, config, task_name=task_name, resume=resume, overwrite=overwrite)
     return trainer.run(progress=progress, max_seconds=max_seconds)

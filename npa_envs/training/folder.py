@@ -71,9 +71,18 @@ class RunFolder:
         """Remove an earlier run's files, and nothing else that may lie in the folder."""
         for path in (self.checkpoint, self.rule, self.log, self.config, self.diagnosis):
             path.unlink(missing_ok=True)
-        for pattern in ("pictures/[0-9]*.png", "tensorboard/events.out.tfevents.*"):
+        patterns = (
+            "rule-[0-9]*.safetensors",
+            "pictures/[0-9]*.png",
+            "tensorboard/events.out.tfevents.*",
+        )
+        for pattern in patterns:
             for path in self.path.glob(pattern):
                 path.unlink()
+
+    def rule_of(self, species: int) -> Path:
+        """Return the path of the rule of a species, of a run that trains several together."""
+        return self.path / f"rule-{species}.safetensors"
 
     def picture(self, iteration: int) -> Path:
         """Return the path of the picture of an iteration."""

@@ -14,12 +14,13 @@ from npa_envs.devices import check_device
 from npa_envs.dynamics import Memory
 from npa_envs.errors import NPAError
 from npa_envs.rule import NPARule
-from npa_envs.rule_io import save_rule
+from npa_envs.rule_io import load_rule, save_rule
 from npa_envs.species import rollout_species
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2D
 from npa_envs.tasks.co_morphogenesis2d_config import CoMorphogenesis2DConfig
 from npa_envs.tasks.rules import differing_fields
 from npa_envs.training.config import TrainConfig
+from npa_envs.training.joint_config import JointTrainConfig
 from npa_envs.training.trainer import Trainer, TrainResult
 
 TASK_NAME = "co_morphogenesis2d"
@@ -59,6 +60,11 @@ class _JointTrainer(Trainer):
     ) -> None:
         self._species = task
         self._given = rules
+        self._frozen: tuple[int, ...] = ()
+        if isinstance(config, JointTrainConfig):
+            self._frozen = config.frozen
+            if rules is None and config.initial_rules:
+                self._given = [load_rule(source) for source in config.initial_rules]
         super().__init__(
             task,
             config,
@@ -103,6 +109,11 @@ class _JointTrainer(Trainer):
         # The trainer asks of its rule what any module has, and for its hyper-parameters.
         made = self._species.make_rules(generator)
         if self._given is None:
+            if self._frozen:
+                raise NPAError(
+                    f"frozen must name rules that were trained before, got {self._frozen} without "
+                    "initial_rules: give one for each species"
+                )
             return cast(NPARule, JointRules(made))
         if len(self._given) != len(made):
             raise NPAError(
@@ -115,15 +126,22 @@ class _JointTrainer(Trainer):
                     f"rules must have the shape of their species, but rule {number} differs in "
                     f"{', '.join(wrong)}: change those fields of species {number}"
                 )
-        return cast(NPARule, JointRules(copy.deepcopy(list(self._given))))
+        rules = copy.deepcopy(list(self._given))
+        for number in self._frozen:
+            if number >= len(rules):
+                raise NPAError(f"frozen must name species from 0 to {len(rules) - 1}, got {number}")
+            rules[number].requires_grad_(False)
+        if not any(p.requires_grad for rule in rules for p in rule.parameters()):
+            raise NPAError("frozen must leave a rule that learns, got all of them: leave one out")
+        return cast(NPARule, JointRules(rules))
 
     def _save_rule(self, told: dict[str, Any]) -> None:
         for number, rule in enumerate(cast(JointRules, self.rule)):
-            own = {**told, "task": told["task"]["species"][number]}
+            own = {name: told[name] for name in told if name not in ("initial_rules", "frozen")}
+            own["task"] = told["task"]["species"][number]
             metadata = {"task": "morphogenesis2d", "config": json.dumps(own)}
             metadata |= {"iteration": str(self.iteration), "trained_in": TASK_NAME}
-            path = self.folder.rule.with_name(f"rule-{number}.safetensors")
-            save_rule(rule, path, metadata=metadata)
+            save_rule(rule, self.folder.rule_of(number), metadata=metadata)
 
 
 def train_together(
@@ -141,8 +159,10 @@ def train_together(
     parameters do not require gradients stays as it is: the others learn to live beside it.
 
     Args:
-        config: The run's configuration, for example `TrainConfig(task=CoMorphogenesis2DConfig())`.
-        rules: What to start from, one rule for each species; copied. None: untrained ones.
+        config: The run's configuration, for example `preset("fast", "co_morphogenesis2d")` or
+            `TrainConfig(task=CoMorphogenesis2DConfig())`.
+        rules: What to start from, one rule for each species; copied. None: the configuration's
+            `initial_rules`, or untrained ones.
         resume: Go on from the checkpoint in `config.out`; give the same `rules` again.
         overwrite: Start anew although `config.out` holds a run; its files are removed.
         progress: Show a progress bar.

@@ -21,7 +21,8 @@ def override(config: TrainConfig[TaskConfigT], /, **fields: Any) -> TrainConfig[
     """Return `config` with fields changed, the run's and the task's alike, by plain name.
 
     Values may be as plain as a file's: a list for a tuple, a string for a path, "5e-4" for a
-    number (YAML reads that as a string). `task` may be a mapping of task fields.
+    number (YAML reads that as a string). `task` may be a mapping of task fields. Mappings of the
+    fields of species are laid over the species that are there; further ones over the last of them.
 
     Args:
         config: The configuration to start from; it stays as it is.
@@ -40,7 +41,7 @@ def override(config: TrainConfig[TaskConfigT], /, **fields: Any) -> TrainConfig[
             for inner, inner_value in value.items():
                 if inner not in task_types:
                     raise NPAError(f"unknown field 'task.{inner}': {suggest(inner, task_types)}")
-                task_changes[inner] = _convert(inner, inner_value, task_types[inner])
+                task_changes[inner] = _converted(task, inner, inner_value)
         elif name == "task":
             if type(value) is not type(config.task):
                 raise NPAError(
@@ -49,9 +50,9 @@ def override(config: TrainConfig[TaskConfigT], /, **fields: Any) -> TrainConfig[
                 )
             task = value
         elif name in own:
-            own_changes[name] = _convert(name, value, own[name])
+            own_changes[name] = _converted(config, name, value)
         elif name in task_types:
-            task_changes[name] = _convert(name, value, task_types[name])
+            task_changes[name] = _converted(task, name, value)
         else:
             known = [*own, *task_types]
             raise NPAError(f"unknown field {name!r}: {suggest(name, known)}")
@@ -141,19 +142,42 @@ def _field_types(config: Any) -> dict[str, Any]:
     return {field.name: hints[field.name] for field in dataclasses.fields(config)}
 
 
-def _convert(name: str, value: Any, kind: Any) -> Any:
-    """Return a plain value as the field's type; ranges are the dataclass's own business."""
+def _converted(config: Any, name: str, value: Any) -> Any:
+    """Return a plain value as the type of a configuration's field, which exists."""
+    return _convert(name, value, _field_types(config)[name], getattr(config, name))
+
+
+def _convert(name: str, value: Any, kind: Any, present: Any) -> Any:
+    """Return a plain value as the field's type; ranges are the dataclass's own business.
+
+    Args:
+        name: The field, for errors.
+        value: The plain value.
+        kind: The field's type.
+        present: What the field holds: mappings are laid over it.
+    """
     origin = typing.get_origin(kind)
     if origin is typing.Literal:
         return value
     if origin in (typing.Union, types.UnionType):
         inner = [option for option in typing.get_args(kind) if option is not type(None)]
-        return None if value is None else _convert(name, value, inner[0])
+        return None if value is None else _convert(name, value, inner[0], present)
     if origin is tuple:
         if not isinstance(value, list | tuple):
             raise NPAError(f"{name} must be a list, got {value!r}: for example {name}: [1, 2]")
         item = typing.get_args(kind)[0]
-        return tuple(_convert(name, entry, item) for entry in value)
+        there = present if isinstance(present, tuple) and present else (None,)
+        return tuple(
+            _convert(f"{name}[{k}]", entry, item, there[min(k, len(there) - 1)])
+            for k, entry in enumerate(value)
+        )
+    if dataclasses.is_dataclass(kind) and isinstance(value, Mapping):
+        known = _field_types(present)
+        for inner in value:
+            if inner not in known:
+                raise NPAError(f"unknown field '{name}.{inner}': {suggest(inner, known)}")
+        changes = {k: _converted(present, k, v) for k, v in value.items()}
+        return dataclasses.replace(present, **changes)
     if kind is Path and isinstance(value, str | Path):
         return Path(value)
     if kind is float and not isinstance(value, bool):

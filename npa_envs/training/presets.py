@@ -4,20 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 
 from npa_envs.errors import NPAError, suggest
+from npa_envs.tasks.co_morphogenesis2d_config import CoMorphogenesis2DConfig
 from npa_envs.tasks.morphogenesis2d_config import Morphogenesis2DConfig
 from npa_envs.tasks.morphogenesis3d_config import Morphogenesis3DConfig
 from npa_envs.tasks.point_classification_config import PointClassificationConfig
 from npa_envs.tasks.task import PictureTask
 from npa_envs.tasks.texture_config import TextureConfig
-from npa_envs.training.config import Morphogenesis2DTrainConfig, TrainConfig
+from npa_envs.training.config import TrainConfig
 from npa_envs.training.overrides import override
+from npa_envs.training.presets2d import MORPHOGENESIS2D_PRESETS
 from npa_envs.training.presets3d import MORPHOGENESIS3D_PRESETS
+from npa_envs.training.presets_joint import CO_MORPHOGENESIS2D_PRESETS
 from npa_envs.training.presets_points import POINT_CLASSIFICATION_PRESETS
 from npa_envs.training.presets_texture import TEXTURE_PRESETS
 
@@ -40,6 +42,9 @@ class TaskEntry:
 
     space_dim: int = 2
     """Space dimension D of its worlds."""
+
+    joint: bool = False
+    """Whether several rules are trained, one for each species, by `train_together`."""
 
 
 def _make_morphogenesis2d(config: Morphogenesis2DConfig, device: torch.device) -> PictureTask:
@@ -87,59 +92,12 @@ def _morphogenesis3d_targets() -> tuple[str, ...]:
     return builtin_meshes()
 
 
-_OUT = Path("runs/morphogenesis2d")
+def _make_co_morphogenesis2d(config: CoMorphogenesis2DConfig, device: torch.device) -> PictureTask:
+    from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2D
 
-MORPHOGENESIS2D_PRESETS: Mapping[str, Morphogenesis2DTrainConfig] = {
-    "paper": TrainConfig(task=Morphogenesis2DConfig(), out=_OUT),
-    # A few particles that see far, in worlds that start from seeds often: a recognisable gecko
-    # after about four minutes on one core (means of 4 worlds: splat loss 0.16 and PSNR 25 dB at
-    # step 64, 0.22 and 23 dB at step 1024; with a seed in every sixth batch 0.21 and 0.43).
-    "fast": TrainConfig(
-        task=Morphogenesis2DConfig(
-            target_point_count=512,
-            particle_count=512,
-            hidden_dim=64,
-            eps=0.2,
-            seed_radius=0.4,
-            resolution=64,
-        ),
-        iterations=2400,
-        repeats=1,
-        world_count=2,
-        pool_size=32,
-        steps=(16, 32),
-        learning_rate=2e-3,
-        milestones=(1500, 2100),
-        seed_interval=2,
-        out=_OUT,
-        picture_interval=200,
-        checkpoint_interval=200,
-        tensorboard=False,
-    ),
-    "tiny": TrainConfig(
-        task=Morphogenesis2DConfig(
-            target="ring",
-            target_point_count=128,
-            particle_count=128,
-            hidden_dim=32,
-            eps=0.3,
-            resolution=32,
-        ),
-        iterations=40,
-        repeats=1,
-        world_count=2,
-        pool_size=8,
-        steps=(8, 16),
-        learning_rate=5e-3,
-        milestones=(30,),
-        out=_OUT,
-        log_interval=1,
-        picture_interval=20,
-        checkpoint_interval=20,
-        tensorboard=False,
-    ),
-}
-"""2D morphogenesis: `paper` (arXiv 2601.16096), `fast` (minutes on one core), `tiny` (tests)."""
+    # Films and the evaluation take its rules one by one, as rules of their own task.
+    return cast(PictureTask, CoMorphogenesis2D(config, device=device))
+
 
 TASKS: Mapping[str, TaskEntry] = {
     "morphogenesis2d": TaskEntry(
@@ -147,6 +105,13 @@ TASKS: Mapping[str, TaskEntry] = {
         presets=MORPHOGENESIS2D_PRESETS,
         make=_make_morphogenesis2d,
         targets=_morphogenesis2d_targets,
+    ),
+    "co_morphogenesis2d": TaskEntry(
+        summary="grow pictures in one world, each by a rule of its own",
+        presets=CO_MORPHOGENESIS2D_PRESETS,
+        make=_make_co_morphogenesis2d,
+        targets=tuple,
+        joint=True,
     ),
     "morphogenesis3d": TaskEntry(
         summary="grow a thing seen from all sides from a ball of blank particles",
