@@ -20,7 +20,7 @@ import npa_envs
 from npa_envs.agents import RulePolicy
 from npa_envs.envs import multispecies_v0
 from npa_envs.envs.species import TASKS as TABLE
-from npa_envs.envs.species import world as world_module
+from npa_envs.envs.species import cohort as cohort_module
 from npa_envs.errors import NPAError
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:pettingzoo")
@@ -147,8 +147,8 @@ def test_one_pass_perceives_for_all_species(monkeypatch):
         calls.append(worlds[0].shape)
         return survey_worlds(*worlds)
 
-    survey_worlds = world_module.survey_worlds
-    monkeypatch.setattr(world_module, "survey_worlds", survey)
+    survey_worlds = cohort_module.survey_worlds
+    monkeypatch.setattr(cohort_module, "survey_worlds", survey)
     observations, *_ = env.step(still(env))
     assert calls == [(1, 41, 2)]
     x, s = env.particles()
@@ -370,7 +370,7 @@ def test_the_registry_of_pettingzoo_makes_every_task(kind, name):
     del keywords["task"]
     env = pettingzoo.make(kind, name, **keywords)
     env.reset(seed=0)
-    assert type(env.unwrapped.world.task) is TABLE[task]
+    assert type(env.unwrapped.worlds.task) is TABLE[task]
     assert env.possible_agents == ["species_0", "species_1"]
     assert pettingzoo.spec(kind, name).id == name
 

@@ -144,7 +144,7 @@ def test_symbiosis_reaches_its_target_together_only():
     count = load_target("heart", point_count=64).point_count
     env = make("symbiosis", target="heart", particle_count=count)
     env.reset(seed=0)
-    goal = env.world.task.goal.target
+    goal = env.worlds.task.goal.target
     s = torch.zeros(count, 16)
     s[:, -3:] = goal.colours - 0.5
     env.place_particles(goal.points, s)
@@ -235,15 +235,20 @@ def test_leaving_does_not_give_back_what_came_at_no_charge():
 
 @pytest.mark.parametrize("carried", [3.0, 0.5, 1.0])
 def test_rewards_of_an_agent_that_left_never_add_up_to_more_than_zero(carried):
-    env = make("mixing")
-    account = Account(env.world.task, np.array([0, 1]), team=False)
-    everyone = np.array([0, 1])
-    account.open({"loss": np.array([1.0, 1.0])})
-    paid = account.pay({"loss": np.array([0.8, 1.0])}, everyone, [])
-    account.carry_over({"loss": np.array([carried, 1.0])})
-    paid = paid + account.pay({"loss": np.array([0.0, 0.0])}, everyone, [0])
-    assert paid[0] == pytest.approx(min(0.0, carried - 0.8), abs=1e-12)
+    account = Account(make("mixing").worlds.task, torch.tensor([0, 1]), 1, team=False)
+
+    def losses(*values):
+        return {"loss": torch.tensor([values], dtype=torch.float64)}
+
+    def pay(parts, fled):
+        return account.pay(parts, torch.tensor([[True, True]]), torch.tensor([[fled, False]]))[0]
+
+    account.open(losses(1.0, 1.0), torch.tensor([0]))
+    paid = pay(losses(0.8, 1.0), False)
+    account.carry_over(losses(carried, 1.0))
+    paid = paid + pay(losses(0.0, 0.0), True)
+    assert float(paid[0]) == pytest.approx(min(0.0, carried - 0.8), abs=1e-12)
     assert paid[1] == 1.0
     # What an episode left behind is forgotten in the next one.
-    account.open({"loss": np.array([1.0, 1.0])})
-    assert account.pay({"loss": np.array([0.0, 1.0])}, everyone, [0])[0] == 0.0
+    account.open(losses(1.0, 1.0), torch.tensor([0]))
+    assert pay(losses(0.0, 1.0), True)[0] == 0.0

@@ -4,14 +4,8 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
-import numpy as np
-import torch
-from numpy.typing import NDArray
-
-from npa_envs.envs.species.account import Losses
 from npa_envs.envs.species.crowd import CrowdEnv
 from npa_envs.envs.species.tables import task_type
-from npa_envs.envs.species.world import SpeciesWorld
 from npa_envs.errors import NPAError
 
 LARGEST_CROWD = 512
@@ -172,16 +166,6 @@ class MultiSpeciesEnv(CrowdEnv):
     def __init__(self, task: str = "mixing", **config: Any) -> None:
         super().__init__(task, config)
 
-    def owners(self, world: SpeciesWorld) -> NDArray[np.int64]:
-        """Return the species of each particle."""
-        return world.species
-
-    @torch.no_grad()
-    def measured(self) -> Losses:
-        """Return the parts of each species' loss."""
-        losses = self.world.task.losses(self.world.population)
-        return {name: loss.cpu().numpy().astype(np.float64) for name, loss in losses.items()}
-
 
 class ParticlesEnv(CrowdEnv):
     """Few particles that share one world, each an agent.
@@ -273,16 +257,3 @@ class ParticlesEnv(CrowdEnv):
                 f"got {count}: make species the agents with npa_envs.envs.multispecies_v0"
             )
         super().__init__(task, config)
-
-    def owners(self, world: SpeciesWorld) -> NDArray[np.int64]:
-        """Return a number of its own for each particle."""
-        return np.arange(world.particle_count)
-
-    @torch.no_grad()
-    def measured(self) -> Losses:
-        """Return the parts of each particle's loss; zeros for those that are gone."""
-        measured = {}
-        for name, loss in self.world.task.particle_losses(self.world.population).items():
-            measured[name] = np.zeros(self.world.particle_count)
-            measured[name][self.world.present] = loss.cpu().numpy()
-        return measured
