@@ -121,6 +121,29 @@ def test_each_species_of_co_morphogenesis_is_paid_for_its_own_picture():
     assert rewards["species_1"] != 0.0
 
 
+def test_after_a_death_each_survivor_is_still_paid_for_its_own_picture():
+    env = make(
+        "co_morphogenesis",
+        species_count=3,
+        targets=("heart", "flower", "ring"),
+        particle_counts=(20, 25, 30),
+        deaths=((1, 1),),
+    )
+    env.reset(seed=0)
+    generator = np.random.default_rng(0)
+    for _ in range(2):
+        *_, infos = env.step(drawn(env, generator))
+    x, s = env.particles()
+    for agent, target, span in (
+        ("species_0", "heart", slice(20)),
+        ("species_2", "ring", slice(20, 50)),
+    ):
+        count = len(x[span])
+        assert infos[agent]["species"] == int(agent[-1])
+        expected = splat_loss(target, x[span], s[span], count)
+        assert infos[agent]["loss"] == pytest.approx(expected, rel=1e-5)
+
+
 @pytest.mark.parametrize("species_count", [2, 4])
 def test_what_the_invaded_gain_the_invaders_lose(species_count):
     env = make("invasion", species_count=species_count, target="heart")
