@@ -10,7 +10,7 @@ import numpy as np
 import pettingzoo
 import pytest
 import torch
-from crowds import TASKS, apart, drawn, make, pair, small, still, targets_made_once
+from crowds import TASKS, apart, drawn, make, module_of, pair, small, still, targets_made_once
 from pettingzoo.test import api_test, parallel_api_test, render_test, seed_test
 from pettingzoo.test.max_cycles_test import max_cycles_test
 from pettingzoo.test.seed_test import parallel_seed_test
@@ -66,8 +66,9 @@ def test_a_window_without_a_screen_warns_and_goes_on(monkeypatch):
     env.close()
 
 
-def test_passes_the_test_of_max_cycles():
-    max_cycles_test(multispecies_v0)
+@pytest.mark.parametrize("task", TASKS)
+def test_passes_the_test_of_max_cycles(task):
+    max_cycles_test(module_of(multispecies_v0, **small(task)))
 
 
 @pytest.mark.parametrize("task", TASKS)

@@ -38,7 +38,8 @@ class MultiSpeciesEnv(CrowdEnv):
     `parallel_env` has all agents act at once. `env` and `raw_env` have them act in turn, by
     PettingZoo's own conversion: the world moves on after the last one; `env` also clips actions
     into their space. The ids are for `pettingzoo.make`, of PettingZoo 1.27 or newer, once
-    `npa_envs.envs.multispecies_v0` is imported: both `"parallel"` and `"aec"` are there.
+    `npa_envs.envs.multispecies_v0` is imported: both `"parallel"` and `"aec"` are there. `batched`
+    steps [many worlds at once](../species.md#many-worlds-at-once), to train on.
 
     A trained rule is a policy for one species:
     `npa_envs.agents.RulePolicy(npa_envs.load_rule("gecko"))`. Where all species follow the same
@@ -176,6 +177,17 @@ class ParticlesEnv(CrowdEnv):
     physics, but every particle is an agent: `particle_0`, `particle_1`, ... in the order of their
     species. `info["species"]` tells which one it is of. Each agent costs places in five dicts a
     step, so there are at most 512; beyond, let species be the agents.
+
+    | `task` | Id |
+    |---|---|
+    | `"mixing"` | `npa/MixingParticles-v0` |
+    | `"segregation"` | `npa/SegregationParticles-v0` |
+    | `"co_morphogenesis"` | `npa/CoMorphogenesisParticles-v0` |
+    | `"invasion"` | `npa/InvasionParticles-v0` |
+    | `"symbiosis"` | `npa/SymbiosisParticles-v0` |
+
+    The ids are for `pettingzoo.make`, of PettingZoo 1.27 or newer, once
+    `npa_envs.envs.particles_v0` is imported.
 
     ## Observation space
 
