@@ -1,4 +1,4 @@
-"""Species as agents, the way PettingZoo has it: `parallel_env`, `env` and `raw_env`.
+"""Species as agents, the way PettingZoo has it: `parallel_env`, `env` and `raw_env`; and `batched`.
 
 Importing this module registers `npa/Mixing-v0` and its like with PettingZoo (1.27 or newer).
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import Any
 
 from npa_envs.envs.species.agents import MultiSpeciesEnv
+from npa_envs.envs.species.vector import MultiSpeciesVectorEnv
 from npa_envs.envs.species.zoo import aec_env, clipped, register
 
 ENVIRONMENTS = {
@@ -32,6 +33,35 @@ def parallel_env(task: str = "mixing", species_count: int = 2, **config: Any) ->
         NPAError: A name is unknown, or a value wrong.
     """
     return MultiSpeciesEnv(task, species_count=species_count, **config)
+
+
+def batched(
+    task: str = "mixing",
+    species_count: int = 2,
+    *,
+    world_count: int = 1,
+    autoreset_mode: str = "same-step",
+    **config: Any,
+) -> MultiSpeciesVectorEnv:
+    """Return many worlds, stepped together on one device; world k is `parallel_env` by itself.
+
+    Args:
+        task: As for `parallel_env`.
+        species_count: As for `parallel_env`.
+        world_count: Worlds B.
+        autoreset_mode: "same-step" or "disabled".
+        config: As for `parallel_env`; device="cuda", output="torch" keep all arrays on a GPU.
+
+    Raises:
+        NPAError: As `parallel_env`, or the worlds do not fit into memory.
+    """
+    return MultiSpeciesVectorEnv(
+        task,
+        species_count=species_count,
+        world_count=world_count,
+        autoreset_mode=autoreset_mode,
+        **config,
+    )
 
 
 def raw_env(task: str = "mixing", species_count: int = 2, **config: Any) -> Any:

@@ -1,4 +1,8 @@
-"""Particles as agents, the way PettingZoo has it: `parallel_env`, `env` and `raw_env`."""
+"""Particles as agents, the way PettingZoo has it: `parallel_env`, `env` and `raw_env`.
+
+Importing this module registers `npa/MixingParticles-v0` and its like with PettingZoo (1.27 or
+newer).
+"""
 
 from __future__ import annotations
 
@@ -6,7 +10,16 @@ from typing import Any
 
 from npa_envs.envs.species.agents import ParticlesEnv
 from npa_envs.envs.species.config import plain
-from npa_envs.envs.species.zoo import aec_env, clipped
+from npa_envs.envs.species.zoo import aec_env, clipped, register
+
+ENVIRONMENTS = {
+    "npa/MixingParticles-v0": "mixing",
+    "npa/SegregationParticles-v0": "segregation",
+    "npa/CoMorphogenesisParticles-v0": "co_morphogenesis",
+    "npa/InvasionParticles-v0": "invasion",
+    "npa/SymbiosisParticles-v0": "symbiosis",
+}
+"""Tasks by the ids that `pettingzoo.make` takes."""
 
 PARTICLE_COUNT = 64
 """Particles by default."""
@@ -55,3 +68,7 @@ def env(task: str = "mixing", species_count: int = 2, **config: Any) -> Any:
         NPAError: As `parallel_env`.
     """
     return clipped(raw_env(task, species_count, **config))
+
+
+for _id, _task in ENVIRONMENTS.items():
+    register(_id, __name__, {"task": _task})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any, Protocol
 
 import gymnasium
 import numpy as np
@@ -15,17 +16,58 @@ SHOWN_ACROSS = 4
 """A window shows at most so many worlds side by side."""
 
 
+class View(Protocol):
+    """Worlds that can be drawn."""
+
+    config: Any
+    """The environment's configuration."""
+
+    world_count: int
+    """Worlds B."""
+
+    def pictures(self, count: int) -> NDArray[np.uint8]:
+        """Return pictures of the first worlds, uint8, shape [count, R, R, 3].
+
+        Args:
+            count: How many.
+        """
+
+
+class WorldsView:
+    """Worlds of one task as they are drawn.
+
+    Args:
+        worlds: The worlds.
+    """
+
+    def __init__(self, worlds: Worlds) -> None:
+        self._worlds = worlds
+        self.config = worlds.task.config
+        self.world_count = worlds.world_count
+
+    def pictures(self, count: int) -> NDArray[np.uint8]:
+        """Return pictures of the first worlds, uint8, shape [count, R, R, 3].
+
+        Args:
+            count: How many.
+        """
+        worlds = self._worlds
+        steps = worlds.elapsed[:count].cpu().numpy()
+        pictures: NDArray[np.uint8] = worlds.task.draw(worlds.x[:count], worlds.s[:count], steps)
+        return pictures
+
+
 class Screen:
     """What `render` of an environment returns or shows.
 
     Args:
-        worlds: The environment's worlds.
+        view: The environment's worlds.
         fps: Most frames a second that the window shows.
     """
 
-    def __init__(self, worlds: Worlds, fps: float) -> None:
-        self._worlds = worlds
-        self._config = worlds.task.config
+    def __init__(self, view: View, fps: float) -> None:
+        self._view = view
+        self._config = view.config
         self._fps = fps
         self._window: Window | None = None
 
@@ -39,7 +81,7 @@ class Screen:
         # A window already shows the worlds as they are.
         if self._config.render_mode != "rgb_array":
             return None
-        return self._pictures(self._worlds.world_count)
+        return self._view.pictures(self._view.world_count)
 
     def show(self, title: str) -> None:
         """Show the worlds as they are, the first ones where they are many; only if "human".
@@ -49,11 +91,11 @@ class Screen:
         """
         if self._config.render_mode != "human":
             return
-        count, size = self._worlds.world_count, self._config.render_size
+        count, size = self._view.world_count, self._config.render_size
         across = min(math.ceil(math.sqrt(count)), SHOWN_ACROSS)
         shown = min(count, across * across)
         frame = np.full((across * across, size, size, 3), 255, np.uint8)
-        frame[:shown] = self._pictures(shown)
+        frame[:shown] = self._view.pictures(shown)
         frame = frame.reshape(across, across, size, size, 3).swapaxes(1, 2)
         if self._window is None:
             self._window = Window(title, across * size, fps=self._fps)
@@ -64,9 +106,3 @@ class Screen:
         if self._window is not None:
             self._window.close()
             self._window = None
-
-    def _pictures(self, count: int) -> NDArray[np.uint8]:
-        worlds = self._worlds
-        steps = worlds.elapsed[:count].cpu().numpy()
-        pictures: NDArray[np.uint8] = worlds.task.draw(worlds.x[:count], worlds.s[:count], steps)
-        return pictures

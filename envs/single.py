@@ -13,7 +13,7 @@ from torch import Tensor
 
 from npa_envs.envs.arrays import checked_action, checked_particles, to_output
 from npa_envs.envs.report import DIVERGED, SUCCESS, reason
-from npa_envs.envs.screen import Screen
+from npa_envs.envs.screen import Screen, WorldsView
 from npa_envs.envs.spaces import action_space, observation_space
 from npa_envs.envs.task import EnvTask
 from npa_envs.envs.vector_options import world_keys
@@ -51,7 +51,7 @@ class NPAEnv(gymnasium.Env[Any, Any]):
         self._started = False
         self._unpaid_steps = 0
         self._warned = False
-        self._screen = Screen(self.worlds, self.metadata["render_fps"])
+        self._screen = Screen(WorldsView(self.worlds), self.metadata["render_fps"])
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

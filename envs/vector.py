@@ -16,7 +16,7 @@ from torch import Tensor
 
 from npa_envs.envs.arrays import checked_action, checked_particles, to_output
 from npa_envs.envs.report import FLAGS, TIME_LIMIT, reason
-from npa_envs.envs.screen import Screen
+from npa_envs.envs.screen import Screen, WorldsView
 from npa_envs.envs.spaces import action_space, observation_space
 from npa_envs.envs.task import EnvTask
 from npa_envs.envs.vector_options import autoreset_mode as checked_mode
@@ -85,7 +85,7 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
         self._started = False
         self._buffer: Tensor | None = None
         self._ended = np.zeros(num_envs, dtype=bool)
-        self._screen = Screen(self.worlds, self.metadata["render_fps"])
+        self._screen = Screen(WorldsView(self.worlds), self.metadata["render_fps"])
 
     @cached_property
     def observation_space(self) -> Space[Any]:  # type: ignore[override]

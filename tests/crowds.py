@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -52,6 +53,15 @@ def drawn(env: Any, generator: np.random.Generator) -> dict[str, Any]:
 def make(task: str = "mixing", **keywords: Any) -> MultiSpeciesEnv:
     """A small world of several species."""
     return multispecies_v0.parallel_env(**small(task, **keywords))
+
+
+def module_of(module: Any, **keywords: Any) -> SimpleNamespace:
+    """What a test of a whole module needs of it, for one task; limits of steps are the test's."""
+    del keywords["max_cycles"]
+    return SimpleNamespace(
+        parallel_env=functools.partial(module.parallel_env, **keywords),
+        env=functools.partial(module.env, **keywords),
+    )
 
 
 def pair(task: str = "mixing", **keywords: Any) -> MultiSpeciesEnv:

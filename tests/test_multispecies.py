@@ -10,7 +10,7 @@ import numpy as np
 import pettingzoo
 import pytest
 import torch
-from crowds import TASKS, apart, drawn, make, pair, small, still, targets_made_once
+from crowds import TASKS, apart, drawn, make, module_of, pair, small, still, targets_made_once
 from pettingzoo.test import api_test, parallel_api_test, render_test, seed_test
 from pettingzoo.test.max_cycles_test import max_cycles_test
 from pettingzoo.test.seed_test import parallel_seed_test
@@ -20,7 +20,7 @@ import npa_envs
 from npa_envs.agents import RulePolicy
 from npa_envs.envs import multispecies_v0
 from npa_envs.envs.species import TASKS as TABLE
-from npa_envs.envs.species import world as world_module
+from npa_envs.envs.species import cohort as cohort_module
 from npa_envs.errors import NPAError
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:pettingzoo")
@@ -66,8 +66,9 @@ def test_a_window_without_a_screen_warns_and_goes_on(monkeypatch):
     env.close()
 
 
-def test_passes_the_test_of_max_cycles():
-    max_cycles_test(multispecies_v0)
+@pytest.mark.parametrize("task", TASKS)
+def test_passes_the_test_of_max_cycles(task):
+    max_cycles_test(module_of(multispecies_v0, **small(task)))
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -147,8 +148,8 @@ def test_one_pass_perceives_for_all_species(monkeypatch):
         calls.append(worlds[0].shape)
         return survey_worlds(*worlds)
 
-    survey_worlds = world_module.survey_worlds
-    monkeypatch.setattr(world_module, "survey_worlds", survey)
+    survey_worlds = cohort_module.survey_worlds
+    monkeypatch.setattr(cohort_module, "survey_worlds", survey)
     observations, *_ = env.step(still(env))
     assert calls == [(1, 41, 2)]
     x, s = env.particles()
@@ -370,7 +371,7 @@ def test_the_registry_of_pettingzoo_makes_every_task(kind, name):
     del keywords["task"]
     env = pettingzoo.make(kind, name, **keywords)
     env.reset(seed=0)
-    assert type(env.unwrapped.world.task) is TABLE[task]
+    assert type(env.unwrapped.worlds.task) is TABLE[task]
     assert env.possible_agents == ["species_0", "species_1"]
     assert pettingzoo.spec(kind, name).id == name
 

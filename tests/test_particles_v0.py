@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
+import pettingzoo
 import pytest
-from crowds import HALF_WAY, TASKS, drawn, small, still, targets_made_once
+from crowds import HALF_WAY, TASKS, drawn, module_of, small, still, targets_made_once
 from pettingzoo.test import api_test, parallel_api_test, render_test, seed_test
 from pettingzoo.test.max_cycles_test import max_cycles_test
 from pettingzoo.test.seed_test import parallel_seed_test
 from pettingzoo.test.state_test import state_test
 
 from npa_envs.envs import multispecies_v0, particles_v0
+from npa_envs.envs.species import TASKS as TABLE
 from npa_envs.errors import NPAError
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:pettingzoo")
@@ -48,8 +50,9 @@ def test_passes_the_render_and_state_tests(task, monkeypatch, recwarn):
     state_test(particles_v0.env(**few(task)), make(task), num_cycles=2)
 
 
-def test_passes_the_test_of_max_cycles():
-    max_cycles_test(particles_v0)
+@pytest.mark.parametrize("task", TASKS)
+def test_passes_the_test_of_max_cycles(task):
+    max_cycles_test(module_of(particles_v0, **few(task)))
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -151,6 +154,19 @@ def test_particles_of_a_removed_species_end_together():
     _, rewards, *_ = env.step(drawn(env, np.random.default_rng(0)))
     assert len(rewards) == 4
     assert all(rewards.values())
+
+
+@pytest.mark.parametrize("kind", ["parallel", "aec"])
+@pytest.mark.parametrize("name", particles_v0.ENVIRONMENTS)
+def test_the_registry_of_pettingzoo_makes_every_task(kind, name):
+    task = particles_v0.ENVIRONMENTS[name]
+    keywords = few(task)
+    del keywords["task"]
+    env = pettingzoo.make(kind, name, **keywords)
+    env.reset(seed=0)
+    assert type(env.unwrapped.worlds.task) is TABLE[task]
+    assert env.possible_agents == [f"particle_{k}" for k in range(9)]
+    assert tuple(particles_v0.ENVIRONMENTS.values()) == TASKS
 
 
 @pytest.mark.parametrize(

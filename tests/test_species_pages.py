@@ -94,9 +94,10 @@ def test_a_page_tells_spaces_and_agents_as_they_are(name):
         assert shown in head
 
 
-def test_the_page_lists_tasks_with_their_ids():
-    rows = re.findall(r'^\| `"(\w+)"` \| `([^`]+)` \|', text_of("MultiSpecies"), re.MULTILINE)
-    assert {name: task for task, name in rows} == multispecies_v0.ENVIRONMENTS
+@every_page
+def test_the_page_lists_tasks_with_their_ids(name):
+    rows = re.findall(r'^\| `"(\w+)"` \| `([^`]+)` \|', text_of(name), re.MULTILINE)
+    assert {id_: task for task, id_ in rows} == MODULES[name].ENVIRONMENTS
 
 
 def test_the_page_tells_how_episodes_end():

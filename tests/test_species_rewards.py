@@ -121,6 +121,29 @@ def test_each_species_of_co_morphogenesis_is_paid_for_its_own_picture():
     assert rewards["species_1"] != 0.0
 
 
+def test_after_a_death_each_survivor_is_still_paid_for_its_own_picture():
+    env = make(
+        "co_morphogenesis",
+        species_count=3,
+        targets=("heart", "flower", "ring"),
+        particle_counts=(20, 25, 30),
+        deaths=((1, 1),),
+    )
+    env.reset(seed=0)
+    generator = np.random.default_rng(0)
+    for _ in range(2):
+        *_, infos = env.step(drawn(env, generator))
+    x, s = env.particles()
+    for agent, target, span in (
+        ("species_0", "heart", slice(20)),
+        ("species_2", "ring", slice(20, 50)),
+    ):
+        count = len(x[span])
+        assert infos[agent]["species"] == int(agent[-1])
+        expected = splat_loss(target, x[span], s[span], count)
+        assert infos[agent]["loss"] == pytest.approx(expected, rel=1e-5)
+
+
 @pytest.mark.parametrize("species_count", [2, 4])
 def test_what_the_invaded_gain_the_invaders_lose(species_count):
     env = make("invasion", species_count=species_count, target="heart")
@@ -144,7 +167,7 @@ def test_symbiosis_reaches_its_target_together_only():
     count = load_target("heart", point_count=64).point_count
     env = make("symbiosis", target="heart", particle_count=count)
     env.reset(seed=0)
-    goal = env.world.task.goal.target
+    goal = env.worlds.task.goal.target
     s = torch.zeros(count, 16)
     s[:, -3:] = goal.colours - 0.5
     env.place_particles(goal.points, s)
@@ -235,15 +258,20 @@ def test_leaving_does_not_give_back_what_came_at_no_charge():
 
 @pytest.mark.parametrize("carried", [3.0, 0.5, 1.0])
 def test_rewards_of_an_agent_that_left_never_add_up_to_more_than_zero(carried):
-    env = make("mixing")
-    account = Account(env.world.task, np.array([0, 1]), team=False)
-    everyone = np.array([0, 1])
-    account.open({"loss": np.array([1.0, 1.0])})
-    paid = account.pay({"loss": np.array([0.8, 1.0])}, everyone, [])
-    account.carry_over({"loss": np.array([carried, 1.0])})
-    paid = paid + account.pay({"loss": np.array([0.0, 0.0])}, everyone, [0])
-    assert paid[0] == pytest.approx(min(0.0, carried - 0.8), abs=1e-12)
+    account = Account(make("mixing").worlds.task, torch.tensor([0, 1]), 1, team=False)
+
+    def losses(*values):
+        return {"loss": torch.tensor([values], dtype=torch.float64)}
+
+    def pay(parts, fled):
+        return account.pay(parts, torch.tensor([[True, True]]), torch.tensor([[fled, False]]))[0]
+
+    account.open(losses(1.0, 1.0), torch.tensor([0]))
+    paid = pay(losses(0.8, 1.0), False)
+    account.carry_over(losses(carried, 1.0))
+    paid = paid + pay(losses(0.0, 0.0), True)
+    assert float(paid[0]) == pytest.approx(min(0.0, carried - 0.8), abs=1e-12)
     assert paid[1] == 1.0
     # What an episode left behind is forgotten in the next one.
-    account.open({"loss": np.array([1.0, 1.0])})
-    assert account.pay({"loss": np.array([0.0, 1.0])}, everyone, [0])[0] == 0.0
+    account.open(losses(1.0, 1.0), torch.tensor([0]))
+    assert pay(losses(0.0, 1.0), True)[0] == 0.0

@@ -15,12 +15,12 @@ from npa_envs.errors import NPAError
 def joined_actions(
     actions: Any, agents: Sequence[str], shapes: Sequence[tuple[int, ...]], device: torch.device
 ) -> Tensor:
-    """Return the actions of all live agents as rows, float32, shape [N, A].
+    """Return the actions of all live agents as rows, float32, shape [N, A] or [B, N, A].
 
     Args:
         actions: An array or tensor for each live agent.
         agents: Live agents, in the order of their particles.
-        shapes: Shape of each one's action, [N_k, A] or [A].
+        shapes: Shape of each one's action, [B, N_k, A], [N_k, A] or [A].
         device: Where the world lives.
 
     Raises:
@@ -46,10 +46,10 @@ def joined_actions(
             "get no more actions until reset; see env.agents"
         )
     rows = [
-        _checked(agent, actions[agent], shape).view(-1, shape[-1])
-        for agent, shape in zip(agents, shapes, strict=True)
+        _checked(agent, actions[agent], shape) for agent, shape in zip(agents, shapes, strict=True)
     ]
-    joined = torch.cat([row.to(device) for row in rows])
+    # What has one row only has no dimension for it.
+    joined = torch.cat([torch.atleast_2d(row.to(device)) for row in rows], dim=-2)
     if not bool(torch.isfinite(joined).all()):
         bad = next(k for k, row in enumerate(rows) if not bool(torch.isfinite(row).all()))
         wrong = rows[bad][~torch.isfinite(rows[bad])]

@@ -4,14 +4,8 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
-import numpy as np
-import torch
-from numpy.typing import NDArray
-
-from npa_envs.envs.species.account import Losses
 from npa_envs.envs.species.crowd import CrowdEnv
 from npa_envs.envs.species.tables import task_type
-from npa_envs.envs.species.world import SpeciesWorld
 from npa_envs.errors import NPAError
 
 LARGEST_CROWD = 512
@@ -44,7 +38,8 @@ class MultiSpeciesEnv(CrowdEnv):
     `parallel_env` has all agents act at once. `env` and `raw_env` have them act in turn, by
     PettingZoo's own conversion: the world moves on after the last one; `env` also clips actions
     into their space. The ids are for `pettingzoo.make`, of PettingZoo 1.27 or newer, once
-    `npa_envs.envs.multispecies_v0` is imported: both `"parallel"` and `"aec"` are there.
+    `npa_envs.envs.multispecies_v0` is imported: both `"parallel"` and `"aec"` are there. `batched`
+    steps [many worlds at once](../species.md#many-worlds-at-once), to train on.
 
     A trained rule is a policy for one species:
     `npa_envs.agents.RulePolicy(npa_envs.load_rule("gecko"))`. Where all species follow the same
@@ -172,16 +167,6 @@ class MultiSpeciesEnv(CrowdEnv):
     def __init__(self, task: str = "mixing", **config: Any) -> None:
         super().__init__(task, config)
 
-    def owners(self, world: SpeciesWorld) -> NDArray[np.int64]:
-        """Return the species of each particle."""
-        return world.species
-
-    @torch.no_grad()
-    def measured(self) -> Losses:
-        """Return the parts of each species' loss."""
-        losses = self.world.task.losses(self.world.population)
-        return {name: loss.cpu().numpy().astype(np.float64) for name, loss in losses.items()}
-
 
 class ParticlesEnv(CrowdEnv):
     """Few particles that share one world, each an agent.
@@ -192,6 +177,17 @@ class ParticlesEnv(CrowdEnv):
     physics, but every particle is an agent: `particle_0`, `particle_1`, ... in the order of their
     species. `info["species"]` tells which one it is of. Each agent costs places in five dicts a
     step, so there are at most 512; beyond, let species be the agents.
+
+    | `task` | Id |
+    |---|---|
+    | `"mixing"` | `npa/MixingParticles-v0` |
+    | `"segregation"` | `npa/SegregationParticles-v0` |
+    | `"co_morphogenesis"` | `npa/CoMorphogenesisParticles-v0` |
+    | `"invasion"` | `npa/InvasionParticles-v0` |
+    | `"symbiosis"` | `npa/SymbiosisParticles-v0` |
+
+    The ids are for `pettingzoo.make`, of PettingZoo 1.27 or newer, once
+    `npa_envs.envs.particles_v0` is imported.
 
     ## Observation space
 
@@ -273,16 +269,3 @@ class ParticlesEnv(CrowdEnv):
                 f"got {count}: make species the agents with npa_envs.envs.multispecies_v0"
             )
         super().__init__(task, config)
-
-    def owners(self, world: SpeciesWorld) -> NDArray[np.int64]:
-        """Return a number of its own for each particle."""
-        return np.arange(world.particle_count)
-
-    @torch.no_grad()
-    def measured(self) -> Losses:
-        """Return the parts of each particle's loss; zeros for those that are gone."""
-        measured = {}
-        for name, loss in self.world.task.particle_losses(self.world.population).items():
-            measured[name] = np.zeros(self.world.particle_count)
-            measured[name][self.world.present] = loss.cpu().numpy()
-        return measured

@@ -84,7 +84,7 @@ class CoMorphogenesisTask(SpeciesTask):
     def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
         """Return each particle's share of its species' splat loss."""
         shares = [self.goals[k].particle_shares(*population.of(k)) for k in present(population)]
-        return {"picture": torch.cat(shares, dim=1)[0]}
+        return {"picture": torch.cat(shares, dim=1)}
 
     @property
     def pixel_size(self) -> float:

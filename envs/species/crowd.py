@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Mapping
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -15,18 +14,14 @@ from torch import Tensor
 
 from npa_envs.envs.arrays import to_output
 from npa_envs.envs.screen import Screen
-from npa_envs.envs.species.account import Account, Losses
 from npa_envs.envs.species.actions import joined_actions
+from npa_envs.envs.species.episodes import Episodes
 from npa_envs.envs.species.pictures import SpeciesView
 from npa_envs.envs.species.spaces import agent_spaces, state_space
-from npa_envs.envs.species.tables import task_type
-from npa_envs.envs.species.world import SpeciesWorld
 from npa_envs.envs.species.zoo import ParallelEnv
 from npa_envs.envs.vector_options import world_keys
 from npa_envs.errors import NPAError, suggest
 
-REMOVED, LEFT, ALONE, LATE = "removed", "left the world", "no opponent", "time limit"
-"""Why an agent's episode ends, as `info["reason"]` says it."""
 Flags = dict[str, bool]
 Infos = dict[str, dict[str, Any]]
 Outcome = tuple[dict[str, Any], dict[str, float], Flags, Flags, Infos]
@@ -53,53 +48,33 @@ class CrowdEnv(ParallelEnv):  # type: ignore[misc]
     }
 
     def __init__(self, task: str, keywords: dict[str, Any]) -> None:
-        found = task_type(task)
-        self.config = found.config_type.from_keywords(keywords)
+        self._episodes = episodes = Episodes(task, keywords, 1, by_particle=not self.rows)
+        self.config = episodes.config
         self.render_mode = self.config.render_mode
         self.max_cycles = self.config.max_cycles
         """Steps after which the episode is cut off for all."""
-        self.world = SpeciesWorld(found, self.config)
-        """The particles."""
+        self.worlds = worlds = episodes.worlds
+        """The particles: a batch of one world."""
         self._task_name = task
-        self._owner = self.owners(self.world)
-        sizes = np.bincount(self._owner)
-        ends = np.cumsum(sizes)
-        self._spans = [slice(int(e - n), int(e)) for e, n in zip(ends, sizes, strict=True)]
-        self._species = self.world.species[ends - 1]
-        self.possible_agents = [f"{self.agent_word}_{k}" for k in range(len(sizes))]
+        self.possible_agents = [f"{self.agent_word}_{k}" for k in range(worlds.agent_count)]
         self.agents: list[str] = []
-        self._live = np.arange(0)
-        rows = [(int(n),) if self.rows else () for n in sizes]
-        physics = self.world.physics
+        self._live: list[int] = []
+        sizes = [span.stop - span.start for span in episodes.spans]
+        rows = [(count,) if self.rows else () for count in sizes]
         self.observation_spaces, self.action_spaces = agent_spaces(
-            physics, self.world.perception_dim, self.possible_agents, rows
+            worlds.physics, worlds.perception_dim, self.possible_agents, rows
         )
-        self.state_space = state_space(physics, self.world.particle_count)
+        self.state_space = state_space(worlds.physics, worlds.particle_count)
         """Space of `state`: float32, shape [N, 2 + C + 1]."""
         self.np_random: np.random.Generator | None = None
         self._started = False
-        team = self.config.reward == "team"
-        self._account = Account(self.world.task, self._species, team)
-        # A screen asks no more of worlds than the view has.
-        self._screen = Screen(cast(Any, SpeciesView(self.world)), self.metadata["render_fps"])
+        self._screen = Screen(SpeciesView(worlds), self.metadata["render_fps"])
 
     agent_word: ClassVar[str]
     """Agents are called this, with a number behind it."""
 
     rows: ClassVar[bool]
-    """Whether an agent's observation and action have a row for each of its particles."""
-
-    def owners(self, world: SpeciesWorld) -> NDArray[np.int64]:
-        """Return the number of the agent that owns each particle, never falling, shape [N].
-
-        Args:
-            world: The world, before its first episode.
-        """
-        raise NotImplementedError
-
-    def measured(self) -> Losses:
-        """Return the parts of every agent's loss, shape [agents]; anything for those that ended."""
-        raise NotImplementedError
+    """Whether agents are species, whose observations and actions have a row for each particle."""
 
     def observation_space(self, agent: str) -> Box:
         """Return the space of an agent's observations, the same object each time.
@@ -142,15 +117,12 @@ class CrowdEnv(ParallelEnv):  # type: ignore[misc]
         if seed is not None or self.np_random is None:
             self.np_random, _ = seeding.np_random(seed)
             key = world_keys(None, 1, self.np_random)
-        with self._here():
-            self.world.start(key)
-            self._account.open(self.measured())
-            observation = self._seen()
-        self.agents = list(self.possible_agents)
-        self._live = np.arange(len(self.agents))
+        with self.worlds.here():
+            observation = self._episodes.start(np.arange(1), key)
+        self._count_agents()
         self._started = True
         self._show()
-        infos = {agent: self._account.info(k) for k, agent in enumerate(self.agents)}
+        infos = self._infos(self._episodes.account.numbers())
         return self._handed_out(observation), infos
 
     def step(self, actions: Mapping[str, Any]) -> Outcome:
@@ -169,30 +141,23 @@ class CrowdEnv(ParallelEnv):  # type: ignore[misc]
         """
         if not self.agents:
             raise NPAError("step needs a live agent, and there is none: call reset first")
-        shapes = [self.action_spaces[agent].shape for agent in self.agents]
-        action = joined_actions(actions, self.agents, shapes, self.world.device)
-        acted, live, world = self.agents, self._live.tolist(), self.world
-        with self._here():
-            world.act(action)
-            reasons = self._gone()
-            fled = [k for k, reason in reasons.items() if reason == LEFT]
-            paid = self._account.pay(self.measured(), self._live, fled).tolist()
-            infos = {self.possible_agents[k]: self._account.step_info(k) for k in live}
-            observation = self._seen()
-            if reasons:
-                observation = self._take_out(reasons, observation)
-        late = int(world.elapsed[0]) >= self.max_cycles
-        terminations = {}
+        worlds, acted, live = self.worlds, self.agents, self._live
+        shapes = [self.action_spaces[agent].shape for agent in acted]
+        action = joined_actions(actions, acted, shapes, worlds.device)
+        with worlds.here():
+            outcome = self._episodes.step(self._everyones(action))
+        ended, late = outcome.endings[0] > 0, bool(outcome.late[0])
+        infos = self._infos(outcome.numbers)
         for k, agent in zip(live, acted, strict=True):
-            terminations[agent] = k in reasons
-            if k in reasons or late:
-                infos[agent]["reason"] = reasons.get(k, LATE)
-        observations = self._handed_out(observation)
-        self._live = np.array([k for k in live if k not in reasons and not late], dtype=np.int64)
-        self.agents = [self.possible_agents[k] for k in self._live]
+            if ended[k] or late:
+                infos[agent]["reason"] = outcome.reasons[0, k]
+        observations = self._handed_out(outcome.observation)
+        paid = outcome.rewards[0].tolist()
+        rewards = {agent: paid[k] for k, agent in zip(live, acted, strict=True)}
+        terminations = {agent: bool(ended[k]) for k, agent in zip(live, acted, strict=True)}
+        self._count_agents()
         self._show()
-        rewards, truncations = dict(zip(acted, paid, strict=True)), dict.fromkeys(acted, late)
-        return observations, rewards, terminations, truncations, infos
+        return observations, rewards, terminations, dict.fromkeys(acted, late), infos
 
     def state(self) -> Any:
         """Return what there is to know of the world, for central critics; see `state_space`.
@@ -206,7 +171,7 @@ class CrowdEnv(ParallelEnv):  # type: ignore[misc]
         """
         if not self._started:
             raise NPAError("state needs a world: call reset first")
-        return to_output(self.world.state(), self.config.output)
+        return to_output(self.worlds.state()[0], self.config.output)
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return the world's picture, shape [R, R, 3], in the mode "rgb_array"."""
@@ -221,7 +186,8 @@ class CrowdEnv(ParallelEnv):  # type: ignore[misc]
 
     def particles(self) -> tuple[Tensor, Tensor]:
         """Return copies of positions [length units], [N now, 2], and states, [N now, C]."""
-        return self.world.x[0].clone(), self.world.s[0].clone()
+        there = self.worlds.population(0)
+        return there.x[0], there.s[0]
 
     def place_particles(self, x: Any, s: Any) -> dict[str, Any]:
         """Replace the particles of all live agents, at no reward, and return the observations.
@@ -235,66 +201,58 @@ class CrowdEnv(ParallelEnv):  # type: ignore[misc]
         """
         if not self.agents:
             raise NPAError("particles need live agents: call reset first")
-        with self._here():
-            self.world.place(x, s)
-            self._account.carry_over(self.measured())
-            observation = self._seen()
+        with self.worlds.here():
+            self.worlds.place(_one_world("x", x), _one_world("s", s))
+            observation = self._episodes.carry_over()
         self._show()
         return self._handed_out(observation)
 
-    def _gone(self) -> dict[int, str]:
-        """Return why agents' episodes end by themselves in this step, by their numbers."""
-        world = self.world
-        inside = self._owner[world.present[world.within_bounds()]]
-        kept = np.bincount(inside, minlength=len(self._spans))
-        step = int(world.elapsed[0])
-        doomed = {species for species, when in self.config.deaths if when == step}
-        reasons = {int(k): REMOVED for k in self._live if int(self._species[k]) in doomed}
-        reasons |= {int(k): LEFT for k in self._live if kept[k] == 0}
-        staying = [k for k in self._live if k not in reasons]
-        counts = np.bincount(self._species[staying], minlength=self.config.species_count)
-        if world.task.is_over(tuple(counts.tolist())):
-            reasons |= {int(k): ALONE for k in staying}
-        return reasons
+    def _count_agents(self) -> None:
+        """Take down who is to act next."""
+        self._live = np.flatnonzero(self._episodes.live[0]).tolist()
+        self.agents = [self.possible_agents[k] for k in self._live]
 
-    def _take_out(self, reasons: dict[int, str], observation: Tensor) -> Tensor:
-        """Take out particles of agents that ended; return what is perceived without them."""
-        world = self.world
-        dead = [k for k, reason in reasons.items() if reason != ALONE]
-        world.keep(~np.isin(self._owner[world.present], dead))
-        if len(reasons) == len(self._live):
-            return observation
-        # What others lose or gain by a death is nobody's merit: the next step counts from here.
-        self._account.carry_over(self.measured())
-        last, observation = observation, self._seen()
-        for k in reasons:
-            observation[self._spans[k]] = last[self._spans[k]]
-        return observation
-
-    def _seen(self) -> Tensor:
-        """Return what particles perceive, in rows for all that an episode starts with, [N, P]."""
-        seen = self.world.perceive()
-        if len(seen) == self.world.particle_count:
-            return seen
-        everyone = seen.new_zeros(self.world.particle_count, seen.shape[1])
-        everyone[torch.from_numpy(self.world.present).to(seen.device)] = seen
+    def _everyones(self, action: Tensor) -> Tensor:
+        """Return actions of live agents, [N now, A], with zeros for all others, [1, N, A]."""
+        count = self.worlds.particle_count
+        if len(action) == count:
+            return action[None]
+        everyone = action.new_zeros(1, count, action.shape[1])
+        live = self._episodes.live[0][self.worlds.owner]
+        everyone[0, torch.from_numpy(live).to(action.device)] = action
         return everyone
 
-    def _handed_out(self, observation: Tensor) -> dict[str, Any]:
-        rows = to_output(observation, self.config.output)
+    def _infos(self, numbers: dict[str, Tensor]) -> Infos:
+        """Return what `info` says of live agents' losses."""
+        rows = torch.stack(list(numbers.values()))[:, 0].tolist()
+        columns = dict(zip(numbers, rows, strict=True))
+        species = self._episodes.species
         return {
-            agent: rows[self._spans[k]] if self.rows else rows[self._spans[k].start]
+            agent: {"species": int(species[k])} | {name: row[k] for name, row in columns.items()}
+            for k, agent in zip(self._live, self.agents, strict=True)
+        }
+
+    def _handed_out(self, observation: Tensor) -> dict[str, Any]:
+        """Return the rows of what all particles perceive, [1, N, P], that are of `agents`."""
+        rows, spans = to_output(observation[0], self.config.output), self._episodes.spans
+        return {
+            agent: rows[spans[k]] if self.rows else rows[spans[k].start]
             for k, agent in zip(self._live, self.agents, strict=True)
         }
 
     def _show(self) -> None:
         self._screen.show(f"{self.metadata['name']}: {self._task_name}")
 
-    def _here(self) -> contextlib.AbstractContextManager[Any]:
-        device = self.world.device
-        return contextlib.nullcontext() if device.type != "cuda" else torch.cuda.device(device)
-
     def _check_agent(self, agent: str) -> None:
         if agent not in self.observation_spaces:
             hint = suggest(str(agent), self.possible_agents[:8])
             raise NPAError(f"agent must be one that exists, got {agent!r}: {hint}")
+
+
+def _one_world(name: str, value: Any) -> Tensor:
+    try:
+        return torch.as_tensor(value)[None]
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise NPAError(
+            f"{name} must be an array of numbers, got {type(value).__name__}: see env.particles()"
+        ) from error

@@ -12,7 +12,7 @@ from npa_envs.envs.species.task import Population
 
 
 def local_entropy(population: Population, *, eps: float, box: float | None) -> Tensor:
-    """Return the entropy of species around each particle, in [0, 1], dimensionless, shape [N].
+    """Return the entropy of species around each particle, in [0, 1], shape [B, N].
 
     The share of species k around particle i is f_k = b_k / Σ b, where b are the SPH-smoothed tags
     (1 for a particle of species k, else 0). The entropy is −Σ f_k ln f_k / ln K: 0 where a particle
@@ -24,17 +24,18 @@ def local_entropy(population: Population, *, eps: float, box: float | None) -> T
         box: Side of the periodic box [length units], or None in open space.
     """
     species_count = len(population.counts)
-    tags = torch.nn.functional.one_hot(population.species, species_count).to(population.x)
+    kinds = torch.arange(species_count, device=population.x.device)
+    tags = (population.species[:, None] == kinds).to(population.x)
     seen = perceive(
         population.x,
-        tags[None],
+        tags.expand(len(population.x), -1, -1).contiguous(),
         eps,
         box=box,
         state_gradient=False,
         moment_correction=False,
         density_gradient=False,
     )
-    blur = seen[0, :, species_count:]
-    shares = blur / blur.sum(dim=1, keepdim=True)
-    entropy: Tensor = torch.special.entr(shares).sum(dim=1)
+    blur = seen[..., species_count:]
+    shares = blur / blur.sum(dim=2, keepdim=True)
+    entropy: Tensor = torch.special.entr(shares).sum(dim=2)
     return entropy / math.log(species_count)

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from npa_envs import world_mean
 from npa_envs.envs.species.growth import make_goal, picture_parts, row_half_width
 from npa_envs.envs.species.symbiosis import OneTargetConfig
 from npa_envs.envs.species.task import Population, SpeciesTask
@@ -54,26 +53,25 @@ class InvasionTask(SpeciesTask):
 
     def losses(self, population: Population) -> Mapping[str, Tensor]:
         """Return the parts of species 0's splat loss, and minus an equal share for each other."""
+        counts = population.counts
         return {
-            name: torch.cat(
-                (loss, (-loss / _others(population.counts)).expand(len(population.counts) - 1))
-            )
+            name: torch.stack([loss, *[-loss / _others(counts)] * (len(counts) - 1)], dim=1)
             for name, loss in picture_parts(self.goal, *population.of(0)).items()
         }
 
     def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
         """Return shares of species 0's splat loss, and minus an equal share for each other one."""
-        own = self.goal.particle_shares(*population.of(0))[0]
-        other_count = sum(population.counts[1:])
-        others = (-own.sum() / max(other_count, 1)).expand(other_count)
-        return {"picture": torch.cat((own, others))}
+        own = self.goal.particle_shares(*population.of(0))
+        own_count, other_count = own.shape[1], sum(population.counts[1:])
+        share = world_mean(own[..., None])[:, 0] * (-own_count / max(other_count, 1))
+        return {"picture": torch.cat((own, share[:, None].expand(-1, other_count)), dim=1)}
 
-    def settle(
-        self, rewards: NDArray[np.float64], species: NDArray[np.int64]
-    ) -> NDArray[np.float64]:
+    def settle(self, rewards: Tensor, live: Tensor, species: Tensor) -> Tensor:
         """Return rewards of which the sum is zero: invaders pay in equal parts for species 0."""
         invading = species > 0
-        return np.where(invading, -rewards[~invading].sum() / max(invading.sum(), 1), rewards)
+        gained = torch.where(invading, 0.0, rewards).sum(dim=1, keepdim=True)
+        payers = live & invading
+        return torch.where(payers, -gained / payers.sum(dim=1, keepdim=True).clamp_min(1), rewards)
 
     def is_over(self, counts: tuple[int, ...]) -> bool:
         """Return whether one side is gone."""

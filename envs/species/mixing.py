@@ -19,7 +19,7 @@ class MixingTask(SpeciesTask):
         return {
             name: by_species(
                 [
-                    world_mean(loss[None, span, None])[:, 0]
+                    world_mean(loss[:, span, None])[:, 0]
                     for span in population.spans
                     if span.stop > span.start
                 ],

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.envs.species.config import SPECIES_STYLE
-from npa_envs.envs.species.world import SpeciesWorld
+from npa_envs.envs.species.task import Population
+from npa_envs.envs.species.worlds import SpeciesWorlds
 from npa_envs.envs.task import SHARPNESS
 from npa_envs.render import draw_worlds
 from npa_envs.rule import COLOUR_OFFSET
@@ -23,51 +24,35 @@ def species_colours(species_count: int) -> Tensor:
 
 
 class SpeciesView:
-    """A world as `Screen` sees it: a batch of one, and a task that draws it.
+    """Worlds of several species as they are drawn.
 
     Args:
-        world: The world.
+        worlds: The worlds.
     """
 
-    world_count = 1
-    """Worlds to be shown."""
+    def __init__(self, worlds: SpeciesWorlds) -> None:
+        self._worlds = worlds
+        self.config = worlds.config
+        self.world_count = worlds.world_count
 
-    def __init__(self, world: SpeciesWorld) -> None:
-        self._world = world
-        self.config = world.config
-        self.elapsed = world.elapsed
-
-    @property
-    def task(self) -> SpeciesView:
-        """What draws."""
-        return self
-
-    @property
-    def x(self) -> Tensor:
-        """Positions [length units], shape [1, N, 2]."""
-        return self._world.x
-
-    @property
-    def s(self) -> Tensor:
-        """States, dimensionless, shape [1, N, C]."""
-        return self._world.s
-
-    def draw(self, x: Tensor, s: Tensor, steps: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Return the world's picture, shape [1, R, R, 3]; white where nobody is left.
+    def pictures(self, count: int) -> NDArray[np.uint8]:
+        """Return pictures of the first worlds, shape [count, R, R, 3]; white where nobody is left.
 
         Args:
-            x: Its positions.
-            s: Its states.
-            steps: Not used.
+            count: How many.
         """
-        config, task = self.config, self._world.task
+        return np.concatenate([self._picture(self._worlds.population(k)) for k in range(count)])
+
+    def _picture(self, population: Population) -> NDArray[np.uint8]:
+        config, task = self.config, self._worlds.task
         size, style = config.render_size, config.render_style
+        x, s = population.x, population.s
         if x.shape[1] == 0:
             return np.full((1, size, size, 3), 255, np.uint8)
         if style == SPECIES_STYLE:
             style = "particles"
             colours = species_colours(config.species_count).to(s)
-            s = (colours[self._world.population.species] - COLOUR_OFFSET)[None]
+            s = (colours[population.species] - COLOUR_OFFSET)[None]
         periodic = config.boundary == "periodic"
         return draw_worlds(
             x,

@@ -64,11 +64,12 @@ class SymbiosisTask(SpeciesTask):
     def losses(self, population: Population) -> Mapping[str, Tensor]:
         """Return the density error and the weighted colour error, the same for every species."""
         parts = picture_parts(self.goal, population.x, population.s)
-        return {name: loss.expand(len(population.counts)) for name, loss in parts.items()}
+        count = len(population.counts)
+        return {name: loss[:, None].expand(-1, count) for name, loss in parts.items()}
 
     def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
         """Return each particle's share of the splat loss."""
-        return {"picture": self.goal.particle_shares(population.x, population.s)[0]}
+        return {"picture": self.goal.particle_shares(population.x, population.s)}
 
     @property
     def pixel_size(self) -> float:

@@ -7,9 +7,7 @@ from collections.abc import Mapping
 from itertools import accumulate
 from typing import Any, ClassVar, NamedTuple
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.envs.species.config import SpeciesConfig
@@ -19,16 +17,22 @@ from npa_envs.tasks.seeds import uniform_ball
 
 
 class Population(NamedTuple):
-    """The particles of a world, those of each species one after the other."""
+    """The particles of worlds that have the same ones, those of each species one after the other.
+
+    Here N counts the particles that are there.
+    """
 
     x: Tensor
-    """Positions [length units], shape [1, N, 2]."""
+    """Positions [length units], shape [B, N, 2]."""
 
     s: Tensor
-    """States, dimensionless, shape [1, N, C]."""
+    """States, dimensionless, shape [B, N, C]."""
 
     counts: tuple[int, ...]
-    """Particles of each species; 0 where it is gone. Known to the host."""
+    """Particles of each species in each world; 0 where it is gone. Known to the host."""
+
+    species: Tensor
+    """Species of each particle, int64, shape [N]."""
 
     @property
     def spans(self) -> list[slice]:
@@ -36,16 +40,10 @@ class Population(NamedTuple):
         ends = list(accumulate(self.counts))
         return [slice(end - count, end) for end, count in zip(ends, self.counts, strict=True)]
 
-    @property
-    def species(self) -> Tensor:
-        """Species of each particle, int64, shape [N]."""
-        counts = torch.tensor(self.counts)
-        return torch.arange(len(self.counts)).repeat_interleave(counts).to(self.x.device)
-
     def of(self, species: int) -> tuple[Tensor, Tensor]:
-        """Return positions and states of one species, shapes [1, N_k, 2] and [1, N_k, C]."""
+        """Return positions and states of one species, shapes [B, N_k, 2] and [B, N_k, C]."""
         span = self.spans[species]
-        return self.x[:, span], self.s[:, span]
+        return self.x[:, span].contiguous(), self.s[:, span].contiguous()
 
 
 class SpeciesTask:
@@ -77,25 +75,27 @@ class SpeciesTask:
         self.device = device
 
     def start(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
-        """Return a fresh world: each species uniform in a disk of its own, all states zero.
+        """Return fresh worlds: each species uniform in a disk of its own, all states zero.
 
         Args:
-            random: Where positions come from, one stream.
+            random: Where positions come from, one stream a world.
 
         Returns:
-            Positions [length units], shape [1, N, 2]; states, dimensionless, shape [1, N, C].
+            Positions [length units], shape [B, N, 2]; states, dimensionless, shape [B, N, C].
         """
         config = self.config
-        count = sum(config.counts)
-        x = uniform_ball(1, count, 2, config.seed_radius, generator=random, device=self.device)
+        shape = random.world_count, sum(config.counts)
+        x = uniform_ball(*shape, 2, config.seed_radius, generator=random, device=self.device)
         middle = 0.5 * (config.species_count - 1)
         places = [config.seed_distance * (k - middle) for k in range(config.species_count)]
         shift = torch.tensor(places).repeat_interleave(torch.tensor(config.counts))
         x[..., 0] += shift.to(self.device)
-        return x, x.new_zeros(1, count, config.state_dim)
+        return x, x.new_zeros(*shape, config.state_dim)
 
     def losses(self, population: Population) -> Mapping[str, Tensor]:
-        """Return the named parts of each species' loss, shape [K] each; their sum is its loss.
+        """Return the named parts of each species' loss, shape [B, K] each; their sum is its loss.
+
+        World k's are the same, bit for bit, in every batch, and nothing may wait for the device.
 
         Args:
             population: At least one particle; the loss of a species that is gone is never read.
@@ -103,21 +103,21 @@ class SpeciesTask:
         raise NotImplementedError
 
     def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
-        """Return the named parts of each particle's loss, shape [N] each; their sum is its loss.
+        """Return the named parts of each particle's loss, shape [B, N] each; their sum is its loss.
 
         Args:
             population: At least one particle.
         """
         raise NotImplementedError
 
-    def settle(
-        self, rewards: NDArray[np.float64], species: NDArray[np.int64]
-    ) -> NDArray[np.float64]:
+    def settle(self, rewards: Tensor, live: Tensor, species: Tensor) -> Tensor:
         """Return what agents are paid; by default what each has earned.
 
         Args:
-            rewards: How much each agent's loss fell in the step, shape [agents].
-            species: Species of each agent, shape [agents].
+            rewards: How much each agent's loss fell in the step, 0 for agents that did not act,
+                float64, shape [B, agents].
+            live: Whether each agent acted, bool, shape [B, agents].
+            species: Species of each agent, int64, shape [agents].
         """
         return rewards
 
@@ -148,12 +148,13 @@ class SpeciesTask:
 
 
 def by_species(losses: list[Tensor], population: Population) -> Tensor:
-    """Return losses of the species that are there as one tensor, shape [K], 0 for the others.
+    """Return losses of the species that are there as one tensor, shape [B, K], 0 for the others.
 
     Args:
-        losses: One for each species with particles, shape [1] each, in order.
+        losses: One for each species with particles, shape [B] each, in order.
         population: Who is there.
     """
     remaining = iter(losses)
-    nothing = population.x.new_zeros(1)
-    return torch.cat([next(remaining) if count else nothing for count in population.counts])
+    nothing = population.x.new_zeros(len(population.x))
+    found = [next(remaining) if count else nothing for count in population.counts]
+    return torch.stack(found, dim=1)

@@ -1,0 +1,174 @@
+"""What becomes of agents in worlds that they share: pay, endings, next episodes."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from npa_envs.envs.species.account import Account
+from npa_envs.envs.species.tables import task_type
+from npa_envs.envs.species.worlds import SpeciesWorlds
+from npa_envs.replay import Beside, sent
+
+REMOVED, LEFT, ALONE = 1, 2, 3
+"""Why an agent's episode ends by itself; 0 where it does not."""
+REASONS = np.array([None, "removed", "left the world", "no opponent", "time limit"], dtype=object)
+"""The same in words, as `info["reason"]` has them; the last one is for worlds that are cut off."""
+
+
+class Outcome(NamedTuple):
+    """What a step brought all agents of all worlds."""
+
+    observation: Tensor
+    """What particles perceive, shape [B, N, P]; the last perception of agents that ended."""
+
+    rewards: Tensor
+    """Rewards, 0 of those that did not act, float64, shape [B, A]."""
+
+    numbers: dict[str, Tensor]
+    """Losses, their parts, and how much these fell, float64, shape [B, A] each."""
+
+    acted: NDArray[np.bool_]
+    """Which agents were alive in this step, shape [B, A]."""
+
+    endings: NDArray[np.uint8]
+    """Why agents' episodes ended by themselves, 0 where they did not, shape [B, A]."""
+
+    late: NDArray[np.bool_]
+    """Worlds that are cut off, shape [B]."""
+
+    @property
+    def reasons(self) -> NDArray[Any]:
+        """Why agents' episodes ended, in words, None where they go on or went before, [B, A]."""
+        late = np.where(self.acted & self.late[:, None], len(REASONS) - 1, 0)
+        return REASONS[np.where(self.endings > 0, self.endings, late)]
+
+
+class Episodes:
+    """B worlds of a task with their agents, the same for every way in which agents are asked.
+
+    Args:
+        task: A name from `npa_envs.envs.species.TASKS`.
+        keywords: Fields of the task's configuration.
+        world_count: Worlds B.
+        by_particle: Whether every particle is an agent, and not every species.
+
+    Raises:
+        NPAError: There is no such task, a keyword is unknown or wrong, or the worlds do not fit
+            into memory.
+    """
+
+    def __init__(
+        self, task: str, keywords: dict[str, Any], world_count: int, *, by_particle: bool
+    ) -> None:
+        found = task_type(task)
+        self.config = config = found.config_type.from_keywords(keywords)
+        self.worlds = worlds = SpeciesWorlds(found, config, world_count, by_particle=by_particle)
+        sizes = np.bincount(worlds.owner)
+        ends = np.cumsum(sizes)
+        self.spans = [slice(int(e - n), int(e)) for e, n in zip(ends, sizes, strict=True)]
+        """Where each agent's particles stand."""
+        self.species = worlds.species[ends - 1]
+        """Species of each agent, int64, shape [A]."""
+        self.live = np.zeros((world_count, len(sizes)), dtype=bool)
+        """Which agents are to act next, shape [B, A]."""
+        device = worlds.device
+        kinds = sent(self.species, device)
+        self.account = Account(worlds.task, kinds, world_count, team=config.reward == "team")
+        """The agents' losses."""
+        self._owner = sent(worlds.owner, device)
+        deaths = dict(config.deaths)
+        self._last_step = np.array([deaths.get(int(k), 0) for k in self.species])
+        self._beside = Beside(device) if device.type == "cuda" else None
+        self._host_left = torch.zeros(
+            self.live.shape, dtype=torch.bool, pin_memory=device.type == "cuda"
+        )
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Pin memory again that the device writes to."""
+        self.__dict__.update(state)
+        if self._beside is not None:
+            self._host_left = self._host_left.pin_memory()
+
+    def start(self, worlds: NDArray[np.int64], keys: Tensor | None = None) -> Tensor:
+        """Start episodes in some worlds with all agents, and return what is perceived there.
+
+        Args:
+            worlds: Which, shape [M].
+            keys: As for `SpeciesWorlds.start`.
+
+        Returns:
+            Shape [M, N, P].
+        """
+        population = self.worlds.start(worlds, keys)
+        parts, seen = self.worlds.opened(population)
+        self.account.open(parts, sent(worlds, self.worlds.device))
+        self.live[worlds] = True
+        return seen
+
+    def step(self, action: Tensor) -> Outcome:
+        """Apply actions, pay, and take agents that ended out of their worlds.
+
+        What the host reads is whether agents left their worlds, one byte for each agent.
+
+        Args:
+            action: Finite, on the device, shape [B, N, A]; of agents that ended it is not read.
+        """
+        worlds, acted = self.worlds, self.live.copy()
+        worlds.act(action)
+        left = worlds.left()
+        self._host_left.copy_(left, non_blocking=True)
+        if self._beside is not None:
+            self._beside.mark()
+        live = sent(acted, worlds.device)
+        rewards = self.account.pay(worlds.measured(stepped=True), live, left & live)
+        numbers = self.account.step_numbers()
+        observation = worlds.perceived(stepped=True)
+        # The device goes on while the host learns who left.
+        if self._beside is not None:
+            self._beside.wait()
+        endings = self._endings(self._host_left.numpy())
+        late = worlds.open & (worlds.elapsed >= self.config.max_cycles)
+        self.live &= endings == 0
+        if endings.any():
+            observation = self._taken_out(endings, observation)
+        self.live[late] = False
+        if not self.live.any(axis=1)[worlds.open].all():
+            worlds.close(~self.live.any(axis=1))
+        return Outcome(observation, rewards, numbers, acted, endings, late)
+
+    def carry_over(self) -> Tensor:
+        """Count losses from now on, at no reward, and return what is perceived, [B, N, P]."""
+        self.account.carry_over(self.worlds.measured())
+        return self.worlds.perceived()
+
+    def _endings(self, left: NDArray[np.bool_]) -> NDArray[np.uint8]:
+        """Return why agents' episodes end by themselves in this step, shape [B, A]."""
+        worlds, live = self.worlds, self.live
+        endings = np.zeros(live.shape, dtype=np.uint8)
+        endings[live & (self._last_step == worlds.elapsed[:, None])] = REMOVED
+        endings[live & left] = LEFT
+        staying = live & (endings == 0)
+        for world in np.flatnonzero((live & ~staying).any(axis=1)):
+            present = self.species[staying[world]]
+            counts = np.bincount(present, minlength=self.config.species_count)
+            if worlds.task.is_over(tuple(counts.tolist())):
+                endings[world, staying[world]] = ALONE
+        return endings
+
+    def _taken_out(self, endings: NDArray[np.uint8], observation: Tensor) -> Tensor:
+        """Take out particles of agents that ended; return what is perceived without them."""
+        worlds = self.worlds
+        worlds.close(~self.live.any(axis=1))
+        worlds.remove((endings == REMOVED) | (endings == LEFT))
+        if not worlds.open.any():
+            return observation
+        # What others lose or gain by a death is nobody's merit: the next step counts from here.
+        seen = self.carry_over()
+        stays = (endings == 0) & worlds.open[:, None]
+        where = sent(stays, worlds.device)[:, self._owner, None]
+        return torch.where(where, seen, observation)

@@ -1,0 +1,320 @@
+"""Batches of worlds of several species: world k is the single environment, whoever dies."""
+
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import pytest
+import torch
+from crowds import TASKS, make, small, targets_made_once
+
+from npa_envs.envs import multispecies_v0
+from npa_envs.envs.species import cohort as cohort_module
+from npa_envs.errors import NPAError
+
+quick_targets = pytest.fixture(scope="module", autouse=True)(targets_made_once)
+
+# Species leave, run out of bounds in their states, are removed, and are cut off.
+DEADLY = {
+    "species_count": 3,
+    "particle_counts": (9, 3, 2),
+    "seed_distance": 0.4,
+    "position_limit": 0.66,
+    "update_prob": 0.8,
+    "position_noise": 0.01,
+    "deaths": ((1, 9),),
+    "max_cycles": 14,
+}
+
+
+@pytest.fixture
+def where(device):
+    """Keywords that put worlds on the device of the numerical tests."""
+    return {"device": str(device)}
+
+
+def batch(task="mixing", world_count=3, autoreset_mode="same-step", **keywords):
+    fields = small(task, **keywords)
+    return multispecies_v0.batched(world_count=world_count, autoreset_mode=autoreset_mode, **fields)
+
+
+def drawn(envs, generator):
+    """Random actions of all species in all worlds."""
+    return {
+        agent: generator.uniform(-1, 1, space.shape).astype(np.float32)
+        for agent, space in envs.action_spaces.items()
+    }
+
+
+def still(envs):
+    """Actions that change nothing."""
+    return {agent: np.zeros(s.shape, np.float32) for agent, s in envs.action_spaces.items()}
+
+
+def assert_info_equal(infos, agent, k, info):
+    for name, value in info.items():
+        got = infos[agent][name]
+        got = got if name == "species" else got[k]
+        assert got == (np.float32(value) if isinstance(value, float) else value), name
+
+
+@pytest.mark.parametrize(
+    ("task", "changes"),
+    [
+        *((task, {}) for task in TASKS),
+        ("co_morphogenesis", {"reward": "team"}),
+        ("segregation", {"perception": "per_species"}),
+    ],
+)
+def test_a_batch_equals_single_environments_while_species_die_here_and_there(task, changes, where):
+    keywords = DEADLY | changes | where
+    envs = batch(task, 3, **keywords)
+    singles = [make(task, **keywords) for _ in range(3)]
+    observations, infos = envs.reset(seed=7)
+    for k, env in enumerate(singles):
+        seen, info = env.reset(seed=7 + k)
+        for agent in env.agents:
+            assert np.array_equal(observations[agent][k], seen[agent])
+            assert_info_equal(infos, agent, k, info[agent])
+    generator = np.random.default_rng(1)
+    reasons, patterns = set(), set()
+    for _ in range(45):
+        actions = drawn(envs, generator)
+        # They drift to where the world ends, each at its own pace.
+        actions["species_2"][..., 0] = np.array([0.2, 0.6, 1.0])[:, None]
+        observations, rewards, terminations, truncations, infos = envs.step(actions)
+        for k, env in enumerate(singles):
+            acted = env.agents
+            seen, paid, ended, cut, info = env.step({a: actions[a][k] for a in acted})
+            restarted = not env.agents
+            for agent in env.possible_agents:
+                assert infos[agent]["acted"][k] == (agent in acted)
+                if agent not in acted:
+                    assert rewards[agent][k] == 0.0
+                    assert not terminations[agent][k]
+                    assert not truncations[agent][k]
+                    assert infos[agent]["loss"][k] == 0.0
+                    if not restarted:
+                        assert not observations[agent][k].any()
+                    continue
+                assert rewards[agent][k] == np.float32(paid[agent])
+                assert terminations[agent][k] == ended[agent]
+                assert truncations[agent][k] == cut[agent]
+                assert_info_equal(infos, agent, k, info[agent])
+                reasons.add(info[agent].get("reason"))
+                last = infos[agent]["final_obs"] if restarted else observations[agent]
+                assert np.array_equal(last[k], seen[agent])
+            if restarted:
+                seen, _ = env.reset()
+                for agent in env.agents:
+                    assert infos[agent]["_final_obs"][k]
+                    assert np.array_equal(observations[agent][k], seen[agent])
+            live = [agent for agent in env.possible_agents if infos[agent]["live"][k]]
+            assert live == env.agents
+            assert np.array_equal(envs.state()[k], env.state())
+        patterns.add(tuple(tuple(infos[agent]["live"]) for agent in envs.agents))
+    assert reasons >= {None, "removed", "left the world", "time limit"} - (
+        {"time limit"} if task == "invasion" else set()
+    )
+    # Worlds had lost different species at the same time.
+    assert any(len(set(zip(*pattern, strict=True))) > 1 for pattern in patterns)
+
+
+def test_a_world_does_not_depend_on_the_number_of_worlds(where):
+    one, many = batch(world_count=1, **DEADLY | where), batch(world_count=5, **DEADLY | where)
+    seen, _ = one.reset(seed=3)
+    there, _ = many.reset(seed=[9, 3, 8, 7, 6])
+    generator = np.random.default_rng(0)
+    for _ in range(20):
+        assert np.array_equal(seen["species_0"][0], there["species_0"][1])
+        actions = drawn(many, generator)
+        there, rewards, *_ = many.step(actions)
+        seen, paid, *_ = one.step({agent: action[1:2] for agent, action in actions.items()})
+        for agent in paid:
+            assert paid[agent][0] == rewards[agent][1]
+    assert np.array_equal(one.state()[0], many.state()[1])
+    assert not np.array_equal(one.state()[0], many.state()[0])
+
+
+def test_all_worlds_are_perceived_in_one_pass_as_long_as_all_are_whole(monkeypatch):
+    envs = batch(world_count=4, deaths=((0, 2),))
+    envs.reset(seed=0)
+    calls = []
+    survey_worlds = cohort_module.survey_worlds
+
+    def survey(*worlds):
+        calls.append(tuple(worlds[0].shape))
+        return survey_worlds(*worlds)
+
+    monkeypatch.setattr(cohort_module, "survey_worlds", survey)
+    for _ in range(3):
+        envs.step(still(envs))
+    # In the step of a death the survivors perceive again, without the dead.
+    assert calls == [(4, 41, 2), (4, 41, 2), (4, 20, 2), (4, 20, 2)]
+
+
+def test_resetting_one_world_leaves_the_others_as_they_are(where):
+    envs, untouched = (batch(autoreset_mode="disabled", **DEADLY | where) for _ in range(2))
+    for e in (envs, untouched):
+        e.reset(seed=0)
+    generator = np.random.default_rng(0)
+    for _ in range(10):
+        actions = drawn(envs, generator)
+        for e in (envs, untouched):
+            e.step(actions)
+    before = envs.state()
+    assert not before[:, 9:12].any()
+    mask = np.array([False, True, False])
+    seen, infos = envs.reset(options={"reset_mask": mask})
+    assert np.array_equal(envs.state()[~mask], before[~mask])
+    assert envs.state()[1, :, -1].all()
+    assert infos["species_1"]["live"].tolist() == [False, True, False]
+    assert not seen["species_1"][~mask].any()
+    single = make(**DEADLY | where)
+    single.reset(seed=1)
+    assert np.array_equal(seen["species_1"][1], single.reset()[0]["species_1"])
+    actions = drawn(envs, generator)
+    _, rewards, *_ = envs.step(actions)
+    _, paid, *_ = untouched.step(actions)
+    assert np.array_equal(rewards["species_0"][~mask], paid["species_0"][~mask])
+
+
+def test_a_disabled_autoreset_waits_for_the_reset():
+    envs = batch(autoreset_mode="disabled", max_cycles=2)
+    envs.reset(seed=0)
+    for _ in range(2):
+        observations, _, terminations, truncations, infos = envs.step(still(envs))
+    assert truncations["species_0"].all()
+    assert not terminations["species_0"].any()
+    assert infos["species_1"]["reason"].tolist() == ["time limit"] * 3
+    assert "final_obs" not in infos["species_0"]
+    assert observations["species_0"].any(axis=(1, 2)).all()
+    with pytest.raises(NPAError, match=r"episodes of worlds \[0, 1, 2\] are over: reset them"):
+        envs.step(still(envs))
+    envs.reset(options={"reset_mask": np.array([True, False, True])})
+    with pytest.raises(NPAError, match=r"episodes of worlds \[1\] are over"):
+        envs.step(still(envs))
+
+
+def test_tensors_stay_on_the_device_where_asked_for(device):
+    keywords = DEADLY | {"device": str(device)}
+    arrays, tensors = batch(**keywords), batch(output="torch", **keywords)
+    arrays.reset(seed=0)
+    observations, _ = tensors.reset(seed=0)
+    generator = np.random.default_rng(0)
+    for _ in range(16):
+        actions = drawn(arrays, generator)
+        expected = arrays.step(actions)
+        sent = {agent: torch.from_numpy(a).to(device) for agent, a in actions.items()}
+        got = tensors.step(sent)
+        for mine, theirs in zip(expected[:4], got[:4], strict=True):
+            for agent, array in mine.items():
+                assert theirs[agent].device.type == device.type
+                assert np.array_equal(array, theirs[agent].cpu().numpy())
+        for name, value in expected[4]["species_2"].items():
+            other = got[4]["species_2"][name]
+            if isinstance(other, torch.Tensor):
+                assert other.device.type == device.type
+                other = other.cpu().numpy()
+            assert np.array_equal(value, other), name
+    assert tensors.state().device.type == device.type
+    assert observations["species_0"].shape == (3, 9, 66)
+    assert got[1]["species_0"].dtype == torch.float32
+
+
+def test_what_was_handed_out_stays_as_it_was():
+    envs = batch(output="torch", **DEADLY)
+    envs.reset(seed=0)
+    generator = np.random.default_rng(0)
+    kept = []
+    for _ in range(16):
+        outcome = envs.step(drawn(envs, generator))
+        kept.append((outcome, pickle.dumps(outcome)))
+    for outcome, bytes_then in kept:
+        then = pickle.loads(bytes_then)
+        for mine, theirs in zip(outcome[:4], then[:4], strict=True):
+            assert all(torch.equal(mine[agent], theirs[agent]) for agent in mine)
+        for agent, info in outcome[4].items():
+            assert torch.equal(info["loss"], then[4][agent]["loss"])
+
+
+def test_a_copy_by_pickle_goes_on_alike(device):
+    envs = batch(**DEADLY, device=str(device))
+    envs.reset(seed=0)
+    generator = np.random.default_rng(0)
+    for _ in range(10):
+        envs.step(drawn(envs, generator))
+    copy = pickle.loads(pickle.dumps(envs))
+    for _ in range(10):
+        actions = drawn(envs, generator)
+        mine, theirs = envs.step(actions)[1], copy.step(actions)[1]
+        assert all(np.array_equal(mine[agent], theirs[agent]) for agent in mine)
+    assert np.array_equal(envs.state(), copy.state())
+
+
+def test_pictures_are_those_of_the_single_worlds():
+    keywords = {"render_mode": "rgb_array", "deaths": ((0, 1),)}
+    envs, single = batch(**keywords), make(**keywords)
+    envs.reset(seed=4)
+    single.reset(seed=5)
+    envs.step(still(envs))
+    single.step({agent: action[1] for agent, action in still(envs).items()})
+    pictures = envs.render()
+    assert len(pictures) == 3
+    assert np.array_equal(pictures[1], single.render())
+    assert pictures[1].min() < 200
+    envs.close()
+
+
+def test_spaces_hold_what_comes_out():
+    envs = batch(particle_counts=(3, 5))
+    observations, _ = envs.reset()
+    assert envs.single_observation_spaces["species_1"].shape == (5, 66)
+    assert envs.action_spaces["species_0"].shape == (3, 3, 18)
+    assert all(
+        envs.observation_spaces[agent].contains(observations[agent]) for agent in envs.agents
+    )
+    assert envs.single_state_space.contains(envs.state()[2])
+
+
+@pytest.mark.parametrize(
+    ("keywords", "message"),
+    [
+        ({"world_count": 0}, "world_count must be a whole number of at least 1, got 0"),
+        ({"autoreset_mode": "next-step"}, "autoreset_mode must be 'same-step' or 'disabled'"),
+        ({"autoreset_mode": "never"}, "autoreset_mode must be a known word, got 'never'"),
+        ({"eps": -1.0}, "eps must be a finite number greater than 0"),
+        ({"num_envs": 3}, "unknown keyword 'num_envs'"),
+        ({"world_count": 10**7, "particle_count": 10**4}, "particle_count is too large"),
+    ],
+)
+def test_a_wrong_configuration_is_refused(keywords, message):
+    with pytest.raises(NPAError, match=message):
+        multispecies_v0.batched(**keywords)
+
+
+def test_a_wrong_action_is_refused_and_leaves_the_worlds_as_they_were():
+    envs, untouched = batch(), batch()
+    with pytest.raises(NPAError, match="step needs worlds: call reset first"):
+        envs.step({})
+    with pytest.raises(NPAError, match="state needs worlds"):
+        envs.state()
+    with pytest.raises(NPAError, match="reset_mask needs worlds to leave alone"):
+        envs.reset(options={"reset_mask": np.array([True, False, True])})
+    for e in (envs, untouched):
+        e.reset(seed=0)
+    before = envs.state()
+    bad = still(envs)
+    bad["species_1"][2, 4, 7] = np.nan
+    with pytest.raises(NPAError, match=r"actions\['species_1'\] must be finite, got nan \(1 such"):
+        envs.step(bad)
+    with pytest.raises(NPAError, match=r"shape \(3, 20, 18\), got \(20, 18\)"):
+        envs.step(still(envs) | {"species_1": np.zeros((20, 18))})
+    with pytest.raises(NPAError, match="got none for species_0"):
+        envs.step({"species_1": bad["species_1"]})
+    assert np.array_equal(envs.state(), before)
+    actions = drawn(envs, np.random.default_rng(0))
+    assert np.array_equal(
+        envs.step(actions)[1]["species_0"], untouched.step(actions)[1]["species_0"]
+    )
