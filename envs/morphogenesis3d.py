@@ -193,7 +193,8 @@ class Morphogenesis3DEnv(NPAEnv):
     morphogenesis3d`; `npa_envs.agents.RulePolicy(npa_envs.load_rule("rule.safetensors"), env)`
     makes a policy of one. Such a rule reads out of its states how particles look: give it as
     `readout` too. Shipped ones want the worlds that they were trained in: `particle_count=16384`,
-    `eps` and `eps0` 0.1, `alpha` and `seed_radius` 1, `sigma=0.02`, `opacity=0.15`.
+    `state_dim=24`, `eps` and `eps0` 0.1, `alpha=1.0`, `seed_radius` 0.7 (the mushroom's 0.5),
+    `sigma=0.02`, `opacity=0.15`.
 
     ## Observation space
 

@@ -587,6 +587,7 @@ def test_pictures_with_a_read_out_show_what_it_says():
             particle_count=256,
             target="duck",
             readout=readout,
+            state_dim=24,
             render_mode="rgb_array",
             render_size=32,
         )

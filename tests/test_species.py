@@ -398,7 +398,7 @@ def test_the_code_about_species_runs():
     assert names["x"].shape == (1, 256, 2)
     assert names["x"].isfinite().all()
     exec(trained, names)
-    assert names["config"].task.counts == (4096, 4096)
+    assert names["config"].task.counts == (512, 512)
 
 
 class TestErrors:
