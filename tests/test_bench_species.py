@@ -22,14 +22,16 @@ def test_calls_are_compared_in_turn_and_each_pair_the_other_way_round(device):
         time.sleep(seconds)
 
     source = torch.Generator(device)
-    first, second = partial(call, "a", 0.003), partial(call, "b", 0.006)
+    first, second = partial(call, "a", 0.01), partial(call, "b", 0.02)
     # A graph holds nothing of a call that launches nothing.
     compared = compare((first, source), (second, source), device, repeats=4, graph=False)
     at_least = 2 if device.type == "cuda" else 1
     readings = "".join(calls)[4:]
     assert readings == "".join(name * at_least for name in "abbaabba")
-    assert compared.first.median == pytest.approx(3000, rel=0.3)
-    assert compared.ratio == pytest.approx(2.0, rel=0.25)
+    # Who sleeps on a busy machine oversleeps, but never wakes early.
+    assert 10_000 <= compared.first.median < compared.second.median
+    assert compared.second.median >= 20_000
+    assert 1.2 < compared.ratio < 3.5
 
 
 def test_one_species_is_compared_with_the_rollout_that_it_is():

@@ -225,6 +225,16 @@ def test_the_code_about_training_runs(capsys):
     assert capsys.readouterr().out.startswith("random: ")
 
 
+def test_the_code_about_many_worlds_of_several_species_runs():
+    _, _, *blocks = code_blocks(DOCS / "species.md")
+    names = {}
+    exec(compile("\n".join(blocks), "species.md", "exec"), names)
+    assert names["observations"]["species_0"].shape == (8, 32, 66)
+    assert names["models"]["species_1"].num_timesteps == 2 * 16 * 8 * 16
+    acted = names["policies"]["species_1"](names["rows"].vector_env.reset()[0]["species_1"])
+    assert acted.shape == (8, 16, 6)
+
+
 def test_the_code_about_3d_morphogenesis_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (block,) = code_blocks(DOCS / "morphogenesis3d.md")

@@ -85,7 +85,7 @@ LADDER = {
     ),
     "npa_envs.envs": rung(11, "torch numpy gymnasium pettingzoo", never=INSIDES),
     "npa_envs.wrappers": rung(
-        12, "torch numpy gymnasium pettingzoo stable_baselines3", never=INSIDES
+        12, "torch numpy gymnasium pettingzoo stable_baselines3 ray", never=INSIDES
     ),
     "npa_envs.agents": rung(
         13, "torch numpy tqdm gymnasium pettingzoo stable_baselines3", never=INSIDES

@@ -1,6 +1,6 @@
 """Adapters between environments and the libraries that train on them, as `npa_envs.wrappers`.
 
-Holds Gymnasium wrappers and the adapter to Stable-Baselines3.
+Holds Gymnasium wrappers, and adapters to Stable-Baselines3, RLlib and TorchRL.
 They use the public API only. Names are imported when they are first used, so that none of these
 libraries is needed for the others.
 """
@@ -10,8 +10,11 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from npa_envs.wrappers.damage import DamageEvents, VectorDamageEvents
     from npa_envs.wrappers.normalize import NormalizePerception, VectorNormalizePerception
+    from npa_envs.wrappers.numeric_infos import NumericInfos as NumericInfos
     from npa_envs.wrappers.particles import ParticleVecEnv as ParticleVecEnv
     from npa_envs.wrappers.species import SpeciesTags, VectorSpeciesTags
+    from npa_envs.wrappers.species_rows import RowPolicy as RowPolicy
+    from npa_envs.wrappers.species_rows import SpeciesVecEnv as SpeciesVecEnv
     from npa_envs.wrappers.statistics import (
         TorchNormalizeObservation,
         TorchNormalizeReward,
@@ -29,15 +32,23 @@ __all__ = [
     "VectorNormalizePerception",
     "VectorSpeciesTags",
 ]
-# A star imports all of them, and must not need Stable-Baselines3.
-ON_REQUEST = ("ParticleVecEnv",)
+# A star imports all of them, and must need neither Stable-Baselines3 nor PettingZoo.
+ON_REQUEST = ("NumericInfos", "ParticleVecEnv", "RowPolicy", "SpeciesVecEnv")
 
 
 def __getattr__(name: str) -> Any:
-    if name in ON_REQUEST:
+    if name == "ParticleVecEnv":
         from npa_envs.wrappers import particles
 
-        return getattr(particles, name)
+        return particles.ParticleVecEnv
+    if name == "NumericInfos":
+        from npa_envs.wrappers import numeric_infos
+
+        return numeric_infos.NumericInfos
+    if name in ON_REQUEST:
+        from npa_envs.wrappers import species_rows
+
+        return getattr(species_rows, name)
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from npa_envs.wrappers import damage, normalize, species, statistics

@@ -49,7 +49,8 @@ def joined_actions(
         _checked(agent, actions[agent], shape) for agent, shape in zip(agents, shapes, strict=True)
     ]
     # What has one row only has no dimension for it.
-    joined = torch.cat([torch.atleast_2d(row.to(device)) for row in rows], dim=-2)
+    blocks = [row if row.ndim > 1 else row[None] for row in rows]
+    joined = torch.cat([block.to(device) for block in blocks], dim=-2)
     if not bool(torch.isfinite(joined).all()):
         bad = next(k for k, row in enumerate(rows) if not bool(torch.isfinite(row).all()))
         wrong = rows[bad][~torch.isfinite(rows[bad])]

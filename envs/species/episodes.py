@@ -137,14 +137,18 @@ class Episodes:
         if endings.any():
             observation = self._taken_out(endings, observation)
         self.live[late] = False
-        if not self.live.any(axis=1)[worlds.open].all():
-            worlds.close(~self.live.any(axis=1))
+        if (worlds.open & self._deserted()).any():
+            worlds.close(self._deserted())
         return Outcome(observation, rewards, numbers, acted, endings, late)
 
     def carry_over(self) -> Tensor:
         """Count losses from now on, at no reward, and return what is perceived, [B, N, P]."""
         self.account.carry_over(self.worlds.measured())
         return self.worlds.perceived()
+
+    def _deserted(self) -> NDArray[np.bool_]:
+        """Return in which worlds no agent is to act, shape [B]."""
+        return np.asarray(~self.live.any(axis=1))
 
     def _endings(self, left: NDArray[np.bool_]) -> NDArray[np.uint8]:
         """Return why agents' episodes end by themselves in this step, shape [B, A]."""
@@ -163,7 +167,7 @@ class Episodes:
     def _taken_out(self, endings: NDArray[np.uint8], observation: Tensor) -> Tensor:
         """Take out particles of agents that ended; return what is perceived without them."""
         worlds = self.worlds
-        worlds.close(~self.live.any(axis=1))
+        worlds.close(self._deserted())
         worlds.remove((endings == REMOVED) | (endings == LEFT))
         if not worlds.open.any():
             return observation

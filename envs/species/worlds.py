@@ -198,8 +198,8 @@ class SpeciesWorlds:
         """
         (cohort,) = self.cohorts
         there = cohort.population
-        shape = there.x.shape[:2]
-        placed = checked_particles(x, s, *shape, self.physics, self.device)
+        count = there.x.shape[1]
+        placed = checked_particles(x, s, self.world_count, count, self.physics, self.device)
         there.x.copy_(placed.x)
         there.s.copy_(placed.s)
 

@@ -62,14 +62,15 @@ def check_world(x: Tensor, s: Tensor) -> None:
 
 
 def check_finite_positions(x: Tensor) -> None:
-    """Check that every position is finite; skipped while a CUDA graph is captured.
+    """Check that every position is finite; skipped while compiled or captured.
 
     Raises:
         NPAError: A coordinate is NaN or infinite; the message names the first such particle.
     """
-    if x.is_cuda and torch.cuda.is_current_stream_capturing():
-        return
+    # Asked in this order: a compiler cannot trace what a stream does.
     if torch.compiler.is_compiling():
+        return
+    if x.is_cuda and torch.cuda.is_current_stream_capturing():
         return
     finite = torch.isfinite(x.detach()).all(dim=-1)
     if not bool(finite.all()):

@@ -1,0 +1,102 @@
+"""Other libraries train on environments of several species; skipped where they are missing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from crowds import small, still
+
+from npa_envs.envs import multispecies_v0, particles_v0
+from npa_envs.errors import NPAError
+from npa_envs.wrappers import NumericInfos
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore::DeprecationWarning"),
+    pytest.mark.filterwarnings("ignore::UserWarning"),
+]
+DEATH = {"deaths": ((1, 3),), "max_cycles": 6}
+
+
+def test_numeric_infos_have_the_same_entries_at_reset_and_in_every_step():
+    env = NumericInfos(multispecies_v0.parallel_env(**small("co_morphogenesis", **DEATH)))
+    plain = multispecies_v0.parallel_env(**small("co_morphogenesis", **DEATH))
+    _, first = env.reset(seed=0)
+    assert plain.reset(seed=0)[1] == first
+    names = {"species", "loss", "loss_density", "loss_colour"}
+    while env.agents:
+        *_, infos = env.step(still(env))
+        *_, expected = plain.step(still(plain))
+        for agent, info in infos.items():
+            assert set(info) == set(first[agent]) == names
+            assert info == {name: expected[agent][name] for name in names}
+
+
+@pytest.mark.parametrize(
+    ("module", "keywords"),
+    [
+        (multispecies_v0, {"particle_counts": (6, 6)}),
+        (multispecies_v0, {"particle_counts": (6, 6)} | DEATH),
+        (multispecies_v0, {"particle_counts": (5, 7), "each": True}),
+        (particles_v0, {"particle_count": 9} | DEATH),
+    ],
+)
+def test_torchrl_finds_the_specs_right_and_rolls_out(module, keywords):
+    torchrl = pytest.importorskip("torchrl.envs")
+    keywords = dict(keywords)
+    groups = {"group_map": torchrl.MarlGroupMapType.ONE_GROUP_PER_AGENT}
+    groups = groups if keywords.pop("each", False) else {}
+    fields = small("mixing", **keywords)
+    env = torchrl.PettingZooWrapper(
+        NumericInfos(module.parallel_env(**fields)), use_mask="deaths" in keywords, **groups
+    )
+    torchrl.check_env_specs(env)
+    env.set_seed(3)
+    rolled = env.rollout(20)
+    single = module.parallel_env(**fields)
+    single.reset(seed=3)
+    # TorchRL resets to set the seed, and again to begin.
+    observations, _ = single.reset()
+    group = next(iter(env.group_map))
+    agent = single.possible_agents[0]
+    for t in range(len(rolled)):
+        assert np.array_equal(rolled[group, "observation"][t, 0].numpy(), observations[agent])
+        acting = {
+            name: rolled[g, "action"][t, names.index(name)].numpy()
+            for g, names in env.group_map.items()
+            for name in names
+            if name in single.agents
+        }
+        observations, rewards, *_ = single.step(acting)
+        paid = rolled["next", group, "reward"][t, 0].item()
+        assert paid == np.float32(rewards[agent])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shared", [False, True])
+def test_rllib_trains_a_policy_for_each_species_or_one_for_all(shared):
+    ray = pytest.importorskip("ray")
+    from npa_envs.wrappers.rllib import rllib_config
+
+    keywords = small("mixing", particle_count=8, state_dim=4, **DEATH)
+    del keywords["task"]
+    config = (
+        rllib_config("npa/MixingParticles-v0", shared=shared, **keywords)
+        .env_runners(num_env_runners=0, rollout_fragment_length=24)
+        .learners(num_learners=0)
+        .training(train_batch_size_per_learner=48, minibatch_size=48, num_epochs=1)
+    )
+    ray.init(num_cpus=1, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
+    try:
+        algorithm = config.build_algo()
+        results = algorithm.train()
+        names = {"everyone"} if shared else {"species_0", "species_1"}
+        assert set(results["learners"]) == names | {"__all_modules__"}
+        assert results["env_runners"]["episode_len_mean"] == 6
+        for name in names:
+            steps = results["learners"][name]["num_module_steps_trained"]
+            assert steps > 0
+        algorithm.stop()
+    finally:
+        ray.shutdown()
+    with pytest.raises(NPAError, match="name must be a known id, got 'npa/Mixin-v0'"):
+        rllib_config("npa/Mixin-v0")

@@ -1,0 +1,80 @@
+"""Environments of several species in RLlib: their ids, and a configuration to begin with."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from npa_envs.envs import multispecies_v0, particles_v0
+from npa_envs.errors import MissingDependencyError, NPAError, suggest
+
+try:
+    from ray.rllib.algorithms.ppo import PPOConfig
+    from ray.rllib.env.wrappers.pettingzoo_env import ParallelPettingZooEnv
+    from ray.tune.registry import register_env
+except ImportError as error:
+    raise MissingDependencyError(
+        f"training with RLlib needs Ray ({error}): pip install 'npa-envs[rllib]'"
+    ) from error
+
+EVERYONE = "everyone"
+"""Name of the policy that all species share, where they do."""
+
+MAKERS = {
+    name: (module.parallel_env, task)
+    for module in (multispecies_v0, particles_v0)
+    for name, task in module.ENVIRONMENTS.items()
+}
+"""Functions that make environments, and their tasks, by the ids of PettingZoo's registry."""
+
+
+class _Maker:
+    """Makes the environment of an id from keywords, as RLlib asks for it."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def __call__(self, keywords: dict[str, Any]) -> ParallelPettingZooEnv:
+        make, task = MAKERS[self.name]
+        return ParallelPettingZooEnv(make(task, **dict(keywords)))
+
+
+class _Mapping:
+    """Names the policy of an agent."""
+
+    def __init__(self, policies: dict[str, str]) -> None:
+        self.policies = policies
+
+    def __call__(self, agent: str, *_: Any, **__: Any) -> str:
+        return self.policies[agent]
+
+
+def rllib_config(name: str, *, shared: bool = False, **keywords: Any) -> PPOConfig:
+    """Register an environment with RLlib, and return a configuration of PPO for it.
+
+    Every species has a policy of its own, `species_0` and so on, which all of its particles share
+    where these are the agents, as in `npa/MixingParticles-v0`. Everything else is RLlib's default,
+    to be changed as always: `rllib_config(...).training(...)`.
+
+    Args:
+        name: An id of PettingZoo's registry.
+        shared: All agents have one policy, "everyone".
+        keywords: Of `parallel_env`.
+
+    Raises:
+        NPAError: There is no such id, or a keyword is wrong.
+    """
+    if name not in MAKERS:
+        raise NPAError(f"name must be a known id, got {name!r}: {suggest(str(name), MAKERS)}")
+    make, task = MAKERS[name]
+    env = make(task, **keywords)
+    _, infos = env.reset(seed=0)
+    policies = {
+        agent: EVERYONE if shared else f"species_{info['species']}" for agent, info in infos.items()
+    }
+    register_env(name, _Maker(name))
+    config: PPOConfig = (
+        PPOConfig()
+        .environment(name, env_config=keywords)
+        .multi_agent(policies=set(policies.values()), policy_mapping_fn=_Mapping(policies))
+    )
+    return config
