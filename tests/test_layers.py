@@ -80,8 +80,10 @@ LADDER = {
     "npa_envs.diagnostics": rung(8, "torch PIL imageio_ffmpeg", never=INSIDES),
     "npa_envs.api": rung(8, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
     "npa_envs": rung(9, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
+    "npa_envs.cli.worlds": rung(9, "torch", never=INSIDES),
+    "npa_envs.stress": rung(10, "torch matplotlib", never=("npa_envs.kernels",)),
     "npa_envs.cli": rung(
-        10, "torch numpy tqdm tyro", never=("npa_envs.kernels", "npa_envs.reference")
+        11, "torch numpy tqdm tyro", never=("npa_envs.kernels", "npa_envs.reference")
     ),
     "npa_envs.envs": rung(11, "torch numpy gymnasium pettingzoo", never=INSIDES),
     "npa_envs.wrappers": rung(

@@ -106,6 +106,25 @@ def test_degenerate_geometry_equals_the_oracle(dtype, space_dim, device):
     assert relative_error(x.grad, exact_x.grad) < POSITION_GRADIENT[dtype]
 
 
+@pytest.mark.parametrize("distance", [1e-8, 1e-12, 1e-16, 1e-19])
+@pytest.mark.parametrize("space_dim", [2, 3])
+@pytest.mark.parametrize("dtype", DTYPES, ids=("float32", "float64"))
+def test_particles_that_nearly_touch_have_finite_gradients(dtype, space_dim, distance, device):
+    """Gradients by positions grow with 1 / distance; nothing on the way to them may overflow."""
+    x = torch.zeros(1, 2, space_dim, dtype=dtype, device=device)
+    x[0, 1, 0] = distance
+    _, s = random_world(1, 2, space_dim, 4, dtype=dtype, device=device)
+    exact_x, exact_s = (t.cpu().double().clone().requires_grad_() for t in (x, s))
+    expected = oracle.perceive(exact_x, exact_s, 0.1, 0.1, detach_positions=False)
+    weights = torch.linspace(-1.0, 1.0, expected.numel(), dtype=torch.float64).view_as(expected)
+    (expected * weights).sum().backward()
+    x.requires_grad_()
+    z = npa_envs.perceive(x, s, 0.1, detach_positions=False)
+    (z * weights.to(z)).sum().backward()
+    assert relative_error(z, expected) < FORWARD[dtype]
+    assert relative_error(x.grad, exact_x.grad) < POSITION_GRADIENT[dtype]
+
+
 @pytest.mark.parametrize("space_dim", [2, 3])
 def test_gradients_pass_gradcheck(space_dim, device):
     x, s = random_world(1, 9, space_dim, 3, dtype=torch.float64, device=device)

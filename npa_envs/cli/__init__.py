@@ -15,6 +15,7 @@ COMMANDS = {
     "evaluate": "measure a rule: loss, PSNR, overflow and extent over thousands of steps",
     "interact": "grow rules beside each other: what each does to the other",
     "bench": "run time against error, the paper's table, scaling; a call explained",
+    "stress": "hard cases, what is expected of each, and where things break",
     "list": "tasks, presets, environments, built-in targets, losses, shipped rules",
     "warmup": "compile the kernels ahead of time",
     "doctor": "versions, devices, kernel cache, fonts",
@@ -94,6 +95,10 @@ def _dispatch(words: list[str]) -> int:
             from npa_envs.cli import bench
 
             return bench.main(rest)
+        case "stress":
+            from npa_envs.cli import stress
+
+            return stress.main(rest)
         case "list":
             from npa_envs.cli import listing
 

@@ -183,7 +183,7 @@ def measured_report(options: BenchOptions, device: torch.device, command: str) -
 
     name = options.suite or QUICK
     suite = suite_of(name)
-    with StepBar(None, show=options.progress, unit="row") as bar, _torch_threads(options.threads):
+    with StepBar(None, show=options.progress, unit="row") as bar, torch_threads(options.threads):
         session = Session(
             device=device,
             repeats=options.repeats,
@@ -206,8 +206,12 @@ def measured_report(options: BenchOptions, device: torch.device, command: str) -
 
 
 @contextlib.contextmanager
-def _torch_threads(count: int) -> Iterator[None]:
-    """Let torch use so many CPU threads while a block runs."""
+def torch_threads(count: int) -> Iterator[None]:
+    """Let torch use so many CPU threads while a block runs.
+
+    Args:
+        count: Threads, at least 1.
+    """
     import torch
 
     before = torch.get_num_threads()

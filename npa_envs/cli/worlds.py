@@ -71,7 +71,7 @@ def task_of_rule(
     own: dict[str, Any] = {"state_dim": rule.state_dim, "hidden_dim": rule.hidden_dim}
     own |= {"eps": rule.eps0} | ({} if rule.static else {"alpha": rule.alpha})
     told = "config" in metadata
-    config = preset("paper", task_name, **own) if not told else _told_config(path, metadata)
+    config = preset("paper", task_name, **own) if not told else trained_config(path, metadata)
     config = override(config, **{k: v for k, v in fields.items() if v is not None})
     if particle_count is not None:
         config = override(config, task=config.task.with_particle_count(particle_count))
@@ -91,8 +91,16 @@ def task_of_rule(
         return TrainedTask(task, f"its target cannot be loaded: {error}")
 
 
-def _told_config(path: Path, metadata: Mapping[str, str]) -> Any:
-    """The configuration that a rule's file says it was trained with."""
+def trained_config(path: Path, metadata: Mapping[str, str]) -> Any:
+    """Return the configuration that a rule's file says it was trained with.
+
+    Args:
+        path: The file, for the message of an error.
+        metadata: Its header, with `config` among it.
+
+    Raises:
+        NPAError: What it says is damaged or of another version.
+    """
     from npa_envs.training import preset
 
     try:

@@ -23,7 +23,7 @@ from npa_envs.kernels.domain import (
     smoothing,
     smoothing_slope,
     spiky_factor,
-    spiky_factor_slope,
+    spiky_radial_slope,
 )
 from npa_envs.kernels.groups import make_add_scaled
 from npa_envs.kernels.lanes import make_lane_scatter, make_wide_load
@@ -240,9 +240,12 @@ def adjoint_kernels(
         distance = wp.sqrt(squared)
         slope = smoothing_slope(squared, domain.inverse_squared_eps, domain.smoothing_norm)
         factor = spiky_factor(distance, domain.inverse_eps, domain.spiky_norm)
-        factor_slope = spiky_factor_slope(distance, domain.inverse_eps, domain.spiky_norm)
-        along = smoothing_bar * slope + factor_slope * wp.dot(offset, kernel_bar)
-        return along * offset + factor * kernel_bar
+        pull = smoothing_bar * slope * offset + factor * kernel_bar
+        if distance > scalar(0.0):
+            direction = offset / distance
+            radial = spiky_radial_slope(distance, domain.inverse_eps, domain.spiky_norm)
+            pull += radial * wp.dot(direction, kernel_bar) * direction
+        return pull
 
     @in_ranges(PAIRS)
     @wp.kernel(enable_backward=False, module=module)

@@ -70,14 +70,16 @@ def spiky_factor(distance: Any, inverse_eps: Any, norm: Any):
 
 
 @wp.func
-def spiky_factor_slope(distance: Any, inverse_eps: Any, norm: Any):
-    """f'(r) / r of the spiky factor, for its adjoint; zero at r = 0 [1 / length^(D+4)]."""
+def spiky_radial_slope(distance: Any, inverse_eps: Any, norm: Any):
+    """f'(r) r of the spiky factor f, for its adjoint; zero at r = 0 [1 / length^(D+2)].
+
+    The adjoint takes it along unit vectors: f' / r itself overflows where two particles nearly
+    touch, although what it is multiplied by is as small.
+    """
     slope = type(norm)(0.0)
     if distance > type(norm)(0.0):
         falloff = type(norm)(1.0) - distance * inverse_eps
-        inverse = type(norm)(1.0) / distance
-        slope = -norm * falloff * inverse * inverse
-        slope *= type(norm)(2.0) * inverse_eps + falloff * inverse
+        slope = -norm * falloff * (type(norm)(2.0) * inverse_eps + falloff / distance)
     return slope
 
 

@@ -1,0 +1,100 @@
+"""What a check is, what it is given, and what it finds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import torch
+
+Verdict = Literal["pass", "fail", "range", "skipped"]
+
+GROUPS = {
+    "geometry": "where particles lie: forwards and backwards, against a float64 reference",
+    "values": "what states hold: tiny, huge, infinite, no number",
+    "time": "every shipped rule for 100 000 steps",
+    "ranges": "how far every shipped rule may leave what it was trained at",
+    "gradients": "how gradients grow with the steps; finite differences; float32's errors",
+    "precision": "shorter numbers, order, batches, repetitions, devices, recorded graphs",
+}
+"""Every group of checks with its summary."""
+
+
+class Skipped(Exception):
+    """A check has nothing to measure here; the message is the reason."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What a check found."""
+
+    figures: Mapping[str, float]
+    """What was measured, by name."""
+    limits: Mapping[str, float] = field(default_factory=dict)
+    """The largest value that the figure of a name may have; others are only told."""
+    holds: str = ""
+    """For a range: where it holds, in words."""
+    note: str = ""
+    """What else there is to know."""
+
+    def exceeded(self) -> list[str]:
+        """Return the names whose figure is above its limit, not a number, or missing."""
+        nan = float("nan")
+        # Comparisons with NaN are false.
+        return [
+            name for name, limit in self.limits.items() if not self.figures.get(name, nan) <= limit
+        ]
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether it is as expected; a range is, where all its limits are kept."""
+        if self.exceeded():
+            return "fail"
+        return "range" if self.holds else "pass"
+
+
+@dataclass
+class Session:
+    """One run of the command."""
+
+    device: torch.device
+    """Where everything is run."""
+    quick: bool = False
+    """Small worlds and few steps: about a minute on two CPU cores."""
+    seed: int = 0
+    """What random worlds are drawn from."""
+    kept: dict[Any, Any] = field(default_factory=dict)
+    """What several checks need and only one has to make."""
+
+    @property
+    def cuda(self) -> bool:
+        """Whether the device is a CUDA device."""
+        return self.device.type == "cuda"
+
+    def once(self, key: Any, make: Callable[[], Any]) -> Any:
+        """Return what a call makes; it is made once for a key."""
+        if key not in self.kept:
+            self.kept[key] = make()
+        return self.kept[key]
+
+    def generator(self, number: int = 0) -> torch.Generator:
+        """Return a source of randomness on the device; others for other numbers."""
+        return torch.Generator(self.device).manual_seed(1000 * self.seed + number)
+
+
+@dataclass(frozen=True)
+class Check:
+    """A hard case."""
+
+    name: str
+    """What it is called, GROUP/CASE or longer."""
+    expected: str
+    """What is expected, a sentence."""
+    run: Callable[[Session], Finding]
+    """Measures it. Raises `Skipped` where there is nothing to measure."""
+
+    @property
+    def group(self) -> str:
+        """The group that it belongs to."""
+        return self.name.partition("/")[0]

@@ -1,0 +1,203 @@
+"""Hard places for particles to lie: small worlds whose perception is known from a reference."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from npa_envs import reference
+
+EPS = 0.125
+"""Perception radius of the scenes [length units], a power of two: borders are hit exactly."""
+
+SIDE = 1.0
+"""Side of the periodic scenes' boxes [length units]."""
+
+STATE_DIM = 5
+"""State channels of the scenes."""
+
+Box = tuple[float, ...] | None
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Worlds that are hard to perceive."""
+
+    name: str
+    """What it is called."""
+    summary: str
+    """Where its particles lie, for a sentence."""
+    x: Tensor
+    """Positions [length units], float64 that float32 holds as well, shape [B, N, D]."""
+    box: Box
+    """Sides of the periodic box [length units], None in open space."""
+
+    @property
+    def s(self) -> Tensor:
+        """States, drawn from a normal distribution, float64 likewise, shape [B, N, C]."""
+        shape = (*self.x.shape[:2], STATE_DIM)
+        return torch.randn(shape, generator=torch.Generator().manual_seed(5)).double()
+
+
+def scenes(space_dim: int, *, periodic: bool, seed: int = 0) -> list[Scene]:
+    """Return every scene of open space or of a periodic box.
+
+    Args:
+        space_dim: Space dimension D.
+        periodic: Whether space is a box of side `SIDE`.
+        seed: What random places are drawn from.
+    """
+    made: list[Scene] = []
+    for name, (summary, place) in PLACES.items():
+        generator = torch.Generator().manual_seed(1000 * seed + len(made))
+        if (name in ONLY_OPEN and periodic) or (name in ONLY_PERIODIC and not periodic):
+            continue
+        if name in ONLY_3D and space_dim != 3:
+            continue
+        # Rounded to float32 first, so that both precisions see the same particles.
+        x = place(space_dim, generator).float().double()
+        side = 2.0 * EPS if name == "tight_box" else SIDE
+        made.append(Scene(name, summary, x, (side,) * space_dim if periodic else None))
+    return made
+
+
+def _uniform(space_dim: int, generator: torch.Generator, count: int, side: float = 0.5) -> Tensor:
+    return (torch.rand(1, count, space_dim, generator=generator) - 0.5) * side
+
+
+def _direction(space_dim: int) -> Tensor:
+    """Return a unit vector along no axis."""
+    slanted = torch.tensor([0.48, 0.64, 0.6] if space_dim == 3 else [0.6, 0.8])
+    return slanted.double()
+
+
+def _one(space_dim: int, generator: torch.Generator) -> Tensor:
+    return _uniform(space_dim, generator, 1)
+
+
+def _coincident(space_dim: int, generator: torch.Generator) -> Tensor:
+    return _uniform(space_dim, generator, 1).expand(1, 48, space_dim)
+
+
+def _touching(space_dim: int, generator: torch.Generator) -> Tensor:
+    """A pair in each world."""
+    distances = torch.tensor([1e-12, 1e-9, 1e-6, 1e-3, 0.5], dtype=torch.float64)
+    distances[3:] *= EPS
+    apart = distances[:, None] * _direction(space_dim)
+    return torch.stack((torch.zeros_like(apart), apart), dim=1)
+
+
+def _at_eps(space_dim: int, generator: torch.Generator) -> Tensor:
+    """Four pairs along the first axis: well within ε, at it, and next to it on either side."""
+    step = 2.0**-20
+    first = torch.full((4, space_dim), -0.375, dtype=torch.float64)
+    first[:, 1] += torch.arange(4) * 2.0 * EPS
+    second = first.clone()
+    second[:, 0] += EPS * torch.tensor([0.5, 1.0 - step, 1.0, 1.0 + step], dtype=torch.float64)
+    return torch.cat((first, second))[None]
+
+
+def _collinear(space_dim: int, generator: torch.Generator) -> Tensor:
+    along = (torch.arange(16) - 8) * (EPS / 4.0)
+    straight = torch.zeros(16, space_dim, dtype=torch.float64)
+    straight[:, 0] = along
+    slanted = along[:, None] * _direction(space_dim)
+    return torch.stack((straight, slanted))
+
+
+def _coplanar(space_dim: int, generator: torch.Generator) -> Tensor:
+    flat = _uniform(space_dim, generator, 60)
+    flat[..., 2] = 0.1
+    return flat
+
+
+def _lattice(space_dim: int, generator: torch.Generator) -> Tensor:
+    axis = (torch.arange(5) - 2) * (EPS / 2.0)
+    return torch.cartesian_prod(*(axis,) * space_dim)[None]
+
+
+def _cell_borders(space_dim: int, generator: torch.Generator) -> Tensor:
+    steps = torch.randint(-4, 4, (1, 60, space_dim), generator=generator)
+    return steps * (EPS / 2.0)
+
+
+def _clump(space_dim: int, generator: torch.Generator) -> Tensor:
+    return 0.03 + _uniform(space_dim, generator, 100, EPS / 4.0)
+
+
+def _seam(space_dim: int, generator: torch.Generator) -> Tensor:
+    x = _uniform(space_dim, generator, 60, 0.3)
+    edges = torch.tensor([-0.5, 0.5, 0.5 - 2.0**-24, -0.5 + 2.0**-24, 0.5 + 2.0**-10])
+    x[..., 0] = edges[torch.randint(5, (1, 60), generator=generator)]
+    return x
+
+
+def _tight_box(space_dim: int, generator: torch.Generator) -> Tensor:
+    x = _uniform(space_dim, generator, 40, 2.0 * EPS)
+    # A pair across the box: each sees the other at exactly ε, on two sides.
+    x[0, 0], x[0, 1] = 0.0, 0.0
+    x[0, 1, 0] = EPS
+    return x
+
+
+def _far(space_dim: int, generator: torch.Generator) -> Tensor:
+    """A crowd around the origin and one around each far place; the farthest overflows squared."""
+    x = _uniform(space_dim, generator, 80)
+    for place, offset in enumerate((1e3, 1e6, -1e30, 3e38)):
+        x[:, 20 * place : 20 * place + 10, 0] += offset
+    return x
+
+
+PLACES: dict[str, tuple[str, Callable[[int, torch.Generator], Tensor]]] = {
+    "one": ("a single particle", _one),
+    "coincident": ("48 particles in one place", _coincident),
+    "touching": ("pairs from 1e-12 length units to ε/2 apart", _touching),
+    "at_eps": ("pairs at ε, and at ε (1 ± 2⁻²⁰)", _at_eps),
+    "collinear": ("particles on a line, straight and slanted", _collinear),
+    "coplanar": ("particles on a plane", _coplanar),
+    "lattice": ("a lattice of ε/2: neighbours at ε exactly", _lattice),
+    "cell_borders": ("particles on the borders of cells", _cell_borders),
+    "clump": ("100 particles in one cell", _clump),
+    "far": ("crowds at 0, 1e3, 1e6, -1e30 and 3e38", _far),
+    "seam": ("particles on both sides of the box's seam and on it", _seam),
+    "tight_box": ("particles in a box of exactly 2 ε", _tight_box),
+}
+"""What each scene is, and where its particles lie."""
+
+ONLY_OPEN = ("far",)
+ONLY_PERIODIC = ("seam", "tight_box")
+ONLY_3D = ("coplanar",)
+
+
+def threshold_scenes(space_dim: int, threshold: float) -> tuple[Tensor, Tensor]:
+    """Return worlds whose first particle's moment matrix has a determinant around a threshold.
+
+    The particles are a corner, one on each other axis, and one whose height over those says how
+    flat the corner is.
+
+    Args:
+        space_dim: Space dimension D.
+        threshold: Smallest determinant that is inverted (dimensionless).
+
+    Returns:
+        Positions [length units], shape [B, 1 + D, D], and how far each determinant was to lie from
+        the threshold, relatively, shape [B].
+    """
+    offsets = torch.tensor([1e-1, 1e-3, 1e-5, 1e-7, 0.0, -1e-7, -1e-5, -1e-3, -1e-1]).double()
+    worlds = torch.zeros(len(offsets), 1 + space_dim, space_dim, dtype=torch.float64)
+    worlds[:, 1:] = 0.4 * EPS * torch.eye(space_dim).double()
+    worlds[:, -1, 0] = 0.5 * EPS
+    s = torch.zeros(*worlds.shape[:2], 1, dtype=torch.float64)
+    wanted = threshold * (1.0 + offsets)
+    # The determinant grows with the height, which is halved in on.
+    low, high = torch.zeros_like(offsets), torch.full_like(offsets, 0.4 * EPS)
+    for _ in range(50):
+        worlds[:, -1, -1] = 0.5 * (low + high)
+        found = torch.linalg.det(reference.fields(worlds, s, EPS).moment[:, 0])
+        low = torch.where(found < wanted, worlds[:, -1, -1], low)
+        high = torch.where(found < wanted, high, worlds[:, -1, -1])
+    torch.testing.assert_close(found, wanted, rtol=1e-9, atol=0.0)
+    return worlds.float().double(), offsets

@@ -1,0 +1,338 @@
+"""The stress command finds what breaks, says where, and goes on where it was stopped."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+from npa_envs import reference
+from npa_envs.cli import main
+from npa_envs.errors import NPAError
+from npa_envs.rule import NPARule
+from npa_envs.stress import accuracy, endurance, geometry, gradients, precision, ranges, suite
+from npa_envs.stress.checks import GROUPS, Check, Finding, Session, Skipped
+from npa_envs.stress.habitats import habitat
+from npa_envs.stress.plots import heat_maps
+from npa_envs.stress.ranges import working_range
+from npa_envs.stress.record import Entry, Record, in_order, read_record
+from npa_envs.stress.runner import chosen_checks, run_check, run_checks
+from npa_envs.stress.scenes import EPS, scenes, threshold_scenes
+
+CHECKS = {check.name: check for check in suite.all_checks(quick=True)}
+FACTS = {"device": "cpu", "commit": "0"}
+
+
+def session(device: torch.device | None = None) -> Session:
+    return Session(device or torch.device("cpu"), quick=True)
+
+
+def told(name: str, **fields) -> Check:
+    """A check that finds what it is told to."""
+    return Check(name, "as told", lambda session: Finding(**{"figures": {}, **fields}))
+
+
+# The registry
+
+
+def test_every_check_has_a_name_of_its_own_a_group_and_an_expectation():
+    for quick in (False, True):
+        checks = suite.all_checks(quick=quick)
+        assert len({check.name for check in checks}) == len(checks)
+        assert {check.group for check in checks} == set(GROUPS)
+        assert all(check.expected for check in checks)
+
+
+def test_checks_are_chosen_by_group_by_name_and_by_how_names_begin():
+    checks = list(CHECKS.values())
+    assert {c.group for c in chosen_checks(checks, ["time", "values"])} == {"time", "values"}
+    assert [c.name for c in chosen_checks(checks, ["time/gecko"])] == ["time/gecko"]
+    clumps = chosen_checks(checks, ["geometry/clump"])
+    assert [c.name.removeprefix("geometry/clump/") for c in clumps] == [
+        "2d/open",
+        "2d/periodic",
+        "3d/open",
+        "3d/periodic",
+    ]
+    assert chosen_checks(checks, []) == checks
+    with pytest.raises(NPAError, match="unknown check 'geometri': did you mean 'geometry'"):
+        chosen_checks(checks, ["geometri"])
+
+
+# Verdicts
+
+
+@pytest.mark.parametrize(
+    ("figures", "holds", "verdict"),
+    [
+        ({"error": 1.0}, "", "pass"),
+        ({"error": 1.5}, "", "fail"),
+        ({"error": math.nan}, "", "fail"),
+        ({"error": math.inf}, "", "fail"),
+        ({}, "", "fail"),
+        ({"error": 0.5}, "0.1 … 1", "range"),
+        ({"error": 1.5}, "0.1 … 1", "fail"),
+    ],
+)
+def test_a_figure_above_its_limit_not_a_number_or_missing_fails(figures, holds, verdict):
+    assert Finding({**figures, "other": 9.0}, {"error": 1.0}, holds).verdict == verdict
+
+
+def test_the_worst_figure_is_named():
+    entry = Entry.of(
+        told("a/b"), Finding({"x": 1.0, "y": 3.0}, {"x": 10.0, "y": 4.0, "z": 1.0}), 0.0
+    )
+    assert entry.worst() == "z nan (at most 1)"
+    assert entry.share("y") == 0.75
+    assert Entry("a/b", "", "fail", {"x": 1.0}, {"x": 0.0}).share("x") == math.inf
+    assert Entry("a/b", "", "pass", {"x": 0.0}, {"x": 0.0}).share("x") == 0.0
+
+
+def test_what_raises_has_failed_and_the_others_go_on():
+    def raising(error: Exception) -> Check:
+        def run(session: Session) -> Finding:
+            raise error
+
+        return Check(f"values/{type(error).__name__}", "no error", run)
+
+    record = Record(dict(FACTS))
+    errors = (ZeroDivisionError("by\nzero"), Skipped("no device"), torch.OutOfMemoryError("much"))
+    run_checks([*map(raising, errors), told("values/last")], session(), record)
+    found = {name: (entry.verdict, entry.note) for name, entry in record.entries.items()}
+    assert found == {
+        "values/ZeroDivisionError": ("fail", "ZeroDivisionError: by zero"),
+        "values/Skipped": ("skipped", "no device"),
+        "values/OutOfMemoryError": ("skipped", "not enough memory"),
+        "values/last": ("pass", ""),
+    }
+    assert "values/ZeroDivisionError failed: ZeroDivisionError: by zero" in record.text()
+    assert record.text().endswith("1 pass, 0 range, 1 fail, 2 skipped")
+
+
+# Records
+
+
+def test_a_record_comes_back_as_it_was_written(tmp_path: Path):
+    path = tmp_path / "record.json"
+    figures = {"a": 1.5, "b": math.inf, "c": math.nan}
+    record = Record(dict(FACTS), {"x/y": Entry("x/y", "s", "fail", figures, {"a": 1.0}, "", "n")})
+    record.write(path)
+    assert json.loads(path.read_text())["counts"] == {
+        "pass": 0,
+        "range": 0,
+        "fail": 1,
+        "skipped": 0,
+    }
+    entry = read_record(path, FACTS).entries["x/y"]
+    assert math.isnan(entry.figures["c"])
+    assert dataclasses.replace(entry, figures={**entry.figures, "c": 0.0}) == dataclasses.replace(
+        record.entries["x/y"], figures={**figures, "c": 0.0}
+    )
+    with pytest.raises(NPAError, match="other settings: commit was '0', now '1'"):
+        read_record(path, FACTS | {"commit": "1"})
+    path.write_text("{}")
+    with pytest.raises(NPAError, match="must hold a record of npa-envs stress"):
+        read_record(path, FACTS)
+    assert read_record(tmp_path / "none.json", FACTS).entries == {}
+
+
+def test_a_run_goes_on_where_it_was_and_repeats_what_did_not_pass():
+    ran: list[str] = []
+
+    def counted(name: str, **fields) -> Check:
+        def run(session: Session) -> Finding:
+            ran.append(name)
+            return Finding(**{"figures": {}, **fields})
+
+        return Check(name, "as told", run)
+
+    failing = {"figures": {"x": 2.0}, "limits": {"x": 1.0}}
+    checks = [counted("a/1"), counted("a/2", **failing), counted("a/3", holds="all")]
+    record, sizes = Record(dict(FACTS)), []
+    run_checks(checks, session(), record, written=lambda r: sizes.append(len(r.entries)))
+    assert sizes == [1, 2, 3]
+    run_checks(checks, session(), record)
+    assert ran == ["a/1", "a/2", "a/3", "a/2"]
+    late = Record(dict(FACTS))
+    run_checks(checks, session(), late, max_seconds=0.0)
+    assert {entry.verdict for entry in late.entries.values()} == {"skipped"}
+    run_checks(checks, session(), late)
+    assert [entry.verdict for entry in late.entries.values()] == ["pass", "fail", "range"]
+    assert list(in_order(late, ["a/3", "a/1"]).entries) == ["a/3", "a/1", "a/2"]
+
+
+# What the checks find
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "geometry/touching/2d/open",
+        "geometry/far/3d/open",
+        "geometry/seam/2d/periodic",
+        "geometry/tight_box/3d/periodic",
+        "geometry/threshold/2d",
+        "geometry/crowd/2d",
+        "geometry/nearest/2d",
+        "values/infinite_channel/2d",
+        "values/gradient_of_nan",
+        "values/nan_state",
+        "values/nan_position",
+        "values/blown_up",
+        "gradients/finite_differences/2d/periodic",
+        "precision/order/2d",
+        "precision/batch/3d",
+        "precision/repeated/2d",
+    ],
+)
+def test_the_library_is_as_expected(name, device):
+    entry = run_check(CHECKS[name], session(device))
+    assert entry.verdict in ("pass", "range"), (entry.worst(), entry.note)
+
+
+@pytest.mark.parametrize("factor", [1.0 + 1e-5, math.nan])
+def test_a_wrong_operator_is_found_out(factor, monkeypatch):
+    def wrong(*arguments, **options):
+        return right(*arguments, **options) * factor
+
+    for module in (accuracy, geometry, precision, gradients):
+        right = module.perceive
+        monkeypatch.setattr(module, "perceive", wrong)
+    for name in ("geometry/clump/2d/open", "geometry/threshold/2d", "geometry/outside/3d"):
+        assert run_check(CHECKS[name], session()).verdict == "fail"
+    difference = run_check(CHECKS["gradients/finite_differences/2d/open"], session())
+    # A wrong factor is differentiated rightly; what is not a number is not.
+    assert difference.verdict == ("fail" if math.isnan(factor) else "pass")
+
+
+def test_results_that_change_from_call_to_call_are_found_out(monkeypatch):
+    calls = iter(range(1000))
+    right = accuracy.perceive
+    monkeypatch.setattr(
+        accuracy, "perceive", lambda *a, **k: right(*a, **k) * (1.0 + 1e-6 * next(calls))
+    )
+    assert run_check(CHECKS["precision/repeated/2d"], session()).verdict == "fail"
+
+
+def test_no_limit_is_more_than_a_scene_asks_for():
+    """Limits follow from how answers change with their last bit, and must not become vacuous."""
+    for space_dim in (2, 3):
+        for periodic in (False, True):
+            for scene in scenes(space_dim, periodic=periodic):
+                exact = accuracy.perceived(scene.x, scene.s, scene.box, by_reference=True)
+                limits = accuracy.error_limits(scene.x, scene.s, scene.box, exact)
+                assert limits.keys() == accuracy.LIMITS.keys()
+                for name, limit in limits.items():
+                    assert accuracy.LIMITS[name] <= limit < 1e-2, (scene.name, name)
+
+
+def test_scenes_are_where_their_names_say():
+    found = {scene.name: scene for scene in scenes(2, periodic=False)}
+    distances = (found["at_eps"].x[0, 4:] - found["at_eps"].x[0, :4]).norm(dim=-1) / EPS
+    assert distances.tolist() == [0.5, 1.0 - 2.0**-20, 1.0, 1.0 + 2.0**-20]
+    assert (found["coincident"].x == found["coincident"].x[:, :1]).all()
+    assert float(found["touching"].x[0, 1].norm()) == pytest.approx(1e-12, rel=1e-6)
+    for scene in found.values():
+        assert torch.equal(scene.x, scene.x.float().double())
+    x, offsets = threshold_scenes(2, 1e-3)
+    s = torch.zeros(*x.shape[:2], 1).double()
+    found_det = torch.linalg.det(reference.fields(x, s, EPS).moment[:, 0])
+    torch.testing.assert_close(found_det, 1e-3 * (1.0 + offsets), rtol=1e-6, atol=0.0)
+
+
+@pytest.mark.parametrize("factor", [1.0, 20.0])
+def test_a_rule_that_blows_up_is_found_out(factor, device, monkeypatch):
+    def tampered(*arguments, **options):
+        home = habitat(*arguments, **options)
+        rule = NPARule(**home.rule.hyper_parameters()).to(home.x)
+        rule.load_state_dict(home.rule.state_dict())
+        with torch.no_grad():
+            rule.output.weight *= factor
+        return dataclasses.replace(home, rule=rule, x=home.x[:, :256], s=home.s[:, :256])
+
+    monkeypatch.setattr(endurance, "habitat", tampered)
+    entry = run_check(CHECKS["time/dots"], session(device))
+    assert entry.verdict == ("pass" if factor == 1.0 else "fail")
+    assert (entry.note == "") == (factor == 1.0)
+
+
+@pytest.mark.parametrize(
+    ("ratios", "text"),
+    [
+        ((3.0, 2.0, 1.0, 1.9, 5.0), "0.2 … 0.8"),
+        ((1.0, 3.0, 1.0, math.nan, 1.5), "0.5 … 0.5, and 0.1, 1"),
+        ((1.0,) * 5, "0.1 … 1"),
+    ],
+)
+def test_a_rule_works_where_its_metric_at_most_doubles(ratios, text):
+    assert working_range((0.1, 0.2, 0.5, 0.8, 1.0), ratios, trained=0.5) == text
+
+
+def test_ranges_run_for_as_many_updates_and_as_much_time_as_trained(monkeypatch):
+    steps: dict[str, list[int]] = {}
+
+    def metric(home, session, count, options):
+        steps.setdefault(axis.name, []).append(count)
+        return float("nan") if options.get("dt") == 2.0 else 1.0
+
+    monkeypatch.setattr(ranges, "_metric", metric)
+    for axis in ranges.AXES[:2]:
+        entry = run_check(CHECKS[f"ranges/{axis.name}/dots"], session())
+        assert entry.verdict == "range"
+    assert steps == {"update_prob": [64, 160, 64, 32], "dt": [64, 128, 64, 32]}
+    assert entry.holds == "0.5 … 1"
+    assert entry.note == "not finite at 2"
+
+
+# The command
+
+
+def test_the_command_writes_a_record_draws_it_and_goes_on(tmp_path, capsys, monkeypatch):
+    words = ["stress", "--quick", "--no-progress", "--output", str(tmp_path), "--commit", "x"]
+    assert main([*words, "--only", "geometry/one", "values/nan_position"]) == 0
+    record = json.loads((tmp_path / "stress_cpu_quick.json").read_text())
+    assert record["counts"] == {"pass": 5, "range": 0, "fail": 0, "skipped": 0}
+    assert record["facts"]["commit"] == "x"
+    assert (tmp_path / "stress_cpu_quick_geometry.png").read_bytes().startswith(b"\x89PNG")
+    assert "5 pass" in capsys.readouterr().out
+    broken = told("values/nan_position", figures={"x": 1.0}, limits={"x": 0.0})
+    monkeypatch.setattr(
+        suite, "all_checks", lambda **options: [broken, *(CHECKS[n] for n in ("time/heart",))]
+    )
+    assert main(["stress", "--no-progress", "--only", "values"]) == 1
+    assert "values/nan_position failed: x 1 (at most 0)" in capsys.readouterr().out
+    assert main([*words, "--only", "values"]) == 0
+    assert "1 of 1 checks were done before" in capsys.readouterr().out
+
+
+def test_the_command_lists_its_checks_and_refuses_mistakes(capsys):
+    assert main(["stress", "--list", "--only", "values"]) == 0
+    text = capsys.readouterr().out
+    assert "values/nan_state: NaN in one state spreads in its own world only" in text
+    assert "geometry" not in text
+    for words in (["--only", "tim"], ["--max-seconds", "0"], ["--threads", "0"]):
+        assert main(["stress", *words]) == 2
+    assert "unknown check 'tim'" in capsys.readouterr().err
+
+
+def test_heat_maps_are_drawn_of_limits_and_of_ranges():
+    figures = {"trained": 1.0, "0.2": 3.0, "0.5": 1.0, "1": math.nan}
+    entries = [
+        Entry("ranges/update_prob/heart", "", "range", figures, {"trained": 9.0}, "0.5 … 0.5"),
+        Entry("geometry/one/2d/open", "", "fail", {"z": math.nan}, {"z": 1.0}),
+        Entry("values/nan_state", "", "skipped"),
+    ]
+    pictures = heat_maps(Record(dict(FACTS), {entry.name: entry for entry in entries}))
+    assert set(pictures) == {"ranges", "geometry"}
+    assert all(picture.startswith(b"\x89PNG") for picture in pictures.values())
+
+
+@pytest.mark.slow
+def test_everything_quick_is_as_expected(device):
+    record = Record(dict(FACTS))
+    run_checks(list(CHECKS.values()), session(device), record)
+    assert [entry.name for entry in record.failed()] == []
