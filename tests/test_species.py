@@ -392,7 +392,7 @@ def test_devices_agree_and_a_rollout_can_be_captured(perception):
 
 def test_the_code_about_species_runs():
     page = Path(__file__).resolve().parent.parent / "docs" / "species.md"
-    rolled, trained = re.findall(r"^```python\n(.*?)^```", page.read_text(), re.M | re.S)
+    rolled, trained, *_ = re.findall(r"^```python\n(.*?)^```", page.read_text(), re.M | re.S)
     names = {}
     exec(rolled, names)
     assert names["x"].shape == (1, 256, 2)

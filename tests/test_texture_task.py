@@ -366,7 +366,7 @@ def test_commands_take_a_texture_s_rule(trained, tmp_path, capsys):
 def test_list_names_textures_and_losses(capsys):
     assert main(["list"]) == 0
     text = capsys.readouterr().out
-    for word in ("texture:", "bubbles, cells, dots, grid, stripes", "vgg_ot", "filter_swd"):
+    for word in ("texture:", "bubbles, cells, dots, grid, maze, stripes", "vgg_ot", "filter_swd"):
         assert word in text
 
 

@@ -1,0 +1,117 @@
+"""The project's own renderer against gsplat, where that can be built (CUDA); in one run.
+
+Four worlds of the shipped duck, 16 384 Gaussians each, seen by four cameras at 192 x 192 pixels:
+the seed, and the world at step 128. Prints the relative differences of pictures and gradients, and
+medians of 20 times [µs], twice, in turn. gsplat draws one world after the other, and cannot be
+recorded in a CUDA graph.
+
+    pip install gsplat ninja
+    python benchmarks/renderers.py
+"""
+
+from __future__ import annotations
+
+import json
+import statistics
+from collections.abc import Callable
+from functools import partial
+
+import gsplat
+import torch
+from torch import Tensor
+
+import npa_envs
+from npa_envs.cli.worlds import task_of_rule
+from npa_envs.tasks.renderers import RENDERERS
+from npa_envs.tasks.views import some_views
+
+DEVICE = torch.device("cuda")
+NAMES = ("own", "gsplat")
+
+
+def median_time(call: Callable[[], object]) -> float:
+    """Return the median of 20 times of a call [µs], after five that do not count."""
+    times = []
+    for number in range(25):
+        start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+        start.record()
+        call()
+        end.record()
+        end.synchronize()
+        if number >= 5:
+            times.append(1e3 * start.elapsed_time(end))
+    return statistics.median(times)
+
+
+def recorded(call: Callable[[], object]) -> Callable[[], object]:
+    """Return the replay of a call in a CUDA graph."""
+    stream = torch.cuda.Stream()
+    stream.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(stream):
+        call()
+    torch.cuda.current_stream().wait_stream(stream)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        call()
+    return graph.replay
+
+
+def difference(value: Tensor, other: Tensor) -> float:
+    """Return |value - other| / |other|."""
+    return float((value - other).detach().norm() / other.detach().norm())
+
+
+def compared(task: object, x: Tensor, s: Tensor, cameras: object) -> dict[str, object]:
+    """Return differences and times of both renderers on some worlds."""
+    looks = task.gaussians(s)
+    fields = ("scales", "quaternions", "opacities", "colours")
+    looks = looks._replace(**{f: getattr(looks, f).detach().requires_grad_() for f in fields})
+    leaves = [x.detach().requires_grad_(), *(getattr(looks, f) for f in fields)]
+
+    def pictures(name: str) -> tuple[Tensor, Tensor]:
+        return RENDERERS[name](leaves[0], looks, cameras)
+
+    drawn = {name: pictures(name) for name in NAMES}
+    weights = torch.randn_like(drawn["own"][0])
+
+    def gradients(name: str) -> tuple[Tensor, ...]:
+        return torch.autograd.grad((pictures(name)[0] * weights).sum(), leaves)
+
+    slopes = zip(("positions", *fields), *(gradients(name) for name in NAMES), strict=True)
+    row: dict[str, object] = {
+        "image": difference(drawn["own"][0], drawn["gsplat"][0]),
+        "alpha": difference(drawn["own"][1], drawn["gsplat"][1]),
+        "gradients": {field: difference(own, other) for field, own, other in slopes},
+    }
+    for number in range(2):
+        for name in NAMES:
+
+            @torch.no_grad()
+            def forward(name: str = name) -> object:
+                return pictures(name)
+
+            row[f"{name} forward us {number}"] = median_time(forward)
+            row[f"{name} forward and backward us {number}"] = median_time(
+                lambda n=name: gradients(n)
+            )
+            if name == "own":
+                row[f"{name} forward in a graph us {number}"] = median_time(recorded(forward))
+    return row
+
+
+def main() -> None:
+    """Print what both renderers make of a seed and of a grown world."""
+    print(f"gsplat {gsplat.__version__}, torch {torch.__version__}, {torch.cuda.get_device_name()}")
+    rule = npa_envs.load_rule("duck", device=DEVICE).requires_grad_(False)
+    task = task_of_rule("duck", rule, DEVICE).task
+    generator = torch.Generator(DEVICE).manual_seed(1)
+    x, s = task.seed(4, generator=generator, device=DEVICE)
+    with torch.no_grad():
+        grown = npa_envs.rollout(rule, x, s, 128, generator=generator)
+    cameras = some_views(task.target.training, torch.arange(4, device=DEVICE)).cameras
+    for what, worlds in (("seed", (x, s)), ("step 128", grown)):
+        print(what, json.dumps(compared(task, *worlds, cameras), indent=1))
+
+
+if __name__ == "__main__":
+    main()
