@@ -91,9 +91,7 @@ def compared(task: object, x: Tensor, s: Tensor, cameras: object) -> dict[str, o
                 return pictures(name)
 
             row[f"{name} forward us {number}"] = median_time(forward)
-            row[f"{name} forward and backward us {number}"] = median_time(
-                lambda n=name: gradients(n)
-            )
+            row[f"{name} forward and backward us {number}"] = median_time(partial(gradients, name))
             if name == "own":
                 row[f"{name} forward in a graph us {number}"] = median_time(recorded(forward))
     return row
