@@ -162,6 +162,9 @@ def test_a_run_goes_on_where_it_was_and_repeats_what_did_not_pass():
     assert {entry.verdict for entry in late.entries.values()} == {"skipped"}
     run_checks(checks, session(), late)
     assert [entry.verdict for entry in late.entries.values()] == ["pass", "fail", "range"]
+    # No time is no reason to forget that something failed.
+    run_checks(checks, session(), late, max_seconds=0.0)
+    assert [entry.verdict for entry in late.entries.values()] == ["pass", "fail", "range"]
     assert list(in_order(late, ["a/3", "a/1"]).entries) == ["a/3", "a/1", "a/2"]
 
 
