@@ -263,6 +263,17 @@ def test_a_rule_that_blows_up_is_found_out(factor, device, monkeypatch):
     assert (entry.note == "") == (factor == 1.0)
 
 
+def test_a_world_of_one_particle_is_measured_although_it_extends_nowhere(monkeypatch):
+    def alone(*arguments, **options):
+        home = habitat(*arguments, **options)
+        return dataclasses.replace(home, x=home.x[:, :1], s=home.s[:, :1])
+
+    monkeypatch.setattr(endurance, "habitat", alone)
+    entry = run_check(CHECKS["time/heart"], session())
+    assert entry.figures["extent"] == 0.0
+    assert entry.figures["drift"] >= 0.0
+
+
 @pytest.mark.parametrize(
     ("ratios", "text"),
     [
