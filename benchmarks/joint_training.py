@@ -238,9 +238,7 @@ def options() -> argparse.Namespace:
     parser.add_argument("--only", choices=RUNS, help="train this run and measure nothing")
     parser.add_argument("--frozen", action="store_true", help="also learn beside a rule that stays")
     parser.add_argument("--max-seconds", type=float, help="for each run; the same command goes on")
-    parser.add_argument(
-        "--steps", type=int, nargs="+", default=[128, 512, 1024], help="measured at"
-    )
+    parser.add_argument("--steps", type=int, nargs="+", default=[128, 512, 1024], help="measured")
     parser.add_argument("--worlds", type=int, default=8, help="measured")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--threads", type=int, default=1, help="CPU threads of torch")

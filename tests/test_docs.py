@@ -225,10 +225,11 @@ def test_the_code_about_training_runs(capsys):
     assert capsys.readouterr().out.startswith("random: ")
 
 
-def test_the_code_about_many_worlds_of_several_species_runs():
-    _, _, *blocks = code_blocks(DOCS / "species.md")
+def test_the_code_about_several_species_runs():
     names = {}
-    exec(compile("\n".join(blocks), "species.md", "exec"), names)
+    exec(compile("\n".join(code_blocks(DOCS / "species.md")), "species.md", "exec"), names)
+    assert names["x"].shape == (1, 256, 2)
+    assert [own.target for own in names["config"].task.species] == ["ring", "heart"]
     assert names["observations"]["species_0"].shape == (8, 32, 66)
     assert names["models"]["species_1"].num_timesteps == 2 * 16 * 8 * 16
     acted = names["policies"]["species_1"](names["rows"].vector_env.reset()[0]["species_1"])

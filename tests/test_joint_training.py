@@ -114,8 +114,8 @@ class TestTask:
     @pytest.mark.parametrize(
         ("fields", "message"),
         [
-            ({"species": (small("ring"),)}, "two Morphogenesis2DConfig or more"),
-            ({"species": (small("ring"), "heart")}, "two Morphogenesis2DConfig or more"),
+            ({"species": (small("ring"),)}, "or more, got Morphogenesis2DConfig: one for"),
+            ({"species": (small("ring"), "heart")}, "got Morphogenesis2DConfig, str: one for"),
             (
                 {"species": (small("ring"), small("heart", eps=0.2))},
                 r"agree in eps, got \[0\.3, 0\.2\]",

@@ -9,7 +9,7 @@ import pytest
 import torch
 from crowds import TASKS, make, small, targets_made_once
 
-from npa_envs.envs import multispecies_v0
+from npa_envs.envs import memory, multispecies_v0
 from npa_envs.envs.species import cohort as cohort_module
 from npa_envs.errors import NPAError
 
@@ -292,6 +292,18 @@ def test_spaces_hold_what_comes_out():
 def test_a_wrong_configuration_is_refused(keywords, message):
     with pytest.raises(NPAError, match=message):
         multispecies_v0.batched(**keywords)
+
+
+def test_telling_species_apart_needs_memory_of_its_own(monkeypatch):
+    # 64 worlds of 41 particles: P is 66, and 8 species append 24 numbers, of which 4 copies live.
+    free = memory.needed_bytes(64, 41, batch().worlds.physics, torch.device("cpu"))
+    monkeypatch.setattr(memory, "free_bytes", lambda device: free + 4 * 4 * 64 * 41 * 24 - 1)
+    assert batch(world_count=64, species_count=8).worlds.perception_dim == 66
+    with pytest.raises(NPAError, match="particle_count must fit into memory"):
+        batch(world_count=64, species_count=8, perception="per_species")
+    monkeypatch.setattr(memory, "free_bytes", lambda device: free + 4 * 4 * 64 * 41 * 24)
+    envs = batch(world_count=64, species_count=8, perception="per_species")
+    assert envs.worlds.perception_dim == 66 + 24
 
 
 def test_a_wrong_action_is_refused_and_leaves_the_worlds_as_they_were():

@@ -162,6 +162,9 @@ def test_a_run_goes_on_where_it_was_and_repeats_what_did_not_pass():
     assert {entry.verdict for entry in late.entries.values()} == {"skipped"}
     run_checks(checks, session(), late)
     assert [entry.verdict for entry in late.entries.values()] == ["pass", "fail", "range"]
+    # No time is no reason to forget that something failed.
+    run_checks(checks, session(), late, max_seconds=0.0)
+    assert [entry.verdict for entry in late.entries.values()] == ["pass", "fail", "range"]
     assert list(in_order(late, ["a/3", "a/1"]).entries) == ["a/3", "a/1", "a/2"]
 
 
@@ -258,6 +261,17 @@ def test_a_rule_that_blows_up_is_found_out(factor, device, monkeypatch):
     entry = run_check(CHECKS["time/dots"], session(device))
     assert entry.verdict == ("pass" if factor == 1.0 else "fail")
     assert (entry.note == "") == (factor == 1.0)
+
+
+def test_a_world_of_one_particle_is_measured_although_it_extends_nowhere(monkeypatch):
+    def alone(*arguments, **options):
+        home = habitat(*arguments, **options)
+        return dataclasses.replace(home, x=home.x[:, :1], s=home.s[:, :1])
+
+    monkeypatch.setattr(endurance, "habitat", alone)
+    entry = run_check(CHECKS["time/heart"], session())
+    assert entry.figures["extent"] == 0.0
+    assert entry.figures["drift"] >= 0.0
 
 
 @pytest.mark.parametrize(

@@ -137,6 +137,7 @@ def test_an_empty_file_sets_nothing(tmp_path):
     [
         ("a.yaml", "itertions: 5", "unknown field 'itertions': did you mean 'iterations'"),
         ("a.toml", "[task]\ntarge = 'x'", "unknown field 'task.targe': did you mean 'target'"),
+        ("a.yaml", "task: {1: 2}", "unknown field 'task.1': known: "),
         ("a.yaml", "- 5", "must hold field names and values at its top level, got list"),
         ("a.yaml", "a: [", "is not valid YAML"),
         ("a.toml", "a = ", "is not valid TOML"),

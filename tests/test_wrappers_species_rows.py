@@ -33,6 +33,11 @@ def by_hand(observations, names, tags=None):
     return np.concatenate(worlds).astype(np.float32)
 
 
+def still(observations):
+    """A policy of five particles that change nothing."""
+    return np.zeros((2, 5, 18), np.float32)
+
+
 def test_rows_are_the_particles_of_all_species_with_tags():
     rows, envs = SpeciesVecEnv(batch(**DEADLY)), batch(**DEADLY)
     assert rows.num_envs == 16
@@ -93,8 +98,10 @@ def test_others_act_by_their_policies():
     seen = rows.reset()
     observations, _ = envs.reset(seed=5)
     actions = np.random.default_rng(0).uniform(-1, 1, (6, 18)).astype(np.float32)
-    for _ in range(6):
-        assert np.array_equal(seen, by_hand(observations, ["species_0"])) or not seen.any()
+    for step in range(6):
+        expected = by_hand(observations, ["species_0"])
+        # Species 0 ends in the second of four steps.
+        assert np.array_equal(seen, expected if step % 4 < 2 else 0.0 * expected)
         previous = observations
         seen, paid, *_ = rows.step(actions)
         observations, rewards, *_ = envs.step(
@@ -126,11 +133,24 @@ def test_what_belongs_to_no_batch_of_species_is_refused():
     with pytest.raises(NPAError, match="make it with autoreset_mode='same-step'"):
         SpeciesVecEnv(batch(autoreset_mode="disabled"))
     with pytest.raises(NPAError, match="others must name species, got 'species_7'"):
-        SpeciesVecEnv(batch(), others={"species_7": None})
+        SpeciesVecEnv(batch(), others={"species_7": still})
     with pytest.raises(NPAError, match="others must leave at least one species"):
-        SpeciesVecEnv(batch(), others={"species_0": None, "species_1": None})
+        SpeciesVecEnv(batch(), others={"species_0": still, "species_1": still})
     with pytest.raises(NPAError, match="species must be one whose particles are rows"):
-        SpeciesVecEnv(batch(), others={"species_0": None}).policy(None, "species_0")
+        SpeciesVecEnv(batch(), others={"species_0": still}).policy(None, "species_0")
+    with pytest.raises(NPAError, match=r"got object for 'species_0': RowPolicy\(model\) makes one"):
+        SpeciesVecEnv(batch(), others={"species_0": object()})
+
+
+def test_rows_need_worlds_and_an_action_each():
+    rows = SpeciesVecEnv(batch(**DEADLY), others={"species_1": still})
+    with pytest.raises(NPAError, match="step needs worlds: call reset first"):
+        rows.step(np.zeros((6, 18)))
+    rows.reset()
+    # As many numbers as wanted, but of twelve rows.
+    with pytest.raises(NPAError, match=r"\[B R, A\] = \(6, 18\), got \(12, 9\): one for each row"):
+        rows.step(np.zeros((12, 9)))
+    assert rows.step(np.zeros((6, 18)))[1].shape == (6,)
 
 
 LEARN = {"particle_count": 32, "state_dim": 4, "max_cycles": 16}

@@ -6,13 +6,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from npa_envs.errors import NPAError
 from npa_envs.wrappers.base import AnyVectorEnv, autoreset_mode, vector_env
 from npa_envs.wrappers.moments import as_tensor
-from npa_envs.wrappers.rows import RowVecEnv, on_host, row_space
+from npa_envs.wrappers.rows import RowVecEnv, check_same_step, on_host, row_space
 
 
 class ParticleVecEnv(RowVecEnv):
@@ -45,11 +43,7 @@ class ParticleVecEnv(RowVecEnv):
 
     def __init__(self, env: AnyVectorEnv, *, bootstrap: bool = True) -> None:
         base = vector_env(env, type(self).__name__)
-        if autoreset_mode(env) is not AutoresetMode.SAME_STEP:
-            raise NPAError(
-                f"env must restart worlds in the step that ends their episodes, got "
-                f"{autoreset_mode(env)}: make it with autoreset_mode='same-step'"
-            )
+        check_same_step(autoreset_mode(env))
         self.bootstrap = bootstrap
         """Whether rows cut off by the step limit say so."""
         self.particle_count = base.config.particle_count

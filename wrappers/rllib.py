@@ -68,6 +68,7 @@ def rllib_config(name: str, *, shared: bool = False, **keywords: Any) -> PPOConf
     make, task = MAKERS[name]
     env = make(task, **keywords)
     _, infos = env.reset(seed=0)
+    env.close()
     policies = {
         agent: EVERYONE if shared else f"species_{info['species']}" for agent, info in infos.items()
     }

@@ -8,7 +8,7 @@ from typing import Any, NoReturn
 import numpy as np
 import torch
 from gymnasium.spaces import Box
-from gymnasium.vector import VectorWrapper
+from gymnasium.vector import AutoresetMode, VectorWrapper
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -83,7 +83,16 @@ class RowVecEnv(VecEnv):
 
         Args:
             actions: Of each row, shape [B R, A].
+
+        Raises:
+            NPAError: They have another shape, which could be read as that of other rows.
         """
+        wanted = (self.num_envs, *(self.action_space.shape or ()))
+        if np.shape(actions) != wanted:
+            raise NPAError(
+                f"actions must have shape [B R, A] = {wanted}, got {np.shape(actions)}: "
+                "one for each row"
+            )
         self._actions = actions.reshape(self.world_count, self.row_count, -1)
 
     def taken_actions(self) -> NDArray[np.float32]:
@@ -194,6 +203,22 @@ class RowVecEnv(VecEnv):
             if hasattr(layer, name):
                 return layer
         raise AttributeError(f"{self.vector_env} has no attribute {name!r}")
+
+
+def check_same_step(mode: AutoresetMode) -> None:
+    """Check that worlds restart by themselves, as rows have to.
+
+    Args:
+        mode: How the environment restarts worlds.
+
+    Raises:
+        NPAError: Not in the step that ends their episodes.
+    """
+    if mode is not AutoresetMode.SAME_STEP:
+        raise NPAError(
+            f"env must restart worlds in the step that ends their episodes, got {mode}: "
+            "make it with autoreset_mode='same-step'"
+        )
 
 
 def on_host(*given: Any) -> list[NDArray[Any]]:

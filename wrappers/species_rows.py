@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 import torch
 from gymnasium.spaces import Box
-from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.envs.species.vector import MultiSpeciesVectorEnv
 from npa_envs.errors import NPAError, suggest
 from npa_envs.wrappers.moments import as_tensor
-from npa_envs.wrappers.rows import RowVecEnv, on_host, row_space
+from npa_envs.wrappers.rows import RowVecEnv, check_same_step, on_host, row_space
 
 SpeciesPolicy = Callable[[Any], Any]
 """Takes a species' observations, shape [B, N_k, P], and returns its actions, [B, N_k, A]."""
@@ -69,7 +68,7 @@ class SpeciesVecEnv(RowVecEnv):
 
     Raises:
         NPAError: `env` is another environment, or does not restart worlds by itself, or there is no
-            species of a name, or none left to be rows.
+            species of a name, or none left to be rows, or a policy is no function.
         MissingDependencyError: Stable-Baselines3 is not installed (on import).
     """
 
@@ -84,14 +83,15 @@ class SpeciesVecEnv(RowVecEnv):
                 f"env must be a batch of worlds of several species, got {type(env).__name__}: "
                 "make one with npa_envs.envs.multispecies_v0.batched"
             )
-        if env.autoreset_mode is not AutoresetMode.SAME_STEP:
-            raise NPAError(
-                f"env must restart worlds in the step that ends their episodes, got "
-                f"{env.autoreset_mode}: make it with autoreset_mode='same-step'"
-            )
+        check_same_step(env.autoreset_mode)
         self.others = dict(others or {})
         """Policies of species that are not rows."""
-        for name in self.others:
+        for name, policy in self.others.items():
+            if not callable(policy):
+                raise NPAError(
+                    f"others must hold functions of observations, got {type(policy).__name__} for "
+                    f"{name!r}: RowPolicy(model) makes one of a model"
+                )
             if name not in env.possible_agents:
                 raise NPAError(
                     f"others must name species, got {name!r}: "
@@ -129,8 +129,11 @@ class SpeciesVecEnv(RowVecEnv):
             infos.
 
         Raises:
-            NPAError: An action is not finite; the worlds are then as they were.
+            NPAError: There are no worlds yet, or an action is not finite; they are then as they
+                were.
         """
+        if not self._seen:
+            raise NPAError("step needs worlds: call reset first")
         own = np.split(self.taken_actions(), np.cumsum(self._counts)[:-1], axis=1)
         actions: dict[str, Any] = dict(zip(self.rows_of, own, strict=True))
         actions |= {name: policy(self._seen[name]) for name, policy in self.others.items()}

@@ -73,6 +73,10 @@ class SpeciesTask:
             )
         self.config = config
         self.device = device
+        middle = 0.5 * (config.species_count - 1)
+        places = [config.seed_distance * (k - middle) for k in range(config.species_count)]
+        # Sent once: worlds that restart would wait for it.
+        self._shift = torch.tensor(places).repeat_interleave(torch.tensor(config.counts)).to(device)
 
     def start(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
         """Return fresh worlds: each species uniform in a disk of its own, all states zero.
@@ -86,10 +90,7 @@ class SpeciesTask:
         config = self.config
         shape = random.world_count, sum(config.counts)
         x = uniform_ball(*shape, 2, config.seed_radius, generator=random, device=self.device)
-        middle = 0.5 * (config.species_count - 1)
-        places = [config.seed_distance * (k - middle) for k in range(config.species_count)]
-        shift = torch.tensor(places).repeat_interleave(torch.tensor(config.counts))
-        x[..., 0] += shift.to(self.device)
+        x[..., 0] += self._shift
         return x, x.new_zeros(*shape, config.state_dim)
 
     def losses(self, population: Population) -> Mapping[str, Tensor]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.envs.arrays import checked_particles
-from npa_envs.envs.memory import check_memory
+from npa_envs.envs.memory import OBSERVATION_COPIES, check_memory
 from npa_envs.envs.species.cohort import Cohort, Judge
 from npa_envs.envs.species.task import Population, SpeciesTask
 from npa_envs.envs.task import EnvTask
@@ -50,7 +50,8 @@ class SpeciesWorlds:
         """Particles of all species at the start of an episode, N."""
         self.physics = make_physics(config.world, EnvTask)
         """The worlds' constants."""
-        check_memory(world_count, count, self.physics, self.device)
+        told_apart = 4 * OBSERVATION_COPIES * world_count * count * self._appended
+        check_memory(world_count, count, self.physics, self.device, told_apart)
         self.task = task_type(config, self.device)
         self.species = np.repeat(np.arange(config.species_count), config.counts)
         """Species of each particle that an episode starts with, int64, shape [N]."""
@@ -75,9 +76,14 @@ class SpeciesWorlds:
     @property
     def perception_dim(self) -> int:
         """Numbers that a particle perceives: P, and K (1 + D) more where species are told apart."""
-        told_apart = self.config.perception == "per_species"
-        appended = self.config.species_count * (1 + self.physics.space_dim) if told_apart else 0
-        return self.physics.perception_dim + appended
+        return self.physics.perception_dim + self._appended
+
+    @property
+    def _appended(self) -> int:
+        """Numbers that a particle perceives of species one by one."""
+        if self.config.perception == "shared":
+            return 0
+        return int(self.config.species_count * (1 + self.physics.space_dim))
 
     @property
     def agent_count(self) -> int:

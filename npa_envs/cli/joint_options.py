@@ -34,7 +34,7 @@ class SpeciesOptions(Morphogenesis2DConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class JointOptions(JointTrainConfig[SpeciesOptions]):
-    """The run's options without that of a run of one rule."""
+    """A training run of several rules in one world; what is said of a species holds for all."""
 
     initial_rule: tyro.conf.Suppress[str] = ""
 

@@ -36,8 +36,8 @@ class StressOptions:
     """Where to run: cpu, cuda, cuda:1."""
 
     only: tuple[str, ...] = ()
-    """Groups (geometry, values, time, ranges, gradients, precision), checks, or what checks' names
-    begin with; default: all."""
+    """Groups (geometry, values, time, ranges, gradients, precision), checks (time/gecko), or the
+    first words of checks (geometry/clump); default: all."""
 
     max_seconds: float | None = None
     """Begin no check after so long [s]; what is left is skipped, and run by the next call."""
@@ -95,7 +95,9 @@ def run(options: StressOptions) -> int:
     from npa_envs.stress.suite import all_checks
 
     if options.max_seconds is not None and not options.max_seconds > 0.0:
-        raise NPAError(f"max_seconds must be positive, got {options.max_seconds}")
+        raise NPAError(
+            f"max_seconds must be positive, got {options.max_seconds}: leave it out for no limit"
+        )
     for name, least in (("seed", 0), ("threads", 1)):
         if getattr(options, name) < least:
             raise NPAError(f"{name} must be at least {least}, got {getattr(options, name)}")

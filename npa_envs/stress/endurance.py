@@ -95,11 +95,12 @@ def _run(name: str, session: Session) -> Finding:
         if not first and not found["not_finite"]:
             first, centroid = dict(found), x.mean(1)
         if not found["not_finite"]:
-            for key in ("extent", "energy"):
-                # A world that has come to rest: what it does then is rounding.
-                found[key] /= max(first[key], 1e-12)
             if open_space:
-                found["drift"] = float((x.mean(1) - centroid).norm(dim=-1).max()) / first["extent"]
+                found["drift"] = float((x.mean(1) - centroid).norm(dim=-1).max())
+            for key, unit in (("extent", "extent"), ("energy", "energy"), ("drift", "extent")):
+                if key in found:
+                    # A world that has come to rest: what it does then is rounding.
+                    found[key] /= max(first[unit], 1e-12)
         for key, value in found.items():
             figures[key] = max(value, figures.get(key, 0.0))
         over = [key for key, limit in limits.items() if not found.get(key, 0.0) <= limit]

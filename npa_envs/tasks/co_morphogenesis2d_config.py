@@ -31,8 +31,10 @@ class CoMorphogenesis2DConfig:
         """
         species = tuple(self.species)
         if len(species) < 2 or not all(isinstance(s, Morphogenesis2DConfig) for s in species):
+            came = ", ".join(type(config).__name__ for config in species) or "nothing"
             raise NPAError(
-                f"species must hold two Morphogenesis2DConfig or more, got {self.species!r}"
+                f"species must hold two Morphogenesis2DConfig or more, got {came}: one for each "
+                "species"
             )
         for name in ("eps", "update_prob", "state_dim"):
             values = [getattr(config, name) for config in species]

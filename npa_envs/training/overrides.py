@@ -40,7 +40,9 @@ def override(config: TrainConfig[TaskConfigT], /, **fields: Any) -> TrainConfig[
         if name == "task" and isinstance(value, Mapping):
             for inner, inner_value in value.items():
                 if inner not in task_types:
-                    raise NPAError(f"unknown field 'task.{inner}': {suggest(inner, task_types)}")
+                    raise NPAError(
+                        f"unknown field 'task.{inner}': {suggest(str(inner), task_types)}"
+                    )
                 task_changes[inner] = _converted(task, inner, inner_value)
         elif name == "task":
             if type(value) is not type(config.task):
@@ -175,7 +177,7 @@ def _convert(name: str, value: Any, kind: Any, present: Any) -> Any:
         known = _field_types(present)
         for inner in value:
             if inner not in known:
-                raise NPAError(f"unknown field '{name}.{inner}': {suggest(inner, known)}")
+                raise NPAError(f"unknown field '{name}.{inner}': {suggest(str(inner), known)}")
         changes = {k: _converted(present, k, v) for k, v in value.items()}
         return dataclasses.replace(present, **changes)
     if kind is Path and isinstance(value, str | Path):
