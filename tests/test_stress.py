@@ -302,6 +302,17 @@ def test_ranges_run_for_as_many_updates_and_as_much_time_as_trained(monkeypatch)
     assert entry.note == "not finite at 2"
 
 
+def test_what_grew_at_another_radius_is_measured_at_its_trained_size(device):
+    free, held = (habitat(session(device), name) for name in ("heart", "dots"))
+    as_trained = free.metric(free.x, free.s)
+    eps = free.task.eps
+    assert free.metric(2.0 * free.x, free.s, eps=2.0 * eps) == pytest.approx(as_trained, rel=1e-5)
+    assert free.metric(2.0 * free.x, free.s, eps=eps) != pytest.approx(as_trained, rel=0.01)
+    # A periodic box keeps its size.
+    metric = held.metric(held.x, held.s)
+    assert held.metric(held.x, held.s, eps=2.0 * held.task.eps) == metric
+
+
 # The command
 
 

@@ -61,8 +61,19 @@ class Habitat:
         task = self.task
         return {"eps": task.eps, "box": task.box, "update_prob": task.update_prob} | changed
 
-    def metric(self, x: Tensor, s: Tensor) -> float:
-        """Return how far worlds are from the goal, mean; lower is better."""
+    def metric(self, x: Tensor, s: Tensor, *, eps: float | None = None) -> float:
+        """Return how far worlds are from the goal, mean; lower is better.
+
+        What grows in open space is as large as the radius is: scaling positions and ε alike is a
+        symmetry of the dynamics. So it is measured at the size that it would have at the task's ε.
+
+        Args:
+            x: Positions [length units], shape [B, N, D].
+            s: States, shape [B, N, C].
+            eps: Perception radius of the worlds [length units]; None: the task's.
+        """
+        if eps is not None and self.task.box is None and not self.rule.static:
+            x = x * (self.task.eps / eps)
         with torch.no_grad():
             return float(self.task.metric(x, s).mean())
 

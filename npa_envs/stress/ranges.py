@@ -65,7 +65,7 @@ AXES = (
     ),
     Axis(
         "eps",
-        "perception radius over the trained one",
+        "perception radius over the trained one; what grows freely is measured at its trained size",
         (0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.4, 1.7, 2.0),
         (0.7, 1.0, 1.4),
     ),
@@ -166,5 +166,5 @@ def _metric(home: Habitat, session: Session, steps: int, options: dict[str, Any]
     run = LongRun(home, session.generator(1), options)
     run.advance(steps)
     finite = bool(run.x.isfinite().all()) and bool(run.s.isfinite().all())
-    metric = home.metric(run.x, run.s) if finite else math.nan
+    metric = home.metric(run.x, run.s, eps=options["eps"]) if finite else math.nan
     return metric if math.isfinite(metric) else math.nan
