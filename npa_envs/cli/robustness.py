@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from npa_envs.robustness.grounds import Ground
     from npa_envs.robustness.record import RuleRecord
 
-QUICK_SEEDS, QUICK_PARTICLES = 2, 512
+QUICK_SEEDS, QUICK_PARTICLES = 2, 256
 """Seeds and particles of a quick run."""
 
 
