@@ -201,7 +201,11 @@ def test_a_course_counts_its_seeds():
     assert course.recovery_steps() == [16, 32, 16, None]
     assert (course.recovered(), course.median_step(), course.within_at_end()) == (3, 16, 2)
     assert course.ratios(-1) == [1.0, 1.0, 2.0, 2.0]
-    assert recovered_share([record(course, dataclasses.replace(course, damage=CONTROL))]) == (3, 4)
+    assert recovered_share([record(course, dataclasses.replace(course, damage=CONTROL))]) == (
+        3,
+        2,
+        4,
+    )
 
 
 def record(*found: Course, **changed) -> RuleRecord:
@@ -327,7 +331,7 @@ def test_tables_say_who_recovered_when_and_what_was_not_measured():
     assert "| dots | – |" in text
     assert "| heart | 0.75 | 1 | 1.67 | nan |" in text
     assert "| heart | 0.75 | 1 | – |" in text
-    assert text.endswith("Recovered: 1 of 2 rule × damage × seed, 50.0%.\n")
+    assert "Recovered: 1 of 2 rule × damage × seed, 50.0%; within 1.1 at the end: 1, 50.0%." in text
 
 
 def test_curves_are_drawn_by_task():

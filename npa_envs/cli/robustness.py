@@ -42,7 +42,7 @@ class RobustnessOptions:
 
     most_particles: int | None = None
     """Particles of all seeds' worlds together, above which a condition is left out; default:
-    131072 on a CPU, 1048576 on CUDA."""
+    131072 on a CPU, 2097152 on CUDA."""
 
     quick: bool = False
     """Small worlds, few steps and values: figures that say nothing but that it runs."""

@@ -13,7 +13,7 @@ from npa_envs.randomness import Purpose
 from npa_envs.robustness.grounds import Ground, Home, courses
 from npa_envs.robustness.plans import TRAINED
 
-MOST_PARTICLES = {"cpu": 1 << 17, "cuda": 1 << 20}
+MOST_PARTICLES = {"cpu": 1 << 17, "cuda": 1 << 21}
 """Particles of all worlds together; where there would be more, a value is left out."""
 
 
@@ -98,4 +98,7 @@ def responses(ground: Ground, trained: Response, most_particles: int) -> Iterato
             if total > max(most_particles, ground.world_count * ground.particle_count):
                 yield Response(condition, value, 0, (), note=f"{total} particles in all")
                 continue
-            yield grow(ground, condition, value)[1]
+            try:
+                yield grow(ground, condition, value)[1]
+            except torch.OutOfMemoryError:
+                yield Response(condition, value, 0, (), note=f"no memory for {total} particles")

@@ -9,20 +9,22 @@ from npa_envs.robustness.conditions import Response
 from npa_envs.robustness.damages import DAMAGES
 from npa_envs.robustness.plans import CONDITIONS
 from npa_envs.robustness.record import RuleRecord
-from npa_envs.robustness.recovery import CONTROL, Course
+from npa_envs.robustness.recovery import CONTROL, RECOVERED, Course
 
 NONE = "–"
 """What was not measured."""
 
 
-def recovered_share(records: Iterable[RuleRecord]) -> tuple[int, int]:
-    """Return how many of all rules' damages and seeds recovered, and how many there are.
+def recovered_share(records: Iterable[RuleRecord]) -> tuple[int, int, int]:
+    """Return how many of all rules' damages and seeds recovered, are so at the end, and there are.
 
     Args:
         records: Those of the rules; the control does not count.
     """
     courses = [c for record in records for c in record.courses if c.damage != CONTROL]
-    return sum(c.recovered() for c in courses), sum(len(c.losses) for c in courses)
+    recovered = sum(course.recovered() for course in courses)
+    at_end = sum(course.within_at_end() for course in courses)
+    return recovered, at_end, sum(len(course.losses) for course in courses)
 
 
 def tables(records: Sequence[RuleRecord]) -> str:
@@ -34,15 +36,18 @@ def tables(records: Sequence[RuleRecord]) -> str:
     parts = [
         f"Recovered seeds, and their median recovery time [steps]:\n\n{_by_damage(records, _time)}",
         "Loss over the twin's right after the damage → at the end (medians of the seeds; seeds "
-        f"within 1.1 at the end):\n\n{_by_damage(records, _size)}",
+        f"within {RECOVERED:g} at the end):\n\n{_by_damage(records, _size)}",
     ]
     for condition, summary in CONDITIONS.items():
         table = _by_value(records, condition)
         if table:
             parts.append(f"Loss over that as trained, by {summary}:\n\n{table}")
-    recovered, total = recovered_share(records)
-    share = f"{recovered / total:.1%}" if total else "none"
-    parts.append(f"Recovered: {recovered} of {total} rule × damage × seed, {share}.")
+    recovered, at_end, total = recovered_share(records)
+    if total:
+        parts.append(
+            f"Recovered: {recovered} of {total} rule × damage × seed, {recovered / total:.1%}; "
+            f"within {RECOVERED:g} at the end: {at_end}, {at_end / total:.1%}."
+        )
     return "\n\n".join(parts) + "\n"
 
 
