@@ -135,9 +135,9 @@ def run(options: RobustnessOptions, command: str = "") -> int:
             records.append(record)
             bar.advance(1)
     text = tables(records)
-    print(text, end="")
-    if folder is not None:
-        _write(folder, text, records)
+    # Before it is printed: whoever reads that may have seen enough.
+    written = [] if folder is None else _write(folder, text, records)
+    print("\n".join([text, *written]))
     return 0
 
 
@@ -182,20 +182,20 @@ def _facts(options: RobustnessOptions, device: torch.device, most: int) -> dict[
     }
 
 
-def _write(folder: Path, text: str, records: Sequence[RuleRecord]) -> None:
-    """Write the tables and, where matplotlib is installed, the curves."""
+def _write(folder: Path, text: str, records: Sequence[RuleRecord]) -> list[str]:
+    """Write the tables and, where matplotlib is installed, the curves; return what was done."""
     from npa_envs.bench.plots import check_matplotlib
     from npa_envs.files import write_bytes, write_text
     from npa_envs.robustness.plots import pictures
 
     write_text(folder / "robustness.md", text)
-    print(f"wrote {folder}: robustness.md and a record for each rule")
+    done = [f"wrote {folder}: robustness.md and a record for each rule"]
     try:
         check_matplotlib()
     except MissingDependencyError as error:
-        print(f"no curves: {error}")
-        return
+        return [*done, f"no curves: {error}"]
     for task, picture in pictures(records).items():
         path = folder / f"robustness_{task}.png"
         write_bytes(path, picture)
-        print(f"wrote {path}")
+        done.append(f"wrote {path}")
+    return done
