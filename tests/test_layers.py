@@ -82,15 +82,18 @@ LADDER = {
     "npa_envs": rung(9, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
     "npa_envs.cli.worlds": rung(9, "torch", never=INSIDES),
     "npa_envs.stress": rung(10, "torch matplotlib", never=("npa_envs.kernels",)),
-    "npa_envs.cli": rung(
-        11, "torch numpy tqdm tyro", never=("npa_envs.kernels", "npa_envs.reference")
+    "npa_envs.robustness": rung(
+        11, "torch matplotlib", never=("npa_envs.kernels", "npa_envs.reference")
     ),
-    "npa_envs.envs": rung(11, "torch numpy gymnasium pettingzoo", never=INSIDES),
+    "npa_envs.cli": rung(
+        12, "torch numpy tqdm tyro", never=("npa_envs.kernels", "npa_envs.reference")
+    ),
+    "npa_envs.envs": rung(12, "torch numpy gymnasium pettingzoo", never=INSIDES),
     "npa_envs.wrappers": rung(
-        12, "torch numpy gymnasium pettingzoo stable_baselines3 ray", never=INSIDES
+        13, "torch numpy gymnasium pettingzoo stable_baselines3 ray", never=INSIDES
     ),
     "npa_envs.agents": rung(
-        13, "torch numpy tqdm gymnasium pettingzoo stable_baselines3", never=INSIDES
+        14, "torch numpy tqdm gymnasium pettingzoo stable_baselines3", never=INSIDES
     ),
 }
 WARP_AND_TORCH = {"npa_envs.sph", "npa_envs.bench.hash_grid"}

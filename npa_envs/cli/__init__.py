@@ -16,6 +16,7 @@ COMMANDS = {
     "interact": "grow rules beside each other: what each does to the other",
     "bench": "run time against error, the paper's table, scaling; a call explained",
     "stress": "hard cases, what is expected of each, and where things break",
+    "robustness": "what rules bear and what they heal: losses and recovery times over many seeds",
     "list": "tasks, presets, environments, built-in targets, losses, shipped rules",
     "warmup": "compile the kernels ahead of time",
     "doctor": "versions, devices, kernel cache, fonts",
@@ -99,6 +100,10 @@ def _dispatch(words: list[str]) -> int:
             from npa_envs.cli import stress
 
             return stress.main(rest)
+        case "robustness":
+            from npa_envs.cli import robustness
+
+            return robustness.main(rest)
         case "list":
             from npa_envs.cli import listing
 

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from npa_envs.cli.worlds import task_of_rule, trained_config
 from npa_envs.dynamics import rollout
+from npa_envs.randomness import Randomness
 from npa_envs.replay import capture
 from npa_envs.rule import NPARule
 from npa_envs.rule_io import load_rule, rule_metadata, shipped_rules
@@ -144,40 +145,42 @@ def trained_particles(session: Session, name: str) -> int:
 class LongRun:
     """Worlds that are run for very long, without gradients.
 
-    On CUDA, `CHUNK` steps are recorded as a graph, which is replayed: their launches would take
+    On CUDA, a chunk of steps is recorded as a graph, which is replayed: their launches would take
     most of the time.
 
     Args:
         home: The rule, and worlds to start from.
         generator: Source of masks and noise, on their device.
         options: Of `rollout`.
+        chunk: Steps that are recorded as a graph.
     """
 
-    def __init__(self, home: Habitat, generator: torch.Generator, options: dict[str, Any]) -> None:
+    def __init__(
+        self, home: Habitat, generator: Randomness, options: dict[str, Any], *, chunk: int = CHUNK
+    ) -> None:
         self.x, self.s = home.x.clone(), home.s.clone()
         self._rule, self._generator, self._options = home.rule, generator, options
+        self._steps = chunk
         self._graph: torch.cuda.CUDAGraph | None = None
 
     def advance(self, steps: int) -> None:
         """Run some steps more."""
         if self.x.is_cuda:
-            while steps >= CHUNK:
+            own = self._generator if isinstance(self._generator, torch.Generator) else None
+            while steps >= self._steps:
                 if self._graph is None:
                     # The warm-up is a chunk of the run.
                     self._graph = capture(
-                        self._chunk,
-                        self.x.device,
-                        generator=self._generator,
-                        warm_up=self._chunk,
+                        self._chunk, self.x.device, generator=own, warm_up=self._chunk
                     )
                 else:
                     self._graph.replay()
-                steps -= CHUNK
+                steps -= self._steps
         if steps:
             self._run(steps)
 
     def _chunk(self) -> None:
-        self._run(CHUNK)
+        self._run(self._steps)
 
     @torch.no_grad()
     def _run(self, steps: int) -> None:

@@ -1,0 +1,201 @@
+"""`npa-envs robustness`: what rules bear, and what they heal, over many seeds."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from npa_envs.errors import MissingDependencyError, NPAError, suggest
+
+if TYPE_CHECKING:
+    import torch
+
+    from npa_envs.robustness.grounds import Ground
+    from npa_envs.robustness.record import RuleRecord
+
+QUICK_SEEDS, QUICK_PARTICLES = 2, 256
+"""Seeds and particles of a quick run."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobustnessOptions:
+    """Measure how rules grow under other conditions, and how they recover from damage.
+
+    Unlike `npa-envs stress` this expects nothing and gives no verdicts: it is a table of figures
+    over seeds. With --output a JSON file is written once a rule is done, and a run that was stopped
+    goes on with the next one.
+    """
+
+    rules: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RULES")] = ()
+    """Shipped rules (`npa-envs list`); default: all."""
+
+    seed_count: int | None = None
+    """Seeds for each figure; default: 8, or 2 when quick."""
+
+    first_seed: int = 1_000_000
+    """The first seed's number; training uses others."""
+
+    most_particles: int | None = None
+    """Particles of all seeds' worlds together, above which a condition is left out; default:
+    131072 on a CPU, 2097152 on CUDA."""
+
+    quick: bool = False
+    """Small worlds, few steps and values: figures that say nothing but that it runs."""
+
+    device: str = "cpu"
+    """Where to run: cpu, cuda, cuda:1."""
+
+    threads: int = 1
+    """CPU threads of torch and of the kernels; the figures are the same."""
+
+    output: Path | None = None
+    """Folder for robustness_RULE.json, robustness.md, and curves (extra `bench`); default: nothing
+    is written."""
+
+    commit: str | None = None
+    """Commit that is measured; default: that of the checkout."""
+
+    progress: bool = True
+    """Show a progress bar."""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run the command.
+
+    Args:
+        arguments: The words after `npa-envs robustness`.
+
+    Returns:
+        0.
+
+    Raises:
+        NPAError: There is no such rule or device, a number is out of range, or the folder cannot be
+            written to or holds figures of other settings.
+    """
+    options = tyro.cli(RobustnessOptions, prog="npa-envs robustness", args=arguments)
+    return run(options, shlex.join(["npa-envs", "robustness", *arguments]))
+
+
+def run(options: RobustnessOptions, command: str = "") -> int:
+    """Measure, print and write.
+
+    Args:
+        options: What the command line said.
+        command: The command line, for the records.
+
+    Raises:
+        NPAError: As for `main`.
+    """
+    from npa_envs.cli.bench import torch_threads
+    from npa_envs.cli.progress import StepBar
+    from npa_envs.cli.rollout import check_writable
+    from npa_envs.cli.worlds import make_folder
+    from npa_envs.devices import check_device
+    from npa_envs.robustness.conditions import MOST_PARTICLES
+    from npa_envs.robustness.record import read_record
+    from npa_envs.robustness.study import measure_rule
+    from npa_envs.robustness.tables import tables
+
+    for name, least in {
+        "seed_count": 1,
+        "first_seed": 0,
+        "most_particles": 1,
+        "threads": 1,
+    }.items():
+        value = getattr(options, name)
+        if value is not None and value < least:
+            raise NPAError(f"{name} must be at least {least}, got {value}")
+    names = _chosen(options.rules)
+    device = check_device(options.device)
+    most = options.most_particles or MOST_PARTICLES[device.type]
+    facts = _facts(options, device, most)
+    folder = options.output
+    if folder is not None:
+        check_writable(make_folder(folder))
+    paths = {name: folder / f"robustness_{name}.json" for name in names} if folder else {}
+    # All are read first: a file of other settings is refused before any work is done.
+    before = {name: read_record(path, facts) for name, path in paths.items()}
+    records = []
+    with (
+        StepBar(len(names), show=options.progress, unit="rule") as bar,
+        torch_threads(options.threads),
+    ):
+        for name in names:
+            record = before.get(name)
+            if record is None:
+                ground = _ground(options, name, device)
+                record = measure_rule(name, ground, most, facts=facts, command=command)
+                if name in paths:
+                    record.write(paths[name])
+            records.append(record)
+            bar.advance(1)
+    text = tables(records)
+    # Before it is printed: whoever reads that may have seen enough.
+    written = [] if folder is None else _write(folder, text, records)
+    print("\n".join([text, *written]))
+    return 0
+
+
+def _chosen(names: Sequence[str]) -> list[str]:
+    from npa_envs.stress.habitats import rule_names
+
+    known = rule_names()
+    for name in names:
+        if name not in known:
+            raise NPAError(f"unknown rule {name!r}: {suggest(name, known)}")
+    return [name for name in known if not names or name in names]
+
+
+def _seeds(options: RobustnessOptions) -> range:
+    count = options.seed_count or (QUICK_SEEDS if options.quick else 8)
+    return range(options.first_seed, options.first_seed + count)
+
+
+def _ground(options: RobustnessOptions, name: str, device: torch.device) -> Ground:
+    from npa_envs.robustness.grounds import Ground
+    from npa_envs.robustness.plans import PLANS, quick_plan
+    from npa_envs.stress.habitats import task_name
+
+    task = task_name(name)
+    plan = quick_plan(task) if options.quick else PLANS[task]
+    small = QUICK_PARTICLES if options.quick else None
+    return Ground(name, device, plan, _seeds(options), small)
+
+
+def _facts(options: RobustnessOptions, device: torch.device, most: int) -> dict[str, Any]:
+    """Return what figures follow from."""
+    from npa_envs.bench.report import current_commit, machine, versions
+
+    return {
+        "device": device.type,
+        "machine": machine(device),
+        "quick": options.quick,
+        "seeds": list(_seeds(options)),
+        "most_particles": most,
+        "commit": options.commit or current_commit(),
+        "versions": versions(),
+    }
+
+
+def _write(folder: Path, text: str, records: Sequence[RuleRecord]) -> list[str]:
+    """Write the tables and, where matplotlib is installed, the curves; return what was done."""
+    from npa_envs.bench.plots import check_matplotlib
+    from npa_envs.files import write_bytes, write_text
+    from npa_envs.robustness.plots import pictures
+
+    write_text(folder / "robustness.md", text)
+    done = [f"wrote {folder}: robustness.md and a record for each rule"]
+    try:
+        check_matplotlib()
+    except MissingDependencyError as error:
+        return [*done, f"no curves: {error}"]
+    for task, picture in pictures(records).items():
+        path = folder / f"robustness_{task}.png"
+        write_bytes(path, picture)
+        done.append(f"wrote {path}")
+    return done

@@ -1,0 +1,118 @@
+"""Records as tables in Markdown: for the eye, and for the documentation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+
+from npa_envs.robustness.conditions import Response
+from npa_envs.robustness.damages import DAMAGES
+from npa_envs.robustness.plans import CONDITIONS
+from npa_envs.robustness.record import RuleRecord
+from npa_envs.robustness.recovery import CONTROL, RECOVERED, Course
+
+NONE = "–"
+"""What was not measured."""
+
+
+def recovered_share(records: Iterable[RuleRecord]) -> tuple[int, int, int]:
+    """Return how many of all rules' damages and seeds recovered, are so at the end, and there are.
+
+    Args:
+        records: Those of the rules; the control does not count.
+    """
+    courses = [c for record in records for c in record.courses if c.damage != CONTROL]
+    recovered = sum(course.recovered() for course in courses)
+    at_end = sum(course.within_at_end() for course in courses)
+    return recovered, at_end, sum(len(course.losses) for course in courses)
+
+
+def tables(records: Sequence[RuleRecord]) -> str:
+    """Return all tables and, last, the share that recovered.
+
+    Args:
+        records: Those of the rules.
+    """
+    parts = [
+        f"Recovered seeds, and their median recovery time [steps]:\n\n{_by_damage(records, _time)}",
+        "Loss over the twin's right after the damage → at the end (medians of the seeds; seeds "
+        f"within {RECOVERED:g} at the end):\n\n{_by_damage(records, _size)}",
+    ]
+    for condition, summary in CONDITIONS.items():
+        table = _by_value(records, condition)
+        if table:
+            parts.append(f"Loss over that as trained, by {summary}:\n\n{table}")
+    recovered, at_end, total = recovered_share(records)
+    if total:
+        parts.append(
+            f"Recovered: {recovered} of {total} rule × damage × seed, {recovered / total:.1%}; "
+            f"within {RECOVERED:g} at the end: {at_end}, {at_end / total:.1%}."
+        )
+    return "\n\n".join(parts) + "\n"
+
+
+def short(value: float) -> str:
+    """Return a number with three digits."""
+    return f"{value:.3g}"
+
+
+def _time(course: Course) -> str:
+    step = course.median_step()
+    told = f"{course.recovered()}/{len(course.losses)}"
+    return told if step is None else f"{told}, {step:g}"
+
+
+def _size(course: Course) -> str:
+    first, last = _median(course.ratios(0)), _median(course.ratios(-1))
+    return f"{short(first)} → {short(last)} ({course.within_at_end()}/{len(course.losses)})"
+
+
+def _median(values: Sequence[float]) -> float:
+    """Return the median; what is not a number counts as worst."""
+    ordered = sorted(math.inf if math.isnan(value) else value for value in values)
+    low, high = ordered[(len(ordered) - 1) // 2], ordered[len(ordered) // 2]
+    return low if low == high else 0.5 * (low + high)
+
+
+def _by_damage(records: Sequence[RuleRecord], cell: Callable[[Course], str]) -> str:
+    done = {course.damage for record in records for course in record.courses}
+    names = [name for name in (CONTROL, *DAMAGES) if name in done]
+    rows = []
+    for record in records:
+        found = {course.damage: course for course in record.courses}
+        rows.append([record.rule, *(cell(found[n]) if n in found else NONE for n in names)])
+    return _table(["rule", *names], rows)
+
+
+def _by_value(records: Sequence[RuleRecord], condition: str) -> str:
+    """Return a table of mean losses over those as trained, which the second column tells."""
+    found = {
+        (record.rule, response.value): response
+        for record in records
+        for response in record.responses
+        if response.condition == condition
+    }
+    values = list(dict.fromkeys(value for _, value in found))
+    rows = [
+        [
+            record.rule,
+            short(record.trained().mean()),
+            *(_change(record, found.get((record.rule, value))) for value in values),
+        ]
+        for record in records
+        if any((record.rule, value) in found for value in values)
+    ]
+    heads = [value if isinstance(value, str) else short(value) for value in values]
+    return _table(["rule", "loss as trained", *heads], rows) if rows else ""
+
+
+def _change(record: RuleRecord, response: Response | None) -> str:
+    if response is None or not response.losses:
+        return NONE
+    mean, trained = response.mean(), record.trained().mean()
+    return short(mean / trained) if trained else short(mean)
+
+
+def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [heads, ["---"] * len(heads), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)

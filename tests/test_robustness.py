@@ -1,0 +1,368 @@
+"""Rules are tried under other conditions and damaged beside twins; recovery is what it is said."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+from npa_envs.cli import main
+from npa_envs.errors import NPAError
+from npa_envs.randomness import WorldRandom
+from npa_envs.robustness.conditions import Response, grow, responses
+from npa_envs.robustness.damages import DAMAGES, STATE_NOISE, wrapped
+from npa_envs.robustness.grounds import Ground, courses
+from npa_envs.robustness.plans import CONDITIONS, PLANS, Plan, quick_plan
+from npa_envs.robustness.plots import pictures
+from npa_envs.robustness.record import RuleRecord, read_record
+from npa_envs.robustness.recovery import CONTROL, Course, healing, recovery_step
+from npa_envs.robustness.shapes import BLOB_DISTANCE, SHAPES, SIZE_FACTOR, disk
+from npa_envs.robustness.tables import recovered_share, tables
+from npa_envs.stress.habitats import rule_names, task_name
+
+SIDE = 2.0
+COUNT = 501
+TINY = Plan(
+    grow_steps=8,
+    heal_steps=(0, 4, 8),
+    chunk=4,
+    values={"eps": (1.0, 2.0), "particles": (1.0, 2.0), "update_prob": (0.25, 0.5)},
+)
+
+
+def ground(name: str, device: torch.device, plan: Plan = TINY, particles: int = 128) -> Ground:
+    return Ground(name, device, plan, range(5, 7), particles)
+
+
+def damaged(name: str, x: torch.Tensor, s: torch.Tensor, box=None, seeds=(1, 2, 3)):
+    before = x.clone(), s.clone()
+    found = DAMAGES[name].apply(x, s, WorldRandom(list(seeds), device=x.device), box)
+    assert torch.equal(x, before[0])
+    assert torch.equal(s, before[1])
+    return found
+
+
+@pytest.fixture(params=[(2, False), (2, True), (3, False)], ids=["2d", "periodic", "3d"])
+def worlds(request, device):
+    space_dim, periodic = request.param
+    draws = torch.Generator().manual_seed(0)
+    x = SIDE * (torch.rand(3, COUNT, space_dim, generator=draws) - 0.5)
+    s = torch.randn(3, COUNT, 4, generator=draws)
+    return x.to(device), s.to(device), (SIDE,) * space_dim if periodic else None
+
+
+# Damages
+
+
+def test_erased_particles_are_those_within_a_radius_of_one(worlds):
+    x, s, box = worlds
+    new_x, new_s = damaged("erase", x, s, box)
+    assert torch.equal(new_x, x)
+    for world in range(3):
+        erased = (new_s[world] == 0.0).all(-1)
+        kept = ~erased
+        assert torch.equal(new_s[world, kept], s[world, kept])
+        # One of them is the centre: all others are within the radius, and nobody else is.
+        away = wrapped(x[world, erased][:, None] - x[world][None], box).norm(dim=-1)
+        centres = [torch.equal(row <= 0.2, erased) for row in away]
+        assert any(centres)
+        assert 1 < int(erased.sum()) < COUNT // 2
+
+
+def test_a_cut_leaves_nobody_near_a_line_and_moves_only_those_beside_it(worlds):
+    x, s, box = worlds
+    new_x, new_s = damaged("cut", x, s, box)
+    moved = wrapped(new_x - x, box)
+    distance = moved.norm(dim=-1)
+    assert torch.equal(new_s, s)
+    assert 0.04 < float(distance.max()) <= 0.05 + 1e-5
+    assert 0 < int((distance > 1e-4).sum()) < 0.4 * distance.numel()
+    for world in range(3):
+        furthest = distance[world].argmax()
+        normal = moved[world, furthest] / distance[world, furthest]
+        along = moved[world] @ normal
+        assert torch.allclose(along.abs(), distance[world], atol=1e-5)
+        if box is None:
+            height = (new_x[world] - x[world].mean(0)) @ normal
+            assert float(height.abs().min()) >= 0.05 - 1e-4
+
+
+def test_a_clump_gathers_a_disk_in_the_place_of_one(worlds):
+    x, s, box = worlds
+    new_x, new_s = damaged("clump", x, s, box)
+    assert torch.equal(new_s, s)
+    for world in range(3):
+        moved = wrapped(new_x[world] - x[world], box).norm(dim=-1)
+        some = moved > 1e-5
+        assert int(some.sum()) > 1
+        place = new_x[world, some][:1]
+        assert float(wrapped(new_x[world, some] - place, box).norm(dim=-1).max()) < 1e-5
+        assert float(moved.max()) <= 0.2 + 1e-5
+        # Nobody of the disk was left out.
+        outside = wrapped(x[world, ~some] - place, box).norm(dim=-1)
+        assert int((outside <= 0.2 - 1e-5).sum()) == 1
+    if box is not None:
+        assert float(new_x.abs().max()) <= 0.5 * SIDE + 1e-6
+
+
+def test_noise_changes_all_states_by_as_much_as_it_says_and_no_position(worlds):
+    x, s, box = worlds
+    new_x, new_s = damaged("noise", x, s, box)
+    assert torch.equal(new_x, x)
+    assert float((new_s - s).std()) == pytest.approx(STATE_NOISE, rel=0.05)
+
+
+@pytest.mark.parametrize("name", ["half", "side"])
+def test_removals_leave_half_of_the_particles_as_they_were(worlds, name):
+    x, s, box = worlds
+    new_x, new_s = damaged(name, x, s, box)
+    assert new_x.shape[1] == new_s.shape[1] == COUNT // 2
+    for world in range(3):
+        rows = {tuple(row) for row in torch.cat((x[world], s[world]), 1).tolist()}
+        kept = {tuple(row) for row in torch.cat((new_x[world], new_s[world]), 1).tolist()}
+        assert kept <= rows
+        assert len(kept) == COUNT // 2
+
+
+def test_a_removed_side_is_a_side_and_a_removed_half_is_none(worlds):
+    x, s, box = worlds
+    shift = {n: (damaged(n, x, s, box)[0].mean(1) - x.mean(1)).norm(dim=-1) for n in DAMAGES}
+    assert float(shift["side"].min()) > 0.35
+    assert float(shift["half"].max()) < 0.12
+
+
+@pytest.mark.parametrize("name", DAMAGES)
+def test_a_damage_of_a_world_does_not_depend_on_the_others(worlds, name):
+    x, s, box = worlds
+    together = damaged(name, x, s, box)
+    alone = damaged(name, x[1:2], s[1:2], box, seeds=(2,))
+    assert all(torch.equal(a[1:2], b) for a, b in zip(together, alone, strict=True))
+
+
+# Seeds
+
+
+@pytest.mark.parametrize("space_dim", [2, 3])
+def test_seeds_of_other_shapes_are_where_they_should_be(space_dim, device):
+    radius, count = 0.5, 4000
+    found = {
+        name: shape(count, space_dim, radius, WorldRandom([3, 4], device=device))
+        for name, shape in {"disk": disk, **SHAPES}.items()
+    }
+    distance = {name: x.norm(dim=-1) for name, x in found.items()}
+    assert all(x.shape == (2, count, space_dim) for x in found.values())
+    outer = radius * 2.0 ** (1.0 / space_dim)
+    assert radius - 1e-5 <= float(distance["ring"].min()) < 1.01 * radius
+    assert 0.99 * outer < float(distance["ring"].max()) <= outer + 1e-5
+    # Uniform: half of the area lies within half of the area.
+    middle = radius * 1.5 ** (1.0 / space_dim)
+    assert float((distance["ring"] < middle).float().mean()) == pytest.approx(0.5, abs=0.03)
+    volume = math.pi * radius**2 if space_dim == 2 else 4.0 / 3.0 * math.pi * radius**3
+    sides = found["square"].amax(1) - found["square"].amin(1)
+    assert float(sides.mean()) ** space_dim == pytest.approx(volume, rel=0.02)
+    for name, size in (("larger", radius * SIZE_FACTOR), ("smaller", radius / SIZE_FACTOR)):
+        assert 0.98 * size < float(distance[name].max()) <= size + 1e-5
+    small = radius * 0.5 ** (1.0 / space_dim)
+    blobs = found["two blobs"].clone()
+    assert float((blobs[..., 0] > 0.0).float().mean()) == 0.5
+    blobs[..., 0] = blobs[..., 0].abs() - BLOB_DISTANCE * small
+    assert 0.97 * small < float(blobs.norm(dim=-1).max()) <= small + 1e-5
+
+
+# Recovery
+
+
+@pytest.mark.parametrize(
+    ("losses", "twins", "step"),
+    [
+        ([5.0, 3.0, 1.1, 1.0], [1.0, 1.0, 1.0, 1.0], 32),
+        ([5.0, 3.0, 1.11, 1.0], [1.0, 1.0, 1.0, 1.0], 64),
+        ([5.0, 3.0, 1.2, 1.2], [1.0, 1.0, 1.0, 1.0], None),
+        ([1.0, 3.0, 3.0, 3.0], [1.0, 1.0, 1.0, 1.0], 0),
+        # It is the twin of the same step that counts.
+        ([4.0, 4.0, 4.0, 4.0], [1.0, 2.0, 3.0, 4.0], 64),
+        ([math.nan, math.nan, math.nan, math.nan], [1.0, 1.0, 1.0, 1.0], None),
+        ([2.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], 16),
+        ([2.0, 0.1, 0.1, 0.1], [1.0, 0.0, 0.0, 0.0], None),
+    ],
+)
+def test_recovery_is_the_first_step_within_a_tenth_of_the_twin(losses, twins, step):
+    assert recovery_step((0, 16, 32, 64), losses, twins) == step
+
+
+def test_a_course_counts_its_seeds():
+    twins = ((1.0, 1.0, 1.0),) * 4
+    losses = ((3.0, 1.0, 1.0), (3.0, 2.0, 1.0), (3.0, 1.05, 2.0), (3.0, 2.0, 2.0))
+    course = Course("erase", (0, 16, 32), losses, twins)
+    assert course.recovery_steps() == [16, 32, 16, None]
+    assert (course.recovered(), course.median_step(), course.within_at_end()) == (3, 16, 2)
+    assert course.ratios(-1) == [1.0, 1.0, 2.0, 2.0]
+    assert recovered_share([record(course, dataclasses.replace(course, damage=CONTROL))]) == (
+        3,
+        2,
+        4,
+    )
+
+
+def record(*found: Course, **changed) -> RuleRecord:
+    values = [("eps", 1.0), ("eps", 2.0), ("particles", 1.0), ("update_prob", 0.5)]
+    told = tuple(Response(name, value, 8, (0.5, value)) for name, value in values)
+    lost = Response("eps", 4.0, 8, (0.5, math.nan))
+    left_out = Response("particles", 2.0, 0, (), note="256 particles in all")
+    fields = {"rule": "heart", "task": "morphogenesis2d", "metric": "loss", "facts": {"a": 1}}
+    return RuleRecord(**fields | {"courses": found, "responses": (*told, lost, left_out)} | changed)
+
+
+# Measuring
+
+
+@pytest.mark.parametrize("name", ["heart", "dots", "digits"])
+def test_damaged_worlds_go_beside_twins_with_the_same_masks(name, device):
+    place = ground(name, device)
+    home, trained = grow(place)
+    found = {course.damage: course for course in healing(place, home)}
+    static = name == "digits"
+    assert set(found) == {CONTROL, *(n for n, d in DAMAGES.items() if d.static or not static)}
+    twins = found["erase"].twins
+    assert twins == found[CONTROL].twins == found["noise"].twins
+    assert tuple(curve[0] for curve in twins) == pytest.approx(trained.losses, rel=1e-6)
+    # At first the control is its twin; then masks are others.
+    assert found[CONTROL].ratios(0) == [1.0, 1.0]
+    if not static:
+        assert found[CONTROL].losses != twins
+        assert all(value != 1.0 for value in found["noise"].ratios(0))
+    assert found["half"].twins == found["side"].twins != twins
+    # What twins do is what the worlds do that go on alone.
+    run = place.run(home, place.random(1001))
+    alone = place.by_seed(courses(home, run, place.plan.heal_steps)).T
+    assert torch.allclose(alone, torch.tensor(twins, dtype=torch.float64).to(alone), rtol=1e-5)
+
+
+def test_worlds_that_nothing_is_done_to_stay_with_their_twins(device, monkeypatch):
+    nothing = dataclasses.replace(DAMAGES["noise"], apply=lambda x, s, random, box: (x, s))
+    monkeypatch.setitem(DAMAGES, "noise", nothing)
+    place = ground("heart", device)
+    found = {course.damage: course for course in healing(place, grow(place)[0])}
+    assert found["noise"].losses == found["noise"].twins
+    assert found["noise"].recovery_steps() == [0, 0]
+
+
+def test_conditions_are_grown_for_as_many_updates_and_left_out_where_too_large(device):
+    place = ground("heart", device)
+    _, trained = grow(place)
+    found = list(responses(place, trained, most_particles=300))
+    assert [(r.condition, r.value, r.steps) for r in found] == [
+        ("eps", 1.0, 8),
+        ("eps", 2.0, 8),
+        ("particles", 1.0, 8),
+        ("particles", 2.0, 0),
+        ("update_prob", 0.25, 16),
+        ("update_prob", 0.5, 8),
+    ]
+    assert found[0].losses == found[2].losses == found[5].losses == trained.losses
+    assert found[3].losses == ()
+    assert found[3].note == "512 particles in all"
+    assert found[1].losses != trained.losses
+
+
+def test_other_numbers_of_particles_have_the_task_of_that_number(device):
+    place = ground("heart", device)
+    x = place.home(share=0.5).x
+    assert x.shape == (2, 64, 2)
+    assert place.home(share=0.5).task.config.target_point_count == 64
+    assert place.home().task.config.target_point_count == 128
+
+
+def test_seeds_are_worlds_of_their_own_whatever_their_number(device):
+    two = ground("heart", device).home(shape="ring")
+    one = Ground("heart", device, TINY, range(6, 7), 128).home(shape="ring")
+    assert torch.equal(two.x[1:], one.x)
+    assert not torch.equal(two.x[0], two.x[1])
+
+
+def test_a_world_that_is_lost_stays_lost_and_leaves_the_others_as_they_are(device):
+    place = ground("heart", device)
+    home, _ = grow(place)
+    whole = courses(home, place.run(home, place.random(9)), (0, 4, 8))
+    run = place.run(home, place.random(9))
+    run.s[0, :, 0] = math.nan
+    found = courses(home, run, (0, 4, 8))
+    assert found[:, 0].isnan().all()
+    assert torch.equal(found[:, 1], whole[:, 1])
+
+
+def test_plans_are_whole_chunks_and_hold_what_was_trained():
+    for name in rule_names():
+        for plan in (PLANS[task_name(name)], quick_plan(task_name(name))):
+            assert plan.heal_steps[0] == 0
+            assert all(step % plan.chunk == 0 for step in (*plan.heal_steps, plan.grow_steps))
+            assert set(plan.values) <= set(CONDITIONS)
+            assert 0.5 in plan.values["update_prob"]
+
+
+# Records and the command
+
+
+def test_a_record_comes_back_and_one_of_other_settings_is_refused(tmp_path: Path):
+    path = tmp_path / "robustness_heart.json"
+    assert read_record(path, {"a": 1}) is None
+    course = Course("erase", (0, 16), ((2.0, 1.0), (math.nan, 3.0)), ((1.0, 1.0), (1.0, 1.0)))
+    written = record(course)
+    written.write(path)
+    assert json.loads(path.read_text())["courses"][0]["recovery_steps"] == [16, None]
+    back = read_record(path, {"a": 1})
+    assert repr(back) == repr(written)
+    with pytest.raises(NPAError, match="other settings: a was 1, now 2"):
+        read_record(path, {"a": 2})
+    path.write_text("{}")
+    with pytest.raises(NPAError, match="must hold a record of npa-envs robustness"):
+        read_record(path, {"a": 1})
+
+
+def test_tables_say_who_recovered_when_and_what_was_not_measured():
+    course = Course("erase", (0, 16), ((2.0, 1.0), (2.0, 3.0)), ((1.0, 1.0), (1.0, 1.0)))
+    text = tables([record(course), record(rule="dots")])
+    assert "| heart | 1/2, 16 |" in text
+    assert "| heart | 2 → 2 (1/2) |" in text
+    assert "| dots | – |" in text
+    assert "| heart | 0.75 | 1 | 1.67 | nan |" in text
+    assert "| heart | 0.75 | 1 | – |" in text
+    assert "Recovered: 1 of 2 rule × damage × seed, 50.0%; within 1.1 at the end: 1, 50.0%." in text
+
+
+def test_curves_are_drawn_by_task():
+    pytest.importorskip("matplotlib")
+    course = Course("erase", (0, 16), ((2.0, 1.0), (2.0, math.nan)), ((1.0, 1.0), (1.0, 1.0)))
+    drawn = pictures([record(course), record(course, task="texture", rule="dots")])
+    assert set(drawn) == {"morphogenesis2d", "texture"}
+    assert all(picture.startswith(b"\x89PNG") for picture in drawn.values())
+
+
+def test_the_command_measures_writes_and_goes_on(tmp_path, capsys, monkeypatch):
+    words = ["robustness", "heart", "--quick", "--no-progress", "--commit", "0"]
+    words += ["--output", str(tmp_path)]
+    assert main(words) == 0
+    first = capsys.readouterr().out
+    held = json.loads((tmp_path / "robustness_heart.json").read_text())
+    assert held["command"].startswith("npa-envs robustness heart --quick")
+    assert held["facts"]["seeds"] == [1_000_000, 1_000_001]
+    assert {row["condition"] for row in held["responses"]} == set(CONDITIONS)
+    assert all(math.isfinite(v) for row in held["responses"] for v in row["losses"])
+    assert (tmp_path / "robustness.md").read_text() in first
+    # Nothing is measured again.
+    monkeypatch.setattr("npa_envs.robustness.study.grow", lambda *_: pytest.fail("measured"))
+    assert main(words) == 0
+    assert capsys.readouterr().out == first
+
+
+def test_the_command_refuses_mistakes(capsys):
+    for words, message in (
+        (["hart"], "unknown rule 'hart': did you mean 'heart'"),
+        (["--seed-count", "0"], "seed_count must be at least 1, got 0"),
+    ):
+        assert main(["robustness", *words]) == 2
+        assert message in capsys.readouterr().err
