@@ -304,13 +304,11 @@ def test_ranges_run_for_as_many_updates_and_as_much_time_as_trained(monkeypatch)
 
 def test_what_grew_at_another_radius_is_measured_at_its_trained_size(device):
     free, held = (habitat(session(device), name) for name in ("heart", "dots"))
-    as_trained = free.metric(free.x, free.s)
     eps = free.task.eps
-    assert free.metric(2.0 * free.x, free.s, eps=2.0 * eps) == pytest.approx(as_trained, rel=1e-5)
-    assert free.metric(2.0 * free.x, free.s, eps=eps) != pytest.approx(as_trained, rel=0.01)
+    torch.testing.assert_close(free.at_trained_size(2.0 * free.x, 2.0 * eps), free.x)
+    assert free.at_trained_size(free.x, eps) is free.x
     # A periodic box keeps its size.
-    metric = held.metric(held.x, held.s)
-    assert held.metric(held.x, held.s, eps=2.0 * held.task.eps) == metric
+    assert held.at_trained_size(held.x, 2.0 * held.task.eps) is held.x
 
 
 # The command

@@ -216,5 +216,6 @@ def courses(home: Home, run: LongRun, steps: tuple[int, ...]) -> Tensor:
         lost |= ~finite_worlds(x, s)
         for worlds, fresh in ((x, home.x), (s, home.s)):
             worlds.copy_(torch.where(lost[:, None, None], fresh, worlds))
-        found.append(torch.where(lost, torch.nan, home.losses(x, s)))
+        losses = home.losses(home.at_trained_size(x, run.eps), s)
+        found.append(torch.where(lost, torch.nan, losses))
     return torch.stack(found)

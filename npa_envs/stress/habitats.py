@@ -62,19 +62,21 @@ class Habitat:
         task = self.task
         return {"eps": task.eps, "box": task.box, "update_prob": task.update_prob} | changed
 
-    def metric(self, x: Tensor, s: Tensor, *, eps: float | None = None) -> float:
-        """Return how far worlds are from the goal, mean; lower is better.
+    def at_trained_size(self, x: Tensor, eps: float) -> Tensor:
+        """Return positions as large as they would be at the radius that the rule was trained at.
 
-        What grows in open space is as large as the radius is: scaling positions and ε alike is a
-        symmetry of the dynamics. So it is measured at the size that it would have at the task's ε.
+        Scaling positions and ε alike is a symmetry of the dynamics, so what grows in open space at
+        another ε is as much larger. Boxes and particles that do not move keep their size.
 
         Args:
             x: Positions [length units], shape [B, N, D].
-            s: States, shape [B, N, C].
-            eps: Perception radius of the worlds [length units]; None: the task's.
+            eps: Perception radius that they grew at [length units].
         """
-        if eps is not None and self.task.box is None and not self.rule.static:
-            x = x * (self.task.eps / eps)
+        free = self.task.box is None and not self.rule.static
+        return x * (self.task.eps / eps) if free and eps != self.task.eps else x
+
+    def metric(self, x: Tensor, s: Tensor) -> float:
+        """Return how far worlds are from the goal, mean; lower is better."""
         with torch.no_grad():
             return float(self.task.metric(x, s).mean())
 
@@ -160,6 +162,8 @@ class LongRun:
     ) -> None:
         self.x, self.s = home.x.clone(), home.s.clone()
         self._rule, self._generator, self._options = home.rule, generator, options
+        self.eps: float = options["eps"]
+        """Perception radius [length units]."""
         self._steps = chunk
         self._graph: torch.cuda.CUDAGraph | None = None
 

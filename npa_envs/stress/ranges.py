@@ -166,5 +166,5 @@ def _metric(home: Habitat, session: Session, steps: int, options: dict[str, Any]
     run = LongRun(home, session.generator(1), options)
     run.advance(steps)
     finite = bool(run.x.isfinite().all()) and bool(run.s.isfinite().all())
-    metric = home.metric(run.x, run.s, eps=options["eps"]) if finite else math.nan
+    metric = home.metric(home.at_trained_size(run.x, run.eps), run.s) if finite else math.nan
     return metric if math.isfinite(metric) else math.nan
