@@ -10,10 +10,10 @@ from npa_envs.randomness import Randomness
 from npa_envs.rule import COLOUR_OFFSET, NPARule
 from npa_envs.sph import splat, world_mean
 from npa_envs.sph.picture_losses import picture_losses
-from npa_envs.tasks.damage import erase_state, random_particle
 from npa_envs.tasks.morphogenesis2d_config import Morphogenesis2DConfig
 from npa_envs.tasks.rules import untrained_rule
 from npa_envs.tasks.seeds import uniform_ball
+from npa_envs.tasks.strays import hurt, stray_motion
 from npa_envs.tasks.targets import PointTarget, load_target
 
 UNOWNED = 0.05
@@ -113,11 +113,9 @@ class Morphogenesis2D:
         return x, x.new_zeros(world_count, count, self.config.state_dim)
 
     def damage(self, x: Tensor, s: Tensor, generator: Randomness) -> tuple[Tensor, Tensor]:
-        """Return the worlds with the states in a disk around one random particle set to zero."""
-        if self.config.damage_radius == 0.0:
-            return x, s
-        centre = random_particle(x, generator)
-        return x, erase_state(x, s, centre=centre, radius=self.config.damage_radius)
+        """Return the worlds with states in a disk erased, and some particles thrown out."""
+        radius, share = self.config.damage_radius, self.config.stray_share
+        return hurt(x, s, damage_radius=radius, stray_share=share, generator=generator)
 
     def picture(self, x: Tensor, s: Tensor, *, centred: bool = True) -> Tensor:
         """Return the picture of each world.
@@ -229,6 +227,9 @@ class Morphogenesis2D:
             + config.overflow_weight * parts["overflow"]
             + config.bound_weight * parts["bound"]
         )
+        if config.stray_weight > 0.0:
+            parts["stray"] = stray_motion(x, path_length)
+            total = total + config.stray_weight * parts["stray"]
         return total, parts
 
     def _centred(self, x: Tensor) -> Tensor:

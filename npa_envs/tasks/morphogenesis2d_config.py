@@ -46,6 +46,9 @@ class Morphogenesis2DConfig:
     damage_radius: float = 0.1
     """Radius of the disk whose state is erased in worlds from the pool [length units]; 0: none."""
 
+    stray_share: float = 0.0
+    """Probability of each particle to be thrown out of worlds from the pool (dimensionless)."""
+
     resolution: int = 256
     """Pixels on each side of the picture that the loss compares, R."""
 
@@ -67,6 +70,9 @@ class Morphogenesis2DConfig:
     bound_weight: float = 100.0
     """Weight of mean |x − clip(x, −1, 1)| (per length unit)."""
 
+    stray_weight: float = 0.0
+    """Weight of the mean path length of particles outside of [−1, 1] (per length unit)."""
+
     def __post_init__(self) -> None:
         """Check every field.
 
@@ -84,6 +90,8 @@ class Morphogenesis2DConfig:
         check_non_negative(
             self,
             "damage_radius",
+            "stray_share",
+            "stray_weight",
             "splat_weight",
             "colour_weight",
             "motion_weight",

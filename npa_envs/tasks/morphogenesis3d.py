@@ -12,11 +12,11 @@ from npa_envs.randomness import Randomness
 from npa_envs.rule import NPARule
 from npa_envs.sph import Cameras, world_mean
 from npa_envs.tasks.appearance import OUTPUTS, Appearance, Gaussians
-from npa_envs.tasks.damage import erase_state, random_particle
 from npa_envs.tasks.morphogenesis3d_config import Morphogenesis3DConfig
 from npa_envs.tasks.renderers import RENDERERS
 from npa_envs.tasks.rules import untrained_rule
 from npa_envs.tasks.seeds import uniform_ball
+from npa_envs.tasks.strays import hurt, stray_motion
 from npa_envs.tasks.structure import MultiScaleSimilarity
 from npa_envs.tasks.view_schedule import ViewSchedule, blurred
 from npa_envs.tasks.views import ViewTarget, load_views, nearest_elevation, over, some_views
@@ -170,11 +170,9 @@ class Morphogenesis3D:
         return x, x.new_zeros(world_count, count, self.config.state_dim)
 
     def damage(self, x: Tensor, s: Tensor, generator: Randomness) -> tuple[Tensor, Tensor]:
-        """Return the worlds with the states in a ball around one random particle set to zero."""
-        if self.config.damage_radius == 0.0:
-            return x, s
-        centre = random_particle(x, generator)
-        return x, erase_state(x, s, centre=centre, radius=self.config.damage_radius)
+        """Return the worlds with states in a ball erased, and some particles thrown out."""
+        radius, share = self.config.damage_radius, self.config.stray_share
+        return hurt(x, s, damage_radius=radius, stray_share=share, generator=generator)
 
     def gaussians(self, s: Tensor) -> Gaussians:
         """Return how particles look.
@@ -205,9 +203,8 @@ class Morphogenesis3D:
 
     def view_psnr(self, x: Tensor, s: Tensor) -> Tensor:
         """Return the PSNR of colours over white, mean of the held-out views [dB], shape [B]."""
-        held_out = self.target.held_out
-        found = self.views(x, s, held_out.cameras)
-        wanted, white = held_out.pictures.to(x), x.new_ones(3)
+        held_out, white = self.target.held_out, x.new_ones(3)
+        found, wanted = self.views(x, s, held_out.cameras), held_out.pictures.to(x)
         error = over(found, white).clamp(0.0, 1.0) - over(wanted, white)
         return (-10.0 * error.square().mean(dim=(2, 3, 4)).log10()).mean(dim=1)
 
@@ -265,6 +262,9 @@ class Morphogenesis3D:
             + config.overflow_weight * parts["overflow"]
             + config.bound_weight * parts["bound"]
         )
+        if config.stray_weight > 0.0:
+            parts["stray"] = stray_motion(x, path_length)
+            total = total + config.stray_weight * parts["stray"]
         return total, parts
 
     def _metric(self, x: Tensor, gaussians: Gaussians) -> Tensor:

@@ -46,6 +46,9 @@ class Morphogenesis3DConfig:
     damage_radius: float = 0.0
     """Radius of the ball whose state is erased in worlds from the pool [length units]; 0: none."""
 
+    stray_share: float = 0.0
+    """Probability of each particle to be thrown out of worlds from the pool (dimensionless)."""
+
     resolution: int = 192
     """Pixels on each side of a view, R."""
 
@@ -94,6 +97,9 @@ class Morphogenesis3DConfig:
     bound_weight: float = 10.0
     """Weight of mean |x − clip(x, −1, 1)| (per length unit)."""
 
+    stray_weight: float = 0.0
+    """Weight of the mean path length of particles outside of [−1, 1] (per length unit)."""
+
     renderer: str = "own"
     """What draws views: "own" kernels, or "gsplat" (CUDA, with `cuda_graph` off)."""
 
@@ -118,6 +124,8 @@ class Morphogenesis3DConfig:
         check_non_negative(
             self,
             "damage_radius",
+            "stray_share",
+            "stray_weight",
             "anisotropy",
             "blur_sigma",
             "view_weight",

@@ -1,0 +1,107 @@
+"""Particles that have lost the others: thrown out on all sides, and taught to rest."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from npa_envs.dynamics import rollout
+from npa_envs.randomness import WorldRandom
+from npa_envs.rule import NPARule
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
+from npa_envs.tasks.morphogenesis2d_config import Morphogenesis2DConfig
+from npa_envs.tasks.strays import FARTHEST, NEAREST, scatter, stray_motion
+from npa_envs.training import TrainConfig, train
+
+SMALL = Morphogenesis2DConfig(
+    target="ring",
+    particle_count=96,
+    target_point_count=96,
+    state_dim=6,
+    hidden_dim=24,
+    eps=0.3,
+    resolution=24,
+    stray_share=0.1,
+    stray_weight=1.0,
+)
+
+
+def generators(device):
+    return [torch.Generator(device).manual_seed(4), WorldRandom([4, 5], device=device)]
+
+
+@pytest.mark.parametrize("which", [0, 1])
+@pytest.mark.parametrize("space_dim", [2, 3])
+def test_as_many_are_thrown_out_as_was_said_and_on_all_sides(device, which, space_dim):
+    x = torch.zeros(2, 4000, space_dim, device=device)
+    found = scatter(x, share=0.25, generator=generators(device)[which])
+    distance = found.norm(dim=-1)
+    out = distance > 0.0
+    assert ((distance[out] >= NEAREST) & (distance[out] <= FARTHEST)).all()
+    # Five standard deviations of a share of 8000, and of the mean of vectors as long as 4.
+    assert float(out.float().mean()) == pytest.approx(0.25, abs=0.025)
+    assert found[out].mean(dim=0).abs().max() < 0.4
+    assert torch.equal(found[~out], x[~out])
+
+
+def test_each_world_throws_what_it_would_throw_alone():
+    x = torch.rand(2, 50, 2)
+    both = scatter(x, share=0.3, generator=WorldRandom([4, 5]))
+    alone = scatter(x[1:], share=0.3, generator=WorldRandom([5]))
+    assert torch.equal(both[1:], alone)
+
+
+def test_only_the_paths_of_those_outside_count():
+    x = torch.tensor([[[0.5, 0.2], [1.5, 0.0], [0.0, -3.0]]])
+    path = torch.tensor([[7.0, 1.0, 2.0]], requires_grad=True)
+    motion = stray_motion(x, path)
+    assert float(motion.detach()) == 1.5
+    motion.backward()
+    assert path.grad.tolist() == [[0.0, 0.5, 0.5]]
+    assert float(stray_motion(x[:, :1], path[:, :1])) == 0.0
+
+
+def test_a_share_throws_particles_of_the_pool_out_and_a_weight_counts_their_paths():
+    task = Morphogenesis2D(SMALL)
+    generator = torch.Generator().manual_seed(1)
+    x, s = task.seed(2, generator=generator)
+    hurt_x, _ = task.damage(x, s, generator)
+    out = hurt_x.norm(dim=-1) > 1.0
+    assert 0 < int(out.sum()) < 60
+    path = torch.ones(2, 96)
+    total, parts = task.loss(hurt_x, s, path)
+    plain, without = Morphogenesis2D(replace(SMALL, stray_weight=0.0)).loss(hurt_x, s, path)
+    assert float(parts["stray"]) == 1.0
+    assert "stray" not in without
+    assert float(total) == pytest.approx(float(plain) + 1.0)
+
+
+def lone_motion(rule: NPARule) -> float:
+    """How far a particle walks in 40 steps that sees nobody [length units], mean of 64."""
+    x = torch.arange(64.0)[None, :, None].repeat(1, 1, 2)
+    s = 0.3 * torch.randn(1, 64, rule.state_dim, generator=torch.Generator().manual_seed(0))
+    generator = torch.Generator().manual_seed(2)
+    with torch.no_grad():
+        moved, _ = rollout(rule, x, s, 40, generator=generator)
+    return float((moved - x).norm(dim=-1).mean())
+
+
+def test_rules_that_saw_strays_let_lone_particles_rest(tmp_path):
+    config = TrainConfig(
+        task=replace(SMALL, stray_share=0.05, stray_weight=10.0),
+        iterations=40,
+        repeats=1,
+        world_count=2,
+        pool_size=6,
+        steps=(4, 8),
+        learning_rate=5e-3,
+        milestones=(),
+        seed_interval=2,
+        out=tmp_path / "strays",
+        tensorboard=False,
+    )
+    taught = train(config, "morphogenesis2d", progress=False)
+    plain = replace(config, task=replace(SMALL, stray_share=0.0, stray_weight=0.0))
+    untaught = train(replace(plain, out=tmp_path / "plain"), "morphogenesis2d", progress=False)
+    # Seen: 0.058 against 0.37 length units.
+    assert lone_motion(taught.rule) < 0.3 * lone_motion(untaught.rule)
