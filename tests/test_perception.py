@@ -125,6 +125,37 @@ def test_particles_that_nearly_touch_have_finite_gradients(dtype, space_dim, dis
     assert relative_error(x.grad, exact_x.grad) < POSITION_GRADIENT[dtype]
 
 
+@pytest.mark.parametrize("box", (None, "oblong"))
+@pytest.mark.parametrize("space_dim", [2, 3])
+@pytest.mark.parametrize("dtype", DTYPES, ids=("float32", "float64"))
+def test_states_whose_squares_overflow_are_perceived(dtype, space_dim, box, device):
+    """Lengths of gradients are taken without their squares where those are no numbers."""
+    box = sides(box, space_dim)
+    largest = 33 if dtype == torch.float32 else 300
+    for power in (largest // 2, largest // 2 + 3, largest):
+        x, s = random_world(2, 83, space_dim, 5, dtype=dtype, device=device)
+        s *= 10.0**power
+        exact_x, exact_s = (t.cpu().double().clone().requires_grad_() for t in (x, s))
+        expected = oracle.perceive(exact_x, exact_s, 0.3, 0.3, box, detach_positions=False)
+        # The other columns are 1e33 times as large, and their gradients too.
+        logarithms = expected[..., 10 : 10 + 5 * space_dim]
+        cotangent = torch.linspace(-1.0, 1.0, logarithms.numel(), dtype=torch.float64)
+        cotangent = cotangent.view_as(logarithms)
+        (logarithms * cotangent).sum().backward()
+        x.requires_grad_()
+        s.requires_grad_()
+        z = npa_envs.perceive(x, s, 0.3, box=box, detach_positions=False)
+        found = z[..., 10 : 10 + 5 * space_dim]
+        (found * cotangent.to(z)).sum().backward()
+        assert relative_error(found, logarithms) < FORWARD[dtype]
+        # The adjoint has |v| from L(v): a rounding of that is one of log |v|.
+        magnified = float(logarithms.detach().abs().max())
+        assert relative_error(found, logarithms) < FORWARD[dtype]
+        error = relative_error(s.grad * 10.0**power, exact_s.grad * 10.0**power)
+        assert error < magnified * GRADIENT[dtype]
+        assert relative_error(x.grad, exact_x.grad) < magnified * POSITION_GRADIENT[dtype]
+
+
 @pytest.mark.parametrize("space_dim", [2, 3])
 def test_gradients_pass_gradcheck(space_dim, device):
     x, s = random_world(1, 9, space_dim, 3, dtype=torch.float64, device=device)

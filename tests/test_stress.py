@@ -178,6 +178,7 @@ def test_a_run_goes_on_where_it_was_and_repeats_what_did_not_pass():
         "geometry/threshold/2d",
         "geometry/crowd/2d",
         "geometry/nearest/2d",
+        "values/scale/2d",
         "values/infinite_channel/2d",
         "values/gradient_of_nan",
         "values/nan_state",

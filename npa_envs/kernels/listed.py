@@ -18,7 +18,7 @@ from npa_envs.kernels.listing import RECORD
 from npa_envs.kernels.slots import (
     SLOT_ENTRIES,
     as_number,
-    log_scale_of_square,
+    log_scaled_fast,
     make_lists,
     make_slots,
     make_stage,
@@ -460,7 +460,7 @@ def listed_perception(
                 along = vector()
                 for d in range(wp.static(space_dim)):
                     along[d] = gradient_scale * gradient[d, c]
-                along *= log_scale_of_square(wp.dot(along, along))
+                along = log_scaled_fast(along)
                 for d in range(wp.static(space_dim)):
                     scaled[c * wp.static(space_dim) + d] = along[d]
             stage_rows(slot, wp.static(2 * width) + mine * wp.static(space_dim), scaled)
@@ -477,7 +477,7 @@ def listed_perception(
             along = vector()
             for d in range(wp.static(space_dim)):
                 along[d] = scalar(wide_sum[d]) * density_scale
-            along *= log_scale_of_square(wp.dot(along, along))
+            along = log_scaled_fast(along)
             if destination >= 0 and lane == 0 and g == 0:
                 for d in range(wp.static(space_dim)):
                     perception[destination, column + d] = within(along[d], bound)
