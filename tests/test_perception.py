@@ -125,7 +125,7 @@ def test_particles_that_nearly_touch_have_finite_gradients(dtype, space_dim, dis
     assert relative_error(x.grad, exact_x.grad) < POSITION_GRADIENT[dtype]
 
 
-@pytest.mark.parametrize("box", (None, "oblong"))
+@pytest.mark.parametrize("box", [None, "oblong"])
 @pytest.mark.parametrize("space_dim", [2, 3])
 @pytest.mark.parametrize("dtype", DTYPES, ids=("float32", "float64"))
 def test_states_whose_squares_overflow_are_perceived(dtype, space_dim, box, device):
