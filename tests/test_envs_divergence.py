@@ -7,6 +7,7 @@ import pytest
 import torch
 from small_envs import IDS, make, make_vec
 
+from npa_envs.envs import multispecies_v0
 from npa_envs.errors import DivergedError, NPAError
 
 NAME = "npa/Morphogenesis2D-v0"
@@ -79,9 +80,9 @@ def test_a_world_that_left_is_named_by_its_coordinate(device):
     env.reset(seed=0)
     action = np.zeros(env.action_space.shape, dtype=np.float32)
     action[:, 1] = 1.0
-    with pytest.raises(DivergedError, match="position_limit = 0.21.*positions coordinate 1 of"):
-        for _ in range(3):
-            env.step(action)
+    # Half of eps in a step takes particles of a disk of radius 0.2 out of 0.21.
+    with pytest.raises(DivergedError, match="in step 1: positions coordinate 1 of particle"):
+        env.step(action)
 
 
 @pytest.mark.parametrize(
@@ -177,3 +178,48 @@ def test_torch_tensors_say_the_same_as_arrays(way, device):
 def test_an_unknown_word_is_refused():
     with pytest.raises(NPAError, match="on_divergence must be a known word, got 'rest': did you"):
         make(NAME, on_divergence="rest")
+
+
+# ----------------------------------------------------------------------------------------------
+# Several species: an agent has diverged once none of its particles is within bounds
+
+
+def species_actions(count, width, world_count=None):
+    """Return actions of two species that push all states of the second one."""
+    shape = (count, width) if world_count is None else (world_count, count, width)
+    still, pushing = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    pushing[..., 2:] = 1.0
+    return {"species_0": still, "species_1": pushing}
+
+
+SPECIES = {"particle_count": 40, "state_dim": 4, "observation_limit": LIMIT, "update_prob": 1.0}
+
+
+def test_species_that_diverge_are_terminated_told_or_let_be(device):
+    for way in ("terminate", "ignore"):
+        keywords = SPECIES | {"on_divergence": way, "device": str(device)}
+        env = multispecies_v0.parallel_env("mixing", **keywords)
+        env.reset(seed=0)
+        for _ in range(LAST):
+            observations, _, terminations, *_ = env.step(species_actions(20, 6))
+        assert terminations == {"species_0": False, "species_1": way == "terminate"}
+        assert env.agents == ["species_0"] + ["species_1"] * (way == "ignore")
+        assert all(np.isfinite(rows).all() for rows in observations.values())
+    assert (env.particles()[1][20:] == LIMIT).all()
+
+
+def test_an_error_names_species_and_world(device):
+    keywords = SPECIES | {"on_divergence": "raise", "device": str(device)}
+    envs = multispecies_v0.batched("mixing", world_count=2, **keywords)
+    envs.reset(seed=0)
+    action = species_actions(20, 6, 2)
+    action["species_1"][0] = 0.0
+    for _ in range(LAST - 1):
+        envs.step(action)
+    with pytest.raises(DivergedError, match="species_1 of world 1 had none after step 4: take"):
+        envs.step(action)
+
+
+def test_a_species_is_not_reset_alone():
+    with pytest.raises(NPAError, match="on_divergence must be a known word, got 'reset'"):
+        multispecies_v0.parallel_env("mixing", on_divergence="reset")

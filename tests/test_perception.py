@@ -157,6 +157,24 @@ def test_states_whose_squares_overflow_are_perceived(dtype, space_dim, box, devi
 
 
 @pytest.mark.parametrize("space_dim", [2, 3])
+def test_a_clump_takes_no_more_memory_than_the_same_particles_apart(space_dim):
+    """All in one cell: time is quadratic in them, but nothing is kept for each pair."""
+
+    def allocated(particle_count, side):
+        x, s = random_world(1, particle_count, space_dim, 16, dtype=torch.float32, device="cpu")
+        x, s = side * x, s.requires_grad_()
+        with torch.profiler.profile(profile_memory=True) as profile:
+            npa_envs.perceive(x, s, 0.1).sum().backward()
+        return sum(max(event.self_cpu_memory_usage, 0) for event in profile.events())
+
+    few, many = allocated(400, 0.03), allocated(800, 0.03)
+    # What 800 particles are given and make: z alone has 800 (4 or 5) 16 numbers of 4 bytes.
+    assert many > 800 * (2 + space_dim) * 16 * 4
+    assert many < 2.1 * few
+    assert many <= 1.1 * allocated(800, 1.0)
+
+
+@pytest.mark.parametrize("space_dim", [2, 3])
 def test_gradients_pass_gradcheck(space_dim, device):
     x, s = random_world(1, 9, space_dim, 3, dtype=torch.float64, device=device)
     x, s = (0.4 * x).requires_grad_(), s.requires_grad_()
