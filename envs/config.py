@@ -16,11 +16,13 @@ from npa_envs.tasks.checks import check_fraction, check_non_negative, check_posi
 Boundary = Literal["open", "periodic"]
 Reward = Literal["dense", "sparse", "particle"]
 Output = Literal["numpy", "torch"]
+OnDivergence = Literal["terminate", "reset", "raise", "ignore"]
 
 CHOICES = {
     "boundary": ("open", "periodic"),
     "reward": ("dense", "sparse", "particle"),
     "output": ("numpy", "torch"),
+    "on_divergence": ("terminate", "reset", "raise", "ignore"),
     "render_mode": (None, "rgb_array", "human"),
     "render_style": STYLES,
 }
@@ -83,6 +85,11 @@ class EnvConfig:
 
     position_limit: float = 4.0
     """A particle with a coordinate beyond ± this has diverged [length units]."""
+
+    on_divergence: OnDivergence = "terminate"
+    """What becomes of a world that diverges, besides `info["diverged"]`: "terminate" ends its
+    episode; "reset" starts it anew within the episode; "raise" is an error that names the particle;
+    "ignore" goes on with its numbers held at the limits."""
 
     reward: Reward = "dense"
     """"dense": each step's improvement of the loss; "sparse": minus the loss at the episode's end;

@@ -266,7 +266,7 @@ class Morphogenesis3DEnv(NPAEnv):
     |---|---|---|
     | `loss`, `loss_views` | reset, step | L as it is now |
     | `reward_views` | step | how much it improved in this step |
-    | `success`, `diverged` | step | whether the episode ended in this way, bool |
+    | `success`, `diverged` | step | whether it did so in this step, bool |
     | `reason` | last step | why the episode ended, see above |
     | `particle_reward` | step, where `reward="particle"` | each particle's own reward, shape [N] |
 

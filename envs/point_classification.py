@@ -253,7 +253,7 @@ class PointClassificationEnv(NPAEnv):
     | `loss` | reset, step | L as it is now |
     | `loss_error`, `loss_overflow` | reset, step | its two parts |
     | `reward_error`, `reward_overflow` | step | how much each part improved in this step |
-    | `success`, `diverged` | step | whether the episode ended in this way, bool |
+    | `success`, `diverged` | step | whether it did so in this step, bool |
     | `reason` | last step | why the episode ended, see above |
     | `particle_reward` | step, where `reward="particle"` | each particle's own reward, shape [N] |
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.envs.arrays import checked_action, checked_particles, to_output
+from npa_envs.envs.divergence import guarded
 from npa_envs.envs.report import DIVERGED, SUCCESS, reason
 from npa_envs.envs.screen import Screen, WorldsView
 from npa_envs.envs.spaces import action_space, observation_space
@@ -93,6 +94,7 @@ class NPAEnv(gymnasium.Env[Any, Any]):
 
         Raises:
             NPAError: The action has another shape or is not finite; the world is then as it was.
+            DivergedError: The world diverged, and `on_divergence` is "raise".
         """
         if not self._started:
             raise NPAError("step needs a world: call reset first")
@@ -102,12 +104,13 @@ class NPAEnv(gymnasium.Env[Any, Any]):
         )
         with worlds.here():
             endings, observation = worlds.step(checked)
-        ending = int(endings[0])
+            diverged = bool(endings[0] & DIVERGED)
+            ending = int(guarded(worlds, endings, observation)[0])
         ended = ending & (SUCCESS | DIVERGED) != 0
         names, numbers = worlds.part_names, worlds.report.numbers[:, 0].tolist()
         info = self._losses(numbers)
         info |= {f"reward_{name}": numbers[2 + len(names) + k] for k, name in enumerate(names)}
-        info |= {"success": bool(ending & SUCCESS), "diverged": bool(ending & DIVERGED)}
+        info |= {"success": bool(ending & SUCCESS), "diverged": diverged}
         if ended:
             info["reason"] = reason(ending)
         if worlds.particle_reward is not None:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.envs.arrays import checked_action, checked_particles, to_output
+from npa_envs.envs.divergence import guarded
 from npa_envs.envs.report import FLAGS, TIME_LIMIT, reason
 from npa_envs.envs.screen import Screen, WorldsView
 from npa_envs.envs.spaces import action_space, observation_space
@@ -153,6 +154,7 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
         Raises:
             NPAError: The actions have another shape or are not finite; the worlds are then as they
                 were.
+            DivergedError: A world diverged, and `on_divergence` is "raise".
         """
         if not self._started:
             raise NPAError("step needs worlds: call reset first")
@@ -176,6 +178,8 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
         stepped = None
         if restarting:
             stepped, endings = ~over, np.where(over, 0, endings)
+        endings = guarded(self.worlds, endings, observation)
+        if restarting:
             self.worlds.restart(np.flatnonzero(over), observation)
         ended = endings != 0
         final = self.autoreset_mode is AutoresetMode.SAME_STEP and bool(ended.any())

@@ -23,7 +23,7 @@ from npa_envs.envs.restarts import Restarts
 from npa_envs.envs.task import EnvTask, Start
 from npa_envs.errors import NPAError
 from npa_envs.randomness import WorldRandom
-from npa_envs.replay import Beside, Replayed
+from npa_envs.replay import Beside, Replayed, sent
 
 # Torch's pool of threads does not survive a fork: a forked worker, as Gymnasium's AsyncVectorEnv
 # starts them, would wait for it for ever.
@@ -222,6 +222,27 @@ class Worlds:
         """
         return survey_worlds(self.x, self.s, self.physics).perceive(out)
 
+    @torch.no_grad()
+    def reseed(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
+        """Start some worlds anew within their episodes; the last step's pay and flags stay.
+
+        Args:
+            worlds: Which, shape [M].
+            observation: Where to write what is perceived in them, shape [B, N, P].
+        """
+        index = sent(worlds, self.x.device)
+        paid, elapsed = self.report.copy(), self.elapsed.clone()
+        own = None if self.particle_reward is None else self.particle_reward.clone()
+        self.restart(worlds, observation)
+        self.elapsed.copy_(elapsed)
+        numbers, before = self.report.numbers, paid.numbers
+        numbers[0, index] = before[0, index]
+        improvements = slice(2 + len(self.part_names), None)
+        numbers[improvements, index] = before[improvements, index]
+        self.report.endings.copy_(paid.endings)
+        if own is not None and self.particle_reward is not None:
+            self.particle_reward.copy_(own)
+
     def here(self) -> contextlib.AbstractContextManager[Any]:
         """Return a context in which the worlds' device is the current one."""
         return (
@@ -277,27 +298,30 @@ class Worlds:
         """Write rewards, losses and endings of the worlds as they now are."""
         config, task = self.task.config, self._aimed
         diverged = self._diverged.bool()
+        # Worlds that have to go on as they are pay and are paid for what they are.
+        lost = torch.zeros_like(diverged) if config.on_divergence == "ignore" else diverged
+        ended = diverged if config.on_divergence == "terminate" else torch.zeros_like(diverged)
         parts = torch.stack(list(task.losses(self.x, self.s).values()))
         loss = total(parts)
         # Leaving the world must not pay, even where an empty picture is better than the start.
-        loss = torch.where(diverged, torch.maximum(loss, self._start_loss), loss)
-        success = (loss <= self._success_loss) & ~diverged
+        loss = torch.where(lost, torch.maximum(loss, self._start_loss), loss)
+        success = (loss <= self._success_loss) & ~lost
         late = torch.zeros_like(success)
         if self.episode_steps is not None:
             late = self.elapsed >= self.episode_steps
         enabled = self._enabled.bool()
-        endings = torch.stack((success | diverged, late, success, diverged))
+        endings = torch.stack((success | ended, late, success, diverged))
         self.report.endings.copy_(torch.where(enabled, endings, self.report.endings))
         improvement = self.loss - loss
         if self.particle_loss is not None and self.particle_reward is not None:
             shares = task.particle_losses(self.x, self.s)
-            own = torch.where(diverged[:, None], improvement[:, None], self.particle_loss - shares)
+            own = torch.where(lost[:, None], improvement[:, None], self.particle_loss - shares)
             self.particle_reward.copy_(torch.where(enabled, own, self.particle_reward))
             self.particle_loss.copy_(shares)
         reward = improvement
         if config.reward == "sparse":
             limit = self.episode_steps or config.episode_steps
-            over = success | diverged | (self.elapsed == limit)
+            over = success | ended | (self.elapsed == limit)
             reward = torch.where(over, -loss, torch.zeros_like(loss))
         numbers = self.report.numbers
         before = numbers[2 : 2 + len(parts)]

@@ -11,12 +11,15 @@ from npa_envs.registration import register_environments as _register_environment
 
 if TYPE_CHECKING:
     from npa_envs.api import (
+        DivergedError,
         MissingDependencyError,
         NPAError,
         NPARule,
         PerceptionFields,
         SpeciesFields,
         WorldRandom,
+        describe_divergence,
+        divergence,
         load_rule,
         perceive,
         perceive_species,
@@ -36,12 +39,15 @@ _register_environments()
 __version__ = "0.1.0"
 
 __all__ = [
+    "DivergedError",
     "MissingDependencyError",
     "NPAError",
     "NPARule",
     "PerceptionFields",
     "SpeciesFields",
     "WorldRandom",
+    "describe_divergence",
+    "divergence",
     "load_rule",
     "perceive",
     "perceive_species",

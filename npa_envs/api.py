@@ -1,7 +1,8 @@
 """The names that `npa_envs` offers; `npa_envs.__getattr__` imports this on first use."""
 
 from npa_envs.dynamics import rollout, step
-from npa_envs.errors import MissingDependencyError, NPAError
+from npa_envs.errors import DivergedError, MissingDependencyError, NPAError
+from npa_envs.guards import describe_divergence, divergence
 from npa_envs.randomness import WorldRandom
 from npa_envs.rule import NPARule
 from npa_envs.rule_io import load_rule, save_rule, shipped_rules
@@ -17,12 +18,15 @@ from npa_envs.sph import (
 )
 
 __all__ = [
+    "DivergedError",
     "MissingDependencyError",
     "NPAError",
     "NPARule",
     "PerceptionFields",
     "SpeciesFields",
     "WorldRandom",
+    "describe_divergence",
+    "divergence",
     "load_rule",
     "perceive",
     "perceive_species",

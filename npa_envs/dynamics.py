@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from npa_envs.errors import NPAError
+from npa_envs.guards import OnDivergence, make_watch
 from npa_envs.randomness import Randomness, WorldRandom, check_generator
 from npa_envs.rule import FoldedRule, NPARule
 from npa_envs.sph.checks import (
@@ -200,6 +201,7 @@ def step(
     position_noise: float = 0.0,
     detach_positions: bool = True,
     generator: Randomness | None = None,
+    on_divergence: OnDivergence = "ignore",
 ) -> tuple[Tensor, Tensor]:
     """Advance worlds by one step: `rollout` with steps=1; its arguments and errors.
 
@@ -218,6 +220,7 @@ def step(
         position_noise=position_noise,
         detach_positions=detach_positions,
         generator=generator,
+        on_divergence=on_divergence,
     )
 
 
@@ -236,6 +239,7 @@ def rollout(
     detach_positions: bool = ...,
     memory: Memory = ...,
     generator: Randomness | None = ...,
+    on_divergence: OnDivergence = ...,
     return_path_length: Literal[False] = ...,
 ) -> tuple[Tensor, Tensor]: ...
 
@@ -255,6 +259,7 @@ def rollout(
     detach_positions: bool = ...,
     memory: Memory = ...,
     generator: Randomness | None = ...,
+    on_divergence: OnDivergence = ...,
     return_path_length: Literal[True],
 ) -> tuple[Tensor, Tensor, Tensor]: ...
 
@@ -273,6 +278,7 @@ def rollout(
     detach_positions: bool = True,
     memory: Memory = "store",
     generator: Randomness | None = None,
+    on_divergence: OnDivergence = "ignore",
     return_path_length: bool = False,
 ) -> tuple[Tensor, Tensor] | tuple[Tensor, Tensor, Tensor]:
     """Run a rule for a number of steps; differentiable, and particle i stays particle i.
@@ -300,6 +306,9 @@ def rollout(
         generator: Source of the masks and the noise, on x's device; default: torch's global one.
             A `WorldRandom` advances by one step before each step's draws, so that every world
             draws what it would draw alone.
+        on_divergence: What is done about worlds whose numbers become infinite or NaN: "ignore", at
+            no cost (the next call refuses such positions), or "raise": look after each step, on the
+            device, and wait for it once, at the end.
         return_path_length: Also return how far each particle travelled.
 
     Returns:
@@ -309,6 +318,8 @@ def rollout(
     Raises:
         NPAError: Shapes, dtypes or devices do not fit each other or the rule, a position is not
             finite, or a number is out of its range.
+        DivergedError: A world diverged and `on_divergence` is "raise"; the message says which, in
+            which step, and which number of which particle.
     """
     steps = checked_count("steps", steps)
     if memory not in STORED_INTERVAL:
@@ -322,6 +333,7 @@ def rollout(
         rule, x, s, eps, box, update_prob, dt, position_noise, detach_positions
     )
     check_generator(generator, x.device, x.shape[0])
+    watch = make_watch(on_divergence, x, s)
     path_length = x.new_zeros(x.shape[:2])
     # Any other rule runs as the module that it is.
     folded = rule.folded() if rule.is_plain() else None
@@ -353,7 +365,13 @@ def rollout(
                 )
             else:
                 worlds = advance(*fixed, *worlds, *drawn)
+            if watch is not None and settled is None:
+                watch.look(*worlds[:2])
+            elif watch is not None and settled is not None:
+                watch.look(x, unsettled_states(settled, worlds[0].detach()))
         if settled is not None:
             worlds = wrapped(x, options.box), unsettled_states(settled, *worlds), path_length
+    if watch is not None:
+        watch.raise_diverged()
     x, s, path_length = worlds
     return (x, s, path_length) if return_path_length else (x, s)

@@ -10,6 +10,10 @@ class NPAError(ValueError):
     """A mistake in what the caller gave; the message says how to mend it."""
 
 
+class DivergedError(NPAError):
+    """Numbers became infinite or NaN; the message says when, which, and in which worlds."""
+
+
 class MissingDependencyError(NPAError, ImportError):
     """An optional dependency is not installed; the message holds the command that installs it."""
 

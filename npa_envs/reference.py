@@ -69,10 +69,14 @@ def spiky_gradient(r: Tensor, eps: float) -> Tensor:
 
 def log_scale(v: Tensor) -> Tensor:
     """Return L(v) = log(1 + |v|) v / |v| of vectors in the last dimension; 0 at 0."""
+    largest = v.detach().abs().amax(dim=-1, keepdim=True)
+    # In units in which its square does not overflow.
+    unit = torch.where(largest > 1e18, largest, 1.0)
+    v = v / unit
     squared = (v * v).sum(dim=-1, keepdim=True)
     nonzero = squared > 0.0
     length = torch.where(nonzero, squared, 1.0).sqrt()
-    return torch.where(nonzero, torch.log1p(length) / length, 1.0) * v
+    return torch.where(nonzero, torch.log1p(unit * length) / length, 1.0) * v
 
 
 def fields(

@@ -12,6 +12,7 @@ from torch.utils.checkpoint import checkpoint
 
 from npa_envs.dynamics import STORED_INTERVAL, Memory, checked_options, rollout
 from npa_envs.errors import NPAError
+from npa_envs.guards import OnDivergence, make_watch
 from npa_envs.randomness import Randomness, check_generator
 from npa_envs.rule import NPARule
 from npa_envs.species_steps import advance, draw, make_community
@@ -53,6 +54,7 @@ def rollout_species(
     perception: SpeciesPerception = ...,
     density_counts: Sequence[float] | None = ...,
     memory: Memory = ...,
+    on_divergence: OnDivergence = ...,
     return_path_length: Literal[False] = ...,
 ) -> tuple[Tensor, Tensor]: ...
 
@@ -75,6 +77,7 @@ def rollout_species(
     perception: SpeciesPerception = ...,
     density_counts: Sequence[float] | None = ...,
     memory: Memory = ...,
+    on_divergence: OnDivergence = ...,
     return_path_length: Literal[True],
 ) -> tuple[Tensor, Tensor, Tensor]: ...
 
@@ -96,6 +99,7 @@ def rollout_species(
     perception: SpeciesPerception = "shared",
     density_counts: Sequence[float] | None = None,
     memory: Memory = "store",
+    on_divergence: OnDivergence = "ignore",
     return_path_length: bool = False,
 ) -> tuple[Tensor, Tensor] | tuple[Tensor, Tensor, Tensor]:
     """Run several rules in one world; differentiable, and particle i stays particle i.
@@ -134,6 +138,7 @@ def rollout_species(
         density_counts: What each species divides densities and their gradients by, positive;
             default: N, the particles of the world, for all.
         memory: What the backward pass reads is stored or recomputed, as in `rollout`.
+        on_divergence: "ignore" worlds that diverge, or "raise" at the end, as in `rollout`.
         return_path_length: Also return how far each particle travelled.
 
     Returns:
@@ -142,6 +147,7 @@ def rollout_species(
 
     Raises:
         NPAError: Rules do not agree, counts do not fit, or as for `rollout`.
+        DivergedError: As for `rollout`.
     """
     steps = checked_count("steps", steps)
     species_rules = _checked_rules(rules)
@@ -166,6 +172,7 @@ def rollout_species(
             detach_positions=detach_positions,
             memory=memory,
             generator=generator,
+            on_divergence=on_divergence,
             return_path_length=True,
         )
         return (after[0], after[1], travelled) if return_path_length else (after[0], after[1])
@@ -177,6 +184,7 @@ def rollout_species(
     told_apart = perception == "per_species"
     community = make_community(species_rules, sizes, options, divisors, x, told_apart=told_apart)
     interval = STORED_INTERVAL[memory] if torch.is_grad_enabled() else 1
+    watch = make_watch(on_divergence, x, s)
     worlds = x, s, x.new_zeros(x.shape[:2])
     # Worlds keep their dtype under autocast: the kernels read what the rules write.
     with torch.autocast(x.device.type, enabled=False):
@@ -189,6 +197,10 @@ def rollout_species(
                 )  # fmt: skip
             else:
                 worlds = advance(community, *worlds, *drawn)
+            if watch is not None:
+                watch.look(*worlds[:2])
+    if watch is not None:
+        watch.raise_diverged()
     return worlds if return_path_length else worlds[:2]
 
 

@@ -49,6 +49,7 @@ LADDER = {
     "npa_envs.rule_formats": rung(3, "torch", never=INSIDES),
     "npa_envs.rule_io": rung(4, "torch safetensors", never=INSIDES),
     "npa_envs.scores": rung(5, "", never=INSIDES),
+    "npa_envs.guards": rung(3, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
     "npa_envs.control": rung(4, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
     "npa_envs.dynamics": rung(4, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
     "npa_envs.species_steps": rung(5, "torch", never=("npa_envs.kernels", "npa_envs.reference")),

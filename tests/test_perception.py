@@ -125,6 +125,57 @@ def test_particles_that_nearly_touch_have_finite_gradients(dtype, space_dim, dis
     assert relative_error(x.grad, exact_x.grad) < POSITION_GRADIENT[dtype]
 
 
+@pytest.mark.parametrize("box", [None, "oblong"])
+@pytest.mark.parametrize("space_dim", [2, 3])
+@pytest.mark.parametrize("dtype", DTYPES, ids=("float32", "float64"))
+def test_states_whose_squares_overflow_are_perceived(dtype, space_dim, box, device):
+    """Lengths of gradients are taken without their squares where those are no numbers."""
+    if device.type == "cuda" and dtype == torch.float32:
+        pytest.skip("the kernel of listed neighbours squares them: docs/stability.md")
+    box = sides(box, space_dim)
+    largest = 33 if dtype == torch.float32 else 300
+    for power in (largest // 2, largest // 2 + 3, largest):
+        x, s = random_world(2, 83, space_dim, 5, dtype=dtype, device=device)
+        s *= 10.0**power
+        exact_x, exact_s = (t.cpu().double().clone().requires_grad_() for t in (x, s))
+        expected = oracle.perceive(exact_x, exact_s, 0.3, 0.3, box, detach_positions=False)
+        # The other columns are 1e33 times as large, and their gradients too.
+        logarithms = expected[..., 10 : 10 + 5 * space_dim]
+        cotangent = torch.linspace(-1.0, 1.0, logarithms.numel(), dtype=torch.float64)
+        cotangent = cotangent.view_as(logarithms)
+        (logarithms * cotangent).sum().backward()
+        x.requires_grad_()
+        s.requires_grad_()
+        z = npa_envs.perceive(x, s, 0.3, box=box, detach_positions=False)
+        found = z[..., 10 : 10 + 5 * space_dim]
+        (found * cotangent.to(z)).sum().backward()
+        assert relative_error(found, logarithms) < FORWARD[dtype]
+        # The adjoint has |v| from L(v): a rounding of that is one of log |v|.
+        magnified = float(logarithms.detach().abs().max())
+        assert relative_error(found, logarithms) < FORWARD[dtype]
+        error = relative_error(s.grad * 10.0**power, exact_s.grad * 10.0**power)
+        assert error < magnified * GRADIENT[dtype]
+        assert relative_error(x.grad, exact_x.grad) < magnified * POSITION_GRADIENT[dtype]
+
+
+@pytest.mark.parametrize("space_dim", [2, 3])
+def test_a_clump_takes_no_more_memory_than_the_same_particles_apart(space_dim):
+    """All in one cell: time is quadratic in them, but nothing is kept for each pair."""
+
+    def allocated(particle_count, side):
+        x, s = random_world(1, particle_count, space_dim, 16, dtype=torch.float32, device="cpu")
+        x, s = side * x, s.requires_grad_()
+        with torch.profiler.profile(profile_memory=True) as profile:
+            npa_envs.perceive(x, s, 0.1).sum().backward()
+        return sum(max(event.self_cpu_memory_usage, 0) for event in profile.events())
+
+    few, many = allocated(400, 0.03), allocated(800, 0.03)
+    # What 800 particles are given and make: z alone has 800 (4 or 5) 16 numbers of 4 bytes.
+    assert many > 800 * (2 + space_dim) * 16 * 4
+    assert many < 2.1 * few
+    assert many <= 1.1 * allocated(800, 1.0)
+
+
 @pytest.mark.parametrize("space_dim", [2, 3])
 def test_gradients_pass_gradcheck(space_dim, device):
     x, s = random_world(1, 9, space_dim, 3, dtype=torch.float64, device=device)

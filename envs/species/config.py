@@ -22,6 +22,11 @@ Perception = Literal["shared", "per_species"]
 PERCEPTIONS = ("shared", "per_species")
 """Whether particles perceive species one by one besides all of them."""
 
+OnDivergence = Literal["terminate", "raise", "ignore"]
+
+DIVERGENCES = ("terminate", "raise", "ignore")
+"""What becomes of agents that are out of bounds with all their particles."""
+
 REWARDS = ("individual", "team")
 """Whose improvement an agent is paid for."""
 
@@ -91,6 +96,10 @@ class SpeciesConfig:
     position_limit: float = 4.0
     """Coordinates are clipped to ± this; a particle held there is out of bounds [length units]."""
 
+    on_divergence: OnDivergence = "terminate"
+    """What becomes of an agent all of whose particles are out of bounds: "terminate" takes it out
+    of the world; "raise" is an error that names it; "ignore" lets it go on, held at the limits."""
+
     seed_radius: float = 0.2
     """Radius of the disk that each species starts in [length units]."""
 
@@ -145,6 +154,11 @@ class SpeciesConfig:
         if self.reward not in REWARDS:
             hint = suggest(str(self.reward), REWARDS)
             raise NPAError(f"reward must be a known word, got {self.reward!r}: {hint}")
+        if self.on_divergence not in DIVERGENCES:
+            hint = suggest(str(self.on_divergence), DIVERGENCES)
+            raise NPAError(
+                f"on_divergence must be a known word, got {self.on_divergence!r}: {hint}"
+            )
         styles = (SPECIES_STYLE, *STYLES)
         if self.render_style not in styles:
             hint = suggest(str(self.render_style), styles)

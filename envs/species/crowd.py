@@ -138,6 +138,7 @@ class CrowdEnv(ParallelEnv):  # type: ignore[misc]
         Raises:
             NPAError: The episode is over, or an action is missing, not wanted, of another shape or
                 not finite; the world is then as it was.
+            DivergedError: An agent is out of bounds, and `on_divergence` is "raise".
         """
         if not self.agents:
             raise NPAError("step needs a live agent, and there is none: call reset first")

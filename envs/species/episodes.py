@@ -12,6 +12,8 @@ from torch import Tensor
 from npa_envs.envs.species.account import Account
 from npa_envs.envs.species.tables import task_type
 from npa_envs.envs.species.worlds import SpeciesWorlds
+from npa_envs.errors import DivergedError
+from npa_envs.guards import LARGEST_REPORT
 from npa_envs.replay import Beside, sent
 
 REMOVED, LEFT, ALONE = 1, 2, 3
@@ -81,6 +83,7 @@ class Episodes:
         self.account = Account(worlds.task, kinds, world_count, team=config.reward == "team")
         """The agents' losses."""
         self._owner = sent(worlds.owner, device)
+        self._by_particle = by_particle
         deaths = dict(config.deaths)
         self._last_step = np.array([deaths.get(int(k), 0) for k in self.species])
         self._beside = Beside(device) if device.type == "cuda" else None
@@ -117,10 +120,15 @@ class Episodes:
 
         Args:
             action: Finite, on the device, shape [B, N, A]; of agents that ended it is not read.
+
+        Raises:
+            DivergedError: An agent is out of bounds, and `on_divergence` is "raise".
         """
         worlds, acted = self.worlds, self.live.copy()
         worlds.act(action)
         left = worlds.left()
+        if self.config.on_divergence == "ignore":
+            left = torch.zeros_like(left)
         self._host_left.copy_(left, non_blocking=True)
         if self._beside is not None:
             self._beside.mark()
@@ -131,7 +139,10 @@ class Episodes:
         # The device goes on while the host learns who left.
         if self._beside is not None:
             self._beside.wait()
-        endings = self._endings(self._host_left.numpy())
+        fled = self._host_left.numpy() & acted
+        if self.config.on_divergence == "raise" and fled.any():
+            raise DivergedError(self._report(fled))
+        endings = self._endings(fled)
         late = worlds.open & (worlds.elapsed >= self.config.max_cycles)
         self.live &= endings == 0
         if endings.any():
@@ -163,6 +174,19 @@ class Episodes:
             if worlds.task.is_over(tuple(counts.tolist())):
                 endings[world, staying[world]] = ALONE
         return endings
+
+    def _report(self, fled: NDArray[np.bool_]) -> str:
+        """Return an error's message about agents that are out of bounds, shape [B, A]."""
+        physics, word = self.worlds.physics, "particle" if self._by_particle else "species"
+        places = np.argwhere(fled)
+        told = [f"{word}_{agent} of world {world}" for world, agent in places[:LARGEST_REPORT]]
+        more = f" and {len(places) - len(told)} more" if len(places) > len(told) else ""
+        return (
+            f"agents must have a particle within position_limit = {physics.position_limit:g} and "
+            f"observation_limit = {physics.state_limit:g}, but {', '.join(told)}{more} had none "
+            f"after step {int(self.worlds.elapsed[places[0, 0]])}: take smaller actions, raise the "
+            "limits, or choose on_divergence='terminate'"
+        )
 
     def _taken_out(self, endings: NDArray[np.uint8], observation: Tensor) -> Tensor:
         """Take out particles of agents that ended; return what is perceived without them."""

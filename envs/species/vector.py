@@ -166,6 +166,7 @@ class MultiSpeciesVectorEnv:
             NPAError: An action is missing, not wanted, of another shape or not finite, or the
                 episode of a world that is not reset by itself is over; the worlds are then as they
                 were.
+            DivergedError: An agent is out of bounds, and `on_divergence` is "raise".
         """
         if not self._started:
             raise NPAError("step needs worlds: call reset first")

@@ -94,12 +94,25 @@ def log1p(value: Any):
 
 
 @wp.func
-def log_scale_factor(length: Any):
-    """L(v) / v of the logarithmic scaling: log(1 + |v|) / |v|, and 1 at 0."""
+def log_scaled_huge(v: Any):
+    """L(v) of a vector whose squared length overflows."""
+    largest = wp.max(wp.abs(v))
+    direction = v / largest
+    length = wp.length(direction)
+    return ((wp.log(largest) + wp.log(length)) / length) * direction
+
+
+@wp.func
+def log_scaled(v: Any):
+    """L(v) = log(1 + |v|) v / |v| of the logarithmic scaling, and 0 at 0."""
+    length = wp.length(v)
     factor = type(length)(1.0)
     if length > type(length)(0.0):
         factor = log1p(length) / length
-    return factor
+    result = factor * v
+    if wp.isinf(length):
+        result = log_scaled_huge(v)
+    return result
 
 
 @wp.func

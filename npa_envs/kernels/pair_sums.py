@@ -16,7 +16,7 @@ from npa_envs.kernels.domain import (
     domain_types,
     kernel_module,
     log_scale_adjoint,
-    log_scale_factor,
+    log_scaled,
 )
 from npa_envs.kernels.groups import make_add_scaled, of_groups
 from npa_envs.kernels.lanes import make_wide_load
@@ -279,7 +279,7 @@ def pair_sum_kernels(
                 along = vector()
                 for d in range(wp.static(space_dim)):
                     along[d] = gradient_scale * gradient[d, c]
-                along *= log_scale_factor(wp.length(along))
+                along = log_scaled(along)
                 for d in range(wp.static(space_dim)):
                     columns[c * wp.static(space_dim) + d] = along[d]
         mine = g * wp.static(width)

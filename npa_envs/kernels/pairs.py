@@ -14,7 +14,7 @@ from npa_envs.kernels.domain import (
     MOMENT_THRESHOLD,
     domain_types,
     kernel_module,
-    log_scale_factor,
+    log_scaled,
     scalar_name,
     smoothing,
     spiky_factor,
@@ -216,7 +216,7 @@ def pair_kernels(
             correction[k] = inverse
         if density_gradient != 0:
             scaled = density_scale * gradients[k]
-            scaled *= log_scale_factor(wp.length(scaled))
+            scaled = log_scaled(scaled)
             columns = vector()
             for d in range(wp.static(space_dim)):
                 columns[d] = scalar(scaled[d])

@@ -16,7 +16,7 @@ from npa_envs.kernels.domain import (
     MOMENT_THRESHOLD,
     domain_types,
     kernel_module,
-    log_scale_factor,
+    log_scaled,
     smoothing,
     spiky_factor,
 )
@@ -280,7 +280,7 @@ def perception_kernels(
                     along = vector()
                     for d in range(wp.static(space_dim)):
                         along[d] = gradient_scale * gradient[d, c]
-                    along *= log_scale_factor(wp.length(along))
+                    along = log_scaled(along)
                     place = 2 * state_dim + channel * wp.static(space_dim)
                     for d in range(wp.static(space_dim)):
                         perception[to, place + d] = clipped(along[d], limit)
@@ -292,7 +292,7 @@ def perception_kernels(
                 column += state_dim * wp.static(space_dim)
             if density_gradient != 0:
                 scaled = density_scale * row_density_gradient[row]
-                scaled *= log_scale_factor(wp.length(scaled))
+                scaled = log_scaled(scaled)
                 for d in range(wp.static(space_dim)):
                     perception[to, column + d] = clipped(scalar(scaled[d]), limit)
                 column += wp.static(space_dim)

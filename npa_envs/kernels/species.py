@@ -14,7 +14,7 @@ import warp as wp
 from npa_envs.kernels.domain import (
     domain_types,
     kernel_module,
-    log_scale_factor,
+    log_scaled,
     smoothing,
     spiky_factor,
 )
@@ -100,7 +100,7 @@ def species_kernel(space_dim: int, scalar: type, species_count: int) -> wp.Kerne
             for d in range(wp.static(space_dim)):
                 sum[d] = gradient_scale * gradients[q, d]
             if logarithmic != 0:
-                sum *= log_scale_factor(wp.length(sum))
+                sum = log_scaled(sum)
             for d in range(wp.static(space_dim)):
                 gradient[i, q, d] = scalar(sum[d])
 

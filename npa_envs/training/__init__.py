@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from npa_envs.devices import check_device
+from npa_envs.errors import DivergedError
 from npa_envs.tasks.task import PictureTask, Task
 from npa_envs.training.config import Morphogenesis2DTrainConfig, TrainConfig
-from npa_envs.training.divergence import DivergedError
 from npa_envs.training.folder import JsonlLog, RunFolder
 from npa_envs.training.joint import JointRules, train_together
 from npa_envs.training.joint_config import JointTrainConfig

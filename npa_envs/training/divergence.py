@@ -10,13 +10,9 @@ from typing import Any
 import torch
 from torch import nn
 
-from npa_envs.errors import NPAError
+from npa_envs.errors import DivergedError
 from npa_envs.rule import NPARule
 from npa_envs.tasks.task import Task, task_for_rule, task_toward
-
-
-class DivergedError(NPAError):
-    """The loss became infinite or NaN; the message says when, which term, and in which worlds."""
 
 
 def divergence_error(

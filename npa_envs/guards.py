@@ -1,0 +1,186 @@
+"""Guards against worlds that leave the numbers: flags on the device, reports on the host."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from npa_envs.errors import DivergedError, NPAError
+from npa_envs.sph.checks import check_world, checked_number
+
+OnDivergence = Literal["ignore", "raise"]
+"""What a rollout does about worlds that diverge."""
+
+RUNAWAY = 1e6
+"""Numbers beyond this have run away: coordinates [length units] and states (dimensionless)."""
+
+LARGEST_REPORT = 8
+"""Worlds that a report names; of the others it gives the number."""
+
+
+class Divergence(NamedTuple):
+    """Which worlds have diverged; both tensors stay on the worlds' device."""
+
+    non_finite: Tensor
+    """A number of the world is infinite or NaN, bool, shape [B]."""
+    runaway: Tensor
+    """All are finite, and one is beyond the limit, bool, shape [B]."""
+
+
+@torch.no_grad()
+def divergence(x: Tensor, s: Tensor, *, limit: float = RUNAWAY) -> Divergence:
+    """Return which worlds have diverged, without waiting for the device.
+
+    Args:
+        x: Particle positions [length units], shape [B, N, D].
+        s: Particle states, dimensionless, shape [B, N, C].
+        limit: Numbers beyond this have run away: coordinates [length units] and states.
+
+    Returns:
+        Flags, bool, shape [B] each. `x[~(flags.non_finite | flags.runaway)]` are the worlds that
+        have not diverged.
+
+    Raises:
+        NPAError: Shapes, dtypes or devices do not fit each other, or the limit is not positive.
+    """
+    check_world(x, s)
+    limit = _checked_limit(limit)
+    # A largest number is NaN where one of the numbers is.
+    largest = torch.stack((x.abs().amax(dim=(1, 2)), s.abs().amax(dim=(1, 2)))).amax(dim=0)
+    finite = largest.isfinite()
+    return Divergence(~finite, finite & (largest > limit))
+
+
+@torch.no_grad()
+def describe_divergence(x: Tensor, s: Tensor, *, limit: float = RUNAWAY) -> str:
+    """Return a line for each world that has diverged, with its first number at fault.
+
+    It waits for the device.
+
+    Args:
+        x: Particle positions [length units], shape [B, N, D].
+        s: Particle states, dimensionless, shape [B, N, C].
+        limit: As for `divergence`.
+
+    Returns:
+        Lines as "world 1: states channel 3 of particle 7 is nan (2 such numbers in 1 particle)", at
+        most eight of them; "" where no world has diverged.
+
+    Raises:
+        NPAError: As for `divergence`.
+    """
+    flags = divergence(x, s, limit=limit)
+    worlds = (flags.non_finite | flags.runaway).nonzero()[:, 0].tolist()
+    lines = []
+    for world in worlds[:LARGEST_REPORT]:
+        numbers = torch.cat((x[world], s[world]), dim=1).cpu()
+        bad = ~numbers.isfinite()
+        beyond = ""
+        if not bool(bad.any()):
+            bad = numbers.abs() > limit
+            beyond = f", beyond {limit:g}"
+        particle, entry = bad.nonzero()[0].tolist()
+        number, particles = int(bad.sum()), int(bad.any(dim=1).sum())
+        lines.append(
+            f"world {world}: {term_name(entry, x.shape[2])} of particle {particle} is "
+            f"{numbers[particle, entry].item():g}{beyond} ({number} such "
+            f"number{'s' * (number > 1)} in {particles} particle{'s' * (particles > 1)})"
+        )
+    if len(worlds) > LARGEST_REPORT:
+        lines.append(f"and {len(worlds) - LARGEST_REPORT} more worlds")
+    return "\n".join(lines)
+
+
+def term_name(entry: int, space_dim: int) -> str:
+    """Return what a number of a particle is called, in the order of coordinates and channels."""
+    if entry < space_dim:
+        return f"positions coordinate {entry}"
+    return f"states channel {entry - space_dim}"
+
+
+class DivergenceWatch:
+    """Keeps when and where each world first had a number that is infinite or NaN.
+
+    It looks after each step, and nothing is read from the device before `raise_diverged`.
+
+    Args:
+        x: Positions at the start [length units], shape [B, N, D].
+        s: States at the start, dimensionless, shape [B, N, C].
+    """
+
+    def __init__(self, x: Tensor, s: Tensor) -> None:
+        world_count, _, self._space_dim = x.shape
+        self._looks = 0
+        self._everyone = torch.arange(world_count, device=x.device)
+        self._first = torch.full_like(self._everyone, -1)
+        self._particle = torch.zeros_like(self._everyone)
+        self._numbers = x.new_zeros(world_count, self._space_dim + s.shape[2])
+        self.look(x, s)
+
+    @torch.no_grad()
+    def look(self, x: Tensor, s: Tensor) -> None:
+        """Look at the worlds after a step."""
+        numbers = torch.cat((x.detach(), s.detach()), dim=2)
+        bad = ~numbers.isfinite().all(dim=2)
+        particle = bad.byte().argmax(dim=1)
+        rose = bad[self._everyone, particle] & (self._first < 0)
+        self._first.masked_fill_(rose, self._looks)
+        self._particle = torch.where(rose, particle, self._particle)
+        found = numbers[self._everyone, particle]
+        self._numbers = torch.where(rose[:, None], found, self._numbers)
+        self._looks += 1
+
+    def raise_diverged(self) -> None:
+        """Raise an error if a world has diverged; it waits for the device.
+
+        Raises:
+            DivergedError: The message says which worlds, at which step, and which number.
+        """
+        first = self._first.tolist()
+        worlds = sorted((step, world) for world, step in enumerate(first) if step >= 0)
+        if not worlds:
+            return
+        told = []
+        for step, world in worlds[:LARGEST_REPORT]:
+            numbers = self._numbers[world].cpu()
+            entry = int((~numbers.isfinite()).nonzero()[0])
+            when = f"in step {step}" if step > 0 else "before the first step"
+            told.append(
+                f"world {world}: {term_name(entry, self._space_dim)} of particle "
+                f"{int(self._particle[world])} was {numbers[entry].item():g} {when}"
+            )
+        if len(worlds) > LARGEST_REPORT:
+            told.append(f"and {len(worlds) - LARGEST_REPORT} more worlds")
+        raise DivergedError(
+            f"worlds must stay finite, but {len(worlds)} of {len(first)} did not, {'; '.join(told)}"
+            ": take smaller steps (dt) or states, or find such worlds with npa_envs.divergence and "
+            "replace them (on_divergence='ignore')"
+        )
+
+
+def make_watch(on_divergence: str, x: Tensor, s: Tensor) -> DivergenceWatch | None:
+    """Return what watches over a rollout, or None where nothing does.
+
+    Raises:
+        NPAError: The word is unknown, or the rollout is being captured, which cannot wait.
+    """
+    if on_divergence not in ("ignore", "raise"):
+        raise NPAError(f"on_divergence must be 'ignore' or 'raise', got {on_divergence!r}")
+    if on_divergence == "ignore":
+        return None
+    if x.is_cuda and torch.cuda.is_current_stream_capturing():
+        raise NPAError(
+            "on_divergence must be 'ignore' while a CUDA graph is captured, got 'raise', which "
+            "waits for the device: read npa_envs.divergence after a replay"
+        )
+    return DivergenceWatch(x, s)
+
+
+def _checked_limit(limit: float) -> float:
+    value = checked_number("limit", limit)
+    if math.isnan(value) or value <= 0.0:
+        raise NPAError(f"limit must be positive, got {limit}")
+    return value

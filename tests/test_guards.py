@@ -1,0 +1,198 @@
+"""Worlds that diverge: found on the device, named on the host, and kept from the others."""
+
+import math
+
+import pytest
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+from worlds import random_world
+
+import npa_envs
+from npa_envs import DivergedError, NPAError, NPARule
+
+STATE_DIM = 4
+
+
+class CountOperators(TorchDispatchMode):
+    """Counts the torch operators that are run, and those that read a number on the host."""
+
+    def __init__(self):
+        super().__init__()
+        self.count = self.reads = 0
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        self.count += 1
+        self.reads += "_local_scalar_dense" in str(function)
+        return function(*args, **(kwargs or {}))
+
+
+def make_rule(device, *, space_dim=2, growth=1.0, static=False):
+    """Return a rule under which each state c, updated, becomes (1 + growth) c."""
+    rule = NPARule(space_dim, STATE_DIM, 2 * STATE_DIM, static=static).to(device)
+    with torch.no_grad():
+        for parameter in rule.parameters():
+            parameter.zero_()
+        offset = 0 if static else space_dim
+        for c in range(STATE_DIM):
+            for sign, unit in ((1.0, c), (-1.0, STATE_DIM + c)):
+                rule.hidden.weight[unit, c] = sign
+                rule.output.weight[offset + c, unit] = sign * growth
+    return rule
+
+
+def worlds(device, space_dim=2, dtype=torch.float32):
+    return random_world(3, 40, space_dim, STATE_DIM, dtype=dtype, device=device)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_number_that_is_not_finite_is_found_in_its_world(dtype, value, device):
+    for name in ("x", "s"):
+        x, s = worlds(device, dtype=dtype)
+        (x if name == "x" else s)[1, 7, 1] = value
+        flags = npa_envs.divergence(x, s)
+        assert flags.non_finite.device == x.device
+        assert flags.non_finite.tolist() == [False, True, False]
+        assert flags.runaway.tolist() == [False, False, False]
+
+
+def test_a_world_has_run_away_beyond_the_limit_and_not_at_it(device):
+    x, s = worlds(device)
+    s[0, 3, 2] = -100.0
+    x[2, 5, 0] = 100.5
+    flags = npa_envs.divergence(x, s, limit=100.0)
+    assert flags.runaway.tolist() == [False, False, True]
+    assert not flags.non_finite.any()
+    s[2, 0, 0] = math.inf
+    flags = npa_envs.divergence(x, s, limit=100.0)
+    assert flags.non_finite.tolist() == [False, False, True]
+    assert not flags.runaway.any()
+
+
+def test_flags_are_not_read_by_the_host(device):
+    x, s = worlds(device)
+    with CountOperators() as operators:
+        npa_envs.divergence(x, s)
+    assert operators.reads == 0
+
+
+def test_a_report_names_world_particle_term_and_value(device):
+    x, s = worlds(device)
+    assert npa_envs.describe_divergence(x, s) == ""
+    s[1, 7, 3] = s[1, 9, 0] = math.nan
+    x[2, 5, 1] = -2e6
+    assert npa_envs.describe_divergence(x, s).splitlines() == [
+        "world 1: states channel 3 of particle 7 is nan (2 such numbers in 2 particles)",
+        "world 2: positions coordinate 1 of particle 5 is -2e+06, beyond 1e+06 (1 such number in "
+        "1 particle)",
+    ]
+
+
+def test_a_report_names_eight_worlds_and_counts_the_others(device):
+    x, s = random_world(11, 5, 2, 3, dtype=torch.float32, device=device)
+    s[1:] = math.inf
+    lines = npa_envs.describe_divergence(x, s).splitlines()
+    assert len(lines) == 9
+    assert lines[-1] == "and 2 more worlds"
+
+
+@pytest.mark.parametrize("limit", [0.0, -1.0, math.nan])
+def test_the_limit_must_be_positive(limit, device):
+    with pytest.raises(NPAError, match="limit must be positive, got"):
+        npa_envs.divergence(*worlds(device), limit=limit)
+
+
+# ----------------------------------------------------------------------------------------------
+# Rollouts
+
+
+@pytest.mark.parametrize("static", [False, True], ids=("moving", "static"))
+def test_a_rollout_says_in_which_step_and_where_a_world_diverged(static, device):
+    """States become 1e3 times as large in a step: from 1.5e30 on, the third is no number."""
+    rule = make_rule(device, growth=999.0, static=static)
+    x, s = worlds(device)
+    s = s.clamp(-1.0, 1.0)
+    s[1, 7, 3] = 1.5e30
+    s[2, 4, 0] = -1.5e33
+    # Alone, lest sums over neighbours overflow first.
+    x[1, 7] = x[2, 4] = 5.0
+    with torch.no_grad(), pytest.raises(DivergedError) as caught:
+        npa_envs.rollout(rule, x, s, 5, update_prob=1.0, on_divergence="raise")
+    text = str(caught.value)
+    assert "worlds must stay finite, but 2 of 3 did not, " in text
+    assert "world 2: states channel 0 of particle 4 was -inf in step 2" in text
+    assert "world 1: states channel 3 of particle 7 was inf in step 3" in text
+    assert text.index("world 2") < text.index("world 1")
+    assert "world 0" not in text
+
+
+def test_what_was_not_finite_before_the_first_step_is_called_so(device):
+    x, s = worlds(device)
+    s[0, 2, 1] = math.nan
+    with pytest.raises(DivergedError, match="channel 1 of particle 2 was nan before the first"):
+        npa_envs.rollout(make_rule(device), x, s, 0, on_divergence="raise")
+
+
+@pytest.mark.parametrize("static", [False, True], ids=("moving", "static"))
+def test_a_watched_rollout_that_stays_finite_is_the_same_rollout(static, device):
+    rule = make_rule(device, growth=0.01, static=static)
+    x, s = worlds(device)
+    s.requires_grad_()
+
+    def run(word):
+        generator = torch.Generator(device).manual_seed(0)
+        after = npa_envs.rollout(
+            rule, x, s, 6, generator=generator, memory="minimal", on_divergence=word
+        )
+        return *after, torch.autograd.grad(after[1].square().sum(), s)[0]
+
+    for found, expected in zip(run("raise"), run("ignore"), strict=True):
+        assert torch.equal(found, expected)
+
+
+def test_an_ignored_world_is_refused_by_the_next_call(device):
+    """The default is as it was: what has become of positions is seen at the door."""
+    rule = make_rule(device)
+    x, s = worlds(device)
+    s[1, 7, 0] = math.nan
+    x, s = npa_envs.rollout(rule, x, s, 3)
+    assert npa_envs.divergence(x, s).non_finite.tolist() == [False, True, False]
+    x[1, 7, 0] = math.nan
+    with pytest.raises(NPAError, match="at world 1, particle 7"):
+        npa_envs.rollout(rule, x, s, 1)
+
+
+def test_the_host_reads_no_more_in_watched_steps_and_nothing_is_run_for_others(device):
+    rule = make_rule(device)
+    x, s = worlds(device)
+
+    def operators(steps, **options):
+        with torch.no_grad(), CountOperators() as counted:
+            npa_envs.rollout(rule, x, s, steps, update_prob=1.0, **options)
+        return counted.count, counted.reads
+
+    plain, watched = operators(5), operators(5, on_divergence="raise")
+    assert operators(5, on_divergence="ignore") == plain
+    assert watched[0] > plain[0]
+    assert operators(9)[1] == plain[1]
+    assert operators(9, on_divergence="raise")[1] == watched[1]
+
+
+def test_steps_and_species_are_watched_as_well(device):
+    rule = make_rule(device, growth=999.0)
+    x, s = worlds(device)
+    s[1, 30, 3] = 1e38
+    x[1, 30] = 5.0
+    with pytest.raises(DivergedError, match="world 1: states channel 3 of particle 30 was inf in"):
+        npa_envs.step(rule, x, s, update_prob=1.0, on_divergence="raise")
+    for density_counts in (None, (15, 25)):
+        with pytest.raises(DivergedError, match="particle 30 was inf in step 1"):
+            npa_envs.rollout_species(
+                (rule, rule), x, s, 2, counts=(15, 25), update_prob=1.0,
+                density_counts=density_counts, on_divergence="raise",
+            )  # fmt: skip
+
+
+def test_an_unknown_word_is_refused(device):
+    with pytest.raises(NPAError, match="on_divergence must be 'ignore' or 'raise', got 'stop'"):
+        npa_envs.rollout(make_rule(device), *worlds(device), 1, on_divergence="stop")
