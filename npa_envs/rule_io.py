@@ -81,6 +81,8 @@ def save_rule(
 ) -> None:
     """Write a rule with all its hyper-parameters to a `.safetensors` file, whole or not at all.
 
+    The same rule and metadata give the same bytes.
+
     Args:
         rule: The rule; its weights are written in their own precision.
         path: The file to write, ending in `.safetensors`; an existing one is replaced.
@@ -108,7 +110,21 @@ def save_rule(
         header[name] = text
     weights = {k: v.detach().cpu().contiguous() for k, v in rule.state_dict().items()}
     _check_finite(weights)
-    write_bytes(path, serialise(weights, metadata=header))
+    write_bytes(path, _with_sorted_metadata(serialise(weights, metadata=header)))
+
+
+def _with_sorted_metadata(file: bytes) -> bytes:
+    """Return a safetensors file whose metadata is in order, so that equal rules make equal files.
+
+    The library writes it in an order that changes from call to call.
+    """
+    size = int.from_bytes(file[:8], "little")
+    header = json.loads(file[8 : 8 + size])
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+    # The format asks for tensors that begin at a multiple of 8 bytes, after spaces.
+    text += b" " * (-len(text) % 8)
+    return len(text).to_bytes(8, "little") + text + file[8 + size :]
 
 
 def rule_metadata(path: str | Path) -> dict[str, str]:

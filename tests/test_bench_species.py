@@ -3,7 +3,6 @@
 import time
 from functools import partial
 
-import pytest
 import torch
 
 from npa_envs.bench import suites
