@@ -204,7 +204,7 @@ def make_policy(name: str, **options: Any) -> None:
 
 
 def command_line(draw: random.Random) -> dict[str, Any]:
-    command = draw.choice([*COMMANDS, "", "trian"])
+    command = draw.choice([*COMMANDS, "", "no-such"])
     begun = {
         "train": ["morphogenesis2d", "--preset", "tiny"],
         "rollout": ["gecko"],

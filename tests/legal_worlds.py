@@ -26,7 +26,7 @@ GRID = 2.0**-10
 UNIT = {torch.float32: 2.0**-24, torch.float64: 2.0**-53}
 """Rounding of one operation, relative."""
 
-ROUNDINGS = 200
+ROUNDINGS = 50
 """Roundings that a sum and what it is made of are allowed."""
 
 PLACES = ("scattered", "lattice", "coincident", "clump", "seam")

@@ -21,10 +21,10 @@ from legal_worlds import (
 import npa_envs
 
 DOUBLE = (torch.float64,)
-GRADIENT_BOUND = 1e-7
-"""Largest error of float64 gradients over their largest number, or over 1 (worst seen WORST_G)."""
-ROLLOUT_BOUND = 1e-7
-"""Largest error of float64 worlds after a few steps (worst seen WORST_R)."""
+GRADIENT_BOUND = 1e-12
+"""Largest error of float64 gradients over their largest number, or over 1 (worst seen 3e-15)."""
+ROLLOUT_BOUND = 1e-10
+"""Largest error of float64 worlds after a few steps (worst seen 5e-13)."""
 
 
 def perceive(w, x=None, s=None, **options):
