@@ -11,6 +11,7 @@ from torch import Tensor
 from npa_envs.agents.policy import Interface, Policy, interface_of, unwrapped
 from npa_envs.errors import NPAError
 from npa_envs.rule import NPARule
+from npa_envs.tasks.checks import is_real
 
 
 class RulePolicy(Policy):
@@ -39,9 +40,9 @@ class RulePolicy(Policy):
                 "rule must perceive gradients with moment_correction=True, as environments offer "
                 "them, got moment_correction=False: train it with the correction"
             )
-        if not (math.isfinite(state_scale) and state_scale > 0.0):
+        if not (is_real(state_scale) and state_scale > 0.0):
             raise NPAError(
-                f"state_scale must be positive and finite, got {state_scale}: give the "
+                f"state_scale must be positive and finite, got {state_scale!r}: give the "
                 "environment's, or env"
             )
         if env is not None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -12,6 +13,7 @@ from npa_envs.agents.policy import Policy, interface_of, unwrapped
 from npa_envs.errors import NPAError
 from npa_envs.randomness import Purpose, WorldRandom
 from npa_envs.rule import COLOUR_OFFSET
+from npa_envs.tasks.checks import is_real, is_whole
 
 
 class ZeroPolicy(Policy):
@@ -47,8 +49,10 @@ class RandomPolicy(Policy):
 
     def __init__(self, env: Any, seed: int = 0) -> None:
         super().__init__(interface_of(env))
-        WorldRandom(seed)
-        self._seed = seed
+        given: Any = seed
+        if not (is_whole(given) or isinstance(given, np.integer)) or given < 0:
+            raise NPAError(f"a seed must be an integer of at least 0, got {given!r}")
+        self._seed = int(given)
         self._random: WorldRandom | None = None
 
     def act(self, observation: Tensor) -> Tensor:
@@ -72,11 +76,13 @@ class SpreadPolicy(Policy):
         gain: Displacement, as a fraction of α ε, at a perceived c^{1+D} ∇ρ / N of 1.
 
     Raises:
-        NPAError: `env` is no environment of `npa_envs`.
+        NPAError: `env` is no environment of `npa_envs`, or the gain no finite number.
     """
 
     def __init__(self, env: Any, gain: float = 0.03) -> None:
         super().__init__(interface_of(env))
+        if not is_real(gain):
+            raise NPAError(f"gain must be a finite number, got {gain!r}: try 0.03")
         self._gain = gain
 
     def act(self, observation: Tensor) -> Tensor:
@@ -115,7 +121,12 @@ class PaintPolicy(SpreadPolicy):
             if goal is None:
                 raise NPAError("colour must be given where env has no target: colour=(0, 0.5, 0)")
             colour = goal.target.mean_colour
-        self._colour = torch.as_tensor(colour, dtype=torch.float32)
+        try:
+            self._colour = torch.as_tensor(colour, dtype=torch.float32)
+        except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+            raise NPAError(
+                f"colour must have three numbers, got {colour!r}: for example colour=(0, 0.5, 0)"
+            ) from error
         if self._colour.shape != (3,):
             raise NPAError(
                 f"colour must have three numbers, got {tuple(self._colour.shape)}: "

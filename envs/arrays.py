@@ -54,8 +54,35 @@ def checked_action(action: Any, shape: tuple[int, ...], batched: bool) -> Tensor
         )
     if action.dtype.is_complex:
         raise NPAError(f"action must be an array of numbers that are real, got {action.dtype}")
+    if action.layout != torch.strided or action.device.type == "meta":
+        raise NPAError(
+            f"action must be a dense array of numbers, got {action.layout} on {action.device}: "
+            "convert it with action.to_dense()"
+        )
     checked: Tensor = action.detach().to(torch.float32).view(shape)
     return checked
+
+
+def number_tensor(name: str, value: Any) -> Tensor:
+    """Return real numbers of any library as a dense tensor.
+
+    Args:
+        name: What the caller calls them.
+        value: The numbers.
+
+    Raises:
+        NPAError: They are none.
+    """
+    try:
+        tensor = torch.as_tensor(value)
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        raise NPAError(f"{name} must be an array of numbers, got {type(value).__name__}") from error
+    if tensor.dtype.is_complex or tensor.layout != torch.strided or tensor.is_meta:
+        raise NPAError(
+            f"{name} must be a dense array of real numbers, got {tensor.dtype}, {tensor.layout} on "
+            f"{tensor.device}"
+        )
+    return tensor
 
 
 def checked_particles(
@@ -80,7 +107,7 @@ def checked_particles(
         ("s", s, physics.state_dim, physics.state_limit, "observation_limit"),
     )
     for name, value, width, limit, limit_name in shapes:
-        tensor = torch.as_tensor(value, dtype=torch.float32, device=device)
+        tensor = number_tensor(name, value).to(device, torch.float32)
         wanted = (world_count, particle_count, width)
         if tuple(tensor.shape) != wanted:
             raise NPAError(

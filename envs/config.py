@@ -11,7 +11,13 @@ import torch
 from npa_envs.devices import check_device
 from npa_envs.errors import NPAError, suggest
 from npa_envs.render import STYLES
-from npa_envs.tasks.checks import check_fraction, check_non_negative, check_positive, is_whole
+from npa_envs.tasks.checks import (
+    check_fraction,
+    check_non_negative,
+    check_positive,
+    is_real,
+    is_whole,
+)
 
 Boundary = Literal["open", "periodic"]
 Reward = Literal["dense", "sparse", "particle"]
@@ -38,6 +44,10 @@ ELSEWHERE = {
 
 LARGEST = 1e9
 """No number of a configuration is larger: products of them stay finite in float32."""
+
+
+LARGEST_RATIO = 1e7
+"""Perception is not scaled by more: its fourth power is a number of float32."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,8 +179,19 @@ class EnvConfig:
             )
         for field in fields(self):
             value = getattr(self, field.name)
-            if isinstance(value, float) and value > LARGEST:
+            if is_real(value) and value > LARGEST:
                 raise NPAError(f"{field.name} must be at most {LARGEST:g}, got {value}")
+        for name in ("eps", "eps0"):
+            if getattr(self, name) < 1.0 / LARGEST:
+                raise NPAError(
+                    f"{name} must be at least {1.0 / LARGEST:g} length units, got "
+                    f"{getattr(self, name)}: choose another unit of length"
+                )
+        if not 1.0 / LARGEST_RATIO <= self.eps / self.eps0 <= LARGEST_RATIO:
+            raise NPAError(
+                f"eps / eps0 must lie in [{1.0 / LARGEST_RATIO:g}, {LARGEST_RATIO:g}], got "
+                f"{self.eps:g} / {self.eps0:g}: perceive at a radius nearer to the rule's own"
+            )
         check_device(self.device)
 
     @property

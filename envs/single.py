@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.envs.arrays import checked_action, checked_particles, to_output
+from npa_envs.envs.arrays import checked_action, checked_particles, number_tensor, to_output
 from npa_envs.envs.divergence import guarded
 from npa_envs.envs.report import DIVERGED, SUCCESS, reason
 from npa_envs.envs.screen import Screen, WorldsView
@@ -63,6 +63,9 @@ class NPAEnv(gymnasium.Env[Any, Any]):
             seed: Begin the sequence of episodes that belongs to this number; without it the
                 sequence goes on.
             options: Not used.
+
+        Raises:
+            gymnasium.error.Error: The seed is no integer of at least 0.
 
         Returns:
             The observation, shape [N, P], and the loss with its parts.
@@ -147,7 +150,7 @@ class NPAEnv(gymnasium.Env[Any, Any]):
         if not self._started:
             raise NPAError("particles need a world: call reset first")
         count, physics = self.config.particle_count, self.worlds.physics
-        x, s = (torch.as_tensor(value)[None] for value in (x, s))
+        x, s = (number_tensor(name, value)[None] for name, value in (("x", x), ("s", s)))
         start = checked_particles(x, s, 1, count, physics, self.task.device)
         with self.worlds.here():
             self.worlds.place(self._world, start)

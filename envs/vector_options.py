@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -74,6 +74,11 @@ def worlds_to_reset(options: dict[str, Any] | None, world_count: int) -> NDArray
         NPAError: The mask is no bool array of shape [B], or chooses no world.
     """
     options = {} if options is None else options
+    if not isinstance(options, Mapping):
+        raise NPAError(
+            f"options must be a dict or None, got {type(options).__name__}: "
+            "for example options={'reset_mask': mask}"
+        )
     for name in options:
         if name != "reset_mask":
             raise NPAError(f"unknown reset option {name!r}: {suggest(str(name), ['reset_mask'])}")

@@ -13,7 +13,7 @@ from torch.utils.checkpoint import checkpoint
 from npa_envs.errors import NPAError
 from npa_envs.guards import OnDivergence, make_watch
 from npa_envs.randomness import Randomness, WorldRandom, check_generator
-from npa_envs.rule import FoldedRule, NPARule
+from npa_envs.rule import FoldedRule, NPARule, check_rule
 from npa_envs.sph.checks import (
     Box,
     check_finite_positions,
@@ -22,6 +22,7 @@ from npa_envs.sph.checks import (
     checked_box,
     checked_count,
     checked_eps,
+    checked_flag,
     checked_number,
 )
 from npa_envs.sph.operators import Terms, perceive_rows
@@ -70,6 +71,12 @@ def row_capacity(particle_total: int, update_prob: float) -> int:
     return min(particle_total, math.ceil(mean + margin))
 
 
+def check_memory(memory: Memory) -> None:
+    """Check what the backward pass shall read."""
+    if not isinstance(memory, str) or memory not in STORED_INTERVAL:
+        raise NPAError(f"memory must be 'store', 'recompute' or 'minimal', got {memory!r}")
+
+
 def checked_options(
     rule: NPARule,
     x: Tensor,
@@ -105,6 +112,7 @@ def checked_options(
         raise NPAError(f"dt must be positive and finite, got {dt}")
     if not (math.isfinite(position_noise) and position_noise >= 0.0):
         raise NPAError(f"position_noise must be finite and not negative, got {position_noise}")
+    detach_positions = checked_flag("detach_positions", detach_positions)
     sides = checked_box(box, rule.space_dim, radius)
     check_finite_positions(x)
     return StepOptions(radius, sides, update_prob, dt, position_noise, detach_positions)
@@ -322,8 +330,8 @@ def rollout(
             which step, and which number of which particle.
     """
     steps = checked_count("steps", steps)
-    if memory not in STORED_INTERVAL:
-        raise NPAError(f"memory must be 'store', 'recompute' or 'minimal', got {memory!r}")
+    check_memory(memory)
+    check_rule(rule)
     if rule.species_count:
         raise NPAError(
             f"the rule must not perceive species by themselves, got species_count="

@@ -22,6 +22,17 @@ _NO_PERMISSION = {errno.EACCES, errno.EPERM, errno.EROFS}
 _NEARLY_FULL_BYTES = 64 * 1024
 
 
+def checked_path(path: str | Path) -> Path:
+    """Return a path as pathlib's own.
+
+    Raises:
+        NPAError: It is neither text nor a path.
+    """
+    if not isinstance(path, str | os.PathLike):
+        raise NPAError(f"a path must be text or a pathlib.Path, got {path!r}")
+    return Path(path)
+
+
 @contextlib.contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path to write to, and rename it over `path` when the block succeeds.
@@ -38,7 +49,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         NPAError: The folder is missing or cannot be written to, `path` is a folder, the disk is
             full, or the system refuses the file for another reason.
     """
-    given = Path(path)
+    given = checked_path(path)
     target = Path(os.path.realpath(given))
     _check_target(given, target)
     temporary = target.with_name(f".{target.stem[:100]}.{secrets.token_hex(6)}.tmp{target.suffix}")

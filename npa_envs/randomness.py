@@ -5,13 +5,16 @@ from __future__ import annotations
 import enum
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from npa_envs.devices import check_device
 from npa_envs.errors import NPAError
-from npa_envs.sph.checks import DTYPES, checked_count, checked_number
+from npa_envs.sph.cells import LARGEST_INDEX
+from npa_envs.sph.checks import DTYPES, check_dense, checked_count, checked_number
 from npa_envs.sph.draws import bernoulli_draw, integer_draw, normal_draw, uniform_draw
 
 
@@ -45,7 +48,7 @@ class WorldRandom:
         device: Where the numbers are drawn.
 
     Raises:
-        NPAError: A seed is no integer of at least 0, or there is none.
+        NPAError: A seed is no integer of at least 0, there is none, or there is no such device.
 
     Attributes:
         keys: Key of each world, the seed's first 64 random bits, int64, shape [B].
@@ -55,7 +58,8 @@ class WorldRandom:
     """
 
     def __init__(self, seeds: int | Sequence[int], *, device: str | torch.device = "cpu") -> None:
-        given = list(seeds) if isinstance(seeds, Sequence | np.ndarray) else [seeds]
+        several = isinstance(seeds, Sequence | np.ndarray) and getattr(seeds, "ndim", 1) != 0
+        given: list[Any] = list(seeds) if several else [seeds]  # type: ignore[arg-type]
         if not given:
             raise NPAError("seeds must hold at least one seed, got none: give one for each world")
         # The first draw of NumPy's generator is what Gymnasium's seeding gives as well.
@@ -64,7 +68,7 @@ class WorldRandom:
             for seed in given
         ]
         bits = torch.from_numpy(np.array(keys, dtype=np.uint64).view(np.int64))
-        self._start(bits.to(device))
+        self._start(bits.to(check_device(device)))
 
     def _start(self, keys: Tensor) -> None:
         self.keys = keys
@@ -92,6 +96,7 @@ class WorldRandom:
                 f"keys must be an int64 tensor of shape [B], got {came}: "
                 f"make streams from integers with WorldRandom(seeds)"
             )
+        check_dense("keys", keys)
         made = cls.__new__(cls)
         made._start(keys.clone(memory_format=torch.contiguous_format))
         return made
@@ -173,7 +178,7 @@ class WorldRandom:
             NPAError: A size is no integer of at least 0, or the dtype is another one.
         """
         _check_dtype(dtype)
-        count = _element_count(shape)
+        count = _element_count(shape, self.world_count)
         drawn: Tensor = uniform_draw(*self._next(), count, dtype)
         return drawn.view(self.world_count, *shape)
 
@@ -188,7 +193,7 @@ class WorldRandom:
             NPAError: A size is no integer of at least 0, or the dtype is another one.
         """
         _check_dtype(dtype)
-        count = _element_count(shape)
+        count = _element_count(shape, self.world_count)
         drawn: Tensor = normal_draw(*self._next(), count, dtype)
         return drawn.view(self.world_count, *shape)
 
@@ -205,7 +210,7 @@ class WorldRandom:
         chance = checked_number("probability", probability)
         if not 0.0 <= chance <= 1.0:
             raise NPAError(f"probability must lie in [0, 1], got {probability}: try 0.5")
-        count = _element_count(shape)
+        count = _element_count(shape, self.world_count)
         drawn: Tensor = bernoulli_draw(*self._next(), count, chance)
         return drawn.view(self.world_count, *shape)
 
@@ -222,7 +227,7 @@ class WorldRandom:
         limit = checked_count("high", high)
         if not 1 <= limit < 2**63:
             raise NPAError(f"high must lie in [1, 2^63 - 1], got {high}: draw from [0, high)")
-        count = _element_count(shape)
+        count = _element_count(shape, self.world_count)
         drawn: Tensor = integer_draw(*self._next(), count, limit)
         return drawn.view(self.world_count, *shape)
 
@@ -295,5 +300,12 @@ def _check_dtype(dtype: torch.dtype) -> None:
         raise NPAError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
 
 
-def _element_count(shape: tuple[int, ...]) -> int:
-    return math.prod(checked_count("a size", size) for size in shape)
+def _element_count(shape: tuple[int, ...], world_count: int) -> int:
+    """Return how many numbers each world draws."""
+    count = math.prod(checked_count("a size", size) for size in shape)
+    if count * world_count > LARGEST_INDEX:
+        raise NPAError(
+            f"a draw must have at most {LARGEST_INDEX} numbers, got {count} for each of "
+            f"{world_count} worlds: draw several times"
+        )
+    return count

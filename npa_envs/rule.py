@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from npa_envs.errors import NPAError
 from npa_envs.sph.arranged import ArrangedWeights, arrange_weights
+from npa_envs.sph.checks import checked_flag, checked_positive
 from npa_envs.sph.network import run_network
 
 COLOUR_OFFSET = 0.5
@@ -20,6 +21,10 @@ INIT_GAIN = 0.1
 
 FOLD = 4
 """Rows of products are padded to a multiple of this many columns: 16 bytes of float32."""
+
+
+LARGEST_DIM = 65536
+"""No dimension of a rule is larger."""
 
 
 OUTPUT_BLOCKS = 4
@@ -114,6 +119,18 @@ def fold_weights(hidden_weight: Tensor, output_weight: Tensor) -> FoldedRule:
     return FoldedRule(hidden_weight, output_weight, arranged, joined)
 
 
+def check_rule(rule: Any) -> None:
+    """Check that something is a rule; one that `torch.compile` has wrapped is one too.
+
+    Raises:
+        NPAError: It is none.
+    """
+    if not isinstance(getattr(rule, "_orig_mod", rule), NPARule):
+        raise NPAError(
+            f"rule must be an NPARule, got {type(rule).__name__}: load it with npa_envs.load_rule"
+        )
+
+
 class NPARule(nn.Module):
     """The update rule of Neural Particle Automata: y = W2 relu(W1 z + b1).
 
@@ -163,12 +180,11 @@ class NPARule(nn.Module):
             raise NPAError(f"dimensions of a rule must be integers, got {sizes}")
         if space_dim not in (2, 3):
             raise NPAError(f"space_dim must be 2 or 3, got {space_dim}")
+        if max(sizes) > LARGEST_DIM:
+            raise NPAError(f"dimensions of a rule must be at most {LARGEST_DIM}, got {sizes}")
         for name, value in (("state_dim", state_dim), ("hidden_dim", hidden_dim)):
             if value < 1:
                 raise NPAError(f"{name} must be at least 1, got {value}")
-        for name, number in (("eps0", eps0), ("alpha", alpha)):
-            if not 0.0 < number < float("inf"):
-                raise NPAError(f"{name} must be positive and finite, got {number}")
         if readout_dim < 0 or (readout_dim > 0 and readout_hidden_dim < 1):
             raise NPAError(
                 f"readout_dim must be 0, or positive with readout_hidden_dim at least 1, "
@@ -179,14 +195,14 @@ class NPARule(nn.Module):
         self.space_dim = space_dim
         self.state_dim = state_dim
         self.hidden_dim = hidden_dim
-        self.eps0 = float(eps0)
-        self.alpha = float(alpha)
-        self.static = static
+        self.eps0 = checked_positive("eps0", eps0, " [length units]")
+        self.alpha = checked_positive("alpha", alpha)
+        self.static = checked_flag("static", static)
         self.readout_dim = readout_dim
         self.readout_hidden_dim = readout_hidden_dim
-        self.moment_correction = moment_correction
-        self.state_gradient = state_gradient
-        self.density_gradient = density_gradient
+        self.moment_correction = checked_flag("moment_correction", moment_correction)
+        self.state_gradient = checked_flag("state_gradient", state_gradient)
+        self.density_gradient = checked_flag("density_gradient", density_gradient)
         self.species_count = species_count
 
         self.hidden = nn.Linear(self.perception_dim, hidden_dim)

@@ -20,8 +20,8 @@ from torch import Tensor
 
 from npa_envs.devices import check_device
 from npa_envs.errors import NPAError, suggest
-from npa_envs.files import write_bytes
-from npa_envs.rule import NPARule, RuleHyperParameters
+from npa_envs.files import checked_path, write_bytes
+from npa_envs.rule import NPARule, RuleHyperParameters, check_rule
 from npa_envs.rule_formats import RuleParts, read_demo_json, read_state_dict
 
 FORMAT_NAME = "npa-envs rule"
@@ -36,9 +36,14 @@ def shipped_rules(task: str | None = None) -> dict[str, Path]:
 
     Args:
         task: Only those that were trained on this task, for example "morphogenesis2d".
+
+    Raises:
+        NPAError: The task is no text.
     """
     folder = Path(__file__).resolve().parent / "rules"
     rules = {path.stem: path for path in sorted(folder.glob("*.safetensors"))}
+    if not isinstance(task, str | None):
+        raise NPAError(f"task must be the name of one, got {task!r}: for example 'texture'")
     if task is None:
         return rules
     return {name: path for name, path in rules.items() if rule_metadata(path).get("task") == task}
@@ -81,6 +86,8 @@ def save_rule(
 ) -> None:
     """Write a rule with all its hyper-parameters to a `.safetensors` file, whole or not at all.
 
+    The same rule and metadata give the same bytes.
+
     Args:
         rule: The rule; its weights are written in their own precision.
         path: The file to write, ending in `.safetensors`; an existing one is replaced.
@@ -90,7 +97,8 @@ def save_rule(
         NPAError: The suffix is another one, the metadata is not text or takes a reserved name, a
             weight is not finite, or the file cannot be written.
     """
-    path = Path(path)
+    check_rule(rule)
+    path = checked_path(path)
     if path.suffix != ".safetensors":
         raise NPAError(
             f"a rule's file must end in .safetensors, got {str(path)!r}: "
@@ -98,6 +106,11 @@ def save_rule(
         )
     header = {"format": FORMAT_NAME, "version": str(FORMAT_VERSION)}
     header |= {name: json.dumps(value) for name, value in rule.hyper_parameters().items()}
+    if not isinstance(metadata, Mapping | None):
+        raise NPAError(
+            f"metadata must map text to text, got {type(metadata).__name__}: for example "
+            "metadata={'trained by': 'me'}"
+        )
     for name, text in (metadata or {}).items():
         if not isinstance(name, str) or not isinstance(text, str):
             raise NPAError(
@@ -108,7 +121,21 @@ def save_rule(
         header[name] = text
     weights = {k: v.detach().cpu().contiguous() for k, v in rule.state_dict().items()}
     _check_finite(weights)
-    write_bytes(path, serialise(weights, metadata=header))
+    write_bytes(path, _with_sorted_metadata(serialise(weights, metadata=header)))
+
+
+def _with_sorted_metadata(file: bytes) -> bytes:
+    """Return a safetensors file whose metadata is in order, so that equal rules make equal files.
+
+    The library writes it in an order that changes from call to call.
+    """
+    size = int.from_bytes(file[:8], "little")
+    header = json.loads(file[8 : 8 + size])
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+    # The format asks for tensors that begin at a multiple of 8 bytes, after spaces.
+    text += b" " * (-len(text) % 8)
+    return len(text).to_bytes(8, "little") + text + file[8 + size :]
 
 
 def rule_metadata(path: str | Path) -> dict[str, str]:
@@ -121,7 +148,7 @@ def rule_metadata(path: str | Path) -> dict[str, str]:
         NPAError: The file is missing, garbage, truncated, or not a rule.
     """
     try:
-        return _read_header(Path(path))
+        return _read_header(checked_path(path))
     except NPAError as error:
         raise NPAError(f"cannot read the header of {str(path)!r}: {error}") from error
 

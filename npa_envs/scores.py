@@ -31,7 +31,7 @@ def scores(name: str) -> dict[str, Any]:
         NPAError: There is no such rule.
     """
     rules = shipped_rules()
-    if name not in rules:
+    if not isinstance(name, str) or name not in rules:
         raise NPAError(f"unknown rule {name!r}: {suggest(str(name), rules)}")
     found: dict[str, Any] = json.loads(rules[name].with_suffix(".json").read_text("utf-8"))
     return found

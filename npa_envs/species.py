@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any, Literal, overload
 
 import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from npa_envs.dynamics import STORED_INTERVAL, Memory, checked_options, rollout
+from npa_envs.dynamics import STORED_INTERVAL, Memory, check_memory, checked_options, rollout
 from npa_envs.errors import NPAError
 from npa_envs.guards import OnDivergence, make_watch
 from npa_envs.randomness import Randomness, check_generator
 from npa_envs.rule import NPARule
 from npa_envs.species_steps import advance, draw, make_community
-from npa_envs.sph.checks import Box, check_world, checked_count, checked_number
+from npa_envs.sph.checks import Box, check_world, checked_count, checked_number, entries
 from npa_envs.sph.species import checked_counts
 
 SpeciesPerception = Literal["shared", "per_species"]
@@ -156,8 +156,7 @@ def rollout_species(
     _check_agreement(species_rules, len(sizes), perception)
     probabilities = _checked_probabilities(update_prob, len(sizes))
     divisors = _checked_divisors(density_counts, sizes)
-    if memory not in STORED_INTERVAL:
-        raise NPAError(f"memory must be 'store', 'recompute' or 'minimal', got {memory!r}")
+    check_memory(memory)
     if perception == "shared" and divisors == (float(x.shape[1]),):
         *after, travelled = rollout(
             species_rules[0],
@@ -205,12 +204,12 @@ def rollout_species(
 
 
 def _checked_rules(rules: Any) -> list[NPARule]:
-    if isinstance(rules, NPARule) or not isinstance(rules, Iterable):
+    given = None if isinstance(rules, NPARule) else entries(rules)
+    if given is None:
         raise NPAError(
             f"rules must hold one rule for each species, got {type(rules).__name__}: "
             f"give (rule,) for one species"
         )
-    given = list(rules)
     for number, rule in enumerate(given):
         if not isinstance(rule, NPARule):
             raise NPAError(
@@ -222,7 +221,7 @@ def _checked_rules(rules: Any) -> list[NPARule]:
 
 def _check_agreement(rules: list[NPARule], species_count: int, perception: str) -> None:
     """Check that rules fit each other, the number of species and the mode of perception."""
-    if perception not in MODES:
+    if not isinstance(perception, str) or perception not in MODES:
         raise NPAError(f"perception must be 'shared' or 'per_species', got {perception!r}")
     if len(rules) != species_count:
         raise NPAError(
@@ -247,11 +246,9 @@ def _check_agreement(rules: list[NPARule], species_count: int, perception: str) 
 
 def _checked_probabilities(update_prob: Any, species_count: int) -> list[Any]:
     """Return one probability for each species; their values are checked with the rules."""
-    if not isinstance(update_prob, Iterable) or isinstance(update_prob, str):
+    given = entries(update_prob)
+    if given is None:
         return [update_prob] * species_count
-    if getattr(update_prob, "ndim", 1) == 0:
-        return [update_prob] * species_count
-    given = list(update_prob)
     if len(given) != species_count:
         raise NPAError(
             f"update_prob must be one number, or one for each of {species_count} species, "
@@ -264,7 +261,9 @@ def _checked_divisors(density_counts: Any, counts: tuple[int, ...]) -> tuple[flo
     """Return what each species divides densities by."""
     if density_counts is None:
         return (float(sum(counts)),) * len(counts)
-    given = list(density_counts) if isinstance(density_counts, Iterable) else [density_counts]
+    given = entries(density_counts)
+    if given is None:
+        given = [density_counts]
     checked = tuple(checked_number("an entry of density_counts", number) for number in given)
     if len(checked) != len(counts) or not all(0.0 < number < math.inf for number in checked):
         raise NPAError(

@@ -1,11 +1,20 @@
 """What the operators and the dynamics refuse, and what they say."""
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
 
 import npa_envs
 from npa_envs import NPAError, NPARule, perceive, perception_fields, rollout
+from npa_envs.render import to_uint8, write_gif
+from npa_envs.scores import scores
+from npa_envs.sph import orbit, periodic_splat, splat
+from npa_envs.tasks.damage import damage_worlds, parse_damage
+from npa_envs.tasks.seeds import uniform_ball, uniform_box
+from npa_envs.tasks.texture_config import TextureConfig
+from npa_envs.training import preset
+from npa_envs.wrappers import TorchNormalizeReward
 
 
 def world(**options):
@@ -160,3 +169,81 @@ class TestRollout:
 def test_rules_out_of_range(options, message):
     with pytest.raises(NPAError, match=message):
         npa_envs.NPARule(**options)
+
+
+def splatted(**options):
+    given = {"resolution": 8, "pixel_size": 0.2} | options
+    return splat(torch.zeros(1, 4, 2), torch.zeros(1, 4, 3), **given)
+
+
+SPARSE = torch.zeros(1, 4, 2).to_sparse()
+META = torch.zeros(1, 4, 2, device="meta")
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: rollout(3, *world(), 1), "rule must be an NPARule, got int"),
+        (lambda: rollout(NPARule(), *world(), 1, memory=[]), "memory must be 'store'"),
+        (lambda: perceive(SPARSE, SPARSE, 0.1), "x must be a dense tensor"),
+        (lambda: perceive(META, META, 0.1), "x must be a dense tensor on 'cpu' or 'cuda'"),
+        (
+            lambda: perceive(*world(), 0.1, detach_positions=torch.ones(2)),
+            "detach_positions must be True or False",
+        ),
+        (
+            lambda: npa_envs.species_fields(world()[0], torch.tensor(4), eps=0.1),
+            "counts must hold one number",
+        ),
+        (lambda: npa_envs.rollout_species(np.array(1.0), *world(), 1, counts=[4]), "rules must"),
+        (lambda: NPARule(alpha=[]), "alpha must be a number"),
+        (lambda: NPARule(hidden_dim=2**31), "at most 65536"),
+        (lambda: npa_envs.save_rule(3, "a.safetensors"), "rule must be an NPARule"),
+        (lambda: npa_envs.save_rule(NPARule(), {}), "a path must be text"),
+        (
+            lambda: npa_envs.save_rule(NPARule(), "a.safetensors", metadata=[1]),
+            "metadata must map text to text",
+        ),
+        (lambda: npa_envs.shipped_rules(np.zeros(2)), "task must be the name of one"),
+        (lambda: npa_envs.world_mean(3.0), "values must be a torch tensor"),
+        (lambda: npa_envs.WorldRandom(0, device=2**31), "device must be text"),
+        (lambda: npa_envs.WorldRandom(0).uniform(2**64), "a draw must have at most"),
+        (lambda: scores(["a"]), "unknown rule"),
+        (lambda: splatted(resolution="8"), "resolution must be an integer"),
+        (lambda: splatted(resolution=2**31), r"resolution must lie in \[1, 16384\]"),
+        (lambda: splatted(hi=[1.0]), "hi must be a number"),
+        (lambda: splatted(hi=1e300), "must have a size in"),
+        (
+            lambda: periodic_splat(
+                torch.zeros(1, 4, 2), torch.zeros(1, 4, 3), resolution=8, pixel_size=0.2, sigma=1e5
+            ),
+            "stay within 16384 pixels",
+        ),
+        (lambda: orbit(1, centre=1.0, width=4, height=4), "centre must be 3 numbers"),
+        (lambda: orbit(1, fov=[1], width=4, height=4), "fov must be a number"),
+        (lambda: orbit(1, width=(4,), height=4), "width must be an integer"),
+        (lambda: uniform_ball(2, None, 2, 0.1), "particle_count must be an integer"),
+        (lambda: uniform_ball(2, 2**31, 2, 0.1), "coordinates must be at most"),
+        (lambda: uniform_box(2, 3, 1.0), "box must hold a side"),
+        (lambda: parse_damage(3), "damage must be text"),
+        (lambda: damage_worlds(*world(), kind="erase", size={}), "size must be a number"),
+        (lambda: damage_worlds(*world(), kind="erase", size=1e300), "at least 0"),
+        (lambda: preset("tiny", 3), "unknown task 3"),
+        (lambda: preset("tiny", decay=10**400), "decay must be of type float"),
+        (lambda: TextureConfig(eps=10**400), "eps must be a finite number"),
+        (lambda: to_uint8(torch.zeros(2, 2, 4), background=2.0), "background must be red"),
+        (lambda: write_gif("a.gif", 3), "frames must be a sequence"),
+        (
+            lambda: gymnasium.make("npa/Texture-v0", particle_count=16, eps=5e-324),
+            "eps must be at least 1e-09",
+        ),
+        (
+            lambda: gymnasium.make("npa/Texture-v0", particle_count=16, success_loss=2**64),
+            "success_loss must be at most",
+        ),
+        (lambda: TorchNormalizeReward(()), "needs a vector environment, got tuple"),
+    ],
+)
+def test_what_the_fuzz_found_is_a_clear_error(call, message):
+    with pytest.raises(NPAError, match=message):
+        call()

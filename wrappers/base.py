@@ -69,6 +69,23 @@ def vector_env(env: Any, wrapper: str) -> NPAVectorEnv:
     return base
 
 
+def check_vector_env(env: Any, wrapper: str) -> None:
+    """Check that something is a vector environment of Gymnasium's.
+
+    Args:
+        env: What a wrapper was given.
+        wrapper: Name of the wrapper, for the error.
+
+    Raises:
+        NPAError: It is none.
+    """
+    if not isinstance(env, VectorEnv):
+        raise NPAError(
+            f"{wrapper} needs a vector environment, got {type(env).__name__}: "
+            "make it with gym.make_vec(..., vectorization_mode='vector_entry_point')"
+        )
+
+
 def check_untouched(env: Any, wrapper: str) -> None:
     """Check that the wrappers beneath leave observations as the environment gives them.
 

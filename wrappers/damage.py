@@ -47,13 +47,16 @@ class Schedule:
 
     def __init__(self, events: Event | Sequence[Event], every: int | None) -> None:
         several: Any = events
-        if isinstance(events, str | DamageEvent) or not isinstance(several, Iterable):
+        listed = isinstance(several, Iterable) and getattr(several, "ndim", 1) != 0
+        if isinstance(events, str | DamageEvent) or not listed:
             several = [events]
         given = list(several)
         if not given:
             raise NPAError("events must hold at least one event, got none: for example '100:cut'")
-        if every is not None and not (is_whole(every) and every >= 1):
-            raise NPAError(f"every must be a whole number of at least 1, got {every!r}")
+        if every is not None and not (is_whole(every) and 1 <= every < 2**63):
+            raise NPAError(
+                f"every must be a whole number of at least 1 and below 2^63, got {every!r}"
+            )
         for event in given:
             if not isinstance(event, str | DamageEvent):
                 raise NPAError(

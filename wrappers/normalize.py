@@ -50,7 +50,7 @@ class PerceptionStatistics:
         for name, value in (("clip", clip), ("epsilon", epsilon)):
             if not is_real(value) or value <= 0:
                 raise NPAError(f"{name} must be a finite number greater than 0, got {value!r}")
-        self.clip, self.epsilon = clip, epsilon
+        self.clip, self.epsilon = float(clip), float(epsilon)
         self.space_dim, self.state_dim = physics.space_dim, physics.state_dim
         self.perception_dim = physics.perception_dim
         self.moments = RunningMoments(3 * self.state_dim + 1)
@@ -143,6 +143,13 @@ def shared_or_new(
     return statistics
 
 
+def checked_training(training: bool) -> bool:
+    """Return whether statistics go on, which must be said by a bool."""
+    if not isinstance(training, bool | np.bool_):
+        raise NPAError(f"training must be True or False, got {training!r}")
+    return bool(training)
+
+
 def recorded(statistics: PerceptionStatistics, training: bool) -> dict[str, Any]:
     """Return the arguments from which a wrapper alike, with new statistics, can be made."""
     return {"clip": statistics.clip, "epsilon": statistics.epsilon, "training": training}
@@ -205,7 +212,7 @@ class NormalizePerception(KeepsStatistics, AnyWrapper, RecordConstructorArgs):
         self.statistics = shared_or_new(statistics, physics, clip, epsilon)
         RecordConstructorArgs.__init__(self, **recorded(self.statistics, training))
         super().__init__(env)
-        self.training = training
+        self.training = checked_training(training)
         assert isinstance(env.observation_space, Box), "environments of this package have boxes"
         self.observation_space = self.statistics.space(env.observation_space)
 
@@ -263,7 +270,7 @@ class VectorNormalizePerception(KeepsStatistics, VectorObservations, RecordConst
         self.statistics = shared_or_new(statistics, physics, clip, epsilon)
         RecordConstructorArgs.__init__(self, **recorded(self.statistics, training))
         super().__init__(env)
-        self.training = training
+        self.training = checked_training(training)
         assert isinstance(env.single_observation_space, Box), "ours are boxes"
         self.single_observation_space = self.statistics.space(env.single_observation_space)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import gymnasium
@@ -53,10 +53,17 @@ class SpeciesPlan:
             raise NPAError(
                 f"species_count must be a whole number of at least 1, got {species_count!r}"
             )
-        if assignment not in ASSIGNMENTS:
+        if not isinstance(assignment, str) or assignment not in ASSIGNMENTS:
             hint = suggest(str(assignment), ASSIGNMENTS)
             raise NPAError(f"assignment must be a known word, got {assignment!r}: {hint}")
-        shares = [1.0] * species_count if fractions is None else list(fractions)
+        if species_count > particle_count:
+            raise NPAError(
+                f"species_count must be at most the {particle_count} particles, got {species_count}"
+            )
+        shares: list[Any] = [1.0] * species_count
+        if fractions is not None:
+            listed = isinstance(fractions, Iterable) and getattr(fractions, "ndim", 1) != 0
+            shares = list(fractions) if listed else []
         if len(shares) != species_count or not all(is_real(f) and f > 0 for f in shares):
             raise NPAError(
                 f"fractions must be {species_count} numbers greater than 0, one for each species, "

@@ -24,6 +24,7 @@ from npa_envs.wrappers.base import (
     EpisodeClock,
     VectorObservations,
     autoreset_mode,
+    check_vector_env,
     world_indices,
 )
 from npa_envs.wrappers.moments import RunningMoments
@@ -42,16 +43,18 @@ class TorchRecordEpisodeStatistics(AnyVectorWrapper):
         stats_key: The key in `infos`.
 
     Raises:
-        NPAError: `buffer_length` is no whole number of at least 1.
+        NPAError: `env` is no vector environment, or `buffer_length` no whole number of at least 1.
     """
 
     def __init__(
         self, env: AnyVectorEnv, buffer_length: int = 100, stats_key: str = "episode"
     ) -> None:
+        check_vector_env(env, type(self).__name__)
         super().__init__(env)
-        if not is_whole(buffer_length) or buffer_length < 1:
+        if not is_whole(buffer_length) or not 1 <= buffer_length < 2**31:
             raise NPAError(
-                f"buffer_length must be a whole number of at least 1, got {buffer_length!r}"
+                "buffer_length must be a whole number of at least 1 and below 2^31, got "
+                f"{buffer_length!r}"
             )
         self._key = stats_key
         self._clock = EpisodeClock(env)
@@ -140,6 +143,7 @@ class TorchNormalizeObservation(VectorObservations):
     """
 
     def __init__(self, env: AnyVectorEnv, epsilon: float = 1e-8) -> None:
+        check_vector_env(env, type(self).__name__)
         super().__init__(env)
         self.epsilon = check_above_zero("epsilon", epsilon)
         shape = env.single_observation_space.shape
@@ -180,6 +184,7 @@ class TorchNormalizeReward(AnyVectorWrapper):
     """
 
     def __init__(self, env: AnyVectorEnv, gamma: float = 0.99, epsilon: float = 1e-8) -> None:
+        check_vector_env(env, type(self).__name__)
         super().__init__(env)
         if not is_real(gamma) or not 0.0 <= gamma <= 1.0:
             raise NPAError(f"gamma must lie in [0, 1], got {gamma!r}: try 0.99")
@@ -257,4 +262,4 @@ def check_above_zero(name: str, value: float) -> float:
     """
     if not is_real(value) or value <= 0:
         raise NPAError(f"{name} must be a finite number greater than 0, got {value!r}")
-    return value
+    return float(value)

@@ -72,6 +72,8 @@ def _checked(agent: str, action: Any, wanted: tuple[int, ...]) -> Tensor:
         raise NPAError(_rule(agent, wanted, type(action).__name__)) from error
     if tuple(action.shape) != wanted or action.dtype.is_complex:
         raise NPAError(_rule(agent, wanted, f"{tuple(action.shape)} of {action.dtype}"))
+    if action.layout != torch.strided or action.is_meta:
+        raise NPAError(_rule(agent, wanted, f"a tensor that is {action.layout} on {action.device}"))
     checked: Tensor = action.detach().to(torch.float32)
     return checked
 

@@ -112,6 +112,9 @@ class CrowdEnv(ParallelEnv):  # type: ignore[misc]
 
         Returns:
             Observations, and each agent's loss with its parts.
+
+        Raises:
+            gymnasium.error.Error: The seed is no integer of at least 0.
         """
         key = None
         if seed is not None or self.np_random is None:

@@ -15,6 +15,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from npa_envs.errors import MissingDependencyError, NPAError
 from npa_envs.files import atomic_path
+from npa_envs.tasks.checks import is_real
 
 Frame = NDArray[np.uint8]
 
@@ -179,12 +180,21 @@ def check_rate(fps: float, *, highest: float = 1000) -> None:
     Raises:
         NPAError: It is not in [0.1, highest].
     """
-    if not (math.isfinite(fps) and 0.1 <= fps <= highest):
+    if not (is_real(fps) and 0.1 <= fps <= highest):
         raise NPAError(f"fps must be in [0.1, {highest}], got {fps}: try 25")
 
 
 def _check_frames(frames: Iterable[Frame]) -> list[Frame]:
-    pictures = [np.ascontiguousarray(frame) for frame in frames]
+    given: Any = frames
+    if not isinstance(given, Iterable) or getattr(given, "ndim", 1) == 0:
+        raise NPAError(
+            f"frames must be a sequence of pictures, got {type(given).__name__}: "
+            "give [frame] for one"
+        )
+    try:
+        pictures = [np.ascontiguousarray(frame) for frame in given]
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise NPAError(f"frames must be uint8 [H, W, 3] arrays, got others ({error})") from error
     if not pictures:
         raise NPAError(
             "frames must hold at least one picture, got none: give uint8 [H, W, 3] arrays"

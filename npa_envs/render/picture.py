@@ -9,6 +9,7 @@ from PIL import ImageColor
 from torch import Tensor
 
 from npa_envs.errors import NPAError
+from npa_envs.sph.checks import check_dense, checked_number, entries
 
 Background = str | tuple[float, float, float]
 
@@ -30,11 +31,16 @@ def to_uint8(picture: Tensor, background: Background = "white") -> NDArray[np.ui
     Raises:
         NPAError: A wrong shape or dtype, or an unknown colour.
     """
+    if not isinstance(picture, Tensor):
+        raise NPAError(
+            f"picture must be a torch tensor, got {type(picture).__name__}: give what splat returns"
+        )
     if picture.ndim < 3 or picture.shape[-1] != 4 or not picture.is_floating_point():
         raise NPAError(
             "picture must be a floating tensor of shape [..., R, R, 4] (colour sums, density), "
             f"got {picture.dtype} {tuple(picture.shape)}: give what splat returns"
         )
+    check_dense("picture", picture)
     behind = background_colour(background)
     fields = picture.detach().float()
     valid = fields.isfinite().all(dim=-1, keepdim=True)
@@ -66,9 +72,11 @@ def background_colour(background: Background) -> tuple[float, float, float]:
                 "give 'white', 'black', another name of CSS, or '#rrggbb'"
             ) from error
         return red / 255, green / 255, blue / 255
-    if len(background) != 3 or not all(0 <= channel <= 1 for channel in background):
+    given = entries(background)
+    channels = [checked_number("a channel of background", part) for part in given or ()]
+    if len(channels) != 3 or not all(0 <= channel <= 1 for channel in channels):
         raise NPAError(
             f"background must be red, green and blue in [0, 1], got {background!r}: "
             "for white give (1, 1, 1)"
         )
-    return background
+    return channels[0], channels[1], channels[2]

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from npa_envs.render.picture import Background, to_uint8
 from npa_envs.sph import Cameras, orbit
+from npa_envs.sph.checks import checked_count, checked_finite
 from npa_envs.tasks.views import ANGLE, DISTANCE
 
 
@@ -41,6 +42,8 @@ def turntable_frames(
     Raises:
         NPAError: A number is out of its range, or the colour is unknown.
     """
+    frame_count = checked_count("frame_count", frame_count)
+    azimuth = checked_finite("azimuth", azimuth, " [degrees]")
     frames = []
     with torch.no_grad():
         for k in range(frame_count):

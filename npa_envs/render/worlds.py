@@ -16,7 +16,14 @@ from npa_envs.render.colours import density_colours, state_colours
 from npa_envs.render.picture import Background, background_colour, to_uint8
 from npa_envs.rule import COLOUR_OFFSET
 from npa_envs.sph import periodic_splat, splat
-from npa_envs.sph.checks import check_world
+from npa_envs.sph.checks import (
+    check_world,
+    checked_flag,
+    checked_number,
+    checked_positive,
+    number_tensor,
+)
+from npa_envs.sph.splat import checked_window
 
 STYLES = ("particles", "density", "states")
 """What a picture can show: the particles' own colours, how dense they are, their hidden states."""
@@ -89,14 +96,17 @@ def draw_worlds(
         NPAError: An unknown style or colour, a shape that does not fit, or a number out of range.
     """
     check_world(x, s)
-    if style not in STYLES:
+    if not isinstance(style, str) or style not in STYLES:
         raise NPAError(f"style must be one that exists, got {style!r}: {suggest(style, STYLES)}")
-    for name, value in (("half_width", half_width), ("pixel_size", pixel_size), ("sigma", sigma)):
-        if not (math.isfinite(value) and value > 0.0):
-            raise NPAError(f"{name} must be positive and finite, got {value}")
+    half_width = checked_positive("half_width", half_width)
+    periodic = checked_flag("periodic", periodic)
+    azimuth, elevation = checked_number("azimuth", azimuth), checked_number("elevation", elevation)
     for name, value in (("azimuth", azimuth), ("elevation", elevation)):
         if not math.isfinite(value):
             raise NPAError(f"{name} must be a finite angle in degrees, got {value}")
+    resolution, pixel_size, sigma, *_ = checked_window(
+        resolution, pixel_size, sigma, -half_width, half_width
+    )
     if periodic and x.shape[2] != 2:
         raise NPAError(f"periodic pictures are of 2D worlds, got D = {x.shape[2]}: leave it out")
     behind = background_colour(background)
@@ -152,7 +162,7 @@ def _middle(centre: Tensor | Sequence[float] | None, x: Tensor) -> Tensor:
     world_count, _, space_dim = x.shape
     if centre is None:
         return x.new_zeros(space_dim)
-    middle = torch.as_tensor(centre).to(x)
+    middle = number_tensor("centre", centre).to(x)
     if middle.shape not in ((space_dim,), (world_count, space_dim)):
         raise NPAError(
             f"centre must have shape [{space_dim}] or [{world_count}, {space_dim}], "

@@ -16,13 +16,22 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.sph.checks import DTYPES, checked_count, checked_number
+from npa_envs.sph.checks import (
+    DTYPES,
+    LARGEST_SIDE,
+    check_dense,
+    checked_count,
+    checked_finite,
+    checked_number,
+    checked_side,
+    number_tensor,
+)
 
 RIGID_TOLERANCE = 1e-3
 """How far R Rᵀ may be from the unit matrix, entry by entry, dimensionless."""
 
-LARGEST_SIDE = 16384
-"""Pixels along a side of a picture, at most."""
+SMALLEST_ANGLE = 1e-9
+"""Angles of view are larger [radians]: focal lengths stay numbers of float32."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -58,9 +67,7 @@ class Cameras:
         """
         self._check_shapes()
         for name in ("width", "height"):
-            side = checked_count(name, getattr(self, name))
-            if not 1 <= side <= LARGEST_SIDE:
-                raise NPAError(f"{name} must lie in [1, {LARGEST_SIDE}] pixels, got {side}")
+            checked_side(name, getattr(self, name))
         near = checked_number("near", self.near)
         if not (math.isfinite(near) and near > 0.0):
             raise NPAError(
@@ -103,6 +110,7 @@ class Cameras:
                     f"{name} must be a float32 or float64 tensor, got {got}: "
                     f"convert it with torch.as_tensor(..., dtype=torch.float32)"
                 )
+            check_dense(name, tensor)
         if motions.ndim not in (3, 4) or motions.shape[-2:] != (4, 4) or 0 in motions.shape:
             cure = "add a dimension of views with world_to_camera[None]"
             raise NPAError(
@@ -169,13 +177,14 @@ def look_at(
     if not isinstance(eyes, Tensor) or eyes.dtype not in DTYPES or eyes.shape[-1:] != (3,):
         got = tuple(eyes.shape) if isinstance(eyes, Tensor) else type(eyes).__name__
         raise NPAError(f"eyes must be a floating tensor of shape [..., 3], got {got}")
-    goal = torch.as_tensor(targets).to(eyes)
+    check_dense("eyes", eyes)
+    goal = number_tensor("targets", targets).to(eyes)
     if goal.shape not in ((3,), eyes.shape):
         raise NPAError(
             f"targets must have shape [3] or that of eyes, {tuple(eyes.shape)}, "
             f"got {tuple(goal.shape)}"
         )
-    high = torch.tensor(tuple(up)).to(eyes)
+    high = number_tensor("up", up).to(eyes)
     if high.shape != (3,):
         raise NPAError(f"up must be 3 numbers, got {up}")
     ahead = goal - eyes
@@ -197,7 +206,10 @@ def look_at(
 
 def _intrinsics(fov: float, width: int, height: int) -> Tensor:
     """Return fx, fy, cx, cy [pixels] of square pixels, `fov` [radians] across the width."""
-    if not 0.0 < fov < math.pi:
+    for name, side in (("width", width), ("height", height)):
+        checked_side(name, side)
+    fov = checked_number("the angle of view", fov)
+    if not SMALLEST_ANGLE < fov < math.pi:
         raise NPAError(
             f"the angle of view must lie between 0 and 180 degrees, got {math.degrees(fov):g}"
         )
@@ -238,9 +250,10 @@ def orbit(
     """
     if checked_count("count", count) < 1:
         raise NPAError(f"count must be at least 1 camera, got {count}")
-    for name, value in (("elevation", elevation), ("azimuth", azimuth), ("radius", radius)):
-        if not math.isfinite(value):
-            raise NPAError(f"{name} must be finite, got {value}")
+    if count > LARGEST_SIDE:
+        raise NPAError(f"count must be at most {LARGEST_SIDE} cameras, got {count}")
+    elevation, azimuth = checked_finite("elevation", elevation), checked_finite("azimuth", azimuth)
+    radius, angle = checked_finite("radius", radius), checked_number("fov", fov)
     if not abs(elevation) < 90.0:
         raise NPAError(
             f"elevation must lie between -90 and 90 degrees, got {elevation:g}: straight from "
@@ -253,12 +266,12 @@ def orbit(
     flat = math.cos(tilt)
     heights = torch.full_like(turn, math.sin(tilt))
     outward = torch.stack((flat * turn.sin(), heights, flat * turn.cos()), dim=-1)
-    middle = torch.tensor(tuple(centre), dtype=torch.float64)
+    middle = number_tensor("centre", centre).double()
     if middle.shape != (3,):
         raise NPAError(f"centre must be 3 numbers [length units], got {centre}")
     return Cameras(
         world_to_camera=look_at(middle + radius * outward, middle).float(),
-        intrinsics=_intrinsics(math.radians(fov), width, height),
+        intrinsics=_intrinsics(math.radians(angle), width, height),
         width=width,
         height=height,
         near=near,
@@ -286,6 +299,12 @@ def cameras_of_poses(
     if not isinstance(camera_to_world, Tensor) or camera_to_world.shape[-2:] != (4, 4):
         got = getattr(camera_to_world, "shape", type(camera_to_world).__name__)
         raise NPAError(f"camera_to_world must have shape [V, 4, 4] or [B, V, 4, 4], got {got}")
+    if camera_to_world.dtype not in DTYPES:
+        raise NPAError(
+            f"camera_to_world must be float32 or float64, got {camera_to_world.dtype}: "
+            f"convert it with .float()"
+        )
+    check_dense("camera_to_world", camera_to_world)
     # Of a rigid motion: R and t become Rᵀ and -Rᵀ t. What is not rigid is refused by `Cameras`.
     flip = camera_to_world.new_tensor([1.0, -1.0, -1.0])
     back = (camera_to_world[..., :3, :3] * flip).mT

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import operator
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -18,8 +18,24 @@ DTYPES = (torch.float32, torch.float64)
 LENGTH_RANGE = {torch.float32: (1e-8, 1e8), torch.float64: (1e-60, 1e60)}
 """Perception radii [length units] whose powers in the kernels stay numbers of the dtype."""
 
+LARGEST_SIDE = 16384
+"""Pixels along a side of a picture, at most."""
+
 Box = float | Sequence[float] | None
 """Sides of a periodic box centred on the origin [length units], one number for all; None: open."""
+
+
+def check_dense(name: str, tensor: Tensor) -> None:
+    """Check that a tensor has its numbers one beside the other, on a CPU or a CUDA device.
+
+    Raises:
+        NPAError: It is sparse, or on another kind of device.
+    """
+    if tensor.layout != torch.strided or tensor.device.type not in ("cpu", "cuda"):
+        raise NPAError(
+            f"{name} must be a dense tensor on 'cpu' or 'cuda', got {tensor.layout} on "
+            f"{tensor.device}: convert it with .to_dense() or .to(device)"
+        )
 
 
 def check_world(x: Tensor, s: Tensor) -> None:
@@ -43,6 +59,7 @@ def check_world(x: Tensor, s: Tensor) -> None:
             raise NPAError(
                 f"{name} must be float32 or float64, got {tensor.dtype}: convert it with .float()"
             )
+        check_dense(name, tensor)
     if x.shape[2] not in (2, 3):
         raise NPAError(f"x must have 2 or 3 coordinates, got shape {tuple(x.shape)}")
     if x.shape[:2] != s.shape[:2]:
@@ -81,6 +98,17 @@ def check_finite_positions(x: Tensor) -> None:
         )
 
 
+def checked_flag(name: str, value: Any) -> bool:
+    """Return whether something is true.
+
+    Raises:
+        NPAError: It is neither true nor false, as an array of several numbers is.
+    """
+    with contextlib.suppress(TypeError, ValueError, RuntimeError):
+        return bool(value)
+    raise NPAError(f"{name} must be True or False, got {value!r}")
+
+
 def checked_number(name: str, value: Any) -> float:
     """Return a number as a float; zero-dimensional tensors and NumPy scalars are numbers too.
 
@@ -105,6 +133,68 @@ def checked_count(name: str, value: Any) -> int:
             if count >= 0:
                 return count
     raise NPAError(f"{name} must be an integer of at least 0, got {value!r}")
+
+
+def checked_positive(name: str, value: Any, unit: str = "") -> float:
+    """Return a number that must be positive and finite, as a float.
+
+    Args:
+        name: What the caller calls it.
+        value: The number.
+        unit: Its unit, for the error, for example " [length units]".
+
+    Raises:
+        NPAError: It is not.
+    """
+    number = checked_number(name, value)
+    if not (math.isfinite(number) and number > 0.0):
+        raise NPAError(f"{name} must be positive and finite{unit}, got {number:g}")
+    return number
+
+
+def checked_finite(name: str, value: Any, unit: str = "") -> float:
+    """Return a number that must be finite, as a float; arguments and errors as above."""
+    number = checked_number(name, value)
+    if not math.isfinite(number):
+        raise NPAError(f"{name} must be finite{unit}, got {number:g}")
+    return number
+
+
+def checked_side(name: str, value: Any) -> int:
+    """Return how many pixels a side of a picture has.
+
+    Raises:
+        NPAError: It is no integer from 1 to `LARGEST_SIDE`.
+    """
+    side = checked_count(name, value)
+    if not 1 <= side <= LARGEST_SIDE:
+        raise NPAError(f"{name} must lie in [1, {LARGEST_SIDE}] pixels, got {side}")
+    return side
+
+
+def entries(value: Any) -> list[Any] | None:
+    """Return the entries of a sequence of any library as a list, or None where it is none."""
+    if isinstance(value, str | bytes) or getattr(value, "ndim", 1) == 0:
+        return None
+    with contextlib.suppress(TypeError, ValueError, RuntimeError):
+        return list(value)
+    return None
+
+
+def number_tensor(name: str, value: Any) -> Tensor:
+    """Return real numbers of any library as a tensor.
+
+    Raises:
+        NPAError: They are none.
+    """
+    try:
+        made = torch.as_tensor(value)
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        raise NPAError(f"{name} must be numbers, got {value!r}") from error
+    if made.dtype.is_complex:
+        raise NPAError(f"{name} must be real numbers, got {value!r}")
+    check_dense(name, made)
+    return made
 
 
 def checked_eps(name: str, eps: float, dtype: torch.dtype) -> float:
@@ -154,11 +244,11 @@ def checked_box(box: Box, space_dim: int, eps: float) -> tuple[float, ...] | Non
     """
     if box is None:
         return None
-    given: Any = box
-    if isinstance(given, Iterable) and getattr(given, "ndim", 1) != 0:
-        sides = tuple(checked_number("a side of box", side) for side in given)
+    given = entries(box)
+    if given is None:
+        sides = (checked_number("box", box),) * space_dim
     else:
-        sides = (checked_number("box", given),) * space_dim
+        sides = tuple(checked_number("a side of box", side) for side in given)
     if len(sides) != space_dim:
         raise NPAError(f"box must have {space_dim} sides, got {len(sides)}: {sides}")
     # Ten digits of grace: a box of exactly 2 eps must pass however both were rounded.

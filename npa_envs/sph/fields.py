@@ -16,6 +16,7 @@ from npa_envs.sph.checks import (
     check_world,
     checked_box,
     checked_eps,
+    checked_flag,
 )
 from npa_envs.sph.operators import perceive_rows
 from npa_envs.sph.passes import Terms, compute_density_gradients, plain_kernels
@@ -82,9 +83,13 @@ def perceive(
     check_scale(radius, radius0, x.shape[2], x.dtype)
     sides = checked_box(box, x.shape[2], radius)
     check_finite_positions(x)
-    terms = Terms(state_gradient, moment_correction, density_gradient)
+    terms = Terms(
+        checked_flag("state_gradient", state_gradient),
+        checked_flag("moment_correction", moment_correction),
+        checked_flag("density_gradient", density_gradient),
+    )
     perception, rows = perceive_rows(
-        x.detach() if detach_positions else x,
+        x.detach() if checked_flag("detach_positions", detach_positions) else x,
         s,
         mask=None,
         row_capacity=x.shape[0] * x.shape[1],

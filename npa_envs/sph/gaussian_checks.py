@@ -9,7 +9,7 @@ from npa_envs.errors import NPAError
 from npa_envs.kernels.projection import CHANNELS
 from npa_envs.sph.cameras import Cameras
 from npa_envs.sph.cells import LARGEST_INDEX
-from npa_envs.sph.checks import DTYPES
+from npa_envs.sph.checks import DTYPES, check_dense
 
 
 def check_gaussians(
@@ -67,6 +67,7 @@ def _check_tensor(name: str, tensor: Tensor, means: Tensor, shape: str) -> None:
         raise NPAError(
             f"{name} must be float32 or float64, got {tensor.dtype}: convert it with .float()"
         )
+    check_dense(name, tensor)
     if tensor.dtype != means.dtype or tensor.device != means.device:
         raise NPAError(
             f"{name} and means must share dtype and device, got {tensor.dtype} on {tensor.device} "

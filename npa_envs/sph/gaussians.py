@@ -13,6 +13,8 @@ from npa_envs.kernels.gaussians import gaussian_kernels
 from npa_envs.kernels.projection import FOOTPRINT, make_frame, tile_total
 from npa_envs.sph.bridge import launch, scalar_type
 from npa_envs.sph.cameras import Cameras
+from npa_envs.sph.cells import LARGEST_INDEX
+from npa_envs.sph.checks import checked_count, checked_number
 from npa_envs.sph.gaussian_checks import check_cameras, check_gaussians
 from npa_envs.sph.gaussian_tiles import blend, pull_back_tiles, sort_pairs
 
@@ -273,12 +275,19 @@ def render_gaussians(
     """
     check_gaussians(means, scales, quaternions, opacities, colours)
     check_cameras(cameras, means, background, colours.shape[-1])
+    dilation = checked_number("dilation", dilation)
     if not (math.isfinite(dilation) and dilation >= 0.0):
         raise NPAError(f"dilation must be finite and at least 0 pixels squared, got {dilation}")
     if pairs_per_particle is None:
         pairs_per_particle = PAIRS_PER_PARTICLE if means.is_cuda else 0
-    elif pairs_per_particle < 1:
+    elif checked_count("pairs_per_particle", pairs_per_particle) < 1:
         raise NPAError(f"pairs_per_particle must be at least 1, got {pairs_per_particle}")
+    images = means.shape[0] * cameras.count
+    if images * means.shape[1] * pairs_per_particle > LARGEST_INDEX:
+        raise NPAError(
+            f"pairs must stay below {LARGEST_INDEX} in one batch, got pairs_per_particle="
+            f"{pairs_per_particle} for {images} pictures of {means.shape[1]} particles: lower it"
+        )
     image, passing, overflow, _ = _Gaussians.apply(  # type: ignore[no-untyped-call]
         *(tensor.contiguous() for tensor in (means, scales, quaternions, opacities, colours)),
         cameras.world_to_camera.to(means.dtype).contiguous(),

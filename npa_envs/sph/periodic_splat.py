@@ -6,8 +6,10 @@ import math
 
 from torch import Tensor
 
+from npa_envs.errors import NPAError
 from npa_envs.kernels.lens import PATCH_SIGMAS
-from npa_envs.sph.splat import check_particles, check_window, splat
+from npa_envs.sph.checks import LARGEST_SIDE
+from npa_envs.sph.splat import check_particles, checked_window, splat
 
 
 def periodic_splat(
@@ -47,11 +49,16 @@ def periodic_splat(
         NPAError: A shape does not fit or a number is out of its range.
     """
     check_particles(x, colour, 3)
-    check_window(resolution, pixel_size, sigma, lo, hi)
+    resolution, pixel_size, sigma, lo, hi = checked_window(resolution, pixel_size, sigma, lo, hi)
     step = (hi - lo) / resolution
     # A particle at the upper edge may round to the pixel behind the last one.
     margin = math.ceil(PATCH_SIGMAS * sigma * pixel_size / step) + 1
     side = resolution + 2 * margin
+    if side > LARGEST_SIDE:
+        raise NPAError(
+            f"spots must reach across so few boxes that picture and margins stay within "
+            f"{LARGEST_SIDE} pixels, got {side}: choose a smaller sigma or pixel_size"
+        )
     # Whole boxes are taken off without gradient: what is left moves as the particle does.
     boxes = ((x.detach() - lo) / (hi - lo)).floor()
     canvas = splat(

@@ -14,7 +14,7 @@ from npa_envs.sph.splat import (
     Splats,
     aligned,
     check_particles,
-    check_window,
+    checked_window,
     device_kernels,
     gather_threads,
     scatter_splats,
@@ -105,7 +105,7 @@ def picture_losses(
             f"target and goal must have shapes [R, R, {CHANNELS}] and [2], "
             f"got {tuple(target.shape)} and {tuple(goal.shape)}"
         )
-    check_window(resolution, pixel_size, sigma, lo, hi)
+    window = checked_window(resolution, pixel_size, sigma, lo, hi)
     x, states, target, goal = (t.detach() for t in (x, states, target.to(x), goal.to(x)))
     losses = _picture_losses(
         x.contiguous(),
@@ -114,9 +114,6 @@ def picture_losses(
         goal.contiguous(),
         target,
         shift,
-        pixel_size,
-        sigma,
-        lo,
-        hi,
+        *window[1:],
     )
     return losses[:, 0], losses[:, 1]

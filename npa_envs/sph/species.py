@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -21,6 +21,7 @@ from npa_envs.sph.checks import (
     checked_box,
     checked_count,
     checked_eps,
+    entries,
 )
 from npa_envs.sph.fields import perceive
 
@@ -47,8 +48,8 @@ def checked_counts(counts: Sequence[int], particle_count: int) -> tuple[int, ...
     Raises:
         NPAError: They are no integers of at least 1, too many, or do not sum to N.
     """
-    given: Any = counts
-    if isinstance(given, str) or not isinstance(given, Iterable):
+    given = entries(counts)
+    if given is None:
         raise NPAError(
             f"counts must hold one number of particles for each species, got {counts!r}: "
             f"for example counts=({particle_count},)"

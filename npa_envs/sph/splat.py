@@ -21,7 +21,16 @@ from npa_envs.kernels.lens import (
 from npa_envs.kernels.splat import splat_kernels
 from npa_envs.sph.bridge import launch, scalar_type
 from npa_envs.sph.cells import LARGEST_INDEX
-from npa_envs.sph.checks import check_world
+from npa_envs.sph.checks import (
+    check_world,
+    checked_count,
+    checked_number,
+    checked_positive,
+    checked_side,
+)
+
+LARGEST_SPOT = 1e6
+"""Pixels of a spot's standard deviation at most, and of one over it."""
 
 
 class Splats(NamedTuple):
@@ -242,9 +251,9 @@ def splat(
         NPAError: A shape does not fit or a number is out of its range.
     """
     check_particles(x, colour, 3)
-    check_window(resolution, pixel_size, sigma, lo, hi)
+    window = checked_window(resolution, pixel_size, sigma, lo, hi)
     picture: Tensor = _Splat.apply(  # type: ignore[no-untyped-call]
-        x.contiguous(), colour.contiguous(), resolution, pixel_size, sigma, lo, hi
+        x.contiguous(), colour.contiguous(), *window
     )
     return picture
 
@@ -262,12 +271,31 @@ def check_particles(x: Tensor, colour: Tensor, width: int | None) -> None:
         )
 
 
-def check_window(resolution: int, pixel_size: float, sigma: float, low: float, high: float) -> None:
-    """Check what pictures are drawn by."""
-    if resolution < 2:
+def checked_window(
+    resolution: int, pixel_size: float, sigma: float, low: float, high: float
+) -> tuple[int, float, float, float, float]:
+    """Return what pictures are drawn by, in this order, as Python's own numbers.
+
+    Raises:
+        NPAError: One is no number or out of its range, or spots have no moderate size in pixels.
+    """
+    if checked_count("resolution", resolution) < 2:
         raise NPAError(f"resolution must be at least 2 pixels, got {resolution}")
-    if not (low < high and math.isfinite(high - low)):
-        raise NPAError(f"the window must have lo < hi, got lo={low} and hi={high}")
-    for name, value in (("pixel_size", pixel_size), ("sigma", sigma)):
-        if not (math.isfinite(value) and value > 0.0):
-            raise NPAError(f"{name} must be positive and finite, got {value}")
+    side = checked_side("resolution", resolution)
+    pixel, spread = checked_positive("pixel_size", pixel_size), checked_positive("sigma", sigma)
+    begin, end = checked_number("lo", low), checked_number("hi", high)
+    if not (begin < end and math.isfinite(end - begin)):
+        raise NPAError(f"the window must have lo < hi, got lo={begin:g} and hi={end:g}")
+    pixels = side * pixel / (end - begin)
+    for what, size in (("a pixel of the target", pixels), ("sigma", spread * pixels)):
+        if not 1.0 / LARGEST_SPOT <= size <= LARGEST_SPOT:
+            raise NPAError(
+                f"{what} must have a size in [{1.0 / LARGEST_SPOT:g}, {LARGEST_SPOT:g}] pixels of "
+                f"the picture, got {size:g}: choose pixel_size, sigma and the window alike"
+            )
+    if not abs(begin) <= LARGEST_SPOT * side * (end - begin):
+        raise NPAError(
+            f"the window must not be tiny beside its distance from the origin, got lo={begin:g} "
+            f"and hi={end:g}: move the particles to the origin"
+        )
+    return side, pixel, spread, begin, end

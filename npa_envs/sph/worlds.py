@@ -10,7 +10,7 @@ from torch import Tensor
 from npa_envs.errors import NPAError
 from npa_envs.kernels.worlds import CHUNK, MEAN_LANES, mean_kernels
 from npa_envs.sph.bridge import launch, scalar_type
-from npa_envs.sph.checks import DTYPES
+from npa_envs.sph.checks import DTYPES, check_dense
 
 
 def average_sums(partial_sums: Tensor, value_count: int, like: Tensor) -> Tensor:
@@ -93,6 +93,11 @@ def world_mean(values: Tensor) -> Tensor:
     Raises:
         NPAError: A wrong shape or dtype, or nothing to average.
     """
+    if not isinstance(values, Tensor):
+        raise NPAError(
+            f"values must be a torch tensor, got {type(values).__name__}: "
+            f"convert it with torch.as_tensor"
+        )
     if values.ndim != 3 or 0 in values.shape:
         raise NPAError(
             f"values must have shape [B, M, K] with at least one of each, "
@@ -102,5 +107,6 @@ def world_mean(values: Tensor) -> Tensor:
         raise NPAError(
             f"values must be float32 or float64, got {values.dtype}: convert it with .float()"
         )
+    check_dense("values", values)
     means: Tensor = _WorldMean.apply(values)  # type: ignore[no-untyped-call]
     return means

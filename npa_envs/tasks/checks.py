@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+import sys
 from typing import Any
 
 from npa_envs.errors import NPAError
@@ -80,7 +80,9 @@ def is_whole(value: Any) -> bool:
 
 def is_real(value: Any) -> bool:
     """Return whether `value` is a finite int or float (a bool is not)."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    # Compared, not converted: an int may be too large for a float.
+    real = isinstance(value, int | float) and not isinstance(value, bool)
+    return real and -sys.float_info.max <= value <= sys.float_info.max
 
 
 def _example(config: object, name: str, otherwise: float) -> object:

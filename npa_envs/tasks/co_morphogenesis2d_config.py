@@ -29,7 +29,7 @@ class CoMorphogenesis2DConfig:
         Raises:
             NPAError: There are fewer than two species, they do not agree, or the distance is wrong.
         """
-        species = tuple(self.species)
+        species = self.species if isinstance(self.species, tuple | list) else ()
         if len(species) < 2 or not all(isinstance(s, Morphogenesis2DConfig) for s in species):
             came = ", ".join(type(config).__name__ for config in species) or "nothing"
             raise NPAError(

@@ -16,6 +16,7 @@ from torch import Tensor
 from npa_envs.errors import NPAError, suggest
 from npa_envs.randomness import Randomness, WorldRandom, check_generator
 from npa_envs.sph import world_mean
+from npa_envs.sph.checks import DTYPES, check_dense, checked_number
 from npa_envs.tasks.checks import is_real, is_whole
 
 DAMAGE_SIZES = {"erase": 0.2, "cut": 0.1, "clump": 0.2, "noise": 0.05}
@@ -44,7 +45,7 @@ class DamageEvent:
         Raises:
             NPAError: The kind is unknown, the step negative, or the size not positive and finite.
         """
-        if self.kind not in DAMAGE_SIZES:
+        if not isinstance(self.kind, str) or self.kind not in DAMAGE_SIZES:
             raise NPAError(f"unknown damage {self.kind!r}: {suggest(str(self.kind), DAMAGE_SIZES)}")
         if not is_whole(self.step) or self.step < 0:
             raise NPAError(f"step must be a whole number of at least 0, got {self.step!r}")
@@ -75,6 +76,8 @@ def parse_damage(text: str) -> DamageEvent:
     Raises:
         NPAError: It is written in another way, or the kind is unknown.
     """
+    if not isinstance(text, str):
+        raise NPAError(f"damage must be text, got {text!r}: for example '300:cut'")
     parts = text.split(":")
     kind = parts[1] if len(parts) > 1 else ""
     if kind and kind not in DAMAGE_SIZES:
@@ -112,12 +115,12 @@ def damage_worlds(
     Raises:
         NPAError: An unknown kind, a wrong shape or dtype, or a size that is negative or not finite.
     """
-    if kind not in DAMAGE_SIZES:
+    if not isinstance(kind, str) or kind not in DAMAGE_SIZES:
         raise NPAError(f"unknown damage {kind!r}: {suggest(str(kind), DAMAGE_SIZES)}")
     _check_world(x, s)
     check_generator(generator, x.device, x.shape[0])
-    extent = DAMAGE_SIZES[kind] if size is None else size
-    if not (math.isfinite(extent) and extent >= 0):
+    extent = DAMAGE_SIZES[kind] if size is None else checked_number("size", size)
+    if not 0 <= extent <= torch.finfo(x.dtype).max:
         raise NPAError(f"the size of a damage must be finite and at least 0, got {extent}: try 0.1")
     if kind == "noise":
         return x + extent * _normal(x, x.shape, generator), s
@@ -263,26 +266,38 @@ def _per_world(name: str, value: float | Tensor, x: Tensor, *, highest: float = 
             )
         # The values stay unread: looking at them would wait for the device.
         return value.to(x).reshape(-1, 1, 1)
-    if not (math.isfinite(value) and 0 <= value <= highest):
+    value = checked_number(name, value)
+    if not 0 <= value <= min(highest, torch.finfo(x.dtype).max):
         rule = "finite and at least 0" if highest == math.inf else f"in [0, {highest:g}]"
         raise NPAError(f"{name} must be {rule}, got {value}: try 0.1")
     return x.new_full((1, 1, 1), value)
 
 
 def _check_positions(x: Tensor) -> None:
+    if not isinstance(x, Tensor):
+        raise NPAError(f"x must be a torch tensor, got {type(x).__name__}: use torch.as_tensor")
     if x.ndim != 3:
         cure = ": add a world dimension with x[None]" if x.ndim == 2 else ""
         raise NPAError(f"x must have shape [B, N, D], got {tuple(x.shape)}{cure}")
-    if not x.is_floating_point():
+    if x.dtype not in DTYPES:
         raise NPAError(f"x must be float32 or float64, got {x.dtype}: convert it with x.float()")
+    check_dense("x", x)
 
 
 def _check_world(x: Tensor, s: Tensor) -> None:
     _check_positions(x)
+    if not isinstance(s, Tensor):
+        raise NPAError(f"s must be a torch tensor, got {type(s).__name__}: use torch.as_tensor")
     if s.ndim != 3 or s.shape[:2] != x.shape[:2]:
         raise NPAError(
             f"s must have shape [B, N, C] with the B and N of x, {tuple(x.shape[:2])}, "
             f"got {tuple(s.shape)}: give one state for each particle"
+        )
+    check_dense("s", s)
+    if s.device != x.device:
+        raise NPAError(
+            f"x and s must share a device, got {x.device} and {s.device}: "
+            f"convert one with .to(other)"
         )
 
 

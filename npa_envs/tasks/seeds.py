@@ -5,7 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from npa_envs.devices import check_device
+from npa_envs.errors import NPAError
 from npa_envs.randomness import Randomness, WorldRandom, check_generator
+from npa_envs.sph.cells import LARGEST_INDEX
+from npa_envs.sph.checks import DTYPES, checked_count, checked_finite, entries
 
 
 def uniform_ball(
@@ -31,9 +35,26 @@ def uniform_ball(
         dtype: Their floating dtype.
 
     Raises:
-        NPAError: The generator is on another device or for another number of worlds.
+        NPAError: A count is no integer of at least 0, the radius not finite or negative, the dtype
+            no float32 or float64, there is no such device, or the generator is on another one or
+            for another number of worlds.
     """
-    check_generator(generator, torch.device(device), world_count)
+    device = check_device(device)
+    world_count, particle_count, space_dim = (
+        checked_count(name, value)
+        for name, value in (
+            ("world_count", world_count),
+            ("particle_count", particle_count),
+            ("space_dim", space_dim),
+        )
+    )
+    if space_dim < 1:
+        raise NPAError(f"space_dim must be at least 1, got {space_dim}: give 2 or 3")
+    radius = checked_finite("radius", radius, " [length units]")
+    if radius < 0.0:
+        raise NPAError(f"radius must not be negative [length units], got {radius:g}")
+    _check_points(world_count * particle_count * space_dim, dtype)
+    check_generator(generator, device, world_count)
     if isinstance(generator, WorldRandom):
         return radius * _unit_ball_by_world(generator, particle_count, space_dim, dtype)
     shape = (world_count, particle_count)
@@ -64,15 +85,33 @@ def uniform_box(
         dtype: Their floating dtype.
 
     Raises:
-        NPAError: The generator is on another device or for another number of worlds.
+        NPAError: As for `uniform_ball`, or a side is no finite number.
     """
-    check_generator(generator, torch.device(device), world_count)
+    device = check_device(device)
+    world_count = checked_count("world_count", world_count)
+    particle_count = checked_count("particle_count", particle_count)
+    given = entries(box)
+    if not given:
+        raise NPAError(f"box must hold a side for each dimension, got {box!r}: give (2.0, 2.0)")
+    sides = [checked_finite("a side of box", side, " [length units]") for side in given]
+    _check_points(world_count * particle_count * len(sides), dtype)
+    check_generator(generator, device, world_count)
     if isinstance(generator, WorldRandom):
-        share = generator.uniform(particle_count, len(box), dtype=dtype)
+        share = generator.uniform(particle_count, len(sides), dtype=dtype)
     else:
-        shape = (world_count, particle_count, len(box))
+        shape = (world_count, particle_count, len(sides))
         share = torch.rand(shape, generator=generator, device=device, dtype=dtype)
-    return torch.stack([side * (share[..., d] - 0.5) for d, side in enumerate(box)], dim=-1)
+    return torch.stack([side * (share[..., d] - 0.5) for d, side in enumerate(sides)], dim=-1)
+
+
+def _check_points(number_count: int, dtype: torch.dtype) -> None:
+    if dtype not in DTYPES:
+        raise NPAError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
+    if number_count > LARGEST_INDEX:
+        raise NPAError(
+            f"coordinates must be at most {LARGEST_INDEX} in one batch, got {number_count}: "
+            "make fewer worlds or particles"
+        )
 
 
 def _unit_ball_by_world(

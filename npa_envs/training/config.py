@@ -126,6 +126,11 @@ class TrainConfig(Generic[TaskConfigT]):
                 f"seed must be a whole number of at least 0 and below 2**63, got {self.seed!r}: "
                 "for example seed=0"
             )
+        if not isinstance(self.initial_rule, str):
+            raise NPAError(
+                f"initial_rule must be the name of a rule or of a file, or '' for none, got "
+                f"{self.initial_rule!r}"
+            )
         self._check_schedule()
         if self.world_count > self.pool_size:
             raise NPAError(
@@ -161,7 +166,8 @@ class TrainConfig(Generic[TaskConfigT]):
             )
 
     def _check_choice(self, name: str, choices: tuple[str, ...]) -> None:
-        if getattr(self, name) not in choices:
+        value = getattr(self, name)
+        if not isinstance(value, str) or value not in choices:
             raise NPAError(
                 f"{name} must be one of {', '.join(choices)}, got {getattr(self, name)!r}"
             )

@@ -145,7 +145,7 @@ def task_entry(task_name: str) -> TaskEntry:
     Raises:
         NPAError: There is no such task.
     """
-    if task_name not in TASKS:
+    if not isinstance(task_name, str) or task_name not in TASKS:
         raise NPAError(f"unknown task {task_name!r}: {suggest(task_name, TASKS)}")
     return TASKS[task_name]
 
@@ -162,6 +162,6 @@ def preset(name: str, task_name: str = "morphogenesis2d", /, **fields: Any) -> T
         NPAError: The task, the preset or a field is unknown, or a value is not allowed.
     """
     presets = task_entry(task_name).presets
-    if name not in presets:
+    if not isinstance(name, str) or name not in presets:
         raise NPAError(f"unknown preset {name!r} of {task_name}: {suggest(name, presets)}")
     return override(presets[name], **fields)

@@ -1,0 +1,251 @@
+"""Calls of operators, rules, pictures and cameras, with arguments that are right."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import random
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from fuzz_values import Target
+from torch import Tensor
+
+import npa_envs
+from npa_envs.render import draw_worlds, to_uint8, turntable_frames, write_gif, write_png
+from npa_envs.scores import scores
+from npa_envs.sph import Cameras, orbit, periodic_splat, render_gaussians, splat
+from npa_envs.sph.cameras import cameras_of_poses, look_at
+from npa_envs.tasks.damage import damage_worlds, parse_damage
+from npa_envs.tasks.seeds import uniform_ball, uniform_box
+
+
+def world(draw: random.Random, dim: int | None = None, channels: int = 4) -> dict[str, Any]:
+    dim = dim or draw.choice((2, 3))
+    dtype = draw.choice((torch.float32, torch.float64))
+    return {"x": torch.rand(2, 5, dim, dtype=dtype), "s": torch.rand(2, 5, channels, dtype=dtype)}
+
+
+def perceived(draw: random.Random) -> dict[str, Any]:
+    return world(draw) | {"eps": 0.3, "eps0": 0.2, "box": 1.0, "detach_positions": False}
+
+
+def fields(draw: random.Random) -> dict[str, Any]:
+    return world(draw) | {"eps": 0.3, "box": (1.0, 2.0)}
+
+
+def rule_of(x: Tensor, **options: Any) -> npa_envs.NPARule:
+    return npa_envs.NPARule(x.shape[2], 4, 6, **options).to(x.dtype)
+
+
+STEPPED: dict[str, Any] = {
+    "eps": 0.3, "box": None, "update_prob": 0.5, "dt": 1.0, "position_noise": 0.01,
+    "detach_positions": True,
+}  # fmt: skip
+
+
+def stepped(draw: random.Random) -> dict[str, Any]:
+    made = world(draw)
+    generator = draw.choice((None, torch.Generator(), npa_envs.WorldRandom([0, 1])))
+    rule = rule_of(made["x"], static=draw.random() < 0.3)
+    return {"rule": rule, **made, **STEPPED, "generator": generator}
+
+
+def rolled(draw: random.Random) -> dict[str, Any]:
+    return stepped(draw) | {"steps": draw.choice((0, 1, 4)), "memory": "recompute"}
+
+
+def rolled_species(draw: random.Random) -> dict[str, Any]:
+    made = rolled(draw)
+    rule, told = made.pop("rule"), draw.random() < 0.5
+    options = {"species_count": 2} if told else {}
+    rules = [rule_of(made["x"], static=rule.static, **options) for _ in range(2)]
+    return made | {
+        "rules": rules, "counts": [2, 3], "update_prob": [0.5, 1.0], "density_counts": [2, 3],
+        "perception": "per_species" if told else "shared",
+    }  # fmt: skip
+
+
+ONE_STEP = object()
+
+
+def run_rule(steps: Any = ONE_STEP, **arguments: Any) -> None:
+    """Run a rule, and back-propagate where something asks for it."""
+    run = npa_envs.step if steps is ONE_STEP else functools.partial(npa_envs.rollout, steps=steps)
+    found = run(**arguments)
+    total = sum(part.sum() for part in found)
+    if total.requires_grad:
+        total.backward()
+
+
+def hyper_parameters(draw: random.Random) -> dict[str, Any]:
+    return {
+        "space_dim": 2, "state_dim": 4, "hidden_dim": 8, "eps0": 0.1, "alpha": 0.5, "static": False,
+        "readout_dim": 3, "readout_hidden_dim": 4, "moment_correction": True,
+        "species_count": draw.choice((0, 2)),
+    }  # fmt: skip
+
+
+def save_and_load(rule: Any, path: Any, metadata: Any, device: Any) -> None:
+    """Write a rule in a folder of its own, and read it."""
+    with tempfile.TemporaryDirectory() as folder:
+        there = Path(folder) / path if isinstance(path, str) and "/" not in path else path
+        npa_envs.save_rule(rule, there, metadata=metadata)
+        npa_envs.load_rule(there, device=device)
+
+
+def saved(draw: random.Random) -> dict[str, Any]:
+    rule = npa_envs.NPARule(2, 3, 4)
+    return {"rule": rule, "path": "a.safetensors", "metadata": {"a": "b"}, "device": "cpu"}
+
+
+def load_bytes(data: Any, suffix: Any) -> None:
+    """Read a rule from a file of these bytes."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"rule{suffix}"
+        path.write_bytes(data)
+        npa_envs.load_rule(path)
+
+
+@functools.cache
+def shipped_bytes() -> bytes:
+    return npa_envs.shipped_rules()["gecko"].read_bytes()
+
+
+def garbage(draw: random.Random) -> dict[str, Any]:
+    data = bytearray(shipped_bytes())
+    for _ in range(draw.choice((0, 1, 5, 50))):
+        data[draw.randrange(min(len(data), draw.choice((16, 1200, 10**6))))] = draw.randrange(256)
+    suffix = draw.choice((".safetensors", ".pth", ".pt", ".json"))
+    return {"data": bytes(data[: draw.choice((0, 7, 8, 300, len(data)))]), "suffix": suffix}
+
+
+def draw_numbers(seeds: Any, device: Any, method: Any, size: Any, extra: Any) -> None:
+    """Make streams and draw from them."""
+    streams = npa_envs.WorldRandom(seeds, device=device)
+    extras = () if method in ("uniform", "normal") else (extra,)
+    getattr(streams, method)(*extras, size)
+    streams.beside(extra).advance()
+
+
+def streams(draw: random.Random) -> dict[str, Any]:
+    return {"seeds": [0, 1], "device": "cpu", "size": 3, "extra": 1}
+
+
+def drawn(draw: random.Random) -> dict[str, Any]:
+    made = {"x": torch.rand(2, 5, 2), "colour": torch.rand(2, 5, 3), "sigma": 1.0}
+    return made | {"resolution": 8, "pixel_size": 0.2, "lo": -1.0, "hi": 1.0}
+
+
+def seen(draw: random.Random) -> dict[str, Any]:
+    return {
+        "means": torch.rand(2, 5, 3), "scales": torch.rand(2, 5, 3) * 0.1,
+        "quaternions": torch.rand(2, 5, 4), "opacities": torch.rand(2, 5),
+        "colours": torch.rand(2, 5, 3), "cameras": orbit(2, width=6, height=5),
+        "background": torch.rand(3), "dilation": 0.3, "pairs_per_particle": 20,
+    }  # fmt: skip
+
+
+def camera_fields(draw: random.Random) -> dict[str, Any]:
+    made = orbit(2, width=6, height=5)
+    return {field.name: getattr(made, field.name) for field in dataclasses.fields(made)}
+
+
+def circled(draw: random.Random) -> dict[str, Any]:
+    return {
+        "count": 2, "elevation": 20.0, "radius": 3.0, "fov": 45.0, "width": 6, "height": 5,
+        "azimuth": 10.0, "centre": (0.0, 0.0, 0.0), "near": 0.01,
+    }  # fmt: skip
+
+
+def painted(draw: random.Random) -> dict[str, Any]:
+    return world(draw) | {
+        "style": draw.choice(("particles", "density", "states")), "resolution": 8,
+        "pixel_size": 0.1, "sigma": 1.0, "centre": None, "half_width": 1.0, "periodic": False,
+        "azimuth": 0.0, "elevation": 20.0, "background": "white",
+    }  # fmt: skip
+
+
+def write_pictures(path: Any, frames: Any, fps: Any) -> None:
+    """Write a GIF or PNG in a folder of its own."""
+    with tempfile.TemporaryDirectory() as folder:
+        there = Path(folder) / path if isinstance(path, str) and "/" not in path else path
+        if not isinstance(there, Path) or folder not in str(there):
+            return  # Nothing is written elsewhere.
+        if fps is None:
+            write_png(there, frames)
+        else:
+            write_gif(there, frames, fps)
+
+
+def films(draw: random.Random) -> dict[str, Any]:
+    return {"path": "a.gif", "frames": [np.zeros((8, 6, 3), np.uint8)] * 2, "fps": 25}
+
+
+def damaged(draw: random.Random) -> dict[str, Any]:
+    kind = draw.choice(("erase", "cut", "clump", "noise"))
+    return world(draw) | {"kind": kind, "size": 0.1, "generator": None}
+
+
+ENGINE: dict[str, Target] = {
+    "perceive": Target(npa_envs.perceive, perceived, 4),
+    "perception_fields": Target(npa_envs.perception_fields, fields, 2),
+    "perceive_species": Target(
+        npa_envs.perceive_species, lambda d: perceived(d) | {"counts": [2, 3]}, 2
+    ),
+    "species_fields": Target(
+        npa_envs.species_fields,
+        lambda d: {k: v for k, v in fields(d).items() if k != "s"} | {"counts": [2, 3]},
+        2,
+    ),
+    "step": Target(run_rule, stepped, 3),
+    "rollout": Target(run_rule, rolled, 5),
+    "rollout_species": Target(npa_envs.rollout_species, rolled_species, 5),
+    "NPARule": Target(npa_envs.NPARule, hyper_parameters, 2),
+    "save_rule": Target(save_and_load, saved, 2),
+    "load_rule": Target(npa_envs.load_rule, lambda d: {"source": "gecko", "device": "cpu"}, 2),
+    "load_rule of a file": Target(load_bytes, garbage, 3),
+    "shipped_rules": Target(npa_envs.shipped_rules, lambda d: {"task": "texture"}),
+    "scores": Target(scores, lambda d: {"name": "gecko"}),
+    "world_mean": Target(npa_envs.world_mean, lambda d: {"values": torch.rand(2, 3, 4)}),
+    "WorldRandom.uniform": Target(functools.partial(draw_numbers, method="uniform"), streams),
+    "WorldRandom.bernoulli": Target(functools.partial(draw_numbers, method="bernoulli"), streams),
+    "WorldRandom.integers": Target(functools.partial(draw_numbers, method="integers"), streams),
+    "WorldRandom.from_keys": Target(
+        npa_envs.WorldRandom.from_keys, lambda d: {"keys": torch.arange(3)}
+    ),
+    "splat": Target(splat, drawn, 2),
+    "periodic_splat": Target(periodic_splat, drawn, 2),
+    "render_gaussians": Target(render_gaussians, seen, 3),
+    "Cameras": Target(Cameras, camera_fields, 2),
+    "orbit": Target(orbit, circled, 2),
+    "look_at": Target(
+        look_at, lambda d: {"eyes": torch.rand(2, 3) + 1, "targets": (0, 0, 0), "up": (0, 1, 0)}
+    ),
+    "cameras_of_poses": Target(
+        cameras_of_poses,
+        lambda d: {"camera_to_world": torch.eye(4)[None], "angle": 0.7, "width": 4, "height": 4},
+    ),
+    "draw_worlds": Target(draw_worlds, painted, 3),
+    "to_uint8": Target(
+        to_uint8, lambda d: {"picture": torch.rand(2, 4, 4, 4), "background": (0.1, 0.2, 0.3)}
+    ),
+    "turntable_frames": Target(
+        functools.partial(turntable_frames, lambda c: torch.rand(1, c.count, c.height, c.width, 4)),
+        lambda d: {"frame_count": 2, "resolution": 8, "elevation": 20.0, "background": "white"},
+    ),
+    "write_gif and write_png": Target(write_pictures, films, 2),
+    "damage_worlds": Target(damage_worlds, damaged, 2),
+    "parse_damage": Target(parse_damage, lambda d: {"text": "300:cut:0.1"}),
+    "uniform_ball": Target(
+        uniform_ball,
+        lambda d: {"world_count": 2, "particle_count": 5, "space_dim": 2, "radius": 0.2},
+    ),
+    "uniform_box": Target(
+        uniform_box, lambda d: {"world_count": 2, "particle_count": 5, "box": (1.0, 2.0)}
+    ),
+}
+"""What is called, by name."""

@@ -1,0 +1,242 @@
+"""Calls of configurations, environments, wrappers, policies and the command line."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import random
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import small_envs
+import torch
+from fuzz_values import Target, wrong
+
+import npa_envs
+from npa_envs import agents, wrappers
+from npa_envs.cli import COMMANDS, main
+from npa_envs.envs import multispecies_v0, particles_v0
+from npa_envs.training import TASKS, load_config, override, preset
+
+
+def configured(draw: random.Random) -> dict[str, Any]:
+    task = draw.choice(tuple(TASKS))
+    config = TASKS[task].presets["tiny"]
+    known = [field.name for part in (config, config.task) for field in dataclasses.fields(part)]
+    name = draw.choice([*known, "", "itertions"])
+    return {"name": "tiny", "task": task, "field": name, "value": getattr(config, name, 1)}
+
+
+def configure(name: Any, task: Any, field: str, value: Any) -> None:
+    preset(name, task, **{str(field): value})
+
+
+def reconfigure(name: Any, task: Any, field: str, value: Any) -> None:
+    """Make a configuration as a program does, whose types nobody converts."""
+    config = override(preset(name, task))
+    for part in (config, config.task):
+        if field in {f.name for f in dataclasses.fields(part)}:
+            dataclasses.replace(part, **{field: value})
+
+
+def read_config(text: Any, suffix: Any) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"config{suffix}"
+        path.write_text(str(text))
+        load_config(path, preset("tiny"))
+
+
+def config_files(draw: random.Random) -> dict[str, Any]:
+    texts = (
+        "iterations: 5",
+        "{}",
+        "[1]",
+        "iterations = nan",
+        '{"steps": [1, "a"]}',
+        "\x00",
+        "a: [",
+    )
+    return {"text": draw.choice(texts), "suffix": draw.choice((".yaml", ".toml", ".json", ".txt"))}
+
+
+def env_fields(draw: random.Random) -> dict[str, Any]:
+    name = draw.choice(small_envs.IDS)
+    known = sorted(config_type(name).__dataclass_fields__)
+    fields = draw.sample([*known, "seed", "rules"], draw.choice((1, 1, 2)))
+    made = {field: getattr(config_type(name), field, None) for field in fields}
+    id = draw.choice((name, name, name, name, "npa/Texture-v9", "npa/None", ""))
+    return {"id": id, "world_count": draw.choice((None, 2)), **(made | small_envs.small(name))}
+
+
+@functools.cache
+def config_type(name: str) -> type:
+    return type(small_envs.make(name).unwrapped.config)
+
+
+def run_env(id: Any, world_count: Any, **keywords: Any) -> None:
+    """Make an environment, act in it once, look at it."""
+    if world_count is None:
+        env = gymnasium.make(id, disable_env_checker=True, **keywords)
+    else:
+        mode = "vector_entry_point"
+        env = gymnasium.make_vec(id, num_envs=world_count, vectorization_mode=mode, **keywords)
+    with contextlib.closing(env):
+        env.reset(seed=0)
+        env.step(env.action_space.sample())
+
+
+@functools.cache
+def standing(kind: str) -> Any:
+    """Return an environment that calls are made to, the same for all of them."""
+    if kind == "single":
+        env = small_envs.make(small_envs.IDS[0], render_mode="rgb_array").unwrapped
+    elif kind == "vector":
+        env = small_envs.make_vec(small_envs.IDS[0], 2, render_mode="rgb_array").unwrapped
+    else:
+        env = multispecies_v0.parallel_env(particle_count=10, eps=0.3, render_size=24)
+    return env
+
+
+def act(kind: str, seed: Any, options: Any, action: Any, x: Any, s: Any) -> None:
+    """Reset an environment, put particles into it, and act."""
+    env = standing(kind)
+    env.reset(seed=seed, options=options)
+    env.place_particles(x, s)
+    env.step(action)
+
+
+def acted(draw: random.Random) -> dict[str, Any]:
+    kind = draw.choice(("single", "vector", "species"))
+    env = standing(kind)
+    env.reset(seed=0)
+    lead = {"single": (61,), "vector": (2, 61), "species": (10,)}[kind]
+    if kind == "species":
+        action = {agent: env.action_space(agent).sample() for agent in env.agents}
+        agent = draw.choice(env.agents)
+        action[agent] = wrong(draw, "action", torch.as_tensor(action[agent]))
+        action = draw.choice((action, {"species_0": action["species_0"]}))
+    else:
+        action = torch.as_tensor(env.action_space.sample())
+    made = {"x": torch.rand(*lead, 2), "s": torch.rand(*lead, 16)}
+    return {"kind": kind, "seed": 0, "options": None, "action": action, **made}
+
+
+def crowd_fields(draw: random.Random) -> dict[str, Any]:
+    task = draw.choice(small_species_tasks())
+    known = sorted(species_config(task).__dataclass_fields__)
+    fields = draw.sample([*known, "seed"], draw.choice((1, 1, 2)))
+    made = {f: getattr(species_config(task), f, None) for f in fields if f != "species_count"}
+    fixed = {"particle_count": 12, "eps": 0.3, "max_cycles": 3, "render_size": 24}
+    maker = draw.choice(("parallel_env", "particles", "batched", "env"))
+    return {"maker": maker, "task": task, "species_count": 2, **(made | fixed)}
+
+
+def small_species_tasks() -> tuple[str, ...]:
+    return tuple(multispecies_v0.ENVIRONMENTS.values())
+
+
+@functools.cache
+def species_config(task: str) -> type:
+    return type(multispecies_v0.parallel_env(task, particle_count=12, eps=0.3).config)
+
+
+def run_species(maker: str, **keywords: Any) -> None:
+    """Make an environment of several species and act in it once."""
+    makers = {
+        "parallel_env": multispecies_v0.parallel_env,
+        "particles": particles_v0.parallel_env,
+        "batched": multispecies_v0.batched,
+        "env": multispecies_v0.env,
+    }
+    env = makers[maker](**keywords)
+    env.reset(seed=0)
+    if maker in ("parallel_env", "particles"):
+        env.step({agent: env.action_space(agent).sample() for agent in env.agents})
+
+
+WRAPPERS: dict[str, dict[str, Any]] = {
+    "DamageEvents": {"events": ["1:cut"], "every": 5},
+    "NormalizePerception": {"clip": 5.0, "epsilon": 1e-8, "training": True, "statistics": None},
+    "SpeciesTags": {"species_count": 2, "fractions": [0.5, 0.5], "assignment": "blocks"},
+    "VectorDamageEvents": {"events": ["1:cut"], "every": 5},
+    "VectorNormalizePerception": {"clip": 5.0, "epsilon": 1e-8, "training": True},
+    "VectorSpeciesTags": {"species_count": 2, "fractions": None, "assignment": "random"},
+    "TorchRecordEpisodeStatistics": {"buffer_length": 10, "stats_key": "episode"},
+    "TorchNormalizeObservation": {"epsilon": 1e-8},
+    "TorchNormalizeReward": {"gamma": 0.9, "epsilon": 1e-8},
+    "ParticleVecEnv": {"bootstrap": True},
+    "SpeciesVecEnv": {"others": None},
+}
+
+
+def wrapped(draw: random.Random) -> dict[str, Any]:
+    name = draw.choice(sorted(WRAPPERS))
+    single = not name.startswith(("Vector", "Torch", "Particle", "SpeciesVec"))
+    return {"name": name, "env": standing("single" if single else "vector"), **WRAPPERS[name]}
+
+
+def wrap(name: str, env: Any, **options: Any) -> None:
+    """Make a wrapper, reset and act through it."""
+    made = getattr(wrappers, name)(env, **options)
+    if name in ("ParticleVecEnv", "SpeciesVecEnv") or name.startswith("Torch"):
+        return
+    made.reset(seed=0)
+    made.step(env.action_space.sample())
+
+
+def policies(draw: random.Random) -> dict[str, Any]:
+    name = draw.choice(("ZeroPolicy", "RandomPolicy", "SpreadPolicy", "PaintPolicy", "RulePolicy"))
+    own = {"RandomPolicy": {"seed": 0}, "SpreadPolicy": {"gain": 0.1}}.get(name, {})
+    if name == "RulePolicy":
+        own = {"rule": npa_envs.NPARule(), "state_scale": 1.0}
+    if name == "PaintPolicy":
+        own = {"colour": (0.1, 0.2, 0.3)}
+    return {"name": name, "env": standing("single"), **own}
+
+
+def make_policy(name: str, **options: Any) -> None:
+    policy = getattr(agents, name)(**options)
+    observation, _ = standing("single").reset(seed=0)
+    policy(observation)
+
+
+def command_line(draw: random.Random) -> dict[str, Any]:
+    command = draw.choice([*COMMANDS, "", "no-such"])
+    begun = {
+        "train": ["morphogenesis2d", "--preset", "tiny"],
+        "rollout": ["gecko"],
+        "evaluate": ["gecko"],
+        "interact": ["gecko", "heart"],
+    }.get(command, [])
+    options = (
+        "--steps", "--iterations", "--out", "--device", "--seed", "--damage", "--particle-count",
+        "--resolution", "--update-prob", "--only", "--config", "--loss", "--resume", "--no-such",
+    )  # fmt: skip
+    values = ("nan", "-1", "", "a", "None", "[]", "--", "é", "1e400", "cuda:99", "0", "100:cut:a")
+    words = [command, *begun, draw.choice(options), draw.choice(values)]
+    # Nothing that is legal may begin to work: this is refused by every command.
+    return {"words": [*words, "--no-such-option"]}
+
+
+def run_command(words: Any) -> None:
+    if "warmup" in words:
+        return
+    code = main(words)
+    assert code in (0, 2), f"exit code {code}"
+
+
+OUTER: dict[str, Target] = {
+    "preset": Target(configure, configured, 4),
+    "TrainConfig": Target(reconfigure, configured, 4),
+    "load_config": Target(read_config, config_files),
+    "gymnasium.make": Target(run_env, env_fields, 5, (gymnasium.error.Error,)),
+    "reset, place_particles and step": Target(act, acted, 5, (gymnasium.error.Error,)),
+    "multispecies_v0": Target(run_species, crowd_fields, 5),
+    "wrappers": Target(wrap, wrapped, 3),
+    "agents": Target(make_policy, policies, 2),
+    "npa-envs": Target(run_command, command_line, 1, (SystemExit,)),
+}
+"""What is called, by name."""

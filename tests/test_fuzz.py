@@ -1,0 +1,66 @@
+"""Whatever the public API is given, it works or says what is wrong: an `NPAError`, nothing else."""
+
+from __future__ import annotations
+
+import os
+import reprlib
+import time
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from crowds import targets_made_once
+from fuzzing import TARGETS, call
+
+from npa_envs import NPAError
+
+FIRST_SEED = int(os.environ.get("NPA_ENVS_FUZZ_SEED", "0"))
+"""Seed of the first call; each further one has one more."""
+
+QUICK, THOROUGH = 150, 10_000
+
+PATIENCE = 30.0
+"""No call takes longer [s]."""
+
+
+# A target drawn once serves all calls; drawing it takes longer than they do.
+quick_targets = pytest.fixture(scope="module", autouse=True)(targets_made_once)
+
+
+def refusal(seed: int) -> str | None:
+    """Make a call; return what it did that no documentation names, or None."""
+    name, arguments = call(seed)
+    target = TARGETS[name]
+    began = time.perf_counter()
+    try:
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")
+            target.function(**arguments)
+    except (NPAError, *target.documented):
+        pass
+    except Exception as error:
+        return f"seed {seed}: {name}({shown(arguments)}) raised {type(error).__name__}: {error}"
+    seconds = time.perf_counter() - began
+    if seconds > PATIENCE:
+        return f"seed {seed}: {name}({shown(arguments)}) took {seconds:.0f} s"
+    return None
+
+
+def shown(arguments: dict[str, object]) -> str:
+    """Return arguments as a reader needs them."""
+    return ", ".join(f"{name}={described(value)}" for name, value in arguments.items())
+
+
+def described(value: object) -> str:
+    if isinstance(value, torch.Tensor) and value.numel() > 4:
+        return f"<{value.dtype} {tuple(value.shape)} on {value.device}>"
+    return reprlib.repr(value)
+
+
+@pytest.mark.parametrize("count", [QUICK, pytest.param(THOROUGH, marks=pytest.mark.slow)])
+def test_only_documented_errors_come_out_of_the_public_api(count: int, capsys) -> None:
+    found = [refusal(seed) for seed in range(FIRST_SEED, FIRST_SEED + count)]
+    capsys.readouterr()
+    wrong = [line for line in found if line]
+    assert not wrong, f"{len(wrong)} of {count} calls:\n" + "\n".join(wrong[:50])

@@ -1,0 +1,238 @@
+"""What holds of every legal world: order, place, scale and company of particles do not matter.
+
+The quick run draws the same few examples each time; the thorough one (marked slow) draws new ones
+and prints what reproduces a failure.
+"""
+
+from __future__ import annotations
+
+import torch
+from legal_worlds import (
+    allowances,
+    clear_of_threshold,
+    every,
+    perception_allowance,
+    some,
+    with_scale,
+    with_shift,
+    within,
+)
+
+import npa_envs
+
+DOUBLE = (torch.float64,)
+GRADIENT_BOUND = 1e-12
+"""Largest error of float64 gradients over their largest number, or over 1 (worst seen 3e-15)."""
+ROLLOUT_BOUND = 1e-10
+"""Largest error of float64 worlds after a few steps (worst seen 5e-13)."""
+
+
+def perceive(w, x=None, s=None, **options):
+    x, s = w.x if x is None else x, w.s if s is None else s
+    return npa_envs.perceive(x, s, w.eps, w.eps0, w.box, **options)
+
+
+def fields_of(w):
+    return npa_envs.perception_fields(w.x, w.s, w.eps, w.box)
+
+
+def gradients(w, cotangent):
+    x, s = w.x.clone().requires_grad_(), w.s.clone().requires_grad_()
+    z = perceive(w, x, s, detach_positions=False)
+    return torch.autograd.grad(z, (x, s), cotangent)
+
+
+def alike(found, expected, bound):
+    for value, answer in zip(found, expected, strict=True):
+        within(value, answer, bound * float(answer.abs().max().clamp(min=1.0)))
+
+
+def rule_of(w, seed=0, **options):
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(w.seed + seed)
+        rule = npa_envs.NPARule(w.shape[2], w.s.shape[2], 8, eps0=w.eps0, **options).to(w.x)
+    with torch.no_grad():
+        rule.output.weight *= 4.0
+    return rule
+
+
+def run(w, rule, steps=3, **options):
+    with torch.no_grad():
+        return npa_envs.rollout(rule, w.x, w.s, steps, eps=w.eps, box=w.box, **options)
+
+
+def modulo(w, positions):
+    """Differences of positions, the shortest ones in a box."""
+    if w.box is None:
+        return positions
+    sides = torch.tensor(w.box).to(positions)
+    return positions - sides * (positions / sides).round()
+
+
+@every(some())
+def test_fields_follow_the_order_of_particles(w):
+    clear_of_threshold(w)
+    order = w.permutation()
+    moved = npa_envs.perception_fields(w.x[:, order], w.s[:, order], w.eps, w.box)
+    for value, answer, allowed in zip(moved, fields_of(w), allowances(w), strict=True):
+        within(value, answer[:, order], allowed[:, order])
+
+
+@every(some())
+def test_perception_follows_the_order_of_particles(w):
+    clear_of_threshold(w)
+    order = w.permutation()
+    moved = perceive(w, w.x[:, order], w.s[:, order])
+    within(moved, perceive(w)[:, order], perception_allowance(w)[:, order])
+
+
+@every(some(dtypes=DOUBLE))
+def test_gradients_follow_the_order_of_particles(w):
+    clear_of_threshold(w)
+    order = w.permutation()
+    cotangent = w.normal(*perceive(w).shape)
+    turned = [part[:, order] for part in gradients(w, cotangent)]
+    w = w.ordered(order)
+    alike(gradients(w, cotangent[:, order]), turned, GRADIENT_BOUND)
+
+
+@every(with_shift())
+def test_perception_does_not_depend_on_the_place(drawn):
+    w, shift = drawn
+    clear_of_threshold(w)
+    within(perceive(w.moved(shift)), perceive(w), perception_allowance(w))
+
+
+@every(with_shift(dtypes=DOUBLE))
+def test_gradients_do_not_depend_on_the_place(drawn):
+    w, shift = drawn
+    clear_of_threshold(w)
+    cotangent = w.normal(*perceive(w).shape)
+    alike(gradients(w.moved(shift), cotangent), gradients(w, cotangent), GRADIENT_BOUND)
+
+
+@every(with_scale())
+def test_fields_scale_with_lengths_bit_for_bit(drawn):
+    """ρ as 1 / length^D, ∇s as 1 / length, ∇ρ as 1 / length^(D+1); s̄ and M not at all."""
+    w, factor = drawn
+    dim = w.shape[2]
+    powers = (-dim, 0, -1, 0, -1, -1 - dim)
+    for value, answer, power in zip(fields_of(w.scaled(factor)), fields_of(w), powers, strict=True):
+        assert torch.equal(value, answer * factor**power)
+
+
+@every(with_scale())
+def test_perception_does_not_depend_on_the_unit_of_length(drawn):
+    """Perceived at a larger radius than it was trained at, a larger world looks the same."""
+    w, factor = drawn
+    assert torch.equal(perceive(w.scaled(factor)), perceive(w))
+
+
+@every(some())
+def test_a_batch_perceives_as_its_worlds_do(w):
+    z, cotangent = perceive(w), w.normal(*perceive(w).shape)
+    bars = gradients(w, cotangent)
+    for k in range(w.shape[0]):
+        alone = w.alone(k)
+        assert torch.equal(perceive(alone)[0], z[k])
+        for value, answer in zip(fields_of(alone), fields_of(w), strict=True):
+            assert torch.equal(value[0], answer[k])
+        for value, answer in zip(gradients(alone, cotangent[k : k + 1]), bars, strict=True):
+            assert torch.equal(value[0], answer[k])
+
+
+@every(some(dtypes=DOUBLE))
+def test_a_rollout_follows_the_order_of_particles(w):
+    clear_of_threshold(w)
+    rule, order = rule_of(w), w.permutation()
+    x, s = run(w, rule, 1, update_prob=1.0)
+    w = w.ordered(order)
+    moved_x, moved_s = run(w, rule, 1, update_prob=1.0)
+    within(modulo(w, moved_x - x[:, order]), torch.zeros_like(x), ROLLOUT_BOUND * w.eps)
+    alike((moved_s,), (s[:, order],), ROLLOUT_BOUND)
+
+
+@every(with_shift(dtypes=DOUBLE))
+def test_a_rollout_does_not_depend_on_the_place(drawn):
+    w, shift = drawn
+    clear_of_threshold(w)
+    rule, options = rule_of(w), {"steps": 1, "position_noise": 0.1 * w.eps}
+    x, s = run(w, rule, generator=npa_envs.WorldRandom(_seeds(w), device=w.x.device), **options)
+    there = w.moved(shift)
+    generator = npa_envs.WorldRandom(_seeds(w), device=w.x.device)
+    moved_x, moved_s = run(there, rule, generator=generator, **options)
+    away = modulo(w, moved_x - x - shift.to(x))
+    within(away, torch.zeros_like(x), ROLLOUT_BOUND * w.eps)
+    alike((moved_s,), (s,), ROLLOUT_BOUND)
+
+
+@every(with_scale())
+def test_a_rollout_does_not_depend_on_the_unit_of_length(drawn):
+    w, factor = drawn
+    rule = rule_of(w, static=w.seed % 3 == 0)
+    results = []
+    for world in (w, w.scaled(factor)):
+        generator = npa_envs.WorldRandom(_seeds(w), device=w.x.device)
+        results.append(run(world, rule, generator=generator, position_noise=0.1 * world.eps))
+    (x, s), (scaled_x, scaled_s) = results
+    assert torch.equal(scaled_x, x * factor)
+    assert torch.equal(scaled_s, s)
+
+
+@every(some(dtypes=DOUBLE))
+def test_a_world_goes_in_a_batch_as_it_goes_alone(w):
+    """Up to rounding: a product of matrices may round rows otherwise where there are more."""
+    clear_of_threshold(w)
+    rule, seeds = rule_of(w, static=w.seed % 3 == 0), _seeds(w)
+    together = run(w, rule, 1, generator=npa_envs.WorldRandom(seeds, device=w.x.device))
+    for k, seed in enumerate(seeds):
+        generator = npa_envs.WorldRandom(seed, device=w.x.device)
+        x, s = run(w.alone(k), rule, 1, generator=generator)
+        within(modulo(w, x[0] - together[0][k]), torch.zeros_like(x[0]), ROLLOUT_BOUND * w.eps)
+        alike((s[0],), (together[1][k],), ROLLOUT_BOUND)
+
+
+@every(some())
+def test_species_have_a_share_of_the_fields_in_any_order_and_company(w):
+    counts, fields, allowed = w.split(2), fields_of(w), allowances(w)
+    shares = npa_envs.species_fields(w.x, counts, eps=w.eps, box=w.box)
+    within(shares.rho.sum(2), fields.rho, 2.0 * allowed.rho)
+    within(shares.drho.sum(2), fields.drho, 2.0 * allowed.drho + 1e-30)
+    ends = torch.arange(w.shape[1], device=w.x.device).split(counts)
+    order = torch.cat([part.flip(0) for part in ends])
+    turned = npa_envs.species_fields(w.x[:, order], counts, eps=w.eps, box=w.box)
+    within(turned.rho, shares.rho[:, order], allowed.rho[:, order, None])
+    within(turned.drho, shares.drho[:, order], allowed.drho[:, order, None] + 1e-30)
+    for k in range(w.shape[0]):
+        alone = npa_envs.species_fields(w.x[k : k + 1], counts, eps=w.eps, box=w.box)
+        assert torch.equal(alone.rho[0], shares.rho[k])
+        assert torch.equal(alone.drho[0], shares.drho[k])
+
+
+@every(with_scale(dtypes=DOUBLE))
+def test_species_go_their_way_in_any_order_and_unit_of_length(drawn):
+    w, factor = drawn
+    clear_of_threshold(w)
+    counts = w.split(2)
+    rules = [rule_of(w, number) for number in range(len(counts))]
+
+    def go(world, x, s):
+        with torch.no_grad():
+            return npa_envs.rollout_species(
+                rules, x, s, 1, counts=counts, eps=world.eps, box=world.box, update_prob=1.0
+            )
+
+    x, s = go(w, w.x, w.s)
+    larger = w.scaled(factor)
+    scaled_x, scaled_s = go(larger, larger.x, larger.s)
+    assert torch.equal(scaled_x, x * factor)
+    assert torch.equal(scaled_s, s)
+    ends = torch.arange(w.shape[1], device=w.x.device).split(counts)
+    order = torch.cat([part.flip(0) for part in ends])
+    moved_x, moved_s = go(w, w.x[:, order], w.s[:, order])
+    within(modulo(w, moved_x - x[:, order]), torch.zeros_like(x), ROLLOUT_BOUND * w.eps)
+    alike((moved_s,), (s[:, order],), ROLLOUT_BOUND)
+
+
+def _seeds(w):
+    return [w.seed + 7 * k for k in range(w.shape[0])]
