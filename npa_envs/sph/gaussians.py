@@ -286,7 +286,8 @@ def render_gaussians(
     if images * means.shape[1] * pairs_per_particle > LARGEST_INDEX:
         raise NPAError(
             f"pairs must stay below {LARGEST_INDEX} in one batch, got pairs_per_particle="
-            f"{pairs_per_particle} for {images} pictures of {means.shape[1]} particles: lower it"
+            f"{pairs_per_particle} for {images} pictures of {means.shape[1]} particles: "
+            "split the batch or lower pairs_per_particle"
         )
     image, passing, overflow, _ = _Gaussians.apply(  # type: ignore[no-untyped-call]
         *(tensor.contiguous() for tensor in (means, scales, quaternions, opacities, colours)),
