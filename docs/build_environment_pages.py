@@ -180,7 +180,8 @@ def index() -> str:
         rows.append((f"[`{registration.id}`]({registration.name}.md)", text))
     opening = (
         "One page each: observation, action, reward, episodes, arguments. Words and letters are "
-        "explained in [the mathematics](../mathematics.md#glossary). To make one of your own: "
+        "explained in [the mathematics](../mathematics.md#glossary). To train a first policy: [the "
+        "tutorial](../tutorial.md). To make one of your own: "
         "[your own task as an environment](../own_environment.md)."
     )
     listing = table(("Environment", "Task"), [*rows, *species_pages.index_rows()])

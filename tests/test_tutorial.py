@@ -1,0 +1,73 @@
+"""The program of docs/tutorial.md: it runs as it stands there, and learns what the page says."""
+
+from __future__ import annotations
+
+import math
+import re
+import time
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+TUTORIAL = Path(__file__).resolve().parent.parent / "docs" / "tutorial.md"
+ROUNDS = "model.learn(100 * 16"
+
+pytest.importorskip("stable_baselines3")
+
+
+def program() -> str:
+    """Return the page's only block of Python."""
+    (block,) = re.findall(r"^```python\n(.*?)^```", TUTORIAL.read_text(), re.MULTILINE | re.DOTALL)
+    return block
+
+
+def run(code: str) -> None:
+    exec(compile(code, TUTORIAL.name, "exec"), {})
+
+
+def printed(text: str) -> dict[str, tuple[float, float]]:
+    """Return mean returns and their standard errors, by policy, of what the program prints."""
+    rows = re.findall(r"^(\w+): (-?[\d.]+) ± ([\d.]+)$", text, re.MULTILINE)
+    return {name: (float(mean), float(error)) for name, mean, error in rows}
+
+
+def told() -> dict[str, float]:
+    """Return the mean returns of the page's table, by policy."""
+    rows = re.findall(r"^\| .*`(\w+)`.* \| ([−\d.]+) ±", TUTORIAL.read_text(), re.MULTILINE)
+    return {name: float(mean.replace("−", "-")) for name, mean in rows}
+
+
+def test_the_program_has_at_most_30_lines():
+    assert len([line for line in program().splitlines() if line.strip()]) <= 30
+
+
+def test_the_program_runs_and_gives_the_returns_that_need_no_training(
+    tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    code = program()
+    assert code.count(ROUNDS) == 1
+    run(code.replace(ROUNDS, "model.learn(16"))
+    returns = printed(capsys.readouterr().out)
+    assert returns.keys() == told().keys()
+    for name in ("RandomPolicy", "ZeroPolicy", "RulePolicy"):
+        assert returns[name][0] == pytest.approx(told()[name], abs=0.02)
+    with Image.open(tmp_path / "ppo.png") as picture:
+        assert picture.width >= 5 * 256
+
+
+@pytest.mark.slow
+def test_ppo_beats_random_actions_by_three_standard_errors_in_five_minutes(
+    tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    start = time.process_time()
+    run(program())
+    assert time.process_time() - start < 300.0
+    returns = printed(capsys.readouterr().out)
+    (mean, error), (random_mean, random_error) = returns["RowPolicy"], returns["RandomPolicy"]
+    assert mean - random_mean > 3.0 * math.hypot(error, random_error)
+    # Not by doing nothing, either.
+    assert mean > 3.0 * error
+    assert mean == pytest.approx(told()["RowPolicy"], abs=0.2)
