@@ -21,7 +21,7 @@ SpeciesPolicy = Callable[[Any], Any]
 
 
 class RowPolicy:
-    """A Stable-Baselines3 model that was trained on rows, as the policy of a species.
+    """A Stable-Baselines3 model that was trained on rows, as the policy of a species or a world.
 
     Args:
         model: The model; the policy follows when it is trained on.
