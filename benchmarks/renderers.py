@@ -21,9 +21,11 @@ import torch
 from torch import Tensor
 
 import npa_envs
-from npa_envs.cli.worlds import task_of_rule
+from npa_envs.bench.session import relative_error
+from npa_envs.replay import capture
 from npa_envs.tasks.renderers import RENDERERS
 from npa_envs.tasks.views import some_views
+from npa_envs.trained_tasks import task_of_rule
 
 DEVICE = torch.device("cuda")
 NAMES = ("own", "gsplat")
@@ -41,24 +43,6 @@ def median_time(call: Callable[[], object]) -> float:
         if number >= 5:
             times.append(1e3 * start.elapsed_time(end))
     return statistics.median(times)
-
-
-def recorded(call: Callable[[], object]) -> Callable[[], object]:
-    """Return the replay of a call in a CUDA graph."""
-    stream = torch.cuda.Stream()
-    stream.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(stream):
-        call()
-    torch.cuda.current_stream().wait_stream(stream)
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        call()
-    return graph.replay
-
-
-def difference(value: Tensor, other: Tensor) -> float:
-    """Return |value - other| / |other|."""
-    return float((value - other).detach().norm() / other.detach().norm())
 
 
 def compared(task: object, x: Tensor, s: Tensor, cameras: object) -> dict[str, object]:
@@ -79,9 +63,9 @@ def compared(task: object, x: Tensor, s: Tensor, cameras: object) -> dict[str, o
 
     slopes = zip(("positions", *fields), *(gradients(name) for name in NAMES), strict=True)
     row: dict[str, object] = {
-        "image": difference(drawn["own"][0], drawn["gsplat"][0]),
-        "alpha": difference(drawn["own"][1], drawn["gsplat"][1]),
-        "gradients": {field: difference(own, other) for field, own, other in slopes},
+        "image": relative_error(drawn["own"][0], drawn["gsplat"][0]),
+        "alpha": relative_error(drawn["own"][1], drawn["gsplat"][1]),
+        "gradients": {field: relative_error(own, other) for field, own, other in slopes},
     }
     for number in range(2):
         for name in NAMES:
@@ -93,7 +77,9 @@ def compared(task: object, x: Tensor, s: Tensor, cameras: object) -> dict[str, o
             row[f"{name} forward us {number}"] = median_time(forward)
             row[f"{name} forward and backward us {number}"] = median_time(partial(gradients, name))
             if name == "own":
-                row[f"{name} forward in a graph us {number}"] = median_time(recorded(forward))
+                row[f"{name} forward in a graph us {number}"] = median_time(
+                    capture(forward, DEVICE, generator=None, warm_up=forward).replay
+                )
     return row
 
 

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 import npa_envs
-from npa_envs.cli.worlds import task_of_rule
 from npa_envs.render import to_uint8, write_filmstrip
 from npa_envs.rule_io import shipped_rules
 from npa_envs.tasks.views import over
+from npa_envs.trained_tasks import task_of_rule
 
 IMAGES = Path(__file__).resolve().parent / "images"
 SEED = 1_000_000

@@ -129,8 +129,8 @@ def run(options: BenchOptions, command: str = "npa-envs bench") -> int:
         print(_explanation(options, device))
         return 0
     if options.output is not None:
+        from npa_envs.cli.folder import make_folder
         from npa_envs.cli.rollout import check_writable
-        from npa_envs.cli.worlds import make_folder
 
         check_writable(make_folder(options.output))
     if options.plots:

@@ -100,10 +100,10 @@ def run(options: EvaluateOptions) -> int:
         NPAError: As for `main`.
     """
     from npa_envs.cli.progress import StepBar
-    from npa_envs.cli.worlds import task_of_rule
     from npa_envs.evaluation import CHECKPOINTS, check_steps, evaluate, healing, table_text
     from npa_envs.rule_io import load_rule
     from npa_envs.tasks.point_classification import PointClassification
+    from npa_envs.trained_tasks import task_of_rule
     from npa_envs.training import check_device
 
     checkpoints = options.checkpoints or CHECKPOINTS

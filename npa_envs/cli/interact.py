@@ -103,9 +103,9 @@ def run(options: InteractOptions) -> int:
     Raises:
         NPAError: As for `main`.
     """
+    from npa_envs.cli.folder import make_folder
     from npa_envs.cli.progress import StepBar
     from npa_envs.cli.rollout import check_writable
-    from npa_envs.cli.worlds import make_folder
     from npa_envs.encounters import Encounters
     from npa_envs.render import write_filmstrip
     from npa_envs.render.tables import table_text
@@ -147,11 +147,11 @@ def _organisms(
     options: InteractOptions, device: torch.device
 ) -> tuple[list[Organism], InteractionSettings]:
     """Load the rules, with what each grows, and settle how they meet."""
-    from npa_envs.cli.worlds import task_of_rule
     from npa_envs.encounters import Organism
     from npa_envs.interaction import InteractionSettings
     from npa_envs.rule_io import load_rule, shipped_rules
     from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
+    from npa_envs.trained_tasks import task_of_rule
 
     sources = list(dict.fromkeys(options.rules)) or list(shipped_rules(TASK))
     organisms: list[Organism] = []
@@ -182,7 +182,7 @@ def _organisms(
 
 
 def _task_of(source: str, rule: NPARule, device: torch.device, count: int) -> Any:
-    from npa_envs.cli.worlds import task_of_rule
+    from npa_envs.trained_tasks import task_of_rule
 
     return task_of_rule(source, rule, device, particle_count=count).task
 

@@ -92,9 +92,9 @@ def run(options: RobustnessOptions, command: str = "") -> int:
         NPAError: As for `main`.
     """
     from npa_envs.cli.bench import torch_threads
+    from npa_envs.cli.folder import make_folder
     from npa_envs.cli.progress import StepBar
     from npa_envs.cli.rollout import check_writable
-    from npa_envs.cli.worlds import make_folder
     from npa_envs.devices import check_device
     from npa_envs.robustness.conditions import MOST_PARTICLES
     from npa_envs.robustness.record import read_record

@@ -123,14 +123,15 @@ def run(options: RolloutOptions) -> int:
     import torch
 
     from npa_envs.cli.film import film_world, write_film, write_solid
+    from npa_envs.cli.folder import make_folder
     from npa_envs.cli.progress import StepBar
-    from npa_envs.cli.worlds import make_folder, task_of_rule
     from npa_envs.evaluation import measure
     from npa_envs.rule_io import load_rule
     from npa_envs.tasks.damage import parse_damage
     from npa_envs.tasks.point_classification import PointClassification
     from npa_envs.tasks.task import ViewTask, seed_worlds, task_toward
     from npa_envs.tasks.votes import majority
+    from npa_envs.trained_tasks import task_of_rule
     from npa_envs.training import check_device
     from npa_envs.training.interrupt import stop_flag
 

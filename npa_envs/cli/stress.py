@@ -165,8 +165,8 @@ def _facts(options: StressOptions, device: torch.device) -> dict[str, Any]:
 
 def _path(options: StressOptions, device: torch.device) -> Path | None:
     """Return the file to write, None where none is asked for."""
+    from npa_envs.cli.folder import make_folder
     from npa_envs.cli.rollout import check_writable
-    from npa_envs.cli.worlds import make_folder
 
     if options.output is None:
         return None

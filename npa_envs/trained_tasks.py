@@ -113,22 +113,3 @@ def trained_config(path: Path, metadata: Mapping[str, str]) -> Any:
             f"the metadata of {str(path)!r} must say how the rule was trained, but it is damaged "
             f"or of another version ({error}): save the rule again with npa_envs.save_rule"
         ) from error
-
-
-def make_folder(path: Path) -> Path:
-    """Create a folder, and those above it, where missing.
-
-    Args:
-        path: The folder.
-
-    Raises:
-        NPAError: It cannot be created.
-    """
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise NPAError(
-            f"out must be a folder that can be created, got {str(path)!r} "
-            f"({error.strerror or error}): choose another one"
-        ) from error
-    return path
