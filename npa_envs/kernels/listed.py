@@ -18,7 +18,7 @@ from npa_envs.kernels.listing import RECORD
 from npa_envs.kernels.slots import (
     SLOT_ENTRIES,
     as_number,
-    log_scale_of_square,
+    log_scaled_fast,
     make_lists,
     make_slots,
     make_stage,
@@ -39,6 +39,10 @@ CUDA_REGISTERS, TEAM_REGISTERS = 80, 96
 
 AHEAD = 2
 """Listed neighbours that a lane asks for together."""
+
+BLOCK = 4096
+"""Neighbours of a list too long to be kept whose states are summed before they are added to the
+others: of a million summed one after the other, too much is rounded away."""
 
 load_record = make_wide_load(RECORD, wp.float32)
 
@@ -397,6 +401,9 @@ def listed_perception(
         # What a round leaves over of a multiple of the lanes is kept free in the next: a
         # neighbour's lane is then its number among all, whatever the rest of the warp does.
         begin = wp.int32(0)
+        block = wp.int32(0)
+        earlier_blur = share()
+        earlier_gradient = share_gradient()
         working = run_count > 0
         while working:
             count = wp.int32(begin)
@@ -439,7 +446,16 @@ def listed_perception(
                 wide_sum,
             )
             blur, gradient = add_states(states, part, first, slot, count, own, blur, gradient)
+            block += count
+            if block >= wp.static(BLOCK) or not working:
+                earlier_blur += blur
+                earlier_gradient += gradient
+                blur = share()
+                gradient = share_gradient()
+                block = wp.int32(0)
             begin = count & wp.static(lanes - 1)
+        blur += earlier_blur
+        gradient += earlier_gradient
         wide_sum = add_wide(wide_sum)
         if wp.static(teams > 1):
             blur = add_share(blur)
@@ -460,7 +476,7 @@ def listed_perception(
                 along = vector()
                 for d in range(wp.static(space_dim)):
                     along[d] = gradient_scale * gradient[d, c]
-                along *= log_scale_of_square(wp.dot(along, along))
+                along = log_scaled_fast(along)
                 for d in range(wp.static(space_dim)):
                     scaled[c * wp.static(space_dim) + d] = along[d]
             stage_rows(slot, wp.static(2 * width) + mine * wp.static(space_dim), scaled)
@@ -477,7 +493,7 @@ def listed_perception(
             along = vector()
             for d in range(wp.static(space_dim)):
                 along[d] = scalar(wide_sum[d]) * density_scale
-            along *= log_scale_of_square(wp.dot(along, along))
+            along = log_scaled_fast(along)
             if destination >= 0 and lane == 0 and g == 0:
                 for d in range(wp.static(space_dim)):
                     perception[destination, column + d] = within(along[d], bound)

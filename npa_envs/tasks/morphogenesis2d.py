@@ -230,6 +230,9 @@ class Morphogenesis2D:
         if config.stray_weight > 0.0:
             parts["stray"] = stray_motion(x, path_length)
             total = total + config.stray_weight * parts["stray"]
+        if config.drift_weight > 0.0:
+            parts["drift"] = world_mean(x).square().sum(dim=-1).add(1e-12).sqrt().mean()
+            total = total + config.drift_weight * parts["drift"]
         return total, parts
 
     def _centred(self, x: Tensor) -> Tensor:

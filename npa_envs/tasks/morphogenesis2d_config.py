@@ -73,6 +73,9 @@ class Morphogenesis2DConfig:
     stray_weight: float = 0.0
     """Weight of the mean path length of particles outside of [−1, 1] (per length unit)."""
 
+    drift_weight: float = 0.0
+    """Weight of the centroids' distance from the origin, where worlds begin (per length unit)."""
+
     def __post_init__(self) -> None:
         """Check every field.
 
@@ -92,6 +95,7 @@ class Morphogenesis2DConfig:
             "damage_radius",
             "stray_share",
             "stray_weight",
+            "drift_weight",
             "splat_weight",
             "colour_weight",
             "motion_weight",
