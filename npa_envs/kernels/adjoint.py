@@ -242,7 +242,7 @@ def adjoint_kernels(
         factor = spiky_factor(distance, domain.inverse_eps, domain.spiky_norm)
         pull = smoothing_bar * slope * offset
         if distance > scalar(0.0):
-            # Where two particles nearly touch, the factor is large, and all that it pulls is across.
+            # Where two particles nearly touch the factor is large, and pulls across alone.
             direction = offset / distance
             share = wp.dot(direction, kernel_bar) / wp.dot(direction, direction)
             along = share * direction

@@ -71,7 +71,7 @@ def spiky_factor(distance: Any, inverse_eps: Any, norm: Any):
 
 @wp.func
 def spiky_radial_slope(distance: Any, inverse_eps: Any, norm: Any):
-    """d(f r)/dr of the spiky gradient kernel's length f(r) r, for its adjoint [1 / length^(D+2)]."""
+    """d(f r)/dr of the spiky kernel's length f(r) r, for its adjoint [1 / length^(D+2)]."""
     falloff = type(norm)(1.0) - distance * inverse_eps
     return -type(norm)(2.0) * norm * falloff * inverse_eps
 

@@ -12,13 +12,18 @@ import math
 
 import warp as wp
 
-from npa_envs.kernels.domain import MOMENT_THRESHOLD, domain_types, kernel_module
+from npa_envs.kernels.domain import (
+    MOMENT_THRESHOLD,
+    domain_types,
+    kernel_module,
+    log_scaled_huge,
+)
 from npa_envs.kernels.lanes import make_lane_sum, make_wide_load, share_type
 from npa_envs.kernels.listing import RECORD
 from npa_envs.kernels.slots import (
     SLOT_ENTRIES,
     as_number,
-    log_scaled_fast,
+    log_scale_of_square,
     make_lists,
     make_slots,
     make_stage,
@@ -39,10 +44,6 @@ CUDA_REGISTERS, TEAM_REGISTERS = 80, 96
 
 AHEAD = 2
 """Listed neighbours that a lane asks for together."""
-
-BLOCK = 4096
-"""Neighbours of a list too long to be kept whose states are summed before they are added to the
-others: of a million summed one after the other, too much is rounded away."""
 
 load_record = make_wide_load(RECORD, wp.float32)
 
@@ -291,6 +292,20 @@ def listed_perception(
         meet_warp()
         return blur, gradient
 
+    @wp.func
+    def scale_huge(gradient_scale: scalar, gradient: share_gradient, scaled: share_rows):
+        """Scaled gradients, those whose squares overflow as well."""
+        result = scaled
+        for c in range(wp.static(share_width)):
+            along = vector()
+            for d in range(wp.static(space_dim)):
+                along[d] = gradient_scale * gradient[d, c]
+            if wp.isinf(wp.dot(along, along)):
+                along = log_scaled_huge(along)
+                for d in range(wp.static(space_dim)):
+                    result[c * wp.static(space_dim) + d] = along[d]
+        return result
+
     @wp.kernel(enable_backward=False, module=module, cuda_max_registers=registers)
     def perceive(
         domain: Domain,
@@ -401,9 +416,6 @@ def listed_perception(
         # What a round leaves over of a multiple of the lanes is kept free in the next: a
         # neighbour's lane is then its number among all, whatever the rest of the warp does.
         begin = wp.int32(0)
-        block = wp.int32(0)
-        earlier_blur = share()
-        earlier_gradient = share_gradient()
         working = run_count > 0
         while working:
             count = wp.int32(begin)
@@ -446,16 +458,7 @@ def listed_perception(
                 wide_sum,
             )
             blur, gradient = add_states(states, part, first, slot, count, own, blur, gradient)
-            block += count
-            if block >= wp.static(BLOCK) or not working:
-                earlier_blur += blur
-                earlier_gradient += gradient
-                blur = share()
-                gradient = share_gradient()
-                block = wp.int32(0)
             begin = count & wp.static(lanes - 1)
-        blur += earlier_blur
-        gradient += earlier_gradient
         wide_sum = add_wide(wide_sum)
         if wp.static(teams > 1):
             blur = add_share(blur)
@@ -472,13 +475,18 @@ def listed_perception(
         stage_share(slot, wp.static(width) + mine, blur)
         if wp.static(state_gradient):
             scaled = share_rows()
+            largest_square = scalar(0.0)
             for c in range(wp.static(share_width)):
                 along = vector()
                 for d in range(wp.static(space_dim)):
                     along[d] = gradient_scale * gradient[d, c]
-                along = log_scaled_fast(along)
+                squared = wp.dot(along, along)
+                largest_square = wp.max(largest_square, squared)
+                along *= log_scale_of_square(squared)
                 for d in range(wp.static(space_dim)):
                     scaled[c * wp.static(space_dim) + d] = along[d]
+            if wp.isinf(largest_square):
+                scaled = scale_huge(gradient_scale, gradient, scaled)
             stage_rows(slot, wp.static(2 * width) + mine * wp.static(space_dim), scaled)
         bound = wp.where(limit > scalar(0.0), limit, scalar(wp.static(math.nan)))
         write_rows(slot, destination, g, state_dim, bound, perception)
@@ -493,7 +501,11 @@ def listed_perception(
             along = vector()
             for d in range(wp.static(space_dim)):
                 along[d] = scalar(wide_sum[d]) * density_scale
-            along = log_scaled_fast(along)
+            squared = wp.dot(along, along)
+            if wp.isinf(squared):
+                along = log_scaled_huge(along)
+            else:
+                along *= log_scale_of_square(squared)
             if destination >= 0 and lane == 0 and g == 0:
                 for d in range(wp.static(space_dim)):
                     perception[destination, column + d] = within(along[d], bound)

@@ -51,8 +51,8 @@ SHARE = 4
 """Channels of a row that one thread unscales."""
 
 BLOCK = 4096
-"""Rows whose cotangents are summed before they are added to the others: of a million summed one after
-the other, too much is rounded away."""
+"""Rows whose cotangents are summed before they are added to the others: of a million summed one
+after the other, too much is rounded away."""
 
 LARGEST_LENGTH = 3e38
 """Farther than any particle [length units]."""

@@ -9,11 +9,9 @@ lanes would make the groups of a warp run one after another.
 
 import functools
 from types import SimpleNamespace
-from typing import Any
 
 import warp as wp
 
-from npa_envs.kernels.domain import log_scaled_huge
 from npa_envs.kernels.warps import CUDA_BLOCK
 
 SLOT_ENTRIES = 32
@@ -342,16 +340,6 @@ def inverse_root(value: wp.float32) -> wp.float32:
 def log_scale_of_square(squared: wp.float32) -> wp.float32:
     """L(v) / v of the logarithmic scaling, from v . v: log(1 + |v|) / |v|."""
     ...
-
-
-@wp.func
-def log_scaled_fast(v: Any):
-    """`log_scaled` of float32 in fewer instructions."""
-    squared = wp.dot(v, v)
-    result = log_scale_of_square(squared) * v
-    if wp.isinf(squared):
-        result = log_scaled_huge(v)
-    return result
 
 
 @wp.func_native("return fminf(fmaxf(value, -limit), limit);")

@@ -11,9 +11,10 @@ from npa_envs.rule import COLOUR_OFFSET, NPARule
 from npa_envs.sph import splat, world_mean
 from npa_envs.sph.picture_losses import picture_losses
 from npa_envs.tasks.morphogenesis2d_config import Morphogenesis2DConfig
+from npa_envs.tasks.pool_damage import hurt
 from npa_envs.tasks.rules import untrained_rule
 from npa_envs.tasks.seeds import uniform_ball
-from npa_envs.tasks.strays import hurt, stray_motion
+from npa_envs.tasks.strays import stray_motion
 from npa_envs.tasks.targets import PointTarget, load_target
 
 UNOWNED = 0.05
@@ -114,8 +115,7 @@ class Morphogenesis2D:
 
     def damage(self, x: Tensor, s: Tensor, generator: Randomness) -> tuple[Tensor, Tensor]:
         """Return the worlds with states in a disk erased, and some particles thrown out."""
-        radius, share = self.config.damage_radius, self.config.stray_share
-        return hurt(x, s, damage_radius=radius, stray_share=share, generator=generator)
+        return hurt(x, s, self.config, generator=generator)
 
     def picture(self, x: Tensor, s: Tensor, *, centred: bool = True) -> Tensor:
         """Return the picture of each world.

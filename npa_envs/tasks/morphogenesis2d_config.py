@@ -46,6 +46,13 @@ class Morphogenesis2DConfig:
     damage_radius: float = 0.1
     """Radius of the disk whose state is erased in worlds from the pool [length units]; 0: none."""
 
+    clump_radius: float = 0.0
+    """Radius of the disk whose particles are pulled to one point, in a quarter of the worlds from
+    the pool [length units]; 0: none."""
+
+    cut_gap: float = 0.0
+    """Width of the slit through a quarter of the worlds from the pool [length units]; 0: none."""
+
     stray_share: float = 0.0
     """Probability of each particle to be thrown out of worlds from the pool (dimensionless)."""
 
@@ -93,6 +100,8 @@ class Morphogenesis2DConfig:
         check_non_negative(
             self,
             "damage_radius",
+            "clump_radius",
+            "cut_gap",
             "stray_share",
             "stray_weight",
             "drift_weight",
