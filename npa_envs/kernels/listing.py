@@ -125,8 +125,12 @@ def listed_density(
             j = begin + lane
             crowded = wp.bool(True)
             while crowded:
-                stop = wp.min(end, j + wp.static(BLOCK))
-                crowded = stop < end
+                stop = end
+                crowded = wp.bool(False)
+                if wp.static(lanes == 1):
+                    # Worlds whose particles have several threads are not as large.
+                    stop = wp.min(end, j + wp.static(BLOCK))
+                    crowded = stop < end
                 # Several positions are asked for before the first is used.
                 while j + wp.static((many - 1) * lanes) < stop:
                     ahead = positions_ahead()
