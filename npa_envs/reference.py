@@ -86,7 +86,8 @@ def threshold_inverse(moment: Tensor) -> Tensor:
     """Return M^-1 where |det M| is at least the threshold, else the identity, shape [..., D, D]."""
     invertible = torch.linalg.det(moment).abs() >= MOMENT_THRESHOLD
     unit = torch.eye(moment.shape[-1], dtype=moment.dtype, device=moment.device).expand_as(moment)
-    return torch.linalg.inv(torch.where(invertible[..., None, None], moment, unit))
+    inverse: Tensor = torch.linalg.inv(torch.where(invertible[..., None, None], moment, unit))
+    return inverse
 
 
 def adjugate(moment: Tensor) -> Tensor:
@@ -106,10 +107,11 @@ def smooth_inverse(moment: Tensor) -> Tensor:
 
     It is w M^-1 + (1 - w) I with w = det² M / (det² M + τ²), written without the inverse.
     """
-    determinant = torch.linalg.det(moment)[..., None, None]
+    determinant: Tensor = torch.linalg.det(moment)[..., None, None]
     softening = MOMENT_SOFTENING**2
     unit = torch.eye(moment.shape[-1], dtype=moment.dtype, device=moment.device)
-    return (determinant * adjugate(moment) + softening * unit) / (determinant**2 + softening)
+    blend = determinant * adjugate(moment) + softening * unit
+    return blend / (determinant * determinant + softening)
 
 
 def fields(
