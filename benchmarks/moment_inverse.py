@@ -72,7 +72,13 @@ def study(name: str, arguments: argparse.Namespace) -> dict[str, Any]:
     loaded = npa_envs.load_rule(name, device=device)
     task = task_of_rule(name, loaded, device).task
     rules = [with_inverse(loaded, inverse) for inverse in INVERSES]
-    result: dict[str, Any] = {"rule": name}
+    result: dict[str, Any] = {
+        "rule": name,
+        "command": " ".join(["python", *sys.argv]),
+        "commit": arguments.commit,
+        "date": date.today().isoformat(),
+        "torch": torch.__version__,
+    }
     for inverse, rule in zip(INVERSES, rules, strict=True):
         x, s = grown(rule, task, arguments)
         losses = task.metric(x, s).double()
@@ -129,14 +135,7 @@ def main() -> None:
         kept = [*(other for other in kept if other["rule"] != name), result]
         print(line(result), flush=True)
         if arguments.output:
-            report = {
-                "command": " ".join(["python", *sys.argv]),
-                "commit": arguments.commit,
-                "date": date.today().isoformat(),
-                "torch": torch.__version__,
-                "rules": kept,
-            }
-            arguments.output.write_text(json.dumps(report, indent=1) + "\n")
+            arguments.output.write_text(json.dumps({"rules": kept}, indent=1) + "\n")
 
 
 if __name__ == "__main__":
