@@ -115,6 +115,12 @@ def _check_fit(rule: NPARule, env: Any) -> None:
             f"rule must be one of {other} particles like the environment's, got one of {kind} "
             f"particles (static={rule.static}): choose another environment or another rule"
         )
+    if rule.moment_inverse != physics.moment_inverse:
+        raise NPAError(
+            f"rule must have the environment's moment_inverse, {physics.moment_inverse!r}, got "
+            f"{rule.moment_inverse!r}: make the environment with "
+            f"moment_inverse={rule.moment_inverse!r}"
+        )
     for name in ("eps0",) if rule.static else ("eps0", "alpha"):
         own, theirs = getattr(rule, name), getattr(config, name)
         if not math.isclose(own, theirs, rel_tol=1e-6):

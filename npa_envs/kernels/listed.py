@@ -20,6 +20,7 @@ from npa_envs.kernels.domain import (
 )
 from npa_envs.kernels.lanes import make_lane_sum, make_wide_load, share_type
 from npa_envs.kernels.listing import RECORD
+from npa_envs.kernels.moments import make_smooth_inverse
 from npa_envs.kernels.slots import (
     SLOT_ENTRIES,
     as_number,
@@ -54,7 +55,7 @@ def listed_perception(
     width: int,
     lanes: int,
     state_gradient: bool,
-    moment_correction: bool,
+    moment_inverse: str | None,
     periodic: bool,
     grouped: bool,
     capacity: int,
@@ -68,7 +69,7 @@ def listed_perception(
         width: Channels of a group.
         lanes: Lanes of a team, which share the channels of a group.
         state_gradient: Whether the state gradient is perceived.
-        moment_correction: Whether it is corrected by the moment matrix.
+        moment_inverse: How it is corrected by the moment matrix; None: not at all.
         periodic: Whether space is a periodic box.
         grouped: Whether channels come in several groups.
         capacity: Neighbours that lists have room for.
@@ -77,6 +78,8 @@ def listed_perception(
             its own part of the list, all channels of it.
     """
     scalar = wp.float32
+    moment_correction = moment_inverse is not None
+    smooth = moment_inverse == "smooth"
     flat = space_dim == 2
     types = domain_types(space_dim, scalar)
     vector, Domain = types.vector, types.Domain
@@ -100,6 +103,7 @@ def listed_perception(
     topic = "listed_smoothing"
     if state_gradient:
         topic = "listed_perception" if moment_correction else "listed_uncorrected_perception"
+        topic = "listed_smoothly_corrected_perception" if smooth else topic
     topic += "_in_box" * periodic + "_grouped" * grouped
     topic += f"_{capacity}" + "_for_adjoint" * for_adjoint
     module = kernel_module(topic, space_dim, scalar, width, lanes)
@@ -122,6 +126,7 @@ def listed_perception(
     places_ahead = wp.types.vector(AHEAD, wp.int32)
     records_ahead = wp.types.matrix((AHEAD, 4), scalar)
     write_rows = slots.write_rows
+    smooth_inverse = make_smooth_inverse(space_dim, scalar)
     stage_share, stage_rows = make_stage(share), make_stage(share_rows)
 
     @wp.func
@@ -468,7 +473,9 @@ def listed_perception(
             for r in range(1, wp.static(space_dim)):
                 for c in range(r):
                     moment[r, c] = moment[c, r]
-            if wp.abs(wp.determinant(moment)) >= scalar(wp.static(MOMENT_THRESHOLD)):
+            if wp.static(smooth):
+                gradient = smooth_inverse(moment) * gradient
+            elif wp.abs(wp.determinant(moment)) >= scalar(wp.static(MOMENT_THRESHOLD)):
                 gradient = wp.inverse(moment) * gradient
         mine = (lane & wp.static(team - 1)) * wp.static(share_width)
         stage_share(slot, mine, wp.where(present, own, share()))
