@@ -53,6 +53,10 @@ class Morphogenesis2DConfig:
     cut_gap: float = 0.0
     """Width of the slit through a quarter of the worlds from the pool [length units]; 0: none."""
 
+    flake_radius: float = 0.0
+    """Radius up to which a disk of particles is torn off and thrown out, in a quarter of the worlds
+    from the pool [length units]; 0: none."""
+
     stray_share: float = 0.0
     """Probability of each particle to be thrown out of worlds from the pool (dimensionless)."""
 
@@ -102,6 +106,7 @@ class Morphogenesis2DConfig:
             "damage_radius",
             "clump_radius",
             "cut_gap",
+            "flake_radius",
             "stray_share",
             "stray_weight",
             "drift_weight",

@@ -9,10 +9,10 @@ from torch import Tensor
 from npa_envs.randomness import Randomness
 from npa_envs.sph import world_mean
 from npa_envs.tasks.damage import clump, cut, erase_state, random_particle, uniform
-from npa_envs.tasks.strays import scatter
+from npa_envs.tasks.strays import scatter, tear
 
 SHARE = 0.25
-"""Share of the worlds that are clumped, and of those that are cut (dimensionless)."""
+"""Share of the worlds that are clumped, that are cut, that lose a flake (dimensionless)."""
 
 
 class PoolDamage(Protocol):
@@ -29,6 +29,10 @@ class PoolDamage(Protocol):
     @property
     def cut_gap(self) -> float:
         """Width of the slit through the middle [length units]."""
+
+    @property
+    def flake_radius(self) -> float:
+        """Largest radius of the flake that is torn off and thrown out [length units]."""
 
     @property
     def stray_share(self) -> float:
@@ -59,6 +63,8 @@ def hurt(
         normal = 2.0 * uniform(x, (len(x), x.shape[2]), generator) - 1.0
         hit = (uniform(x, (len(x), 1), generator)[:, 0] < SHARE).to(x.dtype)
         x, s = cut(x, s, centre=world_mean(x), normal=normal, gap=damage.cut_gap * hit)
+    if damage.flake_radius > 0.0:
+        x = tear(x, radius=damage.flake_radius, chance=SHARE, generator=generator)
     if damage.stray_share > 0.0:
         x = scatter(x, share=damage.stray_share, generator=generator)
     return x, s
