@@ -30,10 +30,18 @@ class Interface(NamedTuple):
     state_scale: float
     """State step of an action of 1, dimensionless."""
 
+    species_count: int = 0
+    """Species whose densities and density gradients follow in an observation; 0: none."""
+
+    @property
+    def shared_dim(self) -> int:
+        """Columns of an observation that tell of all species together."""
+        return self.state_dim * (2 + self.space_dim) + self.space_dim
+
     @property
     def perception_dim(self) -> int:
         """Length P of an observed perception vector."""
-        return self.state_dim * (2 + self.space_dim) + self.space_dim
+        return self.shared_dim + self.species_count * (1 + self.space_dim)
 
     @property
     def action_dim(self) -> int:
@@ -50,7 +58,7 @@ class Interface(NamedTuple):
 
     def density_gradient(self, observation: Tensor) -> Tensor:
         """Return c^{1+D} ∇ρ / N, its logarithmic scale undone, shape [..., D]."""
-        scaled = observation[..., -self.space_dim :]
+        scaled = observation[..., self.shared_dim - self.space_dim : self.shared_dim]
         size = scaled.norm(dim=-1, keepdim=True)
         return scaled * torch.where(size > 0.0, torch.expm1(size) / size, 1.0)
 
@@ -102,8 +110,17 @@ def interface_of(env: Any) -> Interface:
     Raises:
         NPAError: It is none.
     """
-    physics = unwrapped(env).worlds.physics
-    return Interface(physics.space_dim, physics.state_dim, physics.moving, physics.state_scale)
+    worlds = unwrapped(env).worlds
+    physics = worlds.physics
+    # Worlds of species that are told apart perceive more than their physics says.
+    appended = getattr(worlds, "perception_dim", physics.perception_dim) - physics.perception_dim
+    return Interface(
+        physics.space_dim,
+        physics.state_dim,
+        physics.moving,
+        physics.state_scale,
+        appended // (1 + physics.space_dim),
+    )
 
 
 class Policy:

@@ -35,11 +35,7 @@ class RulePolicy(Policy):
             raise NPAError(
                 f"rule must be an NPARule, got {type(rule).__name__}: npa_envs.load_rule('gecko')"
             )
-        if not rule.moment_correction:
-            raise NPAError(
-                "rule must perceive gradients with moment_correction=True, as environments offer "
-                "them, got moment_correction=False: train it with the correction"
-            )
+        _check_correction(rule)
         if not (is_real(state_scale) and state_scale > 0.0):
             raise NPAError(
                 f"state_scale must be positive and finite, got {state_scale!r}: give the "
@@ -48,44 +44,65 @@ class RulePolicy(Policy):
         if env is not None:
             _check_fit(rule, env)
             state_scale = interface_of(env).state_scale
-        super().__init__(Interface(rule.space_dim, rule.state_dim, not rule.static, state_scale))
+        super().__init__(rule_interface(rule, state_scale))
         self.rule = rule
-        self._columns = _perceived_columns(rule)
 
     def act(self, observation: Tensor) -> Tensor:
         """Return the rule's bounded update of every particle."""
-        rule, weight = self.rule, self.rule.hidden.weight
-        rows = observation.flatten(0, 1).to(weight.device, weight.dtype)
-        if self._columns is not None:
-            rows = rows[:, self._columns.to(rows.device)]
-        if rule.is_plain():
-            # The very products of a rollout: a rule amplifies rounding from step to step.
-            folded = rule.folded()
-            padded = rows.new_zeros(len(rows), folded.row_width)
-            padded[:, : rule.perception_dim] = rows
-            padded[:, rule.perception_dim] = 1.0
-            update = folded(padded)[:, : rule.update_dim]
-        else:
-            update = rule(rows)
-        moved = 0 if rule.static else rule.space_dim
-        delta, state_step = update[:, :moved], update[:, moved:]
-        bounded = delta / (1.0 + delta.norm(dim=1, keepdim=True))
-        return self.interface.action(bounded, state_step).float()
+        return self.interface.action(*bounded_update(self.rule, observation.flatten(0, 1))).float()
 
 
-def _perceived_columns(rule: NPARule) -> Tensor | None:
-    """Return which columns of an observation the rule reads, or None for all of them."""
+def rule_interface(rule: NPARule, state_scale: float) -> Interface:
+    """Return what observations and actions mean to a rule.
+
+    Args:
+        rule: The rule.
+        state_scale: State step of an action of 1, dimensionless.
+    """
+    moving = not rule.static
+    return Interface(rule.space_dim, rule.state_dim, moving, state_scale, rule.species_count)
+
+
+def bounded_update(rule: NPARule, observation: Tensor) -> tuple[Tensor, Tensor]:
+    """Return what a rule does about what particles observe; differentiable.
+
+    Args:
+        rule: The rule; the update is computed on its device, in its precision.
+        observation: What environments offer, shape [K, P].
+
+    Returns:
+        Displacements δ / (1 + |δ|) as fractions of α ε, shape [K, D], or [K, 0] where particles are
+        static; and state steps Δs, dimensionless, not bounded, shape [K, C].
+    """
+    weight = rule.hidden.weight
+    rows = _perceived(rule, observation.to(weight.device, weight.dtype))
+    if rule.is_plain():
+        # The very products of a rollout: a rule amplifies rounding from step to step.
+        folded = rule.folded()
+        padded = rows.new_zeros(len(rows), folded.row_width)
+        padded[:, : rule.perception_dim] = rows
+        padded[:, rule.perception_dim] = 1.0
+        update = folded(padded)[:, : rule.update_dim]
+    else:
+        update = rule(rows)
+    moved = 0 if rule.static else rule.space_dim
+    delta, state_step = update[:, :moved], update[:, moved:]
+    return delta / (1.0 + delta.norm(dim=1, keepdim=True)), state_step
+
+
+def _perceived(rule: NPARule, rows: Tensor) -> Tensor:
+    """Return what a rule reads of observations, [K, P], in its order."""
     if rule.state_gradient and rule.density_gradient:
-        return None
-    whole = Interface(rule.space_dim, rule.state_dim, not rule.static, 1.0).perception_dim
-    gradients = 2 * rule.state_dim
-    density = whole - rule.space_dim
-    groups = [torch.arange(gradients)]
+        return rows
+    first, end = 2 * rule.state_dim, rule_interface(rule, 1.0).shared_dim
+    density = end - rule.space_dim
+    groups = [rows[:, :first]]
     if rule.state_gradient:
-        groups.append(torch.arange(gradients, density))
+        groups.append(rows[:, first:density])
     if rule.density_gradient:
-        groups.append(torch.arange(density, whole))
-    return torch.cat(groups)
+        groups.append(rows[:, density:end])
+    # What is offered of each species is read by all rules that tell them apart.
+    return torch.cat((*groups, rows[:, end:]), dim=1)
 
 
 def _check_fit(rule: NPARule, env: Any) -> None:
@@ -98,26 +115,45 @@ def _check_fit(rule: NPARule, env: Any) -> None:
             "a rule must see observations as the environment makes them, and a wrapper changes "
             f"them from {spaces[1]} to {spaces[0]}: give RulePolicy the environment without it"
         )
-    physics, config = unwrapped(env).worlds.physics, unwrapped(env).config
-    if rule.space_dim != physics.space_dim:
+    check_rule_fits(rule, interface_of(env), unwrapped(env).config)
+
+
+def check_rule_fits(rule: NPARule, wanted: Interface, config: Any) -> None:
+    """Check that a rule can act in an environment as it does in a rollout.
+
+    Args:
+        rule: The rule.
+        wanted: What the environment's observations and actions mean.
+        config: The environment's configuration.
+
+    Raises:
+        NPAError: It cannot; the message says in what they differ.
+    """
+    _check_correction(rule)
+    if rule.space_dim != wanted.space_dim:
         raise NPAError(
-            f"rule must have the environment's space_dim, {physics.space_dim}, got "
+            f"rule must have the environment's space_dim, {wanted.space_dim}, got "
             f"{rule.space_dim}: choose another environment or another rule"
         )
-    if rule.state_dim != physics.state_dim:
+    if rule.state_dim != wanted.state_dim:
         raise NPAError(
-            f"rule must have the environment's state_dim, {physics.state_dim}, got "
+            f"rule must have the environment's state_dim, {wanted.state_dim}, got "
             f"{rule.state_dim}: make the environment with state_dim={rule.state_dim}"
         )
-    if rule.static == physics.moving:
+    if rule.static == wanted.moving:
         kind, other = ("static", "moving") if rule.static else ("moving", "static")
         raise NPAError(
             f"rule must be one of {other} particles like the environment's, got one of {kind} "
             f"particles (static={rule.static}): choose another environment or another rule"
         )
-    if rule.moment_inverse != physics.moment_inverse:
+    if rule.species_count != wanted.species_count:
         raise NPAError(
-            f"rule must have the environment's moment_inverse, {physics.moment_inverse!r}, got "
+            f"rule must tell as many species apart as the environment, {wanted.species_count}, got "
+            f"{rule.species_count}: choose another rule, or another perception"
+        )
+    if rule.moment_inverse != config.moment_inverse:
+        raise NPAError(
+            f"rule must have the environment's moment_inverse, {config.moment_inverse!r}, got "
             f"{rule.moment_inverse!r}: make the environment with "
             f"moment_inverse={rule.moment_inverse!r}"
         )
@@ -128,3 +164,11 @@ def _check_fit(rule: NPARule, env: Any) -> None:
                 f"rule must have the environment's {name}, {theirs:g}, got {own:g}: make the "
                 f"environment with {name}={own:g}"
             )
+
+
+def _check_correction(rule: NPARule) -> None:
+    if not rule.moment_correction:
+        raise NPAError(
+            "rule must perceive gradients with moment_correction=True, as environments offer "
+            "them, got moment_correction=False: train it with the correction"
+        )

@@ -8,17 +8,9 @@ from __future__ import annotations
 from typing import Any
 
 from npa_envs.envs.species.agents import MultiSpeciesEnv
+from npa_envs.envs.species.tables import ENVIRONMENTS
 from npa_envs.envs.species.vector import MultiSpeciesVectorEnv
 from npa_envs.envs.species.zoo import aec_env, clipped, register
-
-ENVIRONMENTS = {
-    "npa/Mixing-v0": "mixing",
-    "npa/Segregation-v0": "segregation",
-    "npa/CoMorphogenesis-v0": "co_morphogenesis",
-    "npa/Invasion-v0": "invasion",
-    "npa/Symbiosis-v0": "symbiosis",
-}
-"""Tasks by the ids that `pettingzoo.make` takes."""
 
 
 def parallel_env(task: str = "mixing", species_count: int = 2, **config: Any) -> MultiSpeciesEnv:

@@ -1,4 +1,4 @@
-"""The one table of tasks for several species."""
+"""The one table of tasks for several species, and of their ids."""
 
 from __future__ import annotations
 
@@ -18,6 +18,16 @@ TASKS: dict[str, type[SpeciesTask]] = {
     "symbiosis": SymbiosisTask,
 }
 """Tasks by the names that environments take."""
+
+
+ENVIRONMENTS = {
+    "npa/Mixing-v0": "mixing",
+    "npa/Segregation-v0": "segregation",
+    "npa/CoMorphogenesis-v0": "co_morphogenesis",
+    "npa/Invasion-v0": "invasion",
+    "npa/Symbiosis-v0": "symbiosis",
+}
+"""Tasks by the ids that `pettingzoo.make` takes."""
 
 
 def task_type(name: str) -> type[SpeciesTask]:

@@ -1,0 +1,144 @@
+"""Learners of policies behind one interface, imported as `npa_envs.agents.learning`.
+
+`train(method, problem, budget, seed)` runs any of `METHODS` on a `Problem`, an environment with its
+keywords, and returns rules and a learning curve. A method is a function in a module of its own; a
+method's libraries are imported when it is asked for.
+"""
+
+from __future__ import annotations
+
+import inspect
+import pkgutil
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
+
+import torch
+
+from npa_envs.agents.learning.problem import Problem
+from npa_envs.agents.learning.progress import Budget, Entry, Progress, check_finite
+from npa_envs.agents.learning.rules import RuleSet, RuleSetPolicy
+from npa_envs.devices import check_device
+from npa_envs.errors import NPAError, suggest
+from npa_envs.tasks.checks import is_whole
+
+__all__ = [
+    "METHODS",
+    "Budget",
+    "Entry",
+    "Problem",
+    "Progress",
+    "RuleSet",
+    "RuleSetPolicy",
+    "Trained",
+    "check_finite",
+    "method_options",
+    "train",
+]
+
+METHODS: dict[str, str] = {
+    "gradient": "npa_envs.agents.learning.gradient:train",
+    "ppo": "npa_envs.agents.learning.ppo:train",
+    "ppo_rows": "npa_envs.agents.learning.sb3_rows:train",
+    "ppo_world": "npa_envs.agents.learning.sb3_world:train",
+    "evolution": "npa_envs.agents.learning.evolution:train",
+    "clone": "npa_envs.agents.learning.clone:train",
+    "random": "npa_envs.agents.learning.baselines:train_random",
+    "zero": "npa_envs.agents.learning.baselines:train_zero",
+    "scripted": "npa_envs.agents.learning.baselines:train_scripted",
+}
+"""Where methods are: functions `f(problem, progress, seed, *, device, start, ...)` that return a
+`RuleSet` or a policy. Others may be added."""
+
+EVALUATION_SEEDS = range(1_000_000, 1_000_016)
+"""Seeds of evaluations, far from those that learners begin their worlds with."""
+
+
+class Trained(NamedTuple):
+    """What a run came to."""
+
+    rules: RuleSet | None
+    """The rules, on the run's device; None where a method has none."""
+
+    log: list[Entry]
+    """The learning curve."""
+
+    policy: Callable[[Any], Any]
+    """Maps observations, [B, N, P], to actions, [B, N, A]: the rules' where there are some."""
+
+
+def train(
+    method: str,
+    problem: Problem,
+    budget: Budget,
+    seed: int,
+    *,
+    device: str | torch.device = "cpu",
+    start: RuleSet | None = None,
+    evaluation_seeds: Iterable[int] = EVALUATION_SEEDS,
+    entries: int = 20,
+    on_entry: Callable[[Entry], None] | None = None,
+    **options: Any,
+) -> Trained:
+    """Learn a problem by a method, within a budget.
+
+    Args:
+        method: A name from `METHODS`.
+        problem: What is to be learned.
+        budget: What may be spent.
+        seed: Of everything that the method draws, at least 0.
+        device: Where worlds, rules and evaluations are.
+        start: Rules to begin with, `RuleSet.of(problem, "heart")`; copied. None: new ones.
+        evaluation_seeds: Of the episodes by which the learning curve is drawn.
+        entries: Points of the curve besides the first, at equal shares of the budget.
+        on_entry: Called with each point as soon as it is known.
+        options: The method's own: `method_options` names them.
+
+    Raises:
+        NPAError: There is no such method or option, or the method cannot learn this problem.
+        DivergedError: The rules' weights have become infinite or NaN.
+        MissingDependencyError: The method needs a library that is not installed.
+    """
+    function = _function(method)
+    known = method_options(method)
+    for name in options:
+        if name not in known:
+            raise NPAError(f"method {method!r} has no option {name!r}: {suggest(name, known)}")
+    if not is_whole(seed) or seed < 0:
+        raise NPAError(f"seed must be a whole number of at least 0, got {seed!r}: give seed=0")
+    place = check_device(device)
+    progress = Progress(
+        problem,
+        budget,
+        device=place,
+        evaluation_seeds=evaluation_seeds,
+        entries=entries,
+        on_entry=on_entry,
+    )
+    result = function(problem, progress, seed, device=place, start=start, **options)
+    if isinstance(result, RuleSet):
+        return Trained(result, progress.log, result.policy())
+    return Trained(None, progress.log, result)
+
+
+def method_options(method: str) -> dict[str, Any]:
+    """Return the options of a method, with their defaults.
+
+    Args:
+        method: A name from `METHODS`.
+
+    Raises:
+        NPAError: There is no such method.
+        MissingDependencyError: It needs a library that is not installed.
+    """
+    parameters = inspect.signature(_function(method)).parameters.values()
+    own = [p for p in parameters if p.kind is p.KEYWORD_ONLY and p.name not in ("device", "start")]
+    return {parameter.name: parameter.default for parameter in own}
+
+
+def _function(method: str) -> Callable[..., Any]:
+    if not isinstance(method, str) or method not in METHODS:
+        raise NPAError(
+            f"method must be a known word, got {method!r}: {suggest(str(method), METHODS)}"
+        )
+    function: Callable[..., Any] = pkgutil.resolve_name(METHODS[method])
+    return function

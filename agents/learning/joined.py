@@ -1,0 +1,174 @@
+"""Several species in one array of particles, with what learners know of vector environments."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import accumulate
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
+from torch import Tensor
+
+from npa_envs.control import Physics
+from npa_envs.envs.species.vector import MultiSpeciesVectorEnv
+
+TIME_LIMIT = "time limit"
+
+
+class JoinedWorlds(NamedTuple):
+    """What policies and their evaluation ask of worlds."""
+
+    physics: Physics
+    """The worlds' constants."""
+
+    perception_dim: int
+    """Length P of an observation of a particle."""
+
+    episode_steps: int
+    """Steps after which an episode is cut off."""
+
+
+class JoinedSpeciesEnv:
+    """Worlds of several species whose particles stand one after the other: [B, N, P], [B, N, A].
+
+    It has the interface of `NPAVectorEnv` as far as learners need it. A world is paid the mean of
+    what its species are paid, and its loss is the mean of theirs; a species that ended keeps the
+    loss that it had then. A world terminates where all of its species have ended by themselves.
+
+    Every step's infos have, besides `final_obs` and `final_info` as elsewhere:
+
+    | Key | Value |
+    |---|---|
+    | `loss` | before a restart, shape [B] |
+    | `particle_reward` | what the species of each particle is paid, shape [B, N] |
+    | `acted` | whether that species was alive: rows to leave out where not, bool, shape [B, N] |
+
+    Args:
+        task: A name from `npa_envs.envs.species.TASKS`.
+        num_envs: Worlds B.
+        episode_steps: Steps after which an episode is cut off.
+        device: Where the worlds live.
+        keywords: Fields of the task's configuration.
+
+    Raises:
+        NPAError: As for `multispecies_v0.batched`.
+    """
+
+    def __init__(
+        self,
+        task: str,
+        num_envs: int,
+        episode_steps: int,
+        device: str,
+        keywords: Mapping[str, Any],
+    ) -> None:
+        self.species_env = MultiSpeciesVectorEnv(
+            task,
+            world_count=num_envs,
+            max_cycles=episode_steps,
+            device=device,
+            output="torch",
+            **keywords,
+        )
+        """The environment with an array for each species."""
+        env = self.species_env
+        self.num_envs = env.world_count
+        """Worlds B."""
+        self.config = env.config
+        """Its configuration."""
+        self.task = env.worlds.task
+        """Starts and losses."""
+        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
+        self.worlds = JoinedWorlds(env.worlds.physics, env.worlds.perception_dim, episode_steps)
+        """The worlds' constants."""
+        ends = accumulate(env.config.counts)
+        spans = [slice(end - n, end) for end, n in zip(ends, env.config.counts, strict=True)]
+        self.spans = dict(zip(env.agents, spans, strict=True))
+        """Where each species' particles stand."""
+        self._loss = torch.zeros(self.num_envs, len(spans), device=device)
+
+    @property
+    def unwrapped(self) -> JoinedSpeciesEnv:
+        """The environment itself."""
+        return self
+
+    def reset(
+        self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Tensor, dict[str, Any]]:
+        """Start episodes; arguments and errors of `MultiSpeciesVectorEnv.reset`.
+
+        Args:
+            seed: Of the worlds' sequences of episodes.
+            options: `{"reset_mask": mask}` resets only some worlds.
+
+        Returns:
+            Observations, shape [B, N, P], and infos with `loss`.
+        """
+        rows, infos = self.species_env.reset(seed, options)
+        self._loss = self._stacked(infos, "loss")
+        return self._joined(rows), {"loss": self._loss.mean(dim=1)}
+
+    def step(self, actions: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
+        """Apply an action to each particle, and perceive.
+
+        Args:
+            actions: Shape [B, N, A], in [-1, 1].
+
+        Returns:
+            Observations [B, N, P], rewards [B], terminations [B], truncations [B], and infos.
+
+        Raises:
+            NPAError: The actions have another shape or are not finite; the worlds are then as they
+                were.
+        """
+        by_species = {agent: actions[:, span] for agent, span in self.spans.items()}
+        rows, rewards, _, truncations, infos = self.species_env.step(by_species)
+        acted = self._stacked(infos, "acted")
+        self._loss = torch.where(acted, self._stacked(infos, "loss"), self._loss)
+        paid = torch.stack(list(rewards.values()), dim=1)
+        told: dict[str, Any] = {
+            "loss": self._loss.mean(dim=1),
+            "particle_reward": self._by_particle(paid),
+            "acted": self._by_particle(acted),
+        }
+        late = torch.stack(list(truncations.values()), dim=1).any(dim=1)
+        first = infos[self.species_env.agents[0]]
+        over = first.get("_final_obs", torch.zeros_like(late))
+        if "final_obs" in first:
+            last = {agent: infos[agent]["final_obs"] for agent in self.spans}
+            told |= {"final_obs": self._joined(last), "_final_obs": over}
+            reasons = self._reasons(infos)
+            told["final_info"] = {"loss": told["loss"], "_loss": over, "reason": reasons}
+            told["_final_info"] = over
+        return self._joined(rows), paid.mean(dim=1), over & ~late, over & late, told
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        self.species_env.close()
+
+    def _joined(self, rows: Mapping[str, Tensor]) -> Tensor:
+        return torch.cat([rows[agent] for agent in self.spans], dim=1)
+
+    def _stacked(self, infos: Mapping[str, Mapping[str, Any]], name: str) -> Tensor:
+        """Return what infos say of each species, shape [B, K]."""
+        return torch.stack([infos[agent][name] for agent in self.spans], dim=1)
+
+    def _by_particle(self, values: Tensor) -> Tensor:
+        """Return what holds for species, [B, K], for each of their particles, shape [B, N]."""
+        parts = [
+            values[:, k : k + 1].expand(-1, span.stop - span.start)
+            for k, span in enumerate(self.spans.values())
+        ]
+        return torch.cat(parts, dim=1)
+
+    def _reasons(self, infos: Mapping[str, Mapping[str, Any]]) -> NDArray[Any]:
+        """Return why worlds' episodes ended, by the first species that ended now, shape [B]."""
+        reasons = np.full(self.num_envs, None, dtype=object)
+        for agent in self.spans:
+            own = infos[agent].get("reason")
+            if own is not None:
+                reasons = np.where(reasons == None, own, reasons)  # noqa: E711
+        return reasons

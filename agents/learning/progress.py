@@ -1,0 +1,269 @@
+"""How far a learner has come: what it may spend, what it has spent, and what that was good for."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from npa_envs.agents.evaluation import evaluate_policy
+from npa_envs.agents.learning.problem import Problem
+from npa_envs.agents.learning.rules import RuleSet
+from npa_envs.devices import check_device
+from npa_envs.errors import DivergedError, NPAError
+from npa_envs.tasks.checks import is_real, is_whole
+
+
+@dataclass(frozen=True, kw_only=True)
+class Budget:
+    """What a learner may spend: time, or particle-steps, or whichever is spent first.
+
+    Raises:
+        NPAError: Neither is given, or one is not positive.
+    """
+
+    seconds: float | None = None
+    """Wall-clock time of learning, without set-up and evaluations [s]."""
+
+    particle_steps: int | None = None
+    """Steps of an environment or a rollout, times the particles that took them."""
+
+    def __post_init__(self) -> None:
+        """Check both.
+
+        Raises:
+            NPAError: Neither is given, or one is not positive.
+        """
+        if self.seconds is None and self.particle_steps is None:
+            raise NPAError(
+                "a budget must say something: Budget(seconds=60) or particle_steps=10**7"
+            )
+        if self.seconds is not None and not (is_real(self.seconds) and self.seconds > 0.0):
+            raise NPAError(f"seconds must be positive and finite, got {self.seconds!r}: try 60")
+        steps = self.particle_steps
+        if steps is not None and not (is_whole(steps) and steps > 0):
+            raise NPAError(f"particle_steps must be a positive integer, got {steps!r}: try 10**7")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Entry:
+    """One evaluation: a point of a learning curve."""
+
+    seconds: float
+    """Time spent by then [s]."""
+
+    particle_steps: int
+    """Particle-steps spent by then."""
+
+    mean_return: float
+    """Mean return of the evaluation's episodes."""
+
+    standard_error: float
+    """Its standard error; infinite for a single episode."""
+
+    final_loss: float
+    """Mean loss at the episodes' ends, before the next ones start."""
+
+
+class Progress:
+    """Keeps a learner's account, and evaluates what it has learned every now and then.
+
+    A learner makes its worlds, compiles what it needs, and then:
+
+    ```python
+    progress.start(rules)
+    while not progress.over:
+        ...  # learn for one iteration
+        progress.advance(particle_steps)
+        progress.look(rules)
+    progress.look(rules, force=True)
+    ```
+
+    Neither what happens before `start` nor evaluations count. On CUDA the host waits for the device
+    only where it evaluates; besides, `advance` keeps it at most one iteration ahead, so that time
+    is what the device took.
+
+    Args:
+        problem: What is learned.
+        budget: What may be spent.
+        device: Where evaluations run: the learner's device.
+        evaluation_seeds: Of the episodes, which no learner sees: one each.
+        entries: Evaluations besides the first, at equal shares of the budget.
+        on_entry: Called with each entry.
+
+    Raises:
+        NPAError: There are no seeds, or the number of entries is not positive.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        budget: Budget,
+        *,
+        device: str | torch.device,
+        evaluation_seeds: Iterable[int],
+        entries: int = 20,
+        on_entry: Callable[[Entry], None] | None = None,
+    ) -> None:
+        self.problem = problem
+        """What is learned."""
+        self.budget = budget
+        """What may be spent."""
+        self.particle_steps = 0
+        """Particle-steps spent so far."""
+        self.log: list[Entry] = []
+        """Evaluations so far."""
+        self._seeds = list(evaluation_seeds)
+        if not self._seeds:
+            raise NPAError(
+                "evaluation_seeds must hold at least one seed, got none: range(100, 132)"
+            )
+        if not is_whole(entries) or entries < 1:
+            raise NPAError(f"entries must be a whole number of at least 1, got {entries!r}: try 20")
+        self._entries = entries
+        self._on_entry = on_entry
+        self._device = check_device(device)
+        self._envs: Any = None
+        self._started = False
+        self._since: float | None = None
+        self._seconds = 0.0
+        self._looks = 0
+        self._previous: torch.cuda.Event | None = None
+
+    def start(self, actor: RuleSet | Callable[[Any], Any]) -> None:
+        """Evaluate what the learner begins with, and begin to count.
+
+        Args:
+            actor: The rules, or a policy.
+
+        Raises:
+            NPAError: It has started before.
+        """
+        if self._started:
+            raise NPAError("progress must start once, got a second start: make one for each run")
+        self._started = True
+        self._evaluate(actor)
+        self._since = time.perf_counter()
+
+    @property
+    def seconds(self) -> float:
+        """Time spent so far, as the host sees it [s]."""
+        return self._seconds + (0.0 if self._since is None else time.perf_counter() - self._since)
+
+    @property
+    def share(self) -> float:
+        """Share of the budget that is spent; above 1 by the last iteration's excess."""
+        limits = self.budget
+        by_time = 0.0 if limits.seconds is None else self.seconds / limits.seconds
+        by_steps = 0.0
+        if limits.particle_steps is not None:
+            by_steps = self.particle_steps / limits.particle_steps
+        return max(by_time, by_steps)
+
+    @property
+    def over(self) -> bool:
+        """Whether the budget is spent."""
+        return self.share >= 1.0
+
+    def advance(self, particle_steps: int) -> None:
+        """Take down what an iteration took.
+
+        Args:
+            particle_steps: Steps times the particles that took them.
+
+        Raises:
+            NPAError: Nothing has started yet.
+        """
+        if not self._started:
+            raise NPAError("advance needs a start: call progress.start(rules) after the set-up")
+        self.particle_steps += particle_steps
+        if self._device.type == "cuda":
+            event = torch.cuda.Event()  # type: ignore[no-untyped-call]
+            event.record(torch.cuda.current_stream(self._device))
+            if self._previous is not None:
+                self._previous.synchronize()
+            self._previous = event
+
+    def look(self, actor: RuleSet | Callable[[Any], Any], force: bool = False) -> None:
+        """Evaluate where the next share of the budget is spent.
+
+        Args:
+            actor: The rules, or a policy.
+            force: Evaluate in any case, but where nothing was done since the last evaluation.
+
+        Raises:
+            NPAError: Nothing has started yet.
+            DivergedError: A weight of the rules is not finite, or an action.
+        """
+        if not self._started:
+            raise NPAError("look needs a start: call progress.start(rules) after the set-up")
+        fresh = self.particle_steps > self.log[-1].particle_steps
+        due = self.share >= (self._looks + 1) / self._entries
+        if not fresh or not (force or due):
+            return
+        self._wait()
+        self._seconds, self._since = self.seconds, None
+        self._looks = int(self.share * self._entries)
+        self._evaluate(actor)
+        self._since = time.perf_counter()
+
+    def _evaluate(self, actor: RuleSet | Callable[[Any], Any]) -> None:
+        if self._envs is None:
+            count = min(len(self._seeds), self.problem.num_envs)
+            self._envs = self.problem.make_envs(count, device=self._device)
+        policy = actor
+        if isinstance(actor, RuleSet):
+            policy = actor.policy()
+            check_finite(actor, self.particle_steps)
+        episodes = evaluate_policy(self._envs, policy, self._seeds)
+        entry = Entry(
+            seconds=self._seconds,
+            particle_steps=self.particle_steps,
+            mean_return=episodes.mean_return,
+            standard_error=episodes.standard_error,
+            final_loss=float(episodes.final_losses.mean()),
+        )
+        self._wait()
+        self.log.append(entry)
+        if self._on_entry is not None:
+            self._on_entry(entry)
+
+    def _wait(self) -> None:
+        if self._device.type == "cuda":
+            torch.cuda.synchronize(self._device)
+
+
+def annealed(rate: float, last_rate: float, share: float) -> float:
+    """Return a learning rate that falls along half a cosine.
+
+    Args:
+        rate: At the beginning.
+        last_rate: At the end, as a share of the first (dimensionless).
+        share: Share of the budget that is spent; beyond 1 it stays.
+    """
+    wave = 0.5 * (1.0 + math.cos(math.pi * min(share, 1.0)))
+    return rate * (last_rate + (1.0 - last_rate) * wave)
+
+
+def check_finite(rules: RuleSet, particle_steps: int) -> None:
+    """Check that rules have not diverged; waits for the device.
+
+    Args:
+        rules: The rules.
+        particle_steps: What was spent on them, for the message.
+
+    Raises:
+        DivergedError: A weight is infinite or NaN.
+    """
+    for number, rule in enumerate(rules):
+        for name, weight in rule.named_parameters():
+            bad = int((~torch.isfinite(weight)).sum())
+            if bad:
+                raise DivergedError(
+                    f"weights must stay finite, but {bad} of {weight.numel()} in {name!r} of rule "
+                    f"{number} were not after {particle_steps} particle-steps: learn more slowly"
+                )

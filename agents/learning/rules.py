@@ -1,0 +1,235 @@
+"""The rules of one problem, one for each species: what all learners change."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator, Sequence
+from itertools import accumulate
+from pathlib import Path
+from typing import cast
+
+import torch
+from torch import Tensor, nn
+
+from npa_envs.agents.learning.problem import Problem
+from npa_envs.agents.policy import Interface, Policy
+from npa_envs.agents.rule_policy import bounded_update, check_rule_fits
+from npa_envs.errors import NPAError
+from npa_envs.rule import NPARule
+from npa_envs.rule_io import load_rule, save_rule
+from npa_envs.tasks.checks import is_whole
+
+Source = str | Path | NPARule
+
+
+class RuleSet(nn.Module):
+    """One rule for each species, as a function from observations to actions.
+
+    Make one with `new`, `of` or `load`.
+
+    Args:
+        rules: One for each species, which are not copied.
+        counts: Particles of each species.
+        interface: What observations and actions mean: `problem.interface`.
+
+    Raises:
+        NPAError: There is not one rule for each species.
+    """
+
+    def __init__(
+        self, rules: Sequence[NPARule], counts: Sequence[int], interface: Interface
+    ) -> None:
+        super().__init__()
+        if len(rules) != len(counts):
+            raise NPAError(
+                f"rules must be one for each of {len(counts)} species, got {len(rules)}: "
+                "give them in the species' order"
+            )
+        self.rules = nn.ModuleList(rules)
+        """The rules, in the order of the species."""
+        ends = list(accumulate(counts))
+        self.spans = [slice(end - count, end) for end, count in zip(ends, counts, strict=True)]
+        """Where each species' particles stand."""
+        self.interface = interface
+        """What observations and actions mean."""
+
+    @classmethod
+    def new(cls, problem: Problem, seed: int) -> RuleSet:
+        """Return untrained rules of the architecture that a problem asks for, on the CPU.
+
+        Args:
+            problem: What they are to learn.
+            seed: Of their weights, at least 0; torch's own randomness is left as it is.
+
+        Raises:
+            NPAError: The seed is no such integer.
+        """
+        if not is_whole(seed) or seed < 0:
+            raise NPAError(f"seed must be a whole number of at least 0, got {seed!r}: give seed=0")
+        interface, config = problem.interface, problem.config
+        with torch.random.fork_rng(devices=()):
+            torch.manual_seed(seed)
+            rules = [
+                NPARule(
+                    interface.space_dim,
+                    interface.state_dim,
+                    problem.hidden_dim,
+                    eps0=config.eps0,
+                    alpha=config.alpha,
+                    static=not interface.moving,
+                    moment_inverse=config.moment_inverse,
+                    species_count=interface.species_count,
+                )
+                for _ in problem.counts
+            ]
+        return cls(rules, problem.counts, interface)
+
+    @classmethod
+    def of(cls, problem: Problem, source: Source | Sequence[Source]) -> RuleSet:
+        """Return copies of rules that there are already, for a problem, on the CPU.
+
+        Args:
+            problem: Where they are to act: they need not come from there, but have to fit.
+            source: A rule, a shipped rule's name or a rule's file, for all species or one for each;
+                or a folder that `save` wrote.
+
+        Raises:
+            NPAError: A rule cannot be loaded or does not fit, or there are too few or too many.
+        """
+        if isinstance(source, str | Path) and Path(source).is_dir():
+            source = [Path(source) / _file_name(k) for k in range(len(problem.counts))]
+        single = isinstance(source, Source)
+        given: Sequence[Source] = [source] * len(problem.counts) if single else list(source)  # type: ignore[arg-type, list-item]
+        rules = [
+            copy.deepcopy(one).cpu() if isinstance(one, NPARule) else load_rule(one)
+            for one in given
+        ]
+        for rule in rules:
+            check_rule_fits(rule, problem.interface, problem.config)
+        return cls([rule.float() for rule in rules], problem.counts, problem.interface)
+
+    @classmethod
+    def load(cls, folder: str | Path, problem: Problem) -> RuleSet:
+        """Return the rules that `save` wrote, on the CPU.
+
+        Args:
+            folder: Where they are.
+            problem: Where they are to act.
+
+        Raises:
+            NPAError: A file is missing or holds no rule, or one that does not fit.
+        """
+        return cls.of(problem, [Path(folder) / _file_name(k) for k in range(len(problem.counts))])
+
+    def save(self, folder: str | Path) -> list[Path]:
+        """Write each rule as an ordinary rule's file, and return their paths.
+
+        Args:
+            folder: Made where it is missing; `rule-0.safetensors` and so on are replaced in it.
+
+        Raises:
+            NPAError: A weight is not finite, or a file cannot be written.
+        """
+        paths = [Path(folder) / _file_name(k) for k in range(len(self.rules))]
+        try:
+            Path(folder).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise NPAError(
+                f"folder must be one that can be made, got {str(folder)!r} ({error.strerror}): "
+                "choose another place"
+            ) from error
+        for rule, path in zip(self, paths, strict=True):
+            save_rule(rule, path)
+        return paths
+
+    def __iter__(self) -> Iterator[NPARule]:
+        """Return the rules one by one."""
+        return iter(cast(list[NPARule], list(self.rules)))
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Return `mean` of the observation."""
+        return self.mean(observation)
+
+    def mean(self, observation: Tensor) -> Tensor:
+        """Return every particle's action: a_x = δ / (1 + |δ|) and a_s = Δs / state_scale.
+
+        It is what `policy` does, and `RulePolicy` with each rule, but for state steps beyond the
+        action space: they are clipped there and in environments, and not here, so that gradients do
+        not vanish.
+
+        Args:
+            observation: What is perceived, on the rules' device, shape [B, N, P].
+
+        Returns:
+            Differentiable in the weights and in the observation, shape [B, N, A].
+        """
+        scale = self.interface.state_scale
+        parts = [
+            torch.cat((displacement, state_step / scale), dim=-1)
+            for displacement, state_step in self.updates(observation)
+        ]
+        return parts[0] if len(parts) == 1 else torch.cat(parts, dim=1)
+
+    def updates(self, observation: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """Return the displacements, [B, N_k, D], and state steps, [B, N_k, C], of each species.
+
+        Args:
+            observation: What is perceived, on the rules' device, shape [B, N, P].
+        """
+        found = []
+        for rule, span in zip(self, self.spans, strict=True):
+            rows = observation[:, span]
+            update = bounded_update(rule, rows.flatten(0, 1))
+            displacement, state_step = (
+                part.view(*rows.shape[:2], part.shape[1]) for part in update
+            )
+            found.append((displacement, state_step))
+        return found
+
+    def policy(self) -> RuleSetPolicy:
+        """Return the rules as a policy, which follows when they are trained on."""
+        return RuleSetPolicy(self)
+
+
+class RuleSetPolicy(Policy):
+    """A set of rules as a policy for all particles of its problem.
+
+    Args:
+        rules: The rules; actions are computed on their device.
+    """
+
+    def __init__(self, rules: RuleSet) -> None:
+        super().__init__(rules.interface)
+        self.rules = rules
+
+    def act(self, observation: Tensor) -> Tensor:
+        """Return the rules' bounded updates of every particle."""
+        parts = [self.interface.action(*update) for update in self.rules.updates(observation)]
+        return torch.cat(parts, dim=1).float()
+
+
+def starting_rules(
+    problem: Problem, seed: int, device: torch.device, start: RuleSet | None
+) -> RuleSet:
+    """Return rules for a learner to change: copies of those given, or new ones, on a device.
+
+    Args:
+        problem: What is to be learned.
+        seed: Of new rules.
+        device: Where they are to be.
+        start: What to begin with, or None.
+
+    Raises:
+        NPAError: What was given is no set of rules, or does not fit the problem.
+    """
+    if start is None:
+        return RuleSet.new(problem, seed).to(device)
+    if not isinstance(start, RuleSet):
+        raise NPAError(
+            f"start must be a RuleSet, got {type(start).__name__}: RuleSet.of(problem, 'heart')"
+        )
+    return RuleSet.of(problem, list(start)).to(device)
+
+
+def _file_name(species: int) -> str:
+    return f"rule-{species}.safetensors"
