@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -51,12 +53,23 @@ def test_gymnasiums_wrappers_lie_over_rows():
     assert listed.reset(seed=0)[1] == [{}] * 128
 
 
+@pytest.mark.filterwarnings("error::pytest.PytestUnraisableExceptionWarning")
 def test_what_is_refused():
     with pytest.raises(NPAError, match="make it with autoreset_mode='next-step'"):
         ParticleRows(wrapped_envs.batched(2))
+    gc.collect()
     with pytest.raises(NPAError, match="env must be a vector environment of npa_envs, got"):
         ParticleRows(wrapped_envs.single())
     rows = ParticleRows(batched(2))
     rows.reset()
     with pytest.raises(NPAError, match=r"actions must have shape \[B N, A\] = \(128, 18\), got"):
         rows.step(np.zeros((2, 64, ACTIONS), np.float32))
+
+
+def test_rows_close_their_worlds_once():
+    envs = batched(2)
+    rows = ParticleRows(envs)
+    assert not envs.closed
+    rows.close()
+    assert envs.closed
+    rows.close()

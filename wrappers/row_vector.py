@@ -34,6 +34,9 @@ class ParticleRows(AnyVectorEnv):
         NPAError: The environment is none of this package, or has another autoreset mode.
     """
 
+    # Gymnasium closes what is deleted, also what was refused below: that has nothing to close.
+    closed = True
+
     def __init__(self, env: AnyVectorEnv) -> None:
         base = vector_env(env, type(self).__name__)
         mode = autoreset_mode(env)
@@ -53,6 +56,7 @@ class ParticleRows(AnyVectorEnv):
         self.render_mode = env.render_mode
         self.single_observation_space = row_space(env.single_observation_space)
         self.single_action_space = row_space(env.single_action_space)
+        self.closed = False
 
     @cached_property
     def observation_space(self) -> Space[Any]:  # type: ignore[override]

@@ -59,7 +59,7 @@ class RslRlParticleEnv(VecEnv):  # type: ignore[misc]
         self.particle_count = base.config.particle_count
         """Particles N of a world."""
         self.num_envs = self.world_count * self.particle_count
-        self.num_actions = int(base.single_action_space.shape[-1])
+        self.num_actions = base.worlds.physics.action_dim
         self.max_episode_length = base.worlds.episode_steps or 2**31 - 1
         self.device = base.worlds.x.device
         self.cfg = vars(base.config) | {"num_envs": base.num_envs}
