@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import re
+import sys
 from pathlib import Path
 
 import imageio.v3 as imageio
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from npa_envs import wrappers
+from npa_envs.errors import MissingDependencyError
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "integrations.md"
 RANDOM, RANDOM_ERROR = 0.143, 0.018
@@ -48,6 +52,21 @@ def told(library: str) -> float:
     """Return the return that the page's table tells of a library."""
     (mean,) = re.findall(rf"^\| {library} \|.*\| ([\d.]+) ± [\d.]+ \|", PAGE.read_text(), re.M)
     return float(mean)
+
+
+@pytest.mark.parametrize(
+    ("name", "module", "library", "extra"),
+    [
+        ("NPATorchRLEnv", "torchrl", "torchrl.data", "torchrl"),
+        ("RslRlParticleEnv", "rsl_rl", "rsl_rl.env", "rslrl"),
+    ],
+)
+def test_a_missing_library_is_named_with_its_extra(name, module, library, extra, monkeypatch):
+    monkeypatch.delitem(sys.modules, f"npa_envs.wrappers.{module}", raising=False)
+    monkeypatch.delattr(wrappers, module, raising=False)
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(MissingDependencyError, match=rf"pip install 'npa-envs\[{extra}\]'"):
+        getattr(wrappers, name)
 
 
 def test_callbacks_logs_and_films_of_stable_baselines3(tmp_path):
