@@ -91,7 +91,9 @@ LADDER = {
     ),
     "npa_envs.envs": rung(12, "torch numpy gymnasium pettingzoo", never=INSIDES),
     "npa_envs.wrappers": rung(
-        13, "torch numpy gymnasium pettingzoo stable_baselines3 ray", never=INSIDES
+        13,
+        "torch numpy gymnasium pettingzoo stable_baselines3 ray torchrl tensordict rsl_rl",
+        never=INSIDES,
     ),
     "npa_envs.agents": rung(
         14, "torch numpy tqdm gymnasium pettingzoo stable_baselines3", never=INSIDES

@@ -1,6 +1,6 @@
 """Adapters between environments and the libraries that train on them, as `npa_envs.wrappers`.
 
-Holds Gymnasium wrappers, and adapters to Stable-Baselines3, RLlib and TorchRL.
+Holds Gymnasium wrappers, and adapters to Stable-Baselines3, TorchRL, RSL-RL and RLlib.
 They use the public API only. Names are imported when they are first used, so that none of these
 libraries is needed for the others.
 """
@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from npa_envs.wrappers.normalize import NormalizePerception, VectorNormalizePerception
     from npa_envs.wrappers.numeric_infos import NumericInfos as NumericInfos
     from npa_envs.wrappers.particles import ParticleVecEnv as ParticleVecEnv
+    from npa_envs.wrappers.row_vector import ParticleRows
+    from npa_envs.wrappers.rsl_rl import RslRlParticleEnv as RslRlParticleEnv
     from npa_envs.wrappers.species import SpeciesTags, VectorSpeciesTags
     from npa_envs.wrappers.species_rows import RowPolicy as RowPolicy
     from npa_envs.wrappers.species_rows import SpeciesVecEnv as SpeciesVecEnv
@@ -20,10 +22,12 @@ if TYPE_CHECKING:
         TorchNormalizeReward,
         TorchRecordEpisodeStatistics,
     )
+    from npa_envs.wrappers.torchrl import NPATorchRLEnv as NPATorchRLEnv
 
 __all__ = [
     "DamageEvents",
     "NormalizePerception",
+    "ParticleRows",
     "SpeciesTags",
     "TorchNormalizeObservation",
     "TorchNormalizeReward",
@@ -32,8 +36,15 @@ __all__ = [
     "VectorNormalizePerception",
     "VectorSpeciesTags",
 ]
-# A star imports all of them, and must need neither Stable-Baselines3 nor PettingZoo.
-ON_REQUEST = ("NumericInfos", "ParticleVecEnv", "RowPolicy", "SpeciesVecEnv")
+# A star imports all of them, and must need none of the libraries that are optional.
+ON_REQUEST = (
+    "NPATorchRLEnv",
+    "NumericInfos",
+    "ParticleVecEnv",
+    "RowPolicy",
+    "RslRlParticleEnv",
+    "SpeciesVecEnv",
+)
 
 
 def __getattr__(name: str) -> Any:
@@ -45,15 +56,23 @@ def __getattr__(name: str) -> Any:
         from npa_envs.wrappers import numeric_infos
 
         return numeric_infos.NumericInfos
+    if name == "NPATorchRLEnv":
+        from npa_envs.wrappers import torchrl
+
+        return torchrl.NPATorchRLEnv
+    if name == "RslRlParticleEnv":
+        from npa_envs.wrappers import rsl_rl
+
+        return rsl_rl.RslRlParticleEnv
     if name in ON_REQUEST:
         from npa_envs.wrappers import species_rows
 
         return getattr(species_rows, name)
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from npa_envs.wrappers import damage, normalize, species, statistics
+    from npa_envs.wrappers import damage, normalize, row_vector, species, statistics
 
-    holders = (damage, normalize, species, statistics)
+    holders = (damage, normalize, row_vector, species, statistics)
     return next(getattr(module, name) for module in holders if hasattr(module, name))
 
 
