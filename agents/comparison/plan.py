@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import PurePosixPath
 from typing import Any, Literal, get_args
@@ -49,6 +49,8 @@ class Plan:
     """Seconds or particle-steps that each run may take, by axis."""
     options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     """Keyword options by method; others run with their defaults."""
+    left_out: Collection[tuple[str, str]] = ()
+    """Pairs (task, method) that are not run, as the method has nothing for the task."""
     episodes: int = 32
     """Held-out episodes that tell what a run has reached."""
     settings: Mapping[str, Any] = field(default_factory=dict)
@@ -62,6 +64,7 @@ class Plan:
             for seed in self.seeds
             for task in self.tasks
             for method in self.methods
+            if (task, method) not in self.left_out
         ]
 
     def facts(self, job: Job) -> dict[str, Any]:

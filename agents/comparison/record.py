@@ -124,9 +124,11 @@ def _record(held: dict[str, Any]) -> RunRecord:
         | {
             "job": Job(**held["job"]),
             "facts": dict(held["facts"]),
-            "curve": [Point(**{k: _number(v) for k, v in row.items()}) for row in held["curve"]],
-            "returns": [_number(value) for value in held["returns"]],
-            "final_losses": [_number(value) for value in held["final_losses"]],
+            "curve": tuple(
+                Point(**{k: _number(v) for k, v in row.items()}) for row in held["curve"]
+            ),
+            "returns": tuple(map(_number, held["returns"])),
+            "final_losses": tuple(map(_number, held["final_losses"])),
         }
     )
 

@@ -95,16 +95,16 @@ def run(folder: Path) -> None:
         traceback.print_exc()
         status: Status = "diverged" if isinstance(error, DivergedError) else "failed"
         told = f"{type(error).__name__}: {' '.join(str(error).split())}"
-        record = request.record(status, begin, error=told, curve=curve)
+        record = request.record(status, begin, error=told, curve=tuple(curve))
     else:
         finite = math.isfinite(episodes.mean_return)
         record = request.record(
             "done" if finite else "diverged",
             begin,
             error="" if finite else "returns of held-out episodes are not finite",
-            curve=curve,
-            returns=episodes.returns.tolist(),
-            final_losses=episodes.final_losses.tolist(),
+            curve=tuple(curve),
+            returns=tuple(episodes.returns.tolist()),
+            final_losses=tuple(episodes.final_losses.tolist()),
             endings=dict(Counter(episodes.endings)),
         )
     record.write(folder)

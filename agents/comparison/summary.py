@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from npa_envs.agents.comparison.pictures import write_strips
 from npa_envs.agents.comparison.plan import Plan
@@ -34,8 +35,14 @@ def write_table(plan: Plan, records: Sequence[RunRecord], folder: Path, command:
     table = rows(records)
     told = text(table)
     write_text(folder / TABLE, f"`{command}`\n\n{told}")
-    write_text(folder / FIGURES, as_json(table, {"command": command, **asdict(plan)}))
+    write_text(folder / FIGURES, as_json(table, _facts(plan, command)))
     return told
+
+
+def _facts(plan: Plan, command: str) -> dict[str, Any]:
+    """Return what a table follows from, as JSON has it."""
+    fields = asdict(plan) | {"left_out": sorted(map(list, plan.left_out))}
+    return {"command": command, **fields}
 
 
 def write_pictures(records: Sequence[RunRecord], folder: Path) -> list[str]:

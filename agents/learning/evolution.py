@@ -9,7 +9,6 @@ in the next: differences between candidates are theirs and not their luck's.
 
 from __future__ import annotations
 
-import copy
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -22,7 +21,7 @@ from torch import Tensor
 from npa_envs.agents.learning.population import Population
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Progress
-from npa_envs.agents.learning.rules import RuleSet
+from npa_envs.agents.learning.rules import RuleSet, starting_rules
 from npa_envs.errors import MissingDependencyError
 from npa_envs.tasks.checks import check_positive
 
@@ -47,7 +46,7 @@ def train(
     progress: Progress,
     seed: int,
     *,
-    device: str | torch.device = "cpu",
+    device: torch.device,
     start: RuleSet | None = None,
     population: int = 32,
     worlds_per_candidate: int = 1,
@@ -76,8 +75,7 @@ def train(
     options = _Options(
         population=population, worlds_per_candidate=worlds_per_candidate, sigma=sigma
     )
-    rules = problem.new_rules(seed) if start is None else copy.deepcopy(start)
-    rules.to(device)
+    rules = starting_rules(problem, seed, device, start)
     candidates = Population(rules)
     envs = problem.make_envs(population * worlds_per_candidate, device=device, copy=False)
     draws = np.random.default_rng(seed)

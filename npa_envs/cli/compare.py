@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 RUN_FAILED = 1
 
-LEFT_OUT = ("clone",)
+NEED_MORE = ("clone",)
 """Methods that are compared only when asked for: they need a teacher."""
 
 QUICK_EPISODES, QUICK_STEPS = 4, 200_000
@@ -168,7 +168,7 @@ def make_plan(options: CompareOptions) -> Plan:
         NPAError: As for `main`.
     """
     from npa_envs.agents.comparison.plan import Plan
-    from npa_envs.agents.comparison.problems import PROBLEMS, make_problem
+    from npa_envs.agents.comparison.problems import LEFT_OUT, PROBLEMS, make_problem
     from npa_envs.agents.learning import METHODS
 
     for name in ("seeds", "episodes", "jobs", "threads"):
@@ -178,7 +178,7 @@ def make_plan(options: CompareOptions) -> Plan:
     tasks = _chosen("task", options.tasks, PROBLEMS)
     methods = _chosen("method", options.methods, METHODS)
     if not options.methods:
-        methods = [name for name in methods if name not in LEFT_OUT]
+        methods = [name for name in methods if name not in NEED_MORE]
     problems = {name: make_problem(name, quick=options.quick) for name in tasks}
     return Plan(
         tasks={name: json.loads(problem.to_json()) for name, problem in problems.items()},
@@ -186,6 +186,7 @@ def make_plan(options: CompareOptions) -> Plan:
         seeds=tuple(range(options.seeds)),
         budgets=_budgets(options),
         options=_method_options(options.options, methods),
+        left_out=() if options.methods else LEFT_OUT,
         episodes=options.episodes or (QUICK_EPISODES if options.quick else 32),
         settings=_settings(options),
     )
@@ -220,6 +221,8 @@ def _budgets(options: CompareOptions) -> dict[Axis, float]:
 
 
 def _method_options(words: Sequence[str], methods: Sequence[str]) -> dict[str, dict[str, Any]]:
+    from npa_envs.agents.learning import method_options
+
     found: dict[str, dict[str, Any]] = {}
     for word in words:
         name, mark, value = word.partition("=")
@@ -230,6 +233,9 @@ def _method_options(words: Sequence[str], methods: Sequence[str]) -> dict[str, d
             )
         if method not in methods:
             raise NPAError(f"unknown method {method!r} in {word!r}: {suggest(method, methods)}")
+        known = method_options(method)
+        if option not in known:
+            raise NPAError(f"unknown option {option!r} in {word!r}: {suggest(option, known)}")
         try:
             plain = json.loads(value)
         except ValueError:
