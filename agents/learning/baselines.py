@@ -21,11 +21,11 @@ from npa_envs.agents.scripted import (
 )
 from npa_envs.errors import NPAError
 
-SCRIPTED: tuple[Callable[..., Policy], ...] = (PaintPolicy, MendPolicy, SpreadPolicy)
+SCRIPTED: tuple[Callable[..., Policy], ...] = (PaintPolicy, SpreadPolicy, MendPolicy)
 """Policies to choose from."""
 
-GAINS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3)
-"""Displacements at a perceived c^{1+D} ∇ρ / N of 1, as fractions of α ε, to choose from."""
+GAINS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, -0.01, -0.03, -0.1, -0.3)
+"""Displacements at a perceived c^{1+D} ∇ρ / N of 1, as fractions of α ε; below 0 they gather."""
 
 
 def train_random(
@@ -89,7 +89,7 @@ def train_scripted(
         seed: Of the first world in which policies are compared.
         device: Where the worlds are.
         start: Not for this method.
-        gains: How fast policies spread, as fractions of α ε; positive.
+        gains: How fast policies spread, as fractions of α ε, or gather where it is negative.
 
     Raises:
         NPAError: There is something to start from, or no scripted policy does better than nothing.
