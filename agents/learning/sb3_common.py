@@ -1,0 +1,323 @@
+"""What both forms of Stable-Baselines3's PPO share: options, the budget, and policies of rules."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from gymnasium.spaces import Space
+from torch import Tensor
+
+from npa_envs.agents.learning.critics import Critic, CriticKind
+from npa_envs.agents.learning.gaussian import GaussianRules, first_std
+from npa_envs.agents.learning.ppo_settings import check_words
+from npa_envs.agents.learning.progress import Progress
+from npa_envs.agents.learning.rules import RuleSet
+from npa_envs.errors import MissingDependencyError
+from npa_envs.tasks.checks import check_fraction, check_non_negative, check_positive
+
+try:
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.callbacks import BaseCallback
+    from stable_baselines3.common.policies import ActorCriticPolicy
+    from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+except ImportError as error:
+    raise MissingDependencyError(
+        "this form of PPO needs Stable-Baselines3: pip install 'npa-envs[sb3]'"
+    ) from error
+
+
+@dataclass(frozen=True, kw_only=True)
+class SB3Settings:
+    """Options of both forms; the defaults are those of the device's own PPO."""
+
+    steps: int = 16
+    """Steps of all worlds in a round, T."""
+
+    epochs: int = 4
+    """Passes over a round."""
+
+    minibatches: int = 16
+    """Parts that the rows of a round are shuffled into."""
+
+    learning_rate: float = 1e-3
+    """Adam's step at the start; it falls to zero over the budget."""
+
+    gamma: float = 0.7
+    """Discount of a reward one step later (dimensionless)."""
+
+    gae_lambda: float = 0.9
+    """Discount of what the critic did not foresee, besides `gamma` (dimensionless)."""
+
+    clip: float = 0.2
+    """Ratios of likelihoods count up to 1 plus or minus this (dimensionless)."""
+
+    entropy_weight: float = 0.0
+    """Weight of the entropy in what is maximised."""
+
+    max_gradient_norm: float = 0.5
+    """Gradients are shortened to this norm."""
+
+    target_kl: float | None = 0.05
+    """No more updates in a round once a row's actions are so far from those played [nats]; None:
+    all of them."""
+
+    initial_std: float | None = None
+    """Standard deviation of every action column at first; None: 0.3, or 0.05 with a `start`."""
+
+    critic: CriticKind = "particle"
+    """A value follows from a particle's own perception, or from its whole world ("central")."""
+
+    tensorboard_log: str | None = None
+    """Folder for Stable-Baselines3's own log; None: nowhere."""
+
+    def __post_init__(self) -> None:
+        """Check every field.
+
+        Raises:
+            NPAError: One lies outside its range.
+        """
+        check_positive(self, int, "steps", "epochs", "minibatches")
+        check_positive(self, float, "clip", "max_gradient_norm")
+        check_non_negative(self, "learning_rate", "entropy_weight")
+        check_fraction(self, "gamma", "gae_lambda")
+        for name in ("target_kl", "initial_std"):
+            if getattr(self, name) is not None:
+                check_positive(self, float, name)
+        check_words(self, "critic")
+
+
+class ProgressCallback(BaseCallback):
+    """Keeps a learner's account while Stable-Baselines3 learns, and stops it in time.
+
+    Args:
+        progress: The account.
+        round_size: Particle-steps of a round, T B N.
+    """
+
+    def __init__(self, progress: Progress, round_size: int) -> None:
+        super().__init__()
+        self.progress = progress
+        self.round_size = round_size
+        self.share_left = 1.0
+        """Share of the budget that was left when the round began."""
+
+    @property
+    def rules(self) -> RuleSet:
+        """What is learned."""
+        rules: RuleSet = self.model.policy.actor.rules
+        return rules
+
+    def _on_training_start(self) -> None:
+        self.progress.start(self.rules)
+
+    def _on_rollout_start(self) -> None:
+        self.progress.look(self.rules)
+        self.share_left = max(0.0, 1.0 - self.progress.share)
+
+    def _on_step(self) -> bool:
+        """Return whether to go on; asked in every step, so a round that is none ends at once."""
+        return self.share_left > 0.0
+
+    def _on_rollout_end(self) -> None:
+        self.progress.advance(self.round_size)
+
+    def _on_training_end(self) -> None:
+        self.progress.look(self.rules, force=True)
+
+
+class RuleActorCritic(ActorCriticPolicy):
+    """A policy of Stable-Baselines3 whose actor is rules; subclasses say what a row is.
+
+    Args:
+        observation_space: Of a row.
+        action_space: Of a row.
+        lr_schedule: Learning rate by the share of the steps that is left.
+        rules: The actor's means to begin with; copied.
+        initial_std: Standard deviation of every action column at first.
+        critic: A value follows from a particle alone, or from its world.
+        keywords: For `ActorCriticPolicy`.
+    """
+
+    def __init__(
+        self,
+        observation_space: Space[Any],
+        action_space: Space[Any],
+        lr_schedule: Any,
+        *,
+        rules: RuleSet,
+        initial_std: float = 0.3,
+        critic: CriticKind = "particle",
+        **keywords: Any,
+    ) -> None:
+        super().__init__(observation_space, action_space, lr_schedule, net_arch=[], **keywords)
+        self._made_of = {"rules": rules, "initial_std": initial_std, "critic": critic}
+        self.actor = GaussianRules(rules, initial_std)
+        """Rules that explore: `actor.rules` acts without."""
+        self.critic: Critic = self._new_critic(rules, critic)
+        self.optimizer = self.optimizer_class(
+            self.parameters(),
+            lr=lr_schedule(1),  # type: ignore[call-arg]
+            **self.optimizer_kwargs,
+        )
+
+    @property
+    def log_std(self) -> Tensor:
+        """Logarithms of the standard deviations, for Stable-Baselines3's log."""
+        return self.actor.log_std
+
+    def forward(self, obs: Tensor, deterministic: bool = False) -> tuple[Tensor, Tensor, Tensor]:
+        """Return actions, values [M, 1] and log-probabilities [M] while worlds are played.
+
+        Args:
+            obs: Of M rows.
+            deterministic: Act by the mean.
+        """
+        self.critic.observe(obs)
+        mean, log_std = self._gaussian(obs)
+        action = mean if deterministic else mean + log_std.exp() * torch.randn_like(mean)
+        log_prob = self._row_log_prob(mean, log_std, action)
+        return action, self.predict_values(obs), log_prob
+
+    def evaluate_actions(self, obs: Tensor, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return values [M, 1], log-probabilities [M] and entropies [M] of what was done.
+
+        Args:
+            obs: Of M rows.
+            actions: What they did.
+        """
+        mean, log_std = self._gaussian(obs)
+        log_prob = self._row_log_prob(mean, log_std, actions.view(mean.shape))
+        entropy = self.actor.entropy().expand(len(obs))
+        return self.predict_values(obs), log_prob, entropy
+
+    def predict_values(self, obs: Tensor) -> Tensor:
+        """Return the values of rows, shape [M, 1].
+
+        Args:
+            obs: Of M rows.
+        """
+        raise NotImplementedError
+
+    def get_distribution(self, obs: Tensor) -> Any:
+        """Refuse: actions are drawn by `forward`, and likelihoods found by `evaluate_actions`."""
+        raise NotImplementedError("rules draw their actions themselves: see forward")
+
+    def _new_critic(self, rules: RuleSet, kind: CriticKind) -> Critic:
+        """Return what predicts values."""
+        raise NotImplementedError
+
+    def _gaussian(self, obs: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the means of rows' actions, and logarithms of standard deviations like them."""
+        raise NotImplementedError
+
+    def _row_log_prob(self, mean: Tensor, log_std: Tensor, action: Tensor) -> Tensor:
+        """Return the log-probabilities of rows' actions, shape [M]."""
+        raise NotImplementedError
+
+    def _build(self, lr_schedule: Any) -> None:
+        """Make nothing: networks and optimiser are made once the rules are known."""
+
+    def _predict(self, observation: Any, deterministic: bool = False) -> Tensor:
+        mean, log_std = self._gaussian(observation)
+        return mean if deterministic else mean + log_std.exp() * torch.randn_like(mean)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        given = super()._get_constructor_parameters()
+        del given["net_arch"]
+        return given | self._made_of
+
+
+class BootstrappedRows(VecEnvWrapper):
+    """Rows that were cut off by the step limit are paid what they would still have got.
+
+    Stable-Baselines3 does that row by row, which takes seconds for many thousand rows; here the
+    critic is asked once for all of them, and the rows' infos say so no more.
+
+    Args:
+        venv: The rows.
+        gamma: Discount of a reward one step later (dimensionless).
+
+    Attributes:
+        policy: The policy whose critic is asked; None until there is one.
+    """
+
+    def __init__(self, venv: VecEnv, gamma: float) -> None:
+        super().__init__(venv)
+        self.gamma = gamma
+        self.policy: RuleActorCritic | None = None
+
+    def reset(self) -> Any:
+        """Start episodes in all worlds, and return the rows' observations."""
+        return self.venv.reset()
+
+    def step_wait(self) -> Any:
+        """Step all worlds, and return observations, rewards, endings and infos of the rows."""
+        shown, paid, done, infos = self.venv.step_wait()
+        cut = [row for row in np.flatnonzero(done) if infos[row].get("TimeLimit.truncated")]
+        if cut and self.policy is not None:
+            last = np.stack([infos[row]["terminal_observation"] for row in cut])
+            with torch.no_grad():
+                values = self.policy.predict_values(torch.from_numpy(last).to(self.policy.device))
+            paid[cut] += self.gamma * values.cpu().numpy()[:, 0]
+            for row in cut:
+                infos[row] = {**infos[row], "TimeLimit.truncated": False}
+        return shown, paid, done, infos
+
+
+def learn(
+    env: VecEnv,
+    policy_type: type[RuleActorCritic],
+    progress: Progress,
+    seed: int,
+    *,
+    device: torch.device | str,
+    start: RuleSet | None,
+    settings: SB3Settings,
+) -> RuleSet:
+    """Run Stable-Baselines3's PPO until the budget is spent, and return what it learned.
+
+    Args:
+        env: Rows to learn from.
+        policy_type: The policy for such rows.
+        progress: The budget.
+        seed: Of all that is drawn; Stable-Baselines3 seeds torch and NumPy as a whole.
+        device: Where networks are.
+        start: Rules to begin with; None: fresh ones.
+        settings: Of PPO.
+    """
+    rules = progress.problem.new_rules(seed) if start is None else start
+    rows = settings.steps * env.num_envs
+    problem = progress.problem
+    callback = ProgressCallback(
+        progress, settings.steps * problem.num_envs * problem.particle_count
+    )
+    model = PPO(
+        policy_type,
+        env,
+        learning_rate=lambda _: settings.learning_rate * callback.share_left,
+        n_steps=settings.steps,
+        batch_size=-(-rows // settings.minibatches),
+        n_epochs=settings.epochs,
+        gamma=settings.gamma,
+        gae_lambda=settings.gae_lambda,
+        clip_range=settings.clip,
+        ent_coef=settings.entropy_weight,
+        max_grad_norm=settings.max_gradient_norm,
+        target_kl=settings.target_kl,
+        tensorboard_log=settings.tensorboard_log,
+        policy_kwargs={
+            "rules": rules,
+            "initial_std": first_std(settings.initial_std, start),
+            "critic": settings.critic,
+        },
+        seed=seed,
+        device=device,
+    )
+    if isinstance(env, BootstrappedRows):
+        env.policy = model.policy
+    model.learn(sys.maxsize, callback)
+    return callback.rules
