@@ -21,11 +21,11 @@ from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.agents.learning.sb3_common import (
     BootstrappedRows,
-    RuleActorCritic,
     SB3Settings,
-    VecEnvWrapper,
     learn,
 )
+from npa_envs.agents.learning.sb3_imports import VecEnvWrapper
+from npa_envs.agents.learning.sb3_policy import RuleActorCritic
 from npa_envs.errors import NPAError
 from npa_envs.wrappers.particles import ParticleVecEnv
 from npa_envs.wrappers.rows import RowVecEnv

@@ -11,7 +11,8 @@ from npa_envs.agents.learning.options import takes_fields_of
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rules import RuleSet
-from npa_envs.agents.learning.sb3_common import RuleActorCritic, SB3Settings, learn
+from npa_envs.agents.learning.sb3_common import SB3Settings, learn
+from npa_envs.agents.learning.sb3_policy import RuleActorCritic
 from npa_envs.wrappers.world_rows import WorldVecEnv
 
 
