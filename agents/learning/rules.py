@@ -207,5 +207,28 @@ class RuleSetPolicy(Policy):
         return torch.cat(parts, dim=1).float()
 
 
+def starting_rules(
+    problem: Problem, seed: int, device: torch.device, start: RuleSet | None
+) -> RuleSet:
+    """Return rules for a learner to change: copies of those given, or new ones, on a device.
+
+    Args:
+        problem: What is to be learned.
+        seed: Of new rules.
+        device: Where they are to be.
+        start: What to begin with, or None.
+
+    Raises:
+        NPAError: What was given is no set of rules, or does not fit the problem.
+    """
+    if start is None:
+        return RuleSet.new(problem, seed).to(device)
+    if not isinstance(start, RuleSet):
+        raise NPAError(
+            f"start must be a RuleSet, got {type(start).__name__}: RuleSet.of(problem, 'heart')"
+        )
+    return RuleSet.of(problem, list(start)).to(device)
+
+
 def _file_name(species: int) -> str:
     return f"rule-{species}.safetensors"

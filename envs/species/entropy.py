@@ -31,11 +31,15 @@ def local_entropy(population: Population, *, eps: float, box: float | None) -> T
         tags.expand(len(population.x), -1, -1).contiguous(),
         eps,
         box=box,
+        detach_positions=False,
         state_gradient=False,
         moment_correction=False,
         density_gradient=False,
     )
     blur = seen[..., species_count:]
     shares = blur / blur.sum(dim=2, keepdim=True)
-    entropy: Tensor = torch.special.entr(shares).sum(dim=2)
+    # Beside a share of exactly 0 the entropy has no finite derivative, and NaN would come of it.
+    there = shares > 0.0
+    terms = torch.where(there, torch.special.entr(torch.where(there, shares, 1.0)), 0.0)
+    entropy: Tensor = terms.sum(dim=2)
     return entropy / math.log(species_count)

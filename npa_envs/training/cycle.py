@@ -64,8 +64,8 @@ class TrainingCycle:
         self._draw = Replayed(self._draw_worlds, device, worlds) if graphed else self._draw_worlds
         self._keep = Replayed(self._keep_worlds, device) if graphed else self._keep_worlds
 
-    def run(self, iteration: int) -> None:
-        """Train for one iteration.
+    def run(self, iteration: int) -> int:
+        """Train for one iteration, and return the steps of its rollout, T.
 
         Args:
             iteration: Iterations done so far in the run.
@@ -82,6 +82,7 @@ class TrainingCycle:
         self.meter.begin(iteration + 1, steps)
         self._keep()
         self.optimiser.step(iteration)
+        return steps
 
     def state_dict(self) -> dict[str, Any]:
         """Return all that changes but the rule, for a checkpoint."""
