@@ -82,7 +82,8 @@ class Critic(nn.Module):
         mixed = self.own(features) + self.species(self.row_species)
         if self.pooled is not None:
             mixed = mixed + self.pooled(features.mean(dim=-2, keepdim=True))
-        return self.scale * self.value(torch.tanh(mixed)).squeeze(-1)
+        values: Tensor = self.value(torch.tanh(mixed)).squeeze(-1)
+        return self.scale * values
 
     @torch.no_grad()
     def observe(self, observation: Tensor) -> None:

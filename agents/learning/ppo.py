@@ -82,10 +82,9 @@ class Learner:
         """What is perceived before each step of a round, and after its last, [T + 1, B, N, P]."""
         self.seen[-1].copy_(observation)
         self.critic.observe(observation)
-        self.critic_rounds = settings.critic_rounds
+        asked = settings.critic_rounds
+        self.critic_rounds = (0 if start is None else 4) if asked is None else asked
         """Rounds in which the critic learns alone."""
-        if self.critic_rounds is None:
-            self.critic_rounds = 0 if start is None else 4
         self.rounds = 0
         """Rounds done."""
 
@@ -179,19 +178,19 @@ class Learner:
         if settings.ratio == "world":
             log_ratio = over_particles(log_ratio, weights)
             weights = weights.amax(dim=1, keepdim=True)
-        ratio = log_ratio.exp()
-        clipped = ratio.clamp(1.0 - settings.clip, 1.0 + settings.clip)
+        ratio, clip = log_ratio.exp(), settings.largest_change
+        clipped = ratio.clamp(1.0 - clip, 1.0 + clip)
         gain = torch.minimum(ratio * part.advantages, clipped * part.advantages)
         bonus = settings.entropy_weight * self.actor.entropy()
         return (weights * gain).sum() / weights.sum() + bonus, kl
 
     def _critic_loss(self, part: Round) -> Tensor:
-        error = (self.critic(part.observations) - part.targets) / self.critic.scale
+        error: Tensor = (self.critic(part.observations) - part.targets) / self.critic.scale
         return 0.5 * (part.acted * error.square()).sum() / part.acted.sum()
 
     def _descend(self, loss: Tensor) -> None:
         self.optimizer.zero_grad()
-        loss.backward()
+        loss.backward()  # type: ignore[no-untyped-call]
         for net in (self.actor, self.critic):
             nn.utils.clip_grad_norm_(net.parameters(), self.settings.max_gradient_norm)
         self.optimizer.step()
@@ -199,7 +198,7 @@ class Learner:
     def _values(self, observations: Tensor) -> Tensor:
         """Return what the critic says of many worlds, part by part to save memory, [M, N]."""
         size = -(-len(observations) // self.settings.minibatches)
-        return torch.cat([self.critic(part) for part in observations.split(size)])
+        return torch.cat([self.critic(part) for part in torch.split(observations, size)])
 
     def _by_particle(self, reward: Tensor, infos: dict[str, Any]) -> tuple[Tensor, Tensor]:
         """Return what each particle is paid for the last step, and whether it acted, [B, N]."""

@@ -27,7 +27,7 @@ class Settings:
     epochs: int = 4
     """Passes over the worlds of a round; fewer where `target_kl` is passed."""
 
-    minibatches: int = 4
+    minibatches: int = 16
     """Parts that the T B worlds of a round are shuffled into, each pass anew."""
 
     learning_rate: float = 1e-3
@@ -36,14 +36,15 @@ class Settings:
     critic_learning_rate: float = 1e-3
     """The same for the critic."""
 
-    gamma: float = 0.9
+    gamma: float = 0.7
     """Discount of a reward one step later (dimensionless)."""
 
     gae_lambda: float = 0.9
     """Discount of what the critic did not foresee, besides `gamma` (dimensionless)."""
 
-    clip: float = 0.2
-    """Ratios of likelihoods count up to 1 plus or minus this (dimensionless)."""
+    clip: float | None = None
+    """Ratios of likelihoods count up to 1 plus or minus this (dimensionless). None: 0.2, or 0.02
+    for a world's, whose logarithms are means over many particles."""
 
     entropy_weight: float = 0.0
     """Weight of the entropy of a particle's action in what is maximised."""
@@ -80,13 +81,12 @@ class Settings:
             NPAError: One lies outside its range.
         """
         check_positive(self, int, "steps", "epochs", "minibatches", "critic_width")
-        check_positive(self, float, "clip", "max_gradient_norm")
+        check_positive(self, float, "max_gradient_norm")
         check_non_negative(self, "learning_rate", "critic_learning_rate", "entropy_weight")
         check_fraction(self, "gamma", "gae_lambda")
-        if self.target_kl is not None:
-            check_positive(self, float, "target_kl")
-        if self.initial_std is not None:
-            check_positive(self, float, "initial_std")
+        for name in ("clip", "target_kl", "initial_std"):
+            if getattr(self, name) is not None:
+                check_positive(self, float, name)
         if self.critic_rounds is not None:
             check_positive(self, int, "critic_rounds", at_least=0)
         check_words(self, *CHOICES)
@@ -94,6 +94,13 @@ class Settings:
             raise NPAError(
                 "credit='particle' needs ratio='particle': one ratio a world has one advantage"
             )
+
+    @property
+    def largest_change(self) -> float:
+        """How far ratios count from 1."""
+        if self.clip is not None:
+            return self.clip
+        return 0.2 if self.ratio == "particle" else 0.02
 
 
 def check_words(settings: object, *names: str) -> None:

@@ -97,7 +97,8 @@ class ProgressCallback(BaseCallback):
     @property
     def rules(self) -> RuleSet:
         """What is learned."""
-        rules: RuleSet = self.model.policy.actor.rules
+        policy: Any = self.model.policy
+        rules: RuleSet = policy.actor.rules
         return rules
 
     def _on_training_start(self) -> None:
@@ -205,6 +206,7 @@ def learn(
         device=device,
     )
     if isinstance(env, BootstrappedRows):
-        env.policy = model.policy
+        policy: Any = model.policy
+        env.policy = policy
     model.learn(sys.maxsize, callback)
     return callback.rules

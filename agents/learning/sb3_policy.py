@@ -42,17 +42,13 @@ class RuleActorCritic(ActorCriticPolicy):
         self._made_of = {"rules": rules, "initial_std": initial_std, "critic": critic}
         self.actor = GaussianRules(rules, initial_std)
         """Rules that explore: `actor.rules` acts without."""
+        self.log_std = self.actor.log_std
         self.critic: Critic = self._new_critic(rules, critic)
         self.optimizer = self.optimizer_class(
             self.parameters(),
             lr=lr_schedule(1),  # type: ignore[call-arg]
             **self.optimizer_kwargs,
         )
-
-    @property
-    def log_std(self) -> Tensor:
-        """Logarithms of the standard deviations, for Stable-Baselines3's log."""
-        return self.actor.log_std
 
     def forward(self, obs: Tensor, deterministic: bool = False) -> tuple[Tensor, Tensor, Tensor]:
         """Return actions, values [M, 1] and log-probabilities [M] while worlds are played.
@@ -67,7 +63,7 @@ class RuleActorCritic(ActorCriticPolicy):
         log_prob = self._row_log_prob(mean, log_std, action)
         return action, self.predict_values(obs), log_prob
 
-    def evaluate_actions(self, obs: Tensor, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def evaluate_actions(self, obs: Any, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return values [M, 1], log-probabilities [M] and entropies [M] of what was done.
 
         Args:
@@ -79,7 +75,7 @@ class RuleActorCritic(ActorCriticPolicy):
         entropy = self.actor.entropy().expand(len(obs))
         return self.predict_values(obs), log_prob, entropy
 
-    def predict_values(self, obs: Tensor) -> Tensor:
+    def predict_values(self, obs: Any) -> Tensor:
         """Return the values of rows, shape [M, 1].
 
         Args:
@@ -87,7 +83,7 @@ class RuleActorCritic(ActorCriticPolicy):
         """
         raise NotImplementedError
 
-    def get_distribution(self, obs: Tensor) -> Any:
+    def get_distribution(self, obs: Any) -> Any:
         """Refuse: actions are drawn by `forward`, and likelihoods found by `evaluate_actions`."""
         raise NotImplementedError("rules draw their actions themselves: see forward")
 

@@ -76,6 +76,7 @@ class WorldMeans(VecEnvWrapper):
 
     def step_wait(self) -> Any:
         """Step all worlds, and return observations, rewards, endings and infos of the rows."""
+        seen: Any
         seen, paid, done, infos = self.venv.step_wait()
         for world in np.flatnonzero(done.reshape(-1, self._rows).any(axis=1)).tolist():
             # Of several species, those that end together.
@@ -100,7 +101,7 @@ class RowRulePolicy(RuleActorCritic):
     behind is for the critic.
     """
 
-    def predict_values(self, obs: Tensor) -> Tensor:
+    def predict_values(self, obs: Any) -> Tensor:
         """Return the values of rows, shape [M, 1].
 
         Args:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -16,6 +19,18 @@ from npa_envs.agents.learning.sb3_policy import RuleActorCritic
 from npa_envs.wrappers.world_rows import WorldVecEnv
 
 
+@dataclass(frozen=True, kw_only=True)
+class WorldSettings(SB3Settings):
+    """Options of `train`: those of the other form, with defaults for means over many particles."""
+
+    clip: float = 0.02
+    """Ratios of likelihoods count up to 1 plus or minus this (dimensionless)."""
+
+    target_kl: float | None = 0.001
+    """No more updates in a round once a world's likelihood is so far from what it was [nats]; None:
+    all of them."""
+
+
 class WorldRulePolicy(RuleActorCritic):
     """A policy for rows of `WorldVecEnv`: all particles of a world act by their species' rule.
 
@@ -23,7 +38,7 @@ class WorldRulePolicy(RuleActorCritic):
     of `RuleActorCritic`.
     """
 
-    def predict_values(self, obs: Tensor) -> Tensor:
+    def predict_values(self, obs: Any) -> Tensor:
         """Return the values of worlds, shape [M, 1].
 
         Args:
@@ -43,7 +58,7 @@ class WorldRulePolicy(RuleActorCritic):
         return gaussian_log_prob(mean, log_std, action).mean(dim=1)
 
 
-@takes_fields_of(SB3Settings)
+@takes_fields_of(WorldSettings)
 def train(
     problem: Problem,
     progress: Progress,
@@ -51,7 +66,7 @@ def train(
     *,
     device: torch.device | str = "cpu",
     start: RuleSet | None = None,
-    settings: SB3Settings,
+    settings: WorldSettings,
 ) -> RuleSet:
     """Return the rules that Stable-Baselines3's PPO finds, with a likelihood for each world.
 
