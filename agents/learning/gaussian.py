@@ -13,23 +13,6 @@ from npa_envs.agents.learning.rules import RuleSet
 HALF_LOG_TAU = 0.5 * math.log(2.0 * math.pi)
 """Constant of the logarithm of a Gaussian's density."""
 
-FRESH_STD, WARM_STD = 0.3, 0.05
-"""Standard deviation of actions to begin with: around fresh rules, around given ones."""
-
-
-def first_std(asked: float | None, start: RuleSet | None) -> float:
-    """Return the standard deviation of actions to begin with.
-
-    Rules that are good already are not to be drowned in noise.
-
-    Args:
-        asked: What an option says; None: nothing.
-        start: Rules to begin with; None: fresh ones.
-    """
-    if asked is not None:
-        return asked
-    return FRESH_STD if start is None else WARM_STD
-
 
 def gaussian_log_prob(mean: Tensor, log_std: Tensor, action: Tensor) -> Tensor:
     """Return the log-probability of each row of actions, shape [...].

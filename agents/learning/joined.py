@@ -80,6 +80,8 @@ class JoinedSpeciesEnv:
         """Worlds B."""
         self.config = env.config
         """Its configuration."""
+        self.render_mode = env.render_mode
+        """What `species_env.render()` returns."""
         self.task = env.worlds.task
         """Starts and losses."""
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}

@@ -14,9 +14,9 @@ from torch import Tensor, nn
 
 from npa_envs.agents.learning.advantages import generalised_advantages
 from npa_envs.agents.learning.critics import Critic
-from npa_envs.agents.learning.gaussian import GaussianRules, first_std
+from npa_envs.agents.learning.gaussian import GaussianRules
 from npa_envs.agents.learning.options import takes_fields_of
-from npa_envs.agents.learning.ppo_settings import Settings
+from npa_envs.agents.learning.ppo_settings import Settings, filled
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rules import RuleSet
@@ -58,14 +58,14 @@ class Learner:
         device: torch.device,
         start: RuleSet | None,
     ) -> None:
-        self.settings = settings
+        self.settings = settings = filled(settings, start)
         self.envs = problem.make_envs(
             device=device, row_rewards=settings.credit == "particle", copy=False
         )
         self.generator = torch.Generator(device).manual_seed(seed)
         rules = problem.new_rules(seed) if start is None else start
-        std = first_std(settings.initial_std, start)
-        self.actor = GaussianRules(rules, std).to(device)
+        assert settings.initial_std is not None
+        self.actor = GaussianRules(rules, settings.initial_std).to(device)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             critic = Critic(
@@ -82,9 +82,6 @@ class Learner:
         """What is perceived before each step of a round, and after its last, [T + 1, B, N, P]."""
         self.seen[-1].copy_(observation)
         self.critic.observe(observation)
-        asked = settings.critic_rounds
-        self.critic_rounds = (0 if start is None else 4) if asked is None else asked
-        """Rounds in which the critic learns alone."""
         self.rounds = 0
         """Rounds done."""
 
@@ -145,7 +142,7 @@ class Learner:
                 were at the start.
         """
         settings = self.settings
-        warm_up = self.rounds < self.critic_rounds
+        warm_up = self.rounds < settings.critic_rounds
         self.rounds += 1
         self.critic.observe(batch.observations)
         self.critic.rescale(batch.targets)
@@ -181,8 +178,12 @@ class Learner:
         ratio, clip = log_ratio.exp(), settings.largest_change
         clipped = ratio.clamp(1.0 - clip, 1.0 + clip)
         gain = torch.minimum(ratio * part.advantages, clipped * part.advantages)
-        bonus = settings.entropy_weight * self.actor.entropy()
-        return (weights * gain).sum() / weights.sum() + bonus, kl
+        mean_gain = (weights * gain).sum() / weights.sum()
+        mean_gain = mean_gain + settings.entropy_weight * self.actor.entropy()
+        if settings.target_kl is not None:
+            # Too far already: back, without asking the host.
+            mean_gain = torch.where(kl > settings.target_kl, -kl, mean_gain)
+        return mean_gain, kl
 
     def _critic_loss(self, part: Round) -> Tensor:
         error: Tensor = (self.critic(part.observations) - part.targets) / self.critic.scale

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 from npa_envs.agents.learning.critics import CriticKind
+from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.errors import NPAError, suggest
 from npa_envs.tasks.checks import check_fraction, check_non_negative, check_positive
+
+FRESH = {"learning_rate": 1e-3, "initial_std": 0.3, "critic_rounds": 0}
+"""What options are where they are None, with fresh rules."""
+
+WARM = {"learning_rate": 1e-4, "initial_std": 0.05, "critic_rounds": 4}
+"""The same with rules to begin with: noise, haste and a raw critic would undo what they can do."""
 
 CHOICES = {
     "ratio": ("particle", "world"),
@@ -30,8 +37,9 @@ class Settings:
     minibatches: int = 16
     """Parts that the T B worlds of a round are shuffled into, each pass anew."""
 
-    learning_rate: float = 1e-3
-    """Adam's step of the rules at the start; it falls to zero over the budget."""
+    learning_rate: float | None = None
+    """Adam's step of the rules at the start, from which it falls to zero over the budget; None:
+    0.001, or 0.0001 with a `start`."""
 
     critic_learning_rate: float = 1e-3
     """The same for the critic."""
@@ -53,8 +61,8 @@ class Settings:
     """Gradients of the rules, and those of the critic, are shortened to this norm."""
 
     target_kl: float | None = 0.05
-    """No more passes once a particle's actions are so far from those that were played [nats], as a
-    mean over an epoch; None: all of them."""
+    """Where particles' actions are farther from those that were played [nats], a minibatch draws
+    them back, and after such a pass there are no more; None: no limit."""
 
     initial_std: float | None = None
     """Standard deviation of every action column at first; None: 0.3, or 0.05 with a `start`."""
@@ -82,9 +90,9 @@ class Settings:
         """
         check_positive(self, int, "steps", "epochs", "minibatches", "critic_width")
         check_positive(self, float, "max_gradient_norm")
-        check_non_negative(self, "learning_rate", "critic_learning_rate", "entropy_weight")
+        check_non_negative(self, "critic_learning_rate", "entropy_weight")
         check_fraction(self, "gamma", "gae_lambda")
-        for name in ("clip", "target_kl", "initial_std"):
+        for name in ("clip", "learning_rate", "target_kl", "initial_std"):
             if getattr(self, name) is not None:
                 check_positive(self, float, name)
         if self.critic_rounds is not None:
@@ -117,3 +125,15 @@ def check_words(settings: object, *names: str) -> None:
         word, words = getattr(settings, name), CHOICES[name]
         if word not in words:
             raise NPAError(f"{name} must be a known word, got {word!r}: {suggest(word, words)}")
+
+
+def filled(settings: Any, start: RuleSet | None) -> Any:
+    """Return options with those of `FRESH` or `WARM` where they are None.
+
+    Args:
+        settings: A dataclass with these options.
+        start: Rules to begin with; None: fresh ones.
+    """
+    defaults = FRESH if start is None else WARM
+    missing = {k: value for k, value in defaults.items() if getattr(settings, k) is None}
+    return replace(settings, **missing)

@@ -10,8 +10,7 @@ import numpy as np
 import torch
 
 from npa_envs.agents.learning.critics import CriticKind
-from npa_envs.agents.learning.gaussian import first_std
-from npa_envs.agents.learning.ppo_settings import check_words
+from npa_envs.agents.learning.ppo_settings import check_words, filled
 from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.agents.learning.sb3_imports import PPO, BaseCallback, VecEnv, VecEnvWrapper
@@ -32,8 +31,9 @@ class SB3Settings:
     minibatches: int = 16
     """Parts that the rows of a round are shuffled into."""
 
-    learning_rate: float = 1e-3
-    """Adam's step at the start; it falls to zero over the budget."""
+    learning_rate: float | None = None
+    """Adam's step at the start, from which it falls to zero over the budget; None: 0.001, or 0.0001
+    with a `start`."""
 
     gamma: float = 0.7
     """Discount of a reward one step later (dimensionless)."""
@@ -57,6 +57,9 @@ class SB3Settings:
     initial_std: float | None = None
     """Standard deviation of every action column at first; None: 0.3, or 0.05 with a `start`."""
 
+    critic_rounds: int | None = None
+    """Rounds in which the critic learns alone; None: 0, or 4 with a `start`."""
+
     critic: CriticKind = "particle"
     """A value follows from a particle's own perception, or from its whole world ("central")."""
 
@@ -71,11 +74,13 @@ class SB3Settings:
         """
         check_positive(self, int, "steps", "epochs", "minibatches")
         check_positive(self, float, "clip", "max_gradient_norm")
-        check_non_negative(self, "learning_rate", "entropy_weight")
+        check_non_negative(self, "entropy_weight")
         check_fraction(self, "gamma", "gae_lambda")
-        for name in ("target_kl", "initial_std"):
+        for name in ("learning_rate", "target_kl", "initial_std"):
             if getattr(self, name) is not None:
                 check_positive(self, float, name)
+        if self.critic_rounds is not None:
+            check_positive(self, int, "critic_rounds", at_least=0)
         check_words(self, "critic")
 
 
@@ -85,10 +90,12 @@ class ProgressCallback(BaseCallback):
     Args:
         progress: The account.
         round_size: Particle-steps of a round, T B N.
+        critic_rounds: Rounds in which the critic learns alone.
     """
 
-    def __init__(self, progress: Progress, round_size: int) -> None:
+    def __init__(self, progress: Progress, round_size: int, critic_rounds: int = 0) -> None:
         super().__init__()
+        self.critic_rounds = critic_rounds
         self.progress = progress
         self.round_size = round_size
         self.share_left = 1.0
@@ -107,6 +114,9 @@ class ProgressCallback(BaseCallback):
     def _on_rollout_start(self) -> None:
         self.progress.look(self.rules)
         self.share_left = max(0.0, 1.0 - self.progress.share)
+        policy: Any = self.model.policy
+        policy.actor.requires_grad_(self.critic_rounds <= 0)
+        self.critic_rounds -= 1
 
     def _on_step(self) -> bool:
         """Return whether to go on; asked in every step, so a round that is none ends at once."""
@@ -178,15 +188,20 @@ def learn(
         settings: Of PPO.
     """
     rules = progress.problem.new_rules(seed) if start is None else start
+    settings = filled(settings, start)
+    rate = settings.learning_rate
+    assert rate is not None
     rows = settings.steps * env.num_envs
     problem = progress.problem
     callback = ProgressCallback(
-        progress, settings.steps * problem.num_envs * problem.particle_count
+        progress,
+        settings.steps * problem.num_envs * problem.particle_count,
+        settings.critic_rounds,
     )
     model = PPO(
         policy_type,
         env,
-        learning_rate=lambda _: settings.learning_rate * callback.share_left,
+        learning_rate=lambda _: rate * callback.share_left,
         n_steps=settings.steps,
         batch_size=-(-rows // settings.minibatches),
         n_epochs=settings.epochs,
@@ -199,7 +214,7 @@ def learn(
         tensorboard_log=settings.tensorboard_log,
         policy_kwargs={
             "rules": rules,
-            "initial_std": first_std(settings.initial_std, start),
+            "initial_std": settings.initial_std,
             "critic": settings.critic,
         },
         seed=seed,
