@@ -20,6 +20,7 @@ if TYPE_CHECKING:
         TorchNormalizeReward,
         TorchRecordEpisodeStatistics,
     )
+    from npa_envs.wrappers.world_rows import WorldVecEnv as WorldVecEnv
 
 __all__ = [
     "DamageEvents",
@@ -33,7 +34,7 @@ __all__ = [
     "VectorSpeciesTags",
 ]
 # A star imports all of them, and must need neither Stable-Baselines3 nor PettingZoo.
-ON_REQUEST = ("NumericInfos", "ParticleVecEnv", "RowPolicy", "SpeciesVecEnv")
+ON_REQUEST = ("NumericInfos", "ParticleVecEnv", "RowPolicy", "SpeciesVecEnv", "WorldVecEnv")
 
 
 def __getattr__(name: str) -> Any:
@@ -45,6 +46,10 @@ def __getattr__(name: str) -> Any:
         from npa_envs.wrappers import numeric_infos
 
         return numeric_infos.NumericInfos
+    if name == "WorldVecEnv":
+        from npa_envs.wrappers import world_rows
+
+        return world_rows.WorldVecEnv
     if name in ON_REQUEST:
         from npa_envs.wrappers import species_rows
 
