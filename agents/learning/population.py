@@ -87,15 +87,16 @@ class Population:
         for rule, span in zip(self._rules, self._rules.spans, strict=True):
             size = sum(part.numel() for part in _weights(rule))
             seen = observation[:, span]
-            rows = perceived(rule, seen.flatten(0, 1)).unflatten(0, (candidates, -1))
+            rows = perceived(rule, seen.flatten(0, 1))
+            rows = rows.view(candidates, -1, rows.shape[1])
             update = _updates(rule, weights[:, at : at + size], rows).flatten(0, 1)
             action = self._rules.interface.action(*bounded(rule, update))
-            parts.append(action.unflatten(0, tuple(seen.shape[:2])))
+            parts.append(action.view(*seen.shape[:2], -1))
             at += size
         return torch.cat(parts, dim=1)
 
 
-def _weights(rule: NPARule) -> tuple[nn.Parameter, nn.Parameter, nn.Parameter]:
+def _weights(rule: NPARule) -> tuple[Tensor, Tensor, Tensor]:
     """Return W1 [H, P], b1 [H] and W2 [A, H]."""
     return rule.hidden.weight, rule.hidden.bias, rule.output.weight
 
@@ -105,8 +106,8 @@ def _updates(rule: NPARule, weights: Tensor, rows: Tensor) -> Tensor:
     shapes = [tuple(part.shape) for part in _weights(rule)]
     sizes = [math.prod(shape) for shape in shapes]
     first, bias, second = (
-        part.unflatten(1, shape)
-        for part, shape in zip(weights.split(sizes, dim=1), shapes, strict=True)
+        part.reshape(-1, *shape)
+        for part, shape in zip(torch.split(weights, sizes, dim=1), shapes, strict=True)
     )
     at_once = max(1, MOST_HIDDEN // (rows.shape[1] * rule.hidden_dim))
     updates = []
