@@ -24,6 +24,8 @@ class Sizes(NamedTuple):
     """What it is told."""
     episode_steps: int
     """Length of an episode."""
+    hidden_dim: int
+    """Width of the rules' hidden layer."""
     quick: Mapping[str, Any]
     """Keywords of a quick one."""
 
@@ -47,19 +49,22 @@ PROBLEMS: Mapping[str, Sizes] = {
         "npa/Morphogenesis2D-v0",
         {**GROWTH, "seed_radius": 0.4},
         48,
+        64,
         SMALL,
     ),
     "regeneration2d": Sizes(
         "npa/Regeneration2D-v0",
         {**GROWTH, "rule": "picture", "damage": "erase", "damage_size": 0.4},
         32,
+        64,
         SMALL,
     ),
     "point_classification": Sizes(
         "npa/PointClassification-v0",
-        {"particle_count": 256, "state_dim": 16, "state_scale": 0.1, "eps": 0.15, "eps0": 0.15},
+        {"particle_count": 256, "state_dim": 16, "state_scale": 0.1, "eps": 0.3, "eps0": 0.3},
         24,
-        {"particle_count": 64, "eps": 0.25, "eps0": 0.25},
+        128,
+        {"particle_count": 64},
     ),
     "mixing": Sizes(
         "npa/Mixing-v0",
@@ -71,6 +76,7 @@ PROBLEMS: Mapping[str, Sizes] = {
             "perception": "per_species",
         },
         48,
+        64,
         {"particle_count": 64, "eps": 0.2, "eps0": 0.2},
     ),
 }
@@ -101,5 +107,5 @@ def make_problem(name: str, *, quick: bool = False) -> Problem:
         keywords={**sizes.keywords, **(sizes.quick if quick else {})},
         episode_steps=QUICK_STEPS if quick else sizes.episode_steps,
         num_envs=4 if quick else 32,
-        hidden_dim=16 if quick else 64,
+        hidden_dim=16 if quick else sizes.hidden_dim,
     )
