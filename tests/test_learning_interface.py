@@ -9,11 +9,18 @@ import torch
 from learning_problems import digits, heart, species, wild_rules
 
 import npa_envs
-from npa_envs.agents import RandomPolicy, RulePolicy, evaluate_policy, interface_of
+from npa_envs.agents import (
+    RandomPolicy,
+    RulePolicy,
+    SpreadPolicy,
+    evaluate_policy,
+    interface_of,
+)
 from npa_envs.agents.learning import Problem, RuleSet
 from npa_envs.envs import multispecies_v0
 from npa_envs.errors import NPAError
 from npa_envs.registration import ENVIRONMENTS
+from npa_envs.rule import NPARule
 
 STEP_TOLERANCE = 2e-6
 """As that of RulePolicy: largest difference of positions and states after a step."""
@@ -182,6 +189,33 @@ def test_species_follow_rules_of_their_own():
         alone = RulePolicy(rule)(observation[:, span])
         assert torch.equal(together[:, span], alone)
     assert not torch.equal(*[RulePolicy(rule)(observation) for rule in rules])
+
+
+def test_rules_that_tell_species_apart_may_perceive_less_besides():
+    problem = species(perception="per_species")
+    envs = problem.make_envs()
+    observation, _ = envs.reset(seed=0)
+    observation, *_ = envs.step(wild_rules(problem).policy()(observation))
+    rule = NPARule(
+        2, 4, 16, eps0=0.25, state_gradient=False, density_gradient=False, species_count=2
+    )
+    # Own and mean states, then densities and their gradients of both species.
+    update = rule(torch.cat((observation[..., :8], observation[..., 18:]), dim=-1))
+    displacement = update[..., :2] / (1.0 + update[..., :2].norm(dim=-1, keepdim=True))
+    mean = RuleSet.of(problem, rule).mean(observation)
+    torch.testing.assert_close(mean, torch.cat((displacement, update[..., 2:]), dim=-1))
+
+
+def test_what_is_told_of_species_leaves_scripted_policies_as_they_are():
+    for step in range(3):
+        acting = {}
+        for perception in ("shared", "per_species"):
+            problem = species(perception=perception)
+            envs = problem.make_envs()
+            observation, _ = envs.reset(seed=step)
+            acting[perception] = SpreadPolicy(envs)(observation)
+        assert torch.equal(acting["shared"], acting["per_species"])
+        assert acting["shared"].abs().max() > 1e-3
 
 
 def test_files_keep_rules_bit_for_bit(tmp_path):

@@ -54,7 +54,7 @@ def train(
     world_count: int = 8,
     pool_size: int | None = None,
     fresh_share: float = 0.25,
-    learning_rate: float = 2e-3,
+    learning_rate: float = 4e-3,
     last_rate: float = 0.05,
     normalise_gradients: bool = True,
     memory: Memory = "store",
