@@ -1,4 +1,4 @@
-"""How much better actions were than foreseen: generalised advantage estimation."""
+"""What PPO maximises: how much better actions were than foreseen, and are now likelier."""
 
 from __future__ import annotations
 
@@ -39,3 +39,44 @@ def generalised_advantages(
         later = surprises[step] + discounts[step] * later
         advantages[step] = later
     return advantages
+
+
+def over_particles(values: Tensor, weights: Tensor) -> Tensor:
+    """Return weighted means over the particles of worlds, 0 where nothing has weight, [..., 1].
+
+    Args:
+        values: Shape [..., N].
+        weights: Likewise, not negative.
+    """
+    total = (values * weights).sum(dim=-1, keepdim=True)
+    return total / weights.sum(dim=-1, keepdim=True).clamp(min=1e-8)
+
+
+def standardised(values: Tensor, weights: Tensor) -> Tensor:
+    """Return numbers with their weighted mean taken off, in units of their standard deviation.
+
+    Args:
+        values: Shape [..., N], or [..., 1] for one number a world.
+        weights: Shape [..., N], not negative.
+    """
+    shares = weights.expand_as(values) if values.shape == weights.shape else weights.amax(-1, True)
+    total = shares.sum()
+    centred = values - (values * shares).sum() / total
+    return centred / ((centred.square() * shares).sum() / total + 1e-16).sqrt()
+
+
+def clipped_gain(log_ratio: Tensor, advantages: Tensor, weights: Tensor, *, clip: float) -> Tensor:
+    """Return the weighted mean of min(r A, clip(r) A), for r the ratio of likelihoods to before.
+
+    Source: Schulman et al., arXiv 1707.06347, equation 7.
+
+    Args:
+        log_ratio: Logarithms of the ratios, one a particle or one a world, shape [M, N] or [M, 1].
+        advantages: Likewise.
+        weights: Likewise, not negative.
+        clip: Ratios count up to 1 plus or minus this (dimensionless).
+    """
+    ratio = log_ratio.exp()
+    clipped = ratio.clamp(1.0 - clip, 1.0 + clip)
+    gain = torch.minimum(ratio * advantages, clipped * advantages)
+    return (weights * gain).sum() / weights.sum().clamp(min=1.0)

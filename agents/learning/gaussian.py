@@ -51,6 +51,8 @@ class GaussianRules(nn.Module):
         counts = [span.stop - span.start for span in self.rules.spans]
         kinds = torch.arange(len(widths)).repeat_interleave(torch.tensor(counts))
         self.register_buffer("row_species", kinds, persistent=False)
+        # The same rules one by one, not registered a second time.
+        self._each = tuple(RuleSet([rule], [1], self.rules.interface) for rule in self.rules)
 
     def row_log_std(self) -> Tensor:
         """Return the logarithms of the standard deviations of every particle, shape [N, A]."""
@@ -81,6 +83,25 @@ class GaussianRules(nn.Module):
             action: Shape [M, N, A].
         """
         return gaussian_log_prob(self.rules.mean(observation), self.row_log_std(), action)
+
+    def row_mean(self, species: int, rows: Tensor) -> Tensor:
+        """Return what particles of one species would do without exploration, shape [K, A].
+
+        Args:
+            species: Its number.
+            rows: What they perceive, shape [K, P].
+        """
+        return self._each[species].mean(rows[:, None])[:, 0]
+
+    def row_log_prob(self, species: int, rows: Tensor, action: Tensor) -> Tensor:
+        """Return the log-probability of the actions of particles of one species, shape [K].
+
+        Args:
+            species: Its number.
+            rows: What they perceive, shape [K, P].
+            action: What they did, shape [K, A].
+        """
+        return gaussian_log_prob(self.row_mean(species, rows), self.log_std[species], action)
 
     def entropy(self) -> Tensor:
         """Return the mean entropy of a particle's action [nats]."""

@@ -7,12 +7,18 @@ The host reads one byte a world in each step (has its episode ended?), and one n
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from npa_envs.agents.learning.advantages import generalised_advantages
+from npa_envs.agents.learning.advantages import (
+    clipped_gain,
+    generalised_advantages,
+    over_particles,
+    standardised,
+)
 from npa_envs.agents.learning.critics import Critic
 from npa_envs.agents.learning.gaussian import GaussianRules
 from npa_envs.agents.learning.options import takes_fields_of
@@ -75,8 +81,10 @@ class Learner:
                 settings.critic_width,
             )
         self.critic = critic.to(device)
-        groups = [{"params": list(net.parameters())} for net in (self.actor, self.critic)]
-        self.optimizer = torch.optim.Adam(groups, eps=1e-5, fused=device.type == "cuda")
+        self.optimizer, self.critic_optimizer = (
+            torch.optim.Adam(net.parameters(), lr=rate, eps=1e-5, fused=True)
+            for net, rate in ((self.actor, torch.zeros((), device=device)), (self.critic, 0.0))
+        )
         observation, _ = self.envs.reset(seed=seed)
         self.seen = observation.new_empty(settings.steps + 1, *observation.shape)
         """What is perceived before each step of a round, and after its last, [T + 1, B, N, P]."""
@@ -142,59 +150,81 @@ class Learner:
                 were at the start.
         """
         settings = self.settings
-        warm_up = self.rounds < settings.critic_rounds
+        rules_learn = self.rounds >= settings.critic_rounds
         self.rounds += 1
         self.critic.observe(batch.observations)
         self.critic.rescale(batch.targets)
-        rates = (settings.learning_rate, settings.critic_learning_rate)
-        for group, rate in zip(self.optimizer.param_groups, rates, strict=True):
-            group["lr"] = rate * share_left
+        rate = settings.learning_rate * share_left
+        self.critic_optimizer.param_groups[0]["lr"] = settings.critic_learning_rate * share_left
+        near = torch.ones((), device=batch.targets.device)
+        groups = self._groups(batch)
         for _ in range(settings.epochs):
-            drift = batch.targets.new_zeros(())
-            order = torch.randperm(
-                len(batch.targets), generator=self.generator, device=drift.device
-            )
-            for chosen in order.chunk(settings.minibatches):
-                part = Round(*(values[chosen] for values in batch))
-                loss = self._critic_loss(part)
-                if not warm_up:
-                    surrogate, kl = self._surrogate(part)
-                    loss = loss - surrogate
-                    drift += kl.detach() * (len(chosen) / len(order))
-                self._descend(loss)
-            # The only number that the host waits for.
-            if settings.target_kl is not None and float(drift) > settings.target_kl:
+            critic_parts = self._shuffled([batch])
+            for part, worlds in zip(self._shuffled(groups), critic_parts, strict=True):
+                self._descend(self.critic_optimizer, self._critic_loss(*worlds))
+                if rules_learn:
+                    gain, kl = self._surrogate(part)
+                    if settings.target_kl is not None:
+                        # Rules that have gone too far stay, without a question to the host.
+                        near *= kl.detach() <= settings.target_kl
+                    self.optimizer.param_groups[0]["lr"].copy_(near * rate)
+                    self._descend(self.optimizer, -gain)
+            # All that the host waits for.
+            if rules_learn and not bool(near):
                 break
 
-    def _surrogate(self, part: Round) -> tuple[Tensor, Tensor]:
+    def _groups(self, batch: Round) -> list[Round]:
+        """Return what is shuffled when rules learn: whole worlds, or each species' particles."""
+        if self.settings.ratio == "world":
+            return [batch]
+        spans = self.actor.rules.spans
+        return [Round(*(value[:, span].flatten(0, 1) for value in batch)) for span in spans]
+
+    def _shuffled(self, groups: list[Round]) -> Iterator[list[Round]]:
+        """Return minibatches: parts of each group."""
+        orders = [
+            torch.randperm(len(group.targets), generator=self.generator, device=self.seen.device)
+            for group in groups
+        ]
+        parts = [order.tensor_split(self.settings.minibatches) for order in orders]
+        for chosen in zip(*parts, strict=True):
+            yield [
+                Round(*(value[rows] for value in group))
+                for group, rows in zip(groups, chosen, strict=True)
+            ]
+
+    def _surrogate(self, part: list[Round]) -> tuple[Tensor, Tensor]:
         """Return the clipped gain of the rules, and how far their actions have moved [nats]."""
-        settings = self.settings
-        log_ratio = self.actor.log_prob(part.observations, part.actions) - part.log_probs
-        kl = (part.acted * (torch.expm1(log_ratio) - log_ratio)).sum() / part.acted.sum()
-        weights = part.acted
+        settings, actor = self.settings, self.actor
         if settings.ratio == "world":
-            log_ratio = over_particles(log_ratio, weights)
-            weights = weights.amax(dim=1, keepdim=True)
-        ratio, clip = log_ratio.exp(), settings.largest_change
-        clipped = ratio.clamp(1.0 - clip, 1.0 + clip)
-        gain = torch.minimum(ratio * part.advantages, clipped * part.advantages)
-        mean_gain = (weights * gain).sum() / weights.sum()
-        mean_gain = mean_gain + settings.entropy_weight * self.actor.entropy()
-        if settings.target_kl is not None:
-            # Too far already: back, without asking the host.
-            mean_gain = torch.where(kl > settings.target_kl, -kl, mean_gain)
-        return mean_gain, kl
+            (worlds,) = part
+            changes = [actor.log_prob(worlds.observations, worlds.actions) - worlds.log_probs]
+        else:
+            changes = [
+                actor.row_log_prob(species, rows.observations, rows.actions) - rows.log_probs
+                for species, rows in enumerate(part)
+            ]
+        log_ratio, advantages, acted = (
+            torch.cat(values)
+            for values in (changes, [p.advantages for p in part], [p.acted for p in part])
+        )
+        kl = (acted * (torch.expm1(log_ratio) - log_ratio)).sum() / acted.sum().clamp(min=1.0)
+        if settings.ratio == "world":
+            log_ratio = over_particles(log_ratio, acted)
+            acted = acted.amax(dim=1, keepdim=True)
+        gain = clipped_gain(log_ratio, advantages, acted, clip=settings.largest_change)
+        return gain + settings.entropy_weight * actor.entropy(), kl
 
-    def _critic_loss(self, part: Round) -> Tensor:
-        error: Tensor = (self.critic(part.observations) - part.targets) / self.critic.scale
-        return 0.5 * (part.acted * error.square()).sum() / part.acted.sum()
+    def _critic_loss(self, worlds: Round) -> Tensor:
+        error: Tensor = (self.critic(worlds.observations) - worlds.targets) / self.critic.scale
+        return 0.5 * (worlds.acted * error.square()).sum() / worlds.acted.sum().clamp(min=1.0)
 
-    def _descend(self, loss: Tensor) -> None:
-        self.optimizer.zero_grad()
+    def _descend(self, optimizer: torch.optim.Optimizer, loss: Tensor) -> None:
+        optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
-        for net in (self.actor, self.critic):
-            nn.utils.clip_grad_norm_(net.parameters(), self.settings.max_gradient_norm)
-        self.optimizer.step()
+        parameters = optimizer.param_groups[0]["params"]
+        nn.utils.clip_grad_norm_(parameters, self.settings.max_gradient_norm)
+        optimizer.step()
 
     def _values(self, observations: Tensor) -> Tensor:
         """Return what the critic says of many worlds, part by part to save memory, [M, N]."""
@@ -213,30 +243,6 @@ class Learner:
                 # Worlds that restarted say there what their last step was worth.
                 paid = torch.where(infos["_final_info"][:, None], last, paid)
         return paid.expand(everyone), acted.expand(everyone)
-
-
-def over_particles(values: Tensor, weights: Tensor) -> Tensor:
-    """Return weighted means over the particles of worlds, 0 where nothing has weight, [..., 1].
-
-    Args:
-        values: Shape [..., N].
-        weights: Likewise, not negative.
-    """
-    total = (values * weights).sum(dim=-1, keepdim=True)
-    return total / weights.sum(dim=-1, keepdim=True).clamp(min=1e-8)
-
-
-def standardised(values: Tensor, weights: Tensor) -> Tensor:
-    """Return numbers with their weighted mean taken off, in units of their standard deviation.
-
-    Args:
-        values: Shape [..., N], or [..., 1] for one number a world.
-        weights: Shape [..., N], not negative.
-    """
-    shares = weights.expand_as(values) if values.shape == weights.shape else weights.amax(-1, True)
-    total = shares.sum()
-    centred = values - (values * shares).sum() / total
-    return centred / ((centred.square() * shares).sum() / total + 1e-16).sqrt()
 
 
 @takes_fields_of(Settings)

@@ -32,10 +32,11 @@ class Settings:
     """Steps of all worlds in a round, T."""
 
     epochs: int = 4
-    """Passes over the worlds of a round; fewer where `target_kl` is passed."""
+    """Passes over a round; fewer where `target_kl` is passed."""
 
     minibatches: int = 16
-    """Parts that the T B worlds of a round are shuffled into, each pass anew."""
+    """Parts that the particles of a round are shuffled into in each pass; for the critic, and where
+    a world has one ratio, its worlds are."""
 
     learning_rate: float | None = None
     """Adam's step of the rules at the start, from which it falls to zero over the budget; None:
@@ -61,8 +62,8 @@ class Settings:
     """Gradients of the rules, and those of the critic, are shortened to this norm."""
 
     target_kl: float | None = 0.05
-    """Where particles' actions are farther from those that were played [nats], a minibatch draws
-    them back, and after such a pass there are no more; None: no limit."""
+    """The rules stay as they are for the rest of a round once particles' actions are farther than
+    this from those that were played [nats]; None: no limit."""
 
     initial_std: float | None = None
     """Standard deviation of every action column at first; None: 0.3, or 0.05 with a `start`."""

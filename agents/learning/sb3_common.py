@@ -189,14 +189,14 @@ def learn(
     """
     rules = progress.problem.new_rules(seed) if start is None else start
     settings = filled(settings, start)
-    rate = settings.learning_rate
-    assert rate is not None
+    rate, alone = settings.learning_rate, settings.critic_rounds
+    assert rate is not None and alone is not None, "there are defaults for both"
     rows = settings.steps * env.num_envs
     problem = progress.problem
     callback = ProgressCallback(
         progress,
         settings.steps * problem.num_envs * problem.particle_count,
-        settings.critic_rounds,
+        alone,
     )
     model = PPO(
         policy_type,

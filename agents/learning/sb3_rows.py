@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from npa_envs.agents.learning.critics import Critic, CriticKind
 from npa_envs.agents.learning.gaussian import gaussian_log_prob
@@ -113,18 +113,15 @@ class RowRulePolicy(RuleActorCritic):
     def _new_critic(self, rules: RuleSet, kind: CriticKind) -> Critic:
         # What a central critic is told of a world stands in the row.
         columns = (self.observation_space.shape or (0,))[0]
-        self.each = nn.ModuleList(
-            RuleSet([rule], [1], rules.interface) for rule in self.actor.rules
-        )
         return Critic(columns, (1,))
 
     def _gaussian(self, obs: Tensor) -> tuple[Tensor, Tensor]:
         perceived = self.actor.rules.interface.perception_dim
-        rows = obs[:, None, :perceived]
-        if len(self.each) == 1:
-            return self.each[0](rows)[:, 0], self.actor.log_std
-        tags = obs[:, perceived : perceived + len(self.each)]
-        means = torch.cat([rules(rows) for rules in self.each], dim=1)
+        rows, species_count = obs[:, :perceived], len(self.actor.log_std)
+        if species_count == 1:
+            return self.actor.row_mean(0, rows), self.actor.log_std
+        tags = obs[:, perceived : perceived + species_count]
+        means = torch.stack([self.actor.row_mean(k, rows) for k in range(species_count)], dim=1)
         return (tags[..., None] * means).sum(dim=1), tags @ self.actor.log_std
 
     def _row_log_prob(self, mean: Tensor, log_std: Tensor, action: Tensor) -> Tensor:
