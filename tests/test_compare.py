@@ -10,8 +10,11 @@ import time
 
 import numpy as np
 import pytest
+from PIL import Image
 
+from npa_envs.agents import RandomPolicy, ZeroPolicy
 from npa_envs.agents.comparison import scheduler
+from npa_envs.agents.comparison.pictures import PICTURE, SIZE, final_picture, write_strips
 from npa_envs.agents.comparison.plan import Job, Plan
 from npa_envs.agents.comparison.plots import curve, pictures
 from npa_envs.agents.comparison.problems import LEFT_OUT, PROBLEMS, make_problem
@@ -22,6 +25,7 @@ from npa_envs.agents.learning import METHODS, Problem, RuleSet
 from npa_envs.cli import main
 from npa_envs.cli.compare import CompareOptions, make_plan
 from npa_envs.errors import NPAError
+from npa_envs.render import write_png
 
 FACTS = {"problem": {}, "budget": 1.0, "options": {}, "episodes": 2}
 
@@ -325,6 +329,36 @@ def test_curves_are_drawn_for_each_task():
     drawn = pictures([*synthetic(), record("zero", 2, (0.5,), curve=points((0.0, 0.5)))])
     assert list(drawn) == ["growth"]
     assert drawn["growth"].startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("name", ["morphogenesis2d", "mixing"])
+def test_a_picture_shows_the_end_of_the_episode_and_not_the_next_start(name, device):
+    problem, place = make_problem(name, quick=True), str(device)
+    still = ZeroPolicy(problem.make_envs(1, device=device))
+    restless = RandomPolicy(problem.make_envs(1, device=device))
+    shown = final_picture(problem, still, 3, device=place)
+    assert shown.shape == (SIZE, SIZE, 3)
+    # Nobody moves: the end is the start, of this episode and of no other.
+    shorter = dataclasses.replace(problem, episode_steps=1)
+    assert np.array_equal(shown, final_picture(shorter, still, 3, device=place))
+    assert not np.array_equal(shown, final_picture(problem, still, 4, device=place))
+    assert not np.array_equal(shown, final_picture(problem, restless, 3, device=place))
+
+
+def test_a_strip_has_a_row_for_each_method_and_room_for_what_failed(tmp_path):
+    done, failed = record("ppo", 0, (1.0,)), record("zero", 0, status="failed")
+    folder = tmp_path / done.job.folder
+    folder.mkdir(parents=True)
+    write_png(folder / PICTURE, np.full((SIZE, SIZE, 3), 50, np.uint8))
+    (path,) = write_strips([done, failed], tmp_path)
+    assert path.name == "grown_growth_seconds.png"
+    with Image.open(path) as strip:
+        pixels = np.asarray(strip.convert("RGB"))
+    height, middle = pixels.shape[0], pixels.shape[1] // 2
+    assert pixels.shape[1] < 2 * SIZE
+    assert height > 2 * SIZE
+    assert (pixels[height // 4 - 10, middle] == 50).all()
+    assert (pixels[3 * height // 4 - 10, middle] == 255).all()
 
 
 # The whole command
