@@ -335,14 +335,23 @@ def test_curves_are_drawn_for_each_task():
 def test_a_picture_shows_the_end_of_the_episode_and_not_the_next_start(name, device):
     problem, place = make_problem(name, quick=True), str(device)
     still = ZeroPolicy(problem.make_envs(1, device=device))
-    restless = RandomPolicy(problem.make_envs(1, device=device))
     shown = final_picture(problem, still, 3, device=place)
     assert shown.shape == (SIZE, SIZE, 3)
     # Nobody moves: the end is the start, of this episode and of no other.
     shorter = dataclasses.replace(problem, episode_steps=1)
     assert np.array_equal(shown, final_picture(shorter, still, 3, device=place))
     assert not np.array_equal(shown, final_picture(problem, still, 4, device=place))
-    assert not np.array_equal(shown, final_picture(problem, restless, 3, device=place))
+    first, again = (RandomPolicy(problem.make_envs(1, device=device)) for _ in range(2))
+    keywords = {**problem.keywords, "render_mode": "rgb_array", "render_size": SIZE}
+    envs = dataclasses.replace(problem, keywords=keywords, episode_steps=99).make_envs(
+        1, device=device
+    )
+    observation, _ = envs.reset(seed=[3])
+    for _ in range(problem.episode_steps):
+        observation, *_ = envs.step(first(observation))
+    (last,) = getattr(envs, "species_env", envs).render()
+    assert np.array_equal(last, final_picture(problem, again, 3, device=place))
+    assert not np.array_equal(last, shown)
 
 
 def test_a_strip_has_a_row_for_each_method_and_room_for_what_failed(tmp_path):
