@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import subprocess
 import sys
 import time
 
@@ -231,6 +232,22 @@ def test_no_run_begins_once_the_time_is_over(tmp_path, child):
     made, seen = plan(), []
     run_jobs(made, made.jobs(), tmp_path, Places(("cpu",)), max_seconds=0.2, written=seen.append)
     assert [one.job for one in seen] == made.jobs()[:1]
+
+
+def test_the_process_of_a_run_ends_with_the_comparison(tmp_path):
+    made = make_plan(
+        CompareOptions(quick=True, seconds=600.0, tasks=("mixing",), methods=("random", "gradient"))
+    )
+    job = next(job for job in made.jobs() if job.method == "gradient")
+    request = {"job": dataclasses.asdict(job), "facts": made.facts(job), "device": "cpu"}
+    (tmp_path / "request.json").write_text(json.dumps(request))
+    process = subprocess.Popen(
+        [*scheduler.PROGRAM, str(tmp_path)], stdin=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    _, said = process.communicate(timeout=100)
+    assert process.returncode == 1
+    assert b"Traceback" not in said
+    assert not (tmp_path / "run.json").exists()
 
 
 # Tables

@@ -7,7 +7,18 @@ import sys
 import threading
 from pathlib import Path
 
-from npa_envs.agents.comparison.run import run
+
+def main(folder: Path) -> None:
+    """Do what is asked for in a folder, unless the comparison ends before.
+
+    Args:
+        folder: The run's folder.
+    """
+    threading.Thread(target=_end_with_the_comparison, daemon=True).start()
+    # Not before, as it takes seconds.
+    from npa_envs.agents.comparison.run import run
+
+    run(folder)
 
 
 def _end_with_the_comparison() -> None:
@@ -17,5 +28,4 @@ def _end_with_the_comparison() -> None:
 
 
 if __name__ == "__main__":
-    threading.Thread(target=_end_with_the_comparison, daemon=True).start()
-    run(Path(sys.argv[1]))
+    main(Path(sys.argv[1]))
