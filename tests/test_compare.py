@@ -244,7 +244,10 @@ def test_the_process_of_a_run_ends_with_the_comparison(tmp_path):
     process = subprocess.Popen(
         [*scheduler.PROGRAM, str(tmp_path)], stdin=subprocess.PIPE, stderr=subprocess.PIPE
     )
-    _, said = process.communicate(timeout=100)
+    try:
+        _, said = process.communicate(timeout=100)
+    finally:
+        process.kill()
     assert process.returncode == 1
     assert b"Traceback" not in said
     assert not (tmp_path / "run.json").exists()
