@@ -14,6 +14,7 @@ import torch
 from gymnasium.utils.env_checker import check_env
 
 import npa_envs
+from npa_envs.agents.learning import METHODS, Budget, train
 from npa_envs.registration import ENVIRONMENTS
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -234,6 +235,30 @@ def test_the_code_about_several_species_runs():
     assert names["models"]["species_1"].num_timesteps == 2 * 16 * 8 * 16
     acted = names["policies"]["species_1"](names["rows"].vector_env.reset()[0]["species_1"])
     assert acted.shape == (8, 16, 6)
+
+
+def test_the_code_about_learning_runs(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    example, method, *_ = code_blocks(DOCS / "learning.md")
+    names = {}
+    # Less of it: what is tested is that it runs, and what needs no learning.
+    assert example.count("00_000") == 2
+    exec(compile(example.replace("00_000", "0_000"), "learning.md", "exec"), names)
+    told = capsys.readouterr().out.splitlines()
+    assert [line.split(":")[0] for line in told] == [
+        "zero", "random", "scripted", "gradient", "cold", "warm",
+    ]  # fmt: skip
+    page = (DOCS / "learning.md").read_text()
+    for line in told[1:3]:
+        name, mean = line.split(": ")[0], float(line.split()[1])
+        (printed,) = re.findall(rf"^\| `{name}` \| (\d\.\d+) ±", page, re.MULTILINE)
+        assert mean == pytest.approx(float(printed), abs=0.02)
+    assert (tmp_path / "grown" / "rule-0.safetensors").exists()
+    exec(compile(method, "learning.md", "exec"), names)
+    monkeypatch.setitem(METHODS, "own", "npa_envs:own")
+    monkeypatch.setattr(npa_envs, "own", names["train"], raising=False)
+    trained = train("own", names["problem"], Budget(particle_steps=2000), 0, noise=0.2, entries=1)
+    assert [entry.particle_steps for entry in trained.log] == [0, 2000]
 
 
 def test_the_code_about_3d_morphogenesis_runs(tmp_path, monkeypatch):

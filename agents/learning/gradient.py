@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -10,7 +9,7 @@ import torch
 
 from npa_envs.agents.learning.episode_task import episode_task
 from npa_envs.agents.learning.problem import Problem
-from npa_envs.agents.learning.progress import Progress
+from npa_envs.agents.learning.progress import Progress, annealed
 from npa_envs.agents.learning.rules import RuleSet, starting_rules
 from npa_envs.dynamics import Memory
 from npa_envs.rule import NPARule
@@ -30,8 +29,10 @@ class _Schedule(TrainConfig[Any]):
     """A trainer's configuration whose learning rate follows the budget."""
 
     progress: Progress
+    """The run's account."""
 
     last_rate: float
+    """Learning rate at the end, as a share of the first (dimensionless)."""
 
     def learning_rate_at(self, iteration: int) -> float:
         """Return the learning rate now: half a cosine over the budget.
@@ -39,9 +40,7 @@ class _Schedule(TrainConfig[Any]):
         Args:
             iteration: Iterations done so far; the budget counts, and not they.
         """
-        share = min(self.progress.share, 1.0)
-        wave = 0.5 * (1.0 + math.cos(math.pi * share))
-        return self.learning_rate * (self.last_rate + (1.0 - self.last_rate) * wave)
+        return annealed(self.learning_rate, self.last_rate, self.progress.share)
 
 
 def train(
@@ -55,7 +54,7 @@ def train(
     world_count: int = 8,
     pool_size: int | None = None,
     fresh_share: float = 0.25,
-    learning_rate: float = 2e-3,
+    learning_rate: float = 4e-3,
     last_rate: float = 0.05,
     normalise_gradients: bool = True,
     memory: Memory = "store",
@@ -123,7 +122,9 @@ def train(
     cycle = TrainingCycle(
         cast(Task, task), cast(NPARule, rules), config, device, schedule, task.rollout
     )
-    cycle.batch.run(steps[1] - 1)
+    # On CUDA every number of steps is a recording of its own.
+    for length in range(*steps) if device.type == "cuda" else (steps[0],):
+        cycle.batch.run(length)
     progress.start(rules)
     iteration = 0
     while not progress.over:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -234,6 +235,18 @@ class Progress:
     def _wait(self) -> None:
         if self._device.type == "cuda":
             torch.cuda.synchronize(self._device)
+
+
+def annealed(rate: float, last_rate: float, share: float) -> float:
+    """Return a learning rate that falls along half a cosine.
+
+    Args:
+        rate: At the beginning.
+        last_rate: At the end, as a share of the first (dimensionless).
+        share: Share of the budget that is spent; beyond 1 it stays.
+    """
+    wave = 0.5 * (1.0 + math.cos(math.pi * min(share, 1.0)))
+    return rate * (last_rate + (1.0 - last_rate) * wave)
 
 
 def check_finite(rules: RuleSet, particle_steps: int) -> None:

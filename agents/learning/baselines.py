@@ -1,0 +1,129 @@
+"""Methods that learn nothing: what a learning curve is to be compared with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import torch
+
+from npa_envs.agents.evaluation import evaluate_policy
+from npa_envs.agents.learning.problem import Problem
+from npa_envs.agents.learning.progress import Progress
+from npa_envs.agents.learning.rules import RuleSet
+from npa_envs.agents.policy import Policy
+from npa_envs.agents.scripted import (
+    MendPolicy,
+    PaintPolicy,
+    RandomPolicy,
+    SpreadPolicy,
+    ZeroPolicy,
+)
+from npa_envs.errors import NPAError
+
+SCRIPTED: tuple[Callable[..., Policy], ...] = (PaintPolicy, SpreadPolicy, MendPolicy)
+"""Policies to choose from."""
+
+GAINS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, -0.01, -0.03, -0.1, -0.3)
+"""Displacements at a perceived c^{1+D} ∇ρ / N of 1, as fractions of α ε; below 0 they gather."""
+
+
+def train_random(
+    problem: Problem,
+    progress: Progress,
+    seed: int,
+    *,
+    device: torch.device,
+    start: RuleSet | None = None,
+) -> Policy:
+    """Return the policy that acts at random; nothing is spent.
+
+    Args:
+        problem: Where it acts.
+        progress: The learning curve, which gets one entry.
+        seed: Of its actions.
+        device: Where the worlds are.
+        start: Not for this method.
+
+    Raises:
+        NPAError: There is something to start from.
+    """
+    _check_no_start(start)
+    policy = RandomPolicy(problem.make_envs(1, device=device), seed)
+    progress.start(policy)
+    return policy
+
+
+def train_zero(
+    problem: Problem,
+    progress: Progress,
+    seed: int,
+    *,
+    device: torch.device,
+    start: RuleSet | None = None,
+) -> Policy:
+    """Return the policy that does nothing; arguments and errors of `train_random`."""
+    _check_no_start(start)
+    policy = ZeroPolicy(problem.make_envs(1, device=device))
+    progress.start(policy)
+    return policy
+
+
+def train_scripted(
+    problem: Problem,
+    progress: Progress,
+    seed: int,
+    *,
+    device: torch.device,
+    start: RuleSet | None = None,
+    gains: tuple[float, ...] = GAINS,
+) -> Policy:
+    """Return the scripted policy that fits best; nothing is spent.
+
+    All of `SCRIPTED` that the problem's task allows play one episode in each of the problem's
+    worlds at each gain, from seeds that evaluations do not use. The best one is taken.
+
+    Args:
+        problem: Where it acts.
+        progress: The learning curve, which gets one entry.
+        seed: Of the first world in which policies are compared.
+        device: Where the worlds are.
+        start: Not for this method.
+        gains: How fast policies spread, as fractions of α ε, or gather where it is negative.
+
+    Raises:
+        NPAError: There is something to start from, or no scripted policy does better than nothing.
+    """
+    _check_no_start(start)
+    envs = problem.make_envs(device=device)
+    seeds = range(seed, seed + problem.num_envs)
+    best, most = None, 0.0
+    for policy in _candidates(envs, gains):
+        mean_return = evaluate_policy(envs, policy, seeds).mean_return
+        if mean_return > most:
+            best, most = policy, mean_return
+    if best is None:
+        raise NPAError(
+            f"method='scripted' has no policy that does better than nothing in {problem.env_id}: "
+            "compare with 'zero' and 'random' instead"
+        )
+    progress.start(best)
+    return best
+
+
+def _candidates(envs: Any, gains: tuple[float, ...]) -> Iterator[Policy]:
+    for make in SCRIPTED:
+        if make is PaintPolicy and not hasattr(envs.task, "goal"):
+            continue
+        if make is PaintPolicy and not hasattr(envs.task.goal, "target"):
+            continue
+        for gain in gains:
+            yield make(envs, gain=gain)
+
+
+def _check_no_start(start: RuleSet | None) -> None:
+    if start is not None:
+        raise NPAError(
+            "start must be None for a method that learns nothing: choose 'gradient', 'ppo', "
+            "'evolution' or 'clone'"
+        )

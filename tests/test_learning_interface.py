@@ -1,0 +1,338 @@
+"""Problems, sets of rules and joined species: what all learners share."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+from learning_problems import digits, heart, species, wild_rules
+
+import npa_envs
+from npa_envs.agents import (
+    RandomPolicy,
+    RulePolicy,
+    SpreadPolicy,
+    evaluate_policy,
+    interface_of,
+)
+from npa_envs.agents.learning import Problem, RuleSet
+from npa_envs.envs import multispecies_v0
+from npa_envs.errors import NPAError
+from npa_envs.registration import ENVIRONMENTS
+from npa_envs.rule import NPARule
+
+STEP_TOLERANCE = 2e-6
+"""As that of RulePolicy: largest difference of positions and states after a step."""
+
+
+def same_rules(ours, theirs):
+    pairs = zip(ours.state_dict().items(), theirs.state_dict().items(), strict=True)
+    return all(a == b and torch.equal(v, w) for (a, v), (b, w) in pairs)
+
+
+# Problems
+
+
+@pytest.mark.parametrize(
+    "problem",
+    [heart(), digits(), species(particle_counts=(20, 15), targets=("heart", "ring"),
+                                name="npa/CoMorphogenesis-v0")],
+    ids=lambda p: p.env_id,
+)  # fmt: skip
+def test_json_keeps_a_problem(problem):
+    again = Problem.from_json(problem.to_json())
+    assert again == problem
+    assert hash(again) == hash(problem)
+    assert again.counts == problem.counts
+
+
+def test_a_problem_is_another_one_where_anything_differs():
+    assert heart() != heart(eps=0.2)
+    assert heart() != dataclasses.replace(heart(), episode_steps=9)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"env_id": "npa/Mixng-v0"}, "did you mean 'npa/Mixing-v0'"),
+        ({"env_id": "CartPole-v1"}, "env_id must be of an environment of many worlds"),
+        ({"keywords": {"epsilon": 0.1}}, "unknown keyword 'epsilon'"),
+        ({"keywords": {"eps": -0.1}}, "eps must be"),
+        ({"keywords": {"device": "cuda"}}, "given to train and make_envs"),
+        ({"keywords": {"max_cycles": 3}}, "field episode_steps"),
+        ({"keywords": {"reward": "particle"}}, "row_rewards=True"),
+        ({"keywords": {"box_size": {1, 2}}}, "JSON"),
+        ({"keywords": [1]}, "keywords must map names"),
+        ({"episode_steps": 0}, "episode_steps"),
+        ({"num_envs": 1.5}, "num_envs"),
+    ],
+)
+def test_a_wrong_problem_is_refused_when_it_is_made(fields, message):
+    with pytest.raises(NPAError, match=message):
+        Problem(**({"env_id": "npa/Morphogenesis2D-v0", "episode_steps": 4} | fields))
+
+
+@pytest.mark.parametrize("text", ["{", "[1]", '{"env": 1}'])
+def test_json_of_something_else_is_refused(text):
+    with pytest.raises(NPAError, match="text must be"):
+        Problem.from_json(text)
+
+
+@pytest.mark.parametrize("name", [r.id for r in ENVIRONMENTS] + list(multispecies_v0.ENVIRONMENTS))
+def test_every_environment_is_a_problem_with_rules_that_fit(name):
+    problem = Problem(env_id=name, episode_steps=4)
+    rules = problem.new_rules(0)
+    assert [rule.perception_dim for rule in rules] == [problem.interface.perception_dim] * len(
+        problem.counts
+    )
+    assert {rule.update_dim for rule in rules} == {problem.interface.action_dim}
+    assert problem.spans[-1].stop == problem.particle_count
+
+
+@pytest.mark.parametrize("problem", [heart(), digits(), species(perception="per_species")])
+def test_a_problems_interface_is_that_of_its_environment(problem):
+    envs = problem.make_envs(2)
+    observation, _ = envs.reset(seed=0)
+    assert interface_of(envs) == problem.interface
+    assert observation.shape == (2, 48, problem.interface.perception_dim)
+
+
+def test_rows_are_paid_where_that_is_asked_for():
+    problem = heart()
+    rules = wild_rules(problem).policy()
+    envs = problem.make_envs(row_rewards=True)
+    observation, _ = envs.reset(seed=0)
+    _, reward, _, _, infos = envs.step(rules(observation))
+    assert reward.abs().min() > 1e-3
+    torch.testing.assert_close(infos["particle_reward"].mean(dim=1), reward, atol=1e-5, rtol=0.0)
+    with pytest.raises(NPAError, match="row_rewards"):
+        heart(reward="sparse").make_envs(row_rewards=True)
+
+
+# Sets of rules
+
+
+@pytest.mark.parametrize("problem", [heart(), heart(state_scale=0.1), digits()])
+def test_the_policy_of_one_rule_is_rule_policy_bit_for_bit(problem):
+    rules, envs = wild_rules(problem), problem.make_envs()
+    observation, _ = envs.reset(seed=0)
+    theirs = RulePolicy(next(iter(rules)), envs)
+    for _ in range(4):
+        action = rules.policy()(observation)
+        assert torch.equal(action, theirs(observation))
+        observation, *_ = envs.step(action)
+    assert action.abs().mean() > 0.01
+
+
+@pytest.mark.parametrize("problem", [heart(state_scale=0.1), digits(), species()])
+def test_the_mean_is_what_the_policy_does_but_for_clipping(problem):
+    rules, envs = wild_rules(problem, factor=30.0), problem.make_envs()
+    observation, _ = envs.reset(seed=0)
+    observation, *_ = envs.step(RandomPolicy(envs)(observation))
+    mean = rules.mean(observation)
+    torch.testing.assert_close(mean.clamp(-1.0, 1.0), rules.policy()(observation))
+    assert mean.abs().max() > 1.0
+    (bar,) = torch.autograd.grad(mean.sum(), [rules.rules[0].output.weight])
+    assert bar.abs().sum() > 0.0
+
+
+@pytest.mark.parametrize(
+    "problem",
+    [
+        species(particle_counts=(20, 15)),
+        species(particle_counts=(20, 15), perception="per_species", boundary="periodic"),
+        species("npa/Segregation-v0", species_count=3, alpha=0.3, update_prob=1.0),
+        heart(dt=0.5, position_noise=0.01, eps=0.2),
+    ],
+    ids=["two", "told apart", "three", "alone"],
+)
+def test_every_step_of_an_episode_is_a_step_of_the_rules_rollout(problem):
+    rules, envs = wild_rules(problem), problem.make_envs(1)
+    observation, _ = envs.reset(seed=5)
+    random = npa_envs.WorldRandom(5)
+    x, s, *_ = problem.make_task().start(random)
+    config, physics = problem.config, problem.physics
+    options = {
+        "eps": config.eps,
+        "box": physics.box,
+        "update_prob": config.update_prob,
+        "dt": config.dt,
+        "position_noise": config.position_noise,
+        "generator": random,
+        "counts": problem.counts,
+        "perception": getattr(config, "perception", "shared"),
+    }
+    for _ in range(problem.episode_steps - 1):
+        observation, *_ = envs.step(rules.policy()(observation))
+        with torch.no_grad():
+            x, s = npa_envs.rollout_species(list(rules), x, s, 1, **options)
+    own_x, own_s = particles(problem, envs)
+    assert (s - own_s).abs().max() < 8 * STEP_TOLERANCE
+    assert (x - own_x).abs().max() < 8 * STEP_TOLERANCE
+    assert own_s.abs().mean() > 0.01
+
+
+def particles(problem, envs):
+    if not problem.is_species:
+        return envs.particles()
+    state = envs.species_env.state()
+    return state[..., :2], state[..., 2:-1]
+
+
+def test_species_follow_rules_of_their_own():
+    problem = species(particle_counts=(20, 15))
+    rules, envs = wild_rules(problem), problem.make_envs()
+    observation, _ = envs.reset(seed=0)
+    together = rules.policy()(observation)
+    for rule, span in zip(rules, problem.spans, strict=True):
+        alone = RulePolicy(rule)(observation[:, span])
+        assert torch.equal(together[:, span], alone)
+    assert not torch.equal(*[RulePolicy(rule)(observation) for rule in rules])
+
+
+def test_rules_that_tell_species_apart_may_perceive_less_besides():
+    problem = species(perception="per_species")
+    envs = problem.make_envs()
+    observation, _ = envs.reset(seed=0)
+    observation, *_ = envs.step(wild_rules(problem).policy()(observation))
+    rule = NPARule(
+        2, 4, 16, eps0=0.25, state_gradient=False, density_gradient=False, species_count=2
+    )
+    # Own and mean states, then densities and their gradients of both species.
+    update = rule(torch.cat((observation[..., :8], observation[..., 18:]), dim=-1))
+    displacement = update[..., :2] / (1.0 + update[..., :2].norm(dim=-1, keepdim=True))
+    mean = RuleSet.of(problem, rule).mean(observation)
+    torch.testing.assert_close(mean, torch.cat((displacement, update[..., 2:]), dim=-1))
+
+
+def test_what_is_told_of_species_leaves_scripted_policies_as_they_are():
+    for step in range(3):
+        acting = {}
+        for perception in ("shared", "per_species"):
+            problem = species(perception=perception)
+            envs = problem.make_envs()
+            observation, _ = envs.reset(seed=step)
+            acting[perception] = SpreadPolicy(envs)(observation)
+        assert torch.equal(acting["shared"], acting["per_species"])
+        assert acting["shared"].abs().max() > 1e-3
+
+
+def test_files_keep_rules_bit_for_bit(tmp_path):
+    problem = species(particle_counts=(20, 15))
+    rules = wild_rules(problem)
+    paths = rules.save(tmp_path / "new" / "folder")
+    assert [path.name for path in paths] == ["rule-0.safetensors", "rule-1.safetensors"]
+    assert same_rules(RuleSet.load(tmp_path / "new" / "folder", problem), rules)
+    assert same_rules(RuleSet.of(problem, tmp_path / "new" / "folder"), rules)
+    # Each is an ordinary rule's file.
+    first = npa_envs.load_rule(paths[0])
+    assert torch.equal(first.hidden.weight, rules.rules[0].hidden.weight)
+
+
+def test_new_rules_follow_from_their_seed_alone():
+    torch.manual_seed(1)
+    ours, before = RuleSet.new(species(), 3), torch.random.get_rng_state()
+    theirs = RuleSet.new(species(), 3)
+    assert same_rules(ours, theirs)
+    assert torch.equal(before, torch.random.get_rng_state())
+    assert not same_rules(ours, RuleSet.new(species(), 4))
+    first, second = ours
+    assert not torch.equal(first.hidden.weight, second.hidden.weight)
+
+
+def test_a_shipped_rule_fits_where_the_world_is_like_its_own():
+    wide = {"state_dim": 16, "eps0": 0.1, "eps": 0.2}
+    rules = RuleSet.of(heart(**wide, particle_count=30, update_prob=0.7), "heart")
+    assert torch.equal(next(iter(rules)).hidden.weight, npa_envs.load_rule("heart").hidden.weight)
+    copies = RuleSet.of(species(**wide), npa_envs.load_rule("heart"))
+    assert copies.rules[0] is not copies.rules[1]
+
+
+@pytest.mark.parametrize(
+    ("problem", "source", "message"),
+    [
+        (heart(), "heart", "state_dim"),
+        (heart(state_dim=16), "heart", "eps0"),
+        (digits(state_dim=16), "heart", "static"),
+        (species(state_dim=16, eps0=0.1, perception="per_species"), "heart", "species apart"),
+        (species(state_dim=16, eps0=0.1), ["heart"] * 3, "one for each of 2 species"),
+        (heart(), "hart", "unknown rule"),
+    ],
+)
+def test_rules_that_do_not_fit_are_refused(problem, source, message):
+    with pytest.raises(NPAError, match=message):
+        RuleSet.of(problem, source)
+
+
+# Joined species
+
+
+def test_a_world_is_paid_the_mean_of_its_species_and_rows_what_their_species_is():
+    problem = species("npa/CoMorphogenesis-v0", particle_counts=(20, 15), resolution=16)
+    envs, apart = problem.make_envs(), multispecies_v0.batched(
+        "co_morphogenesis", world_count=3, max_cycles=8, output="torch", **problem.keywords
+    )  # fmt: skip
+    observation, infos = envs.reset(seed=1)
+    rows, own = apart.reset(seed=1)
+    assert torch.equal(observation, torch.cat(list(rows.values()), dim=1))
+    assert torch.equal(infos["loss"], (own["species_0"]["loss"] + own["species_1"]["loss"]) / 2)
+    policy = wild_rules(problem).policy()
+    for _ in range(3):
+        action = policy(observation)
+        observation, reward, _, _, infos = envs.step(action)
+        rows, paid, _, _, own = apart.step(
+            {f"species_{k}": action[:, span] for k, span in enumerate(problem.spans)}
+        )
+    assert torch.equal(observation, torch.cat(list(rows.values()), dim=1))
+    assert torch.equal(reward, (paid["species_0"] + paid["species_1"]) / 2)
+    assert reward.abs().min() > 0.0
+    by_row = infos["particle_reward"]
+    assert torch.equal(by_row[:, :20], paid["species_0"][:, None].expand(-1, 20))
+    assert torch.equal(by_row[:, 20:], paid["species_1"][:, None].expand(-1, 15))
+    assert infos["acted"].all()
+
+
+def test_joined_episodes_end_with_their_last_observations():
+    problem = species(episode_steps=3)
+    envs = problem.make_envs(2)
+    policy = wild_rules(problem).policy()
+    observation, start = envs.reset(seed=0)
+    total = torch.zeros(2)
+    for step in range(3):
+        observation, reward, terminated, truncated, infos = envs.step(policy(observation))
+        total += reward
+        assert truncated.tolist() == [step == 2] * 2
+        assert not terminated.any()
+    assert infos["_final_obs"].all()
+    assert infos["final_info"]["reason"].tolist() == ["time limit"] * 2
+    torch.testing.assert_close(start["loss"] - infos["final_info"]["loss"], total)
+    # What comes back is where the next episodes start: all states are zero again.
+    assert infos["final_obs"][..., :4].abs().sum() > 0.0
+    assert observation[..., :4].abs().sum() == 0.0
+
+
+def test_a_world_terminates_where_its_last_species_ends():
+    problem = species(deaths=[[0, 2], [1, 4]], episode_steps=8)
+    envs = problem.make_envs(2)
+    policy = wild_rules(problem).policy()
+    observation, _ = envs.reset(seed=0)
+    endings, losses, acting = [], [], []
+    for _ in range(4):
+        observation, _, terminated, truncated, infos = envs.step(policy(observation))
+        endings.append((bool(terminated.all()), bool(truncated.any())))
+        losses.append(infos["loss"])
+        acting.append(infos["acted"].float().mean().item())
+    assert endings == [(False, False)] * 3 + [(True, False)]
+    assert acting == [1.0, 1.0, 0.5, 0.5]
+    assert infos["final_info"]["reason"].tolist() == ["removed"] * 2
+    # Who is alone has a loss of 1, and the species that is gone keeps the one that it had.
+    assert (losses[3] > 0.6).all()
+
+
+def test_evaluation_runs_joined_species():
+    problem = species(episode_steps=3)
+    episodes = evaluate_policy(problem.make_envs(2), wild_rules(problem).policy(), range(5))
+    gained = episodes.start_losses - episodes.final_losses
+    assert gained == pytest.approx(episodes.returns, abs=1e-6)
+    assert set(episodes.endings) == {"time limit"}

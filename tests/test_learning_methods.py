@@ -1,0 +1,323 @@
+"""The gradient, cloning, and the methods that learn nothing: each learns what it should."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+from learning_problems import digits, heart, species, wild_rules
+
+import npa_envs
+from npa_envs.agents import MendPolicy, PaintPolicy, RandomPolicy, SpreadPolicy, evaluate_policy
+from npa_envs.agents.learning import Budget, Problem, RuleSet, train
+from npa_envs.agents.learning.clone import Demonstrations, unexplained
+from npa_envs.agents.learning.episode_task import EpisodeTask, episode_task
+from npa_envs.agents.learning.held import HeldRule, hold
+from npa_envs.envs.morphogenesis2d import PictureTask
+from npa_envs.envs.species.task import Population
+from npa_envs.errors import NPAError
+
+GRADIENT_TOLERANCE = 1e-6
+"""Of a directional derivative in float64 against a central difference; measured: 2e-9."""
+
+
+def run(problem, method="gradient", iterations=30, seed=0, worlds=4, **options):
+    """Train with a budget of so many iterations of a batch of worlds for a whole episode."""
+    steps = iterations * worlds * problem.particle_count * problem.episode_steps
+    budget = Budget(particle_steps=steps)
+    seeds = range(500, 503)
+    return train(method, problem, budget, seed, evaluation_seeds=seeds, entries=1, **options)
+
+
+def learned(problem, **options):
+    """Return the first and the last point of the gradient's learning curve."""
+    first, last = run(problem, world_count=4, learning_rate=1e-2, **options).log
+    return first, last
+
+
+# The gradient
+
+
+@pytest.mark.parametrize("name", ["npa/Mixing-v0", "npa/Segregation-v0"])
+@pytest.mark.parametrize("boundary", ["open", "periodic"])
+def test_the_entropy_of_species_has_the_gradient_of_its_differences(name, boundary):
+    problem = species(name, particle_counts=(20, 15), eps=0.15, boundary=boundary)
+    task = problem.make_task()
+    x, s = (t.double() for t in task.start(npa_envs.WorldRandom([1, 2])))
+    kinds = torch.arange(2).repeat_interleave(torch.tensor(problem.counts))
+
+    def loss(x):
+        parts = task.losses(Population(x, s, problem.counts, kinds))
+        return sum(part.mean() for part in parts.values())
+
+    (bar,) = torch.autograd.grad(loss(x.requires_grad_()), x)
+    assert torch.isfinite(bar).all()
+    generator = torch.Generator().manual_seed(0)
+    along = torch.randn(x.shape, dtype=x.dtype, generator=generator)
+    with torch.no_grad():
+        difference = (loss(x + 1e-6 * along) - loss(x - 1e-6 * along)) / 2e-6
+    assert abs(difference) > 1e-2
+    assert abs((bar * along).sum() - difference) < GRADIENT_TOLERANCE
+
+
+def test_held_numbers_are_clipped_and_let_gradients_lead_back():
+    values = torch.tensor([-3.0, -3.0, 0.5, 3.0, 3.0], requires_grad=True)
+    held = hold(values, 1.0)
+    assert held.tolist() == [-1.0, -1.0, 0.5, 1.0, 1.0]
+    held.backward(torch.tensor([2.0, -2.0, 2.0, 2.0, -2.0]))
+    # A step against the gradient would lead the first and the last further out.
+    assert values.grad.tolist() == [0.0, -2.0, 2.0, 2.0, 0.0]
+
+
+def test_a_held_rule_shares_its_weights():
+    (rule,) = wild_rules(heart())
+    held = HeldRule(rule, 0.1)
+    assert [id(p) for p in held.parameters()] == [id(p) for p in rule.parameters()]
+    z = torch.randn(50, rule.perception_dim)
+    torch.testing.assert_close(held(z)[:, :2], rule(z)[:, :2])
+    torch.testing.assert_close(held(z)[:, 2:], rule(z)[:, 2:].clamp(-0.1, 0.1))
+    assert (held(z)[:, 2:].abs() == 0.1).float().mean() > 0.3
+
+
+@pytest.mark.parametrize(
+    "problem",
+    [
+        heart(state_scale=0.1, position_noise=0.01),
+        digits(state_scale=0.1, dt=0.5),
+        species(state_scale=0.1, perception="per_species", particle_counts=(20, 15)),
+    ],
+    ids=lambda p: p.env_id,
+)
+def test_what_is_differentiated_is_the_environments_own_episode(problem):
+    rules, envs = wild_rules(problem), problem.make_envs(1)
+    observation, infos = envs.reset(seed=5)
+    largest = 0.0
+    task, random = episode_task(problem, torch.device("cpu")), npa_envs.WorldRandom(5)
+    x, s, *rest = problem.make_task().start(random)
+    if rest and rest[1] is not None:
+        task = task.toward(rest[1])
+    steps = problem.episode_steps - 1
+    for _ in range(steps):
+        largest = max(largest, rules.mean(observation).abs().max().item())
+        observation, _, _, _, infos = envs.step(rules.policy()(observation))
+    # State steps were clipped, and what follows is held alike.
+    assert largest > 1.5
+    x, s, path_length = task.rollout(
+        rules, x, s, steps,
+        eps=task.eps, box=task.box, update_prob=task.update_prob,
+        memory="store", generator=random, return_path_length=True,
+    )  # fmt: skip
+    loss, _ = task.loss(x, s, path_length)
+    assert loss.item() == pytest.approx(infos["loss"][0].item(), abs=2e-4)
+    bars = torch.autograd.grad(loss, [rule.output.weight for rule in rules])
+    assert all(bar.abs().sum() > 0.0 for bar in bars)
+
+
+def test_the_gradient_grows_what_looks_like_a_heart():
+    first, last = learned(heart())
+    assert last.final_loss < 0.55 * first.final_loss
+    assert last.mean_return > 0.4
+    assert last.mean_return - first.mean_return > 5 * last.standard_error
+
+
+def test_the_gradient_mixes_species():
+    first, last = learned(species(perception="per_species"))
+    assert last.final_loss < 0.5 * first.final_loss
+
+
+def test_the_gradient_parts_species_that_are_told_apart():
+    first, last = learned(species("npa/Segregation-v0", seed_distance=0, perception="per_species"))
+    assert last.final_loss < 0.6 * first.final_loss
+
+
+def test_the_gradient_tells_digits():
+    pytest.importorskip("sklearn")
+    first, last = learned(digits(), iterations=60)
+    # States that say nothing have 0.1.
+    assert first.final_loss > 0.099
+    assert last.final_loss < 0.093
+
+
+def test_the_gradient_heals():
+    problem = Problem(
+        env_id="npa/Regeneration2D-v0",
+        keywords=dict(heart().keywords, rule="picture", damage="erase"),
+        episode_steps=8,
+        num_envs=3,
+    )
+    first, last = learned(problem, iterations=40)
+    assert last.mean_return > first.mean_return + 0.01
+
+
+def test_long_episodes_are_learned_in_pieces():
+    first, last = learned(heart(episode_steps=12), steps=(3, 7), pool_size=8, fresh_share=0.5)
+    assert last.final_loss < 0.7 * first.final_loss
+
+
+def test_what_was_learned_is_better_in_another_world_than_nothing_and_gets_better_still():
+    rules = run(heart(), world_count=4, learning_rate=1e-2).rules
+    changed = heart(eps=0.22, particle_count=36, update_prob=0.8)
+    start = RuleSet.of(changed, list(rules))
+    before = copy.deepcopy(start.state_dict())
+    warm = run(changed, world_count=4, learning_rate=5e-3, iterations=15, start=start).log
+    cold = run(changed, world_count=4, learning_rate=5e-3, iterations=15).log
+    assert warm[0].final_loss < 0.8 * cold[0].final_loss
+    assert warm[-1].mean_return > warm[0].mean_return + warm[0].standard_error
+    assert warm[-1].final_loss < cold[-1].final_loss
+    assert all(torch.equal(before[name], weight) for name, weight in start.state_dict().items())
+
+
+def test_a_run_follows_from_its_seed():
+    problem = heart(episode_steps=4)
+    ours, theirs, other = (
+        run(problem, iterations=3, seed=seed, world_count=4).rules.rules[0].output.weight
+        for seed in (0, 0, 1)
+    )
+    assert torch.equal(ours, theirs)
+    assert not torch.equal(ours, other)
+
+
+def test_what_cannot_be_descended_is_refused():
+    with pytest.raises(NPAError, match="at each other's expense"):
+        run(species("npa/Invasion-v0", seed_distance=0.5))
+    with pytest.raises(NPAError, match="keep all particles"):
+        run(species(deaths=[[0, 2]]))
+    with pytest.raises(NPAError, match="start must be a RuleSet"):
+        run(heart(), start=next(iter(heart().new_rules(0))))
+
+
+def test_a_loss_without_a_gradient_is_refused(monkeypatch):
+    def counted(self, x, s):
+        return {"far": (x.norm(dim=-1) > 0.5).float().mean(dim=1)}
+
+    monkeypatch.setattr(PictureTask, "losses", counted)
+    with pytest.raises(NPAError, match="losses of PictureTask must be differentiable"):
+        run(heart())
+
+
+def test_the_loss_of_species_is_the_mean_of_theirs():
+    problem = species("npa/CoMorphogenesis-v0", particle_counts=(20, 15), resolution=16)
+    task = EpisodeTask(problem, torch.device("cpu"))
+    x, s = task.seed(2, generator=torch.Generator().manual_seed(0), device=torch.device("cpu"))
+    loss, parts = task.loss(x, s, x.new_zeros(2, 35))
+    kinds = torch.arange(2).repeat_interleave(torch.tensor(problem.counts))
+    own = problem.make_task().losses(Population(x, s, problem.counts, kinds))
+    assert float(loss) == pytest.approx(float((own["density"] + own["colour"]).mean()))
+    assert set(parts) == {"density", "colour"}
+
+
+# Cloning
+
+
+def test_a_clone_does_what_its_teacher_does():
+    problem = heart(episode_steps=6)
+    teacher = wild_rules(problem, seed=1)
+    options = {"collect_steps": 6, "worlds": 3, "teacher": teacher}
+    rules = run(problem, "clone", iterations=40, **options).rules
+    envs = problem.make_envs()
+    observation, _ = envs.reset(seed=900)
+    for _ in range(4):
+        observation, *_ = envs.step(teacher.policy()(observation))
+    left = unexplained(rules, observation, teacher.policy()(observation))
+    assert left < 0.05
+    seeds = range(900, 906)
+    taught, clone, untaught = (
+        evaluate_policy(envs, one.policy(), seeds).mean_return
+        for one in (teacher, rules, problem.new_rules(0))
+    )
+    assert abs(clone - taught) < 0.1 * abs(untaught - taught)
+
+
+def test_species_are_cloned_each_by_its_own_rule():
+    problem = species(episode_steps=6)
+    teacher = wild_rules(problem, seed=1)
+    options = {"collect_steps": 6, "worlds": 3, "teacher": teacher}
+    rules = run(problem, "clone", iterations=20, **options).rules
+    observation, _ = problem.make_envs().reset(seed=900)
+    action = teacher.policy()(observation)
+    assert unexplained(rules, observation, action) < 0.2
+    swapped = RuleSet(list(rules)[::-1], problem.counts, problem.interface)
+    assert unexplained(swapped, observation, action) > 1.0
+
+
+def test_demonstrations_keep_the_last_worlds():
+    seen, done = torch.zeros(2, 3, 4), torch.zeros(2, 3, 2)
+    shown = Demonstrations(5, seen, done)
+    generator = torch.Generator().manual_seed(0)
+    for number in range(1, 5):
+        shown.add(seen + number, done - number)
+        observation, action = shown.draw(64, generator)
+        kept = set(range(1, number + 1)) if number < 3 else set(range(number - 2, number + 1))
+        assert {int(k) for k in observation[:, 0, 0]} == kept
+        assert torch.equal(observation[:, 0, 0], -action[:, 0, 0])
+
+
+def test_what_is_unexplained_is_0_for_the_teacher_and_1_for_its_mean():
+    problem = heart()
+    rules = wild_rules(problem)
+    observation, _ = problem.make_envs().reset(seed=0)
+    action = rules.mean(observation).detach()
+    assert unexplained(rules, observation, action).item() == 0.0
+    shifted = action + action.flatten(0, 1).std(dim=0, correction=0)
+    assert unexplained(rules, observation, shifted).item() == pytest.approx(1.0, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({}, "teacher must be given"),
+        ({"teacher": "heart", "student_share": 1.5}, "student_share"),
+        ({"teacher": "heart", "kept_steps": 2}, "kept_steps must be at least collect_steps"),
+        ({"teacher": "heart", "updates": 0}, "updates"),
+        ({"teacher": "heart"}, "state_dim"),
+    ],
+)
+def test_a_wrong_way_to_clone_is_refused(options, message):
+    with pytest.raises(NPAError, match=message):
+        run(heart(), "clone", **options)
+
+
+# Nothing to learn
+
+
+def test_methods_that_learn_nothing_evaluate_once():
+    problem = heart(state_scale=0.1)
+    random, zero = (run(problem, method) for method in ("random", "zero"))
+    assert random.rules is None
+    assert isinstance(random.policy, RandomPolicy)
+    assert len(random.log) == len(zero.log) == 1
+    assert zero.log[0].mean_return == 0.0
+    assert random.log[0].mean_return != 0.0
+
+
+@pytest.mark.parametrize(
+    ("problem", "kind"),
+    [
+        (heart(episode_steps=16), PaintPolicy),
+        (species(episode_steps=16), SpreadPolicy),
+        (species("npa/Symbiosis-v0", episode_steps=16, resolution=16), PaintPolicy),
+    ],
+    ids=lambda p: getattr(p, "env_id", ""),
+)
+def test_the_scripted_policy_that_fits_is_found(problem, kind):
+    trained = run(problem, "scripted", gains=(0.03, -0.03))
+    assert type(trained.policy) is kind
+    assert trained.log[0].mean_return > 0.0
+
+
+def test_where_no_script_helps_there_is_none():
+    pytest.importorskip("sklearn")
+    with pytest.raises(NPAError, match="no policy that does better than nothing"):
+        run(digits(), "scripted", gains=(0.01,))
+
+
+def test_mending_is_known_where_pictures_are_damaged():
+    keywords = dict(heart().keywords, rule="picture", damage="erase", particle_count=200, eps=0.15)
+    problem = Problem(env_id="npa/Regeneration2D-v0", keywords=keywords, episode_steps=8)
+    assert type(run(problem, "scripted", gains=(0.001,)).policy) is MendPolicy
+
+
+def test_what_learns_nothing_starts_from_nothing():
+    with pytest.raises(NPAError, match="start must be None"):
+        run(heart(), "zero", start=heart().new_rules(0))

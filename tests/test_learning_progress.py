@@ -1,0 +1,191 @@
+"""Budgets, learning curves, and the table of methods."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+import torch
+from learning_problems import heart, wild_rules
+
+from npa_envs.agents import evaluate_policy
+from npa_envs.agents.learning import (
+    METHODS,
+    Budget,
+    Progress,
+    method_options,
+    train,
+)
+from npa_envs.agents.learning.progress import annealed
+from npa_envs.errors import DivergedError, NPAError
+
+ITERATION = 480
+"""Particle-steps of an iteration of the learner below."""
+
+
+def progress_of(problem, seeds=range(100, 103), **given):
+    budget = Budget(**{k: given.pop(k) for k in ("seconds", "particle_steps") if k in given})
+    return Progress(problem, budget, device="cpu", evaluation_seeds=seeds, **given)
+
+
+def learn_nothing(progress, rules, pause=0.0):
+    """Spend a budget as a learner does."""
+    progress.start(rules)
+    while not progress.over:
+        time.sleep(pause)
+        progress.advance(ITERATION)
+        progress.look(rules)
+    progress.look(rules, force=True)
+    return progress.log
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({}, "must say something"),
+        ({"seconds": 0.0}, "seconds must be"),
+        ({"seconds": float("nan")}, "seconds must be"),
+        ({"particle_steps": -1}, "particle_steps must be"),
+        ({"particle_steps": 1.5}, "particle_steps must be"),
+    ],
+)
+def test_a_budget_that_means_nothing_is_refused(fields, message):
+    with pytest.raises(NPAError, match=message):
+        Budget(**fields)
+
+
+def test_particle_steps_are_kept_up_to_one_iteration():
+    problem = heart(episode_steps=2)
+    rules = problem.new_rules(0)
+    log = learn_nothing(progress_of(problem, particle_steps=10_000, entries=5), rules)
+    assert 10_000 <= log[-1].particle_steps < 10_000 + ITERATION
+    # At the start, and at the first iteration after each fifth.
+    assert [entry.particle_steps for entry in log] == [0, 2400, 4320, 6240, 8160, 10080]
+
+
+def test_time_is_kept_and_evaluations_take_none_of_it():
+    problem = heart(episode_steps=2)
+    rules = problem.new_rules(0)
+
+    def slow(entry):
+        time.sleep(0.2)
+
+    progress = progress_of(problem, seconds=0.2, entries=4, on_entry=slow)
+    begun = time.perf_counter()
+    log = learn_nothing(progress, rules, pause=0.01)
+    assert time.perf_counter() - begun > 5 * 0.2 + 0.2
+    assert len(log) == 5
+    assert log[0].seconds == 0.0
+    assert 0.2 <= log[-1].seconds < 0.3
+    assert [entry.seconds for entry in log] == sorted(entry.seconds for entry in log)
+
+
+def test_whichever_is_spent_first_ends_it():
+    problem = heart(episode_steps=2)
+    progress = progress_of(problem, seconds=1000.0, particle_steps=1000)
+    assert learn_nothing(progress, problem.new_rules(0))[-1].seconds < 10.0
+
+
+def test_entries_are_evaluations_from_the_seeds_given():
+    problem = heart()
+    rules = wild_rules(problem)
+    log = learn_nothing(progress_of(problem, particle_steps=1000, entries=1), rules)
+    episodes = evaluate_policy(problem.make_envs(), rules.policy(), range(100, 103))
+    for entry in log:
+        assert entry.mean_return == episodes.mean_return
+        assert entry.standard_error == episodes.standard_error
+        assert entry.final_loss == pytest.approx(episodes.final_losses.mean())
+    assert len(log) == 2
+
+
+def test_a_forced_look_after_nothing_was_done_adds_no_entry():
+    problem = heart(episode_steps=2)
+    rules = problem.new_rules(0)
+    progress = progress_of(problem, particle_steps=1000, entries=2)
+    progress.start(rules)
+    progress.look(rules, force=True)
+    assert len(progress.log) == 1
+    progress.advance(1)
+    progress.look(rules)
+    assert len(progress.log) == 1
+    progress.look(rules, force=True)
+    assert len(progress.log) == 2
+
+
+def test_progress_has_to_start_first_and_once():
+    problem = heart(episode_steps=2)
+    rules = problem.new_rules(0)
+    progress = progress_of(problem, particle_steps=1000)
+    with pytest.raises(NPAError, match="advance needs a start"):
+        progress.advance(1)
+    with pytest.raises(NPAError, match="look needs a start"):
+        progress.look(rules)
+    progress.start(rules)
+    with pytest.raises(NPAError, match="start once"):
+        progress.start(rules)
+
+
+@pytest.mark.parametrize(("fields", "word"), [({"entries": 0}, "entries"), ({"seeds": []}, "seed")])
+def test_a_curve_without_points_is_refused(fields, word):
+    with pytest.raises(NPAError, match=word):
+        progress_of(heart(), particle_steps=10, **fields)
+
+
+def test_rules_that_diverged_are_reported():
+    problem = heart(episode_steps=2)
+    rules = problem.new_rules(0)
+    progress = progress_of(problem, particle_steps=1000)
+    progress.start(rules)
+    with torch.no_grad():
+        rules.rules[0].output.weight[3, 5] = torch.nan
+    progress.advance(96)
+    with pytest.raises(DivergedError, match=r"1 of \d+ in 'output.weight' of rule 0 .* after 96"):
+        progress.look(rules, force=True)
+
+
+def test_learning_rates_fall_from_the_first_to_the_last():
+    rates = [annealed(2e-3, 0.1, share) for share in (0.0, 0.25, 0.5, 0.75, 1.0, 1.3)]
+    assert rates[0] == 2e-3
+    assert rates[2] == pytest.approx(1.1e-3)
+    assert rates[-1] == rates[-2] == pytest.approx(2e-4)
+    assert rates == sorted(rates, reverse=True)
+
+
+@pytest.mark.parametrize(
+    ("method", "options", "message"),
+    [
+        ("gradients", {}, "did you mean 'gradient'"),
+        ("gradient", {"learning_rat": 1.0}, "did you mean 'learning_rate'"),
+        ("zero", {"learning_rate": 1.0}, "has no option 'learning_rate'"),
+        ("zero", {"device": "tpu"}, "device"),
+    ],
+)
+def test_unknown_methods_and_options_are_refused(method, options, message):
+    with pytest.raises(NPAError, match=message):
+        train(method, heart(), Budget(particle_steps=10), 0, **options)
+
+
+def test_a_seed_must_be_one():
+    with pytest.raises(NPAError, match="seed must be"):
+        train("zero", heart(), Budget(particle_steps=10), -1)
+
+
+def test_options_are_named_with_their_defaults():
+    assert method_options("gradient")["world_count"] == 8
+    assert method_options("zero") == {}
+
+
+def test_a_method_of_ones_own_is_a_row_of_the_table(monkeypatch):
+    monkeypatch.setitem(METHODS, "own", f"{__name__}:train_wildly")
+    trained = train("own", heart(), Budget(particle_steps=10), 3, factor=2.0)
+    assert trained.rules is not None
+    assert len(trained.log) == 1
+    assert torch.equal(
+        trained.rules.rules[0].output.weight, wild_rules(heart(), 3, 2.0).rules[0].output.weight
+    )
+
+
+def train_wildly(problem, progress, seed, *, device, start=None, factor=1.0):
+    rules = wild_rules(problem, seed, factor).to(device)
+    progress.start(rules)
+    return rules
