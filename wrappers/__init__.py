@@ -23,6 +23,7 @@ if TYPE_CHECKING:
         TorchRecordEpisodeStatistics,
     )
     from npa_envs.wrappers.torchrl import NPATorchRLEnv as NPATorchRLEnv
+    from npa_envs.wrappers.world_rows import WorldVecEnv as WorldVecEnv
 
 __all__ = [
     "DamageEvents",
@@ -44,6 +45,7 @@ ON_REQUEST = (
     "RowPolicy",
     "RslRlParticleEnv",
     "SpeciesVecEnv",
+    "WorldVecEnv",
 )
 
 
@@ -64,6 +66,10 @@ def __getattr__(name: str) -> Any:
         from npa_envs.wrappers import rsl_rl
 
         return rsl_rl.RslRlParticleEnv
+    if name == "WorldVecEnv":
+        from npa_envs.wrappers import world_rows
+
+        return world_rows.WorldVecEnv
     if name in ON_REQUEST:
         from npa_envs.wrappers import species_rows
 

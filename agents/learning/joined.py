@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 from torch import Tensor
@@ -79,6 +80,8 @@ class JoinedSpeciesEnv:
         """Worlds B."""
         self.config = env.config
         """Its configuration."""
+        self.render_mode = env.render_mode
+        """What `species_env.render()` returns."""
         self.task = env.worlds.task
         """Starts and losses."""
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
@@ -88,6 +91,10 @@ class JoinedSpeciesEnv:
         spans = [slice(end - n, end) for end, n in zip(ends, env.config.counts, strict=True)]
         self.spans = dict(zip(env.agents, spans, strict=True))
         """Where each species' particles stand."""
+        self.single_observation_space = _joined_space(env.single_observation_spaces)
+        """Space of one world's observations, shape [N, P]."""
+        self.single_action_space = _joined_space(env.single_action_spaces)
+        """Space of one world's actions, shape [N, A]."""
         self._loss = torch.zeros(self.num_envs, len(spans), device=device)
 
     @property
@@ -172,3 +179,12 @@ class JoinedSpeciesEnv:
             if own is not None:
                 reasons = np.where(reasons == None, own, reasons)  # noqa: E711
         return reasons
+
+
+def _joined_space(spaces: Mapping[str, Any]) -> Box:
+    """Return the space of all species' particles, one after the other."""
+    low, high = (
+        np.concatenate([getattr(space, bound) for space in spaces.values()])
+        for bound in ("low", "high")
+    )
+    return Box(low, high, dtype=np.float32)

@@ -1,0 +1,108 @@
+"""Rules that explore: Gaussian actions around what the rules would do."""
+
+from __future__ import annotations
+
+import copy
+import math
+
+import torch
+from torch import Tensor, nn
+
+from npa_envs.agents.learning.rules import RuleSet
+
+HALF_LOG_TAU = 0.5 * math.log(2.0 * math.pi)
+"""Constant of the logarithm of a Gaussian's density."""
+
+
+def gaussian_log_prob(mean: Tensor, log_std: Tensor, action: Tensor) -> Tensor:
+    """Return the log-probability of each row of actions, shape [...].
+
+    Args:
+        mean: Shape [..., A].
+        log_std: Logarithms of the standard deviations, likewise, or broadcast to it.
+        action: What was done, like the mean.
+    """
+    noise = (action - mean) * torch.exp(-log_std)
+    return -(0.5 * noise.square() + log_std + HALF_LOG_TAU).sum(dim=-1)
+
+
+class GaussianRules(nn.Module):
+    """Rules as the mean of Gaussian actions, whose standard deviations do not depend on the state.
+
+    Each particle has a likelihood of its own, summed over its action's columns. That of a world is
+    the mean over its particles, never the sum: with N A columns the ratio of two sums is far from
+    one after the smallest update.
+
+    Args:
+        rules: Means; copied, so the caller's stay as they are.
+        initial_std: Standard deviation of every action column at first (dimensionless).
+    """
+
+    row_species: Tensor
+
+    def __init__(self, rules: RuleSet, initial_std: float) -> None:
+        super().__init__()
+        self.rules = copy.deepcopy(rules)
+        """What acts without exploration."""
+        widths = [rule.update_dim for rule in self.rules]
+        start = torch.full((len(widths), widths[0]), math.log(initial_std))
+        self.log_std = nn.Parameter(start)
+        """Logarithms of the standard deviations, a row for each species, shape [K, A]."""
+        counts = [span.stop - span.start for span in self.rules.spans]
+        kinds = torch.arange(len(widths)).repeat_interleave(torch.tensor(counts))
+        self.register_buffer("row_species", kinds, persistent=False)
+        # The same rules one by one, not registered a second time.
+        self._each = tuple(RuleSet([rule], [1], self.rules.interface) for rule in self.rules)
+
+    def row_log_std(self) -> Tensor:
+        """Return the logarithms of the standard deviations of every particle, shape [N, A]."""
+        return self.log_std[self.row_species]
+
+    def sample(
+        self, observation: Tensor, generator: torch.Generator | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Draw actions, and return them with their log-probabilities.
+
+        Args:
+            observation: Shape [M, N, P].
+            generator: Where the noise comes from, on the observation's device; None: torch's own.
+
+        Returns:
+            Actions [M, N, A], not clipped, and log-probabilities [M, N].
+        """
+        mean, log_std = self.rules.mean(observation), self.row_log_std()
+        noise = torch.randn(mean.shape, generator=generator, device=mean.device)
+        action = mean + log_std.exp() * noise
+        return action, gaussian_log_prob(mean, log_std, action)
+
+    def log_prob(self, observation: Tensor, action: Tensor) -> Tensor:
+        """Return the log-probability of each particle's action, shape [M, N].
+
+        Args:
+            observation: Shape [M, N, P].
+            action: Shape [M, N, A].
+        """
+        return gaussian_log_prob(self.rules.mean(observation), self.row_log_std(), action)
+
+    def row_mean(self, species: int, rows: Tensor) -> Tensor:
+        """Return what particles of one species would do without exploration, shape [K, A].
+
+        Args:
+            species: Its number.
+            rows: What they perceive, shape [K, P].
+        """
+        return self._each[species].mean(rows[:, None])[:, 0]
+
+    def row_log_prob(self, species: int, rows: Tensor, action: Tensor) -> Tensor:
+        """Return the log-probability of the actions of particles of one species, shape [K].
+
+        Args:
+            species: Its number.
+            rows: What they perceive, shape [K, P].
+            action: What they did, shape [K, A].
+        """
+        return gaussian_log_prob(self.row_mean(species, rows), self.log_std[species], action)
+
+    def entropy(self) -> Tensor:
+        """Return the mean entropy of a particle's action [nats]."""
+        return (self.row_log_std() + HALF_LOG_TAU + 0.5).sum(dim=-1).mean()

@@ -1,0 +1,140 @@
+"""Options of the device's own PPO."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+from npa_envs.agents.learning.critics import CriticKind
+from npa_envs.agents.learning.rules import RuleSet
+from npa_envs.errors import NPAError, suggest
+from npa_envs.tasks.checks import check_fraction, check_non_negative, check_positive
+
+FRESH = {"learning_rate": 1e-3, "initial_std": 0.3, "critic_rounds": 0}
+"""What options are where they are None, with fresh rules."""
+
+WARM = {"learning_rate": 1e-4, "initial_std": 0.05, "critic_rounds": 4}
+"""The same with rules to begin with: noise, haste and a raw critic would undo what they can do."""
+
+CHOICES = {
+    "ratio": ("particle", "world"),
+    "credit": ("world", "particle"),
+    "critic": ("particle", "central"),
+}
+"""Options that take one of a few words."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """Options of `train`."""
+
+    steps: int = 16
+    """Steps of all worlds in a round, T."""
+
+    epochs: int = 4
+    """Passes over a round; fewer where `target_kl` is passed."""
+
+    minibatches: int = 16
+    """Parts that the particles of a round are shuffled into in each pass; for the critic, and where
+    a world has one ratio, its worlds are."""
+
+    learning_rate: float | None = None
+    """Adam's step of the rules at the start, from which it falls to zero over the budget; None:
+    0.001, or 0.0001 with a `start`."""
+
+    critic_learning_rate: float = 1e-3
+    """The same for the critic."""
+
+    gamma: float = 0.7
+    """Discount of a reward one step later (dimensionless)."""
+
+    gae_lambda: float = 0.9
+    """Discount of what the critic did not foresee, besides `gamma` (dimensionless)."""
+
+    clip: float | None = None
+    """Ratios of likelihoods count up to 1 plus or minus this (dimensionless). None: 0.2, or 0.02
+    for a world's, whose logarithms are means over many particles."""
+
+    entropy_weight: float = 0.0
+    """Weight of the entropy of a particle's action in what is maximised."""
+
+    max_gradient_norm: float = 0.5
+    """Gradients of the rules, and those of the critic, are shortened to this norm."""
+
+    target_kl: float | None = 0.05
+    """The rules stay as they are for the rest of a round once particles' actions are farther than
+    this from those that were played [nats]; None: no limit."""
+
+    initial_std: float | None = None
+    """Standard deviation of every action column at first; None: 0.3, or 0.05 with a `start`."""
+
+    critic_rounds: int | None = None
+    """Rounds in which the critic learns alone; None: 0, or 4 with a `start`."""
+
+    ratio: Literal["particle", "world"] = "particle"
+    """Each particle has a ratio of its own, or a world has one, of mean log-probabilities."""
+
+    credit: Literal["world", "particle"] = "world"
+    """Each particle is paid what its world is, or its own share."""
+
+    critic: CriticKind = "particle"
+    """A value follows from a particle's own perception, or from its whole world ("central")."""
+
+    critic_width: int = 64
+    """Units in a hidden layer of the critic."""
+
+    def __post_init__(self) -> None:
+        """Check every field.
+
+        Raises:
+            NPAError: One lies outside its range.
+        """
+        check_positive(self, int, "steps", "epochs", "minibatches", "critic_width")
+        check_positive(self, float, "max_gradient_norm")
+        check_non_negative(self, "critic_learning_rate", "entropy_weight")
+        check_fraction(self, "gamma", "gae_lambda")
+        for name in ("clip", "learning_rate", "target_kl", "initial_std"):
+            if getattr(self, name) is not None:
+                check_positive(self, float, name)
+        if self.critic_rounds is not None:
+            check_positive(self, int, "critic_rounds", at_least=0)
+        check_words(self, *CHOICES)
+        if self.ratio == "world" and self.credit == "particle":
+            raise NPAError(
+                "credit='particle' needs ratio='particle': one ratio a world has one advantage"
+            )
+
+    @property
+    def largest_change(self) -> float:
+        """How far ratios count from 1."""
+        if self.clip is not None:
+            return self.clip
+        return 0.2 if self.ratio == "particle" else 0.02
+
+
+def check_words(settings: object, *names: str) -> None:
+    """Check that options are among the words that they can be.
+
+    Args:
+        settings: What has them.
+        names: Names from `CHOICES`.
+
+    Raises:
+        NPAError: One is not.
+    """
+    for name in names:
+        word, words = getattr(settings, name), CHOICES[name]
+        if word not in words:
+            raise NPAError(f"{name} must be a known word, got {word!r}: {suggest(word, words)}")
+
+
+def filled(settings: Any, start: RuleSet | None) -> Any:
+    """Return options with those of `FRESH` or `WARM` where they are None.
+
+    Args:
+        settings: A dataclass with these options.
+        start: Rules to begin with; None: fresh ones.
+    """
+    defaults = FRESH if start is None else WARM
+    missing = {k: value for k, value in defaults.items() if getattr(settings, k) is None}
+    return replace(settings, **missing)

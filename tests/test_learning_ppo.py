@@ -1,0 +1,396 @@
+"""PPO in its forms: on the device, and Stable-Baselines3's over particles and over worlds."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from npa_envs.agents import RandomPolicy, evaluate_policy
+from npa_envs.agents.learning import Budget, Problem, Progress, RuleSet, method_options, train
+from npa_envs.agents.learning.advantages import (
+    clipped_gain,
+    generalised_advantages,
+    over_particles,
+    standardised,
+)
+from npa_envs.agents.learning.critics import Critic
+from npa_envs.agents.learning.gaussian import GaussianRules
+from npa_envs.agents.learning.ppo import Learner
+from npa_envs.agents.learning.ppo_settings import Settings, filled
+from npa_envs.errors import NPAError
+
+HEART = Problem(
+    env_id="npa/Morphogenesis2D-v0",
+    keywords={
+        "target": "heart",
+        "particle_count": 64,
+        "eps": 0.2,
+        "seed_radius": 0.45,
+        "colour_weight": 20.0,
+        "state_dim": 4,
+        "state_scale": 0.1,
+        "resolution": 32,
+    },
+    episode_steps=16,
+    num_envs=8,
+)
+ROUND = 16 * 8 * 64
+MIXING = Problem(
+    env_id="npa/Mixing-v0",
+    keywords={"particle_counts": [12, 20], "eps": 0.3, "state_dim": 4, "state_scale": 0.1},
+    episode_steps=8,
+    num_envs=4,
+)
+SEEDS = range(100, 116)
+
+FORMS = {
+    "device": ("ppo", {}),
+    "device, by worlds": ("ppo", {"ratio": "world", "critic": "central"}),
+    "rows": ("ppo_rows", {}),
+    "rows, central critic": ("ppo_rows", {"critic": "central"}),
+    "worlds": ("ppo_world", {}),
+}
+EVERY_FORM = pytest.mark.parametrize("form", FORMS)
+
+
+def learner(problem=HEART, start=None, **options):
+    return Learner(problem, Settings(**options), 0, torch.device("cpu"), start)
+
+
+def run(form, problem, budget, seed=0, **keywords):
+    method, options = FORMS[form]
+    return train(
+        method,
+        problem,
+        Budget(particle_steps=budget),
+        seed,
+        evaluation_seeds=SEEDS,
+        entries=1,
+        **options,
+        **keywords,
+    )
+
+
+@EVERY_FORM
+def test_every_form_learns_to_grow_and_colour_particles(form):
+    pytest.importorskip("stable_baselines3")
+    rounds = 12 if form.startswith("device") else 8
+    first, last = run(form, HEART, rounds * ROUND).log
+    envs = HEART.make_envs()
+    by_chance = evaluate_policy(envs, RandomPolicy(envs), SEEDS)
+    # Doing nothing gives 0, and the best of all learners about 2.
+    assert last.particle_steps == rounds * ROUND
+    assert first.mean_return < 0.0
+    assert last.mean_return > 0.05
+    for other in (0.0, by_chance.mean_return, first.mean_return):
+        assert last.mean_return - other > 5.0 * math.hypot(
+            last.standard_error, by_chance.standard_error
+        )
+
+
+@pytest.mark.slow
+def test_more_steps_bring_a_return_of_more_than_half_of_what_the_gradient_finds():
+    longer = Problem(
+        env_id=HEART.env_id,
+        keywords=dict(HEART.keywords) | {"seed_radius": 0.4, "resolution": 64},
+        episode_steps=32,
+        num_envs=16,
+    )
+    trained = train("ppo", longer, Budget(particle_steps=1_500_000), 0, entries=1, gamma=0.5)
+    assert trained.log[-1].mean_return > 1.2
+
+
+@EVERY_FORM
+def test_every_form_trains_a_rule_for_each_species(form):
+    pytest.importorskip("stable_baselines3")
+    trained = run(form, MIXING, 2 * 16 * 4 * 32)
+    fresh = MIXING.new_rules(0)
+    for new, old in zip(trained.rules, fresh, strict=True):
+        assert torch.isfinite(new.output.weight).all()
+        assert not torch.equal(new.output.weight, old.output.weight)
+
+
+@pytest.mark.parametrize("problem", [HEART, MIXING], ids=["heart", "mixing"])
+def test_the_deterministic_policy_of_either_row_form_is_the_exported_rules(problem):
+    pytest.importorskip("stable_baselines3")
+    from npa_envs.agents.learning import sb3_rows, sb3_world
+    from npa_envs.wrappers import WorldVecEnv
+
+    rules = problem.new_rules(1)
+    with torch.no_grad():
+        for rule in rules:
+            rule.output.weight.mul_(20.0)
+    worlds = WorldVecEnv(problem.make_envs())
+    worlds.seed(3)
+    seen = worlds.reset()
+    wanted = rules.policy()(seen)
+    assert np.abs(wanted).max() > 0.1
+    spaces = (worlds.observation_space, worlds.action_space, lambda _: 1e-3)
+    policy = sb3_world.WorldRulePolicy(*spaces, rules=rules)
+    np.testing.assert_allclose(policy.predict(seen, deterministic=True)[0], wanted, atol=1e-6)
+    for critic in ("particle", "central"):
+        rows = sb3_rows.make_rows(problem, sb3_rows.RowSettings(critic=critic), "cpu")
+        rows.seed(3)
+        policy = sb3_rows.RowRulePolicy(
+            rows.observation_space, rows.action_space, lambda _: 1e-3, rules=rules
+        )
+        acted = policy.predict(rows.reset(), deterministic=True)[0]
+        np.testing.assert_allclose(acted.reshape(wanted.shape), wanted, atol=1e-6)
+
+
+def test_what_the_device_s_ppo_exports_is_the_mean_that_it_explores_around(tmp_path):
+    given = learner(MIXING)
+    batch = given.play()
+    given.improve(batch, 1.0)
+    given.actor.rules.save(tmp_path)
+    read = RuleSet.load(tmp_path, MIXING)
+    seen = batch.observations[:4]
+    with torch.no_grad():
+        given.actor.log_std.fill_(-30.0)
+        drawn, _ = given.actor.sample(seen)
+        torch.testing.assert_close(read.mean(seen), drawn, rtol=0.0, atol=1e-6)
+
+
+def test_advantages_are_the_sums_of_the_definition_within_episodes():
+    generator = torch.Generator().manual_seed(0)
+    steps, worlds, gamma, gae_lambda = 12, 40, 0.9, 0.8
+    rewards, values, following = torch.randn(
+        3, steps, worlds, generator=generator, dtype=torch.float64
+    )
+    terminated = torch.rand(steps, worlds, generator=generator) < 0.15
+    truncated = torch.rand(steps, worlds, generator=generator) < 0.15
+    found = generalised_advantages(
+        rewards,
+        values,
+        following,
+        terminated,
+        terminated | truncated,
+        gamma=gamma,
+        gae_lambda=gae_lambda,
+    )
+    assert (terminated & truncated).any()
+    for world in range(worlds):
+        for step in range(steps):
+            total, weight = 0.0, 1.0
+            for later in range(step, steps):
+                end, cut = bool(terminated[later, world]), bool(truncated[later, world])
+                after = 0.0 if end else float(following[later, world])
+                surprise = float(rewards[later, world]) + gamma * after
+                total += weight * (surprise - float(values[later, world]))
+                if end or cut:
+                    break
+                weight *= gamma * gae_lambda
+            assert float(found[step, world]) == pytest.approx(total, abs=1e-12)
+
+
+def test_worlds_that_are_cut_off_are_worth_what_the_critic_says_of_their_last_observation():
+    given = learner(steps=20, gamma=0.5, gae_lambda=1.0)
+    with torch.no_grad():
+        given.critic.value.bias.fill_(3.0)
+    batch = given.play()
+    # Step 16 ends all episodes: its target is its reward and half of what comes after.
+    rewards = batch.targets.view(20, 8, 64)[15] - 0.5 * 3.0
+    assert rewards.abs().max() < 0.5
+    assert (batch.targets.view(20, 8, 64) - 3.0 * 0.5**5 < 3.5).all()
+    torch.testing.assert_close(rewards, rewards[:, :1].expand(-1, 64))
+
+
+def test_likelihoods_are_those_of_gaussians_and_a_world_s_is_their_mean():
+    actor = GaussianRules(MIXING.new_rules(0), 0.2)
+    with torch.no_grad():
+        actor.log_std.add_(0.3 * torch.randn(actor.log_std.shape))
+    seen = torch.randn(5, 32, MIXING.interface.perception_dim)
+    action, told = actor.sample(seen)
+    mean = actor.rules.mean(seen)
+    by_hand = torch.cat(
+        [
+            torch.distributions.Normal(mean[:, span], actor.log_std[k].exp())
+            .log_prob(action[:, span])
+            .sum(dim=-1)
+            for k, span in enumerate(actor.rules.spans)
+        ],
+        dim=1,
+    )
+    torch.testing.assert_close(told, by_hand)
+    torch.testing.assert_close(actor.log_prob(seen, action), by_hand)
+    for k, span in enumerate(actor.rules.spans):
+        rows = actor.row_log_prob(k, seen[:, span].flatten(0, 1), action[:, span].flatten(0, 1))
+        torch.testing.assert_close(rows, by_hand[:, span].flatten())
+    world = over_particles(by_hand, torch.ones(5, 32))
+    torch.testing.assert_close(world, by_hand.sum(dim=1, keepdim=True) / 32.0)
+
+
+def test_a_world_s_policy_in_stable_baselines_means_over_particles():
+    pytest.importorskip("stable_baselines3")
+    from npa_envs.agents.learning.sb3_world import WorldRulePolicy
+    from npa_envs.wrappers import WorldVecEnv
+
+    worlds = WorldVecEnv(HEART.make_envs())
+    policy = WorldRulePolicy(
+        worlds.observation_space, worlds.action_space, lambda _: 1e-3, rules=HEART.new_rules(0)
+    )
+    seen = torch.from_numpy(worlds.reset())
+    action, value, told = policy(seen)
+    normal = torch.distributions.Normal(policy.actor.rules.mean(seen), policy.actor.log_std.exp())
+    torch.testing.assert_close(told, normal.log_prob(action).sum(dim=-1).mean(dim=-1))
+    values, log_prob, entropy = policy.evaluate_actions(seen, action.flatten(1))
+    assert value.shape == values.shape == (8, 1)
+    torch.testing.assert_close(log_prob, told)
+    torch.testing.assert_close(entropy, normal.entropy().sum(dim=-1).mean(dim=-1))
+
+
+def test_gains_are_clipped_where_the_ratio_has_gone_where_it_pays():
+    log_ratio = torch.tensor([[0.5], [0.5], [-0.5], [-0.5], [0.0]]).requires_grad_()
+    advantages = torch.tensor([[1.0], [-1.0], [1.0], [-1.0], [2.0]])
+    weights = torch.tensor([[1.0], [1.0], [1.0], [1.0], [0.0]])
+    gain = clipped_gain(log_ratio, advantages, weights, clip=0.2)
+    wanted = 1.2 - math.exp(0.5) + math.exp(-0.5) - 0.8
+    assert float(gain.detach()) == pytest.approx(wanted / 4.0, abs=1e-6)
+    gain.backward()
+    assert (log_ratio.grad != 0).flatten().tolist() == [False, True, True, False, False]
+
+
+def test_standardised_numbers_have_mean_0_and_deviation_1_where_they_count():
+    values, weights = torch.randn(7, 5), (torch.rand(7, 5) < 0.5).float()
+    found = standardised(3.0 * values + 2.0, weights)[weights > 0]
+    assert float(found.mean()) == pytest.approx(0.0, abs=1e-6)
+    assert float(found.square().mean()) == pytest.approx(1.0, abs=1e-5)
+
+
+def test_a_critic_keeps_its_values_when_its_scale_changes_and_sees_its_world_if_central():
+    critic = Critic(6, (3, 5), "central")
+    with torch.no_grad():
+        critic.value.weight.normal_()
+    seen = torch.randn(4, 8, 6)
+    before = critic(seen)
+    critic.rescale(torch.full((10,), 7.0))
+    assert float(critic.scale) == pytest.approx(7.0)
+    torch.testing.assert_close(critic(seen), before)
+    changed = seen.clone()
+    changed[:, -1] += 1.0
+    assert not torch.allclose(critic(changed)[:, 0], before[:, 0])
+    alone = Critic(6, (3, 5), "particle")
+    torch.testing.assert_close(alone(changed)[:, :-1], alone(seen)[:, :-1])
+
+
+def test_particles_of_a_species_that_is_gone_do_not_count():
+    dying = Problem(
+        env_id=MIXING.env_id,
+        keywords=dict(MIXING.keywords) | {"deaths": [[1, 3]]},
+        episode_steps=8,
+        num_envs=4,
+    )
+    given = learner(dying, steps=8, critic="central", ratio="particle")
+    batch = given.play()
+    acted = batch.acted.view(8, 4, 32)
+    assert acted[:, :, :12].all()
+    alive = acted[:, :, 12:].all(dim=2).any(dim=1).tolist()
+    assert alive == sorted(alive, reverse=True)
+    assert 0 < sum(alive) < 8
+    given.improve(batch, 1.0)
+    assert all(torch.isfinite(weight).all() for weight in given.actor.parameters())
+
+
+def test_equal_seeds_learn_equally_and_others_do_not():
+    found = [run("device", HEART, 2 * ROUND // 4, seed, steps=4).rules for seed in (0, 0, 1)]
+    weights = [next(iter(rules)).output.weight for rules in found]
+    assert torch.equal(weights[0], weights[1])
+    assert not torch.equal(weights[0], weights[2])
+
+
+def test_rules_that_have_gone_far_enough_stay_for_the_rest_of_a_round():
+    def after(epochs, target_kl):
+        given = learner(epochs=epochs, target_kl=target_kl, steps=4)
+        given.improve(given.play(), 1.0)
+        return given.actor.rules.rules[0].output.weight
+
+    # The first minibatch steps, as nothing has moved yet.
+    assert not torch.equal(after(1, 1e-6), HEART.new_rules(0).rules[0].output.weight)
+    assert torch.equal(after(1, 1e-6), after(3, 1e-6))
+    assert not torch.equal(after(1, None), after(3, None))
+
+
+@pytest.fixture(scope="module")
+def taught():
+    """Rules that were trained by gradient."""
+    budget = Budget(particle_steps=4 * ROUND)
+    return train("gradient", HEART, budget, 0, entries=1, evaluation_seeds=SEEDS).rules
+
+
+@pytest.mark.parametrize("form", ["device", "rows", "worlds"])
+def test_fine_tuning_does_not_undo_what_rules_can_do(form, taught):
+    pytest.importorskip("stable_baselines3")
+    given = [weight.clone() for weight in taught.parameters()]
+    first, last = run(form, HEART, 6 * ROUND, start=taught).log
+    assert first.mean_return > 0.5
+    assert last.mean_return > first.mean_return - 3.0 * first.standard_error
+    # They were copied.
+    assert all(map(torch.equal, taught.parameters(), given))
+
+
+def test_a_critic_that_learns_alone_leaves_the_rules_as_they_are():
+    start = HEART.new_rules(5)
+    for form in ("device", "rows"):
+        trained = run(form, HEART, 2 * ROUND // 4, start=start, steps=4)
+        assert all(map(torch.equal, trained.rules.parameters(), start.parameters()))
+
+
+def test_rows_that_are_cut_off_are_paid_what_the_critic_still_expects():
+    pytest.importorskip("stable_baselines3")
+    from npa_envs.agents.learning.sb3_rows import RowSettings, make_rows
+
+    class Constant:
+        device = torch.device("cpu")
+
+        def predict_values(self, obs):
+            return torch.full((len(obs), 1), 5.0)
+
+    actions = np.zeros((8 * 64, 6), np.float32)
+    paid = {}
+    for name in ("without", "with"):
+        rows = make_rows(HEART, RowSettings(gamma=0.5, critic="central"), "cpu")
+        rows.policy = Constant() if name == "with" else None
+        rows.seed(0)
+        rows.reset()
+        for _ in range(16):
+            seen, paid[name], done, infos = rows.step(actions)
+        assert done.all()
+        assert infos[0]["TimeLimit.truncated"] == (name == "without")
+        assert infos[0]["terminal_observation"].shape == seen[0].shape == (36,)
+    np.testing.assert_allclose(paid["with"] - paid["without"], 2.5, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"ratio": "both"}, r"ratio must be a known word, got 'both': known: particle, world"),
+        ({"credit": "particle", "ratio": "world"}, "credit='particle' needs ratio='particle'"),
+        ({"gamma": 0.0}, r"gamma must lie in \(0, 1\], got 0.0"),
+        ({"minibatches": 0}, "minibatches must be a whole number of at least 1"),
+    ],
+)
+def test_options_out_of_their_range_are_named(options, message):
+    with pytest.raises(NPAError, match=message):
+        Settings(**options)
+
+
+def test_options_are_known_by_name_and_depend_on_a_start_where_they_are_none():
+    assert method_options("ppo")["ratio"] == "particle"
+    progress = Progress(HEART, Budget(particle_steps=1), device="cpu", evaluation_seeds=SEEDS)
+    from npa_envs.agents.learning import ppo
+
+    with pytest.raises(NPAError, match="unknown option 'step': did you mean 'steps'"):
+        ppo.train(HEART, progress, 0, step=3)
+    fresh, warm = filled(Settings(), None), filled(Settings(), HEART.new_rules(0))
+    assert fresh.initial_std > warm.initial_std
+    assert fresh.learning_rate > warm.learning_rate
+    assert filled(Settings(initial_std=0.7), None).initial_std == 0.7
+
+
+def test_species_as_rows_cannot_be_paid_by_worlds():
+    pytest.importorskip("stable_baselines3")
+    with pytest.raises(NPAError, match="credit must be 'particle' where several species are rows"):
+        run("rows", MIXING, 1, credit="world")
