@@ -190,7 +190,8 @@ def learn(
     rules = progress.problem.new_rules(seed) if start is None else start
     settings = filled(settings, start)
     rate, alone = settings.learning_rate, settings.critic_rounds
-    assert rate is not None and alone is not None, "there are defaults for both"
+    assert rate is not None, "there is a default"
+    assert alone is not None, "there is a default"
     rows = settings.steps * env.num_envs
     problem = progress.problem
     callback = ProgressCallback(
