@@ -164,9 +164,8 @@ class Learner:
                 self._descend(self.critic_optimizer, self._critic_loss(*worlds))
                 if rules_learn:
                     gain, kl = self._surrogate(part)
-                    if settings.target_kl is not None:
-                        # Rules that have gone too far stay, without a question to the host.
-                        near *= kl.detach() <= settings.target_kl
+                    # Rules that have gone too far stay, without a question to the host.
+                    near *= kl.detach() <= settings.target_kl
                     self.optimizer.param_groups[0]["lr"].copy_(near * rate)
                     self._descend(self.optimizer, -gain)
             # All that the host waits for.
