@@ -70,7 +70,6 @@ class Learner:
         )
         self.generator = torch.Generator(device).manual_seed(seed)
         rules = problem.new_rules(seed) if start is None else start
-        assert settings.initial_std is not None
         self.actor = GaussianRules(rules, settings.initial_std).to(device)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
@@ -185,7 +184,8 @@ class Learner:
             torch.randperm(len(group.targets), generator=self.generator, device=self.seen.device)
             for group in groups
         ]
-        parts = [order.tensor_split(self.settings.minibatches) for order in orders]
+        count = min(self.settings.minibatches, self.seen[1:, :, 0, 0].numel())
+        parts = [order.tensor_split(count) for order in orders]
         for chosen in zip(*parts, strict=True):
             yield [
                 Round(*(value[rows] for value in group))
