@@ -70,6 +70,7 @@ class Learner:
         )
         self.generator = torch.Generator(device).manual_seed(seed)
         rules = problem.new_rules(seed) if start is None else start
+        assert settings.initial_std is not None, "filled in above"
         self.actor = GaussianRules(rules, settings.initial_std).to(device)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
