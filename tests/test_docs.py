@@ -261,6 +261,16 @@ def test_the_code_about_learning_runs(tmp_path, monkeypatch, capsys):
     assert [entry.particle_steps for entry in trained.log] == [0, 2000]
 
 
+def test_the_code_about_ppo_runs(capsys):
+    pytest.importorskip("stable_baselines3")
+    (block,) = [code for code in code_blocks(DOCS / "learning.md") if '"ppo_rows"' in code]
+    assert block.count("500_000") == 1
+    exec(compile(block.replace("500_000", "1_000"), "learning.md", "exec"), {})
+    told = capsys.readouterr().out.splitlines()
+    forms = ("ppo", "ppo_rows", "ppo_world")
+    assert [line.split(":")[0] for line in told] == [form for form in forms for _ in range(3)]
+
+
 def test_the_code_about_3d_morphogenesis_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (block,) = code_blocks(DOCS / "morphogenesis3d.md")

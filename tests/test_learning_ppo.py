@@ -78,7 +78,8 @@ def run(form, problem, budget, seed=0, **keywords):
 def test_every_form_learns_to_grow_and_colour_particles(form):
     pytest.importorskip("stable_baselines3")
     rounds = 12 if form.startswith("device") else 8
-    first, last = run(form, HEART, rounds * ROUND).log
+    # In so few rounds small changes of the policy are the safer ones.
+    first, last = run(form, HEART, rounds * ROUND, target_kl=0.05).log
     envs = HEART.make_envs()
     by_chance = evaluate_policy(envs, RandomPolicy(envs), SEEDS)
     # Doing nothing gives 0, and the best of all learners about 2.
@@ -310,7 +311,7 @@ def test_rules_that_have_gone_far_enough_stay_for_the_rest_of_a_round():
     # The first minibatch steps, as nothing has moved yet.
     assert not torch.equal(after(1, 1e-6), HEART.new_rules(0).rules[0].output.weight)
     assert torch.equal(after(1, 1e-6), after(3, 1e-6))
-    assert not torch.equal(after(1, None), after(3, None))
+    assert not torch.equal(after(1, 1e6), after(3, 1e6))
 
 
 @pytest.fixture(scope="module")

@@ -70,7 +70,7 @@ class Learner:
         )
         self.generator = torch.Generator(device).manual_seed(seed)
         rules = problem.new_rules(seed) if start is None else start
-        assert settings.initial_std is not None
+        assert settings.initial_std is not None, "filled in above"
         self.actor = GaussianRules(rules, settings.initial_std).to(device)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
@@ -164,9 +164,8 @@ class Learner:
                 self._descend(self.critic_optimizer, self._critic_loss(*worlds))
                 if rules_learn:
                     gain, kl = self._surrogate(part)
-                    if settings.target_kl is not None:
-                        # Rules that have gone too far stay, without a question to the host.
-                        near *= kl.detach() <= settings.target_kl
+                    # Rules that have gone too far stay, without a question to the host.
+                    near *= kl.detach() <= settings.target_kl
                     self.optimizer.param_groups[0]["lr"].copy_(near * rate)
                     self._descend(self.optimizer, -gain)
             # All that the host waits for.
@@ -186,7 +185,8 @@ class Learner:
             torch.randperm(len(group.targets), generator=self.generator, device=self.seen.device)
             for group in groups
         ]
-        parts = [order.tensor_split(self.settings.minibatches) for order in orders]
+        count = min(self.settings.minibatches, self.seen[1:, :, 0, 0].numel())
+        parts = [order.tensor_split(count) for order in orders]
         for chosen in zip(*parts, strict=True):
             yield [
                 Round(*(value[rows] for value in group))

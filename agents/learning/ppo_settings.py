@@ -10,10 +10,10 @@ from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.errors import NPAError, suggest
 from npa_envs.tasks.checks import check_fraction, check_non_negative, check_positive
 
-FRESH = {"learning_rate": 1e-3, "initial_std": 0.3, "critic_rounds": 0}
+FRESH = {"learning_rate": 1e-3, "initial_std": 0.3, "critic_rounds": 0, "target_kl": 0.2}
 """What options are where they are None, with fresh rules."""
 
-WARM = {"learning_rate": 1e-4, "initial_std": 0.05, "critic_rounds": 4}
+WARM = {"learning_rate": 1e-4, "initial_std": 0.05, "critic_rounds": 4, "target_kl": 0.05}
 """The same with rules to begin with: noise, haste and a raw critic would undo what they can do."""
 
 CHOICES = {
@@ -61,9 +61,9 @@ class Settings:
     max_gradient_norm: float = 0.5
     """Gradients of the rules, and those of the critic, are shortened to this norm."""
 
-    target_kl: float | None = 0.05
+    target_kl: float | None = None
     """The rules stay as they are for the rest of a round once particles' actions are farther than
-    this from those that were played [nats]; None: no limit."""
+    this from those that were played [nats]; None: 0.2, or 0.05 with a `start`."""
 
     initial_std: float | None = None
     """Standard deviation of every action column at first; None: 0.3, or 0.05 with a `start`."""

@@ -50,9 +50,9 @@ class SB3Settings:
     max_gradient_norm: float = 0.5
     """Gradients are shortened to this norm."""
 
-    target_kl: float | None = 0.05
-    """No more updates in a round once a row's actions are so far from those played [nats]; None:
-    all of them."""
+    target_kl: float | None = None
+    """No more updates in a round once particles' actions are about so far from those that were
+    played [nats]; None: 0.2, or 0.05 with a `start`."""
 
     initial_std: float | None = None
     """Standard deviation of every action column at first; None: 0.3, or 0.05 with a `start`."""
@@ -188,10 +188,8 @@ def learn(
         settings: Of PPO.
     """
     rules = progress.problem.new_rules(seed) if start is None else start
-    settings = filled(settings, start)
-    rate, alone = settings.learning_rate, settings.critic_rounds
-    assert rate is not None, "there is a default"
-    assert alone is not None, "there is a default"
+    chosen: Any = filled(settings, start)
+    rate, alone, far = chosen.learning_rate, chosen.critic_rounds, chosen.target_kl
     rows = settings.steps * env.num_envs
     problem = progress.problem
     callback = ProgressCallback(
@@ -211,11 +209,11 @@ def learn(
         clip_range=settings.clip,
         ent_coef=settings.entropy_weight,
         max_grad_norm=settings.max_gradient_norm,
-        target_kl=settings.target_kl,
+        target_kl=policy_type.row_kl(far),
         tensorboard_log=settings.tensorboard_log,
         policy_kwargs={
             "rules": rules,
-            "initial_std": settings.initial_std,
+            "initial_std": chosen.initial_std,
             "critic": settings.critic,
         },
         seed=seed,

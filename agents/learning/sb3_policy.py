@@ -75,6 +75,15 @@ class RuleActorCritic(ActorCriticPolicy):
         entropy = self.actor.entropy().expand(len(obs))
         return self.predict_values(obs), log_prob, entropy
 
+    @classmethod
+    def row_kl(cls, particle_kl: float) -> float:
+        """Return how far a row's likelihood is when its particles' are.
+
+        Args:
+            particle_kl: Divergence of a particle's actions [nats].
+        """
+        return particle_kl
+
     def predict_values(self, obs: Any) -> Tensor:
         """Return the values of rows, shape [M, 1].
 

@@ -26,10 +26,6 @@ class WorldSettings(SB3Settings):
     clip: float = 0.02
     """Ratios of likelihoods count up to 1 plus or minus this (dimensionless)."""
 
-    target_kl: float | None = 0.001
-    """No more updates in a round once a world's likelihood is so far from what it was [nats]; None:
-    all of them."""
-
 
 class WorldRulePolicy(RuleActorCritic):
     """A policy for rows of `WorldVecEnv`: all particles of a world act by their species' rule.
@@ -37,6 +33,18 @@ class WorldRulePolicy(RuleActorCritic):
     Log-probability, entropy and value of a world are means over its particles. Arguments are those
     of `RuleActorCritic`.
     """
+
+    @classmethod
+    def row_kl(cls, particle_kl: float) -> float:
+        """Return how far a world's likelihood is when its particles' are, as estimated there.
+
+        The mean log-ratio of many particles is close to minus their divergence k, of which
+        r - 1 - log r makes k² / 2.
+
+        Args:
+            particle_kl: Divergence of a particle's actions [nats].
+        """
+        return 0.5 * particle_kl**2
 
     def predict_values(self, obs: Any) -> Tensor:
         """Return the values of worlds, shape [M, 1].
