@@ -130,8 +130,6 @@ def test_particles_that_nearly_touch_have_finite_gradients(dtype, space_dim, dis
 @pytest.mark.parametrize("dtype", DTYPES, ids=("float32", "float64"))
 def test_states_whose_squares_overflow_are_perceived(dtype, space_dim, box, device):
     """Lengths of gradients are taken without their squares where those are no numbers."""
-    if device.type == "cuda" and dtype == torch.float32:
-        pytest.skip("the kernel of listed neighbours squares them: docs/stability.md")
     box = sides(box, space_dim)
     largest = 33 if dtype == torch.float32 else 300
     for power in (largest // 2, largest // 2 + 3, largest):
