@@ -16,13 +16,16 @@ from npa_envs.randomness import WorldRandom
 from npa_envs.robustness.conditions import Response, grow, responses
 from npa_envs.robustness.damages import DAMAGES, STATE_NOISE, wrapped
 from npa_envs.robustness.grounds import Ground, courses
-from npa_envs.robustness.plans import CONDITIONS, PLANS, Plan, quick_plan
+from npa_envs.robustness.plans import CONDITIONS, PLANS, Plan, quick_plan, trained_value
 from npa_envs.robustness.plots import pictures
+from npa_envs.robustness.ranges import where_it_works, working_range
 from npa_envs.robustness.record import RuleRecord, read_record
 from npa_envs.robustness.recovery import CONTROL, Course, healing, recovery_step
 from npa_envs.robustness.shapes import BLOB_DISTANCE, SHAPES, SIZE_FACTOR, disk
 from npa_envs.robustness.tables import recovered_share, tables
+from npa_envs.rule_io import rule_metadata, shipped_rules
 from npa_envs.stress.habitats import rule_names, task_name
+from npa_envs.trained_tasks import trained_config
 
 SIDE = 2.0
 COUNT = 501
@@ -201,11 +204,9 @@ def test_a_course_counts_its_seeds():
     assert course.recovery_steps() == [16, 32, 16, None]
     assert (course.recovered(), course.median_step(), course.within_at_end()) == (3, 16, 2)
     assert course.ratios(-1) == [1.0, 1.0, 2.0, 2.0]
-    assert recovered_share([record(course, dataclasses.replace(course, damage=CONTROL))]) == (
-        3,
-        2,
-        4,
-    )
+    others = [dataclasses.replace(course, damage=name) for name in (CONTROL, "side")]
+    assert recovered_share([record(course, *others)], ["erase", "cut"]) == (3, 2, 4)
+    assert recovered_share([record(course, *others)], DAMAGES) == (6, 4, 8)
 
 
 def record(*found: Course, **changed) -> RuleRecord:
@@ -213,8 +214,64 @@ def record(*found: Course, **changed) -> RuleRecord:
     told = tuple(Response(name, value, 8, (0.5, value)) for name, value in values)
     lost = Response("eps", 4.0, 8, (0.5, math.nan))
     left_out = Response("particles", 2.0, 0, (), note="256 particles in all")
-    fields = {"rule": "heart", "task": "morphogenesis2d", "metric": "loss", "facts": {"a": 1}}
+    fields = {"rule": "heart", "task": "morphogenesis2d", "metric": "loss", "update_prob": 0.5}
+    fields["facts"] = {"a": 1}
     return RuleRecord(**fields | {"courses": found, "responses": (*told, lost, left_out)} | changed)
+
+
+# Where rules work
+
+
+@pytest.mark.parametrize(
+    ("ratios", "text"),
+    [
+        ((3.0, 2.0, 1.0, 1.9, 5.0), "0.2 … 0.8"),
+        ((1.0, 3.0, 1.0, math.nan, 1.5), "0.5 alone, and 0.1, 1"),
+        ((1.0,) * 5, "0.1 … 1"),
+        ((1.0, 1.0, math.nan, 1.0, 1.0), "not at 0.5"),
+    ],
+)
+def test_a_rule_works_where_its_loss_at_most_doubles(ratios, text):
+    assert working_range((0.1, 0.2, 0.5, 0.8, 1.0), ratios, trained=0.5) == text
+
+
+def responding(condition: str, *losses_by_value) -> RuleRecord:
+    """A record of one condition beside the loss as trained, which is 1."""
+    told = [Response(condition, value, 8, losses) for value, losses in losses_by_value]
+    return record(responses=(Response("eps", 1.0, 8, (0.5, 1.5)), *told))
+
+
+@pytest.mark.parametrize(
+    ("condition", "losses_by_value", "text"),
+    [
+        # It is the mean that counts, over that as trained, where all seeds are finite.
+        ("dt", [(0.5, (0.1, 3.8)), (1.0, (0.5, 1.5)), (2.0, (0.1, 4.0))], "0.5 … 1"),
+        ("dt", [(0.5, (0.1, math.nan)), (1.0, (0.5, 1.5)), (2.0, (0.1, 0.1))], "1 … 2"),
+        ("update_prob", [(0.2, (3.0, 3.0)), (0.5, (0.5, 1.5)), (1.0, (1.0, 1.0))], "0.5 … 1"),
+        ("noise", [(0.0, (0.5, 1.5)), (1e-3, (9.0, 9.0))], "0 alone"),
+        (
+            "particles",
+            [(0.5, (1.0, 1.0)), (1.0, (0.5, 1.5)), (2.0, ()), (4.0, (1.0, 1.0)), (8.0, ())],
+            "0.5 … 1, and 4 (not measured: 2, 8)",
+        ),
+        (
+            "shape",
+            [("trained", (0.5, 1.5)), ("ring", (3.0, 3.0)), ("square", (1.0, 2.0))],
+            "trained, square",
+        ),
+        ("shape", [], ""),
+    ],
+)
+def test_where_a_rule_works_follows_from_the_mean_loss_of_its_seeds(
+    condition, losses_by_value, text
+):
+    assert where_it_works(responding(condition, *losses_by_value), condition) == text
+
+
+def test_a_rule_that_is_never_wrong_works_where_it_still_is_not():
+    told = [("eps", 1.0, (0.0, 0.0)), ("dt", 1.0, (0.0, 0.0)), ("dt", 2.0, (0.0, 0.1))]
+    found = record(responses=tuple(Response(name, v, 8, losses) for name, v, losses in told))
+    assert where_it_works(found, "dt") == "1 alone"
 
 
 # Measuring
@@ -295,13 +352,20 @@ def test_a_world_that_is_lost_stays_lost_and_leaves_the_others_as_they_are(devic
     assert torch.equal(found[:, 1], whole[:, 1])
 
 
+def update_prob(name: str) -> float:
+    path = shipped_rules()[name]
+    return trained_config(path, rule_metadata(path)).task.update_prob
+
+
 def test_plans_are_whole_chunks_and_hold_what_was_trained():
     for name in rule_names():
         for plan in (PLANS[task_name(name)], quick_plan(task_name(name))):
             assert plan.heal_steps[0] == 0
             assert all(step % plan.chunk == 0 for step in (*plan.heal_steps, plan.grow_steps))
             assert set(plan.values) <= set(CONDITIONS)
-            assert 0.5 in plan.values["update_prob"]
+            for condition, values in plan.values.items():
+                assert trained_value(condition, update_prob(name)) in values
+                assert condition == "shape" or list(values) == sorted(values)
 
 
 # Records and the command
@@ -325,13 +389,22 @@ def test_a_record_comes_back_and_one_of_other_settings_is_refused(tmp_path: Path
 
 def test_tables_say_who_recovered_when_and_what_was_not_measured():
     course = Course("erase", (0, 16), ((2.0, 1.0), (2.0, 3.0)), ((1.0, 1.0), (1.0, 1.0)))
-    text = tables([record(course), record(rule="dots")])
+    noise = dataclasses.replace(course, damage="noise", losses=course.losses[1:] * 2)
+    text = tables([record(course, noise), record(rule="dots")])
+    assert text.startswith("Where rules work: ")
+    heads = "| rule | eps | particles | update_prob | dt | noise | shape |"
+    ranges = "1 … 2 | 1 alone (not measured: 2) | 0.5 alone | – | – | – |"
+    assert f"{heads}\n{'| --- ' * 7}|\n| heart | {ranges}\n| dots | {ranges}" in text
     assert "| heart | 1/2, 16 |" in text
     assert "| heart | 2 → 2 (1/2) |" in text
     assert "| dots | – |" in text
     assert "| heart | 0.75 | 1 | 1.67 | nan |" in text
     assert "| heart | 0.75 | 1 | – |" in text
-    assert "Recovered: 1 of 2 rule × damage × seed, 50.0%; within 1.1 at the end: 1, 50.0%." in text
+    end = " rule × damage × seed, 50.0%; within 1.1 at the end: 1, 50.0%."
+    asked = "Recovered of what rules are asked to heal (erase, cut, clump, half): 1 of 2"
+    assert asked + end in text
+    beyond = "Recovered of what is beyond that (noise, side): 0 of 2 rule × damage × seed, 0.0%;"
+    assert beyond in text
 
 
 def test_curves_are_drawn_by_task():

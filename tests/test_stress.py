@@ -14,11 +14,10 @@ from npa_envs import reference
 from npa_envs.cli import main
 from npa_envs.errors import NPAError
 from npa_envs.rule import NPARule
-from npa_envs.stress import accuracy, endurance, geometry, gradients, precision, ranges, suite
+from npa_envs.stress import accuracy, endurance, geometry, gradients, precision, suite
 from npa_envs.stress.checks import GROUPS, Check, Finding, Session, Skipped
 from npa_envs.stress.habitats import habitat
 from npa_envs.stress.plots import heat_maps
-from npa_envs.stress.ranges import working_range
 from npa_envs.stress.record import Entry, Record, in_order, read_record
 from npa_envs.stress.runner import chosen_checks, run_check, run_checks
 from npa_envs.stress.scenes import EPS, scenes, threshold_scenes
@@ -287,34 +286,6 @@ def test_a_world_of_one_particle_is_measured_although_it_extends_nowhere(monkeyp
     assert entry.figures["drift"] >= 0.0
 
 
-@pytest.mark.parametrize(
-    ("ratios", "text"),
-    [
-        ((3.0, 2.0, 1.0, 1.9, 5.0), "0.2 … 0.8"),
-        ((1.0, 3.0, 1.0, math.nan, 1.5), "0.5 … 0.5, and 0.1, 1"),
-        ((1.0,) * 5, "0.1 … 1"),
-    ],
-)
-def test_a_rule_works_where_its_metric_at_most_doubles(ratios, text):
-    assert working_range((0.1, 0.2, 0.5, 0.8, 1.0), ratios, trained=0.5) == text
-
-
-def test_ranges_run_for_as_many_updates_and_as_much_time_as_trained(monkeypatch):
-    steps: dict[str, list[int]] = {}
-
-    def metric(home, session, count, options):
-        steps.setdefault(axis.name, []).append(count)
-        return float("nan") if options.get("dt") == 2.0 else 1.0
-
-    monkeypatch.setattr(ranges, "_metric", metric)
-    for axis in ranges.AXES[:2]:
-        entry = run_check(CHECKS[f"ranges/{axis.name}/dots"], session())
-        assert entry.verdict == "range"
-    assert steps == {"update_prob": [64, 160, 64, 32], "dt": [64, 128, 64, 32]}
-    assert entry.holds == "0.5 … 1"
-    assert entry.note == "not finite at 2"
-
-
 def test_what_grew_at_another_radius_is_measured_at_its_trained_size(device):
     free, held = (habitat(session(device), name) for name in ("heart", "dots"))
     eps = free.task.eps
@@ -355,16 +326,16 @@ def test_the_command_lists_its_checks_and_refuses_mistakes(capsys):
     assert "unknown check 'tim'" in capsys.readouterr().err
 
 
-def test_heat_maps_are_drawn_of_limits_and_of_ranges():
-    figures = {"trained": 1.0, "0.2": 3.0, "0.5": 1.0, "1": math.nan}
+def test_heat_maps_are_drawn_of_what_has_limits():
     entries = [
-        Entry("ranges/update_prob/heart", "", "range", figures, {"trained": 9.0}, "0.5 … 0.5"),
-        Entry("geometry/one/2d/open", "", "fail", {"z": math.nan}, {"z": 1.0}),
+        Entry("geometry/one/2d/open", "", "fail", {"z": math.nan, "s": 0.5}, {"z": 1.0}),
+        Entry("geometry/nearest/2d", "", "range", {"z": 2.0}, {"z": 1.0, "s": 1.0}, "near"),
+        Entry("gradients/growth/heart", "", "range", {"norm": 1.0}, {}, "512 steps"),
         Entry("values/nan_state", "", "skipped"),
     ]
     pictures = heat_maps(Record(dict(FACTS), {entry.name: entry for entry in entries}))
-    assert set(pictures) == {"ranges", "geometry"}
-    assert all(picture.startswith(b"\x89PNG") for picture in pictures.values())
+    assert set(pictures) == {"geometry"}
+    assert pictures["geometry"].startswith(b"\x89PNG")
 
 
 @pytest.mark.slow

@@ -22,7 +22,7 @@ FAILED = 1
 
 @dataclass(frozen=True, kw_only=True)
 class StressOptions:
-    """Check hard geometry, hard values, long runs, ranges of rules, gradients, precision.
+    """Check hard geometry, hard values, long runs of rules, gradients, precision.
 
     Every check has an expectation, figures and a verdict: pass, fail, a range (where something
     holds), or skipped. With --output a JSON file is written after each check, and a run that was
@@ -36,8 +36,8 @@ class StressOptions:
     """Where to run: cpu, cuda, cuda:1."""
 
     only: tuple[str, ...] = ()
-    """Groups (geometry, values, time, ranges, gradients, precision), checks (time/gecko), or the
-    first words of checks (geometry/clump); default: all."""
+    """Groups (geometry, values, time, gradients, precision), checks (time/gecko), or the first
+    words of checks (geometry/clump); default: all."""
 
     max_seconds: float | None = None
     """Begin no check after so long [s]; what is left is skipped, and run by the next call."""

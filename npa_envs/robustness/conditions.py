@@ -11,7 +11,7 @@ import torch
 
 from npa_envs.randomness import Purpose
 from npa_envs.robustness.grounds import Ground, Home, courses
-from npa_envs.robustness.plans import TRAINED
+from npa_envs.robustness.plans import trained_value
 
 MOST_PARTICLES = {"cpu": 1 << 17, "cuda": 1 << 21}
 """Particles of all worlds together; where there would be more, a value is left out."""
@@ -35,16 +35,6 @@ class Response:
     def mean(self) -> float:
         """Return the mean loss of the seeds; NaN where one is not finite, or there are none."""
         return math.fsum(self.losses) / len(self.losses) if self.losses else math.nan
-
-
-def trained_value(ground: Ground, condition: str) -> float | str:
-    """Return the value of a condition that a rule was trained at.
-
-    Args:
-        ground: The rule's.
-        condition: One of `CONDITIONS`.
-    """
-    return ground.task.update_prob if condition == "update_prob" else TRAINED[condition]
 
 
 def grow(ground: Ground, condition: str = "", value: float | str = 1.0) -> tuple[Home, Response]:
@@ -90,7 +80,7 @@ def responses(ground: Ground, trained: Response, most_particles: int) -> Iterato
     """
     for condition, values in ground.plan.values.items():
         for value in values:
-            if value == trained_value(ground, condition):
+            if value == trained_value(condition, ground.task.update_prob):
                 yield Response(condition, value, trained.steps, trained.losses)
                 continue
             share = float(value) if condition == "particles" else 1.0

@@ -34,6 +34,8 @@ class Damage:
     """Whether it can be done to worlds whose particles do not move by themselves."""
     halves: bool = False
     """Whether half of the particles are left; else all are."""
+    beyond: bool = False
+    """Whether it is beyond what rules are asked to heal."""
 
 
 def wrapped(x: Tensor, box: Box) -> Tensor:
@@ -116,9 +118,11 @@ DAMAGES = {
         Damage("erase", "states in a disk of radius 0.2 set to 0", erase, static=True),
         Damage("cut", "a slit of width 0.1", slit, static=False),
         Damage("clump", "a disk of radius 0.2 pulled to a point", pull_together, static=False),
-        Damage("noise", "noise of 0.3 on every state", add_state_noise, static=True),
+        Damage("noise", "noise of 0.3 on every state", add_state_noise, static=True, beyond=True),
         Damage("half", "half of the particles removed", remove_half, static=True, halves=True),
-        Damage("side", "all on one side removed", remove_side, static=True, halves=True),
+        Damage(
+            "side", "all on one side removed", remove_side, static=True, halves=True, beyond=True
+        ),
     )
 }
 """Every damage by its name."""

@@ -27,6 +27,16 @@ TRAINED: Mapping[str, float | str] = {
 """The value of each condition as trained; that of `update_prob` is the task's."""
 
 
+def trained_value(condition: str, update_prob: float) -> float | str:
+    """Return the value of a condition that a rule was trained at.
+
+    Args:
+        condition: One of `CONDITIONS`.
+        update_prob: Probability of an update in the rule's task.
+    """
+    return update_prob if condition == "update_prob" else TRAINED[condition]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Plan:
     """What is measured of one rule."""
@@ -40,17 +50,17 @@ class Plan:
     worlds_per_seed: int = 1
     """Worlds whose mean loss is that of a seed."""
     values: Mapping[str, tuple[float | str, ...]]
-    """Values of each condition, the trained one among them."""
+    """Values of each condition, numbers increasing, the trained one among them."""
 
 
 _HEAL_STEPS = (0, 16, 32, 48, 64, 96, 128, 192, 256, 384, 512, 768, 1024)
 
 _VALUES: dict[str, tuple[float | str, ...]] = {
-    "eps": (0.5, 0.71, 1.0, 1.41, 2.0),
+    "eps": (0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.4, 1.7, 2.0),
     "particles": (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0, 2.0, 4.0, 8.0, 16.0),
-    "update_prob": (0.05, 0.1, 0.25, 0.5, 0.75, 1.0),
-    "dt": (0.25, 0.5, 0.75, 1.0, 1.5, 2.0),
-    "noise": (0.0, 0.003, 0.01, 0.03, 0.1),
+    "update_prob": (0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 1.0),
+    "dt": (0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0),
+    "noise": (0.0, 1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.3, 1.0),
     "shape": ("trained", *SHAPES),
 }
 
@@ -80,11 +90,11 @@ def quick_plan(task_name: str) -> Plan:
         task_name: A task of `PLANS`.
     """
     values: dict[str, tuple[float | str, ...]] = {
-        "eps": (0.71, 1.0, 1.41),
+        "eps": (0.7, 1.0, 1.4),
         "particles": (0.5, 1.0),
-        "update_prob": (0.25, 0.5, 1.0),
+        "update_prob": (0.2, 0.5, 1.0),
         "dt": (0.5, 1.0),
-        "noise": (0.0, 0.01),
+        "noise": (0.0, 1e-2),
         "shape": ("trained", "ring"),
     }
     full = PLANS[task_name]

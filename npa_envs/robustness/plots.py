@@ -76,7 +76,7 @@ def _draw_responses(panel: Any, record: RuleRecord, condition: str) -> None:
     panel.axhline(trained[len(trained) // 2], color="black", lw=0.7, ls=":")
     panel.set(xscale="log", yscale="log")
     panel.set_ylabel("loss", fontsize=8)
-    panel.set_xticks(values, [f"{value:.2g}" for value in values])
+    panel.set_xticks(values, [f"{value:.2g}" for value in values], rotation=45)
     panel.minorticks_off()
     panel.tick_params(labelsize=7, which="both")
 

@@ -25,6 +25,8 @@ class RuleRecord:
     """Its task."""
     metric: str
     """What losses are."""
+    update_prob: float
+    """Probability of an update as trained."""
     facts: Mapping[str, Any]
     """What the figures follow from: device, machine, size, seeds, commit, versions."""
     courses: tuple[Course, ...]

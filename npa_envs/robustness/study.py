@@ -34,6 +34,7 @@ def measure_rule(
         rule=name,
         task=ground.task_name,
         metric=ground.metric_name,
+        update_prob=float(ground.task.update_prob),
         facts=facts,
         courses=courses,
         responses=found,

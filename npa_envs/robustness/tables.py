@@ -3,37 +3,52 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 
 from npa_envs.robustness.conditions import Response
 from npa_envs.robustness.damages import DAMAGES
 from npa_envs.robustness.plans import CONDITIONS
+from npa_envs.robustness.ranges import short, where_it_works
 from npa_envs.robustness.record import RuleRecord
 from npa_envs.robustness.recovery import CONTROL, RECOVERED, Course
+from npa_envs.stress.habitats import WORKS
 
 NONE = "–"
 """What was not measured."""
 
 
-def recovered_share(records: Iterable[RuleRecord]) -> tuple[int, int, int]:
+SHARES = {
+    "what rules are asked to heal": [d.name for d in DAMAGES.values() if not d.beyond],
+    "what is beyond that": [d.name for d in DAMAGES.values() if d.beyond],
+}
+"""Damages whose share that recovered is told together; the control does not count."""
+
+
+def recovered_share(
+    records: Iterable[RuleRecord], damages: Collection[str]
+) -> tuple[int, int, int]:
     """Return how many of all rules' damages and seeds recovered, are so at the end, and there are.
 
     Args:
-        records: Those of the rules; the control does not count.
+        records: Those of the rules.
+        damages: Names of the damages that count.
     """
-    courses = [c for record in records for c in record.courses if c.damage != CONTROL]
+    courses = [c for record in records for c in record.courses if c.damage in damages]
     recovered = sum(course.recovered() for course in courses)
     at_end = sum(course.within_at_end() for course in courses)
     return recovered, at_end, sum(len(course.losses) for course in courses)
 
 
 def tables(records: Sequence[RuleRecord]) -> str:
-    """Return all tables and, last, the share that recovered.
+    """Return all tables and, last, the shares that recovered.
 
     Args:
         records: Those of the rules.
     """
     parts = [
+        "Where rules work: values around the trained one, without a gap, at which the mean loss is "
+        f"at most {WORKS:g} times that as trained and all seeds are finite; others that work stand "
+        f"behind them:\n\n{_by_condition(records)}",
         f"Recovered seeds, and their median recovery time [steps]:\n\n{_by_damage(records, _time)}",
         "Loss over the twin's right after the damage → at the end (medians of the seeds; seeds "
         f"within {RECOVERED:g} at the end):\n\n{_by_damage(records, _size)}",
@@ -42,18 +57,15 @@ def tables(records: Sequence[RuleRecord]) -> str:
         table = _by_value(records, condition)
         if table:
             parts.append(f"Loss over that as trained, by {summary}:\n\n{table}")
-    recovered, at_end, total = recovered_share(records)
-    if total:
-        parts.append(
-            f"Recovered: {recovered} of {total} rule × damage × seed, {recovered / total:.1%}; "
-            f"within {RECOVERED:g} at the end: {at_end}, {at_end / total:.1%}."
-        )
+    for summary, damages in SHARES.items():
+        recovered, at_end, total = recovered_share(records, damages)
+        if total:
+            parts.append(
+                f"Recovered of {summary} ({', '.join(damages)}): {recovered} of {total} "
+                f"rule × damage × seed, {recovered / total:.1%}; within {RECOVERED:g} at the end: "
+                f"{at_end}, {at_end / total:.1%}."
+            )
     return "\n\n".join(parts) + "\n"
-
-
-def short(value: float) -> str:
-    """Return a number with three digits."""
-    return f"{value:.3g}"
 
 
 def _time(course: Course) -> str:
@@ -72,6 +84,12 @@ def _median(values: Sequence[float]) -> float:
     ordered = sorted(math.inf if math.isnan(value) else value for value in values)
     low, high = ordered[(len(ordered) - 1) // 2], ordered[len(ordered) // 2]
     return low if low == high else 0.5 * (low + high)
+
+
+def _by_condition(records: Sequence[RuleRecord]) -> str:
+    """Return a table of where each rule works."""
+    rows = [[r.rule, *(where_it_works(r, name) or NONE for name in CONDITIONS)] for r in records]
+    return _table(["rule", *CONDITIONS], rows)
 
 
 def _by_damage(records: Sequence[RuleRecord], cell: Callable[[Course], str]) -> str:
@@ -102,8 +120,7 @@ def _by_value(records: Sequence[RuleRecord], condition: str) -> str:
         for record in records
         if any((record.rule, value) in found for value in values)
     ]
-    heads = [value if isinstance(value, str) else short(value) for value in values]
-    return _table(["rule", "loss as trained", *heads], rows) if rows else ""
+    return _table(["rule", "loss as trained", *map(short, values)], rows) if rows else ""
 
 
 def _change(record: RuleRecord, response: Response | None) -> str:

@@ -14,7 +14,6 @@ GROUPS = {
     "geometry": "where particles lie: forwards and backwards, against a float64 reference",
     "values": "what states hold: tiny, huge, infinite, no number",
     "time": "every shipped rule for 100 000 steps",
-    "ranges": "how far every shipped rule may leave what it was trained at",
     "gradients": "how gradients grow with the steps; finite differences; float32's errors",
     "precision": "shorter numbers, order, batches, repetitions, devices, recorded graphs",
 }

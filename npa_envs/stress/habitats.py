@@ -26,6 +26,9 @@ HORIZONS = {
 }
 """Steps after which rules of a task are judged."""
 
+WORKS = 2.0
+"""A rule works where its loss is at most this many times that as trained, and all is finite."""
+
 QUICK_HORIZON = 64
 """The most of them in a quick run."""
 

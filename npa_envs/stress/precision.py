@@ -22,8 +22,7 @@ from npa_envs.stress.accuracy import (
     relative_error,
 )
 from npa_envs.stress.checks import Check, Finding, Session, Skipped
-from npa_envs.stress.habitats import Habitat, habitat
-from npa_envs.stress.ranges import WORKS
+from npa_envs.stress.habitats import WORKS, Habitat, habitat
 from npa_envs.stress.scenes import EPS, STATE_DIM, Scene, scenes
 from npa_envs.stress.values import differing
 

@@ -7,7 +7,6 @@ from npa_envs.stress.endurance import endurance_checks
 from npa_envs.stress.geometry import geometry_checks
 from npa_envs.stress.gradients import gradients_checks
 from npa_envs.stress.precision import precision_checks
-from npa_envs.stress.ranges import ranges_checks
 from npa_envs.stress.values import values_checks
 
 
@@ -22,7 +21,6 @@ def all_checks(*, quick: bool = False, seed: int = 0) -> list[Check]:
         *geometry_checks(seed),
         *values_checks(),
         *endurance_checks(),
-        *ranges_checks(quick=quick),
         *gradients_checks(quick=quick),
         *precision_checks(quick=quick),
     ]
