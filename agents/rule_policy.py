@@ -75,7 +75,7 @@ def bounded_update(rule: NPARule, observation: Tensor) -> tuple[Tensor, Tensor]:
         static; and state steps Δs, dimensionless, not bounded, shape [K, C].
     """
     weight = rule.hidden.weight
-    rows = _perceived(rule, observation.to(weight.device, weight.dtype))
+    rows = perceived(rule, observation.to(weight.device, weight.dtype))
     if rule.is_plain():
         # The very products of a rollout: a rule amplifies rounding from step to step.
         folded = rule.folded()
@@ -85,13 +85,28 @@ def bounded_update(rule: NPARule, observation: Tensor) -> tuple[Tensor, Tensor]:
         update = folded(padded)[:, : rule.update_dim]
     else:
         update = rule(rows)
+    return bounded(rule, update)
+
+
+def bounded(rule: NPARule, update: Tensor) -> tuple[Tensor, Tensor]:
+    """Return displacements and state steps of raw updates, as `bounded_update` does.
+
+    Args:
+        rule: Says whether particles move.
+        update: What its network gives, shape [K, A].
+    """
     moved = 0 if rule.static else rule.space_dim
     delta, state_step = update[:, :moved], update[:, moved:]
     return delta / (1.0 + delta.norm(dim=1, keepdim=True)), state_step
 
 
-def _perceived(rule: NPARule, rows: Tensor) -> Tensor:
-    """Return what a rule reads of observations, [K, P], in its order."""
+def perceived(rule: NPARule, rows: Tensor) -> Tensor:
+    """Return what a rule reads of observations, in its order.
+
+    Args:
+        rule: The rule.
+        rows: What environments offer, shape [K, P].
+    """
     if rule.state_gradient and rule.density_gradient:
         return rows
     first, end = 2 * rule.state_dim, rule_interface(rule, 1.0).shared_dim
@@ -150,6 +165,12 @@ def check_rule_fits(rule: NPARule, wanted: Interface, config: Any) -> None:
         raise NPAError(
             f"rule must tell as many species apart as the environment, {wanted.species_count}, got "
             f"{rule.species_count}: choose another rule, or another perception"
+        )
+    if rule.moment_inverse != config.moment_inverse:
+        raise NPAError(
+            f"rule must have the environment's moment_inverse, {config.moment_inverse!r}, got "
+            f"{rule.moment_inverse!r}: make the environment with "
+            f"moment_inverse={rule.moment_inverse!r}"
         )
     for name in ("eps0",) if rule.static else ("eps0", "alpha"):
         own, theirs = getattr(rule, name), getattr(config, name)

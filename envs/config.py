@@ -8,6 +8,7 @@ from typing import Any, Literal, Self
 import numpy as np
 import torch
 
+from npa_envs.control import MomentInverse
 from npa_envs.devices import check_device
 from npa_envs.errors import NPAError, suggest
 from npa_envs.render import STYLES
@@ -25,6 +26,7 @@ Output = Literal["numpy", "torch"]
 OnDivergence = Literal["terminate", "reset", "raise", "ignore"]
 
 CHOICES = {
+    "moment_inverse": ("threshold", "smooth"),
     "boundary": ("open", "periodic"),
     "reward": ("dense", "sparse", "particle"),
     "output": ("numpy", "torch"),
@@ -83,6 +85,10 @@ class EnvConfig:
 
     position_noise: float = 0.0
     """Standard deviation of the noise added to every position in a step [length units]."""
+
+    moment_inverse: MomentInverse = "threshold"
+    """How observed state gradients are corrected: "threshold", the paper's, which jumps where
+    neighbours come to lie on a line; or "smooth", for rules that are trained with it."""
 
     boundary: Boundary = "open"
     """"open" space, or a "periodic" box into which positions are wrapped."""

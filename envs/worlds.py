@@ -45,6 +45,7 @@ def make_physics(config: EnvConfig, task_type: type[EnvTask[Any]]) -> Physics:
         position_noise=config.position_noise,
         box=None if config.box is None else (config.box,) * task_type.space_dim,
         moving=not task_type.static,
+        moment_inverse=config.moment_inverse,
         perception_limit=config.observation_limit,
         position_limit=config.position_limit,
         state_limit=config.observation_limit,

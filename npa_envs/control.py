@@ -14,11 +14,19 @@ from torch import Tensor
 
 from npa_envs.randomness import WorldRandom
 from npa_envs.sph.actions import ActionRules, RepeatedActions
+from npa_envs.sph.checks import MomentInverse
 from npa_envs.sph.passes import Terms
 from npa_envs.sph.rows import SurveyedWorlds, survey
 from npa_envs.sph.species import perceive_by_species
 
-__all__ = ["Actions", "Physics", "SurveyedWorlds", "perceive_each_species", "survey_worlds"]
+__all__ = [
+    "Actions",
+    "MomentInverse",
+    "Physics",
+    "SurveyedWorlds",
+    "perceive_each_species",
+    "survey_worlds",
+]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,6 +66,9 @@ class Physics:
     moving: bool
     """Whether particles move; otherwise an action has no displacement."""
 
+    moment_inverse: MomentInverse
+    """How perceived state gradients are corrected, as in `npa_envs.perceive`."""
+
     perception_limit: float
     """What is perceived is clipped to plus and minus this, dimensionless."""
 
@@ -96,7 +107,7 @@ def survey_worlds(
         eps=physics.eps,
         eps0=physics.eps0,
         box=physics.box,
-        terms=Terms(),
+        terms=Terms(moment_inverse=physics.moment_inverse),
         limit=physics.perception_limit,
         places=places,
     )

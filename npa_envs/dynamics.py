@@ -142,7 +142,8 @@ def draw_step(
 
 def rule_terms(rule: NPARule) -> Terms:
     """Return the groups of the perception vector that a rule reads."""
-    return Terms(rule.state_gradient, rule.moment_correction, rule.density_gradient)
+    inverse = rule.moment_inverse if rule.moment_correction else None
+    return Terms(rule.state_gradient, inverse, rule.density_gradient)
 
 
 def _advance(

@@ -15,6 +15,9 @@ from torch import Tensor
 MOMENT_THRESHOLD = 1e-3
 """Smallest |det M| that is inverted, dimensionless."""
 
+MOMENT_SOFTENING = 1e-2
+"""τ: the smooth inverse is half way between M^-1 and I at this det M, dimensionless."""
+
 
 class ReferenceFields(NamedTuple):
     """The unscaled fields; shapes and units as in `npa_envs.PerceptionFields`."""
@@ -79,8 +82,44 @@ def log_scale(v: Tensor) -> Tensor:
     return torch.where(nonzero, torch.log1p(unit * length) / length, 1.0) * v
 
 
+def threshold_inverse(moment: Tensor) -> Tensor:
+    """Return M^-1 where |det M| is at least the threshold, else the identity, shape [..., D, D]."""
+    invertible = torch.linalg.det(moment).abs() >= MOMENT_THRESHOLD
+    unit = torch.eye(moment.shape[-1], dtype=moment.dtype, device=moment.device).expand_as(moment)
+    inverse: Tensor = torch.linalg.inv(torch.where(invertible[..., None, None], moment, unit))
+    return inverse
+
+
+def adjugate(moment: Tensor) -> Tensor:
+    """Return adj M of symmetric matrices M: adj M = det M M^-1 where there is one, [..., D, D]."""
+    trace = torch.diagonal(moment, dim1=-2, dim2=-1).sum(dim=-1)[..., None, None]
+    unit = torch.eye(moment.shape[-1], dtype=moment.dtype, device=moment.device)
+    if moment.shape[-1] == 2:
+        return trace * unit - moment
+    # By the theorem of Cayley and Hamilton.
+    square = moment @ moment
+    square_trace = torch.diagonal(square, dim1=-2, dim2=-1).sum(dim=-1)[..., None, None]
+    return square - trace * moment + 0.5 * (trace * trace - square_trace) * unit
+
+
+def smooth_inverse(moment: Tensor) -> Tensor:
+    """Return (det M adj M + τ² I) / (det² M + τ²) of symmetric matrices, shape [..., D, D].
+
+    It is w M^-1 + (1 - w) I with w = det² M / (det² M + τ²), written without the inverse.
+    """
+    determinant: Tensor = torch.linalg.det(moment)[..., None, None]
+    softening = MOMENT_SOFTENING**2
+    unit = torch.eye(moment.shape[-1], dtype=moment.dtype, device=moment.device)
+    blend = determinant * adjugate(moment) + softening * unit
+    return blend / (determinant * determinant + softening)
+
+
 def fields(
-    x: Tensor, s: Tensor, eps: float, box: tuple[float, ...] | None = None
+    x: Tensor,
+    s: Tensor,
+    eps: float,
+    box: tuple[float, ...] | None = None,
+    moment_inverse: str = "threshold",
 ) -> ReferenceFields:
     """Return the unscaled SPH fields of every particle, differentiable in x and s.
 
@@ -89,6 +128,7 @@ def fields(
         s: States, dimensionless, shape [B, N, C].
         eps: Perception radius [length units].
         box: Sides of the periodic box [length units], or None in open space.
+        moment_inverse: "threshold" or "smooth", as in `npa_envs.perceive`.
     """
     r = differences(x, box)
     weight = smoothing_kernel((r * r).sum(dim=-1), eps, x.shape[2])
@@ -99,9 +139,7 @@ def fields(
     offset = s[:, None, :, :] - s[:, :, None, :]
     grad0 = torch.einsum("bj,bijc,bijd->bicd", volume, offset, kernel)
     moment = torch.einsum("bj,bijd,bije->bide", volume, r, kernel)
-    invertible = torch.linalg.det(moment).abs() >= MOMENT_THRESHOLD
-    unit = torch.eye(x.shape[2], dtype=x.dtype, device=x.device).expand_as(moment)
-    inverse = torch.linalg.inv(torch.where(invertible[..., None, None], moment, unit))
+    inverse = smooth_inverse(moment) if moment_inverse == "smooth" else threshold_inverse(moment)
     return ReferenceFields(rho, blur, grad0, moment, grad0 @ inverse, kernel.sum(dim=2))
 
 
@@ -112,13 +150,14 @@ def perceive(
     eps0: float,
     box: tuple[float, ...] | None = None,
     detach_positions: bool = True,
+    moment_inverse: str = "threshold",
 ) -> Tensor:
     """Return perception vectors z, shape [B, N, P]; arguments as `npa_envs.perceive`."""
     if detach_positions:
         x = x.detach()
     scale = eps / eps0
     particle_count, space_dim = x.shape[1:]
-    values = fields(x, s, eps, box)
+    values = fields(x, s, eps, box, moment_inverse)
     gradient = values.grad0 + (values.grad1 - values.grad0).detach()
     return torch.cat(
         (

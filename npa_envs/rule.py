@@ -9,7 +9,12 @@ from torch import Tensor, nn
 
 from npa_envs.errors import NPAError
 from npa_envs.sph.arranged import ArrangedWeights, arrange_weights
-from npa_envs.sph.checks import checked_flag, checked_positive
+from npa_envs.sph.checks import (
+    MomentInverse,
+    checked_flag,
+    checked_moment_inverse,
+    checked_positive,
+)
 from npa_envs.sph.network import run_network
 
 COLOUR_OFFSET = 0.5
@@ -51,6 +56,7 @@ class RuleHyperParameters(NamedAlways, total=False):
     """Everything besides its weights that makes an `NPARule`."""
 
     species_count: int
+    moment_inverse: MomentInverse
 
 
 class _BlockedProduct(torch.autograd.Function):
@@ -153,9 +159,11 @@ class NPARule(nn.Module):
         density_gradient: The rule perceives the density gradient.
         species_count: Species whose densities and density gradients the rule perceives one by one,
             besides; 0: it does not tell them apart. Others are run by `npa_envs.rollout_species`.
+        moment_inverse: How the moment matrix is inverted for the correction: "threshold", the
+            paper's, or "smooth", as in `npa_envs.perceive`.
 
     Raises:
-        NPAError: A dimension or a length is out of range.
+        NPAError: A dimension or a length is out of range, or `moment_inverse` is another word.
     """
 
     def __init__(
@@ -173,6 +181,7 @@ class NPARule(nn.Module):
         state_gradient: bool = True,
         density_gradient: bool = True,
         species_count: int = 0,
+        moment_inverse: MomentInverse = "threshold",
     ) -> None:
         super().__init__()
         sizes = (space_dim, state_dim, hidden_dim, readout_dim, readout_hidden_dim, species_count)
@@ -201,6 +210,7 @@ class NPARule(nn.Module):
         self.readout_dim = readout_dim
         self.readout_hidden_dim = readout_hidden_dim
         self.moment_correction = checked_flag("moment_correction", moment_correction)
+        self.moment_inverse = checked_moment_inverse(moment_inverse)
         self.state_gradient = checked_flag("state_gradient", state_gradient)
         self.density_gradient = checked_flag("density_gradient", density_gradient)
         self.species_count = species_count
@@ -310,4 +320,6 @@ class NPARule(nn.Module):
         # Left out where it says nothing: files and checkpoints stay those of all versions.
         if self.species_count:
             made["species_count"] = self.species_count
+        if self.moment_inverse != "threshold":
+            made["moment_inverse"] = self.moment_inverse
         return made

@@ -11,7 +11,7 @@ import json
 import reprlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any, Literal, get_origin, get_type_hints
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -26,7 +26,10 @@ from npa_envs.rule_formats import RuleParts, read_demo_json, read_state_dict
 
 FORMAT_NAME = "npa-envs rule"
 FORMAT_VERSION = 1
-_FIELDS = get_type_hints(RuleHyperParameters)
+_FIELDS = {
+    name: str if get_origin(kind) is Literal else kind
+    for name, kind in get_type_hints(RuleHyperParameters).items()
+}
 _RESERVED = {"format", "version", *_FIELDS}
 _SUFFIXES = (".safetensors", ".pth", ".pt", ".json")
 

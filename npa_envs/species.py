@@ -31,6 +31,7 @@ AGREEMENTS = (
     "static",
     "state_gradient",
     "moment_correction",
+    "moment_inverse",
     "density_gradient",
 )
 """What rules must have in common to read one perception pass."""

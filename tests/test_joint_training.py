@@ -202,6 +202,13 @@ class TestRun:
         assert not torch.equal(second.output.weight, before[1])
         assert torch.equal(rules[1].output.weight, before[1])
 
+    def test_all_species_correct_gradients_as_the_run_is_told(self, tmp_path):
+        config = run_config(tmp_path / "run", iterations=1, moment_inverse="smooth")
+        for given in (None, CoMorphogenesis2D(pair()).make_rules(torch.Generator())):
+            result = train_together(config, given, overwrite=True, progress=False)
+            assert [rule.moment_inverse for rule in result.rule] == ["smooth", "smooth"]
+        assert load_rule(tmp_path / "run" / "rule-1.safetensors").moment_inverse == "smooth"
+
     def test_rules_that_do_not_fit_are_refused(self, tmp_path):
         rules = CoMorphogenesis2D(pair()).make_rules(torch.Generator())
         with pytest.raises(NPAError, match="one for each of 2 species, got 1"):

@@ -86,15 +86,18 @@ LADDER = {
     "npa_envs.robustness": rung(
         11, "torch matplotlib", never=("npa_envs.kernels", "npa_envs.reference")
     ),
-    "npa_envs.cli": rung(
-        12, "torch numpy tqdm tyro", never=("npa_envs.kernels", "npa_envs.reference")
-    ),
     "npa_envs.envs": rung(12, "torch numpy gymnasium pettingzoo", never=INSIDES),
     "npa_envs.wrappers": rung(
-        13, "torch numpy gymnasium pettingzoo stable_baselines3 ray", never=INSIDES
+        13,
+        "torch numpy gymnasium pettingzoo stable_baselines3 ray torchrl tensordict rsl_rl",
+        never=INSIDES,
     ),
     "npa_envs.agents": rung(
-        14, "torch numpy tqdm gymnasium pettingzoo stable_baselines3", never=INSIDES
+        14, "torch numpy tqdm gymnasium pettingzoo stable_baselines3 cma", never=INSIDES
+    ),
+    "npa_envs.agents.comparison": rung(15, "torch numpy PIL matplotlib", never=INSIDES),
+    "npa_envs.cli": rung(
+        16, "torch numpy tqdm tyro", never=("npa_envs.kernels", "npa_envs.reference")
     ),
 }
 WARP_AND_TORCH = {"npa_envs.sph", "npa_envs.bench.hash_grid"}

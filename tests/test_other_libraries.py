@@ -1,4 +1,4 @@
-"""Other libraries train on environments of several species; skipped where they are missing."""
+"""PettingZoo's and RLlib's ways to train on environments; skipped where libraries are missing."""
 
 from __future__ import annotations
 
@@ -100,3 +100,46 @@ def test_rllib_trains_a_policy_for_each_species_or_one_for_all(shared):
         ray.shutdown()
     with pytest.raises(NPAError, match="name must be a known id, got 'npa/Mixin-v0'"):
         rllib_config("npa/Mixin-v0")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("runner_count", [0, 2])
+def test_rllib_trains_one_policy_on_the_particles_of_worlds_of_one_species(runner_count):
+    ray = pytest.importorskip("ray")
+    from npa_envs.wrappers.rllib import rllib_rows_config
+
+    keywords = {"particle_count": 16, "eps": 0.3, "resolution": 16, "max_episode_steps": 6}
+    config = (
+        rllib_rows_config("npa/Morphogenesis2D-v0", world_count=2, reward="particle", **keywords)
+        .env_runners(
+            num_env_runners=runner_count, rollout_fragment_length=12 // (runner_count or 1)
+        )
+        .training(train_batch_size_per_learner=12 * 32, minibatch_size=12 * 32, num_epochs=1)
+    )
+    ray.init(num_cpus=3, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
+    try:
+        algorithm = config.build_algo()
+        for _ in range(2):
+            results = algorithm.train()
+        assert results["env_runners"]["episode_len_mean"] == 6
+        assert results["learners"]["default_policy"]["num_module_steps_trained"] > 0
+        module = algorithm.get_module()
+        observed, acted = module.observation_space, module.action_space
+        assert (observed.shape, acted.shape) == ((66,), (18,))
+        algorithm.stop()
+    finally:
+        ray.shutdown()
+
+
+def test_rllib_rows_need_a_known_id_and_right_keywords():
+    pytest.importorskip("ray")
+    from npa_envs.wrappers.rllib import rllib_rows_config
+
+    with pytest.raises(
+        NPAError, match="name must be a known id, got 'npa/Texure-v0': did you mean"
+    ):
+        rllib_rows_config("npa/Texure-v0", particle_count=8)
+    with pytest.raises(NPAError, match="world_count must be a whole number of at least 1, got 0"):
+        rllib_rows_config("npa/Texture-v0", particle_count=8, world_count=0)
+    with pytest.raises(NPAError, match="did you mean 'target'"):
+        rllib_rows_config("npa/Morphogenesis2D-v0", particle_count=8, targets="heart")

@@ -68,7 +68,7 @@ def test_rows_of_perception_may_be_wider(row_width, device):
 
 @pytest.mark.parametrize("space_dim", [2, 3])
 @pytest.mark.parametrize(
-    "terms", [Terms(state_gradient=False), Terms(moment_correction=False, density_gradient=False)]
+    "terms", [Terms(state_gradient=False), Terms(moment_inverse=None, density_gradient=False)]
 )
 def test_state_gradient_of_fewer_groups_equals_that_of_float64(terms, space_dim, device):
     x, s = random_world(2, 50, space_dim, 16, dtype=torch.float32, device=device)

@@ -105,3 +105,19 @@ def test_rules_that_saw_strays_let_lone_particles_rest(tmp_path):
     untaught = train(replace(plain, out=tmp_path / "plain"), "morphogenesis2d", progress=False)
     # Seen: 0.058 against 0.37 length units.
     assert lone_motion(taught.rule) < 0.3 * lone_motion(untaught.rule)
+
+
+def test_the_distance_of_the_centroid_from_where_worlds_begin_is_paid_for():
+    task = Morphogenesis2D(replace(SMALL, drift_weight=2.0), device="cpu")
+    x, s = task.seed(1, generator=torch.Generator().manual_seed(0), device=torch.device("cpu"))
+    moved = (x + torch.tensor([0.3, -0.4])).requires_grad_()
+    still = x.new_zeros(x.shape[:2])
+    near, there = task.loss(x - x.mean(1, keepdim=True), s, still), task.loss(moved, s, still)
+    assert float(near[1]["drift"]) < 2e-6
+    assert float(there[1]["drift"].detach()) == pytest.approx(0.5, abs=0.05)
+    (pull,) = torch.autograd.grad(there[1]["drift"], moved)
+    # Every particle is pulled back along the way that the centroid has gone.
+    torch.testing.assert_close(
+        pull.sum(1), moved.mean(1) / moved.mean(1).norm(dim=-1), rtol=1e-5, atol=1e-6
+    )
+    assert "drift" not in Morphogenesis2D(SMALL, device="cpu").loss(x, s, still)[1]

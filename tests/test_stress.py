@@ -179,6 +179,7 @@ def test_a_run_goes_on_where_it_was_and_repeats_what_did_not_pass():
         "geometry/seam/2d/periodic",
         "geometry/tight_box/3d/periodic",
         "geometry/threshold/2d",
+        "geometry/smooth_inverse/3d",
         "geometry/crowd/2d",
         "geometry/nearest/2d",
         "values/infinite_channel/2d",
@@ -210,6 +211,18 @@ def test_a_wrong_operator_is_found_out(factor, monkeypatch):
     difference = run_check(CHECKS["gradients/finite_differences/2d/open"], session())
     # A wrong factor is differentiated rightly; what is not a number is not.
     assert difference.verdict == ("fail" if math.isnan(factor) else "pass")
+
+
+def test_a_jump_of_the_smooth_inverse_is_found_out(monkeypatch):
+    right = geometry.perceive
+
+    def by_threshold(*arguments, **options):
+        return right(*arguments, **options | {"moment_inverse": "threshold"})
+
+    monkeypatch.setattr(geometry, "perceive", by_threshold)
+    entry = run_check(CHECKS["geometry/smooth_inverse/2d"], session())
+    assert entry.verdict == "fail"
+    assert entry.figures["jump_float64"] == entry.figures["jump_by_threshold_float64"] > 0.5
 
 
 def test_results_that_change_from_call_to_call_are_found_out(monkeypatch):

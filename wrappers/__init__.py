@@ -1,6 +1,6 @@
 """Adapters between environments and the libraries that train on them, as `npa_envs.wrappers`.
 
-Holds Gymnasium wrappers, and adapters to Stable-Baselines3, RLlib and TorchRL.
+Holds Gymnasium wrappers, and adapters to Stable-Baselines3, TorchRL, RSL-RL and RLlib.
 They use the public API only. Names are imported when they are first used, so that none of these
 libraries is needed for the others.
 """
@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from npa_envs.wrappers.normalize import NormalizePerception, VectorNormalizePerception
     from npa_envs.wrappers.numeric_infos import NumericInfos as NumericInfos
     from npa_envs.wrappers.particles import ParticleVecEnv as ParticleVecEnv
+    from npa_envs.wrappers.row_vector import ParticleRows
+    from npa_envs.wrappers.rsl_rl import RslRlParticleEnv as RslRlParticleEnv
     from npa_envs.wrappers.species import SpeciesTags, VectorSpeciesTags
     from npa_envs.wrappers.species_rows import RowPolicy as RowPolicy
     from npa_envs.wrappers.species_rows import SpeciesVecEnv as SpeciesVecEnv
@@ -20,11 +22,13 @@ if TYPE_CHECKING:
         TorchNormalizeReward,
         TorchRecordEpisodeStatistics,
     )
+    from npa_envs.wrappers.torchrl import NPATorchRLEnv as NPATorchRLEnv
     from npa_envs.wrappers.world_rows import WorldVecEnv as WorldVecEnv
 
 __all__ = [
     "DamageEvents",
     "NormalizePerception",
+    "ParticleRows",
     "SpeciesTags",
     "TorchNormalizeObservation",
     "TorchNormalizeReward",
@@ -33,8 +37,16 @@ __all__ = [
     "VectorNormalizePerception",
     "VectorSpeciesTags",
 ]
-# A star imports all of them, and must need neither Stable-Baselines3 nor PettingZoo.
-ON_REQUEST = ("NumericInfos", "ParticleVecEnv", "RowPolicy", "SpeciesVecEnv", "WorldVecEnv")
+# A star imports all of them, and must need none of the libraries that are optional.
+ON_REQUEST = (
+    "NPATorchRLEnv",
+    "NumericInfos",
+    "ParticleVecEnv",
+    "RowPolicy",
+    "RslRlParticleEnv",
+    "SpeciesVecEnv",
+    "WorldVecEnv",
+)
 
 
 def __getattr__(name: str) -> Any:
@@ -46,6 +58,14 @@ def __getattr__(name: str) -> Any:
         from npa_envs.wrappers import numeric_infos
 
         return numeric_infos.NumericInfos
+    if name == "NPATorchRLEnv":
+        from npa_envs.wrappers import torchrl
+
+        return torchrl.NPATorchRLEnv
+    if name == "RslRlParticleEnv":
+        from npa_envs.wrappers import rsl_rl
+
+        return rsl_rl.RslRlParticleEnv
     if name == "WorldVecEnv":
         from npa_envs.wrappers import world_rows
 
@@ -56,9 +76,9 @@ def __getattr__(name: str) -> Any:
         return getattr(species_rows, name)
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from npa_envs.wrappers import damage, normalize, species, statistics
+    from npa_envs.wrappers import damage, normalize, row_vector, species, statistics
 
-    holders = (damage, normalize, species, statistics)
+    holders = (damage, normalize, row_vector, species, statistics)
     return next(getattr(module, name) for module in holders if hasattr(module, name))
 
 

@@ -8,9 +8,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from npa_envs.wrappers.adapters import check_same_step, own_rewards, row_space
 from npa_envs.wrappers.base import AnyVectorEnv, autoreset_mode, vector_env
 from npa_envs.wrappers.moments import as_tensor
-from npa_envs.wrappers.rows import RowVecEnv, check_same_step, on_host, row_space
+from npa_envs.wrappers.rows import RowVecEnv, on_host
 
 
 class ParticleVecEnv(RowVecEnv):
@@ -76,7 +77,7 @@ class ParticleVecEnv(RowVecEnv):
         observations, rewards, terminations, truncations, infos = self.vector_env.step(
             self.taken_actions()
         )
-        own = _own_rewards(infos)
+        own = own_rewards(infos)
         shown, paid, ended, cut = on_host(
             observations, rewards if own is None else own, terminations, truncations
         )
@@ -116,13 +117,3 @@ class ParticleVecEnv(RowVecEnv):
             rows[first : first + count] = [
                 {**common, "terminal_observation": observation} for observation in last[k]
             ]
-
-
-def _own_rewards(infos: dict[str, Any]) -> Any:
-    """Return each particle's reward of the last step, shape [B, N], or None where there is none."""
-    own = infos.get("particle_reward")
-    if own is None or "final_info" not in infos:
-        return own
-    # Worlds that restarted say in their final info what their last step was worth.
-    which = as_tensor(infos["_final_info"])[:, None]
-    return torch.where(which, as_tensor(infos["final_info"]["particle_reward"]), as_tensor(own))

@@ -8,7 +8,7 @@ from typing import Any, NoReturn
 import numpy as np
 import torch
 from gymnasium.spaces import Box
-from gymnasium.vector import AutoresetMode, VectorWrapper
+from gymnasium.vector import VectorWrapper
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -205,22 +205,6 @@ class RowVecEnv(VecEnv):
         raise AttributeError(f"{self.vector_env} has no attribute {name!r}")
 
 
-def check_same_step(mode: AutoresetMode) -> None:
-    """Check that worlds restart by themselves, as rows have to.
-
-    Args:
-        mode: How the environment restarts worlds.
-
-    Raises:
-        NPAError: Not in the step that ends their episodes.
-    """
-    if mode is not AutoresetMode.SAME_STEP:
-        raise NPAError(
-            f"env must restart worlds in the step that ends their episodes, got {mode}: "
-            "make it with autoreset_mode='same-step'"
-        )
-
-
 def on_host(*given: Any) -> list[NDArray[Any]]:
     """Return new arrays with what arrays or tensors hold, after one wait for the device.
 
@@ -236,13 +220,3 @@ def on_host(*given: Any) -> list[NDArray[Any]]:
     for device in {v.device for v in given if isinstance(v, Tensor) and v.is_cuda}:
         torch.cuda.current_stream(device).synchronize()
     return [copy.numpy() for copy in copies]
-
-
-def row_space(space: Any) -> Box:
-    """Return the space of one particle of a world's.
-
-    Args:
-        space: A box of shape [N, ...].
-    """
-    assert isinstance(space, Box), "environments of this package have boxes"
-    return Box(space.low[0], space.high[0], dtype=np.float32)

@@ -13,8 +13,9 @@ from torch import Tensor
 
 from npa_envs.envs.species.vector import MultiSpeciesVectorEnv
 from npa_envs.errors import NPAError, suggest
+from npa_envs.wrappers.adapters import check_same_step, row_space
 from npa_envs.wrappers.moments import as_tensor
-from npa_envs.wrappers.rows import RowVecEnv, check_same_step, on_host, row_space
+from npa_envs.wrappers.rows import RowVecEnv, on_host
 
 SpeciesPolicy = Callable[[Any], Any]
 """Takes a species' observations, shape [B, N_k, P], and returns its actions, [B, N_k, A]."""

@@ -9,8 +9,9 @@ from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from npa_envs.errors import NPAError
+from npa_envs.wrappers.adapters import check_same_step
 from npa_envs.wrappers.base import autoreset_mode
-from npa_envs.wrappers.rows import RowVecEnv, check_same_step, on_host
+from npa_envs.wrappers.rows import RowVecEnv, on_host
 
 
 class WorldVecEnv(RowVecEnv):

@@ -77,6 +77,7 @@ class RuleSet(nn.Module):
                     eps0=config.eps0,
                     alpha=config.alpha,
                     static=not interface.moving,
+                    moment_inverse=config.moment_inverse,
                     species_count=interface.species_count,
                 )
                 for _ in problem.counts

@@ -10,6 +10,7 @@ from typing import Any, Literal, Self
 import numpy as np
 from torch import Tensor
 
+from npa_envs.control import MomentInverse
 from npa_envs.envs.config import LARGEST, Boundary, EnvConfig, Output
 from npa_envs.errors import NPAError, suggest
 from npa_envs.render import STYLES
@@ -79,6 +80,10 @@ class SpeciesConfig:
 
     position_noise: float = 0.0
     """Standard deviation of the noise added to every position in a step [length units]."""
+
+    moment_inverse: MomentInverse = "threshold"
+    """How observed state gradients are corrected: "threshold", the paper's, which jumps where
+    neighbours come to lie on a line; or "smooth", for rules that are trained with it."""
 
     perception: Perception = "shared"
     """"shared": particles perceive each other whatever their species; "per_species": they also

@@ -71,7 +71,7 @@ class Workload:
         s = torch.randn(*shape, self.state_dim, generator=generator, device=device)
         return x.mul_(2.0).sub_(1.0).mul_(self.half_width), s.mul_(0.1)
 
-    def rule(self, device: torch.device, **options: bool) -> NPARule:
+    def rule(self, device: torch.device, **options: Any) -> NPARule:
         """Return a rule with the same fresh weights at every call.
 
         Args:

@@ -17,6 +17,7 @@ COMMANDS = {
     "bench": "run time against error, the paper's table, scaling; a call explained",
     "stress": "hard cases, what is expected of each, and where things break",
     "robustness": "what rules bear and what they heal: losses and recovery times over many seeds",
+    "compare": "reinforcement learning, evolution and the gradient on the same tasks",
     "list": "tasks, presets, environments, built-in targets, losses, shipped rules",
     "warmup": "compile the kernels ahead of time",
     "doctor": "versions, devices, kernel cache, fonts",
@@ -104,6 +105,10 @@ def _dispatch(words: list[str]) -> int:
             from npa_envs.cli import robustness
 
             return robustness.main(rest)
+        case "compare":
+            from npa_envs.cli import compare
+
+            return compare.main(rest)
         case "list":
             from npa_envs.cli import listing
 

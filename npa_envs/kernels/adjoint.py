@@ -240,11 +240,14 @@ def adjoint_kernels(
         distance = wp.sqrt(squared)
         slope = smoothing_slope(squared, domain.inverse_squared_eps, domain.smoothing_norm)
         factor = spiky_factor(distance, domain.inverse_eps, domain.spiky_norm)
-        pull = smoothing_bar * slope * offset + factor * kernel_bar
+        pull = smoothing_bar * slope * offset
         if distance > scalar(0.0):
+            # Where two particles nearly touch the factor is large, and pulls across alone.
             direction = offset / distance
+            share = wp.dot(direction, kernel_bar) / wp.dot(direction, direction)
+            along = share * direction
             radial = spiky_radial_slope(distance, domain.inverse_eps, domain.spiky_norm)
-            pull += radial * wp.dot(direction, kernel_bar) * direction
+            pull += factor * (kernel_bar - along) + radial * along
         return pull
 
     @in_ranges(PAIRS)

@@ -71,16 +71,9 @@ def spiky_factor(distance: Any, inverse_eps: Any, norm: Any):
 
 @wp.func
 def spiky_radial_slope(distance: Any, inverse_eps: Any, norm: Any):
-    """f'(r) r of the spiky factor f, for its adjoint; zero at r = 0 [1 / length^(D+2)].
-
-    The adjoint takes it along unit vectors: f' / r itself overflows where two particles nearly
-    touch, although what it is multiplied by is as small.
-    """
-    slope = type(norm)(0.0)
-    if distance > type(norm)(0.0):
-        falloff = type(norm)(1.0) - distance * inverse_eps
-        slope = -norm * falloff * (type(norm)(2.0) * inverse_eps + falloff / distance)
-    return slope
+    """d(f r)/dr of the spiky kernel's length f(r) r, for its adjoint [1 / length^(D+2)]."""
+    falloff = type(norm)(1.0) - distance * inverse_eps
+    return -type(norm)(2.0) * norm * falloff * inverse_eps
 
 
 @wp.func

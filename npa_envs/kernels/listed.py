@@ -12,9 +12,15 @@ import math
 
 import warp as wp
 
-from npa_envs.kernels.domain import MOMENT_THRESHOLD, domain_types, kernel_module
+from npa_envs.kernels.domain import (
+    MOMENT_THRESHOLD,
+    domain_types,
+    kernel_module,
+    log_scaled_huge,
+)
 from npa_envs.kernels.lanes import make_lane_sum, make_wide_load, share_type
 from npa_envs.kernels.listing import RECORD
+from npa_envs.kernels.moments import make_smooth_inverse
 from npa_envs.kernels.slots import (
     SLOT_ENTRIES,
     as_number,
@@ -49,7 +55,7 @@ def listed_perception(
     width: int,
     lanes: int,
     state_gradient: bool,
-    moment_correction: bool,
+    moment_inverse: str | None,
     periodic: bool,
     grouped: bool,
     capacity: int,
@@ -63,7 +69,7 @@ def listed_perception(
         width: Channels of a group.
         lanes: Lanes of a team, which share the channels of a group.
         state_gradient: Whether the state gradient is perceived.
-        moment_correction: Whether it is corrected by the moment matrix.
+        moment_inverse: How it is corrected by the moment matrix; None: not at all.
         periodic: Whether space is a periodic box.
         grouped: Whether channels come in several groups.
         capacity: Neighbours that lists have room for.
@@ -72,6 +78,8 @@ def listed_perception(
             its own part of the list, all channels of it.
     """
     scalar = wp.float32
+    moment_correction = moment_inverse is not None
+    smooth = moment_inverse == "smooth"
     flat = space_dim == 2
     types = domain_types(space_dim, scalar)
     vector, Domain = types.vector, types.Domain
@@ -95,6 +103,7 @@ def listed_perception(
     topic = "listed_smoothing"
     if state_gradient:
         topic = "listed_perception" if moment_correction else "listed_uncorrected_perception"
+        topic = "listed_smoothly_corrected_perception" if smooth else topic
     topic += "_in_box" * periodic + "_grouped" * grouped
     topic += f"_{capacity}" + "_for_adjoint" * for_adjoint
     module = kernel_module(topic, space_dim, scalar, width, lanes)
@@ -117,6 +126,7 @@ def listed_perception(
     places_ahead = wp.types.vector(AHEAD, wp.int32)
     records_ahead = wp.types.matrix((AHEAD, 4), scalar)
     write_rows = slots.write_rows
+    smooth_inverse = make_smooth_inverse(space_dim, scalar)
     stage_share, stage_rows = make_stage(share), make_stage(share_rows)
 
     @wp.func
@@ -287,6 +297,20 @@ def listed_perception(
         meet_warp()
         return blur, gradient
 
+    @wp.func
+    def scale_huge(gradient_scale: scalar, gradient: share_gradient, scaled: share_rows):
+        """Scaled gradients, those whose squares overflow as well."""
+        result = scaled
+        for c in range(wp.static(share_width)):
+            along = vector()
+            for d in range(wp.static(space_dim)):
+                along[d] = gradient_scale * gradient[d, c]
+            if wp.isinf(wp.dot(along, along)):
+                along = log_scaled_huge(along)
+                for d in range(wp.static(space_dim)):
+                    result[c * wp.static(space_dim) + d] = along[d]
+        return result
+
     @wp.kernel(enable_backward=False, module=module, cuda_max_registers=registers)
     def perceive(
         domain: Domain,
@@ -449,20 +473,27 @@ def listed_perception(
             for r in range(1, wp.static(space_dim)):
                 for c in range(r):
                     moment[r, c] = moment[c, r]
-            if wp.abs(wp.determinant(moment)) >= scalar(wp.static(MOMENT_THRESHOLD)):
+            if wp.static(smooth):
+                gradient = smooth_inverse(moment) * gradient
+            elif wp.abs(wp.determinant(moment)) >= scalar(wp.static(MOMENT_THRESHOLD)):
                 gradient = wp.inverse(moment) * gradient
         mine = (lane & wp.static(team - 1)) * wp.static(share_width)
         stage_share(slot, mine, wp.where(present, own, share()))
         stage_share(slot, wp.static(width) + mine, blur)
         if wp.static(state_gradient):
             scaled = share_rows()
+            largest_square = scalar(0.0)
             for c in range(wp.static(share_width)):
                 along = vector()
                 for d in range(wp.static(space_dim)):
                     along[d] = gradient_scale * gradient[d, c]
-                along *= log_scale_of_square(wp.dot(along, along))
+                squared = wp.dot(along, along)
+                largest_square = wp.max(largest_square, squared)
+                along *= log_scale_of_square(squared)
                 for d in range(wp.static(space_dim)):
                     scaled[c * wp.static(space_dim) + d] = along[d]
+            if wp.isinf(largest_square):
+                scaled = scale_huge(gradient_scale, gradient, scaled)
             stage_rows(slot, wp.static(2 * width) + mine * wp.static(space_dim), scaled)
         bound = wp.where(limit > scalar(0.0), limit, scalar(wp.static(math.nan)))
         write_rows(slot, destination, g, state_dim, bound, perception)
@@ -477,7 +508,11 @@ def listed_perception(
             along = vector()
             for d in range(wp.static(space_dim)):
                 along[d] = scalar(wide_sum[d]) * density_scale
-            along *= log_scale_of_square(wp.dot(along, along))
+            squared = wp.dot(along, along)
+            if wp.isinf(squared):
+                along = log_scaled_huge(along)
+            else:
+                along *= log_scale_of_square(squared)
             if destination >= 0 and lane == 0 and g == 0:
                 for d in range(wp.static(space_dim)):
                     perception[destination, column + d] = within(along[d], bound)

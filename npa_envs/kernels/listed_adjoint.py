@@ -50,6 +50,10 @@ CUDA_REGISTERS = 64
 SHARE = 4
 """Channels of a row that one thread unscales."""
 
+BLOCK = 4096
+"""Rows whose cotangents are summed before they are added to the others: of a million summed one
+after the other, too much is rounded away."""
+
 LARGEST_LENGTH = 3e38
 """Farther than any particle [length units]."""
 
@@ -357,7 +361,9 @@ def listed_adjoint(
             last_column = largest_in_warp(wp.where(served, cell[0], 0))
             from_column, to_column = columns_around(domain, column, last_column)
             run_count = count_runs(domain, to_column)
+            votes = vote_of_warp(served) >> wp.uint32(8 * (lane & 3))
             count = wp.int32(0)
+            block = wp.int32(0)
             found = CHANNELS()
             for first_run in range(0, run_count, wp.static(WARP)):
                 run = first_run + lane
@@ -402,11 +408,14 @@ def listed_adjoint(
                         )
                         carry_rest(address, summed, count)
                         count = wp.max(count - summed, 0)
-            votes = vote_of_warp(served) >> wp.uint32(8 * (lane & 3))
-            for n in range(2):
-                if (votes & wp.uint32(1 << (4 * n))) != wp.uint32(0):
-                    total[n] += found[n]
-                    total[n + 2] += found[n + 2]
+                        block += summed
+                        if finished or block >= wp.static(BLOCK):
+                            for n in range(2):
+                                if (votes & wp.uint32(1 << (4 * n))) != wp.uint32(0):
+                                    total[n] += found[n]
+                                    total[n + 2] += found[n + 2]
+                            found = CHANNELS()
+                            block = wp.int32(0)
         total = share_tile(total)
         if written < end and part * wp.static(SHARE) < wp.static(width) and channel < state_dim:
             volume_place = written * wp.static(space_dim + 1) + wp.static(space_dim)

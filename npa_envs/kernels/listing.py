@@ -27,6 +27,10 @@ LONGEST_STEP = wp.constant(2**15 - 1)
 LIST_BYTES = 2 * CUDA_BLOCK
 """Bytes from one entry of a list to the next while it is made."""
 
+BLOCK = 4096
+"""Candidates whose weights are summed before they are added to the others: of a million summed one
+after the other, too much is rounded away."""
+
 store_record = make_wide_store(RECORD, wp.float32)
 
 
@@ -111,6 +115,7 @@ def listed_density(
             # As if it were full.
             list_end = list_begin + wp.uint32(wp.static(LIST_BYTES * capacity))
         far = wp.bool(False)
+        earlier = scalar(0.0)
         total = scalar(0.0)
         for segment in range(segment_count(domain, cell)):
             first, last = segment_cells(domain, cell, segment)
@@ -118,17 +123,28 @@ def listed_density(
             end = load_integer(starts, base + last)
             far = far or (begin < end and wp.max(k - begin, end - k) > LONGEST_STEP)
             j = begin + lane
-            # Several positions are asked for before the first is used.
-            while j + wp.static((many - 1) * lanes) < end:
-                ahead = positions_ahead()
-                for a in range(wp.static(many)):
-                    ahead[a] = load_vector(sorted_positions, j + a * wp.static(lanes))
-                for a in range(wp.static(many)):
-                    step = j + a * wp.static(lanes) - k
-                    falloff = falloff_at(domain, ahead[a] - position)
-                    list_end = append_step(list_begin, list_end, falloff, step)
-                    total += falloff * falloff * falloff
-                j += wp.static(many * lanes)
+            crowded = wp.bool(True)
+            while crowded:
+                stop = end
+                crowded = wp.bool(False)
+                if wp.static(lanes == 1):
+                    # Worlds whose particles have several threads are not as large.
+                    stop = wp.min(end, j + wp.static(BLOCK))
+                    crowded = stop < end
+                # Several positions are asked for before the first is used.
+                while j + wp.static((many - 1) * lanes) < stop:
+                    ahead = positions_ahead()
+                    for a in range(wp.static(many)):
+                        ahead[a] = load_vector(sorted_positions, j + a * wp.static(lanes))
+                    for a in range(wp.static(many)):
+                        step = j + a * wp.static(lanes) - k
+                        falloff = falloff_at(domain, ahead[a] - position)
+                        list_end = append_step(list_begin, list_end, falloff, step)
+                        total += falloff * falloff * falloff
+                    j += wp.static(many * lanes)
+                if crowded:
+                    earlier += total
+                    total = scalar(0.0)
             if j < end:
                 ahead = positions_ahead()
                 for a in range(wp.static(many - 1)):
@@ -141,7 +157,7 @@ def listed_density(
                     list_end = append_step(list_begin, list_end, falloff, candidate - k)
                     total += falloff * falloff * falloff
         # A particle always sees itself: a position that is not finite would otherwise have rho 0.
-        total = wp.max(add_scalar(total), scalar(1.0))
+        total = wp.max(add_scalar(earlier + total), scalar(1.0))
         length = leave_list(list_begin, list_end, row, lists)
         if lane == 0 and row >= 0:
             list_lengths[row] = wp.where(far, wp.static(capacity + 1), length)

@@ -19,6 +19,7 @@ from npa_envs.kernels.domain import (
     smoothing,
     spiky_factor,
 )
+from npa_envs.kernels.moments import make_smooth_inverse
 from npa_envs.kernels.ranges import PAIRS, in_ranges
 from npa_envs.kernels.sifting import make_sift
 from npa_envs.kernels.wide import make_wide_store
@@ -67,7 +68,7 @@ def make_weigh(space_dim: int, scalar: type) -> wp.Function:
 
 @functools.cache
 def pair_kernels(
-    space_dim: int, scalar: type, lanes: int, ahead: int, moment_correction: bool
+    space_dim: int, scalar: type, lanes: int, ahead: int, moment_inverse: str | None
 ) -> SimpleNamespace:
     """Return the kernels that make lists.
 
@@ -76,8 +77,10 @@ def pair_kernels(
         scalar: `wp.float32` or `wp.float64`.
         lanes: 1 on the CPU, more on CUDA.
         ahead: Lists are filled up to a multiple of this many entries.
-        moment_correction: Whether to invert moment matrices.
+        moment_inverse: How to invert moment matrices; None: not at all.
     """
+    moment_correction = moment_inverse is not None
+    smooth = moment_inverse == "smooth"
     types = domain_types(space_dim, scalar)
     vector, particle, Domain = types.vector, types.particle, types.Domain
     cell_of, segment_count, segment_cells = (
@@ -96,7 +99,9 @@ def pair_kernels(
     weigh = make_weigh(space_dim, scalar)
     packed = packing(scalar).packed
     store_entry = make_wide_store(entry_type, scalar)
+    smooth_inverse = make_smooth_inverse(space_dim, scalar)
     topic = "pairs" if moment_correction else "uncorrected_pairs"
+    topic = "smoothly_corrected_pairs" if smooth else topic
     module = kernel_module(f"{topic}_{ahead}", space_dim, scalar, 0, lanes)
 
     @in_ranges(PAIRS)
@@ -208,7 +213,9 @@ def pair_kernels(
         kernel_sum[k] = total
         if wp.static(moment_correction):
             inverse = square()
-            if wp.abs(wp.determinant(moment)) >= scalar(wp.static(MOMENT_THRESHOLD)):
+            if wp.static(smooth):
+                inverse = smooth_inverse(moment)
+            elif wp.abs(wp.determinant(moment)) >= scalar(wp.static(MOMENT_THRESHOLD)):
                 inverse = wp.inverse(moment)
             else:
                 for d in range(wp.static(space_dim)):

@@ -22,6 +22,7 @@ from npa_envs.kernels.domain import (
 )
 from npa_envs.kernels.groups import make_add_scaled
 from npa_envs.kernels.lanes import make_lane_scatter, make_lane_sum, make_wide_load, share_type
+from npa_envs.kernels.moments import make_smooth_inverse
 from npa_envs.kernels.ranges import PAIRS, in_ranges
 from npa_envs.kernels.sifting import make_sift
 
@@ -36,13 +37,15 @@ def perception_kernels(
     width: int,
     lanes: int,
     state_gradient: bool,
-    moment_correction: bool,
+    moment_inverse: str | None,
 ) -> SimpleNamespace:
     """Return the kernels of one variant: groups of `width` channels, `lanes` to a particle.
 
-    A variant without `state_gradient`, or without `moment_correction` of it, neither sums nor holds
-    what only that needs.
+    A variant without `state_gradient`, or without a correction of it by a `moment_inverse`, neither
+    sums nor holds what only that needs.
     """
+    moment_correction = moment_inverse is not None
+    smooth = moment_inverse == "smooth"
     types = domain_types(space_dim, scalar)
     vector, particle, Domain = types.vector, types.particle, types.Domain
     cell_of, segment_count, segment_cells = (
@@ -59,6 +62,7 @@ def perception_kernels(
     topic = "smoothing"
     if state_gradient:
         topic = "perception" if moment_correction else "uncorrected_perception"
+        topic = "smoothly_corrected_perception" if smooth else topic
     module = kernel_module(topic, space_dim, scalar, width, lanes)
     sift, sift_stride = make_sift(space_dim, scalar, particle, lanes)
     add_scaled = make_add_scaled(group, scalar)
@@ -70,6 +74,7 @@ def perception_kernels(
     scatter_group = make_lane_scatter(group, scalar, lanes)
     scatter_gradient = make_lane_scatter(group_gradient, scalar, lanes)
     gradient_share = share_type(group_gradient, scalar, lanes)
+    smooth_inverse = make_smooth_inverse(space_dim, scalar)
 
     @wp.func
     def spiky_wide(domain: Domain, centre: vector, neighbour: vector):
@@ -200,9 +205,11 @@ def perception_kernels(
 
     @wp.func
     def corrected(gradient: gradient_share, moment: square):
-        """Apply the inverse moment matrix where it is safely invertible."""
+        """Apply the inverse moment matrix where it is safely invertible, or the smooth one."""
         result = gradient
-        if wp.abs(wp.determinant(moment)) >= scalar(wp.static(MOMENT_THRESHOLD)):
+        if wp.static(smooth):
+            result = smooth_inverse(moment) * gradient
+        elif wp.abs(wp.determinant(moment)) >= scalar(wp.static(MOMENT_THRESHOLD)):
             result = wp.inverse(moment) * gradient
         return result
 

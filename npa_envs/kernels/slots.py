@@ -331,10 +331,10 @@ def inverse_root(value: wp.float32) -> wp.float32:
 
 @wp.func_native("""
     float length, inverse;
-    asm("sqrt.approx.ftz.f32 %0, %1;" : "=f"(length) : "f"(squared));
+    asm("sqrt.rn.f32 %0, %1;" : "=f"(length) : "f"(squared));
     const float one_plus = 1.0f + length;
     const float excess = one_plus - 1.0f;
-    asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(inverse) : "f"(excess));
+    asm("rcp.rn.f32 %0, %1;" : "=f"(inverse) : "f"(excess));
     return excess > 0.0f ? logf(one_plus) * inverse : 1.0f;
 """)
 def log_scale_of_square(squared: wp.float32) -> wp.float32:

@@ -6,7 +6,7 @@ import contextlib
 import math
 import operator
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -20,6 +20,10 @@ LENGTH_RANGE = {torch.float32: (1e-8, 1e8), torch.float64: (1e-60, 1e60)}
 
 LARGEST_SIDE = 16384
 """Pixels along a side of a picture, at most."""
+
+MomentInverse = Literal["threshold", "smooth"]
+"""What corrects state gradients: M^-1 where |det M| is at least 1e-3 and nothing below, as in the
+paper, or a smooth function of M that tends to M^-1, and to I as det M tends to 0."""
 
 Box = float | Sequence[float] | None
 """Sides of a periodic box centred on the origin [length units], one number for all; None: open."""
@@ -107,6 +111,21 @@ def checked_flag(name: str, value: Any) -> bool:
     with contextlib.suppress(TypeError, ValueError, RuntimeError):
         return bool(value)
     raise NPAError(f"{name} must be True or False, got {value!r}")
+
+
+def checked_moment_inverse(value: Any) -> MomentInverse:
+    """Return how moment matrices are inverted.
+
+    Raises:
+        NPAError: It is neither "threshold" nor "smooth".
+    """
+    if isinstance(value, str) and value == "threshold":
+        return "threshold"
+    if isinstance(value, str) and value == "smooth":
+        return "smooth"
+    raise NPAError(
+        f"moment_inverse must be 'threshold' or 'smooth', got {value!r}: 'threshold' is the paper's"
+    )
 
 
 def checked_number(name: str, value: Any) -> float:

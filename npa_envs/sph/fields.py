@@ -11,12 +11,14 @@ from npa_envs.sph.bridge import launch
 from npa_envs.sph.cells import make_plan, sort_worlds
 from npa_envs.sph.checks import (
     Box,
+    MomentInverse,
     check_finite_positions,
     check_scale,
     check_world,
     checked_box,
     checked_eps,
     checked_flag,
+    checked_moment_inverse,
 )
 from npa_envs.sph.operators import perceive_rows
 from npa_envs.sph.passes import Terms, compute_density_gradients, plain_kernels
@@ -34,7 +36,7 @@ class PerceptionFields(NamedTuple):
     moment: Tensor
     """Moment matrices M, dimensionless, shape [B, N, D, D]."""
     grad1: Tensor
-    """State gradients times the inverse of M where |det M| >= 1e-3 [1 / length], [B, N, C, D]."""
+    """State gradients corrected by the inverse of M [1 / length], shape [B, N, C, D]."""
     drho: Tensor
     """Density gradients [1 / length^(D+1)], shape [B, N, D]."""
 
@@ -50,6 +52,7 @@ def perceive(
     state_gradient: bool = True,
     moment_correction: bool = True,
     density_gradient: bool = True,
+    moment_inverse: MomentInverse = "threshold",
 ) -> Tensor:
     """Perceive every particle's neighbourhood: z = [s ; smoothed s ; L(c ∇s) ; L(c^(1+D) ∇ρ / N)].
 
@@ -69,13 +72,16 @@ def perceive(
         state_gradient: Include the state gradient in z.
         moment_correction: Correct the state gradient by the inverse moment matrix.
         density_gradient: Include the density gradient in z.
+        moment_inverse: How the moment matrix M is inverted: "threshold", M⁻¹ where
+            |det M| >= 1e-3 and not at all below, as in the paper, which jumps there; or "smooth",
+            (det M adj M + τ² I) / (det² M + τ²), τ = 1e-2, which nears both and never jumps.
 
     Returns:
         Perception vectors z, dimensionless, shape [B, N, P], P = C(2+D)+D with every group.
 
     Raises:
         NPAError: Shapes, dtypes or devices do not fit, a position is not finite, eps or eps0 is
-            not positive and finite, or a box side is below 2 eps.
+            not positive and finite, a box side is below 2 eps, or `moment_inverse` is another word.
     """
     check_world(x, s)
     radius = checked_eps("eps", eps, x.dtype)
@@ -83,9 +89,10 @@ def perceive(
     check_scale(radius, radius0, x.shape[2], x.dtype)
     sides = checked_box(box, x.shape[2], radius)
     check_finite_positions(x)
+    inverse = checked_moment_inverse(moment_inverse)
     terms = Terms(
         checked_flag("state_gradient", state_gradient),
-        checked_flag("moment_correction", moment_correction),
+        inverse if checked_flag("moment_correction", moment_correction) else None,
         checked_flag("density_gradient", density_gradient),
     )
     perception, rows = perceive_rows(
@@ -103,7 +110,14 @@ def perceive(
 
 
 @torch.no_grad()
-def perception_fields(x: Tensor, s: Tensor, eps: float, box: Box = None) -> PerceptionFields:
+def perception_fields(
+    x: Tensor,
+    s: Tensor,
+    eps: float,
+    box: Box = None,
+    *,
+    moment_inverse: MomentInverse = "threshold",
+) -> PerceptionFields:
     """Return the unscaled SPH fields of every particle; not differentiable (`perceive` is).
 
     Args:
@@ -111,10 +125,12 @@ def perception_fields(x: Tensor, s: Tensor, eps: float, box: Box = None) -> Perc
         s: Particle states, dimensionless, shape [B, N, C].
         eps: Perception radius [length units].
         box: Sides of a periodic box centred on the origin [length units], or None for open space.
+        moment_inverse: How `grad1` is corrected, as in `perceive`.
 
     Raises:
         NPAError: As `perceive`.
     """
+    terms = Terms(moment_inverse=checked_moment_inverse(moment_inverse))
     check_world(x, s)
     radius = checked_eps("eps", eps, x.dtype)
     sides = checked_box(box, x.shape[2], radius)
@@ -124,7 +140,7 @@ def perception_fields(x: Tensor, s: Tensor, eps: float, box: Box = None) -> Perc
     state_dim = s.shape[2]
     plan = make_plan(x, x.shape, state_dim, x.shape[0] * x.shape[1], False, radius, sides)
     ordered = sort_worlds(plan, x, s, None)
-    particles, row_density_gradient, _ = compute_density_gradients(plan, ordered, Terms())
+    particles, row_density_gradient, _ = compute_density_gradients(plan, ordered, terms)
     fields = PerceptionFields(
         rho=x.new_empty(plan.total),
         blur=x.new_empty(plan.total, state_dim),
@@ -134,7 +150,7 @@ def perception_fields(x: Tensor, s: Tensor, eps: float, box: Box = None) -> Perc
         drho=row_density_gradient[ordered.row_of].to(x.dtype),
     )
     launch(
-        plain_kernels(plan, Terms()).gather_fields,
+        plain_kernels(plan, terms).gather_fields,
         (plan.total, plan.group_count, plan.lanes),
         x.device,
         plan.domain,

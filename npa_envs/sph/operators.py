@@ -42,13 +42,13 @@ def _perceive_rows(
     scale: float,
     box: list[float] | None,
     state_gradient: bool,
-    moment_correction: bool,
+    moment_inverse: str | None,
     density_gradient: bool,
     for_adjoint: bool,
 ) -> list[Tensor]:
     """Return the particles of the rows, `row_source`, and then what a `SavedPerception` holds."""
     plan = make_plan(x, x.shape, s.shape[2], row_capacity, mask is not None, eps, box)
-    terms = Terms(state_gradient, moment_correction, density_gradient)
+    terms = Terms(state_gradient, moment_inverse, density_gradient)
     ordered = sort_worlds(plan, x, s, mask)
     densities = compute_densities(
         plan, ordered, terms, rollout_listing(plan), with_particles=for_adjoint

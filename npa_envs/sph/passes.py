@@ -31,8 +31,13 @@ class Terms(NamedTuple):
     """Which groups of the perception vector a rule reads: the others are not computed."""
 
     state_gradient: bool = True
-    moment_correction: bool = True
+    moment_inverse: str | None = "threshold"
     density_gradient: bool = True
+
+    @property
+    def correction(self) -> str | None:
+        """How the state gradient is corrected, "threshold" or "smooth"; None: not at all."""
+        return self.moment_inverse if self.state_gradient else None
 
     def perception_dim(self, space_dim: int, state_dim: int) -> int:
         """Length P of a perception vector with these groups."""
@@ -87,7 +92,7 @@ def plain_kernels(plan: Plan, terms: Terms) -> Any:
         plan.width,
         plan.lanes,
         terms.state_gradient,
-        terms.moment_correction,
+        terms.correction,
     )
 
 
@@ -234,7 +239,7 @@ def perception_launch(
             plan.width,
             plan.lanes,
             terms.state_gradient,
-            terms.moment_correction,
+            terms.correction,
             plan.periodic,
             plan.group_count > 1,
             capacity,

@@ -92,9 +92,9 @@ def _entry_bytes(x: Tensor) -> int:
     return ENTRY_SIZE * x.element_size() + (4 if x.shape[-1] == 3 else 0)
 
 
-def _kernels(plan: Plan, moment_correction: bool) -> Any:
+def _kernels(plan: Plan, moment_inverse: str | None) -> Any:
     return pair_kernels(
-        plan.space_dim, plan.scalar, plan.lanes, entries_ahead(plan), moment_correction
+        plan.space_dim, plan.scalar, plan.lanes, entries_ahead(plan), moment_inverse
     )
 
 
@@ -104,7 +104,7 @@ def _sort_settled(
     state_dim: int,
     eps: float,
     box: list[float] | None,
-    moment_correction: bool,
+    moment_inverse: str | None,
     density_gradient: bool,
     counted: bool,
 ) -> list[Tensor]:
@@ -117,7 +117,7 @@ def _sort_settled(
     lengths = x.new_empty(total if counted else 0, dtype=torch.int32)
     if counted:
         launch(
-            _kernels(plan, moment_correction).count_pairs,
+            _kernels(plan, moment_inverse).count_pairs,
             total,
             x.device,
             plan.domain,
@@ -142,7 +142,7 @@ def _(
     state_dim: int,
     eps: float,
     box: list[float] | None,
-    moment_correction: bool,
+    moment_inverse: str | None,
     density_gradient: bool,
     counted: bool,
 ) -> list[Tensor]:
@@ -159,7 +159,7 @@ def _(
 
 
 def _empty_lists(
-    particles: Tensor, entry_count: int, moment_correction: bool, density_gradient: bool
+    particles: Tensor, entry_count: int, moment_inverse: str | None, density_gradient: bool
 ) -> list[Tensor]:
     """Return what listing fills in: weights, neighbours, lengths, and what else is kept."""
     total, space_dim = particles.shape[0], particles.shape[1] - 1
@@ -169,7 +169,7 @@ def _empty_lists(
         particles.new_empty(entry_count if space_dim == 3 else 0, dtype=integers),
         particles.new_empty(total, dtype=integers),
         particles.new_empty(total, space_dim),
-        particles.new_empty(total if moment_correction else 0, space_dim, space_dim),
+        particles.new_empty(0 if moment_inverse is None else total, space_dim, space_dim),
         particles.new_empty(total if density_gradient else 0, space_dim),
     ]
 
@@ -187,13 +187,13 @@ def _list_pairs(
     eps: float,
     scale: float,
     box: list[float] | None,
-    moment_correction: bool,
+    moment_inverse: str | None,
     density_gradient: bool,
 ) -> list[Tensor]:
     plan = make_plan(particles, shape, state_dim, particles.shape[0], False, eps, box)
-    lists = _empty_lists(particles, entry_count, moment_correction, density_gradient)
+    lists = _empty_lists(particles, entry_count, moment_inverse, density_gradient)
     launch(
-        _kernels(plan, moment_correction).list_pairs,
+        _kernels(plan, moment_inverse).list_pairs,
         plan.total,
         particles.device,
         plan.domain,
@@ -256,9 +256,8 @@ def settle(
     row_numbers = total * (terms.perception_dim(space_dim, state_dim) + LARGEST_PADDING)
     if row_numbers >= LARGEST_INDEX or total * capacity * _entry_bytes(x) > LARGEST_LISTS:
         return None
-    corrected = terms.state_gradient and terms.moment_correction
     source, place, starts, particles, gradients, ends = _sort_settled(
-        x, state_dim, eps, sides, corrected, terms.density_gradient, capacity == 0
+        x, state_dim, eps, sides, terms.correction, terms.density_gradient, capacity == 0
     )
     # Reading the number is free on the CPU.
     entry_count = total * capacity if capacity else int(ends[-1])
@@ -277,7 +276,7 @@ def settle(
         eps,
         eps / eps0,
         sides,
-        corrected,
+        terms.correction,
         terms.density_gradient,
     )
     tensors = SettledTensors(source, place, starts, particles, weights, neighbours, ends, *rest)

@@ -43,7 +43,7 @@ def _make_call(
         plan.lanes,
         entries_ahead(plan),
         terms.state_gradient,
-        terms.moment_correction,
+        terms.correction is not None,
         state_dim % width == 0 and row_width % 4 == 0,
     )
     return _Call(plan, kernels, -(-state_dim // width), width)
@@ -64,11 +64,11 @@ def _perceive_settled(
     scale: float,
     box: list[float] | None,
     state_gradient: bool,
-    moment_correction: bool,
+    moment_inverse: str | None,
     density_gradient: bool,
 ) -> Tensor:
     tensors = SettledTensors(*settled)
-    terms = Terms(state_gradient, moment_correction, density_gradient)
+    terms = Terms(state_gradient, moment_inverse, density_gradient)
     plan, kernels, group_count, width = _make_call(
         tensors.particles, shape, state_dim, row_capacity, row_width, eps, box, terms
     )
@@ -127,12 +127,12 @@ def _perceive_settled_backward(
     scale: float,
     box: list[float] | None,
     state_gradient: bool,
-    moment_correction: bool,
+    moment_inverse: str | None,
     density_gradient: bool,
 ) -> Tensor:
     tensors = SettledTensors(*settled)
     row_of, row_place, active_before = rows
-    terms = Terms(state_gradient, moment_correction, density_gradient)
+    terms = Terms(state_gradient, moment_inverse, density_gradient)
     row_capacity, row_width = perception.shape
     plan, kernels, group_count, width = _make_call(
         tensors.particles, shape, state_dim, row_capacity, row_width, eps, box, terms

@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import partial
 
 import torch
+from torch import Tensor
 
 from npa_envs import reference
 from npa_envs.sph import perceive, perception_fields
@@ -21,6 +22,9 @@ from npa_envs.stress.scenes import EPS, SIDE, STATE_DIM, Scene, scenes, threshol
 
 CROWD = {"quick": 2_000, "cpu": 20_000, "cuda": 1_000_000}
 """Particles in one cell."""
+
+NEAR_THRESHOLD = 1e-3
+"""Relative distances from the threshold of an inverse at which perception is to change no more."""
 
 
 def geometry_checks(seed: int = 0) -> list[Check]:
@@ -47,6 +51,12 @@ def geometry_checks(seed: int = 0) -> list[Check]:
                 "a moment matrix at the threshold of its inverse is inverted or is not, and "
                 "nothing between",
                 partial(_run_threshold, space_dim),
+            ),
+            Check(
+                f"geometry/smooth_inverse/{space_dim}d",
+                "perception with moment_inverse='smooth' is as the float64 reference has it, and "
+                "does not jump where that by the threshold does",
+                partial(_run_smooth_inverse, space_dim),
             ),
             Check(
                 f"geometry/crowd/{space_dim}d",
@@ -105,6 +115,36 @@ def _run_threshold(space_dim: int, session: Session) -> Finding:
         # Rounding moved some over the threshold by making float32 of the positions.
         figures[f"other_side_{name}"] = float((errors_of_other < errors)[:, 0].sum())
     return Finding(figures, limits)
+
+
+def _run_smooth_inverse(space_dim: int, session: Session) -> Finding:
+    x, offsets = threshold_scenes(space_dim, reference.MOMENT_THRESHOLD)
+    s = torch.randn(*x.shape[:2], STATE_DIM, generator=torch.Generator().manual_seed(5)).double()
+    # All worlds carry the same states: from one to the next only a determinant changes.
+    s = s[:1].expand_as(s)
+    exact = reference.perceive(x, s, EPS, EPS, moment_inverse="smooth")
+    near = offsets.abs() <= NEAR_THRESHOLD
+    figures: dict[str, float] = {}
+    limits: dict[str, float] = {}
+    for name, dtype in PRECISIONS.items():
+        y, t = (tensor.to(session.device, dtype) for tensor in (x, s))
+        smooth = perceive(y, t, EPS, moment_inverse="smooth").cpu().double()
+        figures[f"z_{name}"] = relative_error(smooth, exact)
+        limits[f"z_{name}"] = LIMITS[f"z_{name}"]
+        figures[f"jump_{name}"] = _largest_jump(smooth[near])
+        limits[f"jump_{name}"] = 2.0 * NEAR_THRESHOLD
+        figures[f"jump_by_threshold_{name}"] = _largest_jump(perceive(y, t, EPS)[near])
+    return Finding(figures, limits)
+
+
+def _largest_jump(z: Tensor) -> float:
+    """Return how far the first particle's perception changes from one world to the next at most.
+
+    Args:
+        z: Perception vectors, shape [B, N, P].
+    """
+    corner = z[:, 0].cpu().double()
+    return float(corner.diff(dim=0).norm(dim=-1).max() / corner.norm(dim=-1).max())
 
 
 def _run_crowd(space_dim: int, session: Session) -> Finding:

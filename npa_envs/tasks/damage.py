@@ -250,6 +250,19 @@ def _normal(x: Tensor, shape: Sequence[int], generator: Randomness | None) -> Te
     return torch.randn(tuple(shape), generator=generator, device=x.device, dtype=x.dtype)
 
 
+def uniform(x: Tensor, shape: Sequence[int], generator: Randomness | None) -> Tensor:
+    """Return uniform numbers in [0, 1) of the dtype and on the device of `x`.
+
+    Args:
+        x: Particle positions of the worlds.
+        shape: Shape, worlds first.
+        generator: Where they come from; None is torch's own.
+    """
+    if isinstance(generator, WorldRandom):
+        return generator.uniform(*shape[1:], dtype=x.dtype)
+    return torch.rand(tuple(shape), generator=generator, device=x.device, dtype=x.dtype)
+
+
 def _inside_ball(x: Tensor, centre: Tensor, radius: float | Tensor) -> Tensor:
     _check_vector("centre", centre, x)
     distance = torch.linalg.vector_norm(x - centre[:, None], dim=-1)

@@ -11,9 +11,10 @@ from npa_envs.rule import COLOUR_OFFSET, NPARule
 from npa_envs.sph import splat, world_mean
 from npa_envs.sph.picture_losses import picture_losses
 from npa_envs.tasks.morphogenesis2d_config import Morphogenesis2DConfig
+from npa_envs.tasks.pool_damage import hurt
 from npa_envs.tasks.rules import untrained_rule
 from npa_envs.tasks.seeds import uniform_ball
-from npa_envs.tasks.strays import hurt, stray_motion
+from npa_envs.tasks.strays import stray_motion
 from npa_envs.tasks.targets import PointTarget, load_target
 
 UNOWNED = 0.05
@@ -114,8 +115,7 @@ class Morphogenesis2D:
 
     def damage(self, x: Tensor, s: Tensor, generator: Randomness) -> tuple[Tensor, Tensor]:
         """Return the worlds with states in a disk erased, and some particles thrown out."""
-        radius, share = self.config.damage_radius, self.config.stray_share
-        return hurt(x, s, damage_radius=radius, stray_share=share, generator=generator)
+        return hurt(x, s, self.config, generator=generator)
 
     def picture(self, x: Tensor, s: Tensor, *, centred: bool = True) -> Tensor:
         """Return the picture of each world.
@@ -230,6 +230,9 @@ class Morphogenesis2D:
         if config.stray_weight > 0.0:
             parts["stray"] = stray_motion(x, path_length)
             total = total + config.stray_weight * parts["stray"]
+        if config.drift_weight > 0.0:
+            parts["drift"] = world_mean(x).square().sum(dim=-1).add(1e-12).sqrt().mean()
+            total = total + config.drift_weight * parts["drift"]
         return total, parts
 
     def _centred(self, x: Tensor) -> Tensor:

@@ -46,6 +46,17 @@ class Morphogenesis2DConfig:
     damage_radius: float = 0.1
     """Radius of the disk whose state is erased in worlds from the pool [length units]; 0: none."""
 
+    clump_radius: float = 0.0
+    """Radius of the disk whose particles are pulled to one point, in a quarter of the worlds from
+    the pool [length units]; 0: none."""
+
+    cut_gap: float = 0.0
+    """Width of the slit through a quarter of the worlds from the pool [length units]; 0: none."""
+
+    flake_radius: float = 0.0
+    """Radius up to which a disk of particles is torn off and thrown out, in a quarter of the worlds
+    from the pool [length units]; 0: none."""
+
     stray_share: float = 0.0
     """Probability of each particle to be thrown out of worlds from the pool (dimensionless)."""
 
@@ -73,6 +84,9 @@ class Morphogenesis2DConfig:
     stray_weight: float = 0.0
     """Weight of the mean path length of particles outside of [−1, 1] (per length unit)."""
 
+    drift_weight: float = 0.0
+    """Weight of the centroids' distance from the origin, where worlds begin (per length unit)."""
+
     def __post_init__(self) -> None:
         """Check every field.
 
@@ -90,8 +104,12 @@ class Morphogenesis2DConfig:
         check_non_negative(
             self,
             "damage_radius",
+            "clump_radius",
+            "cut_gap",
+            "flake_radius",
             "stray_share",
             "stray_weight",
+            "drift_weight",
             "splat_weight",
             "colour_weight",
             "motion_weight",

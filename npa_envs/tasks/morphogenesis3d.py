@@ -13,10 +13,11 @@ from npa_envs.rule import NPARule
 from npa_envs.sph import Cameras, world_mean
 from npa_envs.tasks.appearance import OUTPUTS, Appearance, Gaussians
 from npa_envs.tasks.morphogenesis3d_config import Morphogenesis3DConfig
+from npa_envs.tasks.pool_damage import hurt
 from npa_envs.tasks.renderers import RENDERERS
 from npa_envs.tasks.rules import untrained_rule
 from npa_envs.tasks.seeds import uniform_ball
-from npa_envs.tasks.strays import hurt, stray_motion
+from npa_envs.tasks.strays import stray_motion
 from npa_envs.tasks.structure import MultiScaleSimilarity
 from npa_envs.tasks.view_schedule import ViewSchedule, blurred
 from npa_envs.tasks.views import ViewTarget, load_views, nearest_elevation, over, some_views
@@ -171,8 +172,7 @@ class Morphogenesis3D:
 
     def damage(self, x: Tensor, s: Tensor, generator: Randomness) -> tuple[Tensor, Tensor]:
         """Return the worlds with states in a ball erased, and some particles thrown out."""
-        radius, share = self.config.damage_radius, self.config.stray_share
-        return hurt(x, s, damage_radius=radius, stray_share=share, generator=generator)
+        return hurt(x, s, self.config, generator=generator)
 
     def gaussians(self, s: Tensor) -> Gaussians:
         """Return how particles look.

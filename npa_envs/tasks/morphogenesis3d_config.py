@@ -46,6 +46,17 @@ class Morphogenesis3DConfig:
     damage_radius: float = 0.0
     """Radius of the ball whose state is erased in worlds from the pool [length units]; 0: none."""
 
+    clump_radius: float = 0.0
+    """Radius of the ball whose particles are pulled to one point, in a quarter of the worlds from
+    the pool [length units]; 0: none."""
+
+    cut_gap: float = 0.0
+    """Width of the slit through a quarter of the worlds from the pool [length units]; 0: none."""
+
+    flake_radius: float = 0.0
+    """Radius up to which a ball of particles is torn off and thrown out, in a quarter of the worlds
+    from the pool [length units]; 0: none."""
+
     stray_share: float = 0.0
     """Probability of each particle to be thrown out of worlds from the pool (dimensionless)."""
 
@@ -124,6 +135,9 @@ class Morphogenesis3DConfig:
         check_non_negative(
             self,
             "damage_radius",
+            "clump_radius",
+            "cut_gap",
+            "flake_radius",
             "stray_share",
             "stray_weight",
             "anisotropy",

@@ -9,31 +9,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from npa_envs.randomness import Randomness, WorldRandom, check_generator
-from npa_envs.tasks.damage import erase_state, random_particle
+from npa_envs.randomness import Randomness, check_generator
+from npa_envs.tasks.damage import random_particle, uniform
 from npa_envs.tasks.seeds import uniform_ball
 
 NEAREST, FARTHEST = 2.0, 4.0
 """Distances from the origin between which particles are thrown [length units]."""
-
-
-def hurt(
-    x: Tensor, s: Tensor, *, damage_radius: float, stray_share: float, generator: Randomness
-) -> tuple[Tensor, Tensor]:
-    """Return worlds with the states around one random particle erased, and some thrown out.
-
-    Args:
-        x: Particle positions [length units], shape [B, N, D].
-        s: Particle states (dimensionless), shape [B, N, C].
-        damage_radius: Radius of the ball whose states become zero [length units]; 0: none.
-        stray_share: Probability of each particle to be thrown out (dimensionless); 0: none is.
-        generator: Source of randomness, as for `scatter`.
-    """
-    if damage_radius > 0.0:
-        s = erase_state(x, s, centre=random_particle(x, generator), radius=damage_radius)
-    if stray_share > 0.0:
-        x = scatter(x, share=stray_share, generator=generator)
-    return x, s
 
 
 def scatter(x: Tensor, *, share: float, generator: Randomness | None = None) -> Tensor:
@@ -52,18 +33,45 @@ def scatter(x: Tensor, *, share: float, generator: Randomness | None = None) -> 
     """
     world_count, particle_count, space_dim = x.shape
     check_generator(generator, x.device, world_count)
-    if isinstance(generator, WorldRandom):
-        chance = generator.uniform(particle_count, 1, dtype=x.dtype)
-    else:
-        shape = (world_count, particle_count, 1)
-        chance = torch.rand(shape, generator=generator, device=x.device, dtype=x.dtype)
+    chance = uniform(x, (world_count, particle_count, 1), generator)
     ball = uniform_ball(
         world_count, particle_count, space_dim, 1.0,
         generator=generator, device=x.device, dtype=x.dtype,
     )  # fmt: skip
+    return torch.where(chance < share, _outside(ball), x)
+
+
+def tear(x: Tensor, *, radius: float, chance: float, generator: Randomness | None = None) -> Tensor:
+    """Return the positions with a flake of some worlds torn off and thrown out, as a whole.
+
+    Particles that leave together see each other, and may walk on where a lone one has learned to
+    rest. Nothing waits for the device.
+
+    Args:
+        x: Particle positions [length units], shape [B, N, D].
+        radius: Flakes are disks (balls in 3D) around random particles, of any radius up to this
+            [length units].
+        chance: Probability of a world to lose one (dimensionless).
+        generator: Source of randomness, as for `scatter`.
+
+    Raises:
+        NPAError: The generator is on another device or for another number of worlds.
+    """
+    world_count, _, space_dim = x.shape
+    centre = random_particle(x, generator)
+    draws = uniform(x, (world_count, 2), generator)
+    reach = torch.where(draws[:, :1] < chance, radius * draws[:, 1:], -1.0)
+    place = uniform_ball(
+        world_count, 1, space_dim, 1.0, generator=generator, device=x.device, dtype=x.dtype
+    )[:, 0]
+    torn = (x - centre[:, None]).norm(dim=-1) <= reach
+    return torch.where(torn[..., None], x + (_outside(place) - centre)[:, None], x)
+
+
+def _outside(ball: Tensor) -> Tensor:
+    """Return places between `NEAREST` and `FARTHEST` for places in the unit ball, [..., D]."""
     length = ball.norm(dim=-1, keepdim=True)
-    thrown = ball * ((NEAREST + (FARTHEST - NEAREST) * length) / length.clamp_min(1e-12))
-    return torch.where(chance < share, thrown, x)
+    return ball * ((NEAREST + (FARTHEST - NEAREST) * length) / length.clamp_min(1e-12))
 
 
 def stray_motion(x: Tensor, path_length: Tensor) -> Tensor:

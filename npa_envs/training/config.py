@@ -11,6 +11,7 @@ import torch
 from npa_envs.devices import parse_device
 from npa_envs.dynamics import Memory
 from npa_envs.errors import NPAError
+from npa_envs.sph.checks import MomentInverse
 from npa_envs.tasks.checks import check_fraction, check_non_negative, check_positive, is_whole
 from npa_envs.tasks.morphogenesis2d_config import Morphogenesis2DConfig
 
@@ -30,6 +31,9 @@ class TrainConfig(Generic[TaskConfigT]):
 
     initial_rule: str = ""
     """Start from this rule, a shipped one's name or a file, instead of random weights."""
+
+    moment_inverse: MomentInverse = "threshold"
+    """How the rule's state gradients are corrected: "threshold", the paper's, or "smooth"."""
 
     iterations: int = 10_000
     """Optimiser steps in one repeat."""
@@ -140,6 +144,7 @@ class TrainConfig(Generic[TaskConfigT]):
             )
         self._check_choice("dtype", ("float32", "float64"))
         self._check_choice("memory", get_args(Memory))
+        self._check_choice("moment_inverse", get_args(MomentInverse))
         parse_device(self.device)
         if not isinstance(self.out, Path):
             raise NPAError(f"out must be a pathlib.Path, got {self.out!r}: Path({self.out!r})")

@@ -108,6 +108,8 @@ class _JointTrainer(Trainer):
     def _make_rule(self, generator: torch.Generator) -> NPARule:
         # The trainer asks of its rule what any module has, and for its hyper-parameters.
         made = self._species.make_rules(generator)
+        for rule in made:
+            rule.moment_inverse = self.config.moment_inverse
         if self._given is None:
             if self._frozen:
                 raise NPAError(
@@ -127,6 +129,8 @@ class _JointTrainer(Trainer):
                     f"{', '.join(wrong)}: change those fields of species {number}"
                 )
         rules = copy.deepcopy(list(self._given))
+        for rule in rules:
+            rule.moment_inverse = self.config.moment_inverse
         for number in self._frozen:
             if number >= len(rules):
                 raise NPAError(f"frozen must name species from 0 to {len(rules) - 1}, got {number}")

@@ -15,8 +15,7 @@ from npa_envs.devices import check_device
 from npa_envs.errors import NPAError
 from npa_envs.files import write_text
 from npa_envs.rule import NPARule
-from npa_envs.rule_io import load_rule, save_rule
-from npa_envs.tasks.rules import differing_fields
+from npa_envs.rule_io import save_rule
 from npa_envs.tasks.task import Task
 from npa_envs.training.checkpoint import check_same_run, load_checkpoint, save_checkpoint
 from npa_envs.training.config import TrainConfig
@@ -24,6 +23,7 @@ from npa_envs.training.cycle import TrainingCycle
 from npa_envs.training.divergence import divergence_error
 from npa_envs.training.folder import JsonlLog, RunFolder, open_tensorboard
 from npa_envs.training.graphs import Rollout
+from npa_envs.training.initial import initial_rule
 from npa_envs.training.interrupt import stop_flag
 from npa_envs.training.overrides import config_to_dict
 from npa_envs.training.pictures import write_batch_picture
@@ -199,18 +199,7 @@ class Trainer:
         self.iteration += 1
 
     def _make_rule(self, generator: torch.Generator) -> NPARule:
-        rule = self.task.make_rule(generator)
-        if not self.config.initial_rule:
-            return rule
-        source = self.config.initial_rule
-        initial = load_rule(source)
-        wrong = differing_fields(initial, rule)
-        if wrong:
-            raise NPAError(
-                f"initial_rule must be a rule of the task's shape, but {source!r} differs in "
-                f"{', '.join(wrong)}: change those fields, or start from another rule"
-            )
-        return initial
+        return initial_rule(self.config, self.task.make_rule(generator))
 
     def _due(self, interval: int) -> bool:
         return interval > 0 and self.iteration % interval == 0

@@ -1,0 +1,184 @@
+"""Runs spread over cores or GPUs: one process a run, each of which may fail by itself."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import secrets
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from npa_envs.agents.comparison.plan import Job, Plan
+from npa_envs.agents.comparison.record import (
+    MEASURED,
+    OUTPUT,
+    REQUEST,
+    RunRecord,
+    read_record,
+)
+from npa_envs.files import write_text
+
+PROGRAM = (sys.executable, "-m", "npa_envs.agents.comparison")
+"""What a run's process is, before the folder of the run; it ends when its input does."""
+
+LOOK_SECONDS = 0.1
+"""Pause between two looks at the processes [s]."""
+
+TOLD = 2000
+"""Characters at most that are told of what a dead process said last."""
+
+
+@dataclass(frozen=True)
+class Places:
+    """Where processes run."""
+
+    devices: Sequence[str]
+    """Devices, of which each process gets one."""
+    jobs: int = 1
+    """Processes at once; they are dealt out over the devices."""
+    threads: int = 1
+    """CPU threads of each."""
+
+
+@dataclass(frozen=True)
+class _Process:
+    job: Job
+    place: int
+    folder: Path
+    process: subprocess.Popen[bytes]
+    begin: float
+
+
+def held_records(plan: Plan, folder: Path) -> dict[Job, RunRecord]:
+    """Return what an earlier comparison left in a folder, but for runs that failed.
+
+    Args:
+        plan: What is to be compared.
+        folder: The comparison's folder.
+
+    Raises:
+        NPAError: A record cannot be read, or follows from other settings.
+    """
+    found = {job: read_record(folder / job.folder, plan.facts(job)) for job in plan.jobs()}
+    return {
+        job: record
+        for job, record in found.items()
+        if record is not None and record.status in MEASURED
+    }
+
+
+def run_jobs(
+    plan: Plan,
+    jobs: Sequence[Job],
+    folder: Path,
+    places: Places,
+    *,
+    command: str = "",
+    max_seconds: float = math.inf,
+    written: Callable[[RunRecord], None] = lambda record: None,
+) -> None:
+    """Run jobs, each in a process of its own; one that fails is recorded, and the others go on.
+
+    A run's results appear in its folder all at once, when it is over. If this is interrupted, its
+    processes are ended and leave nothing.
+
+    Args:
+        plan: What they belong to.
+        jobs: Which of the plan's runs.
+        folder: The comparison's folder.
+        places: Where.
+        command: The command line, for the records.
+        max_seconds: No run begins after so long [s].
+        written: Called with each record once it is in its place.
+
+    Raises:
+        NPAError: The folder cannot be written to.
+    """
+    waiting = list(reversed(jobs))
+    running: list[_Process] = []
+    free = list(reversed(range(places.jobs)))
+    for job in jobs:
+        _sweep(folder, job)
+    begin = time.perf_counter()
+    try:
+        while waiting or running:
+            if time.perf_counter() - begin >= max_seconds:
+                waiting.clear()
+            while waiting and free:
+                running.append(_start(plan, waiting.pop(), folder, places, free.pop(), command))
+            for one in [one for one in running if one.process.poll() is not None]:
+                running.remove(one)
+                free.append(one.place)
+                written(_finish(plan, one, folder, command))
+            time.sleep(LOOK_SECONDS if running else 0.0)
+    finally:
+        for one in running:
+            one.process.terminate()
+            one.process.communicate()
+            shutil.rmtree(one.folder, ignore_errors=True)
+
+
+def _sweep(folder: Path, job: Job) -> None:
+    """Remove what a killed comparison left of a run half-way."""
+    target = folder / job.folder
+    for left in target.parent.glob(f".{target.name}.*"):
+        shutil.rmtree(left, ignore_errors=True)
+
+
+def _start(
+    plan: Plan, job: Job, folder: Path, places: Places, place: int, command: str
+) -> _Process:
+    target = folder / job.folder
+    part = target.parent / f".{target.name}.{secrets.token_hex(4)}"
+    part.mkdir(parents=True)
+    request = {
+        "job": asdict(job),
+        "facts": plan.facts(job),
+        "device": places.devices[place % len(places.devices)],
+        "threads": places.threads,
+        "command": command,
+    }
+    write_text(part / REQUEST, json.dumps(request, indent=1) + "\n")
+    environment = os.environ | {"OMP_NUM_THREADS": str(places.threads)}
+    with (part / OUTPUT).open("wb") as output:
+        process = subprocess.Popen(
+            [*PROGRAM, str(part)],
+            stdin=subprocess.PIPE,
+            stdout=output,
+            stderr=output,
+            env=environment,
+        )
+    return _Process(job, place, part, process, time.perf_counter())
+
+
+def _finish(plan: Plan, one: _Process, folder: Path, command: str) -> RunRecord:
+    """Put the results of a process that is over into their place, and return its record."""
+    one.process.communicate()
+    facts = plan.facts(one.job)
+    record = read_record(one.folder, facts)
+    if record is None:
+        code = one.process.returncode
+        told = (one.folder / OUTPUT).read_text("utf-8", errors="replace").strip()[-TOLD:]
+        record = RunRecord(
+            job=one.job,
+            facts=facts,
+            status="failed",
+            error=f"its process ended with code {code}: {' '.join(told.split())}",
+            seconds=time.perf_counter() - one.begin,
+            command=command,
+            date=time.strftime("%Y-%m-%d"),
+        )
+        record.write(one.folder)
+    (one.folder / REQUEST).unlink(missing_ok=True)
+    target = folder / one.job.folder
+    if target.exists():
+        # It holds a run that failed, or no record: else this one would not have been run.
+        shutil.rmtree(target)
+    os.replace(one.folder, target)
+    return record

@@ -1,0 +1,67 @@
+"""The files that show a whole comparison, written anew whenever a run is over."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from npa_envs.agents.comparison.pictures import write_strips
+from npa_envs.agents.comparison.plan import Plan
+from npa_envs.agents.comparison.plots import pictures
+from npa_envs.agents.comparison.record import RunRecord
+from npa_envs.agents.comparison.tables import as_json, rows, text
+from npa_envs.bench.plots import check_matplotlib
+from npa_envs.errors import MissingDependencyError
+from npa_envs.files import write_bytes, write_text
+
+TABLE, FIGURES = "comparison.md", "comparison.json"
+"""Names of the files of the table."""
+
+
+def write_table(plan: Plan, records: Sequence[RunRecord], folder: Path, command: str) -> str:
+    """Write the table, in Markdown and as JSON, and return the former.
+
+    Args:
+        plan: What was compared.
+        records: Those of the runs that are over.
+        folder: The comparison's folder.
+        command: The command line.
+
+    Raises:
+        NPAError: A file cannot be written.
+    """
+    table = rows(records)
+    told = text(table)
+    write_text(folder / TABLE, f"`{command}`\n\n{told}")
+    write_text(folder / FIGURES, as_json(table, _facts(plan, command)))
+    return told
+
+
+def _facts(plan: Plan, command: str) -> dict[str, Any]:
+    """Return what a table follows from, as JSON has it."""
+    fields = asdict(plan) | {"left_out": sorted(map(list, plan.left_out))}
+    return {"command": command, **fields}
+
+
+def write_pictures(records: Sequence[RunRecord], folder: Path) -> list[str]:
+    """Write what was grown and, where matplotlib is installed, the curves; return what was done.
+
+    Args:
+        records: Those of the runs that are over.
+        folder: The comparison's folder.
+
+    Raises:
+        NPAError: A file cannot be written.
+    """
+    done = [f"wrote {path}" for path in write_strips(records, folder)]
+    try:
+        check_matplotlib()
+    except MissingDependencyError as error:
+        return [*done, f"no curves: {error}"]
+    for task, picture in pictures(records).items():
+        path = folder / f"curves_{task}.png"
+        write_bytes(path, picture)
+        done.append(f"wrote {path}")
+    return done

@@ -1,0 +1,268 @@
+"""`npa-envs compare`: reinforcement learning, evolution and the gradient on the same tasks."""
+
+from __future__ import annotations
+
+import json
+import math
+import shlex
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from npa_envs.errors import NPAError, suggest
+
+if TYPE_CHECKING:
+    from npa_envs.agents.comparison.plan import Axis, Plan
+    from npa_envs.agents.comparison.record import RunRecord
+
+RUN_FAILED = 1
+
+NEED_MORE = ("clone",)
+"""Methods that are compared only when asked for: they need a teacher."""
+
+QUICK_EPISODES, QUICK_STEPS = 4, 200_000
+"""Held-out episodes and particle-steps of a quick comparison."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompareOptions:
+    """Compare methods on tasks over seeds, for equal wall time, equal particle-steps, or both.
+
+    Every run is a process of its own. One that fails is recorded with its error, and the others go
+    on; a comparison that was stopped goes on where it was, and repeats runs that failed. Ends with
+    code 1 where a run failed.
+    """
+
+    output: Path = Path("comparison")
+    """Folder for AXIS/TASK/METHOD/seed-K/, comparison.md and .json, pictures, and curves (extra
+    `bench`)."""
+
+    tasks: tuple[str, ...] = ()
+    """morphogenesis2d, regeneration2d, point_classification, mixing; default: all."""
+
+    methods: tuple[str, ...] = ()
+    """Methods of npa_envs.agents.learning; default: all but `clone`, which needs a teacher."""
+
+    seeds: int = 3
+    """Seeds for each method and task: 0, 1, ..."""
+
+    seconds: float | None = None
+    """Compare for equal wall time: seconds that each run may learn."""
+
+    particle_steps: float | None = None
+    """Compare for equal particle-steps: as many as each run may learn from, for example 1e8."""
+
+    episodes: int | None = None
+    """Held-out episodes that tell what a run has reached; default: 32, or 4 when quick."""
+
+    options: Annotated[tuple[str, ...], tyro.conf.arg(metavar="METHOD.NAME=VALUE")] = ()
+    """Options of methods, values as JSON or plain text: evolution.population=64."""
+
+    quick: bool = False
+    """Tiny worlds and, unless said otherwise, few steps: figures that say nothing but that it
+    runs."""
+
+    device: str = "cpu"
+    """Where to run: cpu, cuda, cuda:1."""
+
+    devices: tuple[str, ...] = ()
+    """Several devices that runs are dealt out to, for example cuda:0 cuda:1; default: --device."""
+
+    jobs: int = 1
+    """Runs at once. Those on one device share its time, which counts where wall time is equal."""
+
+    threads: int = 1
+    """CPU threads of each run."""
+
+    max_seconds: float = math.inf
+    """No run begins after so long; the next call goes on."""
+
+    commit: str | None = None
+    """Commit that is measured; default: that of the checkout."""
+
+    progress: bool = True
+    """Show a progress bar."""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run the command.
+
+    Args:
+        arguments: The words after `npa-envs compare`.
+
+    Returns:
+        0, or 1 where a run failed.
+
+    Raises:
+        NPAError: There is no such task, method, option or device, a number is out of range, or the
+            folder cannot be written to or holds figures of other settings.
+    """
+    options = tyro.cli(CompareOptions, prog="npa-envs compare", args=arguments)
+    # Records are not to tell where on which machine they were written.
+    words = ["OUT" if word == str(options.output) else word for word in arguments]
+    return run(options, shlex.join(["npa-envs", "compare", *words]))
+
+
+def run(options: CompareOptions, command: str = "") -> int:
+    """Run what is missing, print and write.
+
+    Args:
+        options: What the command line said.
+        command: The command line, for the records.
+
+    Raises:
+        NPAError: As for `main`.
+    """
+    from npa_envs.agents.comparison.scheduler import Places, held_records, run_jobs
+    from npa_envs.agents.comparison.summary import write_pictures, write_table
+    from npa_envs.cli.folder import make_folder
+    from npa_envs.cli.progress import StepBar
+    from npa_envs.cli.rollout import check_writable
+
+    plan = make_plan(options)
+    folder = options.output
+    check_writable(make_folder(folder))
+    # All are read first: a record of other settings is refused before any work is done.
+    records = held_records(plan, folder)
+    jobs = plan.jobs()
+    missing = [job for job in jobs if job not in records]
+
+    def whole() -> list[RunRecord]:
+        return [records[job] for job in jobs if job in records]
+
+    def written(record: RunRecord) -> None:
+        records[record.job] = record
+        write_table(plan, whole(), folder, command)
+        bar.advance(1)
+
+    places = Places(options.devices or (options.device,), options.jobs, options.threads)
+    with StepBar(len(missing), show=options.progress, unit="run") as bar:
+        run_jobs(
+            plan,
+            missing,
+            folder,
+            places,
+            command=command,
+            max_seconds=options.max_seconds,
+            written=written,
+        )
+    told = [write_table(plan, whole(), folder, command), *write_pictures(whole(), folder)]
+    failed = [record for record in whole() if record.status == "failed"]
+    told += [f"{record.job} failed: {record.error}" for record in failed]
+    left = len(jobs) - len(records)
+    told += [f"{left} runs are left: call again with the same options"] if left else []
+    print("\n".join(told))
+    return RUN_FAILED if failed else 0
+
+
+def make_plan(options: CompareOptions) -> Plan:
+    """Return what the command line asks for.
+
+    Args:
+        options: What it said.
+
+    Raises:
+        NPAError: As for `main`.
+    """
+    from npa_envs.agents.comparison.plan import Plan
+    from npa_envs.agents.comparison.problems import LEFT_OUT, PROBLEMS, make_problem
+    from npa_envs.agents.learning import METHODS
+
+    for name in ("seeds", "episodes", "jobs", "threads"):
+        value = getattr(options, name)
+        if value is not None and value < 1:
+            raise NPAError(f"{name} must be at least 1, got {value}")
+    tasks = _chosen("task", options.tasks, PROBLEMS)
+    methods = _chosen("method", options.methods, METHODS)
+    if not options.methods:
+        methods = [name for name in methods if name not in NEED_MORE]
+    problems = {name: make_problem(name, quick=options.quick) for name in tasks}
+    return Plan(
+        tasks={name: json.loads(problem.to_json()) for name, problem in problems.items()},
+        methods=methods,
+        seeds=tuple(range(options.seeds)),
+        budgets=_budgets(options),
+        options=_method_options(options.options, methods),
+        left_out=() if options.methods else LEFT_OUT,
+        episodes=options.episodes or (QUICK_EPISODES if options.quick else 32),
+        settings=_settings(options),
+    )
+
+
+def _chosen(kind: str, names: Sequence[str], known: Iterable[str]) -> list[str]:
+    """Return those known names that were asked for, all where none was."""
+    for name in names:
+        if name not in known:
+            raise NPAError(f"unknown {kind} {name!r}: {suggest(name, known)}")
+    return [name for name in known if not names or name in names]
+
+
+def _budgets(options: CompareOptions) -> dict[Axis, float]:
+    steps = options.particle_steps
+    if options.quick and steps is None and options.seconds is None:
+        steps = QUICK_STEPS
+    budgets: dict[Axis, float] = {}
+    if options.seconds is not None:
+        budgets["seconds"] = options.seconds
+    if steps is not None:
+        budgets["particle-steps"] = steps
+    if not budgets:
+        raise NPAError(
+            "a comparison needs a budget: give --seconds 60, --particle-steps 1e8 or both"
+        )
+    for axis, value in budgets.items():
+        least = 1.0 if axis == "particle-steps" else 0.0
+        if not (value > 0.0 and value >= least and math.isfinite(value)):
+            raise NPAError(f"{axis} must be positive and finite, got {value}: try 60 or 1e8")
+    return budgets
+
+
+def _method_options(words: Sequence[str], methods: Sequence[str]) -> dict[str, dict[str, Any]]:
+    from npa_envs.agents.learning import method_options
+
+    found: dict[str, dict[str, Any]] = {}
+    for word in words:
+        name, mark, value = word.partition("=")
+        method, dot, option = name.partition(".")
+        if not (mark and dot and option):
+            raise NPAError(
+                f"options must be METHOD.NAME=VALUE, got {word!r}: evolution.population=64"
+            )
+        if method not in methods:
+            raise NPAError(f"unknown method {method!r} in {word!r}: {suggest(method, methods)}")
+        known = method_options(method)
+        if option not in known:
+            raise NPAError(f"unknown option {option!r} in {word!r}: {suggest(option, known)}")
+        try:
+            plain = json.loads(value)
+        except ValueError:
+            plain = value
+        found.setdefault(method, {})[option] = plain
+    return found
+
+
+def _settings(options: CompareOptions) -> dict[str, Any]:
+    """Return what figures follow from besides problems, budgets and options."""
+    from npa_envs.bench.report import current_commit, machine, versions
+    from npa_envs.devices import check_device
+    from npa_envs.diagnostics import installed_version
+
+    places = [check_device(name) for name in options.devices or (options.device,)]
+    kinds = {(place.type, machine(place)) for place in places}
+    if len(kinds) > 1:
+        raise NPAError(
+            f"devices must be of one kind, as times are compared, got {sorted(kinds)}: choose some"
+        )
+    ((kind, name),) = kinds
+    others = {library: installed_version(library) for library in ("stable-baselines3", "cma")}
+    return {
+        "device": kind,
+        "machine": name,
+        "runs_at_once": -(-options.jobs // len(places)),
+        "threads": options.threads,
+        "commit": options.commit or current_commit(),
+        "versions": versions() | others,
+    }

@@ -1,0 +1,445 @@
+"""Comparisons: runs are processes that may fail or stop, and tables say what they reached."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from npa_envs.agents import RandomPolicy, ZeroPolicy
+from npa_envs.agents.comparison import scheduler
+from npa_envs.agents.comparison.pictures import PICTURE, SIZE, final_picture, write_strips
+from npa_envs.agents.comparison.plan import Job, Plan
+from npa_envs.agents.comparison.plots import curve, pictures
+from npa_envs.agents.comparison.problems import LEFT_OUT, PROBLEMS, make_problem
+from npa_envs.agents.comparison.record import Point, RunRecord, read_record
+from npa_envs.agents.comparison.scheduler import Places, held_records, run_jobs
+from npa_envs.agents.comparison.tables import Estimate, estimate, fraction, rows, text
+from npa_envs.agents.learning import METHODS, Problem, RuleSet
+from npa_envs.cli import main
+from npa_envs.cli.compare import CompareOptions, make_plan
+from npa_envs.errors import NPAError
+from npa_envs.render import write_png
+
+FACTS = {"problem": {}, "budget": 1.0, "options": {}, "episodes": 2}
+
+CHILD = """
+import dataclasses, json, sys, time
+from pathlib import Path
+folder = Path(sys.argv[1])
+request = json.loads((folder / "request.json").read_text())
+seed = request["job"]["seed"]
+{body}
+record = {{
+    "job": request["job"], "facts": request["facts"], "status": "done", "error": "",
+    "curve": [], "returns": [1.0 + seed, 2.0 + seed], "final_losses": [0.1, 0.2],
+    "endings": {{"time limit": 2}}, "seconds": 0.0, "command": request["command"], "date": "",
+}}
+(folder / "run.json").write_text(json.dumps(record))
+"""
+"""A process that says at once what it has reached, after something that tests put in."""
+
+
+def plan(**changes) -> Plan:
+    fields = {"tasks": {"growth": {}}, "methods": ["one", "two"], "seeds": (0, 1)}
+    return Plan(**fields | {"budgets": {"seconds": 1.0}, "episodes": 2} | changes)
+
+
+def record(method: str, seed: int, returns=(), *, axis="seconds", status="done", **fields):
+    given = {
+        "facts": FACTS,
+        "returns": tuple(returns),
+        "final_losses": tuple(1.0 - value for value in returns),
+        "endings": {"time limit": len(returns)} if returns else None,
+    }
+    return RunRecord(job=Job(axis, "growth", method, seed), status=status, **given | fields)
+
+
+def points(*pairs: tuple[float, float]) -> tuple[Point, ...]:
+    """A curve of returns against seconds; a second is 100 particle-steps."""
+    return tuple(Point(at, 100.0 * at, value, 0.0, 1.0 - value) for at, value in pairs)
+
+
+@pytest.fixture
+def child(monkeypatch):
+    """Sets what the processes of runs do before they leave their records."""
+
+    def set_body(body: str) -> None:
+        monkeypatch.setattr(scheduler, "PROGRAM", (sys.executable, "-c", CHILD.format(body=body)))
+
+    set_body("")
+    return set_body
+
+
+# Plans
+
+
+def test_every_method_runs_on_every_task_from_every_seed_in_every_budget():
+    jobs = plan(tasks={"a": {}, "b": {}}, budgets={"seconds": 1.0, "particle-steps": 9.0}).jobs()
+    assert len(set(jobs)) == len(jobs) == 2 * 2 * 2 * 2
+    assert [job.seed for job in jobs[:4]] == [0] * 4
+    assert str(jobs[0].folder) == "seconds/a/one/seed-0"
+    fewer = plan(tasks={"a": {}, "b": {}}, left_out={("b", "two")}).jobs()
+    assert {(job.task, job.method) for job in fewer} == {("a", "one"), ("a", "two"), ("b", "one")}
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.parametrize("quick", [True, False])
+def test_a_task_of_the_comparison_survives_json(name, quick):
+    problem = make_problem(name, quick=quick)
+    again = Problem.from_json(json.dumps(json.loads(problem.to_json())))
+    assert again == problem
+    assert (problem.particle_count == 64) == quick
+    assert RuleSet.new(problem, 0).interface.state_scale == 0.1
+
+
+def test_the_command_line_becomes_a_plan():
+    made = make_plan(
+        CompareOptions(seconds=2.0, particle_steps=1e6, options=("evolution.population=8",))
+    )
+    assert list(made.tasks) == list(PROBLEMS)
+    assert list(made.methods) == [name for name in METHODS if name != "clone"]
+    assert made.budgets == {"seconds": 2.0, "particle-steps": 1e6}
+    assert made.left_out == LEFT_OUT
+    job = Job("particle-steps", "mixing", "evolution", 0)
+    facts = made.facts(job)
+    assert (facts["budget"], facts["options"]) == (1e6, {"population": 8})
+    assert facts["problem"]["env_id"] == "npa/Mixing-v0"
+    assert made.facts(dataclasses.replace(job, method="ppo"))["options"] == {}
+    asked = make_plan(CompareOptions(seconds=2.0, methods=("zero", "clone")))
+    assert list(asked.methods) == ["clone", "zero"]
+    assert asked.left_out == ()
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({}, "needs a budget"),
+        ({"seconds": 0.0}, "seconds must be positive"),
+        ({"particle_steps": 0.5}, "particle-steps must be positive"),
+        ({"seconds": 1.0, "seeds": 0}, "seeds must be at least 1"),
+        ({"seconds": 1.0, "tasks": ("mixin",)}, "did you mean 'mixing'"),
+        ({"seconds": 1.0, "methods": ("pp",)}, "did you mean 'ppo'"),
+        ({"seconds": 1.0, "options": ("evolution=3",)}, "METHOD.NAME=VALUE"),
+        ({"seconds": 1.0, "options": ("evolutio.sigma=3",)}, "did you mean 'evolution'"),
+        ({"seconds": 1.0, "options": ("evolution.sigmas=3",)}, "did you mean 'sigma'"),
+        ({"seconds": 1.0, "device": "tpu"}, "tpu"),
+    ],
+)
+def test_mistakes_on_the_command_line_are_told(changes, words):
+    with pytest.raises(NPAError, match=words):
+        make_plan(CompareOptions(**changes))
+
+
+# Records
+
+
+def test_a_record_comes_back_as_it_was_written(tmp_path):
+    written = record("one", 0, (0.25, 0.5), curve=points((0.0, 0.0), (1.0, 0.25)))
+    written.write(tmp_path)
+    assert read_record(tmp_path, FACTS) == written
+    assert read_record(tmp_path / "elsewhere", FACTS) is None
+
+
+def test_what_is_not_finite_comes_back_as_not_a_number(tmp_path):
+    record("one", 0, (0.25, math.inf), status="diverged").write(tmp_path)
+    assert json.loads((tmp_path / "run.json").read_text())["returns"] == [0.25, None]
+    again = read_record(tmp_path, FACTS)
+    assert again.returns[0] == 0.25
+    assert math.isnan(again.mean_return)
+
+
+def test_records_of_other_settings_and_other_files_are_refused(tmp_path):
+    record("one", 0, (0.25,)).write(tmp_path)
+    with pytest.raises(NPAError, match=r"other settings: budget was 1\.0, now 2\.0"):
+        read_record(tmp_path, FACTS | {"budget": 2.0})
+    (tmp_path / "run.json").write_text('{"job": 3}')
+    with pytest.raises(NPAError, match="must hold a record of npa-envs compare"):
+        read_record(tmp_path, FACTS)
+
+
+# Processes
+
+
+def test_runs_are_spread_over_devices_and_leave_their_records(tmp_path, child):
+    child("Path(folder / 'place.txt').write_text(request['device'])")
+    made, seen = plan(seeds=(0, 1, 2)), []
+    places = Places(("cpu", "other"), jobs=2)
+    run_jobs(made, made.jobs(), tmp_path, places, command="it", written=seen.append)
+    assert sorted(map(str, made.jobs())) == sorted(str(one.job) for one in seen)
+    found = held_records(made, tmp_path)
+    assert [found[job].returns for job in made.jobs()] == [
+        (1.0 + job.seed, 2.0 + job.seed) for job in made.jobs()
+    ]
+    assert {one.command for one in seen} == {"it"}
+    used = {(tmp_path / job.folder / "place.txt").read_text() for job in made.jobs()}
+    assert used == {"cpu", "other"}
+    assert not list(tmp_path.rglob(".seed*"))
+    assert not list(tmp_path.rglob("request.json"))
+
+
+def test_a_process_that_dies_is_recorded_the_others_go_on_and_it_is_run_again(tmp_path, child):
+    child("if seed == 0: print('out of luck', flush=True); import os; os._exit(3)")
+    made, seen = plan(methods=["one"]), []
+    run_jobs(made, made.jobs(), tmp_path, Places(("cpu",)), written=seen.append)
+    first, second = seen
+    assert (first.status, second.status) == ("failed", "done")
+    assert first.error == "its process ended with code 3: out of luck"
+    assert list(held_records(made, tmp_path)) == [second.job]
+    assert read_record(tmp_path / first.job.folder, made.facts(first.job)) == first
+    child("")
+    run_jobs(made, [first.job], tmp_path, Places(("cpu",)))
+    assert list(held_records(made, tmp_path)) == made.jobs()
+
+
+def test_an_interrupted_comparison_ends_its_processes_and_goes_on_where_it_was(tmp_path, child):
+    child("time.sleep(60 if seed else 0)")
+    made = plan(methods=["one"])
+
+    def interrupt(_):
+        raise KeyboardInterrupt
+
+    begin = time.perf_counter()
+    with pytest.raises(KeyboardInterrupt):
+        run_jobs(made, made.jobs(), tmp_path, Places(("cpu",), jobs=2), written=interrupt)
+    assert time.perf_counter() - begin < 30.0
+    held = held_records(made, tmp_path)
+    assert list(held) == made.jobs()[:1]
+    assert not list(tmp_path.rglob(".seed*"))
+
+
+def test_what_a_killed_comparison_left_half_way_is_swept_away(tmp_path, child):
+    made = plan(methods=["one"], seeds=(0,))
+    (job,) = made.jobs()
+    left = tmp_path / job.folder.parent / ".seed-0.1234"
+    left.mkdir(parents=True)
+    (left / "run.json").write_text("{")
+    assert held_records(made, tmp_path) == {}
+    run_jobs(made, [job], tmp_path, Places(("cpu",)))
+    assert not left.exists()
+    assert list(held_records(made, tmp_path)) == [job]
+
+
+def test_no_run_begins_once_the_time_is_over(tmp_path, child):
+    child("time.sleep(0.3)")
+    made, seen = plan(), []
+    run_jobs(made, made.jobs(), tmp_path, Places(("cpu",)), max_seconds=0.2, written=seen.append)
+    assert [one.job for one in seen] == made.jobs()[:1]
+
+
+def test_the_process_of_a_run_ends_with_the_comparison(tmp_path):
+    made = make_plan(
+        CompareOptions(quick=True, seconds=600.0, tasks=("mixing",), methods=("random", "gradient"))
+    )
+    job = next(job for job in made.jobs() if job.method == "gradient")
+    request = {"job": dataclasses.asdict(job), "facts": made.facts(job), "device": "cpu"}
+    (tmp_path / "request.json").write_text(json.dumps(request))
+    process = subprocess.Popen(
+        [*scheduler.PROGRAM, str(tmp_path)], stdin=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    try:
+        _, said = process.communicate(timeout=100)
+    finally:
+        process.kill()
+    assert process.returncode == 1
+    assert b"Traceback" not in said
+    assert not (tmp_path / "run.json").exists()
+
+
+# Tables
+
+
+def test_an_estimate_is_the_mean_with_its_standard_error():
+    assert estimate([1.0, 2.0, 6.0, math.nan]) == Estimate(3.0, pytest.approx(math.sqrt(7 / 3)))
+    single, nothing = estimate([2.0]), estimate([])
+    assert single.mean == 2.0
+    assert math.isnan(single.error)
+    assert str(nothing) == "–"
+    assert str(Estimate(1.0, 0.25)) == "1.000 ± 0.250"
+
+
+def test_a_fraction_counts_from_nothing_to_the_gradient():
+    nothing, gradient = Estimate(0.5, 0.0), Estimate(2.5, 0.2)
+    half = fraction(Estimate(1.5, 0.1), nothing, gradient)
+    assert half == (0.5, pytest.approx(math.hypot(0.1, 0.5 * 0.2) / 2.0))
+    assert fraction(Estimate(0.0, 0.1), nothing, gradient).mean == -0.25
+    assert fraction(Estimate(4.5, 0.1), nothing, gradient).mean == 2.0
+    # No share of an improvement that there is not.
+    assert math.isnan(fraction(half, nothing, Estimate(0.5, 0.1)).mean)
+    assert math.isnan(fraction(half, nothing, Estimate(math.nan, 0.1)).mean)
+
+
+def synthetic() -> list[RunRecord]:
+    ended = {"time limit": 3, "diverged": 1}
+    return [
+        *(record("gradient", k, (2.0 + k, 4.0 + k)) for k in range(2)),
+        *(record("zero", k, (0.5, 0.5)) for k in range(2)),
+        record("ppo", 0, (1.0, 1.0), endings=ended, curve=points((0.0, 0.0), (4.0, 1.0))),
+        record("ppo", 1, (3.0, 3.0), curve=points((0.0, 0.0), (6.0, 3.0))),
+        record("ppo", 2, status="failed", error="no"),
+        record("evolution", 0, status="diverged", error="inf"),
+        record("ppo", 0, (7.0,), axis="particle-steps"),
+    ]
+
+
+def test_a_table_has_the_right_numbers():
+    found = {(row.axis, row.method): row for row in rows(synthetic())}
+    gradient, ppo = found["seconds", "gradient"], found["seconds", "ppo"]
+    assert gradient.final_return == (3.5, 0.5)
+    assert gradient.final_loss == (-2.5, 0.5)
+    assert gradient.fraction.mean == 1.0
+    assert found["seconds", "zero"].fraction.mean == 0.0
+    assert ppo.final_return == (2.0, 1.0)
+    assert ppo.fraction == (0.5, pytest.approx(math.hypot(1.0, 0.5 * 0.5) / 3.0))
+    assert (ppo.done, ppo.diverged, ppo.failed) == (2, 0, 1)
+    assert ppo.episodes_diverged == pytest.approx(1 / 6)
+    assert (ppo.seconds, ppo.particle_steps) == (5.0, 500.0)
+    lost = found["seconds", "evolution"]
+    assert (lost.done, lost.diverged) == (0, 1)
+    assert math.isnan(lost.final_return.mean)
+    alone = found["particle-steps", "ppo"]
+    assert alone.final_return.mean == 7.0
+    assert math.isnan(alone.fraction.mean)
+
+
+def test_a_table_in_words_lists_the_best_first_and_leaves_no_method_out():
+    told = text(rows(synthetic()))
+    assert told.startswith("## Equal wall time\n\n### growth\n")
+    by_time, by_steps = told.split("## Equal particle-steps")
+    order = [line.split(" | ")[0][2:] for line in by_time.splitlines() if line.startswith("| ")]
+    assert order == ["method", "---", "gradient", "ppo", "zero", "evolution"]
+    cells = next(line for line in by_time.splitlines() if line.startswith("| ppo")).split(" | ")
+    assert cells[1:5] == [
+        "2, 1 failed, 17% of episodes diverged",
+        "2.000 ± 1.000",
+        "-1.000 ± 1.000",
+        "0.500 ± 0.344",
+    ]
+    assert "| evolution | 0, 1 diverged | – | – | – | – | – |" in by_time
+    assert "| ppo | 1 | 7.000 | -6.000 | – | – | – |" in by_steps
+
+
+# Pictures
+
+
+def test_a_curve_is_the_mean_of_seeds_where_all_of_them_are():
+    some = [
+        record("ppo", 0, curve=points((0.0, 0.0), (2.0, 2.0), (4.0, 2.0))),
+        record("ppo", 1, curve=points((1.0, 3.0), (3.0, 5.0))),
+        record("ppo", 2, status="failed"),
+    ]
+    found = curve(some, lambda point: point.seconds)
+    assert (found.across[0], found.across[-1]) == (1.0, 3.0)
+    assert np.allclose(found.mean, np.interp(found.across, [1, 2, 3], [2.0, 3.0, 3.5]), atol=0.02)
+    assert found.error[0] == pytest.approx(1.0)
+    assert curve(some[2:], lambda point: point.seconds) is None
+    alone = curve([record("zero", 0, curve=points((0.0, 0.5)))], lambda point: point.seconds)
+    assert (alone.across.tolist(), alone.mean.tolist()) == ([0.0], [0.5])
+
+
+def test_curves_are_drawn_for_each_task():
+    pytest.importorskip("matplotlib")
+    drawn = pictures([*synthetic(), record("zero", 2, (0.5,), curve=points((0.0, 0.5)))])
+    assert list(drawn) == ["growth"]
+    assert drawn["growth"].startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("name", ["morphogenesis2d", "mixing"])
+def test_a_picture_shows_the_end_of_the_episode_and_not_the_next_start(name, device):
+    problem, place = make_problem(name, quick=True), str(device)
+    still = ZeroPolicy(problem.make_envs(1, device=device))
+    shown = final_picture(problem, still, 3, device=place)
+    assert shown.shape == (SIZE, SIZE, 3)
+    # Nobody moves: the end is the start, of this episode and of no other.
+    shorter = dataclasses.replace(problem, episode_steps=1)
+    assert np.array_equal(shown, final_picture(shorter, still, 3, device=place))
+    assert not np.array_equal(shown, final_picture(problem, still, 4, device=place))
+    first, again = (RandomPolicy(problem.make_envs(1, device=device)) for _ in range(2))
+    keywords = {**problem.keywords, "render_mode": "rgb_array", "render_size": SIZE}
+    envs = dataclasses.replace(problem, keywords=keywords, episode_steps=99).make_envs(
+        1, device=device
+    )
+    observation, _ = envs.reset(seed=[3])
+    for _ in range(problem.episode_steps):
+        observation, *_ = envs.step(first(observation))
+    (last,) = getattr(envs, "species_env", envs).render()
+    assert np.array_equal(last, final_picture(problem, again, 3, device=place))
+    assert not np.array_equal(last, shown)
+
+
+def test_a_strip_has_a_row_for_each_method_and_room_for_what_failed(tmp_path):
+    done, failed = record("ppo", 0, (1.0,)), record("zero", 0, status="failed")
+    folder = tmp_path / done.job.folder
+    folder.mkdir(parents=True)
+    write_png(folder / PICTURE, np.full((SIZE, SIZE, 3), 50, np.uint8))
+    (path,) = write_strips([done, failed], tmp_path)
+    assert path.name == "grown_growth_seconds.png"
+    with Image.open(path) as strip:
+        pixels = np.asarray(strip.convert("RGB"))
+    height, middle = pixels.shape[0], pixels.shape[1] // 2
+    assert pixels.shape[1] < 2 * SIZE
+    assert height > 2 * SIZE
+    assert (pixels[height // 4 - 10, middle] == 50).all()
+    assert (pixels[3 * height // 4 - 10, middle] == 255).all()
+
+
+# The whole command
+
+
+def test_a_quick_comparison_stops_goes_on_and_refuses_other_settings(tmp_path, capsys):
+    pytest.importorskip("cma")
+    words = (
+        "compare --quick --tasks morphogenesis2d --methods zero evolution --seeds 1 "
+        "--particle-steps 20000 --no-progress --commit test "
+        f"--options evolution.population=4 --output {tmp_path}"
+    ).split()
+    assert main([*words, "--max-seconds", "1e-3"]) == 0
+    assert "1 runs are left: call again" in capsys.readouterr().out
+    folder = tmp_path / "particle-steps" / "morphogenesis2d"
+    (first,) = folder.rglob("run.json")
+    before = first.stat().st_mtime_ns
+    assert main(words) == 0
+    told = capsys.readouterr().out
+    assert "are left" not in told
+    assert first.stat().st_mtime_ns == before
+    assert len(list(folder.rglob("run.json"))) == 2
+
+    held = json.loads((folder / "evolution" / "seed-0" / "run.json").read_text())
+    assert held["status"] == "done"
+    assert len(held["returns"]) == 4
+    assert held["curve"][-1]["particle_steps"] >= 20000
+    assert str(tmp_path) not in json.dumps(held)
+    assert "--output OUT" in held["command"]
+    problem = make_problem("morphogenesis2d", quick=True)
+    assert len(list(RuleSet.load(folder / "evolution" / "seed-0", problem))) == 1
+    assert f"| evolution | 1 | {np.mean(held['returns']):.3f}" in told
+    assert "| zero | 1 | 0.000 |" in told
+    table = json.loads((tmp_path / "comparison.json").read_text())
+    assert [row["method"] for row in table["rows"]] == ["evolution", "zero"]
+    assert (tmp_path / "comparison.md").read_text().endswith(told.split("wrote")[0].rstrip() + "\n")
+    for name in ("grown_morphogenesis2d_particle-steps.png", "curves_morphogenesis2d.png"):
+        assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
+
+    assert main([*words, "--episodes", "5"]) == 2
+    assert "other settings: episodes was 4, now 5" in capsys.readouterr().err
+
+
+def test_a_method_that_raises_is_in_the_table_and_the_command_says_so(tmp_path, capsys):
+    words = (
+        "compare --quick --tasks morphogenesis2d --methods evolution --seeds 1 "
+        "--particle-steps 1000 --no-progress "
+        f"--options evolution.population=1 --output {tmp_path}"
+    ).split()
+    assert main(words) == 1
+    told = capsys.readouterr().out
+    assert "| evolution | 0, 1 failed | – |" in told
+    assert "evolution/seed-0 failed: NPAError: population must be a whole number" in told
+    output = tmp_path / "particle-steps/morphogenesis2d/evolution/seed-0/output.txt"
+    assert "Traceback" in output.read_text()

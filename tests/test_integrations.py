@@ -1,0 +1,146 @@
+"""The programs of docs/integrations.md: each runs as it stands there, and learns."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+import imageio.v3 as imageio
+import pytest
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from npa_envs import wrappers
+from npa_envs.errors import MissingDependencyError
+
+PAGE = Path(__file__).resolve().parent.parent / "docs" / "integrations.md"
+RANDOM, RANDOM_ERROR = 0.143, 0.018
+"""Return of random actions in the worlds of the tutorial, by its table."""
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore::DeprecationWarning"),
+    pytest.mark.filterwarnings("ignore::FutureWarning"),
+    pytest.mark.filterwarnings("ignore::UserWarning"),
+]
+
+
+@pytest.fixture(autouse=True)
+def in_a_folder_of_its_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def program(mark: str) -> str:
+    """Return the page's one program that holds a piece of text."""
+    blocks = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(), re.MULTILINE | re.DOTALL)
+    (block,) = (block for block in blocks if mark in block)
+    return block
+
+
+def run(code: str, *, rounds: int = 60) -> dict:
+    """Run a program, with another number of rounds than the page's."""
+    names: dict = {}
+    exec(
+        compile(
+            re.sub(r"^rounds(.*) = 60", rf"rounds\1 = {rounds}", code, flags=re.M), "x", "exec"
+        ),
+        names,
+    )
+    return names
+
+
+def told(library: str) -> float:
+    """Return the return that the page's table tells of a library."""
+    (mean,) = re.findall(rf"^\| {library} \|.*\| ([\d.]+) ± [\d.]+ \|", PAGE.read_text(), re.M)
+    return float(mean)
+
+
+@pytest.mark.parametrize(
+    ("name", "module", "library", "extra"),
+    [
+        ("NPATorchRLEnv", "torchrl", "torchrl.data", "torchrl"),
+        ("RslRlParticleEnv", "rsl_rl", "rsl_rl.env", "rslrl"),
+    ],
+)
+def test_a_missing_library_is_named_with_its_extra(name, module, library, extra, monkeypatch):
+    monkeypatch.delitem(sys.modules, f"npa_envs.wrappers.{module}", raising=False)
+    monkeypatch.delattr(wrappers, module, raising=False)
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(MissingDependencyError, match=rf"pip install 'npa-envs\[{extra}\]'"):
+        getattr(wrappers, name)
+
+
+def test_callbacks_logs_and_films_of_stable_baselines3(tmp_path):
+    sb3 = pytest.importorskip("stable_baselines3")
+    pytest.importorskip("moviepy")
+    run(program("CheckpointCallback"))
+    runs = tmp_path / "runs"
+    for steps in (8192, 16384):
+        assert sb3.PPO.load(runs / f"rl_model_{steps}_steps.zip").num_timesteps == steps
+    assert sb3.PPO.load(runs / "best_model.zip").num_timesteps in (8192, 16384)
+    log = EventAccumulator(str(runs / "PPO_1")).Reload()
+    assert [event.step for event in log.Scalars("eval/mean_reward")] == [8192, 16384]
+    assert [event.value for event in log.Scalars("eval/mean_ep_length")] == [16.0, 16.0]
+    assert [event.step for event in log.Scalars("rollout/ep_rew_mean")] == [
+        4096,
+        8192,
+        12288,
+        16384,
+    ]
+    (film,) = runs.glob("*.mp4")
+    frames = imageio.imread(film)
+    assert len(frames) in (17, 18)
+    assert abs(frames[16].astype(float) - frames[0]).mean() > 1.0
+
+
+def test_films_of_gymnasium(tmp_path):
+    pytest.importorskip("moviepy")
+    run(program("RecordVideos"))
+    one, four = (
+        imageio.imread(next((tmp_path / "films" / name).glob("*.mp4"))) for name in ("one", "four")
+    )
+    # The first picture and 24 steps; moviepy 1.0.3 may show the last one twice.
+    assert len(one) in (25, 26)
+    assert len(four) in (25, 26)
+    assert one.shape[1:] == (256, 256, 3)
+    assert four.shape[1:] == (512, 512, 3)
+    # World 0 of the four is the one, but for the film's compression.
+    difference = abs(four[-1, :256, :256].astype(float) - one[-1]).mean()
+    assert difference < 4.0
+    assert abs(one[-1].astype(float) - one[0]).mean() > 3.0 * difference
+
+
+def test_weights_and_biases_follows_the_logs(tmp_path, monkeypatch):
+    pytest.importorskip("wandb")
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    run(program("sync_tensorboard"))
+    (record,) = (tmp_path / "wandb").glob("offline-run-*/*.wandb")
+    assert b"rollout/ep_rew_mean" in record.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("library", "module", "mark"),
+    [("TorchRL", "torchrl", "NPATorchRLEnv("), ("RSL-RL", "rsl_rl", "RslRlParticleEnv(")],
+)
+@pytest.mark.parametrize("rounds", [1, pytest.param(60, marks=pytest.mark.slow)])
+def test_particles_learn_to_act_for_their_world(library, module, mark, rounds, capsys):
+    pytest.importorskip(module)
+    run(program(mark), rounds=rounds)
+    ((mean, error),) = re.findall(
+        rf"^{library}: (-?[\d.]+) ± ([\d.]+)$", capsys.readouterr().out, re.M
+    )
+    assert float(error) < 0.05
+    if rounds == 60:
+        assert float(mean) > RANDOM + 10.0 * (RANDOM_ERROR + float(error))
+        assert float(mean) == pytest.approx(told(library), abs=0.3)
+
+
+@pytest.mark.slow
+def test_rllib_learns(capsys):
+    ray = pytest.importorskip("ray")
+    ray.init(num_cpus=1, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
+    try:
+        run(program("rllib_rows_config"), rounds=30)
+    finally:
+        ray.shutdown()
+    (mean,) = re.findall(r"^RLlib: (-?[\d.]+)$", capsys.readouterr().out, re.M)
+    assert float(mean) > 3.0 * RANDOM

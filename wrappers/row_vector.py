@@ -1,0 +1,140 @@
+"""Particles as the sub-environments of a Gymnasium vector environment, for RLlib and its like."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from gymnasium.spaces import Space
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from npa_envs.errors import NPAError
+from npa_envs.wrappers.adapters import own_rewards, row_space
+from npa_envs.wrappers.base import AnyVectorEnv, autoreset_mode, to_host, vector_env
+
+
+class ParticleRows(AnyVectorEnv):
+    """The particles of a vector environment as the rows of another one, arrays on the host.
+
+    Row w N + i is particle i of world w: it observes that particle's perception, shape [P], gives
+    its action, shape [A], and gets its own reward where the environment was made with
+    `reward="particle"`, else its world's. The particles of a world begin and end their episodes
+    together, and a new one begins in the step after (next-step autoreset).
+
+    For libraries that train one policy on the rows of any vector environment of Gymnasium's.
+    Infos are empty, as few of them could read those of many rows.
+
+    Args:
+        env: A vector environment of this package, wrapped or not, with next-step autoreset.
+
+    Raises:
+        NPAError: The environment is none of this package, or has another autoreset mode.
+    """
+
+    # Gymnasium closes what is deleted, also what was refused below: that has nothing to close.
+    closed = True
+
+    def __init__(self, env: AnyVectorEnv) -> None:
+        base = vector_env(env, type(self).__name__)
+        mode = autoreset_mode(env)
+        if mode is not AutoresetMode.NEXT_STEP:
+            raise NPAError(
+                f"env must restart worlds in the step after the last one, got {mode}: "
+                "make it with autoreset_mode='next-step'"
+            )
+        self.vector_env = env
+        """The environment whose particles these are."""
+        self.world_count = base.num_envs
+        """Worlds B."""
+        self.particle_count = base.config.particle_count
+        """Particles N of a world."""
+        self.num_envs = self.world_count * self.particle_count
+        self.metadata = env.metadata
+        self.render_mode = env.render_mode
+        self.single_observation_space = row_space(env.single_observation_space)
+        self.single_action_space = row_space(env.single_action_space)
+        self.closed = False
+
+    @cached_property
+    def observation_space(self) -> Space[Any]:  # type: ignore[override]
+        """Observations of all rows, shape [B N, P]; made when asked for, as it is large."""
+        return batch_space(self.single_observation_space, self.num_envs)
+
+    @cached_property
+    def action_space(self) -> Space[Any]:  # type: ignore[override]
+        """Actions of all rows, shape [B N, A]; made when asked for, as it is large."""
+        return batch_space(self.single_action_space, self.num_envs)
+
+    def reset(
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Start episodes in all worlds.
+
+        Args:
+            seed: World w begins the episodes of seed + w; None: the sequences go on.
+            options: Not used: rows cannot restart without the others of their world.
+
+        Returns:
+            Observations of the rows, shape [B N, P], and an empty info.
+        """
+        observations, _ = self.vector_env.reset(seed=seed)
+        return to_host(observations).reshape(self.num_envs, -1), {}
+
+    def step(
+        self, actions: Any
+    ) -> tuple[
+        NDArray[np.float32],
+        NDArray[np.float64],
+        NDArray[np.bool_],
+        NDArray[np.bool_],
+        dict[str, Any],
+    ]:
+        """Step all worlds.
+
+        Args:
+            actions: Of each row, shape [B N, A].
+
+        Returns:
+            Of each row: observation [B N, P], reward, termination and truncation [B N]; and an
+            empty info.
+
+        Raises:
+            NPAError: The actions have another shape or are not finite; the worlds are then as they
+                were.
+        """
+        wanted = (self.num_envs, *(self.single_action_space.shape or ()))
+        if np.shape(actions) != wanted:
+            raise NPAError(
+                f"actions must have shape [B N, A] = {wanted}, got {np.shape(actions)}: "
+                "one for each row"
+            )
+        by_world = actions.reshape(self.world_count, self.particle_count, -1)
+        observations, rewards, ended, cut, infos = self.vector_env.step(by_world)
+        own = own_rewards(infos)
+        paid = self._repeated(rewards) if own is None else to_host(own).reshape(-1)
+        return (
+            to_host(observations).reshape(self.num_envs, -1),
+            paid.astype(np.float64),
+            self._repeated(ended),
+            self._repeated(cut),
+            {},
+        )
+
+    def render(self) -> Any:
+        """Return what the environment shows: a picture of each world."""
+        return self.vector_env.render()
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Close the environment.
+
+        Args:
+            kwargs: What `close` was given.
+        """
+        self.vector_env.close(**kwargs)
+
+    def _repeated(self, values: Any) -> NDArray[Any]:
+        """Return what worlds have, [B], for each of their rows, shape [B N]."""
+        return np.repeat(to_host(values), self.particle_count)

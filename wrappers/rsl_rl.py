@@ -1,0 +1,132 @@
+"""Particles as the rows of an environment of RSL-RL's, without copies to the host."""
+
+from __future__ import annotations
+
+from typing import Any, NoReturn
+
+import torch
+from torch import Tensor
+
+from npa_envs.errors import MissingDependencyError, NPAError
+from npa_envs.wrappers.adapters import check_same_step, check_torch_output, own_rewards
+from npa_envs.wrappers.base import AnyVectorEnv, autoreset_mode, vector_env
+
+try:
+    from rsl_rl.env import VecEnv
+    from tensordict import TensorDict
+except ImportError as error:
+    raise MissingDependencyError(
+        f"RslRlParticleEnv needs RSL-RL ({error}): pip install 'npa-envs[rslrl]'"
+    ) from error
+
+
+class RslRlParticleEnv(VecEnv):  # type: ignore[misc]
+    """The particles of a vector environment as the rows of RSL-RL's `VecEnv`.
+
+    Row w N + i is particle i of world w. It observes that particle's perception, shape [P], in the
+    observation group "policy", gives its action, shape [A], and gets its own reward where the
+    environment was made with `reward="particle"`, else its world's. One policy is so shared by all
+    particles. Observations, rewards and flags stay on the environment's device.
+
+    At the ends of episodes the means of the last losses and of success are logged, as
+    `Episode/loss` and `Episode/success`.
+
+    Args:
+        env: A vector environment of this package, wrapped or not, made with `output="torch"`, with
+            same-step autoreset.
+        seed: World w begins with the episode of seed + w; None: any.
+        bootstrap: Whether rows cut off by the step limit say so, from which RSL-RL estimates what
+            they would still have got; False: such an end counts as any other.
+
+    Raises:
+        NPAError: The environment is none of this package, hands out arrays, or has another
+            autoreset mode.
+        MissingDependencyError: RSL-RL is not installed (on import).
+    """
+
+    def __init__(
+        self, env: AnyVectorEnv, *, seed: int | None = None, bootstrap: bool = True
+    ) -> None:
+        base = vector_env(env, type(self).__name__)
+        check_torch_output(base, type(self).__name__)
+        check_same_step(autoreset_mode(env))
+        self.vector_env = env
+        """The environment whose particles these are."""
+        self.bootstrap = bootstrap
+        """Whether rows cut off by the step limit say so."""
+        self.world_count = base.num_envs
+        """Worlds B."""
+        self.particle_count = base.config.particle_count
+        """Particles N of a world."""
+        self.num_envs = self.world_count * self.particle_count
+        self.num_actions = base.worlds.physics.action_dim
+        self.max_episode_length = base.worlds.episode_steps or 2**31 - 1
+        self.device = base.worlds.x.device
+        self.cfg = vars(base.config) | {"num_envs": base.num_envs}
+        self._elapsed = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
+        self._seen, _ = env.reset(seed=seed)
+
+    @property
+    def episode_length_buf(self) -> Tensor:
+        """Steps since the start of each row's episode, int64, shape [B N]."""
+        return self._elapsed
+
+    @episode_length_buf.setter
+    def episode_length_buf(self, _: Tensor) -> NoReturn:
+        raise NPAError(
+            "episode_length_buf cannot be set, the worlds keep their own time: "
+            "call learn with init_at_random_ep_len=False"
+        )
+
+    def get_observations(self) -> TensorDict:
+        """Return the current observations, "policy" of shape [B N, P]."""
+        rows = self._seen.reshape(self.num_envs, -1)
+        return TensorDict({"policy": rows}, batch_size=[self.num_envs], device=self.device)
+
+    def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
+        """Step all worlds.
+
+        Args:
+            actions: Of each row, shape [B N, A].
+
+        Returns:
+            Of each row: observations, reward [B N], whether its episode is over, int64, [B N]; and
+            extras, with `time_outs` [B N], and `log` where episodes ended.
+
+        Raises:
+            NPAError: The actions have another shape or are not finite; the worlds are then as they
+                were.
+        """
+        wanted = (self.num_envs, self.num_actions)
+        if tuple(actions.shape) != wanted:
+            raise NPAError(
+                f"actions must have shape [B N, A] = {wanted}, got {tuple(actions.shape)}: "
+                "one for each row"
+            )
+        # RSL-RL collects in inference mode, whose tensors nobody else could write to afterwards.
+        with torch.inference_mode(False), torch.no_grad():
+            by_world = actions.reshape(self.world_count, self.particle_count, -1)
+            self._seen, rewards, ended, cut, infos = self.vector_env.step(by_world.clone())
+            own = own_rewards(infos)
+            paid = self._repeated(rewards) if own is None else own.reshape(-1)
+            over = self._repeated(ended | cut)
+            self._elapsed = torch.where(over, 0, self._elapsed + 1)
+            extras: dict[str, Any] = {}
+            if self.bootstrap:
+                extras["time_outs"] = self._repeated(cut & ~ended)
+            if "final_info" in infos:
+                extras["log"] = _episode_log(infos)
+            return self.get_observations(), paid, over.long(), extras
+
+    def _repeated(self, values: Tensor) -> Tensor:
+        """Return what worlds have, [B], for each of their rows, shape [B N]."""
+        return values.repeat_interleave(self.particle_count, output_size=self.num_envs)
+
+
+def _episode_log(infos: dict[str, Any]) -> dict[str, Tensor]:
+    """Return means over the worlds whose episodes are over, without waiting for the device."""
+    final, which = infos["final_info"], infos["_final_info"]
+    return {
+        f"Episode/{name}": torch.where(which, final[name].float(), 0.0).sum() / which.sum()
+        for name in ("loss", "success")
+    }

@@ -1,0 +1,159 @@
+"""Batches of worlds as an environment of TorchRL's, without copies to the host."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode
+from torch import Tensor
+
+from npa_envs.errors import MissingDependencyError, NPAError
+from npa_envs.wrappers.adapters import check_torch_output
+from npa_envs.wrappers.base import AnyVectorEnv, autoreset_mode, vector_env
+
+try:
+    from tensordict import TensorDict, TensorDictBase
+    from torchrl.data import Bounded, Categorical, Composite, Unbounded
+    from torchrl.envs import EnvBase
+except ImportError as error:
+    raise MissingDependencyError(
+        f"NPATorchRLEnv needs TorchRL ({error}): pip install 'npa-envs[torchrl]'"
+    ) from error
+
+
+class NPATorchRLEnv(EnvBase):  # type: ignore[misc]
+    """B worlds as one TorchRL environment of batch size [B], or of [B, N] with `rows=True`.
+
+    Entries are `observation` [B, N, P], `action` [B, N, A], and `reward`, `done`, `terminated` and
+    `truncated`, [B, 1] each. TorchRL restarts worlds itself, each when its own episode is over.
+    World k, seeded with s, has the episodes of the single environment seeded with s + k.
+
+    With `rows=True` every particle is an environment of its own: all of TorchRL's losses for one
+    agent then train one small policy that all particles share. `observation` and `action` stay as
+    they are, the others become [B, N, 1]; a particle is paid its own reward where the environment
+    was made with `reward="particle"`, else its world's. Frames are then counted in rows. The
+    particles of a world begin and end their episodes together.
+
+    Observations, rewards and flags are the tensors that the environment hands out, on its device.
+
+    Args:
+        env: A vector environment of this package, wrapped or not, made with `output="torch"`,
+            `autoreset_mode="disabled"`, and `copy=True` (the default): TorchRL keeps what it gets.
+        rows: Whether particles are environments of their own.
+
+    Raises:
+        NPAError: The environment is none of this package, hands out arrays, or restarts worlds by
+            itself.
+        MissingDependencyError: TorchRL is not installed (on import).
+    """
+
+    def __init__(self, env: AnyVectorEnv, *, rows: bool = False) -> None:
+        base = vector_env(env, type(self).__name__)
+        check_torch_output(base, type(self).__name__)
+        mode = autoreset_mode(env)
+        if mode is not AutoresetMode.DISABLED:
+            raise NPAError(
+                f"env must leave restarts to TorchRL, got {mode}: "
+                "make it with autoreset_mode='disabled'"
+            )
+        worlds, count = base.num_envs, base.config.particle_count
+        batch = (worlds, count) if rows else (worlds,)
+        super().__init__(device=base.worlds.x.device, batch_size=torch.Size(batch))
+        self.vector_env = env
+        """The environment whose worlds these are."""
+        self.rows = rows
+        """Whether particles are environments of their own."""
+        self.particle_count = count
+        """Particles N of a world."""
+        self._first_seed: int | None = None
+        seen, acted = (
+            _bounded(space, worlds, self.device)
+            for space in (env.single_observation_space, env.single_action_space)
+        )
+        self.observation_spec = Composite(observation=seen, shape=batch, device=self.device)
+        self.action_spec = acted
+        self.reward_spec = Unbounded(shape=(*batch, 1), device=self.device)
+        flag = Categorical(2, shape=(*batch, 1), dtype=torch.bool, device=self.device)
+        names = ("done", "terminated", "truncated")
+        flags = {name: flag.clone() for name in names}
+        self.done_spec = Composite(flags, shape=batch, device=self.device)
+
+    def _reset(self, tensordict: TensorDictBase | None, **_: Any) -> TensorDictBase:
+        """Start episodes where `_reset` says so, or everywhere.
+
+        Raises:
+            NPAError: Only some particles of a world are to start.
+        """
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        chosen = None if mask is None else self._chosen(mask)
+        if chosen is None or bool(chosen.all()):
+            observation, _ = self.vector_env.reset(seed=self._first_seed)
+            self._first_seed = None
+        else:
+            observation, _ = self.vector_env.reset(options={"reset_mask": chosen})
+        off = torch.zeros((*self.batch_size, 1), dtype=torch.bool, device=self.device)
+        return self._entries(observation, done=off, terminated=off.clone(), truncated=off.clone())
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Step all worlds."""
+        outcome = self.vector_env.step(tensordict["action"])
+        observation, reward, terminated, truncated, infos = outcome
+        if self.rows and "particle_reward" in infos:
+            paid = infos["particle_reward"][..., None]
+        else:
+            paid = self._spread(reward)
+        return self._entries(
+            observation,
+            reward=paid,
+            done=self._spread(terminated | truncated),
+            terminated=self._spread(terminated),
+            truncated=self._spread(truncated),
+        )
+
+    def _set_seed(self, seed: int | None) -> None:
+        """Let the next reset of all worlds begin the episodes of seed, seed + 1, ..., one each."""
+        self._first_seed = seed
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Close the environment.
+
+        Args:
+            raise_if_closed: Whether closing twice is an error, as for any of TorchRL's.
+        """
+        super().close(raise_if_closed=raise_if_closed)
+        self.vector_env.close()
+
+    def _chosen(self, mask: Tensor) -> Tensor:
+        """Return which worlds a mask of TorchRL's chooses, bool, shape [B], on the host."""
+        by_world = mask.reshape(self.batch_size[0], -1).cpu()
+        chosen = by_world.any(dim=1)
+        if not torch.equal(chosen, by_world.all(dim=1)):
+            raise NPAError(
+                "_reset must choose all particles of a world or none, got some of them: "
+                "they begin their episodes together"
+            )
+        return chosen
+
+    def _spread(self, values: Tensor) -> Tensor:
+        """Return what worlds have, [B], in the shape of the entries: [B, 1] or [B, N, 1]."""
+        if not self.rows:
+            return values[:, None]
+        return values[:, None, None].expand(-1, self.particle_count, -1).clone()
+
+    def _entries(self, observation: Tensor, **entries: Tensor) -> TensorDictBase:
+        """Return what TorchRL is given after a reset or a step."""
+        entries["observation"] = observation
+        made: TensorDictBase = TensorDict(entries, batch_size=self.batch_size, device=self.device)
+        return made
+
+
+def _bounded(space: Any, world_count: int, device: torch.device | None) -> Bounded:
+    """Return the spec of what all worlds have, by the space of what one has."""
+    assert isinstance(space, Box), "environments of this package have boxes"
+    low, high = (
+        torch.as_tensor(limit, device=device).expand(world_count, *space.shape).clone()
+        for limit in (space.low, space.high)
+    )
+    return Bounded(low, high, (world_count, *space.shape), device=device, dtype=torch.float32)
