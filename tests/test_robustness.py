@@ -432,10 +432,38 @@ def test_the_command_measures_writes_and_goes_on(tmp_path, capsys, monkeypatch):
     assert capsys.readouterr().out == first
 
 
+def test_a_stopped_run_goes_on_where_it_was(tmp_path, capsys, monkeypatch):
+    def measured(*words):
+        assert (
+            main(["robustness", "heart", "--quick", "--no-progress", "--commit", "0", *words]) == 0
+        )
+        return capsys.readouterr().out
+
+    measured("--output", str(tmp_path / "whole"))
+    whole = json.loads((tmp_path / "whole" / "robustness_heart.json").read_text())
+    # Time is up after the damages and three values.
+    words = ["--output", str(tmp_path / "parts")]
+    path = tmp_path / "parts" / "robustness_heart.json"
+    asked = iter([False] * 4)
+    monkeypatch.setattr("npa_envs.cli.robustness._enough", lambda _: next(asked, True))
+    assert measured(*words) == "1 rules are left: call again with the same options\n"
+    part = json.loads(path.read_text())
+    assert not part["done"]
+    assert part["responses"] == whole["responses"][:3]
+    monkeypatch.undo()
+    monkeypatch.setattr("npa_envs.robustness.study.healing", lambda *_: pytest.fail("measured"))
+    assert "Where rules work" in measured(*words)
+    both = json.loads(path.read_text())
+    assert both["done"]
+    assert both["responses"] == whole["responses"]
+    assert both["courses"] == part["courses"] == whole["courses"]
+
+
 def test_the_command_refuses_mistakes(capsys):
     for words, message in (
         (["hart"], "unknown rule 'hart': did you mean 'heart'"),
         (["--seed-count", "0"], "seed_count must be at least 1, got 0"),
+        (["--max-seconds", "0"], "max_seconds must be positive, got 0"),
     ):
         assert main(["robustness", *words]) == 2
         assert message in capsys.readouterr().err

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import shlex
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -27,8 +30,8 @@ class RobustnessOptions:
     """Measure how rules grow under other conditions, and how they recover from damage.
 
     Unlike `npa-envs stress` this expects nothing and gives no verdicts: it is a table of figures
-    over seeds. With --output a JSON file is written once a rule is done, and a run that was stopped
-    goes on with the next one.
+    over seeds. With --output a rule's JSON file is written after each value, and a run that was
+    stopped goes on there.
     """
 
     rules: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RULES")] = ()
@@ -59,6 +62,9 @@ class RobustnessOptions:
 
     commit: str | None = None
     """Commit that is measured; default: that of the checkout."""
+
+    max_seconds: float | None = None
+    """Stop after this time; the same command goes on. Default: never."""
 
     progress: bool = True
     """Show a progress bar."""
@@ -110,6 +116,11 @@ def run(options: RobustnessOptions, command: str = "") -> int:
         value = getattr(options, name)
         if value is not None and value < least:
             raise NPAError(f"{name} must be at least {least}, got {value}")
+    if options.max_seconds is not None and not options.max_seconds > 0.0:
+        raise NPAError(
+            f"max_seconds must be positive, got {options.max_seconds}: leave it out for no limit"
+        )
+    end = math.inf if options.max_seconds is None else time.monotonic() + options.max_seconds
     names = _chosen(options.rules)
     device = check_device(options.device)
     most = options.most_particles or MOST_PARTICLES[device.type]
@@ -127,18 +138,39 @@ def run(options: RobustnessOptions, command: str = "") -> int:
     ):
         for name in names:
             record = before.get(name)
-            if record is None:
-                ground = _ground(options, name, device)
-                record = measure_rule(name, ground, most, facts=facts, command=command)
-                if name in paths:
-                    record.write(paths[name])
-            records.append(record)
+            if (record is None or not record.done) and not _enough(end):
+                record = measure_rule(
+                    name,
+                    _ground(options, name, device),
+                    most,
+                    facts=facts,
+                    command=command,
+                    before=record,
+                    keep=partial(_keep, paths.get(name)),
+                    enough=partial(_enough, end),
+                )
+            if record is not None and record.done:
+                records.append(record)
             bar.advance(1)
-    text = tables(records)
-    # Before it is printed: whoever reads that may have seen enough.
-    written = [] if folder is None else _write(folder, text, records)
-    print("\n".join([text, *written]))
+    lines = []
+    if records:
+        text = tables(records)
+        # Before it is printed: whoever reads that may have seen enough.
+        written = [] if folder is None else _write(folder, text, records)
+        lines += [text, *written]
+    if left := len(names) - len(records):
+        lines.append(f"{left} rules are left: call again with the same options")
+    print("\n".join(lines))
     return 0
+
+
+def _enough(end: float) -> bool:
+    return time.monotonic() > end
+
+
+def _keep(path: Path | None, record: RuleRecord) -> None:
+    if path is not None:
+        record.write(path)
 
 
 def _chosen(names: Sequence[str]) -> list[str]:

@@ -70,25 +70,28 @@ def grow(ground: Ground, condition: str = "", value: float | str = 1.0) -> tuple
 
 
 @torch.no_grad()
-def responses(ground: Ground, trained: Response, most_particles: int) -> Iterator[Response]:
+def responses(
+    ground: Ground, trained: Response, most_particles: int, *, done: int = 0
+) -> Iterator[Response]:
     """Yield what comes of each value of each condition.
 
     Args:
         ground: The rule, and what is measured.
         trained: What comes of worlds as trained; it is not measured again.
         most_particles: Particles of all worlds; where there would be more, a value is left out.
+        done: Values that are measured already, the first in order.
     """
-    for condition, values in ground.plan.values.items():
-        for value in values:
-            if value == trained_value(condition, ground.task.update_prob):
-                yield Response(condition, value, trained.steps, trained.losses)
-                continue
-            share = float(value) if condition == "particles" else 1.0
-            total = ground.world_count * ground.particles(share)
-            if total > max(most_particles, ground.world_count * ground.particle_count):
-                yield Response(condition, value, 0, (), note=f"{total} particles in all")
-                continue
-            try:
-                yield grow(ground, condition, value)[1]
-            except torch.OutOfMemoryError:
-                yield Response(condition, value, 0, (), note=f"no memory for {total} particles")
+    every = [(name, value) for name, values in ground.plan.values.items() for value in values]
+    for condition, value in every[done:]:
+        if value == trained_value(condition, ground.task.update_prob):
+            yield Response(condition, value, trained.steps, trained.losses)
+            continue
+        share = float(value) if condition == "particles" else 1.0
+        total = ground.world_count * ground.particles(share)
+        if total > max(most_particles, ground.world_count * ground.particle_count):
+            yield Response(condition, value, 0, (), note=f"{total} particles in all")
+            continue
+        try:
+            yield grow(ground, condition, value)[1]
+        except torch.OutOfMemoryError:
+            yield Response(condition, value, 0, (), note=f"no memory for {total} particles")

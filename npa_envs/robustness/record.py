@@ -1,4 +1,4 @@
-"""What was measured of each rule, as JSON that is written whole once a rule is done."""
+"""What was measured of each rule, as JSON that is written whole after every value."""
 
 from __future__ import annotations
 
@@ -33,6 +33,8 @@ class RuleRecord:
     """After each damage, the control first."""
     responses: tuple[Response, ...]
     """Under each condition."""
+    done: bool = True
+    """Whether that is all; else a run goes on with the next value."""
     seconds: float = 0.0
     """How long it took [s]."""
     command: str = ""

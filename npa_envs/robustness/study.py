@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from datetime import date
 from typing import Any
 
@@ -14,7 +15,15 @@ from npa_envs.robustness.recovery import healing
 
 
 def measure_rule(
-    name: str, ground: Ground, most_particles: int, *, facts: Mapping[str, Any], command: str = ""
+    name: str,
+    ground: Ground,
+    most_particles: int,
+    *,
+    facts: Mapping[str, Any],
+    command: str = "",
+    before: RuleRecord | None = None,
+    keep: Callable[[RuleRecord], None] = lambda record: None,
+    enough: Callable[[], bool] = lambda: False,
 ) -> RuleRecord:
     """Return what a rule bears and heals.
 
@@ -24,21 +33,33 @@ def measure_rule(
         most_particles: Particles of all worlds; conditions with more are left out.
         facts: What the figures follow from.
         command: The command line, for the record.
+        before: What an earlier run has measured: it is not measured again.
+        keep: Called with what is measured so far, after the damages and after each value.
+        enough: Asked before each value: whether to stop there, with a record that is not done.
     """
-    begin = time.perf_counter()
+    begin = time.perf_counter() - (0.0 if before is None else before.seconds)
     home, trained = grow(ground)
-    courses = tuple(healing(ground, home))
-    found = tuple(responses(ground, trained, most_particles))
-    seconds = time.perf_counter() - begin
-    return RuleRecord(
+    record = before or RuleRecord(
         rule=name,
         task=ground.task_name,
         metric=ground.metric_name,
         update_prob=float(ground.task.update_prob),
         facts=facts,
-        courses=courses,
-        responses=found,
-        seconds=round(seconds, 2),
+        courses=tuple(healing(ground, home)),
+        responses=(),
+        done=False,
         command=command,
         date=date.today().isoformat(),
     )
+    keep(record)
+    rest = responses(ground, trained, most_particles, done=len(record.responses))
+    while not enough():
+        response = next(rest, None)
+        seconds = round(time.perf_counter() - begin, 2)
+        if response is None:
+            record = replace(record, done=True, seconds=seconds)
+            keep(record)
+            break
+        record = replace(record, responses=(*record.responses, response), seconds=seconds)
+        keep(record)
+    return record
