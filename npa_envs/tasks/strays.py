@@ -70,7 +70,7 @@ def tear(x: Tensor, *, radius: float, chance: float, generator: Randomness | Non
 
 def _outside(ball: Tensor) -> Tensor:
     """Return places between `NEAREST` and `FARTHEST` for places in the unit ball, [..., D]."""
-    length = ball.norm(dim=-1, keepdim=True)
+    length: Tensor = ball.norm(dim=-1, keepdim=True)
     return ball * ((NEAREST + (FARTHEST - NEAREST) * length) / length.clamp_min(1e-12))
 
 
