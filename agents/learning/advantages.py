@@ -53,16 +53,20 @@ def over_particles(values: Tensor, weights: Tensor) -> Tensor:
 
 
 def standardised(values: Tensor, weights: Tensor) -> Tensor:
-    """Return numbers with their weighted mean taken off, in units of their standard deviation.
+    """Return numbers less each step's weighted mean, in units of the standard deviation of all.
+
+    A step's mean over all worlds is what it is worth whatever is done: how far an episode has come,
+    which a critic learns only with time. A single world is compared with its own other steps.
 
     Args:
-        values: Shape [..., N], or [..., 1] for one number a world.
-        weights: Shape [..., N], not negative.
+        values: Shape [T, B, N], or [T, B, 1] for one number a world.
+        weights: Shape [T, B, N], not negative.
     """
-    shares = weights.expand_as(values) if values.shape == weights.shape else weights.amax(-1, True)
-    total = shares.sum()
-    centred = values - (values * shares).sum() / total
-    return centred / ((centred.square() * shares).sum() / total + 1e-16).sqrt()
+    shares = weights if values.shape == weights.shape else weights.amax(-1, True)
+    alike = (1, 2) if values.shape[1] > 1 else (0, 1, 2)
+    total = shares.sum(alike, keepdim=True).clamp(min=1e-8)
+    centred = shares * (values - (values * shares).sum(alike, keepdim=True) / total)
+    return centred / (centred.square().sum() / shares.sum().clamp(min=1e-8) + 1e-16).sqrt()
 
 
 def clipped_gain(log_ratio: Tensor, advantages: Tensor, weights: Tensor, *, clip: float) -> Tensor:

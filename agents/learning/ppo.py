@@ -8,6 +8,7 @@ The host reads one byte a world in each step (has its episode ended?), and one n
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
@@ -22,7 +23,8 @@ from npa_envs.agents.learning.advantages import (
 from npa_envs.agents.learning.critics import Critic
 from npa_envs.agents.learning.gaussian import GaussianRules
 from npa_envs.agents.learning.options import takes_fields_of
-from npa_envs.agents.learning.ppo_settings import Settings, filled
+from npa_envs.agents.learning.ppo_settings import Settings, beginning, filled
+from npa_envs.agents.learning.ppo_worlds import world_count
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rules import RuleSet
@@ -38,7 +40,8 @@ class Round(NamedTuple):
     log_probs: Tensor
     """Its log-probability then, shape [M, N]."""
     advantages: Tensor
-    """How much better it was than foreseen, standardised, shape [M, N]."""
+    """How much better it was than foreseen, and than other worlds fared in the same step,
+    standardised, shape [M, N]."""
     targets: Tensor
     """What the critic should have said, shape [M, N]."""
     acted: Tensor
@@ -66,10 +69,10 @@ class Learner:
     ) -> None:
         self.settings = settings = filled(settings, start)
         self.envs = problem.make_envs(
-            device=device, row_rewards=settings.credit == "particle", copy=False
+            settings.worlds, device=device, row_rewards=settings.credit == "particle", copy=False
         )
         self.generator = torch.Generator(device).manual_seed(seed)
-        rules = problem.new_rules(seed) if start is None else start
+        rules = beginning(problem, seed, start)
         assert settings.initial_std is not None, "filled in above"
         self.actor = GaussianRules(rules, settings.initial_std).to(device)
         with torch.random.fork_rng(devices=[]):
@@ -268,7 +271,9 @@ def train(
     Raises:
         NPAError: There is no such option, or one is wrong; or the policy has diverged.
     """
-    learner = Learner(problem, settings, seed, torch.device(device), start)
+    place = torch.device(device)
+    settings = replace(settings, worlds=world_count(problem, settings, place, progress.budget))
+    learner = Learner(problem, settings, seed, place, start)
     rules = learner.actor.rules
     progress.start(rules)
     while not progress.over:

@@ -5,7 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+from torch import nn
+
 from npa_envs.agents.learning.critics import CriticKind
+from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.errors import NPAError, suggest
 from npa_envs.tasks.checks import check_fraction, check_non_negative, check_positive
@@ -28,13 +31,17 @@ CHOICES = {
 class Settings:
     """Options of `train`."""
 
+    worlds: int | None = None
+    """Worlds B to act in; None: the problem's `num_envs`, and on CUDA as many as have 131 072
+    particles together, if memory has room for them and particle-steps are enough for 32 rounds."""
+
     steps: int = 16
     """Steps of all worlds in a round, T."""
 
     epochs: int = 4
     """Passes over a round; fewer where `target_kl` is passed."""
 
-    minibatches: int = 16
+    minibatches: int = 4
     """Parts that the particles of a round are shuffled into in each pass; for the critic, and where
     a world has one ratio, its worlds are."""
 
@@ -96,6 +103,8 @@ class Settings:
         for name in ("clip", "learning_rate", "target_kl", "initial_std"):
             if getattr(self, name) is not None:
                 check_positive(self, float, name)
+        if self.worlds is not None:
+            check_positive(self, int, "worlds")
         if self.critic_rounds is not None:
             check_positive(self, int, "critic_rounds", at_least=0)
         check_words(self, *CHOICES)
@@ -138,3 +147,23 @@ def filled(settings: Any, start: RuleSet | None) -> Any:
     defaults = FRESH if start is None else WARM
     missing = {k: value for k, value in defaults.items() if getattr(settings, k) is None}
     return replace(settings, **missing)
+
+
+def beginning(problem: Problem, seed: int, start: RuleSet | None) -> RuleSet:
+    """Return the rules that PPO begins with: those given, or fresh ones that do nothing.
+
+    Fresh rules have random output layers, and what they do in each step adds up: in
+    `npa/Regeneration2D-v0` they take apart what is whole. Layers of zeros leave it alone, and learn
+    just as well, as what is hidden is random still.
+
+    Args:
+        problem: What is to be learned.
+        seed: Of the other weights.
+        start: Rules to begin with; None: fresh ones.
+    """
+    if start is not None:
+        return start
+    rules = problem.new_rules(seed)
+    for rule in rules:
+        nn.init.zeros_(rule.output.weight)
+    return rules

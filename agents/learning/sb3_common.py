@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from npa_envs.agents.learning.critics import CriticKind
-from npa_envs.agents.learning.ppo_settings import check_words, filled
+from npa_envs.agents.learning.ppo_settings import beginning, check_words, filled
 from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.agents.learning.sb3_imports import PPO, BaseCallback, VecEnv, VecEnvWrapper
@@ -28,7 +28,7 @@ class SB3Settings:
     epochs: int = 4
     """Passes over a round."""
 
-    minibatches: int = 16
+    minibatches: int = 4
     """Parts that the rows of a round are shuffled into."""
 
     learning_rate: float | None = None
@@ -187,7 +187,7 @@ def learn(
         start: Rules to begin with; None: fresh ones.
         settings: Of PPO.
     """
-    rules = progress.problem.new_rules(seed) if start is None else start
+    rules = beginning(progress.problem, seed, start)
     chosen: Any = filled(settings, start)
     rate, alone, far = chosen.learning_rate, chosen.critic_rounds, chosen.target_kl
     rows = settings.steps * env.num_envs
