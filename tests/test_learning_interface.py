@@ -16,7 +16,7 @@ from npa_envs.agents import (
     evaluate_policy,
     interface_of,
 )
-from npa_envs.agents.learning import Problem, RuleSet
+from npa_envs.agents.learning import Budget, Problem, RuleSet, train
 from npa_envs.envs import multispecies_v0
 from npa_envs.errors import NPAError
 from npa_envs.registration import ENVIRONMENTS
@@ -336,3 +336,29 @@ def test_evaluation_runs_joined_species():
     gained = episodes.start_losses - episodes.final_losses
     assert gained == pytest.approx(episodes.returns, abs=1e-6)
     assert set(episodes.endings) == {"time limit"}
+
+
+# Rules to begin with
+
+
+@pytest.mark.parametrize("method", ["ppo", "ppo_rows", "ppo_world", "evolution", "gradient"])
+def test_every_method_refuses_to_begin_with_what_does_not_fit(method):
+    problem, budget = heart(), Budget(particle_steps=1)
+    if method.startswith("ppo_"):
+        pytest.importorskip("stable_baselines3")
+    with pytest.raises(NPAError, match="start must be a RuleSet"):
+        train(method, problem, budget, 0, start=next(iter(problem.new_rules(0))))
+    with pytest.raises(NPAError, match="state_dim"):
+        train(method, problem, budget, 0, start=heart(state_dim=8).new_rules(0))
+
+
+@pytest.mark.parametrize("method", ["ppo", "ppo_rows", "ppo_world", "evolution"])
+def test_rules_of_other_numbers_of_particles_begin_with_those_of_the_problem(method):
+    if method.startswith("ppo_"):
+        pytest.importorskip("stable_baselines3")
+    problem = species(particle_counts=(20, 15))
+    start = species(particle_counts=(6, 8)).new_rules(0)
+    options = {"population": 4} if method == "evolution" else {"steps": 2, "minibatches": 1}
+    trained = train(method, problem, Budget(particle_steps=1), 0, start=start, **options)
+    assert [span.stop - span.start for span in trained.rules.spans] == [20, 15]
+    assert [span.stop - span.start for span in start.spans] == [6, 8]

@@ -295,6 +295,24 @@ def test_particles_of_a_species_that_is_gone_do_not_count():
     assert all(torch.isfinite(weight).all() for weight in given.actor.parameters())
 
 
+@pytest.mark.parametrize("steps", [5, 8], ids=["at the end of a round", "within a round"])
+def test_a_species_that_ends_is_worth_nothing_more(steps):
+    dying = Problem(
+        env_id=MIXING.env_id,
+        keywords=dict(MIXING.keywords) | {"deaths": [[1, 5]]},
+        episode_steps=9,
+        num_envs=4,
+    )
+    given = learner(dying, steps=steps, gamma=0.5, gae_lambda=1.0)
+    with torch.no_grad():
+        given.critic.value.bias.fill_(3.0)
+    batch = given.play()
+    targets = batch.targets.view(steps, 4, 32)[4]
+    # The one that dies in the fifth step gets that step's reward; the other one goes on.
+    assert targets[:, 12:].abs().max() < 0.5
+    assert targets[:, :12].min() > 0.1
+
+
 def test_equal_seeds_learn_equally_and_others_do_not():
     found = [run("device", HEART, 2 * ROUND // 4, seed, steps=4).rules for seed in (0, 0, 1)]
     weights = [next(iter(rules)).output.weight for rules in found]

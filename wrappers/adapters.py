@@ -55,10 +55,11 @@ def own_rewards(infos: dict[str, Any]) -> Any:
             what their last step was worth.
     """
     own = infos.get("particle_reward")
-    if own is None or "final_info" not in infos:
+    last = infos.get("final_info", {}).get("particle_reward")
+    if own is None or last is None:
         return own
     which = as_tensor(infos["_final_info"])[:, None]
-    return torch.where(which, as_tensor(infos["final_info"]["particle_reward"]), as_tensor(own))
+    return torch.where(which, as_tensor(last), as_tensor(own))
 
 
 def row_space(space: Any) -> Box:

@@ -16,7 +16,7 @@ import torch
 
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Budget, Entry, Progress, check_finite
-from npa_envs.agents.learning.rules import RuleSet, RuleSetPolicy
+from npa_envs.agents.learning.rules import RuleSet, RuleSetPolicy, starting_rules
 from npa_envs.devices import check_device
 from npa_envs.errors import NPAError, suggest
 from npa_envs.tasks.checks import is_whole
@@ -94,7 +94,8 @@ def train(
         options: The method's own: `method_options` names them.
 
     Raises:
-        NPAError: There is no such method or option, or the method cannot learn this problem.
+        NPAError: There is no such method or option, the method cannot learn this problem, or the
+            rules to begin with do not fit it.
         DivergedError: The rules' weights have become infinite or NaN.
         MissingDependencyError: The method needs a library that is not installed.
     """
@@ -106,6 +107,8 @@ def train(
     if not is_whole(seed) or seed < 0:
         raise NPAError(f"seed must be a whole number of at least 0, got {seed!r}: give seed=0")
     place = check_device(device)
+    if start is not None:
+        start = starting_rules(problem, seed, place, start)
     progress = Progress(
         problem,
         budget,

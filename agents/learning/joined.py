@@ -46,6 +46,7 @@ class JoinedSpeciesEnv:
     | `loss` | before a restart, shape [B] |
     | `particle_reward` | what the species of each particle is paid, shape [B, N] |
     | `acted` | whether that species was alive: rows to leave out where not, bool, shape [B, N] |
+    | `particle_terminated` | whether that species ended by itself in this step, bool, shape [B, N] |
 
     Args:
         task: A name from `npa_envs.envs.species.TASKS`.
@@ -132,7 +133,7 @@ class JoinedSpeciesEnv:
                 were.
         """
         by_species = {agent: actions[:, span] for agent, span in self.spans.items()}
-        rows, rewards, _, truncations, infos = self.species_env.step(by_species)
+        rows, rewards, terminations, truncations, infos = self.species_env.step(by_species)
         acted = self._stacked(infos, "acted")
         self._loss = torch.where(acted, self._stacked(infos, "loss"), self._loss)
         paid = torch.stack(list(rewards.values()), dim=1)
@@ -140,6 +141,7 @@ class JoinedSpeciesEnv:
             "loss": self._loss.mean(dim=1),
             "particle_reward": self._by_particle(paid),
             "acted": self._by_particle(acted),
+            "particle_terminated": self._by_particle(torch.stack(list(terminations.values()), 1)),
         }
         late = torch.stack(list(truncations.values()), dim=1).any(dim=1)
         first = infos[self.species_env.agents[0]]

@@ -26,6 +26,7 @@ from npa_envs.agents.learning.ppo_settings import Settings, filled
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rules import RuleSet
+from npa_envs.wrappers.adapters import own_rewards
 
 
 class Round(NamedTuple):
@@ -112,14 +113,14 @@ class Learner:
                 last_seen[step] = infos["final_obs"]
             paid, acted = self._by_particle(reward, infos)
             ended = terminated | truncated
-            flags = [flag[:, None].expand_as(paid) for flag in (terminated, ended)]
+            # A species may end before its world does.
+            gone = infos.get("particle_terminated", terminated[:, None])
+            flags = [(flag[:, None] | gone).expand_as(paid) for flag in (terminated, ended)]
             # Environments may hand out the same tensors in each step.
             moves.append([value.clone() for value in (action, log_prob, paid, acted, *flags)])
         actions, log_probs, rewards, acted, terminated, ended = (
             torch.stack(column) for column in zip(*moves, strict=True)
         )
-        # A species may end before its world does.
-        terminated[:-1] |= acted[:-1] & ~acted[1:] & ~ended[:-1]
         values = self._values(seen.flatten(0, 1)).view(len(seen), *paid.shape)
         following = values[1:].clone()
         for step, observation in last_seen.items():
@@ -235,13 +236,7 @@ class Learner:
         """Return what each particle is paid for the last step, and whether it acted, [B, N]."""
         everyone = self.seen.shape[1:3]
         acted = infos.get("acted", torch.ones_like(reward, dtype=torch.bool)[:, None])
-        paid = reward[:, None]
-        if self.settings.credit == "particle":
-            paid = infos["particle_reward"]
-            last = infos.get("final_info", {}).get("particle_reward")
-            if last is not None:
-                # Worlds that restarted say there what their last step was worth.
-                paid = torch.where(infos["_final_info"][:, None], last, paid)
+        paid = own_rewards(infos) if self.settings.credit == "particle" else reward[:, None]
         return paid.expand(everyone), acted.expand(everyone)
 
 
