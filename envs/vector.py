@@ -152,9 +152,9 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
             Observations [B, N, P], rewards [B], terminations [B], truncations [B], and infos.
 
         Raises:
-            NPAError: The actions have another shape or are not finite; the worlds are then as they
-                were.
-            DivergedError: A world diverged, and `on_divergence` is "raise".
+            NPAError: The actions have another shape; the worlds are then as they were.
+            DivergedError: An action is not finite, and the worlds are as they were; or a world
+                diverged, and `on_divergence` is "raise".
         """
         if not self._started:
             raise NPAError("step needs worlds: call reset first")

@@ -14,6 +14,7 @@ import pytest
 from PIL import Image
 
 from npa_envs.agents import RandomPolicy, ZeroPolicy
+from npa_envs.agents.comparison import run as one_run
 from npa_envs.agents.comparison import scheduler
 from npa_envs.agents.comparison.pictures import PICTURE, SIZE, final_picture, write_strips
 from npa_envs.agents.comparison.plan import Job, Plan
@@ -277,7 +278,7 @@ def test_a_fraction_counts_from_nothing_to_the_gradient():
 
 
 def synthetic() -> list[RunRecord]:
-    ended = {"time limit": 3, "diverged": 1}
+    ended = {"time limit": 2, "diverged": 1, "left the world": 1}
     return [
         *(record("gradient", k, (2.0 + k, 4.0 + k)) for k in range(2)),
         *(record("zero", k, (0.5, 0.5)) for k in range(2)),
@@ -299,7 +300,7 @@ def test_a_table_has_the_right_numbers():
     assert ppo.final_return == (2.0, 1.0)
     assert ppo.fraction == (0.5, pytest.approx(math.hypot(1.0, 0.5 * 0.5) / 3.0))
     assert (ppo.done, ppo.diverged, ppo.failed) == (2, 0, 1)
-    assert ppo.episodes_diverged == pytest.approx(1 / 6)
+    assert ppo.episodes_diverged == pytest.approx(2 / 6)
     assert (ppo.seconds, ppo.particle_steps) == (5.0, 500.0)
     lost = found["seconds", "evolution"]
     assert (lost.done, lost.diverged) == (0, 1)
@@ -317,7 +318,7 @@ def test_a_table_in_words_lists_the_best_first_and_leaves_no_method_out():
     assert order == ["method", "---", "gradient", "ppo", "zero", "evolution"]
     cells = next(line for line in by_time.splitlines() if line.startswith("| ppo")).split(" | ")
     assert cells[1:5] == [
-        "2, 1 failed, 17% of episodes diverged",
+        "2, 1 failed, 33% of episodes diverged",
         "2.000 ± 1.000",
         "-1.000 ± 1.000",
         "0.500 ± 0.344",
@@ -443,3 +444,20 @@ def test_a_method_that_raises_is_in_the_table_and_the_command_says_so(tmp_path, 
     assert "evolution/seed-0 failed: NPAError: population must be a whole number" in told
     output = tmp_path / "particle-steps/morphogenesis2d/evolution/seed-0/output.txt"
     assert "Traceback" in output.read_text()
+
+
+def test_a_policy_whose_actions_are_not_finite_has_diverged(tmp_path, monkeypatch):
+    def act_wildly(request, *_):
+        envs = request.problem.make_envs(2)
+        observation, _ = envs.reset(seed=0)
+        envs.step(math.nan * RandomPolicy(envs)(observation))
+
+    monkeypatch.setattr(one_run, "_learn", act_wildly)
+    for name in ("morphogenesis2d", "mixing"):
+        made = make_plan(CompareOptions(quick=True, tasks=(name,), methods=("ppo",)))
+        job = made.jobs()[0]
+        request = {"job": dataclasses.asdict(job), "facts": made.facts(job), "device": "cpu"}
+        (tmp_path / "request.json").write_text(json.dumps(request))
+        one_run.run(tmp_path)
+        found = read_record(tmp_path, made.facts(job))
+        assert (found.status, "must be finite" in found.error) == ("diverged", True)

@@ -87,7 +87,7 @@ def test_every_environment_is_a_problem_with_rules_that_fit(name):
         problem.counts
     )
     assert {rule.update_dim for rule in rules} == {problem.interface.action_dim}
-    assert problem.spans[-1].stop == problem.particle_count
+    assert problem.new_rules(0).spans[-1].stop == problem.particle_count
 
 
 @pytest.mark.parametrize("problem", [heart(), digits(), species(perception="per_species")])
@@ -185,7 +185,7 @@ def test_species_follow_rules_of_their_own():
     rules, envs = wild_rules(problem), problem.make_envs()
     observation, _ = envs.reset(seed=0)
     together = rules.policy()(observation)
-    for rule, span in zip(rules, problem.spans, strict=True):
+    for rule, span in zip(rules, problem.new_rules(0).spans, strict=True):
         alone = RulePolicy(rule)(observation[:, span])
         assert torch.equal(together[:, span], alone)
     assert not torch.equal(*[RulePolicy(rule)(observation) for rule in rules])
@@ -282,7 +282,7 @@ def test_a_world_is_paid_the_mean_of_its_species_and_rows_what_their_species_is(
         action = policy(observation)
         observation, reward, _, _, infos = envs.step(action)
         rows, paid, _, _, own = apart.step(
-            {f"species_{k}": action[:, span] for k, span in enumerate(problem.spans)}
+            {f"species_{k}": action[:, span] for k, span in enumerate(problem.new_rules(0).spans)}
         )
     assert torch.equal(observation, torch.cat(list(rows.values()), dim=1))
     assert torch.equal(reward, (paid["species_0"] + paid["species_1"]) / 2)
@@ -336,6 +336,25 @@ def test_evaluation_runs_joined_species():
     gained = episodes.start_losses - episodes.final_losses
     assert gained == pytest.approx(episodes.returns, abs=1e-6)
     assert set(episodes.endings) == {"time limit"}
+
+
+@pytest.mark.parametrize("deaths", [[], [[0, 1]]], ids=["alone", "after a death"])
+def test_a_species_that_left_its_world_is_the_reason_of_the_episode(deaths):
+    problem = species(observation_limit=1.5, update_prob=1.0, deaths=deaths, species_count=3)
+    envs = problem.make_envs(2)
+    envs.reset(seed=0)
+    action = torch.zeros(2, problem.particle_count, problem.interface.action_dim)
+    # Its states grow in the first world alone.
+    action[0, problem.new_rules(0).spans[1], 2:] = 1.0
+    for step in range(problem.episode_steps):
+        *_, infos = envs.step(action)
+        assert ("final_info" in infos) == (step == problem.episode_steps - 1)
+    other = "removed" if deaths else "time limit"
+    assert infos["final_info"]["reason"].tolist() == ["left the world", other]
+    # The next episode begins without the reasons of this one.
+    for _ in range(problem.episode_steps):
+        *_, infos = envs.step(torch.zeros_like(action))
+    assert infos["final_info"]["reason"].tolist() == [other] * 2
 
 
 # Rules to begin with

@@ -94,8 +94,8 @@ class RslRlParticleEnv(VecEnv):  # type: ignore[misc]
             extras, with `time_outs` [B N], and `log` where episodes ended.
 
         Raises:
-            NPAError: The actions have another shape or are not finite; the worlds are then as they
-                were.
+            NPAError: The actions have another shape; the worlds are then as they were.
+            DivergedError: An action is not finite; the worlds are then as they were.
         """
         wanted = (self.num_envs, self.num_actions)
         if tuple(actions.shape) != wanted:

@@ -14,6 +14,9 @@ from npa_envs.agents.comparison.record import RunRecord
 YARDSTICK, NOTHING = "gradient", "zero"
 """Methods whose returns count as 1 and as 0."""
 
+LOST = ("diverged", "left the world")
+"""Endings of episodes that diverged: of worlds, and of species."""
+
 NONE = "–"
 """What is not known."""
 
@@ -137,7 +140,7 @@ def _row(
     lasts = [record.curve[-1] for record in records if record.curve]
     endings = [record.endings for record in records if record.endings]
     episodes = sum(sum(ending.values()) for ending in endings)
-    lost = sum(ending.get("diverged", 0) for ending in endings)
+    lost = sum(ending.get(word, 0) for ending in endings for word in LOST)
     share = fraction(reached, nothing, yardstick)
     if job.method == YARDSTICK and not math.isnan(share.mean):
         share = Estimate(1.0, math.nan)

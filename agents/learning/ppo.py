@@ -261,7 +261,8 @@ def train(
         settings: Its fields, as keyword arguments.
 
     Raises:
-        NPAError: There is no such option, or one is wrong; or the policy has diverged.
+        NPAError: There is no such option, or one is wrong.
+        DivergedError: The policy has diverged.
     """
     learner = Learner(problem, settings, seed, torch.device(device), start)
     rules = learner.actor.rules

@@ -87,7 +87,8 @@ def train(
         settings: Its fields, as keyword arguments.
 
     Raises:
-        NPAError: There is no such option, or one is wrong; or the policy has diverged.
+        NPAError: There is no such option, or one is wrong.
+        DivergedError: The policy has diverged.
     """
     env = WorldVecEnv(problem.make_envs(device=device))
     return learn(
