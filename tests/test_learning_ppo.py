@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 
 import numpy as np
@@ -241,6 +242,20 @@ def test_a_world_s_policy_in_stable_baselines_means_over_particles():
     assert value.shape == values.shape == (8, 1)
     torch.testing.assert_close(log_prob, told)
     torch.testing.assert_close(entropy, normal.entropy().sum(dim=-1).mean(dim=-1))
+
+
+def test_every_form_of_stable_baselines_ends_a_round_at_the_same_divergence():
+    sb3 = pytest.importorskip("stable_baselines3")
+    from npa_envs.agents.learning.sb3_policy import EXCESS
+    from npa_envs.agents.learning.sb3_rows import RowRulePolicy
+    from npa_envs.agents.learning.sb3_world import WorldRulePolicy
+
+    assert f"approx_kl_div > {EXCESS} * self.target_kl" in inspect.getsource(sb3.PPO.train)
+    assert EXCESS * RowRulePolicy.row_kl(0.2) == pytest.approx(0.2)
+    # A world's log-ratio is close to minus the divergence of its particles.
+    log_ratio = -0.02
+    estimated = math.expm1(log_ratio) - log_ratio
+    assert EXCESS * WorldRulePolicy.row_kl(0.02) == pytest.approx(estimated, rel=0.01)
 
 
 def test_gains_are_clipped_where_the_ratio_has_gone_where_it_pays():

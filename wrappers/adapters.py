@@ -47,6 +47,23 @@ def check_torch_output(env: NPAVectorEnv, adapter: str) -> None:
         )
 
 
+def check_copies(env: NPAVectorEnv, adapter: str) -> None:
+    """Check that a vector environment leaves alone what it has handed out.
+
+    Args:
+        env: The environment itself, without wrappers.
+        adapter: Name of the adapter, which keeps what it gets, for the error.
+
+    Raises:
+        NPAError: It overwrites what it has handed out.
+    """
+    if not env.copies:
+        raise NPAError(
+            f"{adapter} needs new tensors in each step, got copy=False: "
+            "make the environment with copy=True, the default"
+        )
+
+
 def own_rewards(infos: dict[str, Any]) -> Any:
     """Return each particle's reward of the last step, shape [B, N], or None where there is none.
 

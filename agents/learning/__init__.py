@@ -17,6 +17,7 @@ import torch
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Budget, Entry, Progress, check_finite
 from npa_envs.agents.learning.rules import RuleSet, RuleSetPolicy, starting_rules
+from npa_envs.agents.learning.seeds import EVALUATION_SEEDS
 from npa_envs.devices import check_device
 from npa_envs.errors import NPAError, suggest
 from npa_envs.tasks.checks import is_whole
@@ -48,9 +49,6 @@ METHODS: dict[str, str] = {
 }
 """Where methods are: functions `f(problem, progress, seed, *, device, start, ...)` that return a
 `RuleSet` or a policy. Others may be added."""
-
-EVALUATION_SEEDS = range(1_000_000, 1_000_016)
-"""Seeds of evaluations, far from those that learners begin their worlds with."""
 
 
 class Trained(NamedTuple):
@@ -85,7 +83,8 @@ def train(
         method: A name from `METHODS`.
         problem: What is to be learned.
         budget: What may be spent.
-        seed: Of everything that the method draws, at least 0.
+        seed: Of everything that the method draws, from 0 to 99: runs with different seeds learn in
+            different worlds, and none in those of evaluations.
         device: Where worlds, rules and evaluations are.
         start: Rules to begin with, `RuleSet.of(problem, "heart")`; copied. None: new ones.
         evaluation_seeds: Of the episodes by which the learning curve is drawn.
