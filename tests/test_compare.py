@@ -22,10 +22,12 @@ from npa_envs.agents.comparison.plots import curve, pictures
 from npa_envs.agents.comparison.problems import LEFT_OUT, PROBLEMS, make_problem
 from npa_envs.agents.comparison.record import Point, RunRecord, read_record
 from npa_envs.agents.comparison.scheduler import Places, held_records, run_jobs
+from npa_envs.agents.comparison.summary import write_table
 from npa_envs.agents.comparison.tables import Estimate, estimate, fraction, rows, text
 from npa_envs.agents.learning import METHODS, Problem, RuleSet
 from npa_envs.cli import main
 from npa_envs.cli.compare import CompareOptions, make_plan
+from npa_envs.cli.compare import _jobs as jobs_of
 from npa_envs.errors import NPAError
 from npa_envs.render import write_png
 
@@ -137,6 +139,13 @@ def test_the_command_line_becomes_a_plan():
 def test_mistakes_on_the_command_line_are_told(changes, words):
     with pytest.raises(NPAError, match=words):
         make_plan(CompareOptions(**changes))
+
+
+def scheduled(**changes) -> tuple[int, int]:
+    """Return how many runs there are at once, and how many of them on a device."""
+    options = CompareOptions(methods=("zero",), **changes)
+    at_once = make_plan(options).settings["runs_at_once"]
+    return jobs_of(options), at_once
 
 
 # Records
@@ -319,12 +328,38 @@ def test_a_table_in_words_lists_the_best_first_and_leaves_no_method_out():
     cells = next(line for line in by_time.splitlines() if line.startswith("| ppo")).split(" | ")
     assert cells[1:5] == [
         "2, 1 failed, 33% of episodes diverged",
-        "2.000 ± 1.000",
-        "-1.000 ± 1.000",
-        "0.500 ± 0.344",
+        "2.000 ± 1.000 (of 2 of 3)",
+        "-1.000 ± 1.000 (of 2 of 3)",
+        "0.500 ± 0.344 (of 2 of 3)",
     ]
     assert "| evolution | 0, 1 diverged | – | – | – | – | – |" in by_time
     assert "| ppo | 1 | 7.000 | -6.000 | – | – | – |" in by_steps
+    assert "Fractions need" not in by_time
+    assert by_steps.endswith("\n\nFractions need runs of `zero` and `gradient`.\n")
+
+
+@pytest.mark.parametrize(
+    ("budgets", "at_once", "said"),
+    [
+        ({"seconds": 1.0}, 3, True),
+        ({"seconds": 1.0}, 1, False),
+        ({"particle-steps": 9.0}, 3, False),
+    ],
+)
+def test_a_table_says_where_equal_wall_time_was_shared(budgets, at_once, said, tmp_path):
+    made = plan(budgets=budgets, settings={"runs_at_once": at_once})
+    told = write_table(made, synthetic(), tmp_path, "it")
+    assert ("Up to 3 runs at once shared a device" in told) == said
+    assert told in (tmp_path / "comparison.md").read_text("utf-8")
+
+
+def test_every_device_has_a_run_and_none_more_than_another_where_times_are_compared():
+    devices = ("cpu", "cpu")
+    assert scheduled(seconds=1.0, devices=devices) == (2, 1)
+    assert scheduled(seconds=1.0, devices=devices, jobs=4) == (4, 2)
+    assert scheduled(particle_steps=1e6, devices=devices, jobs=3) == (3, 2)
+    with pytest.raises(NPAError, match="multiple of the number of devices, 2.*give --jobs 4"):
+        scheduled(seconds=1.0, devices=devices, jobs=3)
 
 
 # Pictures
@@ -341,6 +376,10 @@ def test_a_curve_is_the_mean_of_seeds_where_all_of_them_are():
     assert np.allclose(found.mean, np.interp(found.across, [1, 2, 3], [2.0, 3.0, 3.5]), atol=0.02)
     assert found.error[0] == pytest.approx(1.0)
     assert curve(some[2:], lambda point: point.seconds) is None
+    # One that broke off early is no part of it, and alone it is all there is.
+    lost = record("ppo", 3, status="diverged", curve=points((0.0, -9.0), (0.5, -9.0)))
+    assert np.array_equal(curve([*some, lost], lambda point: point.seconds), found)
+    assert curve([lost], lambda point: point.seconds).across[-1] == 0.5
     alone = curve([record("zero", 0, curve=points((0.0, 0.5)))], lambda point: point.seconds)
     assert (alone.across.tolist(), alone.mean.tolist()) == ([0.0], [0.5])
 

@@ -142,9 +142,9 @@ def unexplained(rules: RuleSet, observation: Tensor, action: Tensor) -> Tensor:
         observation: What is perceived, shape [B, N, P].
         action: What the teacher does, shape [B, N, A].
     """
-    parts = []
+    parts, errors = [], (rules.mean(observation) - action).square()
     for span in rules.spans:
-        error = (rules.mean(observation)[:, span] - action[:, span]).square()
+        error = errors[:, span]
         variance = action[:, span].flatten(0, 1).var(dim=0, correction=0)
         parts.append((error.flatten(0, 1).mean(dim=0) / (variance + VARIANCE_FLOOR)).mean())
     return torch.stack(parts).mean()
