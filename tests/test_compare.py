@@ -358,7 +358,7 @@ def test_every_device_has_a_run_and_none_more_than_another_where_times_are_compa
     assert scheduled(seconds=1.0, devices=devices) == (2, 1)
     assert scheduled(seconds=1.0, devices=devices, jobs=4) == (4, 2)
     assert scheduled(particle_steps=1e6, devices=devices, jobs=3) == (3, 2)
-    with pytest.raises(NPAError, match="multiple of the number of devices, 2.*give --jobs 4"):
+    with pytest.raises(NPAError, match=r"multiple of the number of devices, 2.*give --jobs 4"):
         scheduled(seconds=1.0, devices=devices, jobs=3)
 
 

@@ -156,7 +156,8 @@ class JoinedSpeciesEnv:
             last = {agent: infos[agent]["final_obs"] for agent in self.spans}
             told |= {"final_obs": self._joined(last), "_final_obs": over}
             which = over.cpu().numpy()
-            reasons = np.where(which, self._reasons, None)
+            reasons = self._reasons.copy()
+            reasons[~which] = None
             self._reasons[which] = None
             told["final_info"] = {"loss": told["loss"], "_loss": over, "reason": reasons}
             told["_final_info"] = over
