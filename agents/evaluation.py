@@ -32,7 +32,8 @@ class Episodes(NamedTuple):
     """Lengths, shape [E]."""
 
     endings: tuple[str, ...]
-    """Why each was over: "success", "diverged" or "time limit"."""
+    """Why each was over: "success", "diverged" or "time limit"; of several species why the first
+    one ended by itself, and "left the world" where one diverged."""
 
     @property
     def mean_return(self) -> float:

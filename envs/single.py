@@ -96,8 +96,9 @@ class NPAEnv(gymnasium.Env[Any, Any]):
             Gymnasium's own), and what the docstring of the environment lists.
 
         Raises:
-            NPAError: The action has another shape or is not finite; the world is then as it was.
-            DivergedError: The world diverged, and `on_divergence` is "raise".
+            NPAError: The action has another shape; the world is then as it was.
+            DivergedError: The action is not finite, and the world is as it was; or the world
+                diverged, and `on_divergence` is "raise".
         """
         if not self._started:
             raise NPAError("step needs a world: call reset first")

@@ -82,7 +82,8 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
         physics, count = self.worlds.physics, self.config.particle_count
         self.single_observation_space = observation_space(physics, count)
         self.single_action_space = action_space(physics, count)
-        self._copy = copy
+        self.copies = copy
+        """Whether what is handed out stays as it is after the next step."""
         self._started = False
         self._buffer: Tensor | None = None
         self._ended = np.zeros(num_envs, dtype=bool)
@@ -132,7 +133,7 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
         with self.worlds.here():
             self.worlds.start(worlds, keys)
             observation = self.worlds.perceive(self._buffer)
-        if not self._copy:
+        if not self.copies:
             self._buffer = observation
         self._started = True
         self._ended[chosen] = False
@@ -152,9 +153,9 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
             Observations [B, N, P], rewards [B], terminations [B], truncations [B], and infos.
 
         Raises:
-            NPAError: The actions have another shape or are not finite; the worlds are then as they
-                were.
-            DivergedError: A world diverged, and `on_divergence` is "raise".
+            NPAError: The actions have another shape; the worlds are then as they were.
+            DivergedError: An action is not finite, and the worlds are as they were; or a world
+                diverged, and `on_divergence` is "raise".
         """
         if not self._started:
             raise NPAError("step needs worlds: call reset first")
@@ -184,17 +185,17 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
         ended = endings != 0
         final = self.autoreset_mode is AutoresetMode.SAME_STEP and bool(ended.any())
         # What a restart overwrites is copied first, whatever the caller wants of the rest.
-        numbers, flags, infos = self._report(stepped, copy=self._copy or final)
+        numbers, flags, infos = self._report(stepped, copy=self.copies or final)
         if final:
             which = self._mask(ended)
             final_infos = self._ending_infos(infos, endings, which)
             final_observation = observation
-            if self._copy and ended.all():
+            if self.copies and ended.all():
                 observation = torch.empty_like(observation)
             else:
                 final_observation = observation.clone()
             self.worlds.restart(np.flatnonzero(ended), observation)
-            _, _, infos = self._report(~ended, copy=self._copy)
+            _, _, infos = self._report(~ended, copy=self.copies)
             infos |= {"final_obs": self._out(final_observation), "_final_obs": which}
             infos |= {"final_info": final_infos, "_final_info": self._mask(ended)}
         else:

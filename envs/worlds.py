@@ -21,7 +21,7 @@ from npa_envs.envs.memory import check_memory
 from npa_envs.envs.report import DIVERGED, SUCCESS, TIME_LIMIT, Report
 from npa_envs.envs.restarts import Restarts
 from npa_envs.envs.task import EnvTask, Start
-from npa_envs.errors import NPAError
+from npa_envs.errors import DivergedError
 from npa_envs.randomness import WorldRandom
 from npa_envs.replay import Beside, Replayed, sent
 
@@ -262,8 +262,8 @@ class Worlds:
             out: Where to write what is perceived; a new tensor otherwise.
 
         Raises:
-            NPAError: An action is not finite; the worlds, and what is reported of them, are then as
-                they were.
+            DivergedError: An action is not finite; the worlds, and what is reported of them, are
+                then as they were.
         """
         observation = self.queue(action, out)
         if self._beside is not None:
@@ -332,10 +332,10 @@ class Worlds:
         self._host_endings.copy_(torch.cat((ending, self._enabled)), non_blocking=True)
         self._enabled.fill_(1)
 
-    def _not_finite(self, action: Tensor) -> NPAError:
+    def _not_finite(self, action: Tensor) -> DivergedError:
         bad = ~torch.isfinite(action)
         world, particle, entry = (int(k) for k in bad.nonzero()[0])
-        return NPAError(
+        return DivergedError(
             f"action must be finite, got {action[world, particle, entry].item()} at world {world}, "
             f"particle {particle}, entry {entry} ({int(bad.sum())} such numbers): check the policy"
         )

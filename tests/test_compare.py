@@ -14,6 +14,7 @@ import pytest
 from PIL import Image
 
 from npa_envs.agents import RandomPolicy, ZeroPolicy
+from npa_envs.agents.comparison import run as one_run
 from npa_envs.agents.comparison import scheduler
 from npa_envs.agents.comparison.pictures import PICTURE, SIZE, final_picture, write_strips
 from npa_envs.agents.comparison.plan import Job, Plan
@@ -21,10 +22,12 @@ from npa_envs.agents.comparison.plots import curve, pictures
 from npa_envs.agents.comparison.problems import LEFT_OUT, PROBLEMS, make_problem
 from npa_envs.agents.comparison.record import Point, RunRecord, read_record
 from npa_envs.agents.comparison.scheduler import Places, held_records, run_jobs
+from npa_envs.agents.comparison.summary import write_table
 from npa_envs.agents.comparison.tables import Estimate, estimate, fraction, rows, text
 from npa_envs.agents.learning import METHODS, Problem, RuleSet
 from npa_envs.cli import main
 from npa_envs.cli.compare import CompareOptions, make_plan
+from npa_envs.cli.compare import _jobs as jobs_of
 from npa_envs.errors import NPAError
 from npa_envs.render import write_png
 
@@ -136,6 +139,13 @@ def test_the_command_line_becomes_a_plan():
 def test_mistakes_on_the_command_line_are_told(changes, words):
     with pytest.raises(NPAError, match=words):
         make_plan(CompareOptions(**changes))
+
+
+def scheduled(**changes) -> tuple[int, int]:
+    """Return how many runs there are at once, and how many of them on a device."""
+    options = CompareOptions(methods=("zero",), **changes)
+    at_once = make_plan(options).settings["runs_at_once"]
+    return jobs_of(options), at_once
 
 
 # Records
@@ -277,7 +287,7 @@ def test_a_fraction_counts_from_nothing_to_the_gradient():
 
 
 def synthetic() -> list[RunRecord]:
-    ended = {"time limit": 3, "diverged": 1}
+    ended = {"time limit": 2, "diverged": 1, "left the world": 1}
     return [
         *(record("gradient", k, (2.0 + k, 4.0 + k)) for k in range(2)),
         *(record("zero", k, (0.5, 0.5)) for k in range(2)),
@@ -299,7 +309,7 @@ def test_a_table_has_the_right_numbers():
     assert ppo.final_return == (2.0, 1.0)
     assert ppo.fraction == (0.5, pytest.approx(math.hypot(1.0, 0.5 * 0.5) / 3.0))
     assert (ppo.done, ppo.diverged, ppo.failed) == (2, 0, 1)
-    assert ppo.episodes_diverged == pytest.approx(1 / 6)
+    assert ppo.episodes_diverged == pytest.approx(2 / 6)
     assert (ppo.seconds, ppo.particle_steps) == (5.0, 500.0)
     lost = found["seconds", "evolution"]
     assert (lost.done, lost.diverged) == (0, 1)
@@ -317,13 +327,39 @@ def test_a_table_in_words_lists_the_best_first_and_leaves_no_method_out():
     assert order == ["method", "---", "gradient", "ppo", "zero", "evolution"]
     cells = next(line for line in by_time.splitlines() if line.startswith("| ppo")).split(" | ")
     assert cells[1:5] == [
-        "2, 1 failed, 17% of episodes diverged",
-        "2.000 ± 1.000",
-        "-1.000 ± 1.000",
-        "0.500 ± 0.344",
+        "2, 1 failed, 33% of episodes diverged",
+        "2.000 ± 1.000 (of 2 of 3)",
+        "-1.000 ± 1.000 (of 2 of 3)",
+        "0.500 ± 0.344 (of 2 of 3)",
     ]
     assert "| evolution | 0, 1 diverged | – | – | – | – | – |" in by_time
     assert "| ppo | 1 | 7.000 | -6.000 | – | – | – |" in by_steps
+    assert "Fractions need" not in by_time
+    assert by_steps.endswith("\n\nFractions need runs of `zero` and `gradient`.\n")
+
+
+@pytest.mark.parametrize(
+    ("budgets", "at_once", "said"),
+    [
+        ({"seconds": 1.0}, 3, True),
+        ({"seconds": 1.0}, 1, False),
+        ({"particle-steps": 9.0}, 3, False),
+    ],
+)
+def test_a_table_says_where_equal_wall_time_was_shared(budgets, at_once, said, tmp_path):
+    made = plan(budgets=budgets, settings={"runs_at_once": at_once})
+    told = write_table(made, synthetic(), tmp_path, "it")
+    assert ("Up to 3 runs at once shared a device" in told) == said
+    assert told in (tmp_path / "comparison.md").read_text("utf-8")
+
+
+def test_every_device_has_a_run_and_none_more_than_another_where_times_are_compared():
+    devices = ("cpu", "cpu")
+    assert scheduled(seconds=1.0, devices=devices) == (2, 1)
+    assert scheduled(seconds=1.0, devices=devices, jobs=4) == (4, 2)
+    assert scheduled(particle_steps=1e6, devices=devices, jobs=3) == (3, 2)
+    with pytest.raises(NPAError, match=r"multiple of the number of devices, 2.*give --jobs 4"):
+        scheduled(seconds=1.0, devices=devices, jobs=3)
 
 
 # Pictures
@@ -340,6 +376,10 @@ def test_a_curve_is_the_mean_of_seeds_where_all_of_them_are():
     assert np.allclose(found.mean, np.interp(found.across, [1, 2, 3], [2.0, 3.0, 3.5]), atol=0.02)
     assert found.error[0] == pytest.approx(1.0)
     assert curve(some[2:], lambda point: point.seconds) is None
+    # One that broke off early is no part of it, and alone it is all there is.
+    lost = record("ppo", 3, status="diverged", curve=points((0.0, -9.0), (0.5, -9.0)))
+    assert np.array_equal(curve([*some, lost], lambda point: point.seconds), found)
+    assert curve([lost], lambda point: point.seconds).across[-1] == 0.5
     alone = curve([record("zero", 0, curve=points((0.0, 0.5)))], lambda point: point.seconds)
     assert (alone.across.tolist(), alone.mean.tolist()) == ([0.0], [0.5])
 
@@ -443,3 +483,20 @@ def test_a_method_that_raises_is_in_the_table_and_the_command_says_so(tmp_path, 
     assert "evolution/seed-0 failed: NPAError: population must be a whole number" in told
     output = tmp_path / "particle-steps/morphogenesis2d/evolution/seed-0/output.txt"
     assert "Traceback" in output.read_text()
+
+
+def test_a_policy_whose_actions_are_not_finite_has_diverged(tmp_path, monkeypatch):
+    def act_wildly(request, *_):
+        envs = request.problem.make_envs(2)
+        observation, _ = envs.reset(seed=0)
+        envs.step(math.nan * RandomPolicy(envs)(observation))
+
+    monkeypatch.setattr(one_run, "_learn", act_wildly)
+    for name in ("morphogenesis2d", "mixing"):
+        made = make_plan(CompareOptions(quick=True, tasks=(name,), methods=("ppo",)))
+        job = made.jobs()[0]
+        request = {"job": dataclasses.asdict(job), "facts": made.facts(job), "device": "cpu"}
+        (tmp_path / "request.json").write_text(json.dumps(request))
+        one_run.run(tmp_path)
+        found = read_record(tmp_path, made.facts(job))
+        assert (found.status, "must be finite" in found.error) == ("diverged", True)

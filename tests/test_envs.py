@@ -17,7 +17,7 @@ from gymnasium.wrappers import FlattenObservation
 from small_envs import IDS, make, make_vec, small
 
 import npa_envs
-from npa_envs.errors import NPAError
+from npa_envs.errors import DivergedError, NPAError
 from npa_envs.randomness import Purpose
 
 every_id = pytest.mark.parametrize("name", IDS)
@@ -434,7 +434,9 @@ def test_action_that_is_no_number_is_an_error_and_changes_nothing(name):
     other.reset(seed=0)
     bad, good = actions(env, 2)
     bad[4, 1] = np.nan
-    with pytest.raises(NPAError, match="action must be finite, got nan at world 0, particle 4"):
+    with pytest.raises(
+        DivergedError, match="action must be finite, got nan at world 0, particle 4"
+    ):
         env.unwrapped.step(bad)
     assert np.array_equal(env.unwrapped.step(good)[0], other.unwrapped.step(good)[0])
 

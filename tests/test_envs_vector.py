@@ -9,7 +9,7 @@ import torch
 from gymnasium.vector import AutoresetMode
 from small_envs import IDS, make, make_vec
 
-from npa_envs.errors import NPAError
+from npa_envs.errors import DivergedError, NPAError
 
 every_id = pytest.mark.parametrize("name", IDS)
 
@@ -205,7 +205,7 @@ def test_action_of_a_restarting_world_may_be_anything():
     action = np.zeros((2, *envs.single_action_space.shape), np.float32)
     envs.step(action)
     envs.step(action * np.nan)
-    with pytest.raises(NPAError, match="action must be finite"):
+    with pytest.raises(DivergedError, match="action must be finite"):
         envs.step(action * np.nan)
 
 

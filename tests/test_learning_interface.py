@@ -16,7 +16,7 @@ from npa_envs.agents import (
     evaluate_policy,
     interface_of,
 )
-from npa_envs.agents.learning import Problem, RuleSet
+from npa_envs.agents.learning import Budget, Problem, RuleSet, train
 from npa_envs.envs import multispecies_v0
 from npa_envs.errors import NPAError
 from npa_envs.registration import ENVIRONMENTS
@@ -87,7 +87,7 @@ def test_every_environment_is_a_problem_with_rules_that_fit(name):
         problem.counts
     )
     assert {rule.update_dim for rule in rules} == {problem.interface.action_dim}
-    assert problem.spans[-1].stop == problem.particle_count
+    assert problem.new_rules(0).spans[-1].stop == problem.particle_count
 
 
 @pytest.mark.parametrize("problem", [heart(), digits(), species(perception="per_species")])
@@ -185,7 +185,7 @@ def test_species_follow_rules_of_their_own():
     rules, envs = wild_rules(problem), problem.make_envs()
     observation, _ = envs.reset(seed=0)
     together = rules.policy()(observation)
-    for rule, span in zip(rules, problem.spans, strict=True):
+    for rule, span in zip(rules, problem.new_rules(0).spans, strict=True):
         alone = RulePolicy(rule)(observation[:, span])
         assert torch.equal(together[:, span], alone)
     assert not torch.equal(*[RulePolicy(rule)(observation) for rule in rules])
@@ -282,7 +282,7 @@ def test_a_world_is_paid_the_mean_of_its_species_and_rows_what_their_species_is(
         action = policy(observation)
         observation, reward, _, _, infos = envs.step(action)
         rows, paid, _, _, own = apart.step(
-            {f"species_{k}": action[:, span] for k, span in enumerate(problem.spans)}
+            {f"species_{k}": action[:, span] for k, span in enumerate(problem.new_rules(0).spans)}
         )
     assert torch.equal(observation, torch.cat(list(rows.values()), dim=1))
     assert torch.equal(reward, (paid["species_0"] + paid["species_1"]) / 2)
@@ -336,3 +336,48 @@ def test_evaluation_runs_joined_species():
     gained = episodes.start_losses - episodes.final_losses
     assert gained == pytest.approx(episodes.returns, abs=1e-6)
     assert set(episodes.endings) == {"time limit"}
+
+
+@pytest.mark.parametrize("deaths", [[], [[0, 1]]], ids=["alone", "after a death"])
+def test_a_species_that_left_its_world_is_the_reason_of_the_episode(deaths):
+    problem = species(observation_limit=1.5, update_prob=1.0, deaths=deaths, species_count=3)
+    envs = problem.make_envs(2)
+    envs.reset(seed=0)
+    action = torch.zeros(2, problem.particle_count, problem.interface.action_dim)
+    # Its states grow in the first world alone.
+    action[0, problem.new_rules(0).spans[1], 2:] = 1.0
+    for step in range(problem.episode_steps):
+        *_, infos = envs.step(action)
+        assert ("final_info" in infos) == (step == problem.episode_steps - 1)
+    other = "removed" if deaths else "time limit"
+    assert infos["final_info"]["reason"].tolist() == ["left the world", other]
+    # The next episode begins without the reasons of this one.
+    for _ in range(problem.episode_steps):
+        *_, infos = envs.step(torch.zeros_like(action))
+    assert infos["final_info"]["reason"].tolist() == [other] * 2
+
+
+# Rules to begin with
+
+
+@pytest.mark.parametrize("method", ["ppo", "ppo_rows", "ppo_world", "evolution", "gradient"])
+def test_every_method_refuses_to_begin_with_what_does_not_fit(method):
+    problem, budget = heart(), Budget(particle_steps=1)
+    if method.startswith("ppo_"):
+        pytest.importorskip("stable_baselines3")
+    with pytest.raises(NPAError, match="start must be a RuleSet"):
+        train(method, problem, budget, 0, start=next(iter(problem.new_rules(0))))
+    with pytest.raises(NPAError, match="state_dim"):
+        train(method, problem, budget, 0, start=heart(state_dim=8).new_rules(0))
+
+
+@pytest.mark.parametrize("method", ["ppo", "ppo_rows", "ppo_world", "evolution"])
+def test_rules_of_other_numbers_of_particles_begin_with_those_of_the_problem(method):
+    if method.startswith("ppo_"):
+        pytest.importorskip("stable_baselines3")
+    problem = species(particle_counts=(20, 15))
+    start = species(particle_counts=(6, 8)).new_rules(0)
+    options = {"population": 4} if method == "evolution" else {"steps": 2, "minibatches": 1}
+    trained = train(method, problem, Budget(particle_steps=1), 0, start=start, **options)
+    assert [span.stop - span.start for span in trained.rules.spans] == [20, 15]
+    assert [span.stop - span.start for span in start.spans] == [6, 8]

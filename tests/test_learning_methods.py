@@ -303,12 +303,24 @@ def test_methods_that_learn_nothing_evaluate_once():
 def test_the_scripted_policy_that_fits_is_found(problem, kind):
     trained = run(problem, "scripted", gains=(0.03, -0.03))
     assert type(trained.policy) is kind
-    assert trained.log[0].mean_return > 0.0
+    nothing, best = trained.log
+    assert nothing.mean_return == 0.0
+    assert best.mean_return > 0.0
+    # Zero and two gains of each policy played 3 episodes.
+    tries, rest = divmod(best.particle_steps, 3 * problem.particle_count * problem.episode_steps)
+    assert (tries % 2, rest) == (1, 0)
+    assert tries >= 3
+
+
+def test_the_search_for_a_script_ends_with_its_budget():
+    trained = run(heart(), "scripted", iterations=2, worlds=3, gains=(0.03, 0.01, 0.003))
+    assert trained.log[-1].particle_steps == 2 * 3 * 48 * 8
+    assert trained.log[-1].mean_return > 0.0
 
 
 def test_where_no_script_helps_there_is_none():
     pytest.importorskip("sklearn")
-    with pytest.raises(NPAError, match="no policy that does better than nothing"):
+    with pytest.raises(NPAError, match="found no policy that does better than nothing"):
         run(digits(), "scripted", gains=(0.01,))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 
 import numpy as np
@@ -250,6 +251,20 @@ def test_a_world_s_policy_in_stable_baselines_means_over_particles():
     torch.testing.assert_close(entropy, normal.entropy().sum(dim=-1).mean(dim=-1))
 
 
+def test_every_form_of_stable_baselines_ends_a_round_at_the_same_divergence():
+    sb3 = pytest.importorskip("stable_baselines3")
+    from npa_envs.agents.learning.sb3_policy import EXCESS
+    from npa_envs.agents.learning.sb3_rows import RowRulePolicy
+    from npa_envs.agents.learning.sb3_world import WorldRulePolicy
+
+    assert f"approx_kl_div > {EXCESS} * self.target_kl" in inspect.getsource(sb3.PPO.train)
+    assert EXCESS * RowRulePolicy.row_kl(0.2) == pytest.approx(0.2)
+    # A world's log-ratio is close to minus the divergence of its particles.
+    log_ratio = -0.02
+    estimated = math.expm1(log_ratio) - log_ratio
+    assert EXCESS * WorldRulePolicy.row_kl(0.02) == pytest.approx(estimated, rel=0.01)
+
+
 def test_gains_are_clipped_where_the_ratio_has_gone_where_it_pays():
     log_ratio = torch.tensor([[0.5], [0.5], [-0.5], [-0.5], [0.0]]).requires_grad_()
     advantages = torch.tensor([[1.0], [-1.0], [1.0], [-1.0], [2.0]])
@@ -311,6 +326,24 @@ def test_particles_of_a_species_that_is_gone_do_not_count():
     assert 0 < sum(alive) < 8
     given.improve(batch, 1.0)
     assert all(torch.isfinite(weight).all() for weight in given.actor.parameters())
+
+
+@pytest.mark.parametrize("steps", [5, 8], ids=["at the end of a round", "within a round"])
+def test_a_species_that_ends_is_worth_nothing_more(steps):
+    dying = Problem(
+        env_id=MIXING.env_id,
+        keywords=dict(MIXING.keywords) | {"deaths": [[1, 5]]},
+        episode_steps=9,
+        num_envs=4,
+    )
+    given = learner(dying, steps=steps, gamma=0.5, gae_lambda=1.0)
+    with torch.no_grad():
+        given.critic.value.bias.fill_(3.0)
+    batch = given.play()
+    targets = batch.targets.view(steps, 4, 32)[4]
+    # The one that dies in the fifth step gets that step's reward; the other one goes on.
+    assert targets[:, 12:].abs().max() < 0.5
+    assert targets[:, :12].min() > 0.1
 
 
 def test_equal_seeds_learn_equally_and_others_do_not():

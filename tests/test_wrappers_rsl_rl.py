@@ -110,6 +110,8 @@ def test_the_runner_of_rsl_rl_updates_the_policy():
 def test_what_is_refused():
     with pytest.raises(NPAError, match="needs torch tensors, got output='numpy'"):
         RslRlParticleEnv(wrapped_envs.batched(2))
+    with pytest.raises(NPAError, match="make the environment with copy=True"):
+        RslRlParticleEnv(batched(copy=False))
     with pytest.raises(NPAError, match="make it with autoreset_mode='same-step'"):
         RslRlParticleEnv(batched(autoreset_mode="next-step"))
     rows = RslRlParticleEnv(batched(2))

@@ -135,6 +135,8 @@ def test_wrapped_worlds_are_seen_as_wrappers_show_them():
 def test_what_is_refused():
     with pytest.raises(NPAError, match="needs torch tensors, got output='numpy'"):
         NPATorchRLEnv(wrapped_envs.batched(2, autoreset_mode="disabled"))
+    with pytest.raises(NPAError, match="make the environment with copy=True"):
+        NPATorchRLEnv(wrapped_envs.batched(output="torch", autoreset_mode="disabled", copy=False))
     with pytest.raises(NPAError, match="make it with autoreset_mode='disabled'"):
         NPATorchRLEnv(wrapped_envs.batched(2, output="torch"))
     with pytest.raises(NPAError, match="env must be a vector environment of npa_envs, got"):

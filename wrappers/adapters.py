@@ -47,6 +47,23 @@ def check_torch_output(env: NPAVectorEnv, adapter: str) -> None:
         )
 
 
+def check_copies(env: NPAVectorEnv, adapter: str) -> None:
+    """Check that a vector environment leaves alone what it has handed out.
+
+    Args:
+        env: The environment itself, without wrappers.
+        adapter: Name of the adapter, which keeps what it gets, for the error.
+
+    Raises:
+        NPAError: It overwrites what it has handed out.
+    """
+    if not env.copies:
+        raise NPAError(
+            f"{adapter} needs new tensors in each step, got copy=False: "
+            "make the environment with copy=True, the default"
+        )
+
+
 def own_rewards(infos: dict[str, Any]) -> Any:
     """Return each particle's reward of the last step, shape [B, N], or None where there is none.
 
@@ -55,10 +72,11 @@ def own_rewards(infos: dict[str, Any]) -> Any:
             what their last step was worth.
     """
     own = infos.get("particle_reward")
-    if own is None or "final_info" not in infos:
+    last = infos.get("final_info", {}).get("particle_reward")
+    if own is None or last is None:
         return own
     which = as_tensor(infos["_final_info"])[:, None]
-    return torch.where(which, as_tensor(infos["final_info"]["particle_reward"]), as_tensor(own))
+    return torch.where(which, as_tensor(last), as_tensor(own))
 
 
 def row_space(space: Any) -> Box:

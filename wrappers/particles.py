@@ -72,7 +72,7 @@ class ParticleVecEnv(RowVecEnv):
             infos.
 
         Raises:
-            NPAError: An action is not finite; the worlds are then as they were.
+            DivergedError: An action is not finite; the worlds are then as they were.
         """
         observations, rewards, terminations, truncations, infos = self.vector_env.step(
             self.taken_actions()

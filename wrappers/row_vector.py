@@ -102,8 +102,8 @@ class ParticleRows(AnyVectorEnv):
             empty info.
 
         Raises:
-            NPAError: The actions have another shape or are not finite; the worlds are then as they
-                were.
+            NPAError: The actions have another shape; the worlds are then as they were.
+            DivergedError: An action is not finite; the worlds are then as they were.
         """
         wanted = (self.num_envs, *(self.single_action_space.shape or ()))
         if np.shape(actions) != wanted:

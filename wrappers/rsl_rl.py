@@ -8,7 +8,12 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import MissingDependencyError, NPAError
-from npa_envs.wrappers.adapters import check_same_step, check_torch_output, own_rewards
+from npa_envs.wrappers.adapters import (
+    check_copies,
+    check_same_step,
+    check_torch_output,
+    own_rewards,
+)
 from npa_envs.wrappers.base import AnyVectorEnv, autoreset_mode, vector_env
 
 try:
@@ -33,14 +38,14 @@ class RslRlParticleEnv(VecEnv):  # type: ignore[misc]
 
     Args:
         env: A vector environment of this package, wrapped or not, made with `output="torch"`, with
-            same-step autoreset.
+            same-step autoreset and `copy=True` (the default): RSL-RL keeps what it gets.
         seed: World w begins with the episode of seed + w; None: any.
         bootstrap: Whether rows cut off by the step limit say so, from which RSL-RL estimates what
             they would still have got; False: such an end counts as any other.
 
     Raises:
-        NPAError: The environment is none of this package, hands out arrays, or has another
-            autoreset mode.
+        NPAError: The environment is none of this package, hands out arrays or the same tensors
+            in each step, or has another autoreset mode.
         MissingDependencyError: RSL-RL is not installed (on import).
     """
 
@@ -49,6 +54,7 @@ class RslRlParticleEnv(VecEnv):  # type: ignore[misc]
     ) -> None:
         base = vector_env(env, type(self).__name__)
         check_torch_output(base, type(self).__name__)
+        check_copies(base, type(self).__name__)
         check_same_step(autoreset_mode(env))
         self.vector_env = env
         """The environment whose particles these are."""
@@ -94,8 +100,8 @@ class RslRlParticleEnv(VecEnv):  # type: ignore[misc]
             extras, with `time_outs` [B N], and `log` where episodes ended.
 
         Raises:
-            NPAError: The actions have another shape or are not finite; the worlds are then as they
-                were.
+            NPAError: The actions have another shape; the worlds are then as they were.
+            DivergedError: An action is not finite; the worlds are then as they were.
         """
         wanted = (self.num_envs, self.num_actions)
         if tuple(actions.shape) != wanted:

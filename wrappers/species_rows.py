@@ -130,8 +130,8 @@ class SpeciesVecEnv(RowVecEnv):
             infos.
 
         Raises:
-            NPAError: There are no worlds yet, or an action is not finite; they are then as they
-                were.
+            NPAError: There are no worlds yet.
+            DivergedError: An action is not finite; the worlds are then as they were.
         """
         if not self._seen:
             raise NPAError("step needs worlds: call reset first")

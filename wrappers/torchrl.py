@@ -10,7 +10,7 @@ from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
 from npa_envs.errors import MissingDependencyError, NPAError
-from npa_envs.wrappers.adapters import check_torch_output
+from npa_envs.wrappers.adapters import check_copies, check_torch_output
 from npa_envs.wrappers.base import AnyVectorEnv, autoreset_mode, vector_env
 
 try:
@@ -44,14 +44,15 @@ class NPATorchRLEnv(EnvBase):  # type: ignore[misc]
         rows: Whether particles are environments of their own.
 
     Raises:
-        NPAError: The environment is none of this package, hands out arrays, or restarts worlds by
-            itself.
+        NPAError: The environment is none of this package, hands out arrays or the same tensors
+            in each step, or restarts worlds by itself.
         MissingDependencyError: TorchRL is not installed (on import).
     """
 
     def __init__(self, env: AnyVectorEnv, *, rows: bool = False) -> None:
         base = vector_env(env, type(self).__name__)
         check_torch_output(base, type(self).__name__)
+        check_copies(base, type(self).__name__)
         mode = autoreset_mode(env)
         if mode is not AutoresetMode.DISABLED:
             raise NPAError(

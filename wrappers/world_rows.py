@@ -58,7 +58,7 @@ class WorldVecEnv(RowVecEnv):
             infos.
 
         Raises:
-            NPAError: An action is not finite; the worlds are then as they were.
+            DivergedError: An action is not finite; the worlds are then as they were.
         """
         actions = self.taken_actions().reshape(self.world_count, *(self.action_space.shape or ()))
         observations, rewards, terminations, truncations, infos = self.vector_env.step(actions)

@@ -41,14 +41,14 @@ def curve(records: Sequence[RunRecord], across: Callable[[Point], float]) -> Cur
     """Return the mean of learning curves where all of them are; None where they nowhere are.
 
     Between its points a curve is straight. What does not learn has a single point: its curve is
-    that.
+    that. Runs that broke off are left out, so that they do not cut off the others, unless all did.
 
     Args:
         records: Of one method on one task from several seeds; those without a curve are left out.
         across: What curves are drawn against.
     """
     lines = []
-    for record in records:
+    for record in _whole(records):
         kept = [point for point in record.curve if np.isfinite(point.mean_return)]
         if kept:
             lines.append(([across(point) for point in kept], [point.mean_return for point in kept]))
@@ -63,6 +63,11 @@ def curve(records: Sequence[RunRecord], across: Callable[[Point], float]) -> Cur
     if len(lines) > 1:
         error = values.std(axis=0, ddof=1) / np.sqrt(len(lines))
     return Curve(grid, values.mean(axis=0), error)
+
+
+def _whole(records: Sequence[RunRecord]) -> Sequence[RunRecord]:
+    """Return the runs that came to their end, all where none did."""
+    return [record for record in records if record.status == "done"] or records
 
 
 def pictures(records: Sequence[RunRecord]) -> dict[str, bytes]:
@@ -86,7 +91,7 @@ def _draw(records: Sequence[RunRecord]) -> bytes:
         for (label, across), panel in zip(ACROSS.items(), panels, strict=True):
             for number, method in enumerate(methods):
                 some = [r for r in records if (r.job.axis, r.job.method) == (axis, method)]
-                _draw_method(panel, curve(some, across), f"C{number}", method)
+                _draw_method(panel, curve(some, across), f"C{number}", _name(method, records))
             panel.set_xlabel(label)
             panel.set_ylabel("return of held-out episodes")
             panel.set_title(HEADINGS[axis], fontsize=9, loc="left")
@@ -97,6 +102,13 @@ def _draw(records: Sequence[RunRecord]) -> bytes:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=90)
     return buffer.getvalue()
+
+
+def _name(method: str, records: Sequence[RunRecord]) -> str:
+    """Return what a method is called in a picture: with the number of whole runs where not all."""
+    states = [record.status for record in records if record.job.method == method]
+    done = states.count("done")
+    return method if done == len(states) else f"{method} ({done} of {len(states)})"
 
 
 def _draw_method(panel: Any, found: Curve | None, colour: str, name: str) -> None:

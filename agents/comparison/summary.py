@@ -33,10 +33,21 @@ def write_table(plan: Plan, records: Sequence[RunRecord], folder: Path, command:
         NPAError: A file cannot be written.
     """
     table = rows(records)
-    told = text(table)
+    told = text(table) + _sharing(plan)
     write_text(folder / TABLE, f"`{command}`\n\n{told}")
     write_text(folder / FIGURES, as_json(table, _facts(plan, command)))
     return told
+
+
+def _sharing(plan: Plan) -> str:
+    """Return what is to be said where runs of equal wall time were not alone; else nothing."""
+    at_once = plan.settings.get("runs_at_once", 1)
+    if "seconds" not in plan.budgets or at_once == 1:
+        return ""
+    return (
+        f"\nUp to {at_once} runs at once shared a device: what each had of it in its wall time is "
+        "not controlled.\n"
+    )
 
 
 def _facts(plan: Plan, command: str) -> dict[str, Any]:

@@ -14,6 +14,9 @@ from npa_envs.agents.comparison.record import RunRecord
 YARDSTICK, NOTHING = "gradient", "zero"
 """Methods whose returns count as 1 and as 0."""
 
+LOST = ("diverged", "left the world")
+"""Endings of episodes that diverged: of worlds, and of species."""
+
 NONE = "–"
 """What is not known."""
 
@@ -70,6 +73,8 @@ class Row:
     """Runs whose numbers became infinite or NaN."""
     failed: int
     """Runs that ended in another error."""
+    counted: int
+    """Runs whose return is finite: those that means are taken of."""
     episodes_diverged: float
     """Share of the held-out episodes in which a world diverged; NaN without episodes."""
     final_return: Estimate
@@ -82,6 +87,11 @@ class Row:
     """Mean wall time that training took [s]."""
     particle_steps: float
     """Mean particle-steps that training took."""
+
+    @property
+    def runs(self) -> int:
+        """All runs, whatever became of them."""
+        return self.done + self.diverged + self.failed
 
 
 def rows(records: Iterable[RunRecord]) -> list[Row]:
@@ -137,7 +147,7 @@ def _row(
     lasts = [record.curve[-1] for record in records if record.curve]
     endings = [record.endings for record in records if record.endings]
     episodes = sum(sum(ending.values()) for ending in endings)
-    lost = sum(ending.get("diverged", 0) for ending in endings)
+    lost = sum(ending.get(word, 0) for ending in endings for word in LOST)
     share = fraction(reached, nothing, yardstick)
     if job.method == YARDSTICK and not math.isnan(share.mean):
         share = Estimate(1.0, math.nan)
@@ -148,6 +158,7 @@ def _row(
         done=states.count("done"),
         diverged=states.count("diverged"),
         failed=states.count("failed"),
+        counted=sum(math.isfinite(record.mean_return) for record in records),
         episodes_diverged=lost / episodes if episodes else math.nan,
         final_return=reached,
         final_loss=estimate(record.mean_loss for record in records),
@@ -169,7 +180,12 @@ def text(table: Sequence[Row]) -> str:
         if found:
             parts.append(f"## {HEADINGS[axis]}")
         for task in dict.fromkeys(row.task for row in found):
-            parts.append(f"### {task}\n\n{_table([row for row in found if row.task == task])}")
+            some = [row for row in found if row.task == task]
+            parts.append(f"### {task}\n\n{_table(some)}")
+            methods = {row.method for row in some}
+            missing = [f"`{name}`" for name in (NOTHING, YARDSTICK) if name not in methods]
+            if missing:
+                parts.append(f"Fractions need runs of {' and '.join(missing)}.")
     return "\n\n".join(parts) + "\n"
 
 
@@ -182,8 +198,15 @@ def _table(table: Sequence[Row]) -> str:
     for row in sorted(table, key=lambda row: -_rank(row.final_return.mean)):
         numbers = (row.final_return, row.final_loss, row.fraction)
         spent = (_short(row.seconds), _short(row.particle_steps))
-        lines.append((row.method, _told(row), *map(str, numbers), *spent))
+        shown = (_marked(number, row) for number in numbers)
+        lines.append((row.method, _told(row), *shown, *spent))
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def _marked(number: Estimate, row: Row) -> str:
+    """Return a mean, and of how many runs it is where not of all."""
+    partial = row.counted < row.runs and not math.isnan(number.mean)
+    return f"{number} (of {row.counted} of {row.runs})" if partial else str(number)
 
 
 def _rank(value: float) -> float:

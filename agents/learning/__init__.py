@@ -16,7 +16,8 @@ import torch
 
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Budget, Entry, Progress, check_finite
-from npa_envs.agents.learning.rules import RuleSet, RuleSetPolicy
+from npa_envs.agents.learning.rules import RuleSet, RuleSetPolicy, starting_rules
+from npa_envs.agents.learning.seeds import EVALUATION_SEEDS
 from npa_envs.devices import check_device
 from npa_envs.errors import NPAError, suggest
 from npa_envs.tasks.checks import is_whole
@@ -48,9 +49,6 @@ METHODS: dict[str, str] = {
 }
 """Where methods are: functions `f(problem, progress, seed, *, device, start, ...)` that return a
 `RuleSet` or a policy. Others may be added."""
-
-EVALUATION_SEEDS = range(1_000_000, 1_000_016)
-"""Seeds of evaluations, far from those that learners begin their worlds with."""
 
 
 class Trained(NamedTuple):
@@ -85,7 +83,8 @@ def train(
         method: A name from `METHODS`.
         problem: What is to be learned.
         budget: What may be spent.
-        seed: Of everything that the method draws, at least 0.
+        seed: Of everything that the method draws, from 0 to 99: runs with different seeds learn in
+            different worlds, and none in those of evaluations.
         device: Where worlds, rules and evaluations are.
         start: Rules to begin with, `RuleSet.of(problem, "heart")`; copied. None: new ones.
         evaluation_seeds: Of the episodes by which the learning curve is drawn.
@@ -94,7 +93,8 @@ def train(
         options: The method's own: `method_options` names them.
 
     Raises:
-        NPAError: There is no such method or option, or the method cannot learn this problem.
+        NPAError: There is no such method or option, the method cannot learn this problem, or the
+            rules to begin with do not fit it.
         DivergedError: The rules' weights have become infinite or NaN.
         MissingDependencyError: The method needs a library that is not installed.
     """
@@ -106,6 +106,8 @@ def train(
     if not is_whole(seed) or seed < 0:
         raise NPAError(f"seed must be a whole number of at least 0, got {seed!r}: give seed=0")
     place = check_device(device)
+    if start is not None:
+        start = starting_rules(problem, seed, place, start)
     progress = Progress(
         problem,
         budget,

@@ -11,6 +11,7 @@ from npa_envs.agents.evaluation import evaluate_policy
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rules import RuleSet
+from npa_envs.agents.learning.seeds import world_seeds
 from npa_envs.agents.policy import Policy
 from npa_envs.agents.scripted import (
     MendPolicy,
@@ -78,15 +79,16 @@ def train_scripted(
     start: RuleSet | None = None,
     gains: tuple[float, ...] = GAINS,
 ) -> Policy:
-    """Return the scripted policy that fits best; nothing is spent.
+    """Return the scripted policy that fits best.
 
-    All of `SCRIPTED` that the problem's task allows play one episode in each of the problem's
-    worlds at each gain, from seeds that evaluations do not use. The best one is taken.
+    Doing nothing, and all of `SCRIPTED` that the problem's task allows at each gain, play one
+    episode in each of the problem's worlds, from seeds that evaluations do not use, until all have
+    done so or the budget is spent. The best one is taken.
 
     Args:
         problem: Where it acts.
-        progress: The learning curve, which gets one entry.
-        seed: Of the first world in which policies are compared.
+        progress: The budget, and the learning curve: of nothing, and of the policy.
+        seed: Of the worlds in which policies are compared.
         device: Where the worlds are.
         start: Not for this method.
         gains: How fast policies spread, as fractions of α ε, or gather where it is negative.
@@ -96,18 +98,31 @@ def train_scripted(
     """
     _check_no_start(start)
     envs = problem.make_envs(device=device)
-    seeds = range(seed, seed + problem.num_envs)
-    best, most = None, 0.0
+    seeds = world_seeds(seed, problem.num_envs)
+    nothing: Policy = ZeroPolicy(envs)
+    progress.start(nothing)
+
+    def tried(policy: Policy) -> float:
+        episodes = evaluate_policy(envs, policy, seeds)
+        # All worlds go on until the last episode is over.
+        steps = int(episodes.steps.max())
+        progress.advance(steps * problem.num_envs * problem.particle_count)
+        return episodes.mean_return
+
+    best, most = nothing, tried(nothing)
     for policy in _candidates(envs, gains):
-        mean_return = evaluate_policy(envs, policy, seeds).mean_return
+        if progress.over:
+            break
+        mean_return = tried(policy)
         if mean_return > most:
             best, most = policy, mean_return
-    if best is None:
+    if best is nothing:
         raise NPAError(
-            f"method='scripted' has no policy that does better than nothing in {problem.env_id}: "
-            "compare with 'zero' and 'random' instead"
+            f"method='scripted' found no policy that does better than nothing in {problem.env_id} "
+            f"after {progress.particle_steps} particle-steps: compare with 'zero' and 'random' "
+            "instead, or give a larger budget"
         )
-    progress.start(best)
+    progress.look(best, force=True)
     return best
 
 

@@ -11,6 +11,7 @@ from torch import Tensor
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Progress, annealed
 from npa_envs.agents.learning.rules import RuleSet, Source, starting_rules
+from npa_envs.agents.learning.seeds import world_seeds
 from npa_envs.errors import NPAError
 from npa_envs.tasks.checks import is_real, is_whole
 
@@ -111,7 +112,7 @@ def train(
     student, envs = rules.policy(), problem.make_envs(device=device)
     generator = torch.Generator(device).manual_seed(seed)
     optimiser = torch.optim.Adam(rules.parameters(), lr=learning_rate, fused=device.type == "cuda")
-    observation, _ = envs.reset(seed=seed)
+    observation, _ = envs.reset(seed=world_seeds(seed, problem.num_envs))
     shown = Demonstrations(kept_steps * problem.num_envs, observation, wise(observation))
     taught = problem.num_envs - round(student_share * problem.num_envs)
     progress.start(rules)
@@ -141,9 +142,9 @@ def unexplained(rules: RuleSet, observation: Tensor, action: Tensor) -> Tensor:
         observation: What is perceived, shape [B, N, P].
         action: What the teacher does, shape [B, N, A].
     """
-    parts = []
+    parts, errors = [], (rules.mean(observation) - action).square()
     for span in rules.spans:
-        error = (rules.mean(observation)[:, span] - action[:, span]).square()
+        error = errors[:, span]
         variance = action[:, span].flatten(0, 1).var(dim=0, correction=0)
         parts.append((error.flatten(0, 1).mean(dim=0) / (variance + VARIANCE_FLOOR)).mean())
     return torch.stack(parts).mean()

@@ -22,11 +22,9 @@ from npa_envs.agents.learning.population import Population
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rules import RuleSet, starting_rules
+from npa_envs.agents.learning.seeds import FIRST_EVALUATION_SEED
 from npa_envs.errors import MissingDependencyError
 from npa_envs.tasks.checks import check_positive
-
-LARGEST_SEED = 2**31
-"""Worlds' seeds are below this."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +82,7 @@ def train(
     progress.start(rules)
     while not progress.over:
         proposed = search.ask()
-        seeds = draws.integers(LARGEST_SEED, size=worlds_per_candidate).tolist()
+        seeds = draws.integers(FIRST_EVALUATION_SEED, size=worlds_per_candidate).tolist()
         weights = torch.as_tensor(np.stack(proposed), dtype=torch.float32).to(device)
         found = fitness(envs, candidates, weights, seeds, problem.episode_steps)
         search.tell(proposed, _costs(found.cpu().double().numpy()))

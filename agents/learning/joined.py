@@ -10,13 +10,14 @@ import numpy as np
 import torch
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
-from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.control import Physics
 from npa_envs.envs.species.vector import MultiSpeciesVectorEnv
+from npa_envs.envs.vector_options import worlds_to_reset
 
-TIME_LIMIT = "time limit"
+TIME_LIMIT, LEFT = "time limit", "left the world"
+"""Why species are cut off, and why they end where they diverge."""
 
 
 class JoinedWorlds(NamedTuple):
@@ -37,7 +38,9 @@ class JoinedSpeciesEnv:
 
     It has the interface of `NPAVectorEnv` as far as learners need it. A world is paid the mean of
     what its species are paid, and its loss is the mean of theirs; a species that ended keeps the
-    loss that it had then. A world terminates where all of its species have ended by themselves.
+    loss that it had then. A world terminates where all of its species have ended by themselves. The
+    reason is that of the first species that ended by itself, unless one left the world: then it is
+    that.
 
     Every step's infos have, besides `final_obs` and `final_info` as elsewhere:
 
@@ -46,6 +49,7 @@ class JoinedSpeciesEnv:
     | `loss` | before a restart, shape [B] |
     | `particle_reward` | what the species of each particle is paid, shape [B, N] |
     | `acted` | whether that species was alive: rows to leave out where not, bool, shape [B, N] |
+    | `particle_terminated` | whether that species ended by itself now, bool, shape [B, N] |
 
     Args:
         task: A name from `npa_envs.envs.species.TASKS`.
@@ -96,6 +100,7 @@ class JoinedSpeciesEnv:
         self.single_action_space = _joined_space(env.single_action_spaces)
         """Space of one world's actions, shape [N, A]."""
         self._loss = torch.zeros(self.num_envs, len(spans), device=device)
+        self._reasons = np.full(self.num_envs, None, dtype=object)
 
     @property
     def unwrapped(self) -> JoinedSpeciesEnv:
@@ -115,6 +120,7 @@ class JoinedSpeciesEnv:
             Observations, shape [B, N, P], and infos with `loss`.
         """
         rows, infos = self.species_env.reset(seed, options)
+        self._reasons[worlds_to_reset(options, self.num_envs)] = None
         self._loss = self._stacked(infos, "loss")
         return self._joined(rows), {"loss": self._loss.mean(dim=1)}
 
@@ -128,11 +134,11 @@ class JoinedSpeciesEnv:
             Observations [B, N, P], rewards [B], terminations [B], truncations [B], and infos.
 
         Raises:
-            NPAError: The actions have another shape or are not finite; the worlds are then as they
-                were.
+            NPAError: The actions have another shape; the worlds are then as they were.
+            DivergedError: An action is not finite; the worlds are then as they were.
         """
         by_species = {agent: actions[:, span] for agent, span in self.spans.items()}
-        rows, rewards, _, truncations, infos = self.species_env.step(by_species)
+        rows, rewards, terminations, truncations, infos = self.species_env.step(by_species)
         acted = self._stacked(infos, "acted")
         self._loss = torch.where(acted, self._stacked(infos, "loss"), self._loss)
         paid = torch.stack(list(rewards.values()), dim=1)
@@ -140,14 +146,19 @@ class JoinedSpeciesEnv:
             "loss": self._loss.mean(dim=1),
             "particle_reward": self._by_particle(paid),
             "acted": self._by_particle(acted),
+            "particle_terminated": self._by_particle(torch.stack(list(terminations.values()), 1)),
         }
         late = torch.stack(list(truncations.values()), dim=1).any(dim=1)
+        self._remember_reasons(infos)
         first = infos[self.species_env.agents[0]]
         over = first.get("_final_obs", torch.zeros_like(late))
         if "final_obs" in first:
             last = {agent: infos[agent]["final_obs"] for agent in self.spans}
             told |= {"final_obs": self._joined(last), "_final_obs": over}
-            reasons = self._reasons(infos)
+            which = over.cpu().numpy()
+            reasons = self._reasons.copy()
+            reasons[~which] = None
+            self._reasons[which] = None
             told["final_info"] = {"loss": told["loss"], "_loss": over, "reason": reasons}
             told["_final_info"] = over
         return self._joined(rows), paid.mean(dim=1), over & ~late, over & late, told
@@ -171,14 +182,14 @@ class JoinedSpeciesEnv:
         ]
         return torch.cat(parts, dim=1)
 
-    def _reasons(self, infos: Mapping[str, Mapping[str, Any]]) -> NDArray[Any]:
-        """Return why worlds' episodes ended, by the first species that ended now, shape [B]."""
-        reasons = np.full(self.num_envs, None, dtype=object)
+    def _remember_reasons(self, infos: Mapping[str, Mapping[str, Any]]) -> None:
+        """Keep why the first species of each world ended; that one left is told before all else."""
         for agent in self.spans:
             own = infos[agent].get("reason")
             if own is not None:
-                reasons = np.where(reasons == None, own, reasons)  # noqa: E711
-        return reasons
+                told = own != None  # noqa: E711
+                held = (self._reasons != None) & (self._reasons != TIME_LIMIT)  # noqa: E711
+                self._reasons = np.where((told & ~held) | (own == LEFT), own, self._reasons)
 
 
 def _joined_space(spaces: Mapping[str, Any]) -> Box:

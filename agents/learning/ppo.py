@@ -28,6 +28,8 @@ from npa_envs.agents.learning.ppo_worlds import world_count
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rules import RuleSet
+from npa_envs.agents.learning.seeds import world_seeds
+from npa_envs.wrappers.adapters import own_rewards
 
 
 class Round(NamedTuple):
@@ -88,7 +90,7 @@ class Learner:
             torch.optim.Adam(net.parameters(), lr=rate, eps=1e-5, fused=True)
             for net, rate in ((self.actor, torch.zeros((), device=device)), (self.critic, 0.0))
         )
-        observation, _ = self.envs.reset(seed=seed)
+        observation, _ = self.envs.reset(seed=world_seeds(seed, problem.num_envs))
         self.seen = observation.new_empty(settings.steps + 1, *observation.shape)
         """What is perceived before each step of a round, and after its last, [T + 1, B, N, P]."""
         self.seen[-1].copy_(observation)
@@ -115,14 +117,14 @@ class Learner:
                 last_seen[step] = infos["final_obs"]
             paid, acted = self._by_particle(reward, infos)
             ended = terminated | truncated
-            flags = [flag[:, None].expand_as(paid) for flag in (terminated, ended)]
+            # A species may end before its world does.
+            gone = infos.get("particle_terminated", terminated[:, None])
+            flags = [(flag[:, None] | gone).expand_as(paid) for flag in (terminated, ended)]
             # Environments may hand out the same tensors in each step.
             moves.append([value.clone() for value in (action, log_prob, paid, acted, *flags)])
         actions, log_probs, rewards, acted, terminated, ended = (
             torch.stack(column) for column in zip(*moves, strict=True)
         )
-        # A species may end before its world does.
-        terminated[:-1] |= acted[:-1] & ~acted[1:] & ~ended[:-1]
         values = self._values(seen.flatten(0, 1)).view(len(seen), *paid.shape)
         following = values[1:].clone()
         for step, observation in last_seen.items():
@@ -238,13 +240,7 @@ class Learner:
         """Return what each particle is paid for the last step, and whether it acted, [B, N]."""
         everyone = self.seen.shape[1:3]
         acted = infos.get("acted", torch.ones_like(reward, dtype=torch.bool)[:, None])
-        paid = reward[:, None]
-        if self.settings.credit == "particle":
-            paid = infos["particle_reward"]
-            last = infos.get("final_info", {}).get("particle_reward")
-            if last is not None:
-                # Worlds that restarted say there what their last step was worth.
-                paid = torch.where(infos["_final_info"][:, None], last, paid)
+        paid = own_rewards(infos) if self.settings.credit == "particle" else reward[:, None]
         return paid.expand(everyone), acted.expand(everyone)
 
 
@@ -269,7 +265,8 @@ def train(
         settings: Its fields, as keyword arguments.
 
     Raises:
-        NPAError: There is no such option, or one is wrong; or the policy has diverged.
+        NPAError: There is no such option, or one is wrong.
+        DivergedError: The policy has diverged.
     """
     place = torch.device(device)
     settings = replace(settings, worlds=world_count(problem, settings, place, progress.budget))

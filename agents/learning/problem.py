@@ -6,7 +6,6 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from itertools import accumulate
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -174,12 +173,6 @@ class Problem:
     def particle_count(self) -> int:
         """Particles of a world, N."""
         return sum(self.counts)
-
-    @property
-    def spans(self) -> list[slice]:
-        """Where each species' particles stand."""
-        ends = accumulate(self.counts)
-        return [slice(end - count, end) for end, count in zip(ends, self.counts, strict=True)]
 
     def make_task(self, device: str | torch.device = "cpu") -> EnvTask[Any] | SpeciesTask:
         """Return the task by itself: starts and losses.

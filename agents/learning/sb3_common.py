@@ -15,6 +15,7 @@ from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.agents.learning.sb3_imports import PPO, BaseCallback, VecEnv, VecEnvWrapper
 from npa_envs.agents.learning.sb3_policy import RuleActorCritic
+from npa_envs.agents.learning.seeds import world_seeds
 from npa_envs.tasks.checks import check_fraction, check_non_negative, check_positive
 
 
@@ -48,7 +49,8 @@ class SB3Settings:
     """Weight of the entropy in what is maximised."""
 
     max_gradient_norm: float = 0.5
-    """Gradients are shortened to this norm."""
+    """Gradients of rules and critic, taken together, are shortened to this norm; the device's own
+    PPO shortens each by itself."""
 
     target_kl: float | None = None
     """No more updates in a round once particles' actions are about so far from those that were
@@ -222,5 +224,7 @@ def learn(
     if isinstance(env, BootstrappedRows):
         policy: Any = model.policy
         env.policy = policy
+    # Stable-Baselines3 would begin with worlds seed, seed + 1, and so on.
+    env.seed(world_seeds(seed, problem.num_envs)[0])
     model.learn(sys.maxsize, callback)
     return callback.rules

@@ -13,6 +13,9 @@ from npa_envs.agents.learning.gaussian import GaussianRules
 from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.agents.learning.sb3_imports import ActorCriticPolicy
 
+EXCESS = 1.5
+"""Stable-Baselines3 goes on until the divergence is so many times `target_kl`."""
+
 
 class RuleActorCritic(ActorCriticPolicy):
     """A policy of Stable-Baselines3 whose actor is rules; subclasses say what a row is.
@@ -77,12 +80,12 @@ class RuleActorCritic(ActorCriticPolicy):
 
     @classmethod
     def row_kl(cls, particle_kl: float) -> float:
-        """Return how far a row's likelihood is when its particles' are.
+        """Return the `target_kl` at which a round ends when particles' likelihoods are so far.
 
         Args:
             particle_kl: Divergence of a particle's actions [nats].
         """
-        return particle_kl
+        return particle_kl / EXCESS
 
     def predict_values(self, obs: Any) -> Tensor:
         """Return the values of rows, shape [M, 1].

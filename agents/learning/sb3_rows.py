@@ -175,7 +175,8 @@ def train(
         settings: Its fields, as keyword arguments.
 
     Raises:
-        NPAError: There is no such option, or one is wrong; or the policy has diverged.
+        NPAError: There is no such option, or one is wrong.
+        DivergedError: The policy has diverged.
     """
     env = make_rows(problem, settings, device)
     return learn(env, RowRulePolicy, progress, seed, device=device, start=start, settings=settings)

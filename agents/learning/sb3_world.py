@@ -15,7 +15,7 @@ from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.agents.learning.sb3_common import SB3Settings, learn
-from npa_envs.agents.learning.sb3_policy import RuleActorCritic
+from npa_envs.agents.learning.sb3_policy import EXCESS, RuleActorCritic
 from npa_envs.wrappers.world_rows import WorldVecEnv
 
 
@@ -36,7 +36,7 @@ class WorldRulePolicy(RuleActorCritic):
 
     @classmethod
     def row_kl(cls, particle_kl: float) -> float:
-        """Return how far a world's likelihood is when its particles' are, as estimated there.
+        """Return the `target_kl` at which a round ends when particles' likelihoods are so far.
 
         The mean log-ratio of many particles is close to minus their divergence k, of which
         r - 1 - log r makes k² / 2.
@@ -44,7 +44,7 @@ class WorldRulePolicy(RuleActorCritic):
         Args:
             particle_kl: Divergence of a particle's actions [nats].
         """
-        return 0.5 * particle_kl**2
+        return 0.5 * particle_kl**2 / EXCESS
 
     def predict_values(self, obs: Any) -> Tensor:
         """Return the values of worlds, shape [M, 1].
@@ -87,7 +87,8 @@ def train(
         settings: Its fields, as keyword arguments.
 
     Raises:
-        NPAError: There is no such option, or one is wrong; or the policy has diverged.
+        NPAError: There is no such option, or one is wrong.
+        DivergedError: The policy has diverged.
     """
     env = WorldVecEnv(problem.make_envs(device=device))
     return learn(

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from npa_envs.errors import NPAError
+from npa_envs.errors import DivergedError, NPAError
 
 
 def joined_actions(
@@ -25,7 +25,8 @@ def joined_actions(
 
     Raises:
         NPAError: There is an action too few or too many, or one has another shape or is no array
-            of finite numbers.
+            of numbers.
+        DivergedError: A number is not finite.
     """
     if not isinstance(actions, Mapping):
         raise NPAError(
@@ -54,7 +55,7 @@ def joined_actions(
     if not bool(torch.isfinite(joined).all()):
         bad = next(k for k, row in enumerate(rows) if not bool(torch.isfinite(row).all()))
         wrong = rows[bad][~torch.isfinite(rows[bad])]
-        raise NPAError(
+        raise DivergedError(
             f"actions[{agents[bad]!r}] must be finite, got {wrong[0].item()} ({wrong.numel()} such "
             "numbers): check the policy; the world is as it was"
         )

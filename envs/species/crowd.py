@@ -139,9 +139,10 @@ class CrowdEnv(ParallelEnv):  # type: ignore[misc]
             off, and infos: of all agents that acted.
 
         Raises:
-            NPAError: The episode is over, or an action is missing, not wanted, of another shape or
-                not finite; the world is then as it was.
-            DivergedError: An agent is out of bounds, and `on_divergence` is "raise".
+            NPAError: The episode is over, or an action is missing, not wanted, or of another
+                shape; the world is then as it was.
+            DivergedError: An action is not finite, and the world is as it was; or an agent is out
+                of bounds, and `on_divergence` is "raise".
         """
         if not self.agents:
             raise NPAError("step needs a live agent, and there is none: call reset first")

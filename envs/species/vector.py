@@ -163,10 +163,10 @@ class MultiSpeciesVectorEnv:
             step, whether it was cut off, and infos.
 
         Raises:
-            NPAError: An action is missing, not wanted, of another shape or not finite, or the
-                episode of a world that is not reset by itself is over; the worlds are then as they
-                were.
-            DivergedError: An agent is out of bounds, and `on_divergence` is "raise".
+            NPAError: An action is missing, not wanted or of another shape, or the episode of a
+                world that is not reset by itself is over; the worlds are then as they were.
+            DivergedError: An action is not finite, and the worlds are as they were; or an agent is
+                out of bounds, and `on_divergence` is "raise".
         """
         if not self._started:
             raise NPAError("step needs worlds: call reset first")

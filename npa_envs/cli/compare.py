@@ -71,8 +71,9 @@ class CompareOptions:
     devices: tuple[str, ...] = ()
     """Several devices that runs are dealt out to, for example cuda:0 cuda:1; default: --device."""
 
-    jobs: int = 1
-    """Runs at once. Those on one device share its time, which counts where wall time is equal."""
+    jobs: int | None = None
+    """Runs at once; default: one for each device. Those on one device share its time, which counts
+    where wall time is equal: with --seconds, as many on each device."""
 
     threads: int = 1
     """CPU threads of each run."""
@@ -138,7 +139,7 @@ def run(options: CompareOptions, command: str = "") -> int:
         write_table(plan, whole(), folder, command)
         bar.advance(1)
 
-    places = Places(options.devices or (options.device,), options.jobs, options.threads)
+    places = Places(_devices(options), _jobs(options), options.threads)
     with StepBar(len(missing), show=options.progress, unit="run") as bar:
         run_jobs(
             plan,
@@ -244,13 +245,29 @@ def _method_options(words: Sequence[str], methods: Sequence[str]) -> dict[str, d
     return found
 
 
+def _devices(options: CompareOptions) -> tuple[str, ...]:
+    return options.devices or (options.device,)
+
+
+def _jobs(options: CompareOptions) -> int:
+    """Return how many runs there are at once, as fairly as times are compared."""
+    count = len(_devices(options))
+    jobs = count if options.jobs is None else options.jobs
+    if options.seconds is not None and jobs % count:
+        raise NPAError(
+            f"jobs must be a multiple of the number of devices, {count}, where wall time is equal, "
+            f"got {jobs}: give --jobs {-(-jobs // count) * count}, or leave it out"
+        )
+    return jobs
+
+
 def _settings(options: CompareOptions) -> dict[str, Any]:
     """Return what figures follow from besides problems, budgets and options."""
     from npa_envs.bench.report import current_commit, machine, versions
     from npa_envs.devices import check_device
     from npa_envs.diagnostics import installed_version
 
-    places = [check_device(name) for name in options.devices or (options.device,)]
+    places = [check_device(name) for name in _devices(options)]
     kinds = {(place.type, machine(place)) for place in places}
     if len(kinds) > 1:
         raise NPAError(
@@ -261,7 +278,7 @@ def _settings(options: CompareOptions) -> dict[str, Any]:
     return {
         "device": kind,
         "machine": name,
-        "runs_at_once": -(-options.jobs // len(places)),
+        "runs_at_once": -(-_jobs(options) // len(places)),
         "threads": options.threads,
         "commit": options.commit or current_commit(),
         "versions": versions() | others,
