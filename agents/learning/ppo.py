@@ -90,7 +90,7 @@ class Learner:
             torch.optim.Adam(net.parameters(), lr=rate, eps=1e-5, fused=True)
             for net, rate in ((self.actor, torch.zeros((), device=device)), (self.critic, 0.0))
         )
-        observation, _ = self.envs.reset(seed=world_seeds(seed, problem.num_envs))
+        observation, _ = self.envs.reset(seed=world_seeds(seed, self.envs.num_envs))
         self.seen = observation.new_empty(settings.steps + 1, *observation.shape)
         """What is perceived before each step of a round, and after its last, [T + 1, B, N, P]."""
         self.seen[-1].copy_(observation)

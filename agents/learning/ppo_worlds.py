@@ -7,6 +7,7 @@ import torch
 from npa_envs.agents.learning.ppo_settings import Settings
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Budget
+from npa_envs.agents.learning.seeds import WORLDS_PER_SEED
 from npa_envs.envs.memory import free_bytes, needed_bytes
 
 MANY_PARTICLES = 2**17
@@ -36,7 +37,7 @@ def world_count(problem: Problem, settings: Settings, device: torch.device, budg
         return settings.worlds
     if device.type != "cuda":
         return problem.num_envs
-    counts = [MANY_PARTICLES // problem.particle_count]
+    counts = [MANY_PARTICLES // problem.particle_count, WORLDS_PER_SEED]
     free = free_bytes(device)
     if free is not None:
         counts.append(int(ROOM * free) // world_bytes(problem, settings, device))

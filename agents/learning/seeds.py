@@ -31,8 +31,8 @@ def world_seeds(seed: int, count: int) -> range:
         )
     if count > WORLDS_PER_SEED:
         raise NPAError(
-            f"num_envs must be at most {WORLDS_PER_SEED}, got {count}: more would share their "
-            "worlds with the next seed"
+            f"worlds must be at most {WORLDS_PER_SEED}, got {count}: more would share their "
+            "seeds with the next run"
         )
     first = seed * WORLDS_PER_SEED
     return range(first, first + count)
