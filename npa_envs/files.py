@@ -9,11 +9,14 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import json
+import math
 import os
 import secrets
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 from npa_envs.errors import NPAError
 
@@ -154,3 +157,25 @@ def _explain(given: Path, error: OSError) -> str:
     else:
         rule, cure = (error.strerror or type(error).__name__), "choose another path"
     return f"cannot write {str(given)!r}: {rule} ({error}): {cure}; nothing was changed"
+
+
+def plain_numbers(value: Any) -> Any:
+    """Return a tree of values as JSON has it; numbers that are not finite are None.
+
+    Args:
+        value: Mappings, lists and tuples of plain values.
+    """
+    if isinstance(value, Mapping):
+        return {key: plain_numbers(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain_numbers(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def json_text(value: Any) -> str:
+    """Return a tree of values as the text of a JSON file, by `plain_numbers`.
+
+    Args:
+        value: As there.
+    """
+    return json.dumps(plain_numbers(value), indent=1, allow_nan=False, ensure_ascii=False) + "\n"

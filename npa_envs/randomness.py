@@ -276,6 +276,26 @@ def check_generator(generator: Randomness | None, device: torch.device, world_co
         )
 
 
+def uniform_draws(generator: Randomness | None, shape: Sequence[int], like: Tensor) -> Tensor:
+    """Return uniform numbers in [0, 1) for worlds.
+
+    Args:
+        generator: Where they come from, checked; None is torch's own.
+        shape: Worlds, then what each of them draws.
+        like: A tensor of their dtype and on their device.
+    """
+    if isinstance(generator, WorldRandom):
+        return generator.uniform(*shape[1:], dtype=like.dtype)
+    return torch.rand(tuple(shape), generator=generator, device=like.device, dtype=like.dtype)
+
+
+def normal_draws(generator: Randomness | None, shape: Sequence[int], like: Tensor) -> Tensor:
+    """Return standard normal numbers for worlds, as `uniform_draws` does."""
+    if isinstance(generator, WorldRandom):
+        return generator.normal(*shape[1:], dtype=like.dtype)
+    return torch.randn(tuple(shape), generator=generator, device=like.device, dtype=like.dtype)
+
+
 GOLDEN = 0x9E3779B97F4A7C15
 MIXERS = ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB), (31, 1))
 

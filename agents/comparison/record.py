@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from npa_envs.agents.comparison.plan import Job
 from npa_envs.errors import NPAError
-from npa_envs.files import write_text
+from npa_envs.files import json_text, plain_numbers, write_text
 
 Status = Literal["done", "diverged", "failed"]
 
@@ -84,8 +84,7 @@ class RunRecord:
         Raises:
             NPAError: It cannot be written.
         """
-        text = json.dumps(_plain(asdict(self)), indent=1, allow_nan=False, ensure_ascii=False)
-        write_text(folder / RECORD, text + "\n")
+        write_text(folder / RECORD, json_text(asdict(self)))
 
 
 def read_record(folder: Path, facts: Mapping[str, Any]) -> RunRecord | None:
@@ -108,7 +107,7 @@ def read_record(folder: Path, facts: Mapping[str, Any]) -> RunRecord | None:
             f"{str(path)!r} must hold a record of npa-envs compare, but cannot be read "
             f"({error}): remove its folder, or choose another one with --output"
         ) from error
-    for name, value in _plain(facts).items():
+    for name, value in plain_numbers(facts).items():
         if record.facts.get(name) != value:
             raise NPAError(
                 f"{str(path)!r} holds figures of other settings: {name} was "
@@ -139,12 +138,3 @@ def _mean(values: Sequence[float]) -> float:
 
 def _number(value: float | None) -> float:
     return math.nan if value is None else float(value)
-
-
-def _plain(value: Any) -> Any:
-    """Return a tree of values as JSON has it; numbers that are not finite are None."""
-    if isinstance(value, Mapping):
-        return {key: _plain(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(inner) for inner in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -12,9 +12,8 @@ from npa_envs.agents.comparison.plan import Plan
 from npa_envs.agents.comparison.plots import pictures
 from npa_envs.agents.comparison.record import RunRecord
 from npa_envs.agents.comparison.tables import as_json, rows, text
-from npa_envs.bench.plots import check_matplotlib
-from npa_envs.errors import MissingDependencyError
-from npa_envs.files import write_bytes, write_text
+from npa_envs.bench.plots import write_plots
+from npa_envs.files import write_text
 
 TABLE, FIGURES = "comparison.md", "comparison.json"
 """Names of the files of the table."""
@@ -66,13 +65,5 @@ def write_pictures(records: Sequence[RunRecord], folder: Path) -> list[str]:
     Raises:
         NPAError: A file cannot be written.
     """
-    done = [f"wrote {path}" for path in write_strips(records, folder)]
-    try:
-        check_matplotlib()
-    except MissingDependencyError as error:
-        return [*done, f"no curves: {error}"]
-    for task, picture in pictures(records).items():
-        path = folder / f"curves_{task}.png"
-        write_bytes(path, picture)
-        done.append(f"wrote {path}")
-    return done
+    strips = [f"wrote {path}" for path in write_strips(records, folder)]
+    return [*strips, *write_plots(lambda: pictures(records), folder / "curves_*.png", "curves")]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from npa_envs.bench.precisions import PRECISIONS
@@ -11,6 +12,7 @@ from npa_envs.bench.report import Report
 from npa_envs.bench.scaling import AXES, ScalingRow
 from npa_envs.bench.strategies import STRATEGIES
 from npa_envs.errors import MissingDependencyError
+from npa_envs.files import write_bytes
 
 FLOOR = 1e-16
 """Errors below this, as that of the float64 reference itself, are drawn here."""
@@ -55,6 +57,29 @@ def check_matplotlib() -> None:
         raise MissingDependencyError(
             "plots need matplotlib, which is not installed: pip install 'npa-envs[bench]'"
         ) from error
+
+
+def write_plots(draw: Callable[[], Mapping[str, bytes]], path: Path, what: str) -> list[str]:
+    """Write pictures where matplotlib is installed, and return what was done, in sentences.
+
+    Args:
+        draw: Returns pictures by name, as bytes of PNG files.
+        path: Their place; "*" in its name stands for each one's.
+        what: What they are, for the sentence that there are none.
+
+    Raises:
+        NPAError: A file cannot be written.
+    """
+    try:
+        check_matplotlib()
+    except MissingDependencyError as error:
+        return [f"no {what}: {error}"]
+    done = []
+    for name, picture in draw().items():
+        place = path.with_name(path.name.replace("*", name))
+        write_bytes(place, picture)
+        done.append(f"wrote {place}")
+    return done
 
 
 def pictures(report: Report) -> dict[str, bytes]:

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import json
-import math
 import platform
 import subprocess
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import date
 from pathlib import Path
-from typing import Any
 
 import torch
 
 from npa_envs.bench.session import LeftOut, Tables
 from npa_envs.diagnostics import installed_version
+from npa_envs.files import json_text
 from npa_envs.render.tables import table_text
 
 LIBRARIES = ("npa-envs", "torch", "warp-lang", "numpy", "scipy", "warpSPHCore")
@@ -77,16 +75,7 @@ class Report:
             "ratios": dict(self.ratios),
             "left_out": [asdict(entry) for entry in self.left_out],
         }
-        return json.dumps(_finite(content), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
-
-
-def _finite(value: Any) -> Any:
-    """Return a tree of values in which numbers that are not finite are None."""
-    if isinstance(value, dict):
-        return {key: _finite(inner) for key, inner in value.items()}
-    if isinstance(value, list):
-        return [_finite(inner) for inner in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+        return json_text(content)
 
 
 def machine(device: torch.device) -> str:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from npa_envs.errors import MissingDependencyError, NPAError, suggest
+from npa_envs.errors import NPAError, suggest
 
 if TYPE_CHECKING:
     import torch
@@ -216,18 +216,11 @@ def _facts(options: RobustnessOptions, device: torch.device, most: int) -> dict[
 
 def _write(folder: Path, text: str, records: Sequence[RuleRecord]) -> list[str]:
     """Write the tables and, where matplotlib is installed, the curves; return what was done."""
-    from npa_envs.bench.plots import check_matplotlib
-    from npa_envs.files import write_bytes, write_text
+    from npa_envs.bench.plots import write_plots
+    from npa_envs.files import write_text
     from npa_envs.robustness.plots import pictures
 
     write_text(folder / "robustness.md", text)
     done = [f"wrote {folder}: robustness.md and a record for each rule"]
-    try:
-        check_matplotlib()
-    except MissingDependencyError as error:
-        return [*done, f"no curves: {error}"]
-    for task, picture in pictures(records).items():
-        path = folder / f"robustness_{task}.png"
-        write_bytes(path, picture)
-        done.append(f"wrote {path}")
-    return done
+    curves = folder / "robustness_*.png"
+    return [*done, *write_plots(lambda: pictures(records), curves, "curves")]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from npa_envs.errors import MissingDependencyError, NPAError
+from npa_envs.errors import NPAError
 
 if TYPE_CHECKING:
     import torch
@@ -176,16 +176,9 @@ def _path(options: StressOptions, device: torch.device) -> Path | None:
 
 def _draw(path: Path, record: Record) -> None:
     """Draw heat maps beside the record, where matplotlib is installed."""
-    from npa_envs.bench.plots import check_matplotlib
-    from npa_envs.files import write_bytes
+    from npa_envs.bench.plots import write_plots
     from npa_envs.stress.plots import heat_maps
 
-    try:
-        check_matplotlib()
-    except MissingDependencyError as error:
-        print(f"no heat maps: {error}")
-        return
-    for group, picture in heat_maps(record).items():
-        picture_path = path.with_name(f"{path.stem}_{group}.png")
-        write_bytes(picture_path, picture)
-        print(f"wrote {picture_path}")
+    maps = path.with_name(f"{path.stem}_*.png")
+    for line in write_plots(lambda: heat_maps(record), maps, "heat maps"):
+        print(line)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from npa_envs.errors import NPAError
-from npa_envs.files import write_text
+from npa_envs.files import json_text, plain_numbers, write_text
 from npa_envs.robustness.conditions import Response
 from npa_envs.robustness.recovery import Course
 
@@ -58,17 +58,7 @@ class RuleRecord:
         content = asdict(self)
         for course, row in zip(self.courses, content["courses"], strict=True):
             row["recovery_steps"] = course.recovery_steps()
-        text = json.dumps(_plain(content), indent=1, allow_nan=False, ensure_ascii=False)
-        write_text(path, text + "\n")
-
-
-def _plain(value: Any) -> Any:
-    """Return a tree of values in which numbers that are not finite are None."""
-    if isinstance(value, Mapping):
-        return {key: _plain(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(inner) for inner in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+        write_text(path, json_text(content))
 
 
 def read_record(path: Path, facts: Mapping[str, Any]) -> RuleRecord | None:
@@ -96,7 +86,7 @@ def read_record(path: Path, facts: Mapping[str, Any]) -> RuleRecord | None:
             f"{str(path)!r} must hold a record of npa-envs robustness, but cannot be read "
             f"({error}): remove it, or choose another folder with --output"
         ) from error
-    for name, value in _plain(facts).items():
+    for name, value in plain_numbers(facts).items():
         if before.get(name) != value:
             raise NPAError(
                 f"{str(path)!r} holds figures of other settings: {name} was {before.get(name)!r}, "

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.randomness import Randomness, WorldRandom
+from npa_envs.randomness import Randomness, WorldRandom, normal_draws, uniform_draws
 from npa_envs.tasks.digits import Split, load_pictures
 
 LEVELS = 2048
@@ -211,7 +211,7 @@ def varied(
     """
     world_count, particle_count = x.shape[:2]
     if rotation > 0.0 or stretch > 0.0:
-        draws = 2.0 * _uniform(generator, world_count, 4, x) - 1.0
+        draws = 2.0 * uniform_draws(generator, (world_count, 4), x) - 1.0
         angle = math.radians(rotation) * draws[:, 0]
         cos, sin = angle.cos(), angle.sin()
         wide, high = 1.0 + stretch * draws[:, 1], 1.0 + stretch * draws[:, 2]
@@ -223,22 +223,8 @@ def varied(
         turned_y = sin[:, None] * across + cos[:, None] * up
         x = torch.stack((turned_x, turned_y), dim=-1) + 0.5
     if jitter > 0.0:
-        x = x + jitter * _normal(generator, world_count, particle_count, x)
+        x = x + jitter * normal_draws(generator, (world_count, particle_count, 2), x)
     return x
-
-
-def _uniform(generator: Randomness, world_count: int, count: int, like: Tensor) -> Tensor:
-    if isinstance(generator, WorldRandom):
-        return generator.uniform(count, dtype=like.dtype)
-    return torch.rand(world_count, count, generator=generator, device=like.device, dtype=like.dtype)
-
-
-def _normal(generator: Randomness, world_count: int, count: int, like: Tensor) -> Tensor:
-    if isinstance(generator, WorldRandom):
-        return generator.normal(count, 2, dtype=like.dtype)
-    return torch.randn(
-        world_count, count, 2, generator=generator, device=like.device, dtype=like.dtype
-    )
 
 
 def drawn_indices(

@@ -6,7 +6,6 @@ Nothing here reads a value back from the device, so all of it may be captured in
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -14,7 +13,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError, suggest
-from npa_envs.randomness import Randomness, WorldRandom, check_generator
+from npa_envs.randomness import Randomness, WorldRandom, check_generator, normal_draws
 from npa_envs.sph import world_mean
 from npa_envs.sph.checks import DTYPES, check_dense, checked_number
 from npa_envs.tasks.checks import is_real, is_whole
@@ -123,9 +122,9 @@ def damage_worlds(
     if not 0 <= extent <= torch.finfo(x.dtype).max:
         raise NPAError(f"the size of a damage must be finite and at least 0, got {extent}: try 0.1")
     if kind == "noise":
-        return x + extent * _normal(x, x.shape, generator), s
+        return x + extent * normal_draws(generator, x.shape, x), s
     if kind == "cut":
-        normal = _normal(x, (len(x), x.shape[2]), generator)
+        normal = normal_draws(generator, (len(x), x.shape[2]), x)
         return cut(x, s, centre=world_mean(x), normal=normal, gap=extent)
     centre = random_particle(x, generator)
     if kind == "clump":
@@ -242,25 +241,6 @@ def clump(
     share = _per_world("factor", factor, x, highest=1.0)
     pulled = x + share * (centre[:, None] - x)
     return torch.where(inside[..., None], pulled, x), s
-
-
-def _normal(x: Tensor, shape: Sequence[int], generator: Randomness | None) -> Tensor:
-    if isinstance(generator, WorldRandom):
-        return generator.normal(*shape[1:], dtype=x.dtype)
-    return torch.randn(tuple(shape), generator=generator, device=x.device, dtype=x.dtype)
-
-
-def uniform(x: Tensor, shape: Sequence[int], generator: Randomness | None) -> Tensor:
-    """Return uniform numbers in [0, 1) of the dtype and on the device of `x`.
-
-    Args:
-        x: Particle positions of the worlds.
-        shape: Shape, worlds first.
-        generator: Where they come from; None is torch's own.
-    """
-    if isinstance(generator, WorldRandom):
-        return generator.uniform(*shape[1:], dtype=x.dtype)
-    return torch.rand(tuple(shape), generator=generator, device=x.device, dtype=x.dtype)
 
 
 def _inside_ball(x: Tensor, centre: Tensor, radius: float | Tensor) -> Tensor:

@@ -6,9 +6,9 @@ from typing import Protocol
 
 from torch import Tensor
 
-from npa_envs.randomness import Randomness
+from npa_envs.randomness import Randomness, uniform_draws
 from npa_envs.sph import world_mean
-from npa_envs.tasks.damage import clump, cut, erase_state, random_particle, uniform
+from npa_envs.tasks.damage import clump, cut, erase_state, random_particle
 from npa_envs.tasks.strays import scatter, tear
 
 SHARE = 0.25
@@ -56,12 +56,12 @@ def hurt(
         s = erase_state(x, s, centre=centre, radius=damage.damage_radius)
     if damage.clump_radius > 0.0:
         centre = random_particle(x, generator)
-        hit = (uniform(x, (len(x), 1), generator)[:, 0] < SHARE).to(x.dtype)
+        hit = (uniform_draws(generator, (len(x), 1), x)[:, 0] < SHARE).to(x.dtype)
         x, s = clump(x, s, centre=centre, radius=damage.clump_radius * hit, factor=1.0)
     if damage.cut_gap > 0.0:
         # Directions need not be spread evenly, and of a zero vector nothing is cut.
-        normal = 2.0 * uniform(x, (len(x), x.shape[2]), generator) - 1.0
-        hit = (uniform(x, (len(x), 1), generator)[:, 0] < SHARE).to(x.dtype)
+        normal = 2.0 * uniform_draws(generator, (len(x), x.shape[2]), x) - 1.0
+        hit = (uniform_draws(generator, (len(x), 1), x)[:, 0] < SHARE).to(x.dtype)
         x, s = cut(x, s, centre=world_mean(x), normal=normal, gap=damage.cut_gap * hit)
     if damage.flake_radius > 0.0:
         x = tear(x, radius=damage.flake_radius, chance=SHARE, generator=generator)

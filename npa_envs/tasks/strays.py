@@ -9,8 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from npa_envs.randomness import Randomness, check_generator
-from npa_envs.tasks.damage import random_particle, uniform
+from npa_envs.randomness import Randomness, check_generator, uniform_draws
+from npa_envs.tasks.damage import random_particle
 from npa_envs.tasks.seeds import uniform_ball
 
 NEAREST, FARTHEST = 2.0, 4.0
@@ -33,7 +33,7 @@ def scatter(x: Tensor, *, share: float, generator: Randomness | None = None) -> 
     """
     world_count, particle_count, space_dim = x.shape
     check_generator(generator, x.device, world_count)
-    chance = uniform(x, (world_count, particle_count, 1), generator)
+    chance = uniform_draws(generator, (world_count, particle_count, 1), x)
     ball = uniform_ball(
         world_count, particle_count, space_dim, 1.0,
         generator=generator, device=x.device, dtype=x.dtype,
@@ -59,7 +59,7 @@ def tear(x: Tensor, *, radius: float, chance: float, generator: Randomness | Non
     """
     world_count, _, space_dim = x.shape
     centre = random_particle(x, generator)
-    draws = uniform(x, (world_count, 2), generator)
+    draws = uniform_draws(generator, (world_count, 2), x)
     reach = torch.where(draws[:, :1] < chance, radius * draws[:, 1:], -1.0)
     place = uniform_ball(
         world_count, 1, space_dim, 1.0, generator=generator, device=x.device, dtype=x.dtype
