@@ -195,6 +195,31 @@ def test_runs_are_spread_over_devices_and_leave_their_records(tmp_path, child):
     assert not list(tmp_path.rglob("request.json"))
 
 
+def test_on_gpus_the_next_process_gets_ready_and_waits_for_its_turn(tmp_path, child):
+    # Each says that it is there, and how many were, beside itself, when it had done its work.
+    child(
+        "(folder / 'there').touch(); sys.stdin.read(1)\n"
+        "others = lambda: len(list(folder.parent.glob('.seed-*/there'))) - 1\n"
+        "until = time.time() + (30 if seed < 2 and request['device'] != 'cpu' else 0.5)\n"
+        "while not others() and time.time() < until: time.sleep(0.01)\n"
+        "(folder / 'others').write_text(str(others()))"
+    )
+    made = plan(methods=["one"], seeds=(0, 1, 2))
+    for device, beside in {"cuda:0": "110", "cpu": "000"}.items():
+        folder = tmp_path / device
+        run_jobs(made, made.jobs(), folder, Places((device,)))
+        found = [(folder / job.folder / "others").read_text() for job in made.jobs()]
+        assert "".join(found) == beside
+
+
+def test_processes_that_wait_leave_nothing_when_the_time_is_over(tmp_path, child):
+    child("sys.stdin.read(1); time.sleep(0.3)")
+    made, seen = plan(), []
+    run_jobs(made, made.jobs(), tmp_path, Places(("cuda",)), max_seconds=0.2, written=seen.append)
+    assert [one.job for one in seen] == made.jobs()[:1]
+    assert not list(tmp_path.rglob(".seed*"))
+
+
 def test_a_process_that_dies_is_recorded_the_others_go_on_and_it_is_run_again(tmp_path, child):
     child("if seed == 0: print('out of luck', flush=True); import os; os._exit(3)")
     made, seen = plan(methods=["one"]), []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import time
@@ -18,10 +19,10 @@ from npa_envs.agents.comparison.pictures import PICTURE, final_picture
 from npa_envs.agents.comparison.plan import Job
 from npa_envs.agents.comparison.record import REQUEST, Point, RunRecord, Status
 from npa_envs.agents.evaluation import Episodes, evaluate_policy
-from npa_envs.agents.learning import train
+from npa_envs.agents.learning import method_options, train
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Budget, Entry
-from npa_envs.errors import DivergedError
+from npa_envs.errors import DivergedError, NPAError
 from npa_envs.render import write_png
 
 FIRST_TEST_SEED = 2_000_000
@@ -75,6 +76,17 @@ class Request:
         )
 
 
+def prepare(folder: Path) -> None:
+    """Load what `request.json` in a folder will need, without a use of its device.
+
+    Args:
+        folder: The run's folder.
+    """
+    # What is missing is told by `run`, in the record.
+    with contextlib.suppress(NPAError):
+        method_options(_request(folder).job.method)
+
+
 def run(folder: Path) -> None:
     """Do what `request.json` in a folder asks for; leave the record, the rules and a picture there.
 
@@ -83,8 +95,7 @@ def run(folder: Path) -> None:
     Args:
         folder: The run's folder.
     """
-    held = json.loads((folder / REQUEST).read_text("utf-8"))
-    request = Request(**held | {"job": Job(**held["job"])})
+    request = _request(folder)
     torch.set_num_threads(request.threads)
     begin = time.perf_counter()
     curve: list[Point] = []
@@ -108,6 +119,11 @@ def run(folder: Path) -> None:
             endings=dict(Counter(episodes.endings)),
         )
     record.write(folder)
+
+
+def _request(folder: Path) -> Request:
+    held = json.loads((folder / REQUEST).read_text("utf-8"))
+    return Request(**held | {"job": Job(**held["job"])})
 
 
 def _learn(request: Request, folder: Path, on_entry: Callable[[Entry], None]) -> Episodes:

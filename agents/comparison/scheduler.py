@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
@@ -25,7 +26,11 @@ from npa_envs.agents.comparison.record import (
 from npa_envs.files import write_text
 
 PROGRAM = (sys.executable, "-m", "npa_envs.agents.comparison")
-"""What a run's process is, before the folder of the run; it ends when its input does."""
+"""What a run's process is, before the folder of the run: it gets ready, begins at a byte of its
+input, and ends when its input does."""
+
+BEGIN = b"g"
+"""The byte."""
 
 LOOK_SECONDS = 0.1
 """Pause between two looks at the processes [s]."""
@@ -45,6 +50,11 @@ class Places:
     threads: int = 1
     """CPU threads of each."""
 
+    @property
+    def ahead(self) -> bool:
+        """Whether the next process gets ready during a run: not on CPUs, which it would slow."""
+        return not any(name.startswith("cpu") for name in self.devices)
+
 
 @dataclass(frozen=True)
 class _Process:
@@ -53,6 +63,20 @@ class _Process:
     folder: Path
     process: subprocess.Popen[bytes]
     begin: float
+
+    def go(self) -> None:
+        """Let it begin."""
+        assert self.process.stdin is not None, "asked for at its start"
+        # One that has died is found dead, and recorded, by whoever looks next.
+        with contextlib.suppress(BrokenPipeError):
+            self.process.stdin.write(BEGIN)
+            self.process.stdin.flush()
+
+    def end(self) -> None:
+        """End it, and leave nothing of it."""
+        self.process.terminate()
+        self.process.communicate()
+        shutil.rmtree(self.folder, ignore_errors=True)
 
 
 def held_records(plan: Plan, folder: Path) -> dict[Job, RunRecord]:
@@ -85,8 +109,9 @@ def run_jobs(
 ) -> None:
     """Run jobs, each in a process of its own; one that fails is recorded, and the others go on.
 
-    A run's results appear in its folder all at once, when it is over. If this is interrupted, its
-    processes are ended and leave nothing.
+    On GPUs the process of the next run is started early, and waits until its turn comes. A run's
+    results appear in its folder all at once, when it is over. If this is interrupted, its processes
+    are ended and leave nothing.
 
     Args:
         plan: What they belong to.
@@ -102,26 +127,38 @@ def run_jobs(
     """
     waiting = list(reversed(jobs))
     running: list[_Process] = []
+    ready: dict[int, _Process] = {}
     free = list(reversed(range(places.jobs)))
+
+    def start(place: int) -> _Process:
+        return _start(plan, waiting.pop(), folder, places, place, command)
+
     for job in jobs:
         _sweep(folder, job)
     begin = time.perf_counter()
     try:
-        while waiting or running:
+        while waiting or ready or running:
             if time.perf_counter() - begin >= max_seconds:
                 waiting.clear()
-            while waiting and free:
-                running.append(_start(plan, waiting.pop(), folder, places, free.pop(), command))
+                while ready:
+                    ready.popitem()[1].end()
+            for place in reversed(free[:]):
+                one = ready.pop(place, None) or (start(place) if waiting else None)
+                if one is not None:
+                    free.remove(place)
+                    running.append(one)
+                    one.go()
+            for place in range(places.jobs if places.ahead else 0):
+                if waiting and place not in ready:
+                    ready[place] = start(place)
             for one in [one for one in running if one.process.poll() is not None]:
                 running.remove(one)
                 free.append(one.place)
                 written(_finish(plan, one, folder, command))
             time.sleep(LOOK_SECONDS if running else 0.0)
     finally:
-        for one in running:
-            one.process.terminate()
-            one.process.communicate()
-            shutil.rmtree(one.folder, ignore_errors=True)
+        for one in [*running, *ready.values()]:
+            one.end()
 
 
 def _sweep(folder: Path, job: Job) -> None:
