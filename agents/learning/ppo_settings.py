@@ -13,7 +13,7 @@ from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.errors import NPAError, suggest
 from npa_envs.tasks.checks import check_fraction, check_non_negative, check_positive
 
-FRESH = {"learning_rate": 1e-3, "initial_std": 0.3, "critic_rounds": 0, "target_kl": 0.2}
+FRESH = {"learning_rate": 1e-3, "initial_std": 0.2, "critic_rounds": 0, "target_kl": 0.2}
 """What options are where they are None, with fresh rules."""
 
 WARM = {"learning_rate": 1e-4, "initial_std": 0.05, "critic_rounds": 4, "target_kl": 0.05}
@@ -52,7 +52,7 @@ class Settings:
     critic_learning_rate: float = 1e-3
     """The same for the critic."""
 
-    gamma: float = 0.7
+    gamma: float = 0.5
     """Discount of a reward one step later (dimensionless)."""
 
     gae_lambda: float = 0.9
@@ -73,7 +73,7 @@ class Settings:
     this from those that were played [nats]; None: 0.2, or 0.05 with a `start`."""
 
     initial_std: float | None = None
-    """Standard deviation of every action column at first; None: 0.3, or 0.05 with a `start`."""
+    """Standard deviation of every action column at first; None: 0.2, or 0.05 with a `start`."""
 
     critic_rounds: int | None = None
     """Rounds in which the critic learns alone; None: 0, or 4 with a `start`."""

@@ -36,7 +36,7 @@ class SB3Settings:
     """Adam's step at the start, from which it falls to zero over the budget; None: 0.001, or 0.0001
     with a `start`."""
 
-    gamma: float = 0.7
+    gamma: float = 0.5
     """Discount of a reward one step later (dimensionless)."""
 
     gae_lambda: float = 0.9
@@ -57,7 +57,7 @@ class SB3Settings:
     played [nats]; None: 0.2, or 0.05 with a `start`."""
 
     initial_std: float | None = None
-    """Standard deviation of every action column at first; None: 0.3, or 0.05 with a `start`."""
+    """Standard deviation of every action column at first; None: 0.2, or 0.05 with a `start`."""
 
     critic_rounds: int | None = None
     """Rounds in which the critic learns alone; None: 0, or 4 with a `start`."""

@@ -37,7 +37,7 @@ class RuleActorCritic(ActorCriticPolicy):
         lr_schedule: Any,
         *,
         rules: RuleSet,
-        initial_std: float = 0.3,
+        initial_std: float = 0.2,
         critic: CriticKind = "particle",
         **keywords: Any,
     ) -> None:
