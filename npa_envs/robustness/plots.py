@@ -21,6 +21,9 @@ DRAWN = {
 BAND = 0.15
 """Opacity of the band from the best seed to the worst."""
 
+FEW_DECADES = 100.0
+"""Axes whose ends are fewer times apart have marks within decades."""
+
 
 def pictures(records: Sequence[RuleRecord]) -> dict[str, bytes]:
     """Return PNG files by their tasks' names. Needs matplotlib.
@@ -60,11 +63,15 @@ def _draw_courses(panel: Any, record: RuleRecord) -> None:
         columns = [course.ratios(place) for place in range(len(course.steps))]
         _draw_band(panel, course.steps, columns, colour, course.damage)
     panel.axhline(RECOVERED, color="black", lw=0.7, ls=":")
-    panel.set_xscale("symlog", linthresh=max(1, record.courses[0].steps[1]))
+    steps = record.courses[0].steps
+    panel.set_xscale("symlog", linthresh=max(1, steps[1]))
+    panel.set_xlim(0, steps[-1])
+    ticks = [step for step in steps if step & (step - 1) == 0]
+    panel.set_xticks(ticks, [str(step) for step in ticks], rotation=45)
     panel.set_yscale("log")
     panel.set_ylabel("loss over the twin's", fontsize=8)
     panel.set_title(record.rule, fontsize=9, loc="left")
-    panel.tick_params(labelsize=7, which="both")
+    _mark(panel)
 
 
 def _draw_responses(panel: Any, record: RuleRecord, condition: str) -> None:
@@ -77,8 +84,19 @@ def _draw_responses(panel: Any, record: RuleRecord, condition: str) -> None:
     panel.set(xscale="log", yscale="log")
     panel.set_ylabel("loss", fontsize=8)
     panel.set_xticks(values, [f"{value:.2g}" for value in values], rotation=45)
+    _mark(panel)
+
+
+def _mark(panel: Any) -> None:
+    """Mark 1, 2 and 5 of each decade, or whole decades where there are many."""
+    from matplotlib.ticker import LogLocator
+
+    low, high = panel.get_ylim()
+    fine = high < FEW_DECADES * low
     panel.minorticks_off()
-    panel.tick_params(labelsize=7, which="both")
+    panel.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if fine else (1.0,)))
+    panel.yaxis.set_major_formatter("{x:g}")
+    panel.tick_params(labelsize=7)
 
 
 def _draw_band(
