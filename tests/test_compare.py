@@ -439,7 +439,7 @@ def test_a_picture_shows_the_end_of_the_episode_and_not_the_next_start(name, dev
     assert not np.array_equal(last, shown)
 
 
-def test_a_strip_has_a_row_for_each_method_and_room_for_what_failed(tmp_path):
+def test_a_strip_has_a_column_for_each_method_and_room_for_what_failed(tmp_path):
     done, failed = record("ppo", 0, (1.0,)), record("zero", 0, status="failed")
     folder = tmp_path / done.job.folder
     folder.mkdir(parents=True)
@@ -448,11 +448,11 @@ def test_a_strip_has_a_row_for_each_method_and_room_for_what_failed(tmp_path):
     assert path.name == "grown_growth_seconds.png"
     with Image.open(path) as strip:
         pixels = np.asarray(strip.convert("RGB"))
-    height, middle = pixels.shape[0], pixels.shape[1] // 2
-    assert pixels.shape[1] < 2 * SIZE
-    assert height > 2 * SIZE
-    assert (pixels[height // 4 - 10, middle] == 50).all()
-    assert (pixels[3 * height // 4 - 10, middle] == 255).all()
+    middle, width = pixels.shape[0] // 2, pixels.shape[1]
+    assert pixels.shape[0] < 2 * SIZE
+    assert width > 2 * SIZE
+    assert (pixels[middle, width // 4] == 50).all()
+    assert (pixels[middle, 3 * width // 4] == 255).all()
 
 
 # The whole command

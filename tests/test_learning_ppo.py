@@ -109,7 +109,7 @@ def test_more_steps_bring_a_return_of_more_than_half_of_what_the_gradient_finds(
         episode_steps=32,
         num_envs=16,
     )
-    trained = train("ppo", longer, Budget(particle_steps=1_500_000), 0, entries=1, gamma=0.5)
+    trained = train("ppo", longer, Budget(particle_steps=1_500_000), 0, entries=1)
     assert trained.log[-1].mean_return > 1.2
 
 

@@ -1,4 +1,4 @@
-"""What each method grew: the last picture of a held-out episode, a row for each method."""
+"""What each method grew: the last picture of a held-out episode, a column for each method."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def final_picture(
 
 
 def write_strips(records: Sequence[RunRecord], folder: Path) -> list[Path]:
-    """Write a filmstrip for each task and axis: a row for each method, a column for each seed.
+    """Write a filmstrip for each task and axis: a column for each method, a row for each seed.
 
     Args:
         records: Those of the runs.
@@ -86,12 +86,12 @@ def _write_strip(records: Sequence[RunRecord], folder: Path, path: Path) -> None
     methods = list(dict.fromkeys(method for method, _ in found))
     seeds = sorted({seed for _, seed in found})
     frames, captions = [], []
-    for method in methods:
-        for seed in seeds:
+    for seed in seeds:
+        for method in methods:
             record = found.get((method, seed))
             frames.append(_frame(record, folder))
             captions.append(_caption(method, seed, record))
-    write_filmstrip(path, frames, captions, columns=len(seeds))
+    write_filmstrip(path, frames, captions, columns=len(methods))
 
 
 def _frame(record: RunRecord | None, folder: Path) -> NDArray[np.uint8]:
