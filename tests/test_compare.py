@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import os
 import subprocess
 import sys
 import time
@@ -39,6 +40,8 @@ from pathlib import Path
 folder = Path(sys.argv[1])
 request = json.loads((folder / "request.json").read_text())
 seed = request["job"]["seed"]
+{before}
+device = sys.stdin.readline().strip()
 {body}
 record = {{
     "job": request["job"], "facts": request["facts"], "status": "done", "error": "",
@@ -47,7 +50,11 @@ record = {{
 }}
 (folder / "run.json").write_text(json.dumps(record))
 """
-"""A process that says at once what it has reached, after something that tests put in."""
+"""A process that says at once what it has reached; tests put in what it does until it is told where
+to run, and then."""
+
+WRITE_PID = "import os; Path('{}', f'pid-{{os.getpid()}}').write_text(str(os.getpid()))"
+"""Code of a process that writes its number into a folder."""
 
 
 def plan(**changes) -> Plan:
@@ -74,11 +81,25 @@ def points(*pairs: tuple[float, float]) -> tuple[Point, ...]:
 def child(monkeypatch):
     """Sets what the processes of runs do before they leave their records."""
 
-    def set_body(body: str) -> None:
-        monkeypatch.setattr(scheduler, "PROGRAM", (sys.executable, "-c", CHILD.format(body=body)))
+    def set_body(body: str, before: str = "") -> None:
+        code = CHILD.format(body=body, before=before)
+        monkeypatch.setattr(scheduler, "PROGRAM", (sys.executable, "-c", code))
 
     set_body("")
     return set_body
+
+
+def pids(folder) -> list[int]:
+    """Numbers of processes that wrote them below a folder."""
+    return [int(path.read_text()) for path in folder.glob("pid-*")]
+
+
+def is_alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
 
 
 # Plans
@@ -179,7 +200,7 @@ def test_records_of_other_settings_and_other_files_are_refused(tmp_path):
 
 
 def test_runs_are_spread_over_devices_and_leave_their_records(tmp_path, child):
-    child("Path(folder / 'place.txt').write_text(request['device'])")
+    child("Path(folder / 'place.txt').write_text(device)")
     made, seen = plan(seeds=(0, 1, 2)), []
     places = Places(("cpu", "other"), jobs=2)
     run_jobs(made, made.jobs(), tmp_path, places, command="it", written=seen.append)
@@ -196,28 +217,46 @@ def test_runs_are_spread_over_devices_and_leave_their_records(tmp_path, child):
 
 
 def test_on_gpus_the_next_process_gets_ready_and_waits_for_its_turn(tmp_path, child):
-    # Each says that it is there, and how many were, beside itself, when it had done its work.
+    # Each says that it is there; how many runs were over when it was told to begin; and how many
+    # others were there when it had done its work.
     child(
-        "(folder / 'there').touch(); sys.stdin.read(1)\n"
+        "over = len(list(folder.parent.glob('seed-*')))\n"
         "others = lambda: len(list(folder.parent.glob('.seed-*/there'))) - 1\n"
-        "until = time.time() + (30 if seed < 2 and request['device'] != 'cpu' else 0.5)\n"
+        "until = time.time() + (30 if seed < 2 and device != 'cpu' else 0.5)\n"
         "while not others() and time.time() < until: time.sleep(0.01)\n"
-        "(folder / 'others').write_text(str(others()))"
+        "(folder / 'seen').write_text(f'{over}{others()}')",
+        before="(folder / 'there').touch()",
     )
     made = plan(methods=["one"], seeds=(0, 1, 2))
-    for device, beside in {"cuda:0": "110", "cpu": "000"}.items():
+    for device, seen in {"cuda:0": ["01", "11", "20"], "cpu": ["00", "10", "20"]}.items():
         folder = tmp_path / device
         run_jobs(made, made.jobs(), folder, Places((device,)))
-        found = [(folder / job.folder / "others").read_text() for job in made.jobs()]
-        assert "".join(found) == beside
+        assert [(folder / job.folder / "seen").read_text() for job in made.jobs()] == seen
+
+
+def test_no_place_stays_free_while_a_process_waits(tmp_path, child):
+    child("time.sleep(0 if seed else 3)")
+    made, seen = plan(methods=["one"], seeds=(0, 1, 2, 3)), []
+    run_jobs(made, made.jobs(), tmp_path, Places(("cuda:0", "cuda:1"), 2), written=seen.append)
+    assert [one.job.seed for one in seen] == [1, 2, 3, 0]
 
 
 def test_processes_that_wait_leave_nothing_when_the_time_is_over(tmp_path, child):
-    child("sys.stdin.read(1); time.sleep(0.3)")
+    child("time.sleep(0.3)", before=WRITE_PID.format(tmp_path))
     made, seen = plan(), []
     run_jobs(made, made.jobs(), tmp_path, Places(("cuda",)), max_seconds=0.2, written=seen.append)
     assert [one.job for one in seen] == made.jobs()[:1]
     assert not list(tmp_path.rglob(".seed*"))
+    assert not any(map(is_alive, pids(tmp_path)))
+
+
+def test_a_process_that_dies_while_it_waits_is_recorded_and_the_others_go_on(tmp_path, child):
+    child("time.sleep(0 if seed else 1)", before="if seed == 1: import os; os._exit(3)")
+    made, seen = plan(methods=["one"], seeds=(0, 1, 2)), []
+    run_jobs(made, made.jobs(), tmp_path, Places(("cuda",)), written=seen.append)
+    assert [one.status for one in seen] == ["done", "failed", "done"]
+    assert "ended with code 3" in seen[1].error
+    assert seen[1].seconds < 1.0
 
 
 def test_a_process_that_dies_is_recorded_the_others_go_on_and_it_is_run_again(tmp_path, child):
@@ -234,16 +273,21 @@ def test_a_process_that_dies_is_recorded_the_others_go_on_and_it_is_run_again(tm
     assert list(held_records(made, tmp_path)) == made.jobs()
 
 
-def test_an_interrupted_comparison_ends_its_processes_and_goes_on_where_it_was(tmp_path, child):
-    child("time.sleep(60 if seed else 0)")
-    made = plan(methods=["one"])
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
+def test_an_interrupted_comparison_ends_its_processes_and_goes_on_where_it_was(
+    tmp_path, child, device
+):
+    child("time.sleep(60 if seed else 0)", before=WRITE_PID.format(tmp_path))
+    made = plan(methods=["one"], seeds=(0, 1, 2, 3))
 
     def interrupt(_):
         raise KeyboardInterrupt
 
     begin = time.perf_counter()
     with pytest.raises(KeyboardInterrupt):
-        run_jobs(made, made.jobs(), tmp_path, Places(("cpu",), jobs=2), written=interrupt)
+        run_jobs(made, made.jobs(), tmp_path, Places((device,), jobs=2), written=interrupt)
+    assert len(pids(tmp_path)) >= 2
+    assert not any(map(is_alive, pids(tmp_path)))
     assert time.perf_counter() - begin < 30.0
     held = held_records(made, tmp_path)
     assert list(held) == made.jobs()[:1]
@@ -269,17 +313,21 @@ def test_no_run_begins_once_the_time_is_over(tmp_path, child):
     assert [one.job for one in seen] == made.jobs()[:1]
 
 
-def test_the_process_of_a_run_ends_with_the_comparison(tmp_path):
+@pytest.mark.parametrize("told", [b"", b"cpu\n"], ids=["that waits", "that learns"])
+def test_the_process_of_a_run_ends_with_the_comparison(tmp_path, told):
     made = make_plan(
         CompareOptions(quick=True, seconds=600.0, tasks=("mixing",), methods=("random", "gradient"))
     )
     job = next(job for job in made.jobs() if job.method == "gradient")
-    request = {"job": dataclasses.asdict(job), "facts": made.facts(job), "device": "cpu"}
+    request = {"job": dataclasses.asdict(job), "facts": made.facts(job)}
     (tmp_path / "request.json").write_text(json.dumps(request))
     process = subprocess.Popen(
         [*scheduler.PROGRAM, str(tmp_path)], stdin=subprocess.PIPE, stderr=subprocess.PIPE
     )
     try:
+        process.stdin.write(told)
+        process.stdin.flush()
+        # Told, it would learn for ten minutes.
         _, said = process.communicate(timeout=100)
     finally:
         process.kill()
@@ -520,8 +568,8 @@ def test_a_policy_whose_actions_are_not_finite_has_diverged(tmp_path, monkeypatc
     for name in ("morphogenesis2d", "mixing"):
         made = make_plan(CompareOptions(quick=True, tasks=(name,), methods=("ppo",)))
         job = made.jobs()[0]
-        request = {"job": dataclasses.asdict(job), "facts": made.facts(job), "device": "cpu"}
+        request = {"job": dataclasses.asdict(job), "facts": made.facts(job)}
         (tmp_path / "request.json").write_text(json.dumps(request))
-        one_run.run(tmp_path)
+        one_run.run(tmp_path, "cpu")
         found = read_record(tmp_path, made.facts(job))
         assert (found.status, "must be finite" in found.error) == ("diverged", True)

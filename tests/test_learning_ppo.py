@@ -28,7 +28,7 @@ from npa_envs.agents.learning.advantages import (
 from npa_envs.agents.learning.critics import Critic
 from npa_envs.agents.learning.gaussian import GaussianRules
 from npa_envs.agents.learning.ppo import Learner
-from npa_envs.agents.learning.ppo_settings import Settings, filled
+from npa_envs.agents.learning.ppo_settings import Settings, filled, noise_left
 from npa_envs.errors import NPAError
 
 HEART = Problem(
@@ -454,6 +454,7 @@ def test_rows_that_are_cut_off_are_paid_what_the_critic_still_expects():
         ({"ratio": "both"}, r"ratio must be a known word, got 'both': known: particle, world"),
         ({"credit": "particle", "ratio": "world"}, "credit='particle' needs ratio='particle'"),
         ({"gamma": 0.0}, r"gamma must lie in \(0, 1\], got 0.0"),
+        ({"last_noise": 0.0}, r"last_noise must lie in \(0, 1\], got 0.0"),
         ({"minibatches": 0}, "minibatches must be a whole number of at least 1"),
         ({"worlds": 0}, "worlds must be a whole number of at least 1"),
     ],
@@ -473,7 +474,34 @@ def test_options_are_known_by_name_and_depend_on_a_start_where_they_are_none():
     fresh, warm = filled(Settings(), None), filled(Settings(), HEART.new_rules(0))
     assert fresh.initial_std > warm.initial_std
     assert fresh.learning_rate > warm.learning_rate
+    assert fresh.last_noise < warm.last_noise == 1.0
     assert filled(Settings(initial_std=0.7), None).initial_std == 0.7
+
+
+def test_noise_is_kept_for_half_of_the_budget_and_then_falls_by_equal_factors():
+    shares = [1.0, 0.75, 0.5, 0.25, 0.0]
+    assert [noise_left(left, 0.25) for left in shares] == [1.0, 1.0, 1.0, 0.5, 0.25]
+    assert [noise_left(left, 1.0) for left in shares] == [1.0] * 5
+
+
+@EVERY_FORM
+def test_in_every_form_the_noise_falls_towards_the_end(form, monkeypatch):
+    pytest.importorskip("stable_baselines3")
+    done = []
+    scale = GaussianRules.scale_noise
+
+    def spy(actor, factor):
+        before = actor.log_std.exp()
+        scale(actor, factor)
+        torch.testing.assert_close(actor.log_std.exp(), factor * before)
+        done.append(factor)
+
+    monkeypatch.setattr(GaussianRules, "scale_noise", spy)
+    run(form, HEART, 8 * ROUND, last_noise=0.1, critic_rounds=0)
+    left = np.cumprod(done)
+    assert left[:4] == pytest.approx(1.0)
+    assert (np.diff(left[4:]) < 0.0).all()
+    assert 0.1 <= left[-1] < 0.25
 
 
 def test_species_as_rows_cannot_be_paid_by_worlds():

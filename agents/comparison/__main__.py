@@ -1,7 +1,7 @@
 """One run of a comparison as a process: `python -m npa_envs.agents.comparison FOLDER`.
 
-It gets ready, waits for a byte on its input, then does what is asked for; it ends when its input
-does.
+It gets ready, waits for a line on its input that names a device, and does there what is asked for;
+it ends when its input does.
 """
 
 from __future__ import annotations
@@ -10,28 +10,28 @@ import os
 import sys
 import threading
 from pathlib import Path
+from queue import SimpleQueue
 
 
 def main(folder: Path) -> None:
-    """Do what is asked for in a folder once it is told to, unless the comparison ends before.
+    """Do what is asked for in a folder once a device is named, unless the comparison ends before.
 
     Args:
         folder: The run's folder.
     """
-    told = threading.Event()
-    threading.Thread(target=_listen, args=(told,), daemon=True).start()
+    lines: SimpleQueue[str] = SimpleQueue()
+    threading.Thread(target=_listen, args=(lines,), daemon=True).start()
     # Not before, as it takes seconds.
     from npa_envs.agents.comparison.run import prepare, run
 
     prepare(folder)
-    told.wait()
-    run(folder)
+    run(folder, lines.get())
 
 
-def _listen(told: threading.Event) -> None:
-    """Set the event at the first byte; end the process once the pipe has no other end."""
-    while os.read(sys.stdin.fileno(), 1):
-        told.set()
+def _listen(lines: SimpleQueue[str]) -> None:
+    """Pass lines on, and end the process once the pipe has no other end."""
+    for line in sys.stdin:
+        lines.put(line.strip())
     os._exit(1)
 
 

@@ -22,7 +22,7 @@ from npa_envs.agents.evaluation import Episodes, evaluate_policy
 from npa_envs.agents.learning import method_options, train
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Budget, Entry
-from npa_envs.errors import DivergedError, NPAError
+from npa_envs.errors import DivergedError
 from npa_envs.render import write_png
 
 FIRST_TEST_SEED = 2_000_000
@@ -37,8 +37,6 @@ class Request:
     """Which run."""
     facts: dict[str, Any]
     """What its figures follow from: problem, budget, options, episodes, and more."""
-    device: str
-    """Where it runs."""
     threads: int = 1
     """CPU threads."""
     command: str = ""
@@ -82,25 +80,26 @@ def prepare(folder: Path) -> None:
     Args:
         folder: The run's folder.
     """
-    # What is missing is told by `run`, in the record.
-    with contextlib.suppress(NPAError):
+    # Whatever breaks here breaks in `run` as well, which puts it into the record.
+    with contextlib.suppress(Exception):
         method_options(_request(folder).job.method)
 
 
-def run(folder: Path) -> None:
+def run(folder: Path, device: str) -> None:
     """Do what `request.json` in a folder asks for; leave the record, the rules and a picture there.
 
     Whatever is raised is recorded, so that other runs can go on.
 
     Args:
         folder: The run's folder.
+        device: Where to run.
     """
     request = _request(folder)
     torch.set_num_threads(request.threads)
     begin = time.perf_counter()
     curve: list[Point] = []
     try:
-        episodes = _learn(request, folder, lambda entry: curve.append(_point(entry)))
+        episodes = _learn(request, folder, device, lambda entry: curve.append(_point(entry)))
     except Exception as error:
         # Whatever breaks here is what the table has to say of the method.
         traceback.print_exc()
@@ -126,7 +125,9 @@ def _request(folder: Path) -> Request:
     return Request(**held | {"job": Job(**held["job"])})
 
 
-def _learn(request: Request, folder: Path, on_entry: Callable[[Entry], None]) -> Episodes:
+def _learn(
+    request: Request, folder: Path, device: str, on_entry: Callable[[Entry], None]
+) -> Episodes:
     """Learn, write what was learned, and return the held-out episodes."""
     problem, job, facts = request.problem, request.job, request.facts
     trained = train(
@@ -134,7 +135,7 @@ def _learn(request: Request, folder: Path, on_entry: Callable[[Entry], None]) ->
         problem,
         request.budget,
         job.seed,
-        device=request.device,
+        device=device,
         on_entry=on_entry,
         **facts["options"],
     )
@@ -142,9 +143,9 @@ def _learn(request: Request, folder: Path, on_entry: Callable[[Entry], None]) ->
         trained.rules.save(folder)
     seeds = range(FIRST_TEST_SEED, FIRST_TEST_SEED + facts["episodes"])
     # Worlds of their own: what a method changed in its environment does not reach them.
-    envs = problem.make_envs(min(len(seeds), problem.num_envs), device=request.device)
+    envs = problem.make_envs(min(len(seeds), problem.num_envs), device=device)
     episodes = evaluate_policy(envs, trained.policy, seeds)
-    picture = final_picture(problem, trained.policy, FIRST_TEST_SEED, device=request.device)
+    picture = final_picture(problem, trained.policy, FIRST_TEST_SEED, device=device)
     write_png(folder / PICTURE, picture)
     return episodes
 

@@ -11,6 +11,7 @@ import shutil
 import subprocess
 import sys
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -26,11 +27,8 @@ from npa_envs.agents.comparison.record import (
 from npa_envs.files import write_text
 
 PROGRAM = (sys.executable, "-m", "npa_envs.agents.comparison")
-"""What a run's process is, before the folder of the run: it gets ready, begins at a byte of its
-input, and ends when its input does."""
-
-BEGIN = b"g"
-"""The byte."""
+"""What a run's process is, before the folder of the run: it gets ready, begins when a line of its
+input names a device, and ends when its input does."""
 
 LOOK_SECONDS = 0.1
 """Pause between two looks at the processes [s]."""
@@ -50,26 +48,38 @@ class Places:
     threads: int = 1
     """CPU threads of each."""
 
+    def device(self, number: int) -> str:
+        """Return the device of one of the processes at once.
+
+        Args:
+            number: Its number, below `jobs`.
+        """
+        return self.devices[number % len(self.devices)]
+
     @property
     def ahead(self) -> bool:
         """Whether the next process gets ready during a run: not on CPUs, which it would slow."""
         return not any(name.startswith("cpu") for name in self.devices)
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Process:
     job: Job
-    place: int
     folder: Path
     process: subprocess.Popen[bytes]
-    begin: float
+    begin: float = 0.0
 
-    def go(self) -> None:
-        """Let it begin."""
+    def go(self, device: str) -> None:
+        """Let it begin.
+
+        Args:
+            device: Where it runs.
+        """
         assert self.process.stdin is not None, "asked for at its start"
+        self.begin = time.perf_counter()
         # One that has died is found dead, and recorded, by whoever looks next.
         with contextlib.suppress(BrokenPipeError):
-            self.process.stdin.write(BEGIN)
+            self.process.stdin.write(f"{device}\n".encode())
             self.process.stdin.flush()
 
     def end(self) -> None:
@@ -125,13 +135,11 @@ def run_jobs(
     Raises:
         NPAError: The folder cannot be written to.
     """
-    waiting = list(reversed(jobs))
-    running: list[_Process] = []
-    ready: dict[int, _Process] = {}
-    free = list(reversed(range(places.jobs)))
+    waiting, ready = deque(jobs), deque[_Process]()
+    running: dict[int, _Process] = {}
 
-    def start(place: int) -> _Process:
-        return _start(plan, waiting.pop(), folder, places, place, command)
+    def start() -> _Process:
+        return _start(plan, waiting.popleft(), folder, places, command)
 
     for job in jobs:
         _sweep(folder, job)
@@ -141,23 +149,20 @@ def run_jobs(
             if time.perf_counter() - begin >= max_seconds:
                 waiting.clear()
                 while ready:
-                    ready.popitem()[1].end()
-            for place in reversed(free[:]):
-                one = ready.pop(place, None) or (start(place) if waiting else None)
-                if one is not None:
-                    free.remove(place)
-                    running.append(one)
-                    one.go()
-            for place in range(places.jobs if places.ahead else 0):
-                if waiting and place not in ready:
-                    ready[place] = start(place)
-            for one in [one for one in running if one.process.poll() is not None]:
-                running.remove(one)
-                free.append(one.place)
-                written(_finish(plan, one, folder, command))
+                    ready.pop().end()
+            for number in range(places.jobs):
+                if number not in running and (ready or waiting):
+                    running[number] = ready.popleft() if ready else start()
+                    running[number].go(places.device(number))
+            while places.ahead and waiting and len(ready) < places.jobs:
+                ready.append(start())
+            for number, one in list(running.items()):
+                if one.process.poll() is not None:
+                    del running[number]
+                    written(_finish(plan, one, folder, command))
             time.sleep(LOOK_SECONDS if running else 0.0)
     finally:
-        for one in [*running, *ready.values()]:
+        for one in [*running.values(), *ready]:
             one.end()
 
 
@@ -168,16 +173,13 @@ def _sweep(folder: Path, job: Job) -> None:
         shutil.rmtree(left, ignore_errors=True)
 
 
-def _start(
-    plan: Plan, job: Job, folder: Path, places: Places, place: int, command: str
-) -> _Process:
+def _start(plan: Plan, job: Job, folder: Path, places: Places, command: str) -> _Process:
     target = folder / job.folder
     part = target.parent / f".{target.name}.{secrets.token_hex(4)}"
     part.mkdir(parents=True)
     request = {
         "job": asdict(job),
         "facts": plan.facts(job),
-        "device": places.devices[place % len(places.devices)],
         "threads": places.threads,
         "command": command,
     }
@@ -191,7 +193,7 @@ def _start(
             stderr=output,
             env=environment,
         )
-    return _Process(job, place, part, process, time.perf_counter())
+    return _Process(job, part, process)
 
 
 def _finish(plan: Plan, one: _Process, folder: Path, command: str) -> RunRecord:

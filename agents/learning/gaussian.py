@@ -58,6 +58,15 @@ class GaussianRules(nn.Module):
         """Return the logarithms of the standard deviations of every particle, shape [N, A]."""
         return self.log_std[self.row_species]
 
+    @torch.no_grad()
+    def scale_noise(self, factor: float) -> None:
+        """Multiply all standard deviations.
+
+        Args:
+            factor: By what, above 0 (dimensionless).
+        """
+        self.log_std.add_(math.log(factor))
+
     def sample(
         self, observation: Tensor, generator: torch.Generator | None = None
     ) -> tuple[Tensor, Tensor]:

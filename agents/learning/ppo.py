@@ -23,7 +23,7 @@ from npa_envs.agents.learning.advantages import (
 from npa_envs.agents.learning.critics import Critic
 from npa_envs.agents.learning.gaussian import GaussianRules
 from npa_envs.agents.learning.options import takes_fields_of
-from npa_envs.agents.learning.ppo_settings import Settings, beginning, filled
+from npa_envs.agents.learning.ppo_settings import Settings, beginning, filled, noise_left
 from npa_envs.agents.learning.ppo_worlds import world_count
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Progress
@@ -97,6 +97,8 @@ class Learner:
         self.critic.observe(observation)
         self.rounds = 0
         """Rounds done."""
+        self.noise = 1.0
+        """What is left of the first noise, but for what is learned of it."""
 
     @property
     def round_size(self) -> int:
@@ -152,7 +154,7 @@ class Learner:
         Args:
             batch: The round.
             share_left: Share of the budget that is left; learning rates are this part of what they
-                were at the start.
+                were at the start, and by it the noise of the next round is made less.
         """
         settings = self.settings
         rules_learn = self.rounds >= settings.critic_rounds
@@ -176,6 +178,10 @@ class Learner:
             # All that the host waits for.
             if rules_learn and not bool(near):
                 break
+        assert settings.last_noise is not None, "filled in above"
+        noise = noise_left(share_left, settings.last_noise)
+        self.actor.scale_noise(noise / self.noise)
+        self.noise = noise
 
     def _groups(self, batch: Round) -> list[Round]:
         """Return what is shuffled when rules learn: whole worlds, or each species' particles."""

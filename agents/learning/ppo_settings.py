@@ -13,10 +13,22 @@ from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.errors import NPAError, suggest
 from npa_envs.tasks.checks import check_fraction, check_non_negative, check_positive
 
-FRESH = {"learning_rate": 1e-3, "initial_std": 0.2, "critic_rounds": 0, "target_kl": 0.2}
+FRESH = {
+    "learning_rate": 1e-3,
+    "initial_std": 0.2,
+    "last_noise": 0.25,
+    "critic_rounds": 0,
+    "target_kl": 0.2,
+}
 """What options are where they are None, with fresh rules."""
 
-WARM = {"learning_rate": 1e-4, "initial_std": 0.05, "critic_rounds": 4, "target_kl": 0.05}
+WARM = {
+    "learning_rate": 1e-4,
+    "initial_std": 0.05,
+    "last_noise": 1.0,
+    "critic_rounds": 4,
+    "target_kl": 0.05,
+}
 """The same with rules to begin with: noise, haste and a raw critic would undo what they can do."""
 
 CHOICES = {
@@ -75,6 +87,10 @@ class Settings:
     initial_std: float | None = None
     """Standard deviation of every action column at first; None: 0.2, or 0.05 with a `start`."""
 
+    last_noise: float | None = None
+    """What is left of the standard deviations at the end of the budget, in whose second half they
+    fall (dimensionless); None: 0.25, or 1 with a `start`."""
+
     critic_rounds: int | None = None
     """Rounds in which the critic learns alone; None: 0, or 4 with a `start`."""
 
@@ -103,6 +119,8 @@ class Settings:
         for name in ("clip", "learning_rate", "target_kl", "initial_std"):
             if getattr(self, name) is not None:
                 check_positive(self, float, name)
+        if self.last_noise is not None:
+            check_fraction(self, "last_noise")
         if self.worlds is not None:
             check_positive(self, int, "worlds")
         if self.critic_rounds is not None:
@@ -147,6 +165,19 @@ def filled(settings: Any, start: RuleSet | None) -> Any:
     defaults = FRESH if start is None else WARM
     missing = {k: value for k, value in defaults.items() if getattr(settings, k) is None}
     return replace(settings, **missing)
+
+
+def noise_left(share_left: float, last_noise: float) -> float:
+    """Return what is left of the first noise: all of it until half of the budget is spent.
+
+    What is learned is what is best with noise, and what counts is what it does without: towards the
+    end the two are to be the same. From the middle on it falls by equal factors.
+
+    Args:
+        share_left: Share of the budget that is left.
+        last_noise: What is left of the noise when nothing is.
+    """
+    return last_noise ** max(0.0, 1.0 - 2.0 * share_left)
 
 
 def beginning(problem: Problem, seed: int, start: RuleSet | None) -> RuleSet:

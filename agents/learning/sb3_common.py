@@ -10,7 +10,12 @@ import numpy as np
 import torch
 
 from npa_envs.agents.learning.critics import CriticKind
-from npa_envs.agents.learning.ppo_settings import beginning, check_words, filled
+from npa_envs.agents.learning.ppo_settings import (
+    beginning,
+    check_words,
+    filled,
+    noise_left,
+)
 from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.agents.learning.sb3_imports import PPO, BaseCallback, VecEnv, VecEnvWrapper
@@ -59,6 +64,10 @@ class SB3Settings:
     initial_std: float | None = None
     """Standard deviation of every action column at first; None: 0.2, or 0.05 with a `start`."""
 
+    last_noise: float | None = None
+    """What is left of the standard deviations at the end of the budget, in whose second half they
+    fall (dimensionless); None: 0.25, or 1 with a `start`."""
+
     critic_rounds: int | None = None
     """Rounds in which the critic learns alone; None: 0, or 4 with a `start`."""
 
@@ -81,6 +90,8 @@ class SB3Settings:
         for name in ("learning_rate", "target_kl", "initial_std"):
             if getattr(self, name) is not None:
                 check_positive(self, float, name)
+        if self.last_noise is not None:
+            check_fraction(self, "last_noise")
         if self.critic_rounds is not None:
             check_positive(self, int, "critic_rounds", at_least=0)
         check_words(self, "critic")
@@ -93,11 +104,21 @@ class ProgressCallback(BaseCallback):
         progress: The account.
         round_size: Particle-steps of a round, T B N.
         critic_rounds: Rounds in which the critic learns alone.
+        last_noise: What is left of the noise in the end.
     """
 
-    def __init__(self, progress: Progress, round_size: int, critic_rounds: int = 0) -> None:
+    def __init__(
+        self,
+        progress: Progress,
+        round_size: int,
+        critic_rounds: int = 0,
+        last_noise: float = 1.0,
+    ) -> None:
         super().__init__()
         self.critic_rounds = critic_rounds
+        self.last_noise = last_noise
+        self.noise = 1.0
+        """What is left of it."""
         self.progress = progress
         self.round_size = round_size
         self.share_left = 1.0
@@ -117,6 +138,9 @@ class ProgressCallback(BaseCallback):
         self.progress.look(self.rules)
         self.share_left = max(0.0, 1.0 - self.progress.share)
         policy: Any = self.model.policy
+        noise = noise_left(self.share_left, self.last_noise)
+        policy.actor.scale_noise(noise / self.noise)
+        self.noise = noise
         policy.actor.requires_grad_(self.critic_rounds <= 0)
         self.critic_rounds -= 1
 
@@ -198,6 +222,7 @@ def learn(
         progress,
         settings.steps * problem.num_envs * problem.particle_count,
         alone,
+        chosen.last_noise,
     )
     model = PPO(
         policy_type,
