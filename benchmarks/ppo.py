@@ -1,9 +1,9 @@
 """What the device's own PPO and Stable-Baselines3's get done in a second; see --help.
 
-All forms learn in the same worlds of the morphogenesis environment, with their default options. Of
-the device's form also how long the GPU was at work while it learned: the time in which at least one
-kernel or copy ran, as the profiler saw it, over wall time. The profiler takes time on the host, so
-without it the share is rather higher.
+All forms learn in as many of the same worlds of the morphogenesis environment, their other options
+as by default. Of the device's form also how long the GPU was at work while it learned: the time in
+which at least one kernel or copy ran, as the profiler saw it, over the wall time of as many rounds.
+The profiler takes time on the host, so that the share under it is a lower bound.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from npa_envs.robustness.conditions import Response, grow, responses
 from npa_envs.robustness.damages import DAMAGES, STATE_NOISE, wrapped
 from npa_envs.robustness.grounds import Ground, courses
 from npa_envs.robustness.plans import CONDITIONS, PLANS, Plan, quick_plan, trained_value
-from npa_envs.robustness.plots import pictures
+from npa_envs.robustness.plots import mark_decades, pictures
 from npa_envs.robustness.ranges import where_it_works, working_range
 from npa_envs.robustness.record import RuleRecord, read_record
 from npa_envs.robustness.recovery import CONTROL, Course, healing, recovery_step
@@ -413,6 +413,22 @@ def test_curves_are_drawn_by_task():
     drawn = pictures([record(course), record(course, task="texture", rule="dots")])
     assert set(drawn) == {"morphogenesis2d", "texture"}
     assert all(picture.startswith(b"\x89PNG") for picture in drawn.values())
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "marks"),
+    [(0.1, 1.0, ["0.1", "0.2", "0.5", "1"]), (1.0, 1000.0, ["1", "10", "100", "1000"])],
+)
+def test_axes_of_few_decades_are_marked_within_them(low, high, marks):
+    pytest.importorskip("matplotlib")
+    from matplotlib.figure import Figure
+
+    panel = Figure().subplots()
+    panel.set(yscale="log", ylim=(0.99 * low, 1.01 * high))
+    mark_decades(panel)
+    places, labels = panel.get_yticks(), panel.yaxis.get_major_formatter().format_ticks
+    assert labels([place for place in places if low <= place <= high]) == marks
+    assert not panel.get_yticks(minor=True).size
 
 
 def test_the_command_measures_writes_and_goes_on(tmp_path, capsys, monkeypatch):

@@ -71,7 +71,7 @@ def _draw_courses(panel: Any, record: RuleRecord) -> None:
     panel.set_yscale("log")
     panel.set_ylabel("loss over the twin's", fontsize=8)
     panel.set_title(record.rule, fontsize=9, loc="left")
-    _mark(panel)
+    mark_decades(panel)
 
 
 def _draw_responses(panel: Any, record: RuleRecord, condition: str) -> None:
@@ -84,11 +84,15 @@ def _draw_responses(panel: Any, record: RuleRecord, condition: str) -> None:
     panel.set(xscale="log", yscale="log")
     panel.set_ylabel("loss", fontsize=8)
     panel.set_xticks(values, [f"{value:.2g}" for value in values], rotation=45)
-    _mark(panel)
+    mark_decades(panel)
 
 
-def _mark(panel: Any) -> None:
-    """Mark 1, 2 and 5 of each decade, or whole decades where there are many."""
+def mark_decades(panel: Any) -> None:
+    """Mark 1, 2 and 5 of each decade of a logarithmic axis y, or the decades where they are many.
+
+    Args:
+        panel: Matplotlib's axes.
+    """
     from matplotlib.ticker import LogLocator
 
     low, high = panel.get_ylim()
