@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -177,7 +178,7 @@ def noise_left(share_left: float, last_noise: float) -> float:
         share_left: Share of the budget that is left.
         last_noise: What is left of the noise when nothing is.
     """
-    return last_noise ** max(0.0, 1.0 - 2.0 * share_left)
+    return math.pow(last_noise, max(0.0, 1.0 - 2.0 * share_left))
 
 
 def beginning(problem: Problem, seed: int, start: RuleSet | None) -> RuleSet:
