@@ -19,7 +19,6 @@ import statistics
 import sys
 from collections.abc import Sequence
 from dataclasses import fields, replace
-from datetime import date
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,7 +26,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from npa_envs.bench.report import machine
+from npa_envs.bench.report import script_facts
 from npa_envs.devices import check_device
 from npa_envs.files import write_text
 from npa_envs.randomness import WorldRandom
@@ -272,11 +271,7 @@ def main() -> None:
     for name in FROZEN if arguments.frozen else ():
         nursery.grow(name, rules_of(runs[name], device), [0, 1])
     report = {
-        "command": " ".join(["python", *sys.argv]),
-        "commit": arguments.commit,
-        "date": date.today().isoformat(),
-        "machine": machine(device),
-        "torch": torch.__version__,
+        **script_facts(arguments.commit, device),
         "targets": arguments.targets,
         "distance": arguments.distance,
         "particle_counts": config.task.counts,

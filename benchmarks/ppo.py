@@ -10,10 +10,8 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 import time
 from collections.abc import Iterable
-from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +20,7 @@ import torch
 from npa_envs.agents.learning import Budget, Problem, train
 from npa_envs.agents.learning.ppo import Learner
 from npa_envs.agents.learning.ppo_settings import Settings
+from npa_envs.bench.report import script_facts
 
 FORMS = ("ppo", "ppo_rows", "ppo_world")
 """Methods of npa_envs.agents.learning; the first is the device's own."""
@@ -139,11 +138,7 @@ def main() -> None:
             f"(under the profiler {100 * share['share_busy_profiled']:.1f} %)"
         )
     report = {
-        "command": " ".join(["python", *sys.argv]),
-        "commit": arguments.commit,
-        "date": date.today().isoformat(),
-        "machine": torch.cuda.get_device_name(arguments.device) if cuda else "CPU",
-        "torch": torch.__version__,
+        **script_facts(arguments.commit, torch.device(arguments.device)),
         "worlds": arguments.worlds,
         "particles": arguments.particles,
         "rows": rows,

@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from collections import Counter
 from collections.abc import Callable
-from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +27,7 @@ from npa_envs.agents import (
     ZeroPolicy,
     evaluate_policy,
 )
+from npa_envs.bench.report import script_facts
 from npa_envs.registration import ENVIRONMENTS
 
 TARGET = "gecko"
@@ -113,13 +112,8 @@ def main() -> None:
             rows.append(row_of(registration.id, name, episodes))
             print_row(rows[-1])
         env.close()
-    cuda = torch.device(arguments.device).type == "cuda"
     report = {
-        "command": " ".join(["python", *sys.argv]),
-        "commit": arguments.commit,
-        "date": date.today().isoformat(),
-        "machine": torch.cuda.get_device_name(arguments.device) if cuda else "CPU",
-        "torch": torch.__version__,
+        **script_facts(arguments.commit, torch.device(arguments.device)),
         "particle_count": arguments.particle_count,
         "rows": rows,
     }

@@ -13,13 +13,13 @@ import json
 import sys
 import time
 from dataclasses import replace
-from datetime import date
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from npa_envs.bench.report import script_facts
 from npa_envs.dynamics import rollout
 from npa_envs.errors import NPAError
 from npa_envs.files import write_text
@@ -172,13 +172,8 @@ def main() -> None:
         rows.append({"trained_with": task.metric_name, "seconds": seconds, "measured_by": found})
         frames.append(drawn(task, x, s))
         captions.append(f"{task.metric_name}, step {arguments.steps}")
-    cuda = torch.device(arguments.device).type == "cuda"
     report = {
-        "command": " ".join(["python", *sys.argv]),
-        "commit": arguments.commit,
-        "date": date.today().isoformat(),
-        "machine": torch.cuda.get_device_name(arguments.device) if cuda else "CPU",
-        "torch": torch.__version__,
+        **script_facts(arguments.commit, torch.device(arguments.device)),
         "target": arguments.target,
         "particle_count": base.task.particle_count,
         "resolution": base.task.resolution,

@@ -487,18 +487,18 @@ def test_noise_is_kept_for_half_of_the_budget_and_then_falls_by_equal_factors():
 @EVERY_FORM
 def test_in_every_form_the_noise_falls_towards_the_end(form, monkeypatch):
     pytest.importorskip("stable_baselines3")
-    done = []
-    scale = GaussianRules.scale_noise
+    left = [1.0]
+    leave = GaussianRules.leave_noise
 
-    def spy(actor, factor):
+    def spy(actor, share):
         before = actor.log_std.exp()
-        scale(actor, factor)
-        torch.testing.assert_close(actor.log_std.exp(), factor * before)
-        done.append(factor)
+        leave(actor, share)
+        torch.testing.assert_close(actor.log_std.exp(), share / left[-1] * before)
+        left.append(share)
 
-    monkeypatch.setattr(GaussianRules, "scale_noise", spy)
+    monkeypatch.setattr(GaussianRules, "leave_noise", spy)
     run(form, HEART, 8 * ROUND, last_noise=0.1, critic_rounds=0)
-    left = np.cumprod(done)
+    left = np.array(left[1:])
     assert left[:4] == pytest.approx(1.0)
     assert (np.diff(left[4:]) < 0.0).all()
     assert 0.1 <= left[-1] < 0.25

@@ -46,6 +46,7 @@ class GaussianRules(nn.Module):
         """What acts without exploration."""
         widths = [rule.update_dim for rule in self.rules]
         start = torch.full((len(widths), widths[0]), math.log(initial_std))
+        self._left = 1.0
         self.log_std = nn.Parameter(start)
         """Logarithms of the standard deviations, a row for each species, shape [K, A]."""
         counts = [span.stop - span.start for span in self.rules.spans]
@@ -59,13 +60,14 @@ class GaussianRules(nn.Module):
         return self.log_std[self.row_species]
 
     @torch.no_grad()
-    def scale_noise(self, factor: float) -> None:
-        """Multiply all standard deviations.
+    def leave_noise(self, left: float) -> None:
+        """Scale all standard deviations, what was learned of them stays.
 
         Args:
-            factor: By what, above 0 (dimensionless).
+            left: What is to be left of those at first, above 0 (dimensionless).
         """
-        self.log_std.add_(math.log(factor))
+        self.log_std.add_(math.log(left / self._left))
+        self._left = left
 
     def sample(
         self, observation: Tensor, generator: torch.Generator | None = None

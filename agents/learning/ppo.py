@@ -97,8 +97,6 @@ class Learner:
         self.critic.observe(observation)
         self.rounds = 0
         """Rounds done."""
-        self.noise = 1.0
-        """What is left of the first noise, but for what is learned of it."""
 
     @property
     def round_size(self) -> int:
@@ -179,9 +177,7 @@ class Learner:
             if rules_learn and not bool(near):
                 break
         assert settings.last_noise is not None, "filled in above"
-        noise = noise_left(share_left, settings.last_noise)
-        self.actor.scale_noise(noise / self.noise)
-        self.noise = noise
+        self.actor.leave_noise(noise_left(share_left, settings.last_noise))
 
     def _groups(self, batch: Round) -> list[Round]:
         """Return what is shuffled when rules learn: whole worlds, or each species' particles."""

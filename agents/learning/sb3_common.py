@@ -117,8 +117,6 @@ class ProgressCallback(BaseCallback):
         super().__init__()
         self.critic_rounds = critic_rounds
         self.last_noise = last_noise
-        self.noise = 1.0
-        """What is left of it."""
         self.progress = progress
         self.round_size = round_size
         self.share_left = 1.0
@@ -138,9 +136,7 @@ class ProgressCallback(BaseCallback):
         self.progress.look(self.rules)
         self.share_left = max(0.0, 1.0 - self.progress.share)
         policy: Any = self.model.policy
-        noise = noise_left(self.share_left, self.last_noise)
-        policy.actor.scale_noise(noise / self.noise)
-        self.noise = noise
+        policy.actor.leave_noise(noise_left(self.share_left, self.last_noise))
         policy.actor.requires_grad_(self.critic_rounds <= 0)
         self.critic_rounds -= 1
 

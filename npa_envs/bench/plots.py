@@ -172,7 +172,7 @@ def _draw_front(axis: Any, points: Sequence[Point], across: str, up: str) -> Non
         )
     axis.set(xscale="log", yscale="log", xlabel=across, ylabel=up)
     axis.margins(0.08)
-    _number_plainly(axis.yaxis)
+    number_plainly(axis.yaxis)
     axis.grid(alpha=0.3)
 
 
@@ -196,15 +196,28 @@ def _add_legend(figure: Any, points: Sequence[Point]) -> None:
     figure.legend(handles=marks, loc="outside lower center", ncols=5, fontsize=8)
 
 
-def _number_plainly(axis: Any, values: Sequence[float] | None = None) -> None:
-    """Label a logarithmic axis at 1, 2, 5, 10 ... or at some values, without powers of ten."""
+def number_plainly(
+    axis: Any,
+    values: Sequence[float] | None = None,
+    *,
+    within: Sequence[float] = (1, 2, 5),
+    text: Callable[[float], str] | None = None,
+) -> None:
+    """Label a logarithmic axis at 1, 2, 5, 10 ... or at some values, without powers of ten.
+
+    Args:
+        axis: Matplotlib's.
+        values: The values; None: some in each decade.
+        within: Which, as multiples of the power of ten.
+        text: What a value's label is; None: with k or M for thousands and millions.
+    """
     from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocator
 
     axis.set_major_locator(
-        LogLocator(subs=(1, 2, 5)) if values is None else FixedLocator(values, nbins=9)
+        LogLocator(subs=within) if values is None else FixedLocator(values, nbins=9)
     )
     axis.set_minor_locator(NullLocator())
-    axis.set_major_formatter(FuncFormatter(lambda value, _: _short(value)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: (text or _short)(value)))
 
 
 def _short(value: float) -> str:
@@ -223,8 +236,8 @@ def _draw_scaling(report: Report, what: str) -> Any:
             panel.plot([row.value for row in rows], values, marker="o", ms=4, label=label)
         panel.set(xscale="log", yscale="log", xlabel=AXIS_LABELS[name])
         panel.set_ylabel("time of a step [µs]" if what == "time" else "peak memory [MiB]")
-        _number_plainly(panel.xaxis, [row.value for row in rows])
-        _number_plainly(panel.yaxis)
+        number_plainly(panel.xaxis, [row.value for row in rows])
+        number_plainly(panel.yaxis)
         panel.tick_params(axis="x", labelsize=8)
         panel.grid(alpha=0.3)
     panels[0].legend(fontsize=8)

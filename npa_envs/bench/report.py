@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import platform
 import subprocess
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import date
@@ -83,6 +84,22 @@ def machine(device: torch.device) -> str:
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
     return f"CPU ({_processor()})"
+
+
+def script_facts(commit: str, device: torch.device) -> dict[str, str]:
+    """Return what the record of a script in `benchmarks/` begins with.
+
+    Args:
+        commit: Commit that is measured.
+        device: Where.
+    """
+    return {
+        "command": " ".join(["python", *sys.argv]),
+        "commit": commit,
+        "date": date.today().isoformat(),
+        "machine": machine(device),
+        "torch": torch.__version__,
+    }
 
 
 def _processor() -> str:

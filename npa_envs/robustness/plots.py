@@ -7,6 +7,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+from npa_envs.bench.plots import number_plainly
 from npa_envs.robustness.plans import CONDITIONS
 from npa_envs.robustness.record import RuleRecord
 from npa_envs.robustness.recovery import CONTROL, RECOVERED
@@ -93,13 +94,10 @@ def mark_decades(panel: Any) -> None:
     Args:
         panel: Matplotlib's axes.
     """
-    from matplotlib.ticker import LogLocator
-
     low, high = panel.get_ylim()
     fine = high < FEW_DECADES * low
     panel.minorticks_off()
-    panel.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if fine else (1.0,)))
-    panel.yaxis.set_major_formatter("{x:g}")
+    number_plainly(panel.yaxis, within=(1, 2, 5) if fine else (1,), text="{:g}".format)
     panel.tick_params(labelsize=7)
 
 
