@@ -33,7 +33,7 @@ from npa_envs.registration import ENVIRONMENTS
 TARGET = "gecko"
 """What pictures are of; the shipped rule of that name plays where there are pictures."""
 
-NO_RULE = ("npa/Texture-v0", "npa/PointClassification-v0")
+NO_RULE = ("npa/Texture-v0", "npa/PointClassification-v0", "npa/Morphogenesis3D-v0")
 """Environments with targets of their own, for which no rule is shipped."""
 
 POLICIES: dict[str, Callable[[Any], Any]] = {
