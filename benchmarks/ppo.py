@@ -78,7 +78,8 @@ def device_share(problem: Problem, rounds: int, device: str) -> dict[str, Any]:
         torch.cuda.synchronize(place)
         begin = time.perf_counter()
         for _ in range(count):
-            learner.improve(learner.play(), 1.0)
+            learner.play()
+            learner.improve(1.0)
         torch.cuda.synchronize(place)
         return time.perf_counter() - begin
 

@@ -16,6 +16,7 @@ from npa_envs.agents.learning import (
     Progress,
     RuleSet,
     method_options,
+    ppo,
     ppo_worlds,
     train,
 )
@@ -153,7 +154,7 @@ def test_the_deterministic_policy_of_either_row_form_is_the_exported_rules(probl
 def test_what_the_device_s_ppo_exports_is_the_mean_that_it_explores_around(tmp_path):
     given = learner(MIXING)
     batch = given.play()
-    given.improve(batch, 1.0)
+    given.improve(1.0)
     given.actor.rules.save(tmp_path)
     read = RuleSet.load(tmp_path, MIXING)
     seen = batch.observations[:4]
@@ -324,7 +325,7 @@ def test_particles_of_a_species_that_is_gone_do_not_count():
     alive = acted[:, :, 12:].all(dim=2).any(dim=1).tolist()
     assert alive == sorted(alive, reverse=True)
     assert 0 < sum(alive) < 8
-    given.improve(batch, 1.0)
+    given.improve(1.0)
     assert all(torch.isfinite(weight).all() for weight in given.actor.parameters())
 
 
@@ -356,13 +357,34 @@ def test_equal_seeds_learn_equally_and_others_do_not():
 def test_rules_that_have_gone_far_enough_stay_for_the_rest_of_a_round():
     def after(epochs, target_kl):
         given = learner(epochs=epochs, target_kl=target_kl, steps=4)
-        given.improve(given.play(), 1.0)
+        given.play()
+        given.improve(1.0)
         return given.actor.rules.rules[0].output.weight
 
     # The first minibatch steps, as nothing has moved yet.
     assert after(1, 1e-6).abs().max() > 0.0
     assert torch.equal(after(1, 1e-6), after(3, 1e-6))
     assert not torch.equal(after(1, 1e6), after(3, 1e6))
+
+
+@pytest.mark.parametrize("form", ["device", "device, by worlds"])
+def test_recorded_rounds_are_those_of_kernels_one_by_one(form, device, monkeypatch):
+    if device.type != "cuda":
+        pytest.skip("rounds are recorded on CUDA only")
+
+    def learned():
+        given = Learner(HEART, Settings(critic_rounds=3, **FORMS[form][1]), 0, device, None)
+        # The third call of what is recorded is the first replay that nothing was recorded in.
+        for share_left in (1.0, 0.9, 0.7, 0.5, 0.3, 0.1):
+            batch = given.play()
+            given.improve(share_left)
+        return [*batch, *given.actor.parameters(), *given.critic.parameters()]
+
+    recorded = learned()
+    monkeypatch.setattr(ppo, "Replayed", lambda function, *_: function)
+    for value, wanted in zip(recorded, learned(), strict=True):
+        assert float(wanted.detach().norm()) > 0.0
+        torch.testing.assert_close(value, wanted, rtol=1e-3, atol=1e-5)
 
 
 @EVERY_FORM

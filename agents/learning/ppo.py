@@ -1,15 +1,18 @@
 """Proximal policy optimisation that stays on the device, from the first world to the last gradient.
 
 Source: Schulman et al., arXiv 1707.06347, in the manner of CleanRL: one file, read from the top. A
-round is `steps` steps of all worlds, then `epochs` passes over them in minibatches of whole worlds.
-The host reads one byte a world in each step (has its episode ended?), and one number an epoch.
+round is `steps` steps of all worlds, then `epochs` passes over them in minibatches of particles.
+The host reads one byte a world in each step (has its episode ended?), and one number a pass. On
+CUDA what is drawn, judged and learned is recorded once and replayed: a round is thousands of short
+kernels, which a host takes longer to launch than a GPU to run.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any, NamedTuple
+from functools import partial
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -29,6 +32,7 @@ from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.agents.learning.seeds import world_seeds
+from npa_envs.replay import Replayed
 from npa_envs.wrappers.adapters import own_rewards
 
 
@@ -43,11 +47,61 @@ class Round(NamedTuple):
     """Its log-probability then, shape [M, N]."""
     advantages: Tensor
     """How much better it was than foreseen, and than other worlds fared in the same step,
-    standardised, shape [M, N]."""
+    standardised, shape [M, N], or [M, 1] where a world has one."""
     targets: Tensor
     """What the critic should have said, shape [M, N]."""
     acted: Tensor
     """1 where a particle's species was alive, else 0, shape [M, N]."""
+
+
+class Memory:
+    """Where rounds are written, each over the one before, as what is recorded stays at its place.
+
+    Args:
+        steps: Steps T of a round.
+        observation: What is perceived at first, shape [B, N, P].
+        action_dim: Columns A of an action.
+        own_advantages: Each particle has an advantage of its own; else a world has one.
+    """
+
+    def __init__(
+        self, steps: int, observation: Tensor, action_dim: int, *, own_advantages: bool
+    ) -> None:
+        worlds, particles = observation.shape[:2]
+
+        def zeros(*shape: int, dtype: torch.dtype = observation.dtype) -> Tensor:
+            return observation.new_zeros(*shape, dtype=dtype)
+
+        single = (steps, worlds, particles)
+        self.seen = zeros(steps + 1, *observation.shape)
+        """What is perceived before each step, and after the last one, shape [T + 1, B, N, P]."""
+        self.seen[-1].copy_(observation)
+        self.actions = zeros(*single, action_dim)
+        """What is done, not clipped, shape [T, B, N, A]."""
+        self.log_probs = zeros(*single)
+        """Log-probabilities of that, shape [T, B, N]."""
+        self.acted = zeros(*single).fill_(1.0)
+        """1 where a particle's species is alive, else 0, likewise."""
+        self.rewards = zeros(*single)
+        """What each particle is paid, likewise."""
+        self.terminated = zeros(*single, dtype=torch.bool)
+        """Whether a particle's episode has ended by itself in a step, likewise."""
+        self.ended = zeros(*single, dtype=torch.bool)
+        """Whether it has ended or was cut off, likewise."""
+        self.values = zeros(steps + 1, worlds, particles)
+        """What the critic says of what is seen, shape [T + 1, B, N]."""
+        self.following = zeros(*single)
+        """What it says of the states after each step, before any restart, shape [T, B, N]."""
+        self.advantages = zeros(steps, worlds, particles if own_advantages else 1)
+        """As those of a `Round`, shape [T, B, N] or [T, B, 1]."""
+        self.targets = zeros(*single)
+        """What the critic should have said, shape [T, B, N]."""
+
+    @property
+    def round(self) -> Round:
+        """What is learned from, as views."""
+        kept = (self.actions, self.log_probs, self.advantages, self.targets, self.acted)
+        return Round(*(part.flatten(0, 1) for part in (self.seen[:-1], *kept)))
 
 
 class Learner:
@@ -86,98 +140,155 @@ class Learner:
                 settings.critic_width,
             )
         self.critic = critic.to(device)
+        # Recorded steps read their length where it can be changed.
         self.optimizer, self.critic_optimizer = (
-            torch.optim.Adam(net.parameters(), lr=rate, eps=1e-5, fused=True)
-            for net, rate in ((self.actor, torch.zeros((), device=device)), (self.critic, 0.0))
+            torch.optim.Adam(
+                net.parameters(),
+                lr=torch.zeros((), device=device),
+                eps=1e-5,
+                fused=True,
+                capturable=device.type == "cuda",
+            )
+            for net in (self.actor, self.critic)
         )
         observation, _ = self.envs.reset(seed=world_seeds(seed, self.envs.num_envs))
-        self.seen = observation.new_empty(settings.steps + 1, *observation.shape)
-        """What is perceived before each step of a round, and after its last, [T + 1, B, N, P]."""
-        self.seen[-1].copy_(observation)
+        self.memory = Memory(
+            settings.steps,
+            observation,
+            problem.interface.action_dim,
+            own_advantages=settings.ratio == "particle",
+        )
         self.critic.observe(observation)
         self.rounds = 0
         """Rounds done."""
+        # What recorded work reads and writes besides.
+        self._now = observation.clone()
+        self._action, self._log_prob = (
+            part[0].clone() for part in (self.memory.actions, self.memory.log_probs)
+        )
+        self._near, self._rate = torch.ones(2, device=device)
+        played = settings.steps * self.envs.num_envs
+        sizes = [played] if settings.ratio == "world" else [played * n for n in problem.counts]
+        # Of what is shuffled for the rules, and of worlds for the critic.
+        self._orders = [
+            torch.zeros(size, dtype=torch.int64, device=device) for size in (*sizes, played)
+        ]
+        self._act = Replayed(self._draw_actions, device, self.generator)
+        self._value = Replayed(self._find_values, device)
+        self._judge = Replayed(self._find_advantages, device)
+        self._learn = {flag: Replayed(partial(self._pass, flag), device) for flag in (False, True)}
 
     @property
     def round_size(self) -> int:
         """Particle steps of a round, T B N."""
-        return self.seen[1:, ..., 0].numel()
+        return self.memory.rewards.numel()
 
     @torch.no_grad()
     def play(self) -> Round:
-        """Act for T steps in all worlds, and judge what was done."""
-        seen = self.seen
-        seen[0].copy_(seen[-1])
-        moves, last_seen = [], {}
+        """Act for T steps in all worlds, and judge what was done.
+
+        Returns:
+            The round, where the next one will be.
+        """
+        memory = self.memory
+        memory.seen[0].copy_(memory.seen[-1])
+        last_seen = {}
         for step in range(self.settings.steps):
-            action, log_prob = self.actor.sample(seen[step], self.generator)
-            observation, reward, terminated, truncated, infos = self.envs.step(action)
-            seen[step + 1].copy_(observation)
+            self._now.copy_(memory.seen[step])
+            self._act()
+            memory.actions[step].copy_(self._action)
+            memory.log_probs[step].copy_(self._log_prob)
+            observation, reward, terminated, truncated, infos = self.envs.step(self._action)
+            memory.seen[step + 1].copy_(observation)
             if "final_obs" in infos:
                 last_seen[step] = infos["final_obs"]
-            paid, acted = self._by_particle(reward, infos)
-            ended = terminated | truncated
+            shared = self.settings.credit == "world"
+            memory.rewards[step].copy_(reward[:, None] if shared else own_rewards(infos))
+            if "acted" in infos:
+                memory.acted[step].copy_(infos["acted"])
             # A species may end before its world does.
             gone = infos.get("particle_terminated", terminated[:, None])
-            flags = [(flag[:, None] | gone).expand_as(paid) for flag in (terminated, ended)]
-            # Environments may hand out the same tensors in each step.
-            moves.append([value.clone() for value in (action, log_prob, paid, acted, *flags)])
-        actions, log_probs, rewards, acted, terminated, ended = (
-            torch.stack(column) for column in zip(*moves, strict=True)
-        )
-        values = self._values(seen.flatten(0, 1)).view(len(seen), *paid.shape)
-        following = values[1:].clone()
+            memory.terminated[step].copy_(terminated[:, None] | gone)
+            memory.ended[step].copy_((terminated | truncated)[:, None] | gone)
+        self._value()
         for step, observation in last_seen.items():
-            following[step] = self.critic(observation)
+            memory.following[step].copy_(self.critic(observation))
+        self._judge()
+        return memory.round
+
+    @torch.no_grad()
+    def _draw_actions(self) -> None:
+        """Draw what particles do about what they perceive now."""
+        action, log_prob = self.actor.sample(self._now, self.generator)
+        self._action.copy_(action)
+        self._log_prob.copy_(log_prob)
+
+    @torch.no_grad()
+    def _find_values(self) -> None:
+        """Ask the critic about all that was seen, part by part to save memory."""
+        memory, seen = self.memory, self.memory.seen.flatten(0, 1)
+        size = -(-len(seen) // self.settings.minibatches)
+        values = torch.cat([self.critic(part) for part in torch.split(seen, size)])
+        memory.values.copy_(values.view_as(memory.values))
+        memory.following.copy_(memory.values[1:])
+
+    @torch.no_grad()
+    def _find_advantages(self) -> None:
+        """Judge what was done by what was paid, and by what the critic had foreseen."""
+        memory, values = self.memory, self.memory.values[:-1]
         advantages = generalised_advantages(
-            rewards,
-            values[:-1],
-            following,
-            terminated,
-            ended,
+            memory.rewards,
+            values,
+            memory.following,
+            memory.terminated,
+            memory.ended,
             gamma=self.settings.gamma,
             gae_lambda=self.settings.gae_lambda,
         )
-        targets = advantages + values[:-1]
-        counted = acted.to(rewards.dtype)
+        memory.targets.copy_(advantages + values)
         if self.settings.ratio == "world":
-            advantages = over_particles(advantages, counted)
-        advantages = standardised(advantages, counted)
-        parts = (seen[:-1], actions, log_probs, advantages, targets, counted)
-        return Round(*(part.flatten(0, 1) for part in parts))
+            advantages = over_particles(advantages, memory.acted)
+        memory.advantages.copy_(standardised(advantages, memory.acted))
 
-    def improve(self, batch: Round, share_left: float) -> None:
-        """Let rules and critic learn from a round.
+    def improve(self, share_left: float) -> None:
+        """Let rules and critic learn from the last round.
 
         Args:
-            batch: The round.
             share_left: Share of the budget that is left; learning rates are this part of what they
                 were at the start, and by it the noise of the next round is made less.
         """
         settings = self.settings
         rules_learn = self.rounds >= settings.critic_rounds
         self.rounds += 1
-        self.critic.observe(batch.observations)
-        self.critic.rescale(batch.targets)
-        rate = settings.learning_rate * share_left
-        self.critic_optimizer.param_groups[0]["lr"] = settings.critic_learning_rate * share_left
-        near = torch.ones((), device=batch.targets.device)
-        groups = self._groups(batch)
+        self.critic.observe(self.memory.seen[:-1])
+        self.critic.rescale(self.memory.targets)
+        rate = self.critic_optimizer.param_groups[0]["lr"]
+        rate.fill_(settings.critic_learning_rate * share_left)
+        self._rate.fill_(settings.learning_rate * share_left)
+        self._near.fill_(1.0)
         for _ in range(settings.epochs):
-            critic_parts = self._shuffled([batch])
-            for part, worlds in zip(self._shuffled(groups), critic_parts, strict=True):
-                self._descend(self.critic_optimizer, self._critic_loss(*worlds))
-                if rules_learn:
-                    gain, kl = self._surrogate(part)
-                    # Rules that have gone too far stay, without a question to the host.
-                    near *= kl.detach() <= settings.target_kl
-                    self.optimizer.param_groups[0]["lr"].copy_(near * rate)
-                    self._descend(self.optimizer, -gain)
+            for order in self._orders:
+                torch.randperm(len(order), generator=self.generator, out=order)
+            self._learn[rules_learn]()
             # All that the host waits for.
-            if rules_learn and not bool(near):
+            if rules_learn and not bool(self._near):
                 break
         assert settings.last_noise is not None, "filled in above"
         self.actor.leave_noise(noise_left(share_left, settings.last_noise))
+
+    def _pass(self, rules_learn: bool) -> None:
+        """Learn once from all of a round, in the order that was drawn."""
+        whole = self.memory.round
+        *orders, order = self._orders
+        parts = self._shuffled(self._groups(whole), orders)
+        for part, worlds in zip(parts, self._shuffled([whole], [order]), strict=True):
+            self._descend(self.critic_optimizer, self._critic_loss(*worlds))
+            if rules_learn:
+                gain, kl = self._surrogate(part)
+                # Rules that have gone too far stay, without a question to the host.
+                self._near *= kl.detach() <= self.settings.target_kl
+                self.optimizer.param_groups[0]["lr"].copy_(self._near * self._rate)
+                self._descend(self.optimizer, -gain)
 
     def _groups(self, batch: Round) -> list[Round]:
         """Return what is shuffled when rules learn: whole worlds, or each species' particles."""
@@ -186,13 +297,9 @@ class Learner:
         spans = self.actor.rules.spans
         return [Round(*(value[:, span].flatten(0, 1) for value in batch)) for span in spans]
 
-    def _shuffled(self, groups: list[Round]) -> Iterator[list[Round]]:
-        """Return minibatches: parts of each group."""
-        orders = [
-            torch.randperm(len(group.targets), generator=self.generator, device=self.seen.device)
-            for group in groups
-        ]
-        count = min(self.settings.minibatches, self.seen[1:, :, 0, 0].numel())
+    def _shuffled(self, groups: list[Round], orders: list[Tensor]) -> Iterator[list[Round]]:
+        """Return minibatches: parts of each group, in an order of its own."""
+        count = min(self.settings.minibatches, len(self.memory.round.targets))
         parts = [order.tensor_split(count) for order in orders]
         for chosen in zip(*parts, strict=True):
             yield [
@@ -220,30 +327,24 @@ class Learner:
             log_ratio = over_particles(log_ratio, acted)
             acted = acted.amax(dim=1, keepdim=True)
         gain = clipped_gain(log_ratio, advantages, acted, clip=settings.largest_change)
-        return gain + settings.entropy_weight * actor.entropy(), kl
+        if settings.entropy_weight:
+            gain = gain + settings.entropy_weight * actor.entropy()
+        return gain, kl
 
     def _critic_loss(self, worlds: Round) -> Tensor:
         error: Tensor = (self.critic(worlds.observations) - worlds.targets) / self.critic.scale
         return 0.5 * (worlds.acted * error.square()).sum() / worlds.acted.sum().clamp(min=1.0)
 
     def _descend(self, optimizer: torch.optim.Optimizer, loss: Tensor) -> None:
-        optimizer.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
         parameters = optimizer.param_groups[0]["params"]
+        # Not backward(): its accumulation nodes remember the stream they were first used on, which
+        # a capture on another stream must not touch.
+        gradients = torch.autograd.grad(loss, parameters)
+        for parameter, gradient in zip(parameters, gradients, strict=True):
+            # Laid out like the parameter, as the fused optimizer takes for granted.
+            parameter.grad = torch.empty_like(parameter).copy_(gradient)
         nn.utils.clip_grad_norm_(parameters, self.settings.max_gradient_norm)
         optimizer.step()
-
-    def _values(self, observations: Tensor) -> Tensor:
-        """Return what the critic says of many worlds, part by part to save memory, [M, N]."""
-        size = -(-len(observations) // self.settings.minibatches)
-        return torch.cat([self.critic(part) for part in torch.split(observations, size)])
-
-    def _by_particle(self, reward: Tensor, infos: dict[str, Any]) -> tuple[Tensor, Tensor]:
-        """Return what each particle is paid for the last step, and whether it acted, [B, N]."""
-        everyone = self.seen.shape[1:3]
-        acted = infos.get("acted", torch.ones_like(reward, dtype=torch.bool)[:, None])
-        paid = own_rewards(infos) if self.settings.credit == "particle" else reward[:, None]
-        return paid.expand(everyone), acted.expand(everyone)
 
 
 @takes_fields_of(Settings)
@@ -277,9 +378,9 @@ def train(
     progress.start(rules)
     while not progress.over:
         share_left = 1.0 - progress.share
-        batch = learner.play()
+        learner.play()
         progress.advance(learner.round_size)
-        learner.improve(batch, share_left)
+        learner.improve(share_left)
         progress.look(rules)
     progress.look(rules, force=True)
     return rules
