@@ -9,6 +9,7 @@ The profiler takes time on the host, so that the share under it is a lower bound
 from __future__ import annotations
 
 import argparse
+import gc
 import json
 import time
 from collections.abc import Iterable
@@ -20,6 +21,7 @@ import torch
 from npa_envs.agents.learning import Budget, Problem, train
 from npa_envs.agents.learning.ppo import Learner
 from npa_envs.agents.learning.ppo_settings import Settings
+from npa_envs.agents.learning.ppo_worlds import world_bytes
 from npa_envs.bench.report import script_facts
 
 FORMS = ("ppo", "ppo_rows", "ppo_world")
@@ -70,9 +72,15 @@ def covered(intervals: Iterable[tuple[float, float]]) -> float:
 
 
 def device_share(problem: Problem, rounds: int, device: str) -> dict[str, Any]:
-    """Return the share of the wall time of some rounds in which the GPU was at work."""
+    """Return the share of the wall time of some rounds in which the GPU was at work, and memory."""
     place = torch.device(device)
-    learner = Learner(problem, Settings(worlds=problem.num_envs), 0, place, None)
+    settings = Settings(worlds=problem.num_envs)
+    # What the forms before have left.
+    gc.collect()
+    torch.cuda.empty_cache()
+    torch.cuda.reset_peak_memory_stats(place)
+    held = torch.cuda.memory_reserved(place)
+    learner = Learner(problem, settings, 0, place, None)
 
     def learn(count: int) -> float:
         torch.cuda.synchronize(place)
@@ -105,6 +113,8 @@ def device_share(problem: Problem, rounds: int, device: str) -> dict[str, Any]:
         "share_busy_profiled": busy / wall,
         "device_events": len(spans),
         "particle_steps_per_second": rounds * learner.round_size / plain,
+        "reserved_mib": (torch.cuda.max_memory_reserved(place) - held) / 2**20,
+        "expected_mib": problem.num_envs * world_bytes(problem, settings, place) / 2**20,
     }
 
 
@@ -136,7 +146,8 @@ def main() -> None:
         print(
             f"{FORMS[0]}: {share['rounds']} rounds take {share['seconds']:.3f} s, in which the GPU "
             f"is at work for {share['seconds_busy']:.3f} s, {100 * share['share_busy']:.1f} % "
-            f"(under the profiler {100 * share['share_busy_profiled']:.1f} %)"
+            f"(under the profiler {100 * share['share_busy_profiled']:.1f} %); it takes "
+            f"{share['reserved_mib']:.0f} MiB, {share['expected_mib']:.0f} were expected"
         )
     report = {
         **script_facts(arguments.commit, torch.device(arguments.device)),

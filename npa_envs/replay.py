@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import functools
 import gc
+import inspect
+import weakref
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -133,6 +135,9 @@ class Replayed:
     Launches of many short kernels would otherwise take longer than the kernels do. The first call
     runs the function kernel by kernel, which loads them; the second captures it.
 
+    A method's object is not kept alive: it mostly keeps this one, and graphs and their memory would
+    stay until garbage is collected.
+
     Args:
         function: Reads and writes the same tensors in every call, and never waits for the device.
         device: Where these are.
@@ -146,7 +151,7 @@ class Replayed:
         device: torch.device,
         generator: torch.Generator | None = None,
     ) -> None:
-        self._function = function
+        self._function = _weak(function)
         self._device = device
         self._generator = generator
         self._warm = False
@@ -154,17 +159,30 @@ class Replayed:
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the graph, which cannot be pickled: it is captured anew."""
-        return self.__dict__ | {"_warm": False, "_graph": None}
+        return self.__dict__ | {"_function": self._function(), "_warm": False, "_graph": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take the function of the copied object."""
+        self.__dict__ |= state | {"_function": _weak(state["_function"])}
 
     def __call__(self) -> None:
         """Run the function."""
+        if self._device.type == "cuda" and self._graph is not None:
+            self._graph.replay()
+            return
+        function = self._function()
+        assert function is not None, "whoever calls holds the object"
         if self._device.type == "cpu" or not self._warm:
-            self._function()
+            function()
             self._warm = True
             return
-        if self._graph is None:
-            self._graph = capture(self._function, self._device, generator=self._generator)
+        self._graph = capture(function, self._device, generator=self._generator)
         self._graph.replay()
+
+
+def _weak(function: Callable[[], None]) -> Callable[[], Callable[[], None] | None]:
+    """Return what returns a function, or None where it is a method whose object is gone."""
+    return weakref.WeakMethod(function) if inspect.ismethod(function) else lambda: function
 
 
 class Beside:

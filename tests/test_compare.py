@@ -24,7 +24,7 @@ from npa_envs.agents.comparison.problems import LEFT_OUT, PROBLEMS, make_problem
 from npa_envs.agents.comparison.record import Point, RunRecord, read_record
 from npa_envs.agents.comparison.scheduler import Places, held_records, run_jobs
 from npa_envs.agents.comparison.summary import write_table
-from npa_envs.agents.comparison.tables import Estimate, estimate, fraction, rows, text
+from npa_envs.agents.comparison.tables import Estimate, curves, estimate, fraction, rows, text
 from npa_envs.agents.learning import METHODS, Problem, RuleSet
 from npa_envs.cli import main
 from npa_envs.cli.compare import CompareOptions, make_plan
@@ -392,6 +392,17 @@ def test_a_table_has_the_right_numbers():
     assert math.isnan(alone.fraction.mean)
 
 
+def test_curves_have_a_line_for_each_point_of_each_run():
+    lost = record("evolution", 1, status="diverged", curve=points((0.5, 1.0), (2.0, float("nan"))))
+    some = [record("ppo", 0, curve=points((1.25, 0.125))), record("zero", 0), lost]
+    assert curves(some).splitlines() == [
+        "axis,task,method,seed,status,seconds,particle_steps,mean_return,standard_error,final_loss",
+        "seconds,growth,ppo,0,done,1.25,125,0.125,0,0.875",
+        "seconds,growth,evolution,1,diverged,0.5,50,1,0,0",
+        "seconds,growth,evolution,1,diverged,2,200,nan,0,nan",
+    ]
+
+
 def test_a_table_in_words_lists_the_best_first_and_leaves_no_method_out():
     told = text(rows(synthetic()))
     assert told.startswith("## Equal wall time\n\n### growth\n")
@@ -536,6 +547,12 @@ def test_a_quick_comparison_stops_goes_on_and_refuses_other_settings(tmp_path, c
     assert "| zero | 1 | 0.000 |" in told
     table = json.loads((tmp_path / "comparison.json").read_text())
     assert [row["method"] for row in table["rows"]] == ["evolution", "zero"]
+    lines = (tmp_path / "comparison.csv").read_text().splitlines()
+    ends = [
+        line for line in lines if line.startswith("particle-steps,morphogenesis2d,evolution,0,")
+    ]
+    assert len(ends) == len(held["curve"])
+    assert float(ends[-1].split(",")[7]) == pytest.approx(held["curve"][-1]["mean_return"])
     assert (tmp_path / "comparison.md").read_text().endswith(told.split("wrote")[0].rstrip() + "\n")
     for name in ("grown_morphogenesis2d_particle-steps.png", "curves_morphogenesis2d.png"):
         assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
+import weakref
 
 import numpy as np
 import pytest
@@ -31,6 +32,8 @@ from npa_envs.agents.learning.gaussian import GaussianRules
 from npa_envs.agents.learning.ppo import Learner
 from npa_envs.agents.learning.ppo_settings import Settings, filled, noise_left
 from npa_envs.errors import NPAError
+from npa_envs.replay import no_garbage_collection
+from npa_envs.rule import NPARule
 
 HEART = Problem(
     env_id="npa/Morphogenesis2D-v0",
@@ -52,6 +55,12 @@ MIXING = Problem(
     env_id="npa/Mixing-v0",
     keywords={"particle_counts": [12, 20], "eps": 0.3, "state_dim": 4, "state_scale": 0.1},
     episode_steps=8,
+    num_envs=4,
+)
+DYING = Problem(
+    env_id=MIXING.env_id,
+    keywords=dict(MIXING.keywords) | {"deaths": [[1, 5]]},
+    episode_steps=9,
     num_envs=4,
 )
 SEEDS = range(100, 116)
@@ -331,13 +340,7 @@ def test_particles_of_a_species_that_is_gone_do_not_count():
 
 @pytest.mark.parametrize("steps", [5, 8], ids=["at the end of a round", "within a round"])
 def test_a_species_that_ends_is_worth_nothing_more(steps):
-    dying = Problem(
-        env_id=MIXING.env_id,
-        keywords=dict(MIXING.keywords) | {"deaths": [[1, 5]]},
-        episode_steps=9,
-        num_envs=4,
-    )
-    given = learner(dying, steps=steps, gamma=0.5, gae_lambda=1.0)
+    given = learner(DYING, steps=steps, gamma=0.5, gae_lambda=1.0)
     with torch.no_grad():
         given.critic.value.bias.fill_(3.0)
     batch = given.play()
@@ -367,13 +370,26 @@ def test_rules_that_have_gone_far_enough_stay_for_the_rest_of_a_round():
     assert not torch.equal(after(1, 1e6), after(3, 1e6))
 
 
-@pytest.mark.parametrize("form", ["device", "device, by worlds"])
-def test_recorded_rounds_are_those_of_kernels_one_by_one(form, device, monkeypatch):
+@pytest.mark.parametrize(
+    ("form", "problem", "options"),
+    [
+        ("device", HEART, {}),
+        ("device, by worlds", HEART, {}),
+        ("device", HEART, {"target_kl": 1e-6}),
+        ("device", DYING, {}),
+        ("device, by worlds", DYING, {}),
+    ],
+    ids=["particles", "worlds", "rules that stay", "species", "species, by worlds"],
+)
+def test_recorded_rounds_are_those_of_kernels_one_by_one(
+    form, problem, options, device, monkeypatch
+):
     if device.type != "cuda":
         pytest.skip("rounds are recorded on CUDA only")
 
     def learned():
-        given = Learner(HEART, Settings(critic_rounds=3, **FORMS[form][1]), 0, device, None)
+        settings = Settings(critic_rounds=3, **FORMS[form][1], **options)
+        given = Learner(problem, settings, 0, device, None)
         # The third call of what is recorded is the first replay that nothing was recorded in.
         for share_left in (1.0, 0.9, 0.7, 0.5, 0.3, 0.1):
             batch = given.play()
@@ -385,6 +401,30 @@ def test_recorded_rounds_are_those_of_kernels_one_by_one(form, device, monkeypat
     for value, wanted in zip(recorded, learned(), strict=True):
         assert float(wanted.detach().norm()) > 0.0
         torch.testing.assert_close(value, wanted, rtol=1e-3, atol=1e-5)
+
+
+@pytest.mark.parametrize("problem", [HEART, MIXING], ids=["one", "two species"])
+def test_a_learner_and_its_memory_are_freed_at_once(problem):
+    given = learner(problem, steps=4)
+    given.play()
+    given.improve(1.0)
+    held = [weakref.ref(thing) for thing in (given, given.memory, given.envs)]
+    with no_garbage_collection():
+        del given
+        assert [thing() for thing in held] == [None] * 3
+
+
+def test_read_outs_and_frozen_layers_stay_as_they_are():
+    rule = NPARule(2, 4, 16, readout_dim=10, readout_hidden_dim=8)
+    rule.hidden.requires_grad_(False)
+    with torch.no_grad():
+        rule.readout[2].weight.normal_()
+    start = RuleSet.of(HEART, rule)
+    (found,) = run("device", HEART, 2 * ROUND, start=start, critic_rounds=0).rules
+    assert torch.equal(found.hidden.weight, rule.hidden.weight)
+    assert torch.equal(found.readout[2].weight, rule.readout[2].weight)
+    assert not torch.equal(found.output.weight, rule.output.weight)
+    assert found.output.weight.grad is None
 
 
 @EVERY_FORM
@@ -405,7 +445,7 @@ def test_a_gpu_is_kept_busy_where_neither_memory_nor_budget_forbids(monkeypatch)
     assert ppo_worlds.world_count(HEART, settings, cuda, long) == 2048
     assert ppo_worlds.world_count(HEART, settings, cpu, long) == 8
     assert ppo_worlds.world_count(HEART, Settings(worlds=3), cuda, long) == 3
-    rounds = Budget(particle_steps=32 * 16 * 64 * 100)
+    rounds = Budget(particle_steps=128 * 16 * 64 * 100)
     assert ppo_worlds.world_count(HEART, settings, cuda, rounds) == 100
     free["bytes"] = gib
     fewer = ppo_worlds.world_count(HEART, settings, cuda, long)

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import gc
+import pickle
+import weakref
 from types import SimpleNamespace
 
 import pytest
 import torch
 
 from npa_envs import replay
-from npa_envs.replay import Replayed, capture
+from npa_envs.replay import Replayed, capture, no_garbage_collection
 
 CUDA = torch.device("cuda", 0)
 
@@ -149,6 +152,42 @@ def test_on_a_cpu_a_replayed_function_is_simply_called(events):
     for _ in range(3):
         replayed()
     assert events == ["run"] * 3
+
+
+class Counter:
+    """Counts its runs, through a method that is replayed."""
+
+    def __init__(self, device=CUDA):
+        self.count = 0
+        self.run = Replayed(self.add, device)
+
+    def add(self):
+        self.count += 1
+
+
+def test_an_object_whose_method_is_replayed_is_freed_at_once(events):
+    counter = Counter()
+    for _ in range(3):
+        counter.run()
+    assert counter.count == 2
+    assert events.count("replay") == 2
+    held = [weakref.ref(thing) for thing in (counter, counter.run)]
+    with no_garbage_collection():
+        del counter
+        assert [thing() for thing in held] == [None, None]
+
+
+@pytest.mark.parametrize(
+    "copied",
+    [copy.deepcopy, lambda given: pickle.loads(pickle.dumps(given))],
+    ids=["copy", "pickle"],
+)
+def test_a_copied_object_replays_its_own_method(copied):
+    counter = Counter(torch.device("cpu"))
+    counter.run()
+    other = copied(counter)
+    other.run()
+    assert (counter.count, other.count) == (1, 2)
 
 
 needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")

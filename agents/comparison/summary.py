@@ -11,16 +11,16 @@ from npa_envs.agents.comparison.pictures import write_strips
 from npa_envs.agents.comparison.plan import Plan
 from npa_envs.agents.comparison.plots import pictures
 from npa_envs.agents.comparison.record import RunRecord
-from npa_envs.agents.comparison.tables import as_json, rows, text
+from npa_envs.agents.comparison.tables import as_json, curves, rows, text
 from npa_envs.bench.plots import write_plots
 from npa_envs.files import write_text
 
-TABLE, FIGURES = "comparison.md", "comparison.json"
-"""Names of the files of the table."""
+TABLE, FIGURES, CURVES = "comparison.md", "comparison.json", "comparison.csv"
+"""Names of the files of the table, and of the curves."""
 
 
 def write_table(plan: Plan, records: Sequence[RunRecord], folder: Path, command: str) -> str:
-    """Write the table, in Markdown and as JSON, and return the former.
+    """Write the table, in Markdown and as JSON, and all curves; return the table in Markdown.
 
     Args:
         plan: What was compared.
@@ -35,6 +35,7 @@ def write_table(plan: Plan, records: Sequence[RunRecord], folder: Path, command:
     told = text(table) + _sharing(plan)
     write_text(folder / TABLE, f"`{command}`\n\n{told}")
     write_text(folder / FIGURES, as_json(table, _facts(plan, command)))
+    write_text(folder / CURVES, curves(records))
     return told
 
 

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import astuple, dataclass, fields
 from typing import Any, NamedTuple
 
 from npa_envs.agents.comparison.plan import AXES, Axis
-from npa_envs.agents.comparison.record import RunRecord
+from npa_envs.agents.comparison.record import Point, RunRecord
 
 YARDSTICK, NOTHING = "gradient", "zero"
 """Methods whose returns count as 1 and as 0."""
@@ -247,3 +249,22 @@ def as_json(table: Sequence[Row], facts: Mapping[str, Any]) -> str:
     own = [{field.name: plain(getattr(row, field.name)) for field in fields(row)} for row in table]
     content = {"facts": dict(facts), "rows": own}
     return json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+
+
+def curves(records: Iterable[RunRecord]) -> str:
+    """Return all learning curves as comma-separated values, a line for each point.
+
+    Args:
+        records: Those of the runs; of those that failed, the curves up to there.
+    """
+    written = io.StringIO()
+    writer = csv.writer(written, lineterminator="\n")
+    runs = ("axis", "task", "method", "seed", "status")
+    writer.writerow((*runs, *(field.name for field in fields(Point))))
+    for record in records:
+        job = record.job
+        named = (job.axis, job.task, job.method, job.seed, record.status)
+        for point in record.curve:
+            numbers = (f"{value:.9g}" for value in astuple(point))
+            writer.writerow((*named, *numbers))
+    return written.getvalue()

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -166,7 +165,7 @@ class Learner:
         self._action, self._log_prob = (
             part[0].clone() for part in (self.memory.actions, self.memory.log_probs)
         )
-        self._near, self._rate = torch.ones(2, device=device)
+        self._near, self._rate, self._all_act = torch.ones(3, device=device)
         played = settings.steps * self.envs.num_envs
         sizes = [played] if settings.ratio == "world" else [played * n for n in problem.counts]
         # Of what is shuffled for the rules, and of worlds for the critic.
@@ -176,7 +175,8 @@ class Learner:
         self._act = Replayed(self._draw_actions, device, self.generator)
         self._value = Replayed(self._find_values, device)
         self._judge = Replayed(self._find_advantages, device)
-        self._learn = {flag: Replayed(partial(self._pass, flag), device) for flag in (False, True)}
+        self._learn_values = Replayed(self._improve_critic, device)
+        self._learn = Replayed(self._improve_both, device)
 
     @property
     def round_size(self) -> int:
@@ -204,8 +204,7 @@ class Learner:
                 last_seen[step] = infos["final_obs"]
             shared = self.settings.credit == "world"
             memory.rewards[step].copy_(reward[:, None] if shared else own_rewards(infos))
-            if "acted" in infos:
-                memory.acted[step].copy_(infos["acted"])
+            memory.acted[step].copy_(infos.get("acted", self._all_act))
             # A species may end before its world does.
             gone = infos.get("particle_terminated", terminated[:, None])
             memory.terminated[step].copy_(terminated[:, None] | gone)
@@ -269,26 +268,33 @@ class Learner:
         for _ in range(settings.epochs):
             for order in self._orders:
                 torch.randperm(len(order), generator=self.generator, out=order)
-            self._learn[rules_learn]()
+            if not rules_learn:
+                self._learn_values()
+                continue
+            self._learn()
             # All that the host waits for.
-            if rules_learn and not bool(self._near):
+            if not bool(self._near):
                 break
         assert settings.last_noise is not None, "filled in above"
         self.actor.leave_noise(noise_left(share_left, settings.last_noise))
 
-    def _pass(self, rules_learn: bool) -> None:
-        """Learn once from all of a round, in the order that was drawn."""
+    def _improve_critic(self) -> None:
+        """Let the critic learn once from all of a round, in the order that was drawn."""
+        for worlds in self._shuffled([self.memory.round], self._orders[-1:]):
+            self._descend(self.critic_optimizer, self._critic_loss(*worlds))
+
+    def _improve_both(self) -> None:
+        """Let critic and rules learn once from all of a round, in the orders that were drawn."""
         whole = self.memory.round
         *orders, order = self._orders
         parts = self._shuffled(self._groups(whole), orders)
         for part, worlds in zip(parts, self._shuffled([whole], [order]), strict=True):
             self._descend(self.critic_optimizer, self._critic_loss(*worlds))
-            if rules_learn:
-                gain, kl = self._surrogate(part)
-                # Rules that have gone too far stay, without a question to the host.
-                self._near *= kl.detach() <= self.settings.target_kl
-                self.optimizer.param_groups[0]["lr"].copy_(self._near * self._rate)
-                self._descend(self.optimizer, -gain)
+            gain, kl = self._surrogate(part)
+            # Rules that have gone too far stay, without a question to the host.
+            self._near *= kl.detach() <= self.settings.target_kl
+            self.optimizer.param_groups[0]["lr"].copy_(self._near * self._rate)
+            self._descend(self.optimizer, -gain)
 
     def _groups(self, batch: Round) -> list[Round]:
         """Return what is shuffled when rules learn: whole worlds, or each species' particles."""
@@ -336,13 +342,15 @@ class Learner:
         return 0.5 * (worlds.acted * error.square()).sum() / worlds.acted.sum().clamp(min=1.0)
 
     def _descend(self, optimizer: torch.optim.Optimizer, loss: Tensor) -> None:
-        parameters = optimizer.param_groups[0]["params"]
+        # A read-out does not act, and layers may be frozen.
+        parameters = [p for p in optimizer.param_groups[0]["params"] if p.requires_grad]
         # Not backward(): its accumulation nodes remember the stream they were first used on, which
         # a capture on another stream must not touch.
-        gradients = torch.autograd.grad(loss, parameters)
+        gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
         for parameter, gradient in zip(parameters, gradients, strict=True):
-            # Laid out like the parameter, as the fused optimizer takes for granted.
-            parameter.grad = torch.empty_like(parameter).copy_(gradient)
+            if gradient is not None:
+                # Laid out like the parameter, as the fused optimizer takes for granted.
+                parameter.grad = torch.empty_like(parameter).copy_(gradient)
         nn.utils.clip_grad_norm_(parameters, self.settings.max_gradient_norm)
         optimizer.step()
 
@@ -383,4 +391,6 @@ def train(
         learner.improve(share_left)
         progress.look(rules)
     progress.look(rules, force=True)
+    # Gradients lie in the memory of what was recorded.
+    learner.actor.zero_grad()
     return rules

@@ -46,7 +46,7 @@ class Settings:
 
     worlds: int | None = None
     """Worlds B to act in; None: the problem's `num_envs`, and on CUDA as many as have 131 072
-    particles together, if memory has room for them and particle-steps are enough for 32 rounds."""
+    particles together, if memory has room for them and particle-steps are enough for 128 rounds."""
 
     steps: int = 16
     """Steps of all worlds in a round, T."""

@@ -37,8 +37,8 @@ class CompareOptions:
     """
 
     output: Path = Path("comparison")
-    """Folder for AXIS/TASK/METHOD/seed-K/, comparison.md and .json, pictures, and curves (extra
-    `bench`)."""
+    """Folder for AXIS/TASK/METHOD/seed-K/, comparison.md, .json and .csv, and pictures
+    (curves need the extra `bench`)."""
 
     tasks: tuple[str, ...] = ()
     """morphogenesis2d, regeneration2d, point_classification, mixing; default: all."""
