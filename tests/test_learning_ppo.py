@@ -517,6 +517,7 @@ def test_rows_that_are_cut_off_are_paid_what_the_critic_still_expects():
         ({"credit": "particle", "ratio": "world"}, "credit='particle' needs ratio='particle'"),
         ({"gamma": 0.0}, r"gamma must lie in \(0, 1\], got 0.0"),
         ({"last_noise": 0.0}, r"last_noise must lie in \(0, 1\], got 0.0"),
+        ({"noise_decay_share": 0.0}, r"noise_decay_share must lie in \(0, 1\], got 0.0"),
         ({"minibatches": 0}, "minibatches must be a whole number of at least 1"),
         ({"worlds": 0}, "worlds must be a whole number of at least 1"),
     ],
@@ -540,14 +541,16 @@ def test_options_are_known_by_name_and_depend_on_a_start_where_they_are_none():
     assert filled(Settings(initial_std=0.7), None).initial_std == 0.7
 
 
-def test_noise_is_kept_for_half_of_the_budget_and_then_falls_by_equal_factors():
+def test_noise_is_kept_at_first_and_then_falls_by_equal_factors():
     shares = [1.0, 0.75, 0.5, 0.25, 0.0]
-    assert [noise_left(left, 0.25) for left in shares] == [1.0, 1.0, 1.0, 0.5, 0.25]
-    assert [noise_left(left, 1.0) for left in shares] == [1.0] * 5
+    assert [noise_left(left, 0.25, 0.5) for left in shares] == [1.0, 1.0, 1.0, 0.5, 0.25]
+    assert [noise_left(left, 1.0, 0.5) for left in shares] == [1.0] * 5
+    assert [noise_left(left, 1 / 16, 1.0) for left in shares] == [1.0, 0.5, 0.25, 0.125, 1 / 16]
 
 
+@pytest.mark.parametrize(("decay_share", "kept"), [(0.5, 4), (0.25, 6)])
 @EVERY_FORM
-def test_in_every_form_the_noise_falls_towards_the_end(form, monkeypatch):
+def test_in_every_form_the_noise_falls_towards_the_end(form, decay_share, kept, monkeypatch):
     pytest.importorskip("stable_baselines3")
     left = [1.0]
     leave = GaussianRules.leave_noise
@@ -559,11 +562,12 @@ def test_in_every_form_the_noise_falls_towards_the_end(form, monkeypatch):
         left.append(share)
 
     monkeypatch.setattr(GaussianRules, "leave_noise", spy)
-    run(form, HEART, 8 * ROUND, last_noise=0.1, critic_rounds=0)
+    options = {"last_noise": 0.1, "noise_decay_share": decay_share}
+    run(form, HEART, 8 * ROUND, critic_rounds=0, **options)
     left = np.array(left[1:])
-    assert left[:4] == pytest.approx(1.0)
-    assert (np.diff(left[4:]) < 0.0).all()
-    assert 0.1 <= left[-1] < 0.25
+    assert left[:kept] == pytest.approx(1.0)
+    assert (np.diff(left[kept:]) < 0.0).all()
+    assert 0.1 <= left[-1] < 0.5
 
 
 def test_species_as_rows_cannot_be_paid_by_worlds():

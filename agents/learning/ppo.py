@@ -276,7 +276,9 @@ class Learner:
             if not bool(self._near):
                 break
         assert settings.last_noise is not None, "filled in above"
-        self.actor.leave_noise(noise_left(share_left, settings.last_noise))
+        self.actor.leave_noise(
+            noise_left(share_left, settings.last_noise, settings.noise_decay_share)
+        )
 
     def _improve_critic(self) -> None:
         """Let the critic learn once from all of a round, in the order that was drawn."""

@@ -89,8 +89,12 @@ class Settings:
     """Standard deviation of every action column at first; None: 0.2, or 0.05 with a `start`."""
 
     last_noise: float | None = None
-    """What is left of the standard deviations at the end of the budget, in whose second half they
-    fall (dimensionless); None: 0.25, or 1 with a `start`."""
+    """What is left of the standard deviations at the end of the budget (dimensionless); None: 0.25,
+    or 1 with a `start`."""
+
+    noise_decay_share: float = 0.5
+    """Share of the budget, its last, in which standard deviations fall to that; 1: from the
+    start."""
 
     critic_rounds: int | None = None
     """Rounds in which the critic learns alone; None: 0, or 4 with a `start`."""
@@ -116,7 +120,7 @@ class Settings:
         check_positive(self, int, "steps", "epochs", "minibatches", "critic_width")
         check_positive(self, float, "max_gradient_norm")
         check_non_negative(self, "critic_learning_rate", "entropy_weight")
-        check_fraction(self, "gamma", "gae_lambda")
+        check_fraction(self, "gamma", "gae_lambda", "noise_decay_share")
         for name in ("clip", "learning_rate", "target_kl", "initial_std"):
             if getattr(self, name) is not None:
                 check_positive(self, float, name)
@@ -168,17 +172,18 @@ def filled(settings: Any, start: RuleSet | None) -> Any:
     return replace(settings, **missing)
 
 
-def noise_left(share_left: float, last_noise: float) -> float:
-    """Return what is left of the first noise: all of it until half of the budget is spent.
+def noise_left(share_left: float, last_noise: float, decay_share: float) -> float:
+    """Return what is left of the first noise: all of it at first, then it falls by equal factors.
 
     What is learned is what is best with noise, and what counts is what it does without: towards the
-    end the two are to be the same. From the middle on it falls by equal factors.
+    end the two are to be the same.
 
     Args:
         share_left: Share of the budget that is left.
         last_noise: What is left of the noise when nothing is.
+        decay_share: Share of the budget, its last, in which it falls.
     """
-    return math.pow(last_noise, max(0.0, 1.0 - 2.0 * share_left))
+    return math.pow(last_noise, max(0.0, 1.0 - share_left / decay_share))
 
 
 def beginning(problem: Problem, seed: int, start: RuleSet | None) -> RuleSet:

@@ -65,8 +65,12 @@ class SB3Settings:
     """Standard deviation of every action column at first; None: 0.2, or 0.05 with a `start`."""
 
     last_noise: float | None = None
-    """What is left of the standard deviations at the end of the budget, in whose second half they
-    fall (dimensionless); None: 0.25, or 1 with a `start`."""
+    """What is left of the standard deviations at the end of the budget (dimensionless); None: 0.25,
+    or 1 with a `start`."""
+
+    noise_decay_share: float = 0.5
+    """Share of the budget, its last, in which standard deviations fall to that; 1: from the
+    start."""
 
     critic_rounds: int | None = None
     """Rounds in which the critic learns alone; None: 0, or 4 with a `start`."""
@@ -86,7 +90,7 @@ class SB3Settings:
         check_positive(self, int, "steps", "epochs", "minibatches")
         check_positive(self, float, "clip", "max_gradient_norm")
         check_non_negative(self, "entropy_weight")
-        check_fraction(self, "gamma", "gae_lambda")
+        check_fraction(self, "gamma", "gae_lambda", "noise_decay_share")
         for name in ("learning_rate", "target_kl", "initial_std"):
             if getattr(self, name) is not None:
                 check_positive(self, float, name)
@@ -105,6 +109,7 @@ class ProgressCallback(BaseCallback):
         round_size: Particle-steps of a round, T B N.
         critic_rounds: Rounds in which the critic learns alone.
         last_noise: What is left of the noise in the end.
+        noise_decay_share: Share of the budget, its last, in which it falls.
     """
 
     def __init__(
@@ -113,10 +118,12 @@ class ProgressCallback(BaseCallback):
         round_size: int,
         critic_rounds: int = 0,
         last_noise: float = 1.0,
+        noise_decay_share: float = 1.0,
     ) -> None:
         super().__init__()
         self.critic_rounds = critic_rounds
         self.last_noise = last_noise
+        self.noise_decay_share = noise_decay_share
         self.progress = progress
         self.round_size = round_size
         self.share_left = 1.0
@@ -136,7 +143,9 @@ class ProgressCallback(BaseCallback):
         self.progress.look(self.rules)
         self.share_left = max(0.0, 1.0 - self.progress.share)
         policy: Any = self.model.policy
-        policy.actor.leave_noise(noise_left(self.share_left, self.last_noise))
+        policy.actor.leave_noise(
+            noise_left(self.share_left, self.last_noise, self.noise_decay_share)
+        )
         policy.actor.requires_grad_(self.critic_rounds <= 0)
         self.critic_rounds -= 1
 
@@ -219,6 +228,7 @@ def learn(
         settings.steps * problem.num_envs * problem.particle_count,
         alone,
         chosen.last_noise,
+        settings.noise_decay_share,
     )
     model = PPO(
         policy_type,
