@@ -233,7 +233,7 @@ def test_loss_is_the_weighted_sum_of_its_parts(target):
     assert float(parts["motion"]) == pytest.approx(0.4)
     assert float(parts["overflow"]) == pytest.approx(float((s.abs() - 1).clamp_min(0).mean()))
     assert float(parts["bound"]) == pytest.approx(float((x.abs() - 1).clamp_min(0).mean()))
-    assert float(parts["isotropy"]) == pytest.approx(
+    assert float(parts["isotropy"].detach()) == pytest.approx(
         float(seen.gaussians(s.detach()).stretch.detach().abs().mean())
     )
     expected = (

@@ -58,7 +58,7 @@ def test_only_the_paths_of_those_outside_count():
     assert float(motion.detach()) == 1.5
     motion.backward()
     assert path.grad.tolist() == [[0.0, 0.5, 0.5]]
-    assert float(stray_motion(x[:, :1], path[:, :1])) == 0.0
+    assert float(stray_motion(x[:, :1], path[:, :1]).detach()) == 0.0
 
 
 def test_a_share_throws_particles_of_the_pool_out_and_a_weight_counts_their_paths():
