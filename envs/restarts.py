@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.control import SurveyedWorlds
-from npa_envs.replay import Replayed, sent
+from npa_envs.replay import Replayed, WeakFunction, sent
 
 GROWTH = 4
 """Each recorded size is so many times the one before it."""
@@ -25,7 +25,8 @@ class Restarts:
 
     Args:
         start: Starts the next episodes of worlds (indices, int64, shape [M]) and returns them made
-            ready for perception in the rows of the whole batch.
+            ready for perception in the rows of the whole batch. A method's object has to be kept
+            by others.
         world_count: Worlds B.
         device: Where they live.
         recorded: Whether `start` may be recorded: it never waits for the device.
@@ -39,7 +40,7 @@ class Restarts:
         *,
         recorded: bool,
     ) -> None:
-        self._start = start
+        self._start = WeakFunction(start)
         self._world_count = world_count
         self._device = device
         self._recorded = recorded and device.type == "cuda"
@@ -57,7 +58,7 @@ class Restarts:
             observation: Where to write what is perceived in them, shape [B, N, P].
         """
         if not self._recorded:
-            self._start(sent(worlds, self._device)).perceive(observation)
+            self._start()(sent(worlds, self._device)).perceive(observation)
             return
         size = 1
         while size < len(worlds):
@@ -72,9 +73,7 @@ class Restarts:
 class _Chunk:
     """The recorded start of a fixed number of worlds."""
 
-    def __init__(
-        self, start: Callable[[Tensor], SurveyedWorlds], size: int, device: torch.device
-    ) -> None:
+    def __init__(self, start: WeakFunction, size: int, device: torch.device) -> None:
         self._start = start
         self._index = torch.zeros(size, dtype=torch.int64, device=device)
         self._replayed = Replayed(self._run, device)
@@ -86,4 +85,4 @@ class _Chunk:
         self._surveyed.perceive(observation)
 
     def _run(self) -> None:
-        self._surveyed = self._start(self._index)
+        self._surveyed: SurveyedWorlds = self._start()(self._index)

@@ -129,17 +129,44 @@ def _record(function: Callable[[], object], graph: torch.cuda.CUDAGraph, pool: A
     graph.capture_end()
 
 
+class WeakFunction:
+    """A function that is kept, or a method whose object is not kept alive.
+
+    An object that keeps its own method is freed only when garbage is collected, and with it graphs
+    and their memory. What this returns is of no use once its object is gone.
+
+    Args:
+        function: The function, or the method of an object that others keep.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._get = weakref.WeakMethod(function) if inspect.ismethod(function) else lambda: function
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copy and pickle the method of the copied object."""
+        return WeakFunction, (self(),)
+
+    def __call__(self) -> Callable[..., Any]:
+        """Return the function.
+
+        Raises:
+            ReferenceError: Its object is gone.
+        """
+        function = self._get()
+        if function is None:
+            raise ReferenceError("the object of this method is gone: keep it as long as the method")
+        return function
+
+
 class Replayed:
     """A function without arguments that is run as it is on a CPU, and as a CUDA graph on CUDA.
 
     Launches of many short kernels would otherwise take longer than the kernels do. The first call
     runs the function kernel by kernel, which loads them; the second captures it.
 
-    A method's object is not kept alive: it mostly keeps this one, and graphs and their memory would
-    stay until garbage is collected.
-
     Args:
-        function: Reads and writes the same tensors in every call, and never waits for the device.
+        function: Reads and writes the same tensors in every call, and never waits for the device. A
+            method's object has to be kept by others (`WeakFunction`).
         device: Where these are.
         generator: A generator on the device that the function draws from; the numbers are the same
             whether it is captured or not.
@@ -151,7 +178,7 @@ class Replayed:
         device: torch.device,
         generator: torch.Generator | None = None,
     ) -> None:
-        self._function = _weak(function)
+        self._function = WeakFunction(function)
         self._device = device
         self._generator = generator
         self._warm = False
@@ -159,30 +186,22 @@ class Replayed:
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the graph, which cannot be pickled: it is captured anew."""
-        return self.__dict__ | {"_function": self._function(), "_warm": False, "_graph": None}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Take the function of the copied object."""
-        self.__dict__ |= state | {"_function": _weak(state["_function"])}
+        return self.__dict__ | {"_warm": False, "_graph": None}
 
     def __call__(self) -> None:
-        """Run the function."""
-        if self._device.type == "cuda" and self._graph is not None:
-            self._graph.replay()
-            return
+        """Run the function.
+
+        Raises:
+            ReferenceError: It is a method, and its object is gone.
+        """
         function = self._function()
-        assert function is not None, "whoever calls holds the object"
         if self._device.type == "cpu" or not self._warm:
             function()
             self._warm = True
             return
-        self._graph = capture(function, self._device, generator=self._generator)
+        if self._graph is None:
+            self._graph = capture(function, self._device, generator=self._generator)
         self._graph.replay()
-
-
-def _weak(function: Callable[[], None]) -> Callable[[], Callable[[], None] | None]:
-    """Return what returns a function, or None where it is a method whose object is gone."""
-    return weakref.WeakMethod(function) if inspect.ismethod(function) else lambda: function
 
 
 class Beside:

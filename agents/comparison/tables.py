@@ -265,6 +265,6 @@ def curves(records: Iterable[RunRecord]) -> str:
         job = record.job
         named = (job.axis, job.task, job.method, job.seed, record.status)
         for point in record.curve:
-            numbers = (f"{value:.9g}" for value in astuple(point))
+            numbers = (f"{value:.12g}" for value in astuple(point))
             writer.writerow((*named, *numbers))
     return written.getvalue()

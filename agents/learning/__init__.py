@@ -118,6 +118,8 @@ def train(
     )
     result = function(problem, progress, seed, device=place, start=start, **options)
     if isinstance(result, RuleSet):
+        # Of no use any more, they may keep the memory of recorded work.
+        result.zero_grad()
         return Trained(result, progress.log, result.policy())
     return Trained(None, progress.log, result)
 

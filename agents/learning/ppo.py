@@ -393,6 +393,4 @@ def train(
         learner.improve(share_left)
         progress.look(rules)
     progress.look(rules, force=True)
-    # Gradients lie in the memory of what was recorded.
-    learner.actor.zero_grad()
     return rules

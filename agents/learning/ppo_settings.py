@@ -45,8 +45,9 @@ class Settings:
     """Options of `train`."""
 
     worlds: int | None = None
-    """Worlds B to act in; None: the problem's `num_envs`, and on CUDA as many as have 131 072
-    particles together, if memory has room for them and particle-steps are enough for 128 rounds."""
+    """Worlds B to act in; None: the problem's `num_envs`, and on CUDA, where that is more, as many
+    as have 131 072 particles together, if memory has room for them and particle-steps are enough
+    for 128 rounds."""
 
     steps: int = 16
     """Steps of all worlds in a round, T."""

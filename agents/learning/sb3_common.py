@@ -137,6 +137,8 @@ class ProgressCallback(BaseCallback):
         return rules
 
     def _on_training_start(self) -> None:
+        policy: Any = self.model.policy
+        self._learned = [p for p in policy.actor.parameters() if p.requires_grad]
         self.progress.start(self.rules)
 
     def _on_rollout_start(self) -> None:
@@ -146,7 +148,8 @@ class ProgressCallback(BaseCallback):
         policy.actor.leave_noise(
             noise_left(self.share_left, self.last_noise, self.noise_decay_share)
         )
-        policy.actor.requires_grad_(self.critic_rounds <= 0)
+        for parameter in self._learned:
+            parameter.requires_grad_(self.critic_rounds <= 0)
         self.critic_rounds -= 1
 
     def _on_step(self) -> bool:
