@@ -572,7 +572,9 @@ def test_in_every_form_the_noise_falls_towards_the_end(form, decay_share, kept, 
     left = np.array(left[1:])
     assert left[:kept] == pytest.approx(1.0)
     assert (np.diff(left[kept:]) < 0.0).all()
-    assert 0.1 <= left[-1] < 0.5
+    # The last of eight rounds begins with an eighth of the budget.
+    assert left[7] == pytest.approx(0.1 ** (1.0 - 0.125 / decay_share))
+    assert 0.1 <= left[-1] <= left[7]
 
 
 def test_species_as_rows_cannot_be_paid_by_worlds():

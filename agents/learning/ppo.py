@@ -79,7 +79,7 @@ class Memory:
         """What is done, not clipped, shape [T, B, N, A]."""
         self.log_probs = zeros(*single)
         """Log-probabilities of that, shape [T, B, N]."""
-        self.acted = zeros(*single).fill_(1.0)
+        self.acted = zeros(*single)
         """1 where a particle's species is alive, else 0, likewise."""
         self.rewards = zeros(*single)
         """What each particle is paid, likewise."""
@@ -307,7 +307,7 @@ class Learner:
 
     def _shuffled(self, groups: list[Round], orders: list[Tensor]) -> Iterator[list[Round]]:
         """Return minibatches: parts of each group, in an order of its own."""
-        count = min(self.settings.minibatches, len(self.memory.round.targets))
+        count = min(self.settings.minibatches, len(self._orders[-1]))
         parts = [order.tensor_split(count) for order in orders]
         for chosen in zip(*parts, strict=True):
             yield [

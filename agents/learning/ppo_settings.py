@@ -1,4 +1,4 @@
-"""Options of the device's own PPO."""
+"""Options of PPO: those that all forms share, and those of the device's own."""
 
 from __future__ import annotations
 
@@ -41,13 +41,8 @@ CHOICES = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class Settings:
-    """Options of `train`."""
-
-    worlds: int | None = None
-    """Worlds B to act in; None: the problem's `num_envs`, and on CUDA, where that is more, as many
-    as have 131 072 particles together, if memory has room for them and particle-steps are enough
-    for 128 rounds."""
+class CommonSettings:
+    """Options that the device's own PPO and Stable-Baselines3's share."""
 
     steps: int = 16
     """Steps of all worlds in a round, T."""
@@ -55,16 +50,9 @@ class Settings:
     epochs: int = 4
     """Passes over a round; fewer where `target_kl` is passed."""
 
-    minibatches: int = 4
-    """Parts that the particles of a round are shuffled into in each pass; for the critic, and where
-    a world has one ratio, its worlds are."""
-
     learning_rate: float | None = None
-    """Adam's step of the rules at the start, from which it falls to zero over the budget; None:
-    0.001, or 0.0001 with a `start`."""
-
-    critic_learning_rate: float = 1e-3
-    """The same for the critic."""
+    """Adam's step at the start, from which it falls to zero over the budget; None: 0.001, or 0.0001
+    with a `start`."""
 
     gamma: float = 0.5
     """Discount of a reward one step later (dimensionless)."""
@@ -72,19 +60,8 @@ class Settings:
     gae_lambda: float = 0.9
     """Discount of what the critic did not foresee, besides `gamma` (dimensionless)."""
 
-    clip: float | None = None
-    """Ratios of likelihoods count up to 1 plus or minus this (dimensionless). None: 0.2, or 0.02
-    for a world's, whose logarithms are means over many particles."""
-
     entropy_weight: float = 0.0
-    """Weight of the entropy of a particle's action in what is maximised."""
-
-    max_gradient_norm: float = 0.5
-    """Gradients of the rules, and those of the critic, are shortened to this norm."""
-
-    target_kl: float | None = None
-    """The rules stay as they are for the rest of a round once particles' actions are farther than
-    this from those that were played [nats]; None: 0.2, or 0.05 with a `start`."""
+    """Weight of the entropy of an action in what is maximised."""
 
     initial_std: float | None = None
     """Standard deviation of every action column at first; None: 0.2, or 0.05 with a `start`."""
@@ -100,14 +77,60 @@ class Settings:
     critic_rounds: int | None = None
     """Rounds in which the critic learns alone; None: 0, or 4 with a `start`."""
 
+    critic: CriticKind = "particle"
+    """A value follows from a particle's own perception, or from its whole world ("central")."""
+
+    def __post_init__(self) -> None:
+        """Check every field.
+
+        Raises:
+            NPAError: One lies outside its range.
+        """
+        check_positive(self, int, "steps", "epochs")
+        check_non_negative(self, "entropy_weight")
+        check_fraction(self, "gamma", "gae_lambda", "noise_decay_share")
+        for name in ("learning_rate", "initial_std"):
+            if getattr(self, name) is not None:
+                check_positive(self, float, name)
+        if self.last_noise is not None:
+            check_fraction(self, "last_noise")
+        if self.critic_rounds is not None:
+            check_positive(self, int, "critic_rounds", at_least=0)
+        check_words(self, "critic")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings(CommonSettings):
+    """Options of `train`."""
+
+    worlds: int | None = None
+    """Worlds B to act in; None: the problem's `num_envs`, and on CUDA, where that is more, as many
+    as have 131 072 particles together, if memory has room for them and particle-steps are enough
+    for 128 rounds."""
+
+    minibatches: int = 4
+    """Parts that the particles of a round are shuffled into in each pass; for the critic, and where
+    a world has one ratio, its worlds are."""
+
+    critic_learning_rate: float = 1e-3
+    """The critic's step at the start, as `learning_rate` is the rules'."""
+
+    clip: float | None = None
+    """Ratios of likelihoods count up to 1 plus or minus this (dimensionless). None: 0.2, or 0.02
+    for a world's, whose logarithms are means over many particles."""
+
+    max_gradient_norm: float = 0.5
+    """Gradients of the rules, and those of the critic, are shortened to this norm."""
+
+    target_kl: float | None = None
+    """The rules stay as they are for the rest of a round once particles' actions are farther than
+    this from those that were played [nats]; None: 0.2, or 0.05 with a `start`."""
+
     ratio: Literal["particle", "world"] = "particle"
     """Each particle has a ratio of its own, or a world has one, of mean log-probabilities."""
 
     credit: Literal["world", "particle"] = "world"
     """Each particle is paid what its world is, or its own share."""
-
-    critic: CriticKind = "particle"
-    """A value follows from a particle's own perception, or from its whole world ("central")."""
 
     critic_width: int = 64
     """Units in a hidden layer of the critic."""
@@ -118,20 +141,16 @@ class Settings:
         Raises:
             NPAError: One lies outside its range.
         """
-        check_positive(self, int, "steps", "epochs", "minibatches", "critic_width")
+        super().__post_init__()
+        check_positive(self, int, "minibatches", "critic_width")
         check_positive(self, float, "max_gradient_norm")
-        check_non_negative(self, "critic_learning_rate", "entropy_weight")
-        check_fraction(self, "gamma", "gae_lambda", "noise_decay_share")
-        for name in ("clip", "learning_rate", "target_kl", "initial_std"):
+        check_non_negative(self, "critic_learning_rate")
+        for name in ("clip", "target_kl"):
             if getattr(self, name) is not None:
                 check_positive(self, float, name)
-        if self.last_noise is not None:
-            check_fraction(self, "last_noise")
         if self.worlds is not None:
             check_positive(self, int, "worlds")
-        if self.critic_rounds is not None:
-            check_positive(self, int, "critic_rounds", at_least=0)
-        check_words(self, *CHOICES)
+        check_words(self, "ratio", "credit")
         if self.ratio == "world" and self.credit == "particle":
             raise NPAError(
                 "credit='particle' needs ratio='particle': one ratio a world has one advantage"

@@ -9,49 +9,24 @@ from typing import Any
 import numpy as np
 import torch
 
-from npa_envs.agents.learning.critics import CriticKind
-from npa_envs.agents.learning.ppo_settings import (
-    beginning,
-    check_words,
-    filled,
-    noise_left,
-)
+from npa_envs.agents.learning.ppo_settings import CommonSettings, beginning, filled, noise_left
 from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.agents.learning.sb3_imports import PPO, BaseCallback, VecEnv, VecEnvWrapper
 from npa_envs.agents.learning.sb3_policy import RuleActorCritic
 from npa_envs.agents.learning.seeds import world_seeds
-from npa_envs.tasks.checks import check_fraction, check_non_negative, check_positive
+from npa_envs.tasks.checks import check_positive
 
 
 @dataclass(frozen=True, kw_only=True)
-class SB3Settings:
+class SB3Settings(CommonSettings):
     """Options of both forms; the defaults are those of the device's own PPO."""
-
-    steps: int = 16
-    """Steps of all worlds in a round, T."""
-
-    epochs: int = 4
-    """Passes over a round."""
 
     minibatches: int = 4
     """Parts that the rows of a round are shuffled into."""
 
-    learning_rate: float | None = None
-    """Adam's step at the start, from which it falls to zero over the budget; None: 0.001, or 0.0001
-    with a `start`."""
-
-    gamma: float = 0.5
-    """Discount of a reward one step later (dimensionless)."""
-
-    gae_lambda: float = 0.9
-    """Discount of what the critic did not foresee, besides `gamma` (dimensionless)."""
-
     clip: float = 0.2
     """Ratios of likelihoods count up to 1 plus or minus this (dimensionless)."""
-
-    entropy_weight: float = 0.0
-    """Weight of the entropy in what is maximised."""
 
     max_gradient_norm: float = 0.5
     """Gradients of rules and critic, taken together, are shortened to this norm; the device's own
@@ -60,23 +35,6 @@ class SB3Settings:
     target_kl: float | None = None
     """No more updates in a round once particles' actions are about so far from those that were
     played [nats]; None: 0.2, or 0.05 with a `start`."""
-
-    initial_std: float | None = None
-    """Standard deviation of every action column at first; None: 0.2, or 0.05 with a `start`."""
-
-    last_noise: float | None = None
-    """What is left of the standard deviations at the end of the budget (dimensionless); None: 0.25,
-    or 1 with a `start`."""
-
-    noise_decay_share: float = 0.5
-    """Share of the budget, its last, in which standard deviations fall to that; 1: from the
-    start."""
-
-    critic_rounds: int | None = None
-    """Rounds in which the critic learns alone; None: 0, or 4 with a `start`."""
-
-    critic: CriticKind = "particle"
-    """A value follows from a particle's own perception, or from its whole world ("central")."""
 
     tensorboard_log: str | None = None
     """Folder for Stable-Baselines3's own log; None: nowhere."""
@@ -87,18 +45,11 @@ class SB3Settings:
         Raises:
             NPAError: One lies outside its range.
         """
-        check_positive(self, int, "steps", "epochs", "minibatches")
+        super().__post_init__()
+        check_positive(self, int, "minibatches")
         check_positive(self, float, "clip", "max_gradient_norm")
-        check_non_negative(self, "entropy_weight")
-        check_fraction(self, "gamma", "gae_lambda", "noise_decay_share")
-        for name in ("learning_rate", "target_kl", "initial_std"):
-            if getattr(self, name) is not None:
-                check_positive(self, float, name)
-        if self.last_noise is not None:
-            check_fraction(self, "last_noise")
-        if self.critic_rounds is not None:
-            check_positive(self, int, "critic_rounds", at_least=0)
-        check_words(self, "critic")
+        if self.target_kl is not None:
+            check_positive(self, float, "target_kl")
 
 
 class ProgressCallback(BaseCallback):
@@ -106,26 +57,15 @@ class ProgressCallback(BaseCallback):
 
     Args:
         progress: The account.
-        round_size: Particle-steps of a round, T B N.
-        critic_rounds: Rounds in which the critic learns alone.
-        last_noise: What is left of the noise in the end.
-        noise_decay_share: Share of the budget, its last, in which it falls.
+        settings: Of PPO, none of them None any more.
     """
 
-    def __init__(
-        self,
-        progress: Progress,
-        round_size: int,
-        critic_rounds: int = 0,
-        last_noise: float = 1.0,
-        noise_decay_share: float = 1.0,
-    ) -> None:
+    def __init__(self, progress: Progress, settings: Any) -> None:
         super().__init__()
-        self.critic_rounds = critic_rounds
-        self.last_noise = last_noise
-        self.noise_decay_share = noise_decay_share
         self.progress = progress
-        self.round_size = round_size
+        self.settings = settings
+        self.rounds = 0
+        """Rounds begun."""
         self.share_left = 1.0
         """Share of the budget that was left when the round began."""
 
@@ -144,20 +84,22 @@ class ProgressCallback(BaseCallback):
     def _on_rollout_start(self) -> None:
         self.progress.look(self.rules)
         self.share_left = max(0.0, 1.0 - self.progress.share)
+        settings = self.settings
         policy: Any = self.model.policy
         policy.actor.leave_noise(
-            noise_left(self.share_left, self.last_noise, self.noise_decay_share)
+            noise_left(self.share_left, settings.last_noise, settings.noise_decay_share)
         )
         for parameter in self._learned:
-            parameter.requires_grad_(self.critic_rounds <= 0)
-        self.critic_rounds -= 1
+            parameter.requires_grad_(self.rounds >= settings.critic_rounds)
+        self.rounds += 1
 
     def _on_step(self) -> bool:
         """Return whether to go on; asked in every step, so a round that is none ends at once."""
         return self.share_left > 0.0
 
     def _on_rollout_end(self) -> None:
-        self.progress.advance(self.round_size)
+        problem = self.progress.problem
+        self.progress.advance(self.settings.steps * problem.num_envs * problem.particle_count)
 
     def _on_training_end(self) -> None:
         self.progress.look(self.rules, force=True)
@@ -223,20 +165,13 @@ def learn(
     """
     rules = beginning(progress.problem, seed, start)
     chosen: Any = filled(settings, start)
-    rate, alone, far = chosen.learning_rate, chosen.critic_rounds, chosen.target_kl
     rows = settings.steps * env.num_envs
     problem = progress.problem
-    callback = ProgressCallback(
-        progress,
-        settings.steps * problem.num_envs * problem.particle_count,
-        alone,
-        chosen.last_noise,
-        settings.noise_decay_share,
-    )
+    callback = ProgressCallback(progress, chosen)
     model = PPO(
         policy_type,
         env,
-        learning_rate=lambda _: rate * callback.share_left,
+        learning_rate=lambda _: chosen.learning_rate * callback.share_left,
         n_steps=settings.steps,
         batch_size=-(-rows // settings.minibatches),
         n_epochs=settings.epochs,
@@ -245,7 +180,7 @@ def learn(
         clip_range=settings.clip,
         ent_coef=settings.entropy_weight,
         max_grad_norm=settings.max_gradient_norm,
-        target_kl=policy_type.row_kl(far),
+        target_kl=policy_type.row_kl(chosen.target_kl),
         tensorboard_log=settings.tensorboard_log,
         policy_kwargs={
             "rules": rules,
