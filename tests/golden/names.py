@@ -1,0 +1,123 @@
+"""What is public besides numbers: names, ids, commands with their options, documented imports."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import inspect
+import io
+import re
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+
+import npa_envs
+from npa_envs.cli import COMMANDS, main
+
+PACKAGES = (
+    "npa_envs",
+    "npa_envs.agents",
+    "npa_envs.agents.learning",
+    "npa_envs.envs",
+    "npa_envs.envs.species",
+    "npa_envs.render",
+    "npa_envs.sph",
+    "npa_envs.training",
+    "npa_envs.wrappers",
+)
+"""Packages that list their public names."""
+
+
+def public_names() -> dict[str, list[str]]:
+    """Return each package's public names."""
+    return {name: sorted(importlib.import_module(name).__all__) for name in PACKAGES}
+
+
+def signatures() -> dict[str, list[str]]:
+    """Return what each public callable of the library takes: names, kinds, whether optional."""
+    found = {}
+    for name in npa_envs.__all__:
+        value = getattr(npa_envs, name)
+        if not (isinstance(value, type) and issubclass(value, Exception | tuple)):
+            parameters = inspect.signature(value).parameters.values()
+            found[name] = [
+                f"{p.name} {p.kind.name}" + ("" if p.default is p.empty else f" = {p.default!r}")
+                for p in parameters
+            ]
+    return found
+
+
+def ids() -> dict[str, list[str]]:
+    """Return the ids that Gymnasium and PettingZoo know of ours."""
+    import pettingzoo
+
+    for module in ("multispecies_v0", "particles_v0"):
+        importlib.import_module(f"npa_envs.envs.{module}")
+    # PettingZoo before 1.27 has no registries.
+    tables = {
+        "gymnasium": gymnasium.registry,
+        "parallel": getattr(pettingzoo, "parallel_registry", {}),
+        "aec": getattr(pettingzoo, "aec_registry", {}),
+    }
+    return {
+        kind: sorted(name for name in table if name.startswith("npa/"))
+        for kind, table in tables.items()
+    }
+
+
+def options(*words: str) -> list[str]:
+    """Return the options that a command's help names."""
+    text = io.StringIO()
+    with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
+        main([*words, "--help"])
+    return sorted(set(re.findall(r"--[a-z][a-z0-9-]*[a-z0-9]", text.getvalue())))
+
+
+def documented(folder: Path) -> list[str]:
+    """Return the names that documents take from the library and that are there.
+
+    Args:
+        folder: The repository.
+    """
+    texts = [path.read_text(encoding="utf-8") for path in sorted(folder.glob("docs/**/*.md"))]
+    text = "\n".join([*texts, (folder / "README.md").read_text(encoding="utf-8")])
+    names = set(re.findall(r"\bnpa_envs(?:\.\w+)+", text))
+    pattern = r"from (npa_envs[\w.]*) import (\([^)]*\)|[^\n]*)"
+    for module, group in re.findall(pattern, text):
+        words = re.sub(r"#.*", "", group).strip("() \n").replace("\n", " ").split(",")
+        names |= {f"{module}.{word.split()[0]}" for word in words if word.split()}
+    return sorted(name for name in names if is_there(name))
+
+
+def is_there(name: str) -> bool:
+    """Return whether a dotted name can be imported."""
+    parts = name.split(".")
+    for size in range(len(parts), 0, -1):
+        try:
+            value = importlib.import_module(".".join(parts[:size]))
+        except ImportError:
+            continue
+        try:
+            for part in parts[size:]:
+                value = getattr(value, part)
+        except (AttributeError, ImportError):
+            return False
+        return True
+    return False
+
+
+def everything() -> dict[str, Any]:
+    """Return all of it but the documented names."""
+    from npa_envs.training import TASKS
+
+    commands = {name: options(name) for name in COMMANDS if name != "train"}
+    commands |= {f"train {task}": options("train", task) for task in TASKS}
+    return {
+        "packages": public_names(),
+        "signatures": signatures(),
+        "ids": ids(),
+        "commands": commands,
+        "presets": {name: sorted(entry.presets) for name, entry in TASKS.items()},
+        "rules": sorted(npa_envs.shipped_rules()),
+    }

@@ -1,0 +1,169 @@
+"""Results are those of the commit that wrote the golden files; NPA_GOLDEN=exact: bit for bit."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import names
+import numpy as np
+import pytest
+import runs
+import scenes
+import torch
+from numpy.typing import NDArray
+
+import npa_envs
+from npa_envs.cli import main
+
+FOLDER = Path(__file__).resolve().parent
+EXACT = os.environ.get("NPA_GOLDEN") == "exact"
+
+DOUBLE = 1e-11
+"""Bound on errors in float64, relative to the largest number of the array."""
+
+SINGLE = 2e-5
+"""Likewise in float32: states, observations, reports."""
+
+SINGLE_GRADIENT = 5e-3
+"""Likewise of gradients in float32."""
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def stored() -> dict[str, NDArray[Any]]:
+    with np.load(scenes.GOLDEN) as file:
+        return {name: file[name] for name in file.files}
+
+
+@pytest.fixture(scope="module")
+def content() -> dict[str, Any]:
+    return json.loads((FOLDER / "golden.json").read_text(encoding="utf-8"))
+
+
+def bound(key: str, dtype: np.dtype[Any]) -> float:
+    """Return what the largest error may be, relative to the largest number."""
+    if dtype == np.float64:
+        return DOUBLE
+    return SINGLE_GRADIENT if "/grad/" in key else SINGLE
+
+
+def complaint(
+    key: str, got: NDArray[Any], expected: NDArray[Any], exact: bool = EXACT
+) -> str | None:
+    """Return what is wrong with an array, or None."""
+    if got.dtype != expected.dtype or got.shape != expected.shape:
+        return f"{key}: {got.dtype} {got.shape}, was {expected.dtype} {expected.shape}"
+    if got.dtype.kind == "f" and not np.isfinite(got).all():
+        return f"{key}: not finite"
+    if np.array_equal(got, expected):
+        return None
+    difference = np.abs(got.astype(np.float64) - expected.astype(np.float64))
+    if got.dtype.kind == "f":
+        limit = bound(key, got.dtype)
+        error = float(difference.max() / max(np.abs(expected).max(), np.finfo(np.float32).tiny))
+        fine = error <= limit
+    else:
+        # A colour that is rounded to whole numbers may fall to the next one.
+        limit = 1.0 if key.endswith("/picture") else 0.0
+        error = float(difference.max())
+        fine = error <= limit
+    return None if fine and not exact else f"{key}: error {error:.3g}, allowed {limit:.3g}"
+
+
+@pytest.mark.parametrize("name", scenes.SCENES)
+def test_scene_is_as_it_was(name: str, stored: dict[str, NDArray[Any]]) -> None:
+    got = scenes.compute(name)
+    assert sorted(got) == sorted(key for key in stored if key.startswith(f"{name}/"))
+    found = [complaint(key, array, stored[key]) for key, array in got.items()]
+    wrong = [line for line in found if line is not None]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_all_that_is_stored_is_compared(stored: dict[str, NDArray[Any]]) -> None:
+    worlds = {f"world/{rule}" for rule in scenes.RULES}
+    found = {key.rsplit("/", 1)[0] for key in stored if key.startswith("world/")}
+    assert found == worlds
+    assert {key.split("/")[0] for key in stored} == {*scenes.SCENES, "world"}
+
+
+def test_wrong_numbers_are_found(stored: dict[str, NDArray[Any]]) -> None:
+    for key, limit in (
+        ("grown-gecko/f32/s", SINGLE),
+        ("grown-gecko/f64/s", DOUBLE),
+        ("gradients-gecko/f32/grad/hidden.weight", SINGLE_GRADIENT),
+    ):
+        right = stored[key]
+        for factor, fine in ((1.0, True), (1.0 + 0.3 * limit, True), (1.0 + 3.0 * limit, False)):
+            wrong = (right.astype(np.float64) * factor).astype(right.dtype)
+            assert (complaint(key, wrong, right, exact=False) is None) == fine, (key, factor)
+        assert complaint(key, right * np.nan, right, exact=False) is not None
+        assert complaint(key, right[1:], right, exact=False) is not None
+        assert complaint(key, np.nextafter(right, right.dtype.type(9)), right, exact=True)
+    ends = stored["env-texture/ends"]
+    assert complaint("env-texture/ends", ~ends, ends, exact=False) is not None
+
+
+def test_public_names_are_there(content: dict[str, Any]) -> None:
+    got = names.public_names()
+    assert got["npa_envs"] == content["packages"]["npa_envs"]
+    for package, expected in content["packages"].items():
+        assert set(expected) <= set(got[package]), package
+        assert [name for name in expected if not names.is_there(f"{package}.{name}")] == []
+    assert names.signatures() == content["signatures"]
+    assert names.ids() == content["ids"]
+    assert sorted(npa_envs.shipped_rules()) == content["rules"]
+
+
+def test_documented_names_are_there(content: dict[str, Any]) -> None:
+    assert [name for name in content["documented"] if not names.is_there(name)] == []
+
+
+def test_commands_take_the_same_options(
+    content: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    got = names.everything()
+    assert got["presets"] == content["presets"]
+    assert got["commands"] == content["commands"]
+
+
+@pytest.mark.parametrize("task", runs.FOLDERS)
+def test_run_killed_at_the_old_commit_goes_on(task: str, tmp_path: Path) -> None:
+    """Its next iterations are those of a run that was never killed."""
+    folder = tmp_path / "run"
+    runs.keep(FOLDER / runs.FOLDERS[task], folder)
+    whole = records(folder / "whole_log.jsonl")
+    assert len(records(folder / "log.jsonl")) < runs.ITERATIONS
+    assert main(["train", task, "--out", str(folder), "--resume", "--no-progress"]) == 0
+    resumed = records(folder / "log.jsonl")
+    assert [r["iteration"] for r in resumed] == [r["iteration"] for r in whole]
+    count = runs.ITERATIONS if EXACT else runs.CHECKPOINT_INTERVAL + 1
+    for got, expected in zip(resumed[:count], whole, strict=False):
+        assert got.keys() == expected.keys()
+        for name, value in expected.items():
+            if "seconds" not in name and isinstance(value, float):
+                close = pytest.approx(value, rel=0.0 if EXACT else 1e-2, abs=0.0)
+                assert got[name] == close, (got["iteration"], name)
+    for path in folder.glob("rule*.safetensors"):
+        assert np.isfinite([p.detach().sum() for p in npa_envs.load_rule(path).parameters()]).all()
+
+
+def records(path: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+
+
+def test_kept_runs_are_not_written_to() -> None:
+    """The resumed ones were copies."""
+    for folder in runs.FOLDERS.values():
+        assert len(records(FOLDER / folder / "log.jsonl")) < runs.ITERATIONS
