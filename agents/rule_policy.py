@@ -10,7 +10,7 @@ from torch import Tensor
 
 from npa_envs.agents.policy import Interface, Policy, interface_of, unwrapped
 from npa_envs.errors import NPAError
-from npa_envs.rule import NPARule
+from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.checks import is_real
 
 

@@ -31,8 +31,8 @@ from npa_envs.devices import check_device
 from npa_envs.files import write_text
 from npa_envs.randomness import WorldRandom
 from npa_envs.render import draw_worlds, write_filmstrip
-from npa_envs.rule import NPARule
-from npa_envs.rule_io import load_rule
+from npa_envs.rule.files import load_rule
+from npa_envs.rule.rule import NPARule
 from npa_envs.species import rollout_species
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2D
 from npa_envs.tasks.co_morphogenesis2d_config import CoMorphogenesis2DConfig

@@ -17,8 +17,8 @@ from npa_envs.envs.task import EnvTask, Start
 from npa_envs.envs.vector import NPAVectorEnv
 from npa_envs.errors import NPAError
 from npa_envs.randomness import WorldRandom
-from npa_envs.rule import COLOUR_OFFSET, NPARule
-from npa_envs.rule_io import load_rule
+from npa_envs.rule.files import load_rule
+from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
 from npa_envs.tasks.checks import check_non_negative, check_positive
 from npa_envs.tasks.digits import Split
 from npa_envs.tasks.point_classification import PointClassification

@@ -15,8 +15,8 @@ from npa_envs.envs.vector import NPAVectorEnv
 from npa_envs.envs.worlds import total
 from npa_envs.errors import NPAError, suggest
 from npa_envs.randomness import Purpose, WorldRandom
-from npa_envs.rule import COLOUR_OFFSET, NPARule
-from npa_envs.rule_io import load_rule, shipped_rules
+from npa_envs.rule.files import load_rule, shipped_rules
+from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
 from npa_envs.tasks.checks import check_fraction, check_positive
 from npa_envs.tasks.damage import damage_worlds
 

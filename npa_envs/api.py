@@ -4,8 +4,8 @@ from npa_envs.dynamics import rollout, step
 from npa_envs.errors import DivergedError, MissingDependencyError, NPAError
 from npa_envs.guards import describe_divergence, divergence
 from npa_envs.randomness import WorldRandom
-from npa_envs.rule import NPARule
-from npa_envs.rule_io import load_rule, save_rule, shipped_rules
+from npa_envs.rule.files import load_rule, save_rule, shipped_rules
+from npa_envs.rule.rule import NPARule
 from npa_envs.species import rollout_species
 from npa_envs.sph import (
     PerceptionFields,

@@ -12,7 +12,7 @@ from torch import Tensor
 from npa_envs.dynamics import rollout
 from npa_envs.errors import NPAError
 from npa_envs.evaluation import check_steps
-from npa_envs.rule import NPARule
+from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.point_classification import PointClassification
 from npa_envs.tasks.votes import majority, particle_classes
 

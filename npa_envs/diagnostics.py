@@ -165,7 +165,7 @@ def _ffmpeg() -> list[Finding]:
 
 
 def _shipped_rules() -> list[Finding]:
-    from npa_envs.rule_io import load_rule, shipped_rules
+    from npa_envs.rule.files import load_rule, shipped_rules
 
     names = list(shipped_rules())
     for name in names:

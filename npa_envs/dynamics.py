@@ -13,7 +13,7 @@ from torch.utils.checkpoint import checkpoint
 from npa_envs.errors import NPAError
 from npa_envs.guards import OnDivergence, make_watch
 from npa_envs.randomness import Randomness, WorldRandom, check_generator
-from npa_envs.rule import FoldedRule, NPARule, check_rule
+from npa_envs.rule.rule import FoldedRule, NPARule, check_rule
 from npa_envs.sph.checks import (
     Box,
     check_finite_positions,

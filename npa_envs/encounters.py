@@ -16,7 +16,7 @@ from npa_envs.errors import NPAError
 from npa_envs.interaction import InteractionRow, InteractionSettings, mixing_index, verdict
 from npa_envs.randomness import Purpose, WorldRandom
 from npa_envs.render import draw_worlds
-from npa_envs.rule import NPARule
+from npa_envs.rule.rule import NPARule
 from npa_envs.species import rollout_species
 from npa_envs.tasks.task import PictureTask
 

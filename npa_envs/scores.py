@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from npa_envs.errors import NPAError, suggest
-from npa_envs.rule_io import shipped_rules
+from npa_envs.rule.files import shipped_rules
 
 STEPS = (128, 256, 512, 1024, 4096)
 """Steps from the seed that a line of scores names, where they were measured."""
@@ -20,7 +20,7 @@ def scores(name: str) -> dict[str, Any]:
     """Return what was measured of a shipped rule.
 
     Args:
-        name: A name from `npa_envs.rule_io.shipped_rules`.
+        name: A name from `npa_envs.rule.files.shipped_rules`.
 
     Returns:
         `command`, `commit`, `date`, `machine`, `metric` (what the loss is), and tables, lists of

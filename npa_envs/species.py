@@ -14,7 +14,7 @@ from npa_envs.dynamics import STORED_INTERVAL, Memory, check_memory, checked_opt
 from npa_envs.errors import NPAError
 from npa_envs.guards import OnDivergence, make_watch
 from npa_envs.randomness import Randomness, check_generator
-from npa_envs.rule import NPARule
+from npa_envs.rule.rule import NPARule
 from npa_envs.species_steps import advance, draw, make_community
 from npa_envs.sph.checks import Box, check_world, checked_count, checked_number, entries
 from npa_envs.sph.species import checked_counts

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from npa_envs.dynamics import StepOptions, draw_step, row_capacity, rule_terms
 from npa_envs.randomness import Randomness, WorldRandom
-from npa_envs.rule import FoldedRule, NPARule
+from npa_envs.rule.rule import FoldedRule, NPARule
 from npa_envs.sph.operators import perceive_rows
 from npa_envs.sph.species import perceive_by_species
 from npa_envs.sph.update import update_particles

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from npa_envs.errors import NPAError
-from npa_envs.rule import NPARule
-from npa_envs.rule_io import rule_metadata, shipped_rules
+from npa_envs.rule.files import rule_metadata, shipped_rules
+from npa_envs.rule.rule import NPARule
 
 if TYPE_CHECKING:
     from npa_envs.tasks.task import PictureTask

@@ -20,7 +20,7 @@ from npa_envs.agents import (
     interface_of,
 )
 from npa_envs.errors import NPAError
-from npa_envs.rule import COLOUR_OFFSET
+from npa_envs.rule.rule import COLOUR_OFFSET
 
 MORPHOGENESIS = "npa/Morphogenesis2D-v0"
 REGENERATION = "npa/Regeneration2D-v0"

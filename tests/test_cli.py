@@ -21,8 +21,8 @@ from npa_envs.cli import COMMANDS, main
 from npa_envs.cli.film import Film
 from npa_envs.cli.rollout import RolloutOptions
 from npa_envs.errors import NPAError
-from npa_envs.rule import NPARule
-from npa_envs.rule_io import load_rule, save_rule
+from npa_envs.rule.files import load_rule, save_rule
+from npa_envs.rule.rule import NPARule
 
 TINY = ["morphogenesis2d", "--preset", "tiny", "--iterations", "6", "--no-progress"]
 

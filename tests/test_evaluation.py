@@ -20,7 +20,7 @@ from npa_envs.evaluation import (
     table_text,
     tables_json,
 )
-from npa_envs.rule import NPARule
+from npa_envs.rule.rule import NPARule
 
 
 def make_rule(scale):

@@ -15,8 +15,8 @@ from npa_envs.errors import NPAError
 from npa_envs.interaction import MIXED, InteractionRow, InteractionSettings, mixing_index, verdict
 from npa_envs.interaction_plots import heat_map
 from npa_envs.randomness import WorldRandom
-from npa_envs.rule import NPARule
-from npa_envs.rule_io import save_rule
+from npa_envs.rule.files import save_rule
+from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 
 CPU = torch.device("cpu")

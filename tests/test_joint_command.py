@@ -10,7 +10,7 @@ import torch
 from npa_envs.cli import main
 from npa_envs.cli.train import parse, starting_configuration
 from npa_envs.errors import NPAError
-from npa_envs.rule_io import load_rule, rule_metadata
+from npa_envs.rule.files import load_rule, rule_metadata
 from npa_envs.tasks.co_morphogenesis2d_config import CoMorphogenesis2DConfig
 from npa_envs.training import RunFolder, load_config, preset, train
 

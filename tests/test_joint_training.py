@@ -7,7 +7,7 @@ import torch
 
 from npa_envs.errors import NPAError
 from npa_envs.evaluation import evaluate
-from npa_envs.rule_io import load_rule, rule_metadata
+from npa_envs.rule.files import load_rule, rule_metadata
 from npa_envs.species import rollout_species
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2D
 from npa_envs.tasks.co_morphogenesis2d_config import CoMorphogenesis2DConfig

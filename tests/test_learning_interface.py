@@ -20,7 +20,7 @@ from npa_envs.agents.learning import Budget, Problem, RuleSet, train
 from npa_envs.envs import multispecies_v0
 from npa_envs.errors import NPAError
 from npa_envs.registration import ENVIRONMENTS
-from npa_envs.rule import NPARule
+from npa_envs.rule.rule import NPARule
 
 STEP_TOLERANCE = 2e-6
 """As that of RulePolicy: largest difference of positions and states after a step."""

@@ -17,8 +17,8 @@ from npa_envs.errors import MissingDependencyError, NPAError
 from npa_envs.evaluation import evaluate, measure
 from npa_envs.randomness import WorldRandom
 from npa_envs.render import turntable_frames, write_gaussians, write_points, write_splat
-from npa_envs.rule import NPARule
-from npa_envs.rule_io import load_rule
+from npa_envs.rule.files import load_rule
+from npa_envs.rule.rule import NPARule
 from npa_envs.sph import orbit
 from npa_envs.tasks.appearance import FLAT, OUTPUTS, Appearance
 from npa_envs.tasks.meshes import load_mesh

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 import npa_envs
-from npa_envs.rule import NPARule, fold_weights
+from npa_envs.rule.rule import NPARule, fold_weights
 
 # Norms of errors over norms of answers, against float64; beside, the worst measured on an H200.
 FORWARD_TOLERANCE = 1e-6  # 2.5e-7

@@ -75,7 +75,9 @@ def test_wheel_holds_every_source_file_and_the_rules(site: Path) -> None:
         expected |= {
             f"npa_envs/{p.relative_to(ROOT).as_posix()}" for p in (ROOT / name).rglob("*.py")
         }
-    expected |= {f"npa_envs/rules/{p.name}" for p in (ROOT / "npa_envs/rules").glob("*.*")}
+    expected |= {
+        f"npa_envs/rule/shipped/{p.name}" for p in (ROOT / "npa_envs/rule/shipped").glob("*.*")
+    }
     expected.add("npa_envs/py.typed")
     built = {p.relative_to(site).as_posix() for p in (site / "npa_envs").rglob("*") if p.is_file()}
     assert built == expected

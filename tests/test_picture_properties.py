@@ -16,7 +16,7 @@ from legal_worlds import GRID, UNIT, every, within
 from torch import Tensor
 
 import npa_envs
-from npa_envs.rule_io import rule_metadata
+from npa_envs.rule.files import rule_metadata
 from npa_envs.sph import Cameras, orbit, periodic_splat, render_gaussians, splat
 
 PICTURE_BOUND = 200

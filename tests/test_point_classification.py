@@ -15,7 +15,7 @@ from npa_envs.classification import _chimera, _cut, _partners, accuracies, chang
 from npa_envs.cli import main
 from npa_envs.dynamics import rollout
 from npa_envs.errors import NPAError
-from npa_envs.rule_io import load_rule
+from npa_envs.rule.files import load_rule
 from npa_envs.tasks.point_classification import PointClassification
 from npa_envs.tasks.point_classification_config import PointClassificationConfig
 from npa_envs.tasks.task import task_for_rule
@@ -319,7 +319,7 @@ def test_the_commands_measure_and_film_a_rule_that_classifies(trained, tmp_path,
 
 
 def test_a_static_rule_of_no_known_task_is_refused(task, tmp_path, capsys):
-    from npa_envs.rule_io import save_rule
+    from npa_envs.rule.files import save_rule
 
     path = tmp_path / "rule.safetensors"
     save_rule(task.make_rule(random()), path)

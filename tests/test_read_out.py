@@ -8,8 +8,8 @@ import pytest
 import torch
 from circle_task import STATE_DIM, CircleTask, circle_config, plain_rollout
 
-from npa_envs.rule import COLOUR_OFFSET, NPARule
-from npa_envs.rule_io import load_rule
+from npa_envs.rule.files import load_rule
+from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
 from npa_envs.tasks.rules import untrained_rule
 from npa_envs.tasks.task import task_for_rule
 from npa_envs.training import DivergedError, Trainer

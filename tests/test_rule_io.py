@@ -16,8 +16,8 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.rule import NPARule
-from npa_envs.rule_io import load_rule, rule_metadata, save_rule, shipped_rules
+from npa_envs.rule.files import load_rule, rule_metadata, save_rule, shipped_rules
+from npa_envs.rule.rule import NPARule
 
 REFERENCE = Path(__file__).resolve().parent.parent.parent / "shared" / "reference"
 AUBERGINE = REFERENCE / "authors_demo_aubergine.json"
@@ -404,7 +404,7 @@ def test_an_unknown_name_suggests_a_shipped_rule(
 ) -> None:
     save_rule(NPARule(), tmp_path / "gecko.safetensors")
     monkeypatch.setattr(
-        "npa_envs.rule_io.shipped_rules", lambda: {"gecko": tmp_path / "gecko.safetensors"}
+        "npa_envs.rule.files.shipped_rules", lambda: {"gecko": tmp_path / "gecko.safetensors"}
     )
     with pytest.raises(NPAError, match="unknown rule 'geko': did you mean 'gecko'"):
         load_rule("geko")

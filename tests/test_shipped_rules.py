@@ -11,7 +11,7 @@ from npa_envs.classification import accuracies
 from npa_envs.cli import main
 from npa_envs.errors import NPAError
 from npa_envs.evaluation import evaluate
-from npa_envs.rule_io import rule_metadata, shipped_rules
+from npa_envs.rule.files import rule_metadata, shipped_rules
 from npa_envs.scores import score_line, scores
 from npa_envs.trained_tasks import task_of_rule
 

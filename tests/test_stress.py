@@ -13,7 +13,7 @@ import torch
 from npa_envs import reference
 from npa_envs.cli import main
 from npa_envs.errors import NPAError
-from npa_envs.rule import NPARule
+from npa_envs.rule.rule import NPARule
 from npa_envs.stress import accuracy, endurance, geometry, gradients, precision, suite
 from npa_envs.stress.checks import GROUPS, Check, Finding, Session, Skipped
 from npa_envs.stress.habitats import habitat

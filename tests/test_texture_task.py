@@ -10,7 +10,7 @@ from npa_envs.cli import main
 from npa_envs.errors import NPAError
 from npa_envs.evaluation import evaluate
 from npa_envs.randomness import WorldRandom
-from npa_envs.rule_io import load_rule
+from npa_envs.rule.files import load_rule
 from npa_envs.tasks.texture import Texture, colour_image, density_image
 from npa_envs.tasks.texture_config import TextureConfig
 from npa_envs.tasks.textures import load_texture

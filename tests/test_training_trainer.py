@@ -19,8 +19,8 @@ from PIL import Image
 
 import npa_envs
 from npa_envs.errors import NPAError
-from npa_envs.rule import NPARule
-from npa_envs.rule_io import load_rule, rule_metadata, save_rule
+from npa_envs.rule.files import load_rule, rule_metadata, save_rule
+from npa_envs.rule.rule import NPARule
 from npa_envs.training import (
     DivergedError,
     JsonlLog,

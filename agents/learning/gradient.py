@@ -12,7 +12,7 @@ from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Progress, annealed
 from npa_envs.agents.learning.rules import RuleSet, starting_rules
 from npa_envs.dynamics import Memory
-from npa_envs.rule import NPARule
+from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.task import Task
 from npa_envs.training.config import TrainConfig
 from npa_envs.training.cycle import TrainingCycle

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from npa_envs.rule import FoldedRule, NPARule
+from npa_envs.rule.rule import FoldedRule, NPARule
 
 
 class _Hold(torch.autograd.Function):

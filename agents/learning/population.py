@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.agents.rule_policy import bounded, perceived
 from npa_envs.errors import NPAError
-from npa_envs.rule import NPARule
+from npa_envs.rule.rule import NPARule
 
 MOST_HIDDEN = 2**27
 """Numbers of hidden layers that are held at once, at most: 512 MiB of float32."""

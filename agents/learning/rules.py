@@ -15,8 +15,8 @@ from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.policy import Interface, Policy
 from npa_envs.agents.rule_policy import bounded_update, check_rule_fits
 from npa_envs.errors import NPAError
-from npa_envs.rule import NPARule
-from npa_envs.rule_io import load_rule, save_rule
+from npa_envs.rule.files import load_rule, save_rule
+from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.checks import is_whole
 
 Source = str | Path | NPARule

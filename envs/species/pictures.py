@@ -14,7 +14,7 @@ from npa_envs.envs.species.task import Population
 from npa_envs.envs.species.worlds import SpeciesWorlds
 from npa_envs.envs.task import SHARPNESS
 from npa_envs.render import draw_worlds
-from npa_envs.rule import COLOUR_OFFSET
+from npa_envs.rule.rule import COLOUR_OFFSET
 
 
 def species_colours(species_count: int) -> Tensor:

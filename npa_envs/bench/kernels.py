@@ -49,12 +49,12 @@ def kernel_rows(session: Session, workloads: Sequence[Workload]) -> list[KernelR
                 run()
                 torch.cuda.synchronize(session.device)
             name = f"{workload.name} {'training' if train else 'inference'}"
-            rows += _rows(name, profiler, workload.steps)
+            rows += _kernel_rows(name, profiler, workload.steps)
             session.progress(1)
     return rows
 
 
-def _rows(workload: str, profiler: profile, steps: int) -> list[KernelRow]:
+def _kernel_rows(workload: str, profiler: profile, steps: int) -> list[KernelRow]:
     rows = [
         KernelRow(
             workload,

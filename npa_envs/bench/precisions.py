@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from npa_envs.errors import NPAError, suggest
-from npa_envs.rule import NPARule
+from npa_envs.rule.rule import NPARule
 
 
 class TorchRule(NPARule):

@@ -21,7 +21,7 @@ from npa_envs.bench.timing import Cost, Timing
 from npa_envs.bench.workloads import Gecko, gecko
 from npa_envs.dynamics import rollout
 from npa_envs.evaluation import psnr
-from npa_envs.rule import NPARule
+from npa_envs.rule.rule import NPARule
 
 MARKS = (1, 8, 64)
 """Steps after which worlds are compared."""

@@ -12,10 +12,10 @@ from torch import Tensor
 from npa_envs.bench.session import Session
 from npa_envs.bench.timing import Timing, compare
 from npa_envs.bench.workloads import Workload, rollout_call
-from npa_envs.rule import NPARule
+from npa_envs.rule.rule import NPARule
 from npa_envs.species import rollout_species
 
-WORLDS, CPU_WORLDS, SMALL_WORLDS = (
+SPECIES_WORLDS, CPU_SPECIES_WORLDS, SMALL_SPECIES_WORLDS = (
     (Workload(2, 8, 4096, 16), Workload(2, 1, 256, 16)),
     (Workload(2, 1, 4096, 4), Workload(2, 1, 256, 4)),
     (Workload(2, 1, 256, 2),),
@@ -47,17 +47,25 @@ class OneSpeciesRow:
 
 def one_species_rows(session: Session) -> list[OneSpeciesRow]:
     """Return what one species costs beside `rollout`, inference and training."""
-    workloads = SMALL_WORLDS if session.small else WORLDS if session.cuda else CPU_WORLDS
+    workloads = (
+        SMALL_SPECIES_WORLDS
+        if session.small
+        else SPECIES_WORLDS
+        if session.cuda
+        else CPU_SPECIES_WORLDS
+    )
     rows: list[OneSpeciesRow] = []
     for workload in workloads:
         for train in (False, True):
             for graph in (False, True) if session.cuda else (False,):
                 what = f"one species, {'training' if train else 'inference'} of {workload.name}"
-                rows += session.attempt(what, partial(_row, session, workload, train, graph))
+                rows += session.attempt(
+                    what, partial(_species_row, session, workload, train, graph)
+                )
     return rows
 
 
-def _row(session: Session, workload: Workload, train: bool, graph: bool) -> OneSpeciesRow:
+def _species_row(session: Session, workload: Workload, train: bool, graph: bool) -> OneSpeciesRow:
     x, s = workload.worlds(session.device)
     make: Callable[..., Any] = partial(rollout_call, workload, x, s, train=train)
     # Each draws the same masks, as often as the other one is called.

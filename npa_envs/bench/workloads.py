@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from npa_envs.dynamics import rollout
-from npa_envs.rule import NPARule
-from npa_envs.rule_io import load_rule
+from npa_envs.rule.files import load_rule
+from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
 from npa_envs.tasks.morphogenesis2d_config import Morphogenesis2DConfig
 

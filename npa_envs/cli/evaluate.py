@@ -12,7 +12,7 @@ import tyro
 from npa_envs.errors import NPAError
 
 if TYPE_CHECKING:
-    from npa_envs.rule import NPARule
+    from npa_envs.rule.rule import NPARule
     from npa_envs.tasks.point_classification import PointClassification
 
 
@@ -101,7 +101,7 @@ def run(options: EvaluateOptions) -> int:
     """
     from npa_envs.cli.progress import StepBar
     from npa_envs.evaluation import CHECKPOINTS, check_steps, evaluate, healing, table_text
-    from npa_envs.rule_io import load_rule
+    from npa_envs.rule.files import load_rule
     from npa_envs.tasks.point_classification import PointClassification
     from npa_envs.trained_tasks import task_of_rule
     from npa_envs.training import check_device

@@ -25,7 +25,7 @@ from npa_envs.render import (
     write_points,
     write_splat,
 )
-from npa_envs.rule import NPARule
+from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.damage import DamageEvent, damage_worlds
 
 if TYPE_CHECKING:

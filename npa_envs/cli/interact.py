@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from npa_envs.encounters import Organism
     from npa_envs.interaction import InteractionRow, InteractionSettings
-    from npa_envs.rule import NPARule
+    from npa_envs.rule.rule import NPARule
 
 RESULTS = "interactions.json"
 """The file that says everything, and that a stopped run goes on from."""
@@ -149,7 +149,7 @@ def _organisms(
     """Load the rules, with what each grows, and settle how they meet."""
     from npa_envs.encounters import Organism
     from npa_envs.interaction import InteractionSettings
-    from npa_envs.rule_io import load_rule, shipped_rules
+    from npa_envs.rule.files import load_rule, shipped_rules
     from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
     from npa_envs.trained_tasks import task_of_rule
 

@@ -24,7 +24,7 @@ def main(arguments: Sequence[str]) -> int:
     """
     tyro.cli(ListOptions, prog="npa-envs list", args=arguments)
     from npa_envs.registration import ENVIRONMENTS
-    from npa_envs.rule_io import load_rule, shipped_rules
+    from npa_envs.rule.files import load_rule, shipped_rules
     from npa_envs.scores import score_line, scores
     from npa_envs.tasks.digits import BUILT_IN
     from npa_envs.tasks.texture_losses import TEXTURE_LOSSES

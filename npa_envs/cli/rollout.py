@@ -126,7 +126,7 @@ def run(options: RolloutOptions) -> int:
     from npa_envs.cli.folder import make_folder
     from npa_envs.cli.progress import StepBar
     from npa_envs.evaluation import measure
-    from npa_envs.rule_io import load_rule
+    from npa_envs.rule.files import load_rule
     from npa_envs.tasks.damage import parse_damage
     from npa_envs.tasks.point_classification import PointClassification
     from npa_envs.tasks.task import ViewTask, seed_worlds, task_toward

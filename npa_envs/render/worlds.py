@@ -14,7 +14,7 @@ from torch import Tensor
 from npa_envs.errors import NPAError, suggest
 from npa_envs.render.colours import density_colours, state_colours
 from npa_envs.render.picture import Background, background_colour, to_uint8
-from npa_envs.rule import COLOUR_OFFSET
+from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.sph import periodic_splat, splat
 from npa_envs.sph.checks import (
     check_world,

@@ -12,8 +12,8 @@ from npa_envs.errors import NPAError
 from npa_envs.randomness import Purpose, WorldRandom
 from npa_envs.robustness.plans import Plan
 from npa_envs.robustness.shapes import SHAPES
-from npa_envs.rule import NPARule
-from npa_envs.rule_io import load_rule
+from npa_envs.rule.files import load_rule
+from npa_envs.rule.rule import NPARule
 from npa_envs.stress.habitats import SMALLEST_VIEWS, Habitat, LongRun, task_name
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.dynamics import rollout
-from npa_envs.rule import NPARule
+from npa_envs.rule.rule import NPARule
 from npa_envs.sph import perceive
 from npa_envs.stress.accuracy import relative_error
 from npa_envs.stress.checks import Check, Finding, Session

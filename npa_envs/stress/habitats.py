@@ -12,8 +12,8 @@ from torch import Tensor
 from npa_envs.dynamics import rollout
 from npa_envs.randomness import Randomness
 from npa_envs.replay import capture
-from npa_envs.rule import NPARule
-from npa_envs.rule_io import load_rule, rule_metadata, shipped_rules
+from npa_envs.rule.files import load_rule, rule_metadata, shipped_rules
+from npa_envs.rule.rule import NPARule
 from npa_envs.stress.checks import Session
 from npa_envs.tasks.task import Task, seed_worlds, task_toward
 from npa_envs.trained_tasks import task_of_rule, trained_config

@@ -12,7 +12,7 @@ from npa_envs.bench.precisions import PRECISIONS, Precision
 from npa_envs.dynamics import rollout
 from npa_envs.randomness import WorldRandom
 from npa_envs.replay import capture
-from npa_envs.rule_io import load_rule
+from npa_envs.rule.files import load_rule
 from npa_envs.sph import perceive
 from npa_envs.stress.accuracy import (
     Perceived,

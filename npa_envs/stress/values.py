@@ -12,7 +12,7 @@ from torch import Tensor
 
 from npa_envs.dynamics import rollout
 from npa_envs.errors import NPAError
-from npa_envs.rule_io import load_rule
+from npa_envs.rule.files import load_rule
 from npa_envs.sph import perceive
 from npa_envs.stress.accuracy import LIMITS, perceived, relative_error
 from npa_envs.stress.checks import Check, Finding, Session

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from npa_envs.errors import NPAError
 from npa_envs.randomness import Randomness
-from npa_envs.rule import COLOUR_OFFSET, NPARule
+from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
 from npa_envs.sph import splat, world_mean
 from npa_envs.sph.picture_losses import picture_losses
 from npa_envs.tasks.morphogenesis2d_config import Morphogenesis2DConfig

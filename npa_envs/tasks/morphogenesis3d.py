@@ -9,7 +9,7 @@ from torch import Tensor
 
 from npa_envs.errors import NPAError
 from npa_envs.randomness import Randomness
-from npa_envs.rule import NPARule
+from npa_envs.rule.rule import NPARule
 from npa_envs.sph import Cameras, world_mean
 from npa_envs.tasks.appearance import OUTPUTS, Appearance, Gaussians
 from npa_envs.tasks.morphogenesis3d_config import Morphogenesis3DConfig

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from npa_envs.errors import NPAError
 from npa_envs.randomness import Randomness
-from npa_envs.rule import NPARule
+from npa_envs.rule.rule import NPARule
 from npa_envs.sph import splat, world_mean
 from npa_envs.tasks.clouds import PointClouds, drawn_indices, load_clouds, share_of_worlds, varied
 from npa_envs.tasks.digits import Split

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from npa_envs.rule import NPARule
+from npa_envs.rule.rule import NPARule
 
 
 def untrained_rule(

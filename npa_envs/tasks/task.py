@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.randomness import Randomness
-from npa_envs.rule import NPARule
+from npa_envs.rule.rule import NPARule
 from npa_envs.sph import Cameras
 from npa_envs.tasks.appearance import Gaussians
 

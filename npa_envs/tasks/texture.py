@@ -9,7 +9,7 @@ from torch import Tensor
 
 from npa_envs.errors import NPAError
 from npa_envs.randomness import Randomness
-from npa_envs.rule import COLOUR_OFFSET, NPARule
+from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
 from npa_envs.sph import periodic_splat, world_mean
 from npa_envs.tasks.damage import erase_state, random_particle
 from npa_envs.tasks.rules import untrained_rule

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.replay import Replayed
-from npa_envs.rule import NPARule
+from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.task import GoalTask, ScheduledTask, Task, seed_worlds, task_for_rule
 from npa_envs.training.config import TrainConfig
 from npa_envs.training.graphs import EagerIteration, GraphedIteration, Rollout

@@ -11,7 +11,7 @@ import torch
 from torch import nn
 
 from npa_envs.errors import DivergedError
-from npa_envs.rule import NPARule
+from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.task import Task, task_for_rule, task_toward
 
 

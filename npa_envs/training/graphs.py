@@ -10,7 +10,7 @@ from torch import Tensor
 import npa_envs.dynamics
 from npa_envs.dynamics import Memory
 from npa_envs.replay import capture
-from npa_envs.rule import NPARule
+from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.task import Task, task_toward
 from npa_envs.training.config import TrainConfig
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from npa_envs.errors import NPAError
-from npa_envs.rule import NPARule
-from npa_envs.rule_io import load_rule
+from npa_envs.rule.files import load_rule
+from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.rules import differing_fields
 from npa_envs.training.config import TrainConfig
 

@@ -13,8 +13,8 @@ from torch import Tensor, nn
 from npa_envs.devices import check_device
 from npa_envs.dynamics import Memory
 from npa_envs.errors import NPAError
-from npa_envs.rule import NPARule
-from npa_envs.rule_io import load_rule, save_rule
+from npa_envs.rule.files import load_rule, save_rule
+from npa_envs.rule.rule import NPARule
 from npa_envs.species import rollout_species
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2D
 from npa_envs.tasks.co_morphogenesis2d_config import CoMorphogenesis2DConfig

@@ -14,8 +14,8 @@ from tqdm import tqdm
 from npa_envs.devices import check_device
 from npa_envs.errors import NPAError
 from npa_envs.files import write_text
-from npa_envs.rule import NPARule
-from npa_envs.rule_io import save_rule
+from npa_envs.rule.files import save_rule
+from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.task import Task
 from npa_envs.training.checkpoint import check_same_run, load_checkpoint, save_checkpoint
 from npa_envs.training.config import TrainConfig

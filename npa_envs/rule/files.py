@@ -1,0 +1,565 @@
+"""The two file formats in which the paper's authors publish their rules, as our own parts.
+
+State dict (`npa.pth`): `model.0.weight` [H, P], `model.0.bias` [H], `model.2.weight` [A, H] with
+rows [δ (D); Δs (C)], `eps0`, `alpha`, and for rules with a read-out `decoder.0.*`, `decoder.2.*`.
+Web demo (`models.json`): for each name `w1.weight` [H, P], `w1.bias`, `w2.weight.T` [H, A] with
+columns [Δs (C), δ (2)], both padded with zeros to a multiple of four columns; float32 in base64.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import io
+import json
+import math
+import pickle
+import reprlib
+import struct
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, get_origin, get_type_hints
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save as serialise
+from torch import Tensor
+
+from npa_envs.devices import check_device
+from npa_envs.errors import NPAError, suggest
+from npa_envs.files import checked_path, write_bytes
+from npa_envs.rule.rule import NPARule, RuleHyperParameters, check_rule
+
+_DEMO_SPACE_DIM = 2
+_TEXEL = 4
+"""The web demo keeps its weights in RGBA textures: rows are padded to a multiple of this."""
+
+_ZIP_MARK = b"PK\x03\x04"
+"""What a file of torch.save begins with, unless it is in torch's legacy format."""
+
+_WEIGHT_NAMES = {
+    "model.0.weight": "hidden.weight",
+    "model.0.bias": "hidden.bias",
+    "model.2.weight": "output.weight",
+    "decoder.0.weight": "readout.0.weight",
+    "decoder.0.bias": "readout.0.bias",
+    "decoder.2.weight": "readout.2.weight",
+    "decoder.2.bias": "readout.2.bias",
+}
+_DECODER_NAMES = {name for name in _WEIGHT_NAMES if name.startswith("decoder")}
+_IGNORED = {"N0"}
+
+
+@dataclass(frozen=True)
+class RuleParts:
+    """A rule taken apart: what `NPARule` is made with, and its weights by its own names."""
+
+    hyper_parameters: dict[str, Any]
+    weights: dict[str, Tensor]
+
+
+def read_state_dict(data: bytes) -> RuleParts:
+    """Read the authors' state dict.
+
+    The space dimension and the number of channels follow from the shapes.
+
+    Args:
+        data: The content of the `.pth` file.
+
+    Raises:
+        NPAError: This is not such a file.
+    """
+    state = _unpickle(data)
+    required = {"model.0.weight", "model.0.bias", "model.2.weight", "eps0", "alpha"}
+    missing = required - state.keys()
+    if state.keys() & _DECODER_NAMES:
+        missing |= _DECODER_NAMES - state.keys()
+    unknown = state.keys() - required - _DECODER_NAMES - _IGNORED
+    if missing or unknown:
+        raise NPAError(
+            f"the state dict must hold {sorted(required)} and, with a read-out, "
+            f"{sorted(_DECODER_NAMES)}; missing: {sorted(missing)}, unknown: "
+            f"{sorted(map(str, unknown))}"
+        )
+    weights = {}
+    for theirs, ours in _WEIGHT_NAMES.items():
+        if theirs in state:
+            weights[ours] = _matrix(theirs, state[theirs])
+    hidden_dim, perception_dim = weights["hidden.weight"].shape
+    update_dim = weights["output.weight"].shape[0]
+    has_readout = "readout.0.weight" in weights
+    channels = weights["readout.0.weight"].shape[1] if has_readout else None
+    space_dim, state_dim, static = _infer_dimensions(perception_dim, update_dim, channels)
+    hyper_parameters = {
+        "space_dim": space_dim,
+        "state_dim": state_dim,
+        "hidden_dim": hidden_dim,
+        "eps0": _scalar("eps0", state["eps0"]),
+        "alpha": _scalar("alpha", state["alpha"]),
+        "static": static,
+    }
+    if has_readout:
+        hyper_parameters["readout_dim"] = weights["readout.2.weight"].shape[0]
+        hyper_parameters["readout_hidden_dim"] = weights["readout.0.weight"].shape[0]
+    return RuleParts(hyper_parameters, weights)
+
+
+def read_demo_json(data: bytes, name: str | None) -> RuleParts:
+    """Read one rule of the authors' web demo.
+
+    Args:
+        data: The content of the JSON file.
+        name: The rule's name in it; None where the file holds one only.
+
+    Raises:
+        NPAError: This is not such a file, or it has no rule of that name.
+    """
+    try:
+        collection = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise NPAError(f"this is no JSON file, or a truncated one ({error})") from error
+    names = sorted(collection) if isinstance(collection, dict) else []
+    if not names or not all(isinstance(collection[known], dict) for known in names):
+        raise NPAError("the JSON file must map names to rules, as the authors' web demo has them")
+    if name is None and len(names) > 1:
+        raise NPAError(f"the file holds several rules: add #name; names: {', '.join(names)}")
+    name = names[0] if name is None else name
+    if name not in collection:
+        raise NPAError(f"the file holds no rule {name!r}: {suggest(name, names)}")
+    entry = collection[name]
+    first = _decode(entry, "w1.weight", 2)
+    bias = _decode(entry, "w1.bias", 1)
+    second = _decode(entry, "w2.weight.T", 2)
+    hidden_dim, padded = first.shape
+    state_dim = padded // _TEXEL - 1
+    update_dim = state_dim + _DEMO_SPACE_DIM
+    padded_update = _TEXEL * math.ceil(update_dim / _TEXEL)
+    if state_dim < 1 or second.shape != (hidden_dim, padded_update) or bias.shape[0] < hidden_dim:
+        raise NPAError(
+            "w1.weight [H, 4C+4], w1.bias [H] and w2.weight.T [H, C+2 padded to a multiple of 4] "
+            f"must agree, got {tuple(first.shape)}, {tuple(bias.shape)}, {tuple(second.shape)}"
+        )
+    perception_dim = state_dim * (2 + _DEMO_SPACE_DIM) + _DEMO_SPACE_DIM
+    state_rows = second[:, :state_dim].T
+    displacement_rows = second[:, state_dim:update_dim].T
+    weights = {
+        "hidden.weight": first[:, :perception_dim].clone(),
+        "hidden.bias": bias[:hidden_dim].clone(),
+        "output.weight": torch.cat([displacement_rows, state_rows]).contiguous(),
+    }
+    hyper_parameters = {
+        "space_dim": _DEMO_SPACE_DIM,
+        "state_dim": state_dim,
+        "hidden_dim": hidden_dim,
+        "eps0": _scalar("eps0", entry.get("eps0")),
+        "alpha": _scalar("alpha", entry.get("alpha")),
+    }
+    return RuleParts(hyper_parameters, weights)
+
+
+def _unpickle(data: bytes) -> Mapping[Any, Any]:
+    is_zip = data.startswith(_ZIP_MARK)
+    if is_zip:
+        _check_zip(data)
+    try:
+        state = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError as error:
+        doubt = "" if is_zip else "is no state dict, is damaged, or "
+        raise NPAError(
+            f"the file {doubt}holds objects other than tensors, which could run code: export a "
+            "plain state dict with torch.save(model.state_dict(), path)"
+        ) from error
+    except Exception as error:
+        # What torch raises for garbage depends on where in its readers the garbage lands.
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise NPAError(
+            "this is no state dict of tensors that torch reads without running code, or a "
+            f"truncated one ({reason[:200]})"
+        ) from error
+    if not isinstance(state, Mapping):
+        raise NPAError(f"the file must hold a state dict, got a {type(state).__name__}")
+    return state
+
+
+def _check_zip(data: bytes) -> None:
+    """Compare the checksums, which torch does not look at."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            bad = archive.testzip()
+    except Exception as error:
+        # What zipfile raises depends on where the damage lies.
+        raise NPAError(
+            f"the file is damaged or truncated ({type(error).__name__}): fetch or save it again"
+        ) from error
+    if bad is not None:
+        raise NPAError(f"the file is damaged (wrong checksum of {bad!r}): fetch or save it again")
+
+
+def _check_plain(name: str, tensor: Tensor) -> None:
+    if tensor.layout != torch.strided or tensor.is_meta or tensor.is_nested or tensor.is_quantized:
+        raise NPAError(
+            f"{name} must be a dense tensor with data, got a sparse, meta, nested or quantised "
+            "one: export the state dict with plain tensors"
+        )
+
+
+def _matrix(name: str, value: Any) -> Tensor:
+    """Return a weight or a bias; some of the authors' matrices come as 1x1 convolutions."""
+    rank = 1 if name.endswith("bias") else 2
+    if not isinstance(value, Tensor):
+        raise NPAError(f"{name} must be a tensor, got a {type(value).__name__}")
+    _check_plain(name, value)
+    if value.ndim == 4 and rank == 2 and value.shape[2:] == (1, 1):
+        value = value[:, :, 0, 0]
+    if value.ndim != rank:
+        raise NPAError(f"{name} must have {rank} dimension(s), got shape {tuple(value.shape)}")
+    tensor: Tensor = value.detach().contiguous()
+    return tensor
+
+
+def _infer_dimensions(
+    perception_dim: int, update_dim: int, channels: int | None
+) -> tuple[int, int, bool]:
+    """Find (D, C, static) with P = C(2+D)+D and A = C+D, or C where static."""
+    found = []
+    for space_dim in (2, 3):
+        state_dim, rest = divmod(perception_dim - space_dim, 2 + space_dim)
+        if rest or state_dim < 1 or channels not in (None, state_dim):
+            continue
+        if update_dim in (state_dim, state_dim + space_dim):
+            found.append((space_dim, state_dim, update_dim == state_dim))
+    if len(found) != 1:
+        raise NPAError(
+            "model.0.weight [H, C(2+D)+D] and model.2.weight [C+D or C, H] must fit one space "
+            f"dimension D of 2 or 3, got {perception_dim} inputs and {update_dim} outputs, which "
+            f"fit {len(found)}"
+        )
+    return found[0]
+
+
+def _scalar(name: str, value: Any) -> float:
+    """Return a number that the authors' tools may have rounded to float32 as the decimal meant."""
+    if isinstance(value, Tensor):
+        _check_plain(name, value)
+        value = value.item() if value.numel() == 1 else value
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise NPAError(f"{name} must be a finite number, got {reprlib.repr(value)}")
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
+    if not math.isfinite(number):
+        raise NPAError(f"{name} must be a finite number, got {reprlib.repr(value)}")
+    for digits in range(1, 10):
+        rounded = float(f"{number:.{digits}g}")
+        if _as_float32(rounded) == number:
+            return rounded
+    return number
+
+
+def _as_float32(number: float) -> float:
+    try:
+        return float(struct.unpack("<f", struct.pack("<f", number))[0])
+    except OverflowError:
+        return math.inf
+
+
+def _decode(entry: Mapping[str, Any], name: str, rank: int) -> Tensor:
+    packed = entry.get(name)
+    if not isinstance(packed, dict) or not {"shape", "dtype", "data64"} <= packed.keys():
+        raise NPAError(f"the rule lacks {name!r} with its shape, dtype and data64")
+    shape, dtype = packed["shape"], packed["dtype"]
+    sizes_fit = isinstance(shape, list) and all(type(n) is int and n > 0 for n in shape)
+    if dtype != "float32" or not sizes_fit or len(shape) != rank:
+        raise NPAError(f"{name} must be float32 with {rank} dimension(s), got {dtype!r} {shape!r}")
+    try:
+        data = base64.b64decode(packed["data64"], validate=True)
+    except (binascii.Error, TypeError, ValueError) as error:
+        raise NPAError(f"the data of {name} is no base64 text ({error})") from error
+    if len(data) != 4 * math.prod(shape):
+        raise NPAError(
+            f"the data of {name} must be {4 * math.prod(shape)} bytes for shape {shape}, got "
+            f"{len(data)}: the file is damaged"
+        )
+    return torch.frombuffer(bytearray(data), dtype=torch.float32).reshape(shape)
+
+
+# Rules as files: ours (safetensors), and the two formats of the paper's authors.
+#
+# Ours holds the weights under `NPARule`'s own names and, in the header's metadata, the format's
+# name and version and every hyper-parameter, so that a file is all that is needed to run a rule.
+
+
+FORMAT_NAME = "npa-envs rule"
+FORMAT_VERSION = 1
+_FIELDS = {
+    name: str if get_origin(kind) is Literal else kind
+    for name, kind in get_type_hints(RuleHyperParameters).items()
+}
+_RESERVED = {"format", "version", *_FIELDS}
+_SUFFIXES = (".safetensors", ".pth", ".pt", ".json")
+
+
+def shipped_rules(task: str | None = None) -> dict[str, Path]:
+    """Return the rules that come with the package: name -> file, sorted by name.
+
+    Args:
+        task: Only those that were trained on this task, for example "morphogenesis2d".
+
+    Raises:
+        NPAError: The task is no text.
+    """
+    folder = Path(__file__).resolve().parent / "shipped"
+    rules = {path.stem: path for path in sorted(folder.glob("*.safetensors"))}
+    if not isinstance(task, str | None):
+        raise NPAError(f"task must be the name of one, got {task!r}: for example 'texture'")
+    if task is None:
+        return rules
+    return {name: path for name, path in rules.items() if rule_metadata(path).get("task") == task}
+
+
+def load_rule(source: str | Path, *, device: str | torch.device = "cpu") -> NPARule:
+    """Load a rule: a shipped one by name, or a file in our format or one of the authors'.
+
+    Args:
+        source: The name of a shipped rule (`shipped_rules()`), or the path of a `.safetensors`
+            file that `save_rule` wrote, of the authors' state dict (`.pth`, `.pt`; no code in it
+            is run), or of their web demo's collection: `"models.json#name"`.
+        device: Where the weights go: "cpu", "cuda", "cuda:1", or torch's own device.
+
+    Returns:
+        The rule, its weights in the precision of the file (float32 or float64). Torch's random
+        state is left alone.
+
+    Raises:
+        NPAError: The name is unknown, the file is missing, garbage, truncated, of an unknown
+            version, does not hold a rule, or holds weights that are not finite; or there is no
+            such device.
+    """
+    target = check_device(device)
+    path, name = _locate(source)
+    try:
+        if path.suffix == ".safetensors":
+            rule = _assemble(_read_ours(path))
+        elif path.suffix == ".json":
+            rule = _assemble(read_demo_json(_read_file(path), name))
+        else:
+            rule = _assemble(read_state_dict(_read_file(path)))
+    except NPAError as error:
+        raise NPAError(f"cannot load a rule from {str(source)!r}: {error}") from error
+    return rule.to(target)
+
+
+def save_rule(
+    rule: NPARule, path: str | Path, *, metadata: Mapping[str, str] | None = None
+) -> None:
+    """Write a rule with all its hyper-parameters to a `.safetensors` file, whole or not at all.
+
+    The same rule and metadata give the same bytes.
+
+    Args:
+        rule: The rule; its weights are written in their own precision.
+        path: The file to write, ending in `.safetensors`; an existing one is replaced.
+        metadata: More text for the header, for example how the rule was trained.
+
+    Raises:
+        NPAError: The suffix is another one, the metadata is not text or takes a reserved name, a
+            weight is not finite, or the file cannot be written.
+    """
+    check_rule(rule)
+    path = checked_path(path)
+    if path.suffix != ".safetensors":
+        raise NPAError(
+            f"a rule's file must end in .safetensors, got {str(path)!r}: "
+            f"use {str(path.with_suffix('.safetensors'))!r}"
+        )
+    header = {"format": FORMAT_NAME, "version": str(FORMAT_VERSION)}
+    header |= {name: json.dumps(value) for name, value in rule.hyper_parameters().items()}
+    if not isinstance(metadata, Mapping | None):
+        raise NPAError(
+            f"metadata must map text to text, got {type(metadata).__name__}: for example "
+            "metadata={'trained by': 'me'}"
+        )
+    for name, text in (metadata or {}).items():
+        if not isinstance(name, str) or not isinstance(text, str):
+            raise NPAError(
+                f"metadata must map text to text, got {name!r}: {text!r}: use str({text!r})"
+            )
+        if name in _RESERVED:
+            raise NPAError(f"metadata must not use the name {name!r}: the format holds it itself")
+        header[name] = text
+    weights = {k: v.detach().cpu().contiguous() for k, v in rule.state_dict().items()}
+    _check_finite(weights)
+    write_bytes(path, _with_sorted_metadata(serialise(weights, metadata=header)))
+
+
+def _with_sorted_metadata(file: bytes) -> bytes:
+    """Return a safetensors file whose metadata is in order, so that equal rules make equal files.
+
+    The library writes it in an order that changes from call to call.
+    """
+    size = int.from_bytes(file[:8], "little")
+    header = json.loads(file[8 : 8 + size])
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+    # The format asks for tensors that begin at a multiple of 8 bytes, after spaces.
+    text += b" " * (-len(text) % 8)
+    return len(text).to_bytes(8, "little") + text + file[8 + size :]
+
+
+def rule_metadata(path: str | Path) -> dict[str, str]:
+    """Return the text in the header of a file that `save_rule` wrote, all of it.
+
+    Args:
+        path: The `.safetensors` file.
+
+    Raises:
+        NPAError: The file is missing, garbage, truncated, or not a rule.
+    """
+    try:
+        return _read_header(checked_path(path))
+    except NPAError as error:
+        raise NPAError(f"cannot read the header of {str(path)!r}: {error}") from error
+
+
+def _locate(source: str | Path) -> tuple[Path, str | None]:
+    """Find the file that `source` means, and the name after '#'."""
+    text = str(source)
+    known = shipped_rules()
+    suffixes = ", ".join(_SUFFIXES)
+    if not text:
+        raise NPAError(
+            "source must be the name of a shipped rule or the path of a file that ends in "
+            f"{suffixes}, got '': names: {', '.join(known)}"
+        )
+    if text in known:
+        return known[text], None
+    base, mark, name = text.rpartition("#")
+    path, inner = (Path(base), name) if mark and base.endswith(".json") else (Path(text), None)
+    if path.suffix in _SUFFIXES:
+        return path, inner
+    try:
+        exists = path.exists()
+    except (OSError, ValueError) as error:
+        raise NPAError(
+            "source must be the name of a shipped rule or the path of a file that ends in "
+            f"{suffixes}, got {reprlib.repr(text)}, which cannot be a path "
+            f"({_reason(error)}): names: {', '.join(known)}"
+        ) from error
+    if exists:
+        raise NPAError(f"a rule's file must end in {suffixes}, got {text!r}: rename it")
+    raise NPAError(
+        f"unknown rule {text!r}: {suggest(text, known)}; or give the path of a file that ends in "
+        f"{suffixes}"
+    )
+
+
+def _read_file(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except (OSError, ValueError) as error:
+        raise NPAError(_explain_unreadable(error)) from error
+
+
+def _explain_unreadable(error: OSError | ValueError) -> str:
+    return f"the file cannot be read ({_reason(error)}): check the path"
+
+
+def _reason(error: OSError | ValueError) -> str:
+    """Return the system's words without the path, or Python's for a path with a zero byte."""
+    return (isinstance(error, OSError) and error.strerror) or str(error)
+
+
+def _read_header(path: Path) -> dict[str, str]:
+    try:
+        with safe_open(path, framework="pt") as file:
+            header: dict[str, str] = file.metadata() or {}
+    except (OSError, ValueError) as error:
+        raise NPAError(_explain_unreadable(error)) from error
+    except SafetensorError as error:
+        raise NPAError(f"this is no safetensors file, or a truncated one ({error})") from error
+    _check_format(header)
+    return header
+
+
+def _check_format(header: Mapping[str, str]) -> None:
+    if header.get("format") != FORMAT_NAME:
+        raise NPAError(
+            f"the metadata's format must be {FORMAT_NAME!r}, got {header.get('format')!r}: "
+            "this safetensors file was not written by npa_envs.save_rule"
+        )
+    if header.get("version") != str(FORMAT_VERSION):
+        raise NPAError(
+            f"the metadata's version must be {FORMAT_VERSION}, got {header.get('version')!r}: "
+            "upgrade with pip install -U npa-envs"
+        )
+
+
+def _read_ours(path: Path) -> RuleParts:
+    header = _read_header(path)
+    hyper_parameters = {
+        name: _parse(header, name, kind)
+        for name, kind in _FIELDS.items()
+        if name in header or name in RuleHyperParameters.__required_keys__
+    }
+    try:
+        with safe_open(path, framework="pt") as file:
+            weights = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
+    except (OSError, SafetensorError) as error:
+        raise NPAError(f"the weights cannot be read ({error})") from error
+    return RuleParts(hyper_parameters, weights)
+
+
+def _parse(header: Mapping[str, str], name: str, kind: type) -> Any:
+    if name not in header:
+        raise NPAError(f"the metadata lacks {name!r}: save the rule again with npa_envs.save_rule")
+    try:
+        value = json.loads(header[name])
+        if kind is float and type(value) is int:
+            value = float(value)
+    except (ValueError, OverflowError, RecursionError):
+        value = None
+    if type(value) is not kind:
+        raise NPAError(
+            f"the metadata's {name!r} must be a JSON {kind.__name__}, got {header[name]!r}"
+        )
+    return value
+
+
+def _assemble(parts: RuleParts) -> NPARule:
+    """Build the rule without drawing initial weights: shapes first, then the tensors themselves."""
+    try:
+        with torch.device("meta"):
+            rule = NPARule(**parts.hyper_parameters)
+    except (RuntimeError, TypeError, OverflowError) as error:
+        raise NPAError(f"no rule has the hyper-parameters {parts.hyper_parameters}") from error
+    expected = {name: tuple(tensor.shape) for name, tensor in rule.state_dict().items()}
+    got = {name: tuple(tensor.shape) for name, tensor in parts.weights.items()}
+    if got != expected:
+        wrong = sorted(
+            f"{name}: {got.get(name, 'missing')} instead of {expected.get(name, 'nothing')}"
+            for name in expected.keys() | got.keys()
+            if expected.get(name) != got.get(name)
+        )
+        raise NPAError(f"the weights must have the hyper-parameters' shapes, got {wrong}")
+    dtypes = {tensor.dtype for tensor in parts.weights.values()}
+    if len(dtypes) != 1 or not dtypes <= {torch.float32, torch.float64}:
+        raise NPAError(
+            "the weights must be all float32 or all float64, got "
+            f"{sorted(str(dtype) for dtype in dtypes)}: convert them and save the rule again"
+        )
+    _check_finite(parts.weights)
+    rule.load_state_dict(dict(parts.weights), assign=True)
+    return rule.requires_grad_()
+
+
+def _check_finite(weights: Mapping[str, Tensor]) -> None:
+    for name, tensor in weights.items():
+        bad = int((~torch.isfinite(tensor)).sum())
+        if bad:
+            raise NPAError(
+                f"the weights must be finite, got {bad} of {tensor.numel()} numbers in {name!r} "
+                "NaN or infinite: take an earlier checkpoint, or train with a lower learning rate"
+            )
