@@ -10,7 +10,7 @@ from worlds import relative_error
 
 from npa_envs import NPAError
 from npa_envs import reference_gaussians as oracle
-from npa_envs.kernels.blending import TILE_PIXELS, block_kernels
+from npa_envs.kernels.pictures.blending import TILE_PIXELS, block_kernels
 from npa_envs.replay import capture
 from npa_envs.sph import render_gaussians
 from npa_envs.sph.bridge import launch, scalar_type

@@ -42,7 +42,7 @@ LADDER = {
     "npa_envs.reference": rung(1, "torch"),
     "npa_envs.reference_gaussians": rung(1, "torch"),
     "npa_envs.replay": rung(1, "torch numpy"),
-    "npa_envs.warp_report": rung(1, "warp"),
+    "npa_envs.kernels.runtime": rung(1, "warp"),
     "npa_envs.sph": rung(2, "warp torch", never=("npa_envs.reference",)),
     "npa_envs.randomness": rung(3, "torch numpy", never=("npa_envs.kernels", "npa_envs.reference")),
     "npa_envs.rule.rule": rung(3, "torch"),
@@ -189,8 +189,8 @@ def test_only_sph_and_the_benchmarked_hash_grid_know_both_warp_and_torch() -> No
 @pytest.mark.parametrize(
     ("module", "source"),
     [
-        ("npa_envs.kernels.cells", "import torch"),
-        ("npa_envs.kernels.cells", "from npa_envs.sph import perceive"),
+        ("npa_envs.kernels.portable.sort", "import torch"),
+        ("npa_envs.kernels.portable.sort", "from npa_envs.sph import perceive"),
         ("npa_envs.reference", "import warp as wp"),
         ("npa_envs.rule.rule", "import warp"),
         ("npa_envs.dynamics", "def f():\n    import warp"),
@@ -214,7 +214,7 @@ def test_the_checker_refuses_a_wrong_import(module: str, source: str) -> None:
 @pytest.mark.parametrize(
     ("module", "source"),
     [
-        ("npa_envs.kernels.cells", "import math\nimport warp as wp\nfrom . import domain"),
+        ("npa_envs.kernels.portable.sort", "import math\nimport warp as wp\nfrom . import domain"),
         ("npa_envs.sph.bridge", "import torch\nimport warp\nfrom npa_envs.kernels import cells"),
         ("npa_envs.envs.new", "import gymnasium\nfrom npa_envs import dynamics, tasks"),
         ("npa_envs.agents.new", "import npa_envs\nfrom npa_envs.envs import new"),

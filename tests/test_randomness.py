@@ -9,7 +9,7 @@ import torch
 import npa_envs
 from npa_envs import WorldRandom
 from npa_envs.errors import NPAError
-from npa_envs.kernels.draws import draw_words
+from npa_envs.kernels.portable.draws import draw_words
 from npa_envs.randomness import Purpose, check_generator
 from npa_envs.sph.bridge import launch
 from npa_envs.tasks.damage import random_particle

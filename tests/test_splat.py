@@ -6,7 +6,7 @@ from worlds import relative_error
 
 from npa_envs import NPAError
 from npa_envs import reference as oracle
-from npa_envs.kernels.lens import make_lens
+from npa_envs.kernels.pictures.splat import make_lens
 from npa_envs.sph import splat
 from npa_envs.sph.bridge import launch, scalar_type
 from npa_envs.sph.splat import Splats, device_kernels, gather_threads, scatter_splats, sort_splats

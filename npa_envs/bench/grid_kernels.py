@@ -5,13 +5,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from npa_envs.kernels.domain import (
-    MOMENT_THRESHOLD,
-    domain_types,
-    scalar_name,
-    smoothing,
-    spiky_factor,
-)
+from npa_envs.kernels.domain import domain_types, scalar_name
+from npa_envs.kernels.mathematics import MOMENT_THRESHOLD, smoothing, spiky_factor
 
 
 @functools.cache

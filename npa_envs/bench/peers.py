@@ -18,8 +18,8 @@ from npa_envs.bench.hash_grid import grid_fields
 from npa_envs.bench.session import Session, relative_error
 from npa_envs.bench.timing import Timing
 from npa_envs.bench.workloads import Workload
+from npa_envs.kernels.runtime import quiet_warp, start_warp
 from npa_envs.sph import perception_fields
-from npa_envs.warp_report import quiet_warp, start_warp
 
 OPERATIONS = ("density", "interpolation", "gradient")
 """rho, smoothed states, and state gradients without correction."""

@@ -41,9 +41,9 @@ def main(arguments: Sequence[str]) -> int:
     options = tyro.cli(WarmupOptions, prog="npa-envs warmup", args=arguments)
     import torch
 
+    from npa_envs.kernels.runtime import kernel_cache_folder
     from npa_envs.sph import warmup
     from npa_envs.training import check_device
-    from npa_envs.warp_report import kernel_cache_folder
 
     if not options.space_dims or not options.dtypes or not set(options.space_dims) <= {2, 3}:
         raise NPAError(

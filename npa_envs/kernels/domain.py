@@ -1,4 +1,4 @@
-"""Types, the `Domain` struct and the mathematics that every kernel shares.
+"""The `Domain` struct: radius, box and cell grid that all worlds share, and functions on it.
 
 Kernels are made by cached factories for one space dimension and one scalar type, so that the same
 source serves 2D and 3D, float32 and float64, CPU and CUDA. Each (dimension, scalar, channel width)
@@ -20,12 +20,6 @@ CELL_SLACK = 1.0 + 2.0**-20
 FAR = 2.0**62
 """Cells from the origin beyond which all are one: positions there are equal or far apart."""
 
-MOMENT_THRESHOLD = 1e-3
-"""Smallest |det M| that is inverted, dimensionless; below it the gradient stays uncorrected."""
-
-SMALL_LOG = 5e-2
-"""Below this |z| the ratio |z| / (exp|z| - 1) is evaluated by its series: the quotient cancels."""
-
 
 def scalar_name(scalar: type) -> str:
     """Return "f32" or "f64"."""
@@ -43,96 +37,6 @@ def kernel_module(
     if lanes:
         variant += f"_l{lanes}"
     return wp.get_module(f"npa_envs.kernels.{topic}_{variant}")
-
-
-@wp.func
-def smoothing(squared_distance: Any, inverse_squared_eps: Any, norm: Any):
-    """Poly6 smoothing kernel W, inside its support [1 / length^D]."""
-    falloff = type(norm)(1.0) - squared_distance * inverse_squared_eps
-    return norm * falloff * falloff * falloff
-
-
-@wp.func
-def smoothing_slope(squared_distance: Any, inverse_squared_eps: Any, norm: Any):
-    """Factor g of the gradient dW/dr = g r of the smoothing kernel [1 / length^(D+2)]."""
-    falloff = type(norm)(1.0) - squared_distance * inverse_squared_eps
-    return type(norm)(-6.0) * norm * inverse_squared_eps * falloff * falloff
-
-
-@wp.func
-def spiky_factor(distance: Any, inverse_eps: Any, norm: Any):
-    """Factor f of the spiky gradient kernel K(r) = f r; zero at r = 0 [1 / length^(D+2)]."""
-    factor = type(norm)(0.0)
-    if distance > type(norm)(0.0):
-        falloff = type(norm)(1.0) - distance * inverse_eps
-        factor = norm * falloff * falloff / distance
-    return factor
-
-
-@wp.func
-def spiky_radial_slope(distance: Any, inverse_eps: Any, norm: Any):
-    """d(f r)/dr of the spiky kernel's length f(r) r, for its adjoint [1 / length^(D+2)]."""
-    falloff = type(norm)(1.0) - distance * inverse_eps
-    return -type(norm)(2.0) * norm * falloff * inverse_eps
-
-
-@wp.func
-def log1p(value: Any):
-    """log(1 + value), accurate also where value is far below one."""
-    one_plus = type(value)(1.0) + value
-    result = value
-    if one_plus > type(value)(1.0):
-        result = wp.log(one_plus) * (value / (one_plus - type(value)(1.0)))
-    return result
-
-
-@wp.func
-def log_scaled_huge(v: Any):
-    """L(v) of a vector whose squared length overflows."""
-    largest = wp.max(wp.abs(v))
-    direction = v / largest
-    length = wp.length(direction)
-    return ((wp.log(largest) + wp.log(length)) / length) * direction
-
-
-@wp.func
-def log_scaled(v: Any):
-    """L(v) = log(1 + |v|) v / |v| of the logarithmic scaling, and 0 at 0."""
-    length = wp.length(v)
-    factor = type(length)(1.0)
-    if length > type(length)(0.0):
-        factor = log1p(length) / length
-    result = factor * v
-    if wp.isinf(length):
-        result = log_scaled_huge(v)
-    return result
-
-
-@wp.func
-def log_scale_tangential(length: Any):
-    """Derivative of L across its direction as a function of |L|: |L| / (exp|L| - 1)."""
-    ratio = type(length)(1.0)
-    if length < type(length)(SMALL_LOG):
-        series = type(length)(1.0)
-        for k in range(6):
-            series = type(length)(1.0) + series * length / type(length)(7 - k)
-        ratio = type(length)(1.0) / series
-    else:
-        ratio = length / (wp.exp(length) - type(length)(1.0))
-    return ratio
-
-
-@wp.func
-def log_scale_adjoint(scaled: Any, cotangent: Any):
-    """Pull a cotangent of L(v) back to v, given L(v): L is radial, so its value suffices."""
-    length = wp.length(scaled)
-    tangential = log_scale_tangential(length)
-    result = tangential * cotangent
-    if length > type(length)(0.0):
-        radial = wp.exp(-length)
-        direction = scaled / length
-        result += (radial - tangential) * wp.dot(direction, cotangent) * direction
-    return result
 
 
 @functools.cache

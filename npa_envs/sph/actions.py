@@ -9,8 +9,12 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.kernels.finite import VALUES_PER_THREAD, find_not_finite
-from npa_envs.kernels.update import CHANNEL_SHARE, update_kernels
+from npa_envs.kernels.portable.update import (
+    CHANNEL_SHARE,
+    VALUES_PER_THREAD,
+    find_not_finite,
+    update_kernels,
+)
 from npa_envs.sph.bridge import Repeated, launch, scalar_type
 from npa_envs.sph.cells import LARGEST_INDEX
 from npa_envs.sph.checks import check_world

@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from npa_envs.kernels.adjoint import adjoint_kernels
-from npa_envs.kernels.listed_adjoint import SHARE, listed_adjoint
-from npa_envs.kernels.tiles import TILE
-from npa_envs.kernels.warps import WARP
+from npa_envs.kernels.cuda.adjoint import SHARE, listed_adjoint
+from npa_envs.kernels.cuda.tiles import TILE
+from npa_envs.kernels.cuda.warps import WARP
+from npa_envs.kernels.portable.adjoint import adjoint_kernels
 from npa_envs.sph.bridge import launch
 from npa_envs.sph.cells import Plan, density_scale, make_plan
 

@@ -8,10 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from npa_envs.kernels.network import arrangement_kernels
-from npa_envs.kernels.products import UNIT_GROUP
-from npa_envs.kernels.warps import WARP
-from npa_envs.kernels.weight_sums import WARP_UNITS
+from npa_envs.kernels.cuda.network import UNIT_GROUP, WARP_UNITS, arrangement_kernels
+from npa_envs.kernels.cuda.warps import WARP
 from npa_envs.sph.bridge import is_modern, launch
 
 LARGEST_ROW, LARGEST_UPDATE, LARGEST_HIDDEN = 128, 32, 512

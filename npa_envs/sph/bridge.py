@@ -11,11 +11,11 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from npa_envs.kernels.lanes import CUDA_LANES
-from npa_envs.kernels.ranges import SMALLEST_RANGES
-from npa_envs.kernels.warps import CUDA_BLOCK
+from npa_envs.kernels.cpu import SMALLEST_RANGES
+from npa_envs.kernels.cuda.warps import CUDA_BLOCK
+from npa_envs.kernels.runtime import quiet_warp, start_warp
+from npa_envs.kernels.wide import CUDA_LANES
 from npa_envs.sph.threads import even_ranges, run_together
-from npa_envs.warp_report import quiet_warp, start_warp
 
 SCALARS: dict[torch.dtype, Any] = {torch.float32: wp.float32, torch.float64: wp.float64}
 """Warp's scalar type for each floating dtype that the operators take."""

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from npa_envs.kernels.draws import (
+from npa_envs.kernels.portable.draws import (
     BITS_PER_THREAD,
     INTEGERS_PER_THREAD,
     draw_bernoulli,

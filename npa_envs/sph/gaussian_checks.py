@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.kernels.projection import CHANNELS
+from npa_envs.kernels.pictures.gaussians import CHANNELS
 from npa_envs.sph.cameras import Cameras
 from npa_envs.sph.cells import LARGEST_INDEX
 from npa_envs.sph.checks import DTYPES, check_dense

@@ -8,9 +8,8 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.kernels.blending import TILE_PIXELS, block_kernels, tile_kernels
-from npa_envs.kernels.gaussians import gaussian_kernels
-from npa_envs.kernels.projection import PULLS
+from npa_envs.kernels.pictures.blending import TILE_PIXELS, block_kernels, tile_kernels
+from npa_envs.kernels.pictures.gaussians import PULLS, gaussian_kernels
 from npa_envs.sph.bridge import launch, scalar_type
 from npa_envs.sph.cells import LARGEST_INDEX
 

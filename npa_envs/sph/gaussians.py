@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.kernels.gaussians import gaussian_kernels
-from npa_envs.kernels.projection import FOOTPRINT, make_frame, tile_total
+from npa_envs.kernels.pictures.gaussians import FOOTPRINT, gaussian_kernels, make_frame, tile_total
 from npa_envs.sph.bridge import launch, scalar_type
 from npa_envs.sph.cameras import Cameras
 from npa_envs.sph.cells import LARGEST_INDEX

@@ -7,9 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from npa_envs.kernels.network import two_layer_kernel, weight_gradient_kernels
-from npa_envs.kernels.warps import WARP
-from npa_envs.kernels.weight_sums import WARP_UNITS
+from npa_envs.kernels.cuda.network import WARP_UNITS, two_layer_kernel, weight_gradient_kernels
+from npa_envs.kernels.cuda.warps import WARP
 from npa_envs.sph.arranged import ArrangedWeights, arrange
 from npa_envs.sph.bridge import launch
 

@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from npa_envs.kernels.listed import listed_perception
-from npa_envs.kernels.listing import listed_density
-from npa_envs.kernels.perception import perception_kernels
-from npa_envs.kernels.warps import WARP
+from npa_envs.kernels.cuda.density import listed_density
+from npa_envs.kernels.cuda.perceive import listed_perception
+from npa_envs.kernels.cuda.warps import WARP
+from npa_envs.kernels.portable.perceive import perception_kernels
 from npa_envs.sph.bridge import launch
 from npa_envs.sph.cells import Plan, SortedWorlds, density_scale
 

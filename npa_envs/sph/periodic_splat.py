@@ -7,7 +7,7 @@ import math
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.kernels.lens import PATCH_SIGMAS
+from npa_envs.kernels.pictures.splat import PATCH_SIGMAS
 from npa_envs.sph.checks import LARGEST_SIDE
 from npa_envs.sph.splat import check_particles, checked_window, splat
 

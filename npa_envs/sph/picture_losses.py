@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.kernels.lens import CHANNELS, group_count, make_lens
+from npa_envs.kernels.pictures.splat import CHANNELS, group_count, make_lens
 from npa_envs.sph.bridge import launch, scalar_type
 from npa_envs.sph.splat import (
     Splats,

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from npa_envs.kernels.pairs import ENTRY_SIZE, pair_kernels
+from npa_envs.kernels.portable.static import ENTRY_SIZE, pair_kernels
 from npa_envs.sph.bridge import launch
 from npa_envs.sph.cells import LARGEST_INDEX, Plan, density_scale, make_plan, sort_worlds
 from npa_envs.sph.passes import Terms, compute_density_gradients

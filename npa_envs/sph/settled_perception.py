@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from npa_envs.kernels.pair_sums import pair_sum_kernels
+from npa_envs.kernels.portable.static import pair_sum_kernels
 from npa_envs.sph.bridge import launch
 from npa_envs.sph.cells import Plan, make_plan
 from npa_envs.sph.passes import Terms

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.kernels.state_update import state_update_kernels
+from npa_envs.kernels.portable.static import state_update_kernels
 from npa_envs.sph.bridge import channel_width, lane_count, launch, scalar_type
 from npa_envs.sph.cells import LARGEST_INDEX
 from npa_envs.sph.settled import SettledWorlds

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.kernels.species import species_kernel
+from npa_envs.kernels.portable.species import species_kernel
 from npa_envs.sph.bridge import launch, scalar_type
 from npa_envs.sph.cells import density_scale, make_plan, sort_worlds
 from npa_envs.sph.checks import (

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.kernels.lens import (
+from npa_envs.kernels.pictures.splat import (
     CHANNELS,
     FOOTPRINT,
     GROUP_HEIGHT,
@@ -17,8 +17,8 @@ from npa_envs.kernels.lens import (
     TILE_LANES,
     group_count,
     make_lens,
+    splat_kernels,
 )
-from npa_envs.kernels.splat import splat_kernels
 from npa_envs.sph.bridge import launch, scalar_type
 from npa_envs.sph.cells import LARGEST_INDEX
 from npa_envs.sph.checks import (

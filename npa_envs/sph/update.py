@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.kernels.update import CHANNEL_SHARE, TEAM, UPDATE_ALIGNMENT, update_kernels
+from npa_envs.kernels.portable.update import CHANNEL_SHARE, TEAM, UPDATE_ALIGNMENT, update_kernels
 from npa_envs.sph.bridge import launch, scalar_type
 from npa_envs.sph.cells import LARGEST_INDEX
 from npa_envs.sph.operators import Rows

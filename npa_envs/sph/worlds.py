@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.kernels.worlds import CHUNK, MEAN_LANES, mean_kernels
+from npa_envs.kernels.portable.mean import CHUNK, MEAN_LANES, mean_kernels
 from npa_envs.sph.bridge import launch, scalar_type
 from npa_envs.sph.checks import DTYPES, check_dense
 

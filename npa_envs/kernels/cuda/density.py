@@ -9,11 +9,10 @@ import functools
 
 import warp as wp
 
+from npa_envs.kernels.cuda.slots import as_word, make_lists
+from npa_envs.kernels.cuda.warps import CUDA_BLOCK, load_integer
 from npa_envs.kernels.domain import domain_types, kernel_module
-from npa_envs.kernels.lanes import make_lane_sum, make_wide_load
-from npa_envs.kernels.slots import as_word, make_lists
-from npa_envs.kernels.warps import CUDA_BLOCK, load_integer
-from npa_envs.kernels.wide import make_wide_store
+from npa_envs.kernels.wide import make_lane_sum, make_wide_load, make_wide_store
 
 AHEAD, SHARED_AHEAD = 3, 5
 """Candidates that a thread looks at together: alone with a particle, and one of several lanes."""

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from npa_envs.kernels.warps import CUDA_BLOCK, WARP
+from npa_envs.kernels.cuda.warps import CUDA_BLOCK, WARP
 
 TILE = 8
 """Particles that a warp serves together, and rows of one product."""

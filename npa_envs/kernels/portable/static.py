@@ -1,10 +1,8 @@
-"""Perception of particles that never move, over weighed pairs, and its adjoint: both gathers.
+"""Pairs of particles that never move: found and weighed once, then summed over in every step.
 
-A thread has a group of a particle's channels and runs through the whole list, in its order;
-adjacent threads have adjacent groups, so that they read a neighbour's state together.
-Adjoint, in the notation of `adjoint`: the list of k holds v_i W_ki and v_i K_ki = -v_i K_ik, so
-cotangents of row i are divided by v_i once, and
-    s_k += v_k sum_i (v_i W_ki) (b_i / v_i) - (v_i K_ki) (G_i / v_i) - G_k sum_j v_j K_kj.
+Centre i has an entry for each neighbour j, itself included: v_j W_ij, v_j K_ij and where j is in
+the sorted order. A list that has no room for all neighbours is marked: its particle searches for
+them, and weighs them again.
 """
 
 import functools
@@ -12,19 +10,234 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from npa_envs.kernels.domain import (
-    domain_types,
-    kernel_module,
+from npa_envs.kernels.cpu import PAIRS, PARTICLES, in_ranges, make_add_scaled, make_sift, of_groups
+from npa_envs.kernels.cuda.warps import load_integer
+from npa_envs.kernels.domain import domain_types, kernel_module, scalar_name
+from npa_envs.kernels.mathematics import (
+    MOMENT_THRESHOLD,
     log_scale_adjoint,
     log_scaled,
+    make_smooth_inverse,
+    smoothing,
+    spiky_factor,
 )
-from npa_envs.kernels.groups import make_add_scaled, of_groups
-from npa_envs.kernels.lanes import make_wide_load
-from npa_envs.kernels.pairs import ENTRY_SIZE, make_weigh, packing
-from npa_envs.kernels.ranges import PAIRS, in_ranges
-from npa_envs.kernels.sifting import make_sift
-from npa_envs.kernels.warps import load_integer
-from npa_envs.kernels.wide import make_wide_store, make_write_at
+from npa_envs.kernels.wide import make_read_channels, make_wide_load, make_wide_store, make_write_at
+
+ENTRY_SIZE = 4
+"""Numbers of an entry: weights of values and of differences along each axis, in 2D a place."""
+
+SEARCHED = -1
+"""Length of a list that has no room for all neighbours."""
+
+_PACK = "union {{ {part} word; int number; }} both; both.word = 0; {do}"
+
+
+@functools.cache
+def packing(scalar: type) -> SimpleNamespace:
+    """Return Warp functions that put an integer's bits into a scalar, and that read them there."""
+    part = {"f32": "float", "f64": "double"}[scalar_name(scalar)]
+    pack = _PACK.format(part=part, do="both.number = number; return both.word;")
+    unpack = _PACK.format(part=part, do="both.word = word; return both.number;")
+
+    @wp.func_native(pack)
+    def packed(number: wp.int32) -> scalar: ...
+
+    @wp.func_native(unpack)
+    def unpacked(word: scalar) -> wp.int32: ...
+
+    return SimpleNamespace(packed=packed, unpacked=unpacked)
+
+
+@functools.cache
+def make_weigh(space_dim: int, scalar: type) -> wp.Function:
+    """Return a Warp function that weighs a pair, just as `perception` does."""
+    types = domain_types(space_dim, scalar)
+    vector, Domain = types.vector, types.Domain
+
+    @wp.func
+    def weigh(domain: Domain, offset: vector, volume: scalar):
+        """Return v W and v K of a neighbour within eps, at an offset from the centre."""
+        squared = wp.dot(offset, offset)
+        weight = smoothing(squared, domain.inverse_squared_eps, domain.smoothing_norm)
+        kernel = offset * spiky_factor(wp.sqrt(squared), domain.inverse_eps, domain.spiky_norm)
+        return volume * weight, volume * kernel
+
+    return weigh
+
+
+@functools.cache
+def pair_kernels(
+    space_dim: int, scalar: type, lanes: int, ahead: int, moment_inverse: str | None
+) -> SimpleNamespace:
+    """Return the kernels that make lists.
+
+    Args:
+        space_dim: Space dimension D.
+        scalar: `wp.float32` or `wp.float64`.
+        lanes: 1 on the CPU, more on CUDA.
+        ahead: Lists are filled up to a multiple of this many entries.
+        moment_inverse: How to invert moment matrices; None: not at all.
+    """
+    moment_correction = moment_inverse is not None
+    smooth = moment_inverse == "smooth"
+    types = domain_types(space_dim, scalar)
+    vector, particle, Domain = types.vector, types.particle, types.Domain
+    cell_of, segment_count, segment_cells = (
+        types.cell_of,
+        types.segment_count,
+        types.segment_cells,
+    )
+    minimum_image, position_of = types.minimum_image, types.position_of
+    wide = wp.types.vector(space_dim, wp.float64)
+    square = wp.types.matrix((space_dim, space_dim), scalar)
+    entry_type = wp.types.vector(ENTRY_SIZE, scalar)
+    flat = space_dim == 2
+    sift, stride = make_sift(space_dim, scalar, particle, lanes)
+    # Here every particle has one thread, which takes all sifts.
+    stride //= lanes
+    weigh = make_weigh(space_dim, scalar)
+    packed = packing(scalar).packed
+    store_entry = make_wide_store(entry_type, scalar)
+    smooth_inverse = make_smooth_inverse(space_dim, scalar)
+    topic = "pairs" if moment_correction else "uncorrected_pairs"
+    topic = "smoothly_corrected_pairs" if smooth else topic
+    module = kernel_module(f"{topic}_{ahead}", space_dim, scalar, 0, lanes)
+
+    @in_ranges(PAIRS)
+    @wp.kernel(enable_backward=False, module=module)
+    def count_pairs(
+        range_start: wp.int32,
+        domain: Domain,
+        particle_count: wp.int32,
+        starts: wp.array(dtype=wp.int32),
+        particles: wp.array(dtype=particle),
+        # outputs
+        lengths: wp.array(dtype=wp.int32),
+    ):
+        """Write how many entries the list of each particle shall have."""
+        k = range_start + wp.tid()
+        position = position_of(particles[k])
+        base = (k / particle_count) * domain.cell_count
+        cell = cell_of(domain, position)
+        length = wp.int32(0)
+        for segment in range(segment_count(domain, cell)):
+            first, last = segment_cells(domain, cell, segment)
+            end = starts[base + last]
+            for begin in range(starts[base + first], end, wp.static(stride)):
+                _near, count = sift(domain, particles, position, begin, end)
+                length += count
+        lengths[k] = (length + wp.static(ahead - 1)) / wp.static(ahead) * wp.static(ahead)
+
+    @wp.func
+    def put(
+        weights: wp.array(dtype=entry_type),
+        neighbours: wp.array(dtype=wp.int32),
+        place: wp.int32,
+        weight: scalar,
+        weighted: vector,
+        j: wp.int32,
+    ):
+        entry = entry_type()
+        entry[0] = weight
+        for d in range(wp.static(space_dim)):
+            entry[d + 1] = weighted[d]
+        if wp.static(flat):
+            entry[3] = packed(j)
+        else:
+            neighbours[place] = j
+        store_entry(weights, place, entry)
+
+    @in_ranges(PAIRS)
+    @wp.kernel(enable_backward=False, module=module)
+    def list_pairs(
+        range_start: wp.int32,
+        domain: Domain,
+        particle_count: wp.int32,
+        capacity: wp.int32,
+        density_gradient: wp.int32,
+        density_scale: wp.float64,
+        starts: wp.array(dtype=wp.int32),
+        particles: wp.array(dtype=particle),
+        gradients: wp.array(dtype=wide),
+        ends: wp.array(dtype=wp.int32),
+        # outputs
+        weights: wp.array(dtype=entry_type),
+        neighbours: wp.array(dtype=wp.int32),
+        lengths: wp.array(dtype=wp.int32),
+        kernel_sum: wp.array(dtype=vector),
+        correction: wp.array(dtype=square),
+        density_columns: wp.array(dtype=vector),
+    ):
+        """Write the list of each particle, and whatever else of it stays as it is.
+
+        Lists have room for `capacity` entries each, or end where `ends` says unless it is empty.
+        """
+        k = range_start + wp.tid()
+        position = position_of(particles[k])
+        base = (k / particle_count) * domain.cell_count
+        cell = cell_of(domain, position)
+        first_place = k * capacity
+        room = capacity
+        if ends.shape[0] > 0:
+            first_place = wp.int32(0)
+            if k > 0:
+                first_place = ends[k - 1]
+            room = ends[k] - first_place
+        length = wp.int32(0)
+        total = vector()
+        moment = square()
+        for segment in range(segment_count(domain, cell)):
+            first, last = segment_cells(domain, cell, segment)
+            end = starts[base + last]
+            for begin in range(starts[base + first], end, wp.static(stride)):
+                near, count = sift(domain, particles, position, begin, end)
+                for n in range(count):
+                    j = near[n]
+                    entry = particles[j]
+                    offset = minimum_image(domain, position_of(entry) - position)
+                    weight, weighted = weigh(domain, offset, entry[wp.static(space_dim)])
+                    total += weighted
+                    if wp.static(moment_correction):
+                        moment += wp.outer(offset, weighted)
+                    if length < room:
+                        put(weights, neighbours, first_place + length, weight, weighted, j)
+                    length += 1
+        if length <= room:
+            while length % wp.static(ahead) != 0:
+                put(weights, neighbours, first_place + length, scalar(0.0), vector(), k)
+                length += 1
+        else:
+            length = wp.int32(wp.static(SEARCHED))
+        lengths[k] = length
+        kernel_sum[k] = total
+        if wp.static(moment_correction):
+            inverse = square()
+            if wp.static(smooth):
+                inverse = smooth_inverse(moment)
+            elif wp.abs(wp.determinant(moment)) >= scalar(wp.static(MOMENT_THRESHOLD)):
+                inverse = wp.inverse(moment)
+            else:
+                for d in range(wp.static(space_dim)):
+                    inverse[d, d] = scalar(1.0)
+            correction[k] = inverse
+        if density_gradient != 0:
+            scaled = density_scale * gradients[k]
+            scaled = log_scaled(scaled)
+            columns = vector()
+            for d in range(wp.static(space_dim)):
+                columns[d] = scalar(scaled[d])
+            density_columns[k] = columns
+
+    return SimpleNamespace(count_pairs=count_pairs, list_pairs=list_pairs)
+
+
+# Perception of particles that never move, over weighed pairs, and its adjoint: both gathers.
+#
+# A thread has a group of a particle's channels and runs through the whole list, in its order;
+# adjacent threads have adjacent groups, so that they read a neighbour's state together. Adjoint,
+# in the notation of `adjoint`: the list of k holds v_i W_ki and v_i K_ki = -v_i K_ik, so
+# cotangents of row i are divided by v_i once, and s_k += v_k sum_i (v_i W_ki) (b_i / v_i) - (v_i
+# K_ki) (G_i / v_i) - G_k sum_j v_j K_kj.
 
 
 @functools.cache
@@ -450,4 +663,119 @@ def pair_sum_kernels(
         perceive=perceive,
         unscale_cotangents=unscale_cotangents,
         gather_state_cotangents=gather_state_cotangents,
+    )
+
+
+# Steps of particles that never move: which of them have rows, and the update of their states.
+
+
+@functools.cache
+def state_update_kernels(scalar: type, width: int) -> SimpleNamespace:
+    """Return the kernels of one variant, for groups of `width` channels."""
+    group = wp.types.vector(width, scalar)
+    load_group = make_wide_load(group, scalar)
+    store_group = make_wide_store(group, scalar)
+    write_group = make_write_at(group, scalar)
+    read_channels = make_read_channels(group, scalar)
+    module = kernel_module("state_update", 0, scalar, width)
+
+    @in_ranges(PARTICLES)
+    @wp.kernel(enable_backward=False, module=module)
+    def give_rows(
+        range_start: wp.int32,
+        total: wp.int32,
+        row_capacity: wp.int32,
+        active_before: wp.array(dtype=wp.int32),
+        # outputs
+        row_of: wp.array(dtype=wp.int32),
+        row_place: wp.array(dtype=wp.int32),
+    ):
+        """Give the active particles of each step rows in their order.
+
+        `active_before` counts each active particle itself.
+        """
+        t = range_start + wp.tid()
+        step = t / total
+        k = t - step * total
+        count = load_integer(active_before, t)
+        before = wp.int32(0)
+        if k > 0:
+            before = load_integer(active_before, t - 1)
+        row = wp.int32(-1)
+        if count > before and before < row_capacity:
+            row = before
+            row_place[step * row_capacity + row] = k
+        row_of[t] = row
+
+    @in_ranges(PARTICLES)
+    @wp.kernel(enable_backward=False, module=module)
+    def update_states(
+        range_start: wp.int32,
+        dt: scalar,
+        state_dim: wp.int32,
+        group_count: wp.int32,
+        update_width: wp.int32,
+        aligned: wp.int32,
+        row_of: wp.array(dtype=wp.int32),
+        update: wp.array(dtype=scalar),
+        states: wp.array(dtype=group),
+        # outputs
+        new_states: wp.array(dtype=group),
+    ):
+        """Change the states of the particles that have a row; copy the others."""
+        k, g = of_groups(range_start + wp.tid(), group_count)
+        place = k * group_count + g
+        state = load_group(states, place)
+        row = k
+        if row_of.shape[0] > 0:
+            row = load_integer(row_of, k)
+        if row >= 0:
+            change = read_channels(update, update_width, aligned, row, g * wp.static(width))
+            for c in range(wp.static(width)):
+                # Updates may be padded with columns that nothing reads.
+                if g * wp.static(width) + c < state_dim:
+                    state[c] += dt * change[c]
+        store_group(new_states, place, state)
+
+    @in_ranges(PARTICLES)
+    @wp.kernel(enable_backward=False, module=module)
+    def pull_back_update(
+        range_start: wp.int32,
+        dt: scalar,
+        state_dim: wp.int32,
+        group_count: wp.int32,
+        update_width: wp.int32,
+        aligned: wp.int32,
+        row_place: wp.array(dtype=wp.int32),
+        active_before: wp.array(dtype=wp.int32),
+        new_states_bar: wp.array(dtype=group),
+        # outputs
+        update_bar: wp.array(dtype=scalar),
+    ):
+        """Write the cotangent of every row's update, zero beyond the last active row."""
+        parts = (update_width + wp.static(width - 1)) / wp.static(width)
+        row, part = of_groups(range_start + wp.tid(), parts)
+        k = row
+        active = part < group_count
+        if row_place.shape[0] > 0:
+            active = active and row < load_integer(active_before, active_before.shape[0] - 1)
+            if active:
+                k = load_integer(row_place, row)
+        first = part * wp.static(width)
+        bar = group()
+        if active:
+            state_bar = load_group(new_states_bar, k * group_count + part)
+            for c in range(wp.static(width)):
+                if first + c < state_dim:
+                    bar[c] = dt * state_bar[c]
+        place = row * update_width + first
+        if aligned != 0:
+            write_group(update_bar, place, bar)
+        else:
+            for c in range(wp.static(width)):
+                if first + c < update_width:
+                    update_bar[place + c] = bar[c]
+
+    return SimpleNamespace(
+        give_rows=give_rows, update_states=update_states, pull_back_update=pull_back_update
     )

@@ -12,19 +12,16 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from npa_envs.kernels.domain import (
+from npa_envs.kernels.cpu import PAIRS, in_ranges, make_add_scaled, make_sift
+from npa_envs.kernels.domain import domain_types, kernel_module
+from npa_envs.kernels.mathematics import (
     MOMENT_THRESHOLD,
-    domain_types,
-    kernel_module,
     log_scaled,
+    make_smooth_inverse,
     smoothing,
     spiky_factor,
 )
-from npa_envs.kernels.groups import make_add_scaled
-from npa_envs.kernels.lanes import make_lane_scatter, make_lane_sum, make_wide_load, share_type
-from npa_envs.kernels.moments import make_smooth_inverse
-from npa_envs.kernels.ranges import PAIRS, in_ranges
-from npa_envs.kernels.sifting import make_sift
+from npa_envs.kernels.wide import make_lane_scatter, make_lane_sum, make_wide_load, share_type
 
 CUDA_REGISTERS = 128
 """Registers of a thread of the perception pass: more threads in flight are worth a few spills."""

@@ -11,10 +11,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from npa_envs.kernels.domain import domain_types, kernel_module
-from npa_envs.kernels.lanes import make_wide_load
-from npa_envs.kernels.slots import as_word, inverse_root
-from npa_envs.kernels.tiles import (
+from npa_envs.kernels.cuda.slots import as_word, inverse_root
+from npa_envs.kernels.cuda.tiles import (
     CHANNELS,
     ENTRY,
     LIST_ENTRIES,
@@ -29,7 +27,7 @@ from npa_envs.kernels.tiles import (
     smallest_in_tile,
     write_columns,
 )
-from npa_envs.kernels.warps import (
+from npa_envs.kernels.cuda.warps import (
     WARP,
     any_in_warp,
     first_in_warp,
@@ -42,7 +40,8 @@ from npa_envs.kernels.warps import (
     thread_of,
     vote_of_warp,
 )
-from npa_envs.kernels.wide import make_fast_exp2, make_wide_store
+from npa_envs.kernels.domain import domain_types, kernel_module
+from npa_envs.kernels.wide import make_fast_exp2, make_wide_load, make_wide_store
 
 CUDA_REGISTERS = 64
 """Registers of a thread that gathers state cotangents."""

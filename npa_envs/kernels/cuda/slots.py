@@ -12,7 +12,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from npa_envs.kernels.warps import CUDA_BLOCK
+from npa_envs.kernels.cuda.warps import CUDA_BLOCK
 
 SLOT_ENTRIES = 32
 """Neighbours that a slot has room for; longer neighbourhoods are summed in several rounds."""

@@ -11,8 +11,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from npa_envs.kernels.domain import domain_types, kernel_module
-from npa_envs.kernels.lanes import make_wide_load
-from npa_envs.kernels.wide import make_read_channels, make_wide_store
+from npa_envs.kernels.wide import make_read_channels, make_wide_load, make_wide_store
 
 BLOCKS = {1024: 256, 4096: 1024}
 """Threads of a block by the particles that it has room for."""

@@ -1,37 +1,22 @@
-"""Perception on CUDA in float32, by the lists of neighbours that the density pass left.
-
-The same sums as `perception`, in another order of work. The lanes of a particle weigh the listed
-neighbours, one for each lane, and put the weights into fast memory; then they run through these
-together, a few channels for each lane: weights are computed once, and only for neighbours; a
-neighbour's state is read once, by adjacent lanes. Rows leave through fast memory too, in whole
-transactions. A list that is too long was not kept: its neighbours are searched for again.
-"""
+"""Spiky factors of pairs in float64 for positions in float32: density gradients cancel."""
 
 import functools
 import math
 
 import warp as wp
 
-from npa_envs.kernels.domain import (
-    MOMENT_THRESHOLD,
-    domain_types,
-    kernel_module,
-    log_scaled_huge,
-)
-from npa_envs.kernels.lanes import make_lane_sum, make_wide_load, share_type
-from npa_envs.kernels.listing import RECORD
-from npa_envs.kernels.moments import make_smooth_inverse
-from npa_envs.kernels.slots import (
+from npa_envs.kernels.cuda.density import RECORD
+from npa_envs.kernels.cuda.slots import (
     SLOT_ENTRIES,
     as_number,
+    inverse_root,
     log_scale_of_square,
     make_lists,
     make_slots,
     make_stage,
     within,
 )
-from npa_envs.kernels.spiky import make_spiky_wide
-from npa_envs.kernels.warps import (
+from npa_envs.kernels.cuda.warps import (
     any_in_warp,
     largest_in_warp,
     load_integer,
@@ -39,6 +24,55 @@ from npa_envs.kernels.warps import (
     of_lane,
     thread_number,
 )
+from npa_envs.kernels.domain import domain_types, kernel_module
+from npa_envs.kernels.mathematics import MOMENT_THRESHOLD, log_scaled_huge, make_smooth_inverse
+from npa_envs.kernels.wide import make_lane_sum, make_wide_load, share_type
+
+
+@functools.cache
+def make_spiky_wide(space_dim: int, periodic: bool) -> wp.Function:
+    """Return the function of one variant.
+
+    Args:
+        space_dim: Space dimension D.
+        periodic: Whether space is a periodic box.
+    """
+    scalar = wp.float32
+    types = domain_types(space_dim, scalar)
+    vector, Domain = types.vector, types.Domain
+    wide = wp.types.vector(space_dim, wp.float64)
+
+    @wp.func
+    def spiky_wide(domain: Domain, centre: vector, neighbour: vector, squared: scalar):
+        """Spiky factor and distance vector of a pair in float64, as in `perception`."""
+        r = wide()
+        start = squared
+        for d in range(wp.static(space_dim)):
+            r[d] = wp.float64(neighbour[d]) - wp.float64(centre[d])
+        if wp.static(periodic):
+            for d in range(wp.static(space_dim)):
+                images = wp.round((neighbour[d] - centre[d]) * domain.inverse_box[d])
+                r[d] -= wp.float64(images) * wp.float64(domain.box[d])
+            start = scalar(wp.dot(r, r))
+        exact = wp.dot(r, r)
+        apart = wp.where(start > scalar(0.0), inverse_root(start), scalar(0.0))
+        inverse = wp.float64(apart)
+        inverse *= wp.float64(1.5) - wp.float64(0.5) * exact * inverse * inverse
+        falloff = wp.float64(1.0) - exact * inverse * wp.float64(domain.inverse_eps)
+        return wp.float64(domain.spiky_norm) * falloff * falloff * inverse, r
+
+    return spiky_wide
+
+
+# Perception on CUDA in float32, by the lists of neighbours that the density pass left.
+#
+# The same sums as `perception`, in another order of work. The lanes of a particle weigh the
+# listed neighbours, one for each lane, and put the weights into fast memory; then they run
+# through these together, a few channels for each lane: weights are computed once, and only for
+# neighbours; a neighbour's state is read once, by adjacent lanes. Rows leave through fast memory
+# too, in whole transactions. A list that is too long was not kept: its neighbours are searched
+# for again.
+
 
 CUDA_REGISTERS, TEAM_REGISTERS = 80, 96
 """Registers of a thread of the perception pass, of one team and of several."""

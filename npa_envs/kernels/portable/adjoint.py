@@ -16,19 +16,16 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from npa_envs.kernels.domain import (
-    domain_types,
-    kernel_module,
+from npa_envs.kernels.cpu import PAIRS, in_ranges, make_add_scaled, make_sift
+from npa_envs.kernels.domain import domain_types, kernel_module
+from npa_envs.kernels.mathematics import (
     log_scale_adjoint,
     smoothing,
     smoothing_slope,
     spiky_factor,
     spiky_radial_slope,
 )
-from npa_envs.kernels.groups import make_add_scaled
-from npa_envs.kernels.lanes import make_lane_scatter, make_wide_load
-from npa_envs.kernels.ranges import PAIRS, in_ranges
-from npa_envs.kernels.sifting import make_sift
+from npa_envs.kernels.wide import make_lane_scatter, make_wide_load
 
 CUDA_REGISTERS = 64
 """Registers of a thread that gathers state cotangents: it mostly waits for memory."""

@@ -10,11 +10,10 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from npa_envs.kernels.domain import domain_types, kernel_module
-from npa_envs.kernels.lanes import make_wide_load
-from npa_envs.kernels.ranges import ELEMENTS, in_ranges
-from npa_envs.kernels.warps import load_integer
-from npa_envs.kernels.wide import make_read_at, make_write_at
+from npa_envs.kernels.cpu import ELEMENTS, in_ranges
+from npa_envs.kernels.cuda.warps import load_integer
+from npa_envs.kernels.domain import domain_types, kernel_module, scalar_name
+from npa_envs.kernels.wide import make_read_at, make_wide_load, make_write_at
 
 CHANNEL_SHARE = 4
 """Adjacent channels of a particle, or columns of a row, that one thread changes."""
@@ -328,3 +327,46 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
     return SimpleNamespace(
         apply_update=apply_update, pull_back_update=pull_back_update, apply_actions=apply_actions
     )
+
+
+# Whether numbers are finite, without waiting for the answer.
+
+
+QUAD = 4
+"""Values that a thread reads at once."""
+
+VALUES_PER_THREAD = 8
+"""Values that a thread looks at."""
+
+
+@functools.cache
+def find_not_finite(scalar: type) -> wp.Kernel:
+    """Return the kernel of one scalar type."""
+    module = wp.get_module(f"npa_envs.kernels.finite_{scalar_name(scalar)}")
+    read_quad = make_read_at(wp.types.vector(QUAD, scalar), scalar, 16)
+
+    @wp.kernel(enable_backward=False, module=module)
+    def find(
+        thread_count: wp.int32,
+        values: wp.array(dtype=scalar),
+        # outputs
+        finite: wp.array(dtype=wp.uint8),
+    ):
+        """Write 0 where a value, aligned to 16 bytes in memory, is infinite or not a number."""
+        t = wp.tid()
+        found = wp.int32(0)
+        for k in range(wp.static(VALUES_PER_THREAD // QUAD)):
+            first = (t + k * thread_count) * wp.static(QUAD)
+            if first <= values.shape[0] - wp.static(QUAD):
+                together = read_quad(values, first)
+                for c in range(wp.static(QUAD)):
+                    if not wp.isfinite(together[c]):
+                        found = wp.int32(1)
+            else:
+                for i in range(first, values.shape[0]):
+                    if not wp.isfinite(values[i]):
+                        found = wp.int32(1)
+        if found != 0:
+            finite[0] = wp.uint8(0)
+
+    return find

@@ -8,7 +8,7 @@ import functools
 
 import warp as wp
 
-from npa_envs.kernels.lanes import make_wide_load
+from npa_envs.kernels.wide import make_wide_load
 
 WARP = 32
 """Threads of a warp."""

@@ -11,14 +11,9 @@ import functools
 
 import warp as wp
 
-from npa_envs.kernels.domain import (
-    domain_types,
-    kernel_module,
-    log_scaled,
-    smoothing,
-    spiky_factor,
-)
-from npa_envs.kernels.ranges import PAIRS, in_ranges
+from npa_envs.kernels.cpu import PAIRS, in_ranges
+from npa_envs.kernels.domain import domain_types, kernel_module
+from npa_envs.kernels.mathematics import log_scaled, smoothing, spiky_factor
 
 
 @functools.cache

@@ -20,9 +20,11 @@ from typing import Any
 
 import warp as wp
 
+from npa_envs.kernels.cpu import TILES, in_ranges
+from npa_envs.kernels.cuda.sort import meet_block
+from npa_envs.kernels.cuda.warps import WARP, any_in_warp, load_integer
 from npa_envs.kernels.domain import scalar_name
-from npa_envs.kernels.lanes import c_scalar, make_lane_sum, make_wide_load
-from npa_envs.kernels.projection import (
+from npa_envs.kernels.pictures.gaussians import (
     CHANNELS,
     PULLS,
     SMALLEST_ALPHA,
@@ -30,10 +32,7 @@ from npa_envs.kernels.projection import (
     gaussian_types,
     projection_functions,
 )
-from npa_envs.kernels.ranges import TILES, in_ranges
-from npa_envs.kernels.small_worlds import meet_block
-from npa_envs.kernels.warps import WARP, any_in_warp, load_integer
-from npa_envs.kernels.wide import make_fast_exp2
+from npa_envs.kernels.wide import c_scalar, make_fast_exp2, make_lane_sum, make_wide_load
 
 LARGEST_ALPHA = 0.99
 """What a Gaussian covers of a pixel, at most: the adjoint divides by the rest."""

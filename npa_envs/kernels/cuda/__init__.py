@@ -1,0 +1,1 @@
+"""Kernels for CUDA in float32 on compute capability 8.0 and above."""

@@ -1,0 +1,148 @@
+"""The formulas of perception, each once: kernels W and K, the scaling L, the inverse of moments.
+
+Sources: arXiv 2601.16096, section 3 and appendix; `npa_envs.reference` has the same in plain torch.
+"""
+
+import functools
+from typing import Any
+
+import warp as wp
+
+MOMENT_THRESHOLD = 1e-3
+"""Smallest |det M| that is inverted, dimensionless; below it the gradient stays uncorrected."""
+
+SMALL_LOG = 5e-2
+"""Below this |z| the ratio |z| / (exp|z| - 1) is evaluated by its series: the quotient cancels."""
+
+MOMENT_SOFTENING = 1e-2
+"""τ: the smooth inverse is half way between M^-1 and I at this det M, dimensionless."""
+
+
+@wp.func
+def smoothing(squared_distance: Any, inverse_squared_eps: Any, norm: Any):
+    """Poly6 smoothing kernel W, inside its support [1 / length^D]."""
+    falloff = type(norm)(1.0) - squared_distance * inverse_squared_eps
+    return norm * falloff * falloff * falloff
+
+
+@wp.func
+def smoothing_slope(squared_distance: Any, inverse_squared_eps: Any, norm: Any):
+    """Factor g of the gradient dW/dr = g r of the smoothing kernel [1 / length^(D+2)]."""
+    falloff = type(norm)(1.0) - squared_distance * inverse_squared_eps
+    return type(norm)(-6.0) * norm * inverse_squared_eps * falloff * falloff
+
+
+@wp.func
+def spiky_factor(distance: Any, inverse_eps: Any, norm: Any):
+    """Factor f of the spiky gradient kernel K(r) = f r; zero at r = 0 [1 / length^(D+2)]."""
+    factor = type(norm)(0.0)
+    if distance > type(norm)(0.0):
+        falloff = type(norm)(1.0) - distance * inverse_eps
+        factor = norm * falloff * falloff / distance
+    return factor
+
+
+@wp.func
+def spiky_radial_slope(distance: Any, inverse_eps: Any, norm: Any):
+    """d(f r)/dr of the spiky kernel's length f(r) r, for its adjoint [1 / length^(D+2)]."""
+    falloff = type(norm)(1.0) - distance * inverse_eps
+    return -type(norm)(2.0) * norm * falloff * inverse_eps
+
+
+@wp.func
+def log1p(value: Any):
+    """log(1 + value), accurate also where value is far below one."""
+    one_plus = type(value)(1.0) + value
+    result = value
+    if one_plus > type(value)(1.0):
+        result = wp.log(one_plus) * (value / (one_plus - type(value)(1.0)))
+    return result
+
+
+@wp.func
+def log_scaled_huge(v: Any):
+    """L(v) of a vector whose squared length overflows."""
+    largest = wp.max(wp.abs(v))
+    direction = v / largest
+    length = wp.length(direction)
+    return ((wp.log(largest) + wp.log(length)) / length) * direction
+
+
+@wp.func
+def log_scaled(v: Any):
+    """L(v) = log(1 + |v|) v / |v| of the logarithmic scaling, and 0 at 0."""
+    length = wp.length(v)
+    factor = type(length)(1.0)
+    if length > type(length)(0.0):
+        factor = log1p(length) / length
+    result = factor * v
+    if wp.isinf(length):
+        result = log_scaled_huge(v)
+    return result
+
+
+@wp.func
+def log_scale_tangential(length: Any):
+    """Derivative of L across its direction as a function of |L|: |L| / (exp|L| - 1)."""
+    ratio = type(length)(1.0)
+    if length < type(length)(SMALL_LOG):
+        series = type(length)(1.0)
+        for k in range(6):
+            series = type(length)(1.0) + series * length / type(length)(7 - k)
+        ratio = type(length)(1.0) / series
+    else:
+        ratio = length / (wp.exp(length) - type(length)(1.0))
+    return ratio
+
+
+@wp.func
+def log_scale_adjoint(scaled: Any, cotangent: Any):
+    """Pull a cotangent of L(v) back to v, given L(v): L is radial, so its value suffices."""
+    length = wp.length(scaled)
+    tangential = log_scale_tangential(length)
+    result = tangential * cotangent
+    if length > type(length)(0.0):
+        radial = wp.exp(-length)
+        direction = scaled / length
+        result += (radial - tangential) * wp.dot(direction, cotangent) * direction
+    return result
+
+
+@functools.cache
+def make_smooth_inverse(space_dim: int, scalar: type) -> wp.Function:
+    """Return a Warp function of symmetric M: (det M adj M + τ² I) / (det² M + τ²).
+
+    It is w M^-1 + (1 - w) I with w = det² M / (det² M + τ²), and has no singularity.
+    """
+    square = wp.types.matrix((space_dim, space_dim), scalar)
+
+    @wp.func
+    def adjugate(moment: square):
+        result = square()
+        if wp.static(space_dim == 2):
+            result[0, 0] = moment[1, 1]
+            result[1, 1] = moment[0, 0]
+            result[0, 1] = -moment[0, 1]
+            result[1, 0] = -moment[1, 0]
+        else:
+            for row in range(3):
+                a = (row + 1) % 3
+                b = (row + 2) % 3
+                for column in range(3):
+                    c = (column + 1) % 3
+                    d = (column + 2) % 3
+                    cofactor = moment[a, c] * moment[b, d] - moment[a, d] * moment[b, c]
+                    result[column, row] = cofactor
+        return result
+
+    @wp.func
+    def smooth_inverse(moment: square):
+        determinant = wp.determinant(moment)
+        softening = scalar(wp.static(MOMENT_SOFTENING * MOMENT_SOFTENING))
+        factor = scalar(1.0) / (determinant * determinant + softening)
+        result = (factor * determinant) * adjugate(moment)
+        for d in range(wp.static(space_dim)):
+            result[d, d] += factor * softening
+        return result
+
+    return smooth_inverse

@@ -1,0 +1,1 @@
+"""Kernels that draw particles: splats in 2D, Gaussians in 3D."""
