@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from npa_envs.agents.policy import unwrapped
 from npa_envs.errors import NPAError
-from npa_envs.randomness import WorldRandom
+from npa_envs.world.randomness import WorldRandom
 
 
 class Episodes(NamedTuple):

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from npa_envs.agents.policy import Policy, interface_of, unwrapped
 from npa_envs.errors import NPAError
-from npa_envs.randomness import Purpose, WorldRandom
 from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.checks import is_real, is_whole
+from npa_envs.world.randomness import Purpose, WorldRandom
 
 
 class ZeroPolicy(Policy):

@@ -22,10 +22,10 @@ from torch import Tensor
 
 import npa_envs
 from npa_envs.bench.session import relative_error
-from npa_envs.replay import capture
 from npa_envs.tasks.renderers import RENDERERS
 from npa_envs.tasks.views import some_views
 from npa_envs.trained_tasks import task_of_rule
+from npa_envs.world.cuda_graph import capture
 
 DEVICE = torch.device("cuda")
 NAMES = ("own", "gsplat")

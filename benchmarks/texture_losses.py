@@ -20,7 +20,6 @@ import torch
 from torch import Tensor
 
 from npa_envs.bench.report import script_facts
-from npa_envs.dynamics import rollout
 from npa_envs.errors import NPAError
 from npa_envs.files import write_text
 from npa_envs.render import to_uint8, write_filmstrip
@@ -28,6 +27,7 @@ from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.texture import Texture
 from npa_envs.tasks.texture_losses import TEXTURE_LOSSES
 from npa_envs.training import TrainConfig, preset, train
+from npa_envs.world.rollout import rollout
 
 FIRST_SEED = 1_000_000
 """The first grown world's number; training uses others."""

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import torch
 
+from npa_envs.ops import orbit
 from npa_envs.render import to_uint8, write_filmstrip
-from npa_envs.sph import orbit
 from npa_envs.tasks.meshes import builtin_meshes, load_mesh
 from npa_envs.tasks.raster import draw_mesh
 from npa_envs.tasks.views import ANGLE, DISTANCE

@@ -2,7 +2,8 @@
 
 `gym.make` and `gym.make_vec` take the ids of `npa_envs.registration`; the names here are for those
 who write a task of their own (docs/own_environment.md). No kernels and no physics live here: tasks
-say where worlds start and how far they are from the goal, `npa_envs.control` moves the particles.
+say where worlds start and how far they are from the goal, `npa_envs.world.actions` moves the
+particles.
 """
 
 from npa_envs.envs.config import EnvConfig

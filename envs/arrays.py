@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from npa_envs.control import Physics
 from npa_envs.envs.task import Start
 from npa_envs.errors import NPAError
+from npa_envs.world.actions import Physics
 
 
 def to_output(tensor: Tensor, output: str) -> Any:

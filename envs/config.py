@@ -8,7 +8,6 @@ from typing import Any, Literal, Self
 import numpy as np
 import torch
 
-from npa_envs.control import MomentInverse
 from npa_envs.devices import check_device
 from npa_envs.errors import NPAError, suggest
 from npa_envs.render import STYLES
@@ -19,6 +18,7 @@ from npa_envs.tasks.checks import (
     is_real,
     is_whole,
 )
+from npa_envs.world.actions import MomentInverse
 
 Boundary = Literal["open", "periodic"]
 Reward = Literal["dense", "sparse", "particle"]

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import torch
 
-from npa_envs.control import Physics
 from npa_envs.errors import NPAError
+from npa_envs.world.actions import Physics
 
 OBSERVATION_COPIES = 4
 """Observations alive at once: the rows, the arrays handed out, the last ones, one to spare."""

@@ -16,13 +16,13 @@ from npa_envs.envs.single import NPAEnv
 from npa_envs.envs.task import TURN, EnvTask
 from npa_envs.envs.vector import NPAVectorEnv
 from npa_envs.errors import NPAError
-from npa_envs.randomness import WorldRandom
 from npa_envs.render import turntable_frames
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.checks import check_fraction, check_positive
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D
 from npa_envs.tasks.morphogenesis3d_config import Morphogenesis3DConfig
+from npa_envs.world.randomness import WorldRandom
 
 PIXEL_BYTES = 200
 """About what comparing one pixel of a view needs [bytes]."""

@@ -16,7 +16,6 @@ from npa_envs.envs.single import NPAEnv
 from npa_envs.envs.task import EnvTask, Start
 from npa_envs.envs.vector import NPAVectorEnv
 from npa_envs.errors import NPAError
-from npa_envs.randomness import WorldRandom
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
 from npa_envs.tasks.checks import check_non_negative, check_positive
@@ -24,6 +23,7 @@ from npa_envs.tasks.digits import Split
 from npa_envs.tasks.point_classification import PointClassification
 from npa_envs.tasks.point_classification_config import PointClassificationConfig
 from npa_envs.tasks.votes import class_colours
+from npa_envs.world.randomness import WorldRandom
 
 
 @dataclass(frozen=True, kw_only=True)

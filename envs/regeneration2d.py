@@ -7,18 +7,18 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from npa_envs.dynamics import rollout
 from npa_envs.envs.morphogenesis2d import Morphogenesis2DEnvConfig, PictureTask
 from npa_envs.envs.single import NPAEnv
 from npa_envs.envs.task import Start
 from npa_envs.envs.vector import NPAVectorEnv
 from npa_envs.envs.worlds import total
 from npa_envs.errors import NPAError, suggest
-from npa_envs.randomness import Purpose, WorldRandom
 from npa_envs.rule.files import load_rule, shipped_rules
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
 from npa_envs.tasks.checks import check_fraction, check_positive
 from npa_envs.tasks.damage import damage_worlds
+from npa_envs.world.randomness import Purpose, WorldRandom
+from npa_envs.world.rollout import rollout
 
 RANDOM_DAMAGE = "random"
 """Each episode draws its kind of damage."""

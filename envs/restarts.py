@@ -10,8 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.control import SurveyedWorlds
-from npa_envs.replay import Replayed, WeakFunction, sent
+from npa_envs.world.actions import SurveyedWorlds
+from npa_envs.world.cuda_graph import Replayed, WeakFunction, sent
 
 GROWTH = 4
 """Each recorded size is so many times the one before it."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from gymnasium.spaces import Box
 
-from npa_envs.control import Physics
+from npa_envs.world.actions import Physics
 
 
 def observation_space(physics: Physics, particle_count: int) -> Box:

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from npa_envs.envs.config import EnvConfig
 from npa_envs.errors import NPAError
-from npa_envs.randomness import Purpose, WorldRandom
 from npa_envs.render import draw_worlds
+from npa_envs.world.randomness import Purpose, WorldRandom
 
 Config = TypeVar("Config", bound=EnvConfig)
 

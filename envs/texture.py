@@ -13,11 +13,11 @@ from npa_envs.envs.single import NPAEnv
 from npa_envs.envs.task import EnvTask
 from npa_envs.envs.vector import NPAVectorEnv
 from npa_envs.errors import NPAError
-from npa_envs.randomness import WorldRandom
 from npa_envs.tasks.checks import check_non_negative, check_positive
 from npa_envs.tasks.texture import Texture
 from npa_envs.tasks.texture_config import TextureConfig
 from npa_envs.tasks.texture_losses import DEFAULT_LOSS, check_loss_name
+from npa_envs.world.randomness import WorldRandom
 
 LOSS_BYTES = 4000
 """About what comparing one pixel of a picture needs [bytes]."""

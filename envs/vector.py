@@ -24,7 +24,7 @@ from npa_envs.envs.vector_options import autoreset_mode as checked_mode
 from npa_envs.envs.vector_options import checked_count, world_keys, worlds_to_reset
 from npa_envs.envs.worlds import Worlds
 from npa_envs.errors import NPAError
-from npa_envs.replay import sent
+from npa_envs.world.cuda_graph import sent
 
 REASONS = np.array([reason(ending) for ending in range(2 * TIME_LIMIT)], dtype=object)
 """Why an episode ended, in words, for each combination of endings."""

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.errors import NPAError, suggest
-from npa_envs.randomness import WorldRandom
 from npa_envs.tasks.checks import is_whole
+from npa_envs.world.randomness import WorldRandom
 
 AUTORESET_MODES = {
     "same-step": AutoresetMode.SAME_STEP,

@@ -15,15 +15,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.control import Actions, Physics, SurveyedWorlds, survey_worlds
 from npa_envs.envs.config import EnvConfig
 from npa_envs.envs.memory import check_memory
 from npa_envs.envs.report import DIVERGED, SUCCESS, TIME_LIMIT, Report
 from npa_envs.envs.restarts import Restarts
 from npa_envs.envs.task import EnvTask, Start
 from npa_envs.errors import DivergedError
-from npa_envs.randomness import WorldRandom
-from npa_envs.replay import Beside, Replayed, sent
+from npa_envs.world.actions import Actions, Physics, SurveyedWorlds, survey_worlds
+from npa_envs.world.cuda_graph import Beside, Replayed, sent
+from npa_envs.world.randomness import WorldRandom
 
 # Torch's pool of threads does not survive a fork: a forked worker, as Gymnasium's AsyncVectorEnv
 # starts them, would wait for it for ever.

@@ -14,11 +14,11 @@ from torch import Tensor
 
 from npa_envs.errors import NPAError
 from npa_envs.interaction import InteractionRow, InteractionSettings, mixing_index, verdict
-from npa_envs.randomness import Purpose, WorldRandom
 from npa_envs.render import draw_worlds
 from npa_envs.rule.rule import NPARule
-from npa_envs.species import rollout_species
 from npa_envs.tasks.task import PictureTask
+from npa_envs.world.randomness import Purpose, WorldRandom
+from npa_envs.world.species import rollout_species
 
 PROGRESS_STEPS = 32
 """Steps between two reports of progress."""

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.sph import species_fields
+from npa_envs.ops import species_fields
 
 MARGIN = 0.2
 """A loss that changes by less than this share of itself counts as undisturbed."""

@@ -181,7 +181,7 @@ def splat(
     hi: float = 1.0,
     patch_sigmas: float = 3.0,
 ) -> Tensor:
-    """Return pictures of 2D worlds, shape [B, R, R, 4]; arguments as `npa_envs.sph.splat`."""
+    """Return pictures of 2D worlds, shape [B, R, R, 4]; arguments as `npa_envs.ops.splat`."""
     pixels = resolution * pixel_size / (hi - lo)
     deviation = sigma * pixels
     radius = math.ceil(patch_sigmas * deviation)

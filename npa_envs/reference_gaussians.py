@@ -93,7 +93,7 @@ def draw(
 ) -> tuple[Tensor, Tensor]:
     """Return one picture [H, W, K], without background, and what passes [H, W].
 
-    Arguments are those of `npa_envs.sph.render_gaussians` for one world, with one camera's
+    Arguments are those of `npa_envs.ops.render_gaussians` for one world, with one camera's
     world-to-camera matrix [4, 4] and fx, fy, cx, cy [4].
     """
     rotation, shift = view[:3, :3], view[:3, 3]
@@ -134,7 +134,7 @@ def render_gaussians(
 ) -> tuple[Tensor, Tensor]:
     """Return pictures [B, V, H, W, K] and alphas [B, V, H, W].
 
-    Arguments as `npa_envs.sph.render_gaussians`, with world-to-camera matrices [B, V, 4, 4] and fx,
+    Arguments as `npa_envs.ops.render_gaussians`, with world-to-camera matrices [B, V, 4, 4] and fx,
     fy, cx, cy [B, V, 4].
     """
     shapes = (means, scales, quaternions, opacities, colours)

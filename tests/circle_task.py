@@ -7,10 +7,10 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from npa_envs.dynamics import Memory
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.morphogenesis2d_config import Morphogenesis2DConfig
 from npa_envs.training import TrainConfig
+from npa_envs.world.rollout import Memory
 
 PARTICLE_COUNT = 12
 STATE_DIM = 3

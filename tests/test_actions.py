@@ -7,10 +7,9 @@ import pytest
 import torch
 
 from npa_envs.errors import NPAError
-from npa_envs.sph import apply_actions
-from npa_envs.sph.actions import ActionRules, RepeatedActions
-from npa_envs.sph.operators import Rows
-from npa_envs.sph.update import update_particles
+from npa_envs.ops import apply_actions
+from npa_envs.ops.perceive import Rows
+from npa_envs.ops.update import ActionRules, RepeatedActions, update_particles
 
 B, N, C = 3, 77, 5
 REACH, DT, STATE_SCALE = 0.07, 0.8, 0.6

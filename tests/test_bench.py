@@ -29,8 +29,8 @@ from npa_envs.bench.throughput import PAPER, aim_rows, throughput_rows
 from npa_envs.bench.timing import Timing, measure
 from npa_envs.bench.workloads import Workload, gecko
 from npa_envs.cli import main
-from npa_envs.dynamics import rollout, step
-from npa_envs.sph import perceive
+from npa_envs.ops import perceive
+from npa_envs.world.rollout import rollout, step
 
 TINY = Workload(2, 2, 150, 2, hidden_dim=16, eps=0.2)
 FORWARD = 1e-5

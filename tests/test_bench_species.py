@@ -10,7 +10,7 @@ from npa_envs.bench.session import Session
 from npa_envs.bench.species import roll_one_species
 from npa_envs.bench.timing import compare
 from npa_envs.bench.workloads import Workload
-from npa_envs.dynamics import rollout
+from npa_envs.world.rollout import rollout
 
 
 def test_calls_are_compared_in_turn_and_each_pair_the_other_way_round(device):

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from npa_envs import NPAError
+from npa_envs.ops import Cameras, cameras_of_poses, look_at, orbit, render_gaussians
 from npa_envs.render.worlds import _seen_from
-from npa_envs.sph import Cameras, cameras_of_poses, look_at, orbit, render_gaussians
 
 SIZE = {"width": 40, "height": 30}
 

@@ -12,9 +12,9 @@ import torch
 from small_digits import COUNTS, idx, pictures, write_idx
 
 from npa_envs.errors import MissingDependencyError, NPAError
-from npa_envs.randomness import WorldRandom
 from npa_envs.tasks.clouds import _farthest_points, load_clouds, sample_ink, varied
 from npa_envs.tasks.digits import load_pictures, read_idx
+from npa_envs.world.randomness import WorldRandom
 
 
 @pytest.fixture(scope="module")

@@ -7,11 +7,11 @@ from worlds import random_world, relative_error
 
 import npa_envs
 from npa_envs import reference as oracle
-from npa_envs.dynamics import row_capacity
-from npa_envs.sph import splat
-from npa_envs.sph.operators import Rows
-from npa_envs.sph.update import update_particles
+from npa_envs.ops import splat
+from npa_envs.ops.perceive import Rows
+from npa_envs.ops.update import update_particles
 from npa_envs.tasks.seeds import uniform_ball
+from npa_envs.world.rollout import row_capacity
 
 
 def small_rule(device, dtype=torch.float64, seed=0, gain=8.0, **options):
@@ -179,13 +179,13 @@ def test_masked_gradients_equal_plain_torch(device):
 
 def test_recomputing_gives_the_gradients_of_storing(device, monkeypatch):
     advanced = []
-    advance = npa_envs.dynamics._advance
+    advance = npa_envs.world.rollout._advance
 
     def counted(*args):
         advanced[-1] += 1
         return advance(*args)
 
-    monkeypatch.setattr(npa_envs.dynamics, "_advance", counted)
+    monkeypatch.setattr(npa_envs.world.rollout, "_advance", counted)
     rule = small_rule(device, dtype=torch.float32)
     x, s = random_world(2, 200, 2, 5, dtype=torch.float32, device=device)
     results = []

@@ -18,7 +18,7 @@ from small_envs import IDS, make, make_vec, small
 
 import npa_envs
 from npa_envs.errors import DivergedError, NPAError
-from npa_envs.randomness import Purpose
+from npa_envs.world.randomness import Purpose
 
 every_id = pytest.mark.parametrize("name", IDS)
 

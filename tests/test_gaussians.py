@@ -11,11 +11,11 @@ from worlds import relative_error
 from npa_envs import NPAError
 from npa_envs import reference_gaussians as oracle
 from npa_envs.kernels.pictures.blending import TILE_PIXELS, block_kernels
-from npa_envs.replay import capture
-from npa_envs.sph import render_gaussians
-from npa_envs.sph.bridge import launch, scalar_type
-from npa_envs.sph.cameras import Cameras, look_at, orbit
-from npa_envs.sph.gaussians import _frame, _gaussians
+from npa_envs.ops import render_gaussians
+from npa_envs.ops.launch import launch, scalar_type
+from npa_envs.ops.pictures.cameras import Cameras, look_at, orbit
+from npa_envs.ops.pictures.gaussians import _frame, _gaussians
+from npa_envs.world.cuda_graph import capture
 
 # Worst error measured over all scenes, then the bound.
 PICTURE_BOUND = {torch.float32: 1e-5, torch.float64: 1e-13}  # 2e-6, 3e-15

@@ -14,10 +14,10 @@ from npa_envs.encounters import FRAME_SHARES, Encounters, Organism
 from npa_envs.errors import NPAError
 from npa_envs.interaction import MIXED, InteractionRow, InteractionSettings, mixing_index, verdict
 from npa_envs.interaction_plots import heat_map
-from npa_envs.randomness import WorldRandom
 from npa_envs.rule.files import save_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
+from npa_envs.world.randomness import WorldRandom
 
 CPU = torch.device("cpu")
 COUNT = 40

@@ -31,7 +31,7 @@ def rung(level: int, libraries: str = "", never: tuple[str, ...] = ()) -> Rung:
     return Rung(level, frozenset(libraries.split()), never)
 
 
-INSIDES = ("npa_envs.kernels", "npa_envs.sph", "npa_envs.reference")
+INSIDES = ("npa_envs.kernels", "npa_envs.ops", "npa_envs.reference")
 LADDER = {
     "npa_envs._checkout": rung(0),
     "npa_envs.errors": rung(0),
@@ -41,19 +41,20 @@ LADDER = {
     "npa_envs.kernels": rung(1, "warp"),
     "npa_envs.reference": rung(1, "torch"),
     "npa_envs.reference_gaussians": rung(1, "torch"),
-    "npa_envs.replay": rung(1, "torch numpy"),
+    "npa_envs.world.cuda_graph": rung(1, "torch numpy"),
     "npa_envs.kernels.runtime": rung(1, "warp"),
-    "npa_envs.sph": rung(2, "warp torch", never=("npa_envs.reference",)),
-    "npa_envs.randomness": rung(3, "torch numpy", never=("npa_envs.kernels", "npa_envs.reference")),
+    "npa_envs.ops": rung(2, "warp torch", never=("npa_envs.reference",)),
+    "npa_envs.world.randomness": rung(
+        3, "torch numpy", never=("npa_envs.kernels", "npa_envs.reference")
+    ),
     "npa_envs.rule.rule": rung(3, "torch"),
     "npa_envs.rule": rung(4, "torch", never=INSIDES),
     "npa_envs.rule.files": rung(4, "torch safetensors", never=INSIDES),
     "npa_envs.scores": rung(5, "", never=INSIDES),
-    "npa_envs.guards": rung(3, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
-    "npa_envs.control": rung(4, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
-    "npa_envs.dynamics": rung(4, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
-    "npa_envs.species_steps": rung(5, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
-    "npa_envs.species": rung(6, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
+    "npa_envs.world.divergence": rung(3, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
+    "npa_envs.world.actions": rung(4, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
+    "npa_envs.world.rollout": rung(4, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
+    "npa_envs.world.species": rung(6, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
     "npa_envs.tasks": rung(
         5,
         "torch numpy PIL sklearn torchvision trimesh pytorch_msssim gsplat",
@@ -100,7 +101,7 @@ LADDER = {
         16, "torch numpy tqdm tyro", never=("npa_envs.kernels", "npa_envs.reference")
     ),
 }
-WARP_AND_TORCH = {"npa_envs.sph", "npa_envs.bench.hash_grid"}
+WARP_AND_TORCH = {"npa_envs.ops", "npa_envs.bench.hash_grid"}
 
 
 def source_files() -> list[Path]:
@@ -190,18 +191,18 @@ def test_only_sph_and_the_benchmarked_hash_grid_know_both_warp_and_torch() -> No
     ("module", "source"),
     [
         ("npa_envs.kernels.portable.sort", "import torch"),
-        ("npa_envs.kernels.portable.sort", "from npa_envs.sph import perceive"),
+        ("npa_envs.kernels.portable.sort", "from npa_envs.ops import perceive"),
         ("npa_envs.reference", "import warp as wp"),
         ("npa_envs.rule.rule", "import warp"),
-        ("npa_envs.dynamics", "def f():\n    import warp"),
-        ("npa_envs.dynamics", "from npa_envs.kernels import cells"),
-        ("npa_envs.sph.new", "from npa_envs.reference_gaussians import draw"),
-        ("npa_envs.dynamics", "from .tasks import targets"),
+        ("npa_envs.world.rollout", "def f():\n    import warp"),
+        ("npa_envs.world.rollout", "from npa_envs.kernels import cells"),
+        ("npa_envs.ops.new", "from npa_envs.reference_gaussians import draw"),
+        ("npa_envs.world.rollout", "from .tasks import targets"),
         ("npa_envs.tasks.new", "from npa_envs.training import trainer"),
         ("npa_envs.tasks.new", "import matplotlib.pyplot"),
         ("npa_envs.training.new", "import importlib\nimportlib.import_module('warp')"),
         ("npa_envs.training.new", "import npa_envs"),
-        ("npa_envs.envs.new", "from npa_envs.sph.splat import splat"),
+        ("npa_envs.envs.new", "from npa_envs.ops.pictures.splat import splat"),
         ("npa_envs.envs.new", "from ..kernels import cells"),
         ("npa_envs.envs.new", "import stable_baselines3"),
         ("npa_envs.unheard_of", ""),
@@ -215,7 +216,7 @@ def test_the_checker_refuses_a_wrong_import(module: str, source: str) -> None:
     ("module", "source"),
     [
         ("npa_envs.kernels.portable.sort", "import math\nimport warp as wp\nfrom . import domain"),
-        ("npa_envs.sph.bridge", "import torch\nimport warp\nfrom npa_envs.kernels import cells"),
+        ("npa_envs.ops.launch", "import torch\nimport warp\nfrom npa_envs.kernels import cells"),
         ("npa_envs.envs.new", "import gymnasium\nfrom npa_envs import dynamics, tasks"),
         ("npa_envs.agents.new", "import npa_envs\nfrom npa_envs.envs import new"),
     ],

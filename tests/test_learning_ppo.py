@@ -32,8 +32,8 @@ from npa_envs.agents.learning.gaussian import GaussianRules
 from npa_envs.agents.learning.ppo import Learner
 from npa_envs.agents.learning.ppo_settings import Settings, filled, noise_left
 from npa_envs.errors import NPAError
-from npa_envs.replay import no_garbage_collection
 from npa_envs.rule.rule import NPARule
+from npa_envs.world.cuda_graph import no_garbage_collection
 
 HEART = Problem(
     env_id="npa/Morphogenesis2D-v0",

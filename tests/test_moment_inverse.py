@@ -9,8 +9,7 @@ from worlds import degenerate_world, random_world, relative_error
 import npa_envs
 from npa_envs import reference as oracle
 from npa_envs.kernels import mathematics as moments
-from npa_envs.sph.operators import Terms
-from npa_envs.sph.rows import survey
+from npa_envs.ops.perceive import Terms, survey
 
 DTYPES = (torch.float32, torch.float64)
 

@@ -15,11 +15,10 @@ import torch
 from npa_envs.cli import main
 from npa_envs.errors import MissingDependencyError, NPAError
 from npa_envs.evaluation import evaluate, measure
-from npa_envs.randomness import WorldRandom
+from npa_envs.ops import orbit
 from npa_envs.render import turntable_frames, write_gaussians, write_points, write_splat
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
-from npa_envs.sph import orbit
 from npa_envs.tasks.appearance import FLAT, OUTPUTS, Appearance
 from npa_envs.tasks.meshes import load_mesh
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D
@@ -29,6 +28,7 @@ from npa_envs.tasks.renderers import gsplat_renderer, own_renderer
 from npa_envs.tasks.task import ReadOutTask, ScheduledTask, ViewTask
 from npa_envs.tasks.views import ANGLE, DISTANCE, load_views, over, some_views
 from npa_envs.training import JsonlLog, Trainer, preset, train
+from npa_envs.world.randomness import WorldRandom
 
 needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 SMALL = Morphogenesis3DConfig(

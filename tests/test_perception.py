@@ -7,10 +7,10 @@ from worlds import degenerate_world, random_world, relative_error
 
 import npa_envs
 from npa_envs import reference as oracle
-from npa_envs.sph import cells, passes
-from npa_envs.sph.cells import make_plan, sort_worlds
-from npa_envs.sph.operators import Terms, perceive_rows
-from npa_envs.sph.rows import survey
+from npa_envs.ops import backend as passes
+from npa_envs.ops import sort as cells
+from npa_envs.ops.perceive import Terms, perceive_rows, survey
+from npa_envs.ops.sort import make_plan, sort_worlds
 
 # Worst error measured on CPU and CUDA, then the bound of the test: a few times larger.
 FORWARD = {torch.float32: 2e-6, torch.float64: 5e-15}  # 3.1e-7, 5e-16

@@ -5,7 +5,7 @@ import torch
 from worlds import relative_error
 
 from npa_envs import NPAError
-from npa_envs.sph import periodic_splat, splat
+from npa_envs.ops import periodic_splat, splat
 
 OPTIONS = {"resolution": 24, "pixel_size": 0.11, "sigma": 0.9}
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from npa_envs import NPAError, WorldRandom
-from npa_envs.sph.picture_losses import picture_losses
+from npa_envs.ops.pictures.losses import picture_losses
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 
 ERRORS = {torch.float32: 3e-6, torch.float64: 1e-13}

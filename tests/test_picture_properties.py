@@ -16,8 +16,8 @@ from legal_worlds import GRID, UNIT, every, within
 from torch import Tensor
 
 import npa_envs
+from npa_envs.ops import Cameras, orbit, periodic_splat, render_gaussians, splat
 from npa_envs.rule.files import rule_metadata
-from npa_envs.sph import Cameras, orbit, periodic_splat, render_gaussians, splat
 
 PICTURE_BOUND = 200
 """Roundings of a pixel's sum, over the sum of what particles add to it at most."""

@@ -13,7 +13,6 @@ from test_training_cycle import Recording, assert_same, make_cycle
 from npa_envs.agents import RulePolicy
 from npa_envs.classification import _chimera, _cut, _partners, accuracies, changes_of_mind
 from npa_envs.cli import main
-from npa_envs.dynamics import rollout
 from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule
 from npa_envs.tasks.point_classification import PointClassification
@@ -21,6 +20,7 @@ from npa_envs.tasks.point_classification_config import PointClassificationConfig
 from npa_envs.tasks.task import task_for_rule
 from npa_envs.tasks.votes import PALETTE, UNDECIDED, class_colours, majority
 from npa_envs.training import Trainer, preset, train
+from npa_envs.world.rollout import rollout
 
 SMALL = {"class_count": 3, "particle_count": 24, "state_dim": 6, "hidden_dim": 8, "eps": 0.3}
 

@@ -10,11 +10,11 @@ import npa_envs
 from npa_envs import WorldRandom
 from npa_envs.errors import NPAError
 from npa_envs.kernels.portable.draws import draw_words
-from npa_envs.randomness import Purpose, check_generator
-from npa_envs.sph.bridge import launch
+from npa_envs.ops.launch import launch
 from npa_envs.tasks.damage import random_particle
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.tasks.seeds import uniform_ball
+from npa_envs.world.randomness import Purpose, check_generator
 
 DRAWS = {
     "uniform": lambda random: random.uniform(5, 3),

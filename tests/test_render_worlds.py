@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from npa_envs.errors import NPAError
+from npa_envs.ops import splat
 from npa_envs.render import STYLES, draw_worlds, to_uint8
 from npa_envs.render.colours import RAMP_LENGTH, RAMP_STOPS, ramp
-from npa_envs.sph import splat
 
 RED = (0.5, -0.5, -0.5)
 BLUE = (-0.5, -0.5, 0.5)

@@ -12,8 +12,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from npa_envs import replay
-from npa_envs.replay import Replayed, capture, no_garbage_collection
+from npa_envs.world import cuda_graph as replay
+from npa_envs.world.cuda_graph import Replayed, capture, no_garbage_collection
 
 CUDA = torch.device("cuda", 0)
 

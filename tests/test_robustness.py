@@ -12,7 +12,6 @@ import torch
 
 from npa_envs.cli import main
 from npa_envs.errors import NPAError
-from npa_envs.randomness import WorldRandom
 from npa_envs.robustness.conditions import Response, grow, responses
 from npa_envs.robustness.damages import DAMAGES, STATE_NOISE, wrapped
 from npa_envs.robustness.grounds import Ground, courses
@@ -26,6 +25,7 @@ from npa_envs.robustness.tables import recovered_share, tables
 from npa_envs.rule.files import rule_metadata, shipped_rules
 from npa_envs.stress.habitats import rule_names, task_name
 from npa_envs.trained_tasks import trained_config
+from npa_envs.world.randomness import WorldRandom
 
 SIDE = 2.0
 COUNT = 501

@@ -422,7 +422,7 @@ def test_every_shipped_rule_loads_and_has_a_model_card(name: str) -> None:
 @needs_reference
 def test_the_authors_aubergine_has_the_layout_that_its_rollout_shows() -> None:
     """A wrong order of rows or columns moves particles by 0.3 and more in these eight steps."""
-    from npa_envs.dynamics import rollout
+    from npa_envs.world.rollout import rollout
 
     rule = load_rule(f"{AUBERGINE}#aubergine").double()
     assert (rule.eps0, rule.alpha, rule.state_dim, rule.hidden_dim) == (0.1, 0.5, 16, 128)

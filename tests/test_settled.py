@@ -5,14 +5,23 @@ import torch
 from worlds import degenerate_world, random_world, relative_error
 
 import npa_envs
-from npa_envs import dynamics
 from npa_envs import reference as oracle
-from npa_envs.dynamics import FEWEST_SETTLED
-from npa_envs.sph import bridge, settled, settled_perception, settled_steps, warmup
-from npa_envs.sph import settled_states as settled_states_module
-from npa_envs.sph.passes import Terms
-from npa_envs.sph.settled_perception import perceive_settled
-from npa_envs.sph.settled_states import all_rows, settled_rows, settled_states, unsettled_states
+from npa_envs.ops import launch as bridge
+from npa_envs.ops import static as settled
+from npa_envs.ops import static as settled_perception
+from npa_envs.ops import static as settled_states_module
+from npa_envs.ops import static as settled_steps
+from npa_envs.ops import warmup
+from npa_envs.ops.backend import Terms
+from npa_envs.ops.static import (
+    all_rows,
+    perceive_settled,
+    settled_rows,
+    settled_states,
+    unsettled_states,
+)
+from npa_envs.world import rollout as dynamics
+from npa_envs.world.rollout import FEWEST_SETTLED
 
 STEPS = 5
 

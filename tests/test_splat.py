@@ -7,9 +7,15 @@ from worlds import relative_error
 from npa_envs import NPAError
 from npa_envs import reference as oracle
 from npa_envs.kernels.pictures.splat import make_lens
-from npa_envs.sph import splat
-from npa_envs.sph.bridge import launch, scalar_type
-from npa_envs.sph.splat import Splats, device_kernels, gather_threads, scatter_splats, sort_splats
+from npa_envs.ops import splat
+from npa_envs.ops.launch import launch, scalar_type
+from npa_envs.ops.pictures.splat import (
+    Splats,
+    device_kernels,
+    gather_threads,
+    scatter_splats,
+    sort_splats,
+)
 
 # Worst error measured, then the bound.
 BOUND = {torch.float32: 5e-6, torch.float64: 1e-13}  # 8e-7, 4e-16

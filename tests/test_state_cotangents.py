@@ -4,7 +4,7 @@ import pytest
 import torch
 from worlds import degenerate_world, random_world, relative_error
 
-from npa_envs.sph.operators import Terms, perceive_rows
+from npa_envs.ops.perceive import Terms, perceive_rows
 
 # Worst error measured, in a box of two eps: 2.1e-6 on CUDA, 1.3e-6 on the CPU.
 BOUND = 5e-6

@@ -5,13 +5,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from npa_envs.dynamics import rollout
-from npa_envs.randomness import WorldRandom
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
 from npa_envs.tasks.morphogenesis2d_config import Morphogenesis2DConfig
 from npa_envs.tasks.strays import FARTHEST, NEAREST, scatter, stray_motion
 from npa_envs.training import TrainConfig, train
+from npa_envs.world.randomness import WorldRandom
+from npa_envs.world.rollout import rollout
 
 SMALL = Morphogenesis2DConfig(
     target="ring",

@@ -9,12 +9,12 @@ import torch
 from npa_envs.cli import main
 from npa_envs.errors import NPAError
 from npa_envs.evaluation import evaluate
-from npa_envs.randomness import WorldRandom
 from npa_envs.rule.files import load_rule
 from npa_envs.tasks.texture import Texture, colour_image, density_image
 from npa_envs.tasks.texture_config import TextureConfig
 from npa_envs.tasks.textures import load_texture
 from npa_envs.training import JsonlLog, Trainer, preset, train
+from npa_envs.world.randomness import WorldRandom
 
 needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 SMALL = TextureConfig(target="bubbles", particle_count=300, resolution=24, eps=0.3)

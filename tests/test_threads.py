@@ -10,14 +10,14 @@ import torch
 from worlds import random_world
 
 import npa_envs
-from npa_envs.sph import bridge, orbit, render_gaussians, threads
-from npa_envs.sph.actions import ActionRules, RepeatedActions
-from npa_envs.sph.operators import Terms, perceive_rows
-from npa_envs.sph.picture_losses import picture_losses
-from npa_envs.sph.rows import survey
-from npa_envs.sph.splat import splat
-from npa_envs.sph.threads import even_ranges, run_together
-from npa_envs.sph.update import update_particles
+from npa_envs.ops import launch as bridge
+from npa_envs.ops import launch as threads
+from npa_envs.ops import orbit, render_gaussians
+from npa_envs.ops.launch import even_ranges, run_together
+from npa_envs.ops.perceive import Terms, perceive_rows, survey
+from npa_envs.ops.pictures.losses import picture_losses
+from npa_envs.ops.pictures.splat import splat
+from npa_envs.ops.update import ActionRules, RepeatedActions, update_particles
 
 STATE_DIM = 5
 SMALL_RANGE = 7
@@ -208,7 +208,7 @@ def test_worker_processes_use_one_thread_unless_told_otherwise(tmp_path):
     script.write_text(
         "import multiprocessing\n"
         "import torch\n"
-        "from npa_envs.sph.threads import thread_count\n"
+        "from npa_envs.ops.launch import thread_count\n"
         "def counts(_):\n"
         "    default = thread_count()\n"
         "    torch.set_num_threads(5)\n"

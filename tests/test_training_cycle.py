@@ -18,7 +18,7 @@ needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a C
 class Recording(TorchDispatchMode):
     """A CUDA graph for the CPU: the same operations on the same memory, with numbers as they were.
 
-    The second call of the function is recorded, as by `npa_envs.replay.Replayed`.
+    The second call of the function is recorded, as by `npa_envs.world.cuda_graph.Replayed`.
     """
 
     def __init__(self, function):

@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 
 from npa_envs.errors import MissingDependencyError, NPAError
-from npa_envs.sph import Cameras, orbit
+from npa_envs.ops import Cameras, orbit
 from npa_envs.tasks.meshes import (
     MESHES,
     RADIUS,

@@ -5,7 +5,7 @@ import torch
 
 from npa_envs import WorldRandom
 from npa_envs.errors import NPAError
-from npa_envs.sph import world_mean
+from npa_envs.ops import world_mean
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 
 ERRORS = {torch.float32: 3e-7, torch.float64: 2e-15}

@@ -16,9 +16,9 @@ from npa_envs.envs.arrays import to_output
 from npa_envs.envs.single import NPAEnv
 from npa_envs.envs.vector import NPAVectorEnv
 from npa_envs.errors import NPAError
-from npa_envs.randomness import Purpose
 from npa_envs.tasks.checks import is_whole
 from npa_envs.tasks.damage import DamageEvent, damage_worlds, parse_damage
+from npa_envs.world.randomness import Purpose
 from npa_envs.wrappers.base import (
     AnyVectorEnv,
     AnyVectorWrapper,

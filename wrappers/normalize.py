@@ -12,9 +12,9 @@ from gymnasium.spaces import Box
 from gymnasium.utils import RecordConstructorArgs
 from torch import Tensor
 
-from npa_envs.control import Physics
 from npa_envs.errors import NPAError
 from npa_envs.tasks.checks import is_real
+from npa_envs.world.actions import Physics
 from npa_envs.wrappers.base import (
     AnyVectorEnv,
     AnyWrapper,

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from npa_envs.envs.arrays import to_output
 from npa_envs.errors import NPAError, suggest
-from npa_envs.randomness import Purpose, WorldRandom
 from npa_envs.tasks.checks import is_real, is_whole
+from npa_envs.world.randomness import Purpose, WorldRandom
 from npa_envs.wrappers.base import (
     AnyVectorEnv,
     AnyWrapper,

@@ -11,11 +11,11 @@ from npa_envs.agents.learning.episode_task import episode_task
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Progress, annealed
 from npa_envs.agents.learning.rules import RuleSet, starting_rules
-from npa_envs.dynamics import Memory
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.task import Task
 from npa_envs.training.config import TrainConfig
 from npa_envs.training.cycle import TrainingCycle
+from npa_envs.world.rollout import Memory
 
 LONGEST = 96
 """Rollouts are no longer than this unless asked for: longer episodes go on in a pool."""

@@ -12,9 +12,9 @@ from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
-from npa_envs.control import Physics
 from npa_envs.envs.species.vector import MultiSpeciesVectorEnv
 from npa_envs.envs.vector_options import worlds_to_reset
+from npa_envs.world.actions import Physics
 
 TIME_LIMIT, LEFT = "time limit", "left the world"
 """Why species are cut off, and why they end where they diverge."""

@@ -31,7 +31,7 @@ from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.agents.learning.seeds import world_seeds
-from npa_envs.replay import Replayed
+from npa_envs.world.cuda_graph import Replayed
 from npa_envs.wrappers.adapters import own_rewards
 
 

@@ -13,7 +13,6 @@ import torch
 
 from npa_envs.agents.learning.joined import JoinedSpeciesEnv
 from npa_envs.agents.policy import Interface
-from npa_envs.control import Physics
 from npa_envs.devices import check_device
 from npa_envs.envs.config import EnvConfig
 from npa_envs.envs.species.config import SpeciesConfig
@@ -26,6 +25,7 @@ from npa_envs.envs.worlds import make_physics
 from npa_envs.errors import NPAError, suggest
 from npa_envs.registration import ENVIRONMENTS
 from npa_envs.tasks.checks import check_positive
+from npa_envs.world.actions import Physics
 
 if TYPE_CHECKING:
     from npa_envs.agents.learning.rules import RuleSet

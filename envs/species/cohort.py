@@ -9,16 +9,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.control import (
+from npa_envs.envs.species.task import Population, SpeciesTask
+from npa_envs.world.actions import (
     Actions,
     Physics,
     SurveyedWorlds,
     perceive_each_species,
     survey_worlds,
 )
-from npa_envs.envs.species.task import Population, SpeciesTask
-from npa_envs.randomness import WorldRandom
-from npa_envs.replay import Replayed, sent
+from npa_envs.world.cuda_graph import Replayed, sent
+from npa_envs.world.randomness import WorldRandom
 
 
 class Judge:

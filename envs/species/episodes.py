@@ -13,8 +13,8 @@ from npa_envs.envs.species.account import Account
 from npa_envs.envs.species.tables import task_type
 from npa_envs.envs.species.worlds import SpeciesWorlds
 from npa_envs.errors import DivergedError
-from npa_envs.guards import LARGEST_REPORT
-from npa_envs.replay import Beside, sent
+from npa_envs.world.cuda_graph import Beside, sent
+from npa_envs.world.divergence import LARGEST_REPORT
 
 REMOVED, LEFT, ALONE = 1, 2, 3
 """Why an agent's episode ends by itself; 0 where it does not."""

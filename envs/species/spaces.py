@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from gymnasium.spaces import Box
 
-from npa_envs.control import Physics
+from npa_envs.world.actions import Physics
 
 
 def agent_spaces(

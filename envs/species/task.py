@@ -12,8 +12,8 @@ from torch import Tensor
 
 from npa_envs.envs.species.config import SpeciesConfig
 from npa_envs.errors import NPAError
-from npa_envs.randomness import WorldRandom
 from npa_envs.tasks.seeds import uniform_ball
+from npa_envs.world.randomness import WorldRandom
 
 
 class Population(NamedTuple):

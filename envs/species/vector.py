@@ -24,7 +24,7 @@ from npa_envs.envs.species.spaces import agent_spaces, state_space
 from npa_envs.envs.vector_options import autoreset_mode as checked_mode
 from npa_envs.envs.vector_options import checked_count, world_keys, worlds_to_reset
 from npa_envs.errors import NPAError
-from npa_envs.replay import sent
+from npa_envs.world.cuda_graph import sent
 
 ByAgent = dict[str, Any]
 """An array for each species, whose first dimension is the world."""

@@ -20,8 +20,8 @@ from npa_envs.envs.species.cohort import Cohort, Judge
 from npa_envs.envs.species.task import Population, SpeciesTask
 from npa_envs.envs.task import EnvTask
 from npa_envs.envs.worlds import make_physics
-from npa_envs.randomness import WorldRandom
-from npa_envs.replay import sent
+from npa_envs.world.cuda_graph import sent
+from npa_envs.world.randomness import WorldRandom
 
 
 class SpeciesWorlds:

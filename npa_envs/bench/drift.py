@@ -15,7 +15,7 @@ from npa_envs.bench.rollouts import composed_step, drawn_mask
 from npa_envs.bench.session import Session, relative_error
 from npa_envs.bench.strategies import STRATEGIES, Strategy
 from npa_envs.bench.workloads import Workload
-from npa_envs.dynamics import rollout
+from npa_envs.world.rollout import rollout
 
 PEER = STRATEGIES["dense"]
 """What any float32 errs by: no approximation, one torch operator after the other."""

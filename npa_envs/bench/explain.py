@@ -8,10 +8,10 @@ import torch
 
 from npa_envs.bench.launches import Launch, recorded_launches
 from npa_envs.bench.workloads import Workload
-from npa_envs.dynamics import row_capacity, step
 from npa_envs.errors import NPAError, suggest
-from npa_envs.sph.cells import Plan, make_plan
-from npa_envs.sph.passes import rollout_listing
+from npa_envs.ops.backend import rollout_listing
+from npa_envs.ops.sort import Plan, make_plan
+from npa_envs.world.rollout import row_capacity, step
 
 GRADIENTS = ("none", "weights", "positions")
 """What is differentiated: nothing; by weights and states; by positions as well."""

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from npa_envs.bench.grid_kernels import grid_kernels
 from npa_envs.kernels.domain import make_domain
-from npa_envs.sph.bridge import launch, scalar_type, warp_device
+from npa_envs.ops.launch import launch, scalar_type, warp_device
 
 GRID_CELLS = 128
 """Buckets of the hash grid along each axis; the third has one in 2D."""

@@ -19,7 +19,7 @@ from npa_envs.bench.session import Session, relative_error
 from npa_envs.bench.timing import Timing
 from npa_envs.bench.workloads import Workload
 from npa_envs.kernels.runtime import quiet_warp, start_warp
-from npa_envs.sph import perception_fields
+from npa_envs.ops import perception_fields
 
 OPERATIONS = ("density", "interpolation", "gradient")
 """rho, smoothed states, and state gradients without correction."""

@@ -14,8 +14,8 @@ from npa_envs.bench.rollouts import composed_step, drawn_mask
 from npa_envs.bench.session import Session
 from npa_envs.bench.strategies import STRATEGIES
 from npa_envs.bench.workloads import Workload
-from npa_envs.dynamics import step
 from npa_envs.errors import NPAError
+from npa_envs.world.rollout import step
 
 WORKLOAD = Workload(2, 1, 1024, 1)
 """Small enough for dense torch."""

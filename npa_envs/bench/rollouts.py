@@ -19,9 +19,9 @@ from npa_envs.bench.session import Session, relative_error
 from npa_envs.bench.strategies import STRATEGIES, Strategy
 from npa_envs.bench.timing import Cost, Timing
 from npa_envs.bench.workloads import Gecko, gecko
-from npa_envs.dynamics import rollout
 from npa_envs.evaluation import psnr
 from npa_envs.rule.rule import NPARule
+from npa_envs.world.rollout import rollout
 
 MARKS = (1, 8, 64)
 """Steps after which worlds are compared."""

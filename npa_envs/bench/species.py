@@ -13,7 +13,7 @@ from npa_envs.bench.session import Session
 from npa_envs.bench.timing import Timing, compare
 from npa_envs.bench.workloads import Workload, rollout_call
 from npa_envs.rule.rule import NPARule
-from npa_envs.species import rollout_species
+from npa_envs.world.species import rollout_species
 
 SPECIES_WORLDS, CPU_SPECIES_WORLDS, SMALL_SPECIES_WORLDS = (
     (Workload(2, 8, 4096, 16), Workload(2, 1, 256, 16)),

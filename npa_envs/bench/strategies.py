@@ -11,7 +11,7 @@ from torch import Tensor
 from npa_envs import reference
 from npa_envs.bench.hash_grid import grid_fields
 from npa_envs.errors import NPAError, suggest
-from npa_envs.sph import perceive, perception_fields
+from npa_envs.ops import perceive, perception_fields
 
 NEIGHBOUR_CAP = 32
 """Neighbours, the particle included, that the capped strategy sums over."""

@@ -13,7 +13,7 @@ import torch
 from npa_envs.bench.session import Session
 from npa_envs.bench.timing import Cost, Timing
 from npa_envs.bench.workloads import Workload, rollout_call
-from npa_envs.dynamics import Memory
+from npa_envs.world.rollout import Memory
 
 
 class Aim(NamedTuple):

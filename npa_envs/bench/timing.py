@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import torch
 
-from npa_envs.replay import capture
+from npa_envs.world.cuda_graph import capture
 
 Sampled = tuple[Callable[[], object], torch.Generator]
 """A call, and the generator that it draws from."""

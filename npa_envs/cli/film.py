@@ -14,7 +14,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.dynamics import rollout
 from npa_envs.render import (
     to_uint8,
     turntable_frames,
@@ -27,6 +26,7 @@ from npa_envs.render import (
 )
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.damage import DamageEvent, damage_worlds
+from npa_envs.world.rollout import rollout
 
 if TYPE_CHECKING:
     from npa_envs.tasks.task import PictureTask, ViewTask

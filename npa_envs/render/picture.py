@@ -9,7 +9,7 @@ from PIL import ImageColor
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.sph.checks import check_dense, checked_number, entries
+from npa_envs.ops.checks import check_dense, checked_number, entries
 
 Background = str | tuple[float, float, float]
 

@@ -9,9 +9,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from npa_envs.ops import Cameras, orbit
+from npa_envs.ops.checks import checked_count, checked_finite
 from npa_envs.render.picture import Background, to_uint8
-from npa_envs.sph import Cameras, orbit
-from npa_envs.sph.checks import checked_count, checked_finite
 from npa_envs.tasks.views import ANGLE, DISTANCE
 
 

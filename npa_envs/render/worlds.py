@@ -12,18 +12,18 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.errors import NPAError, suggest
-from npa_envs.render.colours import density_colours, state_colours
-from npa_envs.render.picture import Background, background_colour, to_uint8
-from npa_envs.rule.rule import COLOUR_OFFSET
-from npa_envs.sph import periodic_splat, splat
-from npa_envs.sph.checks import (
+from npa_envs.ops import periodic_splat, splat
+from npa_envs.ops.checks import (
     check_world,
     checked_flag,
     checked_number,
     checked_positive,
     number_tensor,
 )
-from npa_envs.sph.splat import checked_window
+from npa_envs.ops.pictures.splat import checked_window
+from npa_envs.render.colours import density_colours, state_colours
+from npa_envs.render.picture import Background, background_colour, to_uint8
+from npa_envs.rule.rule import COLOUR_OFFSET
 
 STYLES = ("particles", "density", "states")
 """What a picture can show: the particles' own colours, how dense they are, their hidden states."""

@@ -9,9 +9,9 @@ from typing import Any
 
 import torch
 
-from npa_envs.randomness import Purpose
 from npa_envs.robustness.grounds import Ground, Home, courses
 from npa_envs.robustness.plans import trained_value
+from npa_envs.world.randomness import Purpose
 
 MOST_PARTICLES = {"cpu": 1 << 17, "cuda": 1 << 21}
 """Particles of all worlds together; where there would be more, a value is left out."""

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from npa_envs.randomness import WorldRandom
-from npa_envs.sph import world_mean
+from npa_envs.ops import world_mean
 from npa_envs.tasks.damage import DAMAGE_SIZES, clump, cut, erase_state, random_particle
+from npa_envs.world.randomness import WorldRandom
 
 STATE_NOISE = 0.3
 """Standard deviation of what is added to every state (dimensionless)."""

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.randomness import Purpose, WorldRandom
 from npa_envs.robustness.plans import Plan
 from npa_envs.robustness.shapes import SHAPES
 from npa_envs.rule.files import load_rule
@@ -22,6 +21,7 @@ from npa_envs.tasks.task import Task, seed_worlds, task_for_rule, task_toward
 from npa_envs.tasks.texture import Texture
 from npa_envs.tasks.votes import particle_classes
 from npa_envs.trained_tasks import task_of_rule
+from npa_envs.world.randomness import Purpose, WorldRandom
 
 SEEN_AT_ONCE = 1 << 17
 """Particles of the worlds whose loss is taken at once: many views of many Gaussians take room."""

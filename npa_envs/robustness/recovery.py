@@ -9,9 +9,9 @@ from statistics import median
 
 import torch
 
-from npa_envs.randomness import Purpose, WorldRandom
 from npa_envs.robustness.damages import DAMAGES, Damage
 from npa_envs.robustness.grounds import Ground, Home, courses
+from npa_envs.world.randomness import Purpose, WorldRandom
 
 RECOVERED = 1.1
 """A world has recovered once its loss is at most this many times its twin's at the same step."""

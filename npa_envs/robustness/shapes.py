@@ -8,8 +8,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from npa_envs.randomness import WorldRandom
 from npa_envs.tasks.seeds import uniform_ball, uniform_box
+from npa_envs.world.randomness import WorldRandom
 
 SIZE_FACTOR = 1.5
 """By how much a larger disk's radius is larger, and a smaller one's smaller."""

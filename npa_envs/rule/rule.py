@@ -8,14 +8,13 @@ import torch
 from torch import Tensor, nn
 
 from npa_envs.errors import NPAError
-from npa_envs.sph.arranged import ArrangedWeights, arrange_weights
-from npa_envs.sph.checks import (
+from npa_envs.ops.checks import (
     MomentInverse,
     checked_flag,
     checked_moment_inverse,
     checked_positive,
 )
-from npa_envs.sph.network import run_network
+from npa_envs.ops.network import ArrangedWeights, arrange_weights, run_network
 
 COLOUR_OFFSET = 0.5
 """A particle's colour is its last three outputs plus this, dimensionless."""

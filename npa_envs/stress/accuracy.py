@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from npa_envs import reference
-from npa_envs.sph import perceive
+from npa_envs.ops import perceive
 from npa_envs.stress.scenes import EPS, SIDE
 
 LIMITS = {

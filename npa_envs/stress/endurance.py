@@ -7,9 +7,9 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from npa_envs.dynamics import rollout
 from npa_envs.stress.checks import Check, Finding, Session
 from npa_envs.stress.habitats import Habitat, LongRun, habitat, rule_names
+from npa_envs.world.rollout import rollout
 
 STEPS, QUICK_STEPS = 100_000, 200
 """How long a rule is run."""

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from npa_envs import reference
-from npa_envs.sph import perceive, perception_fields
+from npa_envs.ops import perceive, perception_fields
 from npa_envs.stress.accuracy import (
     LIMITS,
     PRECISIONS,

@@ -9,13 +9,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from npa_envs.dynamics import rollout
+from npa_envs.ops import perceive
 from npa_envs.rule.rule import NPARule
-from npa_envs.sph import perceive
 from npa_envs.stress.accuracy import relative_error
 from npa_envs.stress.checks import Check, Finding, Session
 from npa_envs.stress.habitats import Habitat, habitat
 from npa_envs.stress.scenes import EPS, SIDE, Scene, scenes
+from npa_envs.world.rollout import rollout
 
 RULES = ("gecko", "dots", "digits", "duck")
 """One rule of each task."""

@@ -9,11 +9,8 @@ import torch
 from torch import Tensor
 
 from npa_envs.bench.precisions import PRECISIONS, Precision
-from npa_envs.dynamics import rollout
-from npa_envs.randomness import WorldRandom
-from npa_envs.replay import capture
+from npa_envs.ops import perceive
 from npa_envs.rule.files import load_rule
-from npa_envs.sph import perceive
 from npa_envs.stress.accuracy import (
     Perceived,
     error_limits,
@@ -25,6 +22,9 @@ from npa_envs.stress.checks import Check, Finding, Session, Skipped
 from npa_envs.stress.habitats import WORKS, Habitat, habitat
 from npa_envs.stress.scenes import EPS, STATE_DIM, Scene, scenes
 from npa_envs.stress.values import differing
+from npa_envs.world.cuda_graph import capture
+from npa_envs.world.randomness import WorldRandom
+from npa_envs.world.rollout import rollout
 
 SHORT = ("tf32", "bf16_storage", "mixed")
 """Precisions below float32, as `npa-envs bench` has them."""

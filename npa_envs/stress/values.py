@@ -10,13 +10,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from npa_envs.dynamics import rollout
 from npa_envs.errors import NPAError
+from npa_envs.ops import perceive
 from npa_envs.rule.files import load_rule
-from npa_envs.sph import perceive
 from npa_envs.stress.accuracy import LIMITS, perceived, relative_error
 from npa_envs.stress.checks import Check, Finding, Session
 from npa_envs.stress.scenes import EPS, STATE_DIM
+from npa_envs.world.rollout import rollout
 
 POWERS = range(-30, 31, 2)
 """Scales of states that are tried, as powers of ten."""

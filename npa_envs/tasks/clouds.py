@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.randomness import Randomness, WorldRandom, normal_draws, uniform_draws
 from npa_envs.tasks.digits import Split, load_pictures
+from npa_envs.world.randomness import Randomness, WorldRandom, normal_draws, uniform_draws
 
 LEVELS = 2048
 """Coordinates are whole numbers below this while points are chosen: squares of distances are exact

@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.randomness import Randomness
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.co_morphogenesis2d_config import CoMorphogenesis2DConfig
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
+from npa_envs.world.randomness import Randomness
 
 
 class CoMorphogenesis2D:

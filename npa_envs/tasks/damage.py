@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError, suggest
-from npa_envs.randomness import Randomness, WorldRandom, check_generator, normal_draws
-from npa_envs.sph import world_mean
-from npa_envs.sph.checks import DTYPES, check_dense, checked_number
+from npa_envs.ops import world_mean
+from npa_envs.ops.checks import DTYPES, check_dense, checked_number
 from npa_envs.tasks.checks import is_real, is_whole
+from npa_envs.world.randomness import Randomness, WorldRandom, check_generator, normal_draws
 
 DAMAGE_SIZES = {"erase": 0.2, "cut": 0.1, "clump": 0.2, "noise": 0.05}
 """Kinds of damage with their usual size: radius, gap, radius, standard deviation [length units]."""

@@ -6,16 +6,16 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.randomness import Randomness
+from npa_envs.ops import splat, world_mean
+from npa_envs.ops.pictures.losses import picture_losses
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
-from npa_envs.sph import splat, world_mean
-from npa_envs.sph.picture_losses import picture_losses
 from npa_envs.tasks.morphogenesis2d_config import Morphogenesis2DConfig
 from npa_envs.tasks.pool_damage import hurt
 from npa_envs.tasks.rules import untrained_rule
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.tasks.strays import stray_motion
 from npa_envs.tasks.targets import PointTarget, load_target
+from npa_envs.world.randomness import Randomness
 
 UNOWNED = 0.05
 """Density that belongs to nobody when a pixel's error is shared out among particles."""

@@ -8,9 +8,8 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.randomness import Randomness
+from npa_envs.ops import Cameras, world_mean
 from npa_envs.rule.rule import NPARule
-from npa_envs.sph import Cameras, world_mean
 from npa_envs.tasks.appearance import OUTPUTS, Appearance, Gaussians
 from npa_envs.tasks.morphogenesis3d_config import Morphogenesis3DConfig
 from npa_envs.tasks.pool_damage import hurt
@@ -21,6 +20,7 @@ from npa_envs.tasks.strays import stray_motion
 from npa_envs.tasks.structure import MultiScaleSimilarity
 from npa_envs.tasks.view_schedule import ViewSchedule, blurred
 from npa_envs.tasks.views import ViewTarget, load_views, nearest_elevation, over, some_views
+from npa_envs.world.randomness import Randomness
 
 SHOWN_FROM = 20.0
 """Pictures show the held-out view whose elevation is nearest to this [degrees]."""

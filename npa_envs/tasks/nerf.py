@@ -14,7 +14,7 @@ from PIL import Image
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.sph import Cameras, cameras_of_poses
+from npa_envs.ops import Cameras, cameras_of_poses
 from npa_envs.tasks.checks import is_real
 from npa_envs.tasks.images import open_image
 from npa_envs.tasks.meshes import RADIUS

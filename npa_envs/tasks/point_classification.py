@@ -11,14 +11,14 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.randomness import Randomness
+from npa_envs.ops import splat, world_mean
 from npa_envs.rule.rule import NPARule
-from npa_envs.sph import splat, world_mean
 from npa_envs.tasks.clouds import PointClouds, drawn_indices, load_clouds, share_of_worlds, varied
 from npa_envs.tasks.digits import Split
 from npa_envs.tasks.point_classification_config import PointClassificationConfig
 from npa_envs.tasks.rules import untrained_rule
 from npa_envs.tasks.votes import class_colours
+from npa_envs.world.randomness import Randomness
 
 SIGMA = 0.7
 """Standard deviation of a particle's splat, in distances between particles (dimensionless)."""

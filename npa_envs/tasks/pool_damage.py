@@ -6,10 +6,10 @@ from typing import Protocol
 
 from torch import Tensor
 
-from npa_envs.randomness import Randomness, uniform_draws
-from npa_envs.sph import world_mean
+from npa_envs.ops import world_mean
 from npa_envs.tasks.damage import clump, cut, erase_state, random_particle
 from npa_envs.tasks.strays import scatter, tear
+from npa_envs.world.randomness import Randomness, uniform_draws
 
 SHARE = 0.25
 """Share of the worlds that are clumped, that are cut, that lose a flake (dimensionless)."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from npa_envs.sph import Cameras
+from npa_envs.ops import Cameras
 from npa_envs.tasks.meshes import FloatArray, Mesh
 
 LIGHT = (0.35, 0.80, 0.50)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import MissingDependencyError, NPAError
-from npa_envs.sph import Cameras, render_gaussians
+from npa_envs.ops import Cameras, render_gaussians
 from npa_envs.tasks.appearance import Gaussians
 
 

@@ -7,9 +7,9 @@ from torch import Tensor
 
 from npa_envs.devices import check_device
 from npa_envs.errors import NPAError
-from npa_envs.randomness import Randomness, WorldRandom, check_generator
-from npa_envs.sph.cells import LARGEST_INDEX
-from npa_envs.sph.checks import DTYPES, checked_count, checked_finite, entries
+from npa_envs.ops.checks import DTYPES, checked_count, checked_finite, entries
+from npa_envs.ops.sort import LARGEST_INDEX
+from npa_envs.world.randomness import Randomness, WorldRandom, check_generator
 
 
 def uniform_ball(

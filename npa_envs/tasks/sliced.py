@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.sph import world_mean
+from npa_envs.ops import world_mean
 
 PATCH = 5
 """Pixels along each side of a patch."""

@@ -9,9 +9,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from npa_envs.randomness import Randomness, check_generator, uniform_draws
 from npa_envs.tasks.damage import random_particle
 from npa_envs.tasks.seeds import uniform_ball
+from npa_envs.world.randomness import Randomness, check_generator, uniform_draws
 
 NEAREST, FARTHEST = 2.0, 4.0
 """Distances from the origin between which particles are thrown [length units]."""

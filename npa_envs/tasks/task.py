@@ -7,10 +7,10 @@ from typing import Protocol, TypeVar, cast, runtime_checkable
 import torch
 from torch import Tensor
 
-from npa_envs.randomness import Randomness
+from npa_envs.ops import Cameras
 from npa_envs.rule.rule import NPARule
-from npa_envs.sph import Cameras
 from npa_envs.tasks.appearance import Gaussians
+from npa_envs.world.randomness import Randomness
 
 
 class Task(Protocol):

@@ -8,15 +8,15 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.randomness import Randomness
+from npa_envs.ops import periodic_splat, world_mean
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
-from npa_envs.sph import periodic_splat, world_mean
 from npa_envs.tasks.damage import erase_state, random_particle
 from npa_envs.tasks.rules import untrained_rule
 from npa_envs.tasks.seeds import uniform_box
 from npa_envs.tasks.texture_config import TextureConfig
 from npa_envs.tasks.texture_losses import LossOptions, TextureLoss, make_texture_loss
 from npa_envs.tasks.textures import TextureTarget, load_texture
+from npa_envs.world.randomness import Randomness
 
 DENSITY_FLOOR = 1e-6
 """Density that empty places count as, so that the power has a slope there."""

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from npa_envs.replay import sent
+from npa_envs.world.cuda_graph import sent
 
 
 class ViewSchedule:

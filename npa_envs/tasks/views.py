@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.sph import Cameras, look_at, orbit
+from npa_envs.ops import Cameras, look_at, orbit
 from npa_envs.tasks.meshes import load_mesh
 from npa_envs.tasks.raster import draw_mesh
 

@@ -9,11 +9,11 @@ from typing import Generic, Literal, TypeVar, get_args
 import torch
 
 from npa_envs.devices import parse_device
-from npa_envs.dynamics import Memory
 from npa_envs.errors import NPAError
-from npa_envs.sph.checks import MomentInverse
+from npa_envs.ops.checks import MomentInverse
 from npa_envs.tasks.checks import check_fraction, check_non_negative, check_positive, is_whole
 from npa_envs.tasks.morphogenesis2d_config import Morphogenesis2DConfig
+from npa_envs.world.rollout import Memory
 
 TaskConfigT = TypeVar("TaskConfigT")
 

@@ -7,7 +7,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from npa_envs.replay import Replayed
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.task import GoalTask, ScheduledTask, Task, seed_worlds, task_for_rule
 from npa_envs.training.config import TrainConfig
@@ -15,6 +14,7 @@ from npa_envs.training.graphs import EagerIteration, GraphedIteration, Rollout
 from npa_envs.training.meter import LossMeter
 from npa_envs.training.optimiser import RuleOptimiser
 from npa_envs.training.pool import WorldPool
+from npa_envs.world.cuda_graph import Replayed
 
 
 class TrainingCycle:

@@ -7,12 +7,12 @@ from typing import Any, Literal, Protocol
 import torch
 from torch import Tensor
 
-import npa_envs.dynamics
-from npa_envs.dynamics import Memory
-from npa_envs.replay import capture
+import npa_envs.world.rollout
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.task import Task, task_toward
 from npa_envs.training.config import TrainConfig
+from npa_envs.world.cuda_graph import capture
+from npa_envs.world.rollout import Memory
 
 WARM_UP_STEPS = 2
 """Steps of the eager rollout that loads every kernel before the first capture."""
@@ -90,7 +90,7 @@ class EagerIteration:
         self._rule = rule
         self._memory = config.memory
         self._generator = generator
-        self._rollout: Rollout = npa_envs.dynamics.rollout if rollout is None else rollout
+        self._rollout: Rollout = npa_envs.world.rollout.rollout if rollout is None else rollout
 
     def aim(self, goal: Tensor) -> None:
         """Give the worlds their goals, int64, shape [B]."""

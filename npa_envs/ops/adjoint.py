@@ -11,8 +11,8 @@ from npa_envs.kernels.cuda.adjoint import SHARE, listed_adjoint
 from npa_envs.kernels.cuda.tiles import TILE
 from npa_envs.kernels.cuda.warps import WARP
 from npa_envs.kernels.portable.adjoint import adjoint_kernels
-from npa_envs.sph.bridge import launch
-from npa_envs.sph.cells import Plan, density_scale, make_plan
+from npa_envs.ops.launch import launch
+from npa_envs.ops.sort import Plan, density_scale, make_plan
 
 
 class SavedPerception(NamedTuple):

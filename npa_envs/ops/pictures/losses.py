@@ -9,8 +9,9 @@ from torch import Tensor
 
 from npa_envs.errors import NPAError
 from npa_envs.kernels.pictures.splat import CHANNELS, group_count, make_lens
-from npa_envs.sph.bridge import launch, scalar_type
-from npa_envs.sph.splat import (
+from npa_envs.ops.launch import launch, scalar_type
+from npa_envs.ops.mean import average_sums, world_mean
+from npa_envs.ops.pictures.splat import (
     Splats,
     aligned,
     check_particles,
@@ -20,7 +21,6 @@ from npa_envs.sph.splat import (
     scatter_splats,
     sort_splats,
 )
-from npa_envs.sph.worlds import average_sums, world_mean
 
 
 @torch.library.custom_op("npa::picture_losses", mutates_args=())

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import DivergedError, NPAError
-from npa_envs.sph.checks import check_world, checked_number
+from npa_envs.ops.checks import check_world, checked_number
 
 OnDivergence = Literal["ignore", "raise"]
 """What a rollout does about worlds that diverge."""

@@ -11,9 +11,7 @@ from torch import Tensor
 
 from npa_envs.errors import NPAError
 from npa_envs.kernels.portable.species import species_kernel
-from npa_envs.sph.bridge import launch, scalar_type
-from npa_envs.sph.cells import density_scale, make_plan, sort_worlds
-from npa_envs.sph.checks import (
+from npa_envs.ops.checks import (
     Box,
     check_finite_positions,
     check_scale,
@@ -23,7 +21,9 @@ from npa_envs.sph.checks import (
     checked_eps,
     entries,
 )
-from npa_envs.sph.fields import perceive
+from npa_envs.ops.launch import launch, scalar_type
+from npa_envs.ops.perceive import perceive
+from npa_envs.ops.sort import density_scale, make_plan, sort_worlds
 
 MOST_SPECIES = 64
 """Species of a world: a thread keeps one sum for each."""

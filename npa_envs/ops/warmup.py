@@ -6,21 +6,21 @@ from collections.abc import Iterable
 
 import torch
 
-from npa_envs.sph.actions import ActionRules, RepeatedActions
-from npa_envs.sph.arranged import arrange_weights
-from npa_envs.sph.draws import bernoulli_draw, integer_draw, normal_draw, uniform_draw
-from npa_envs.sph.fields import perceive
-from npa_envs.sph.network import run_network
-from npa_envs.sph.operators import Rows, perceive_rows
-from npa_envs.sph.passes import SHARED_WORLD, Terms
-from npa_envs.sph.picture_losses import picture_losses
-from npa_envs.sph.rows import survey
-from npa_envs.sph.settled import settle
-from npa_envs.sph.settled_perception import perceive_settled
-from npa_envs.sph.settled_states import settled_rows, settled_states, update_settled
-from npa_envs.sph.splat import splat
-from npa_envs.sph.update import update_particles
-from npa_envs.sph.worlds import world_mean
+from npa_envs.ops.backend import SHARED_WORLD, Terms
+from npa_envs.ops.draws import bernoulli_draw, integer_draw, normal_draw, uniform_draw
+from npa_envs.ops.mean import world_mean
+from npa_envs.ops.network import arrange_weights, run_network
+from npa_envs.ops.perceive import Rows, perceive, perceive_rows, survey
+from npa_envs.ops.pictures.losses import picture_losses
+from npa_envs.ops.pictures.splat import splat
+from npa_envs.ops.static import (
+    perceive_settled,
+    settle,
+    settled_rows,
+    settled_states,
+    update_settled,
+)
+from npa_envs.ops.update import ActionRules, RepeatedActions, update_particles
 
 
 def warmup(

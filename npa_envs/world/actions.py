@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from npa_envs.randomness import WorldRandom
-from npa_envs.sph.actions import ActionRules, RepeatedActions
-from npa_envs.sph.checks import MomentInverse
-from npa_envs.sph.passes import Terms
-from npa_envs.sph.rows import SurveyedWorlds, survey
-from npa_envs.sph.species import perceive_by_species
+from npa_envs.ops.backend import Terms
+from npa_envs.ops.checks import MomentInverse
+from npa_envs.ops.perceive import SurveyedWorlds, survey
+from npa_envs.ops.species import perceive_by_species
+from npa_envs.ops.update import ActionRules, RepeatedActions
+from npa_envs.world.randomness import WorldRandom
 
 __all__ = [
     "Actions",

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from npa_envs.errors import NPAError
 from npa_envs.kernels.portable.mean import CHUNK, MEAN_LANES, mean_kernels
-from npa_envs.sph.bridge import launch, scalar_type
-from npa_envs.sph.checks import DTYPES, check_dense
+from npa_envs.ops.checks import DTYPES, check_dense
+from npa_envs.ops.launch import launch, scalar_type
 
 
 def average_sums(partial_sums: Tensor, value_count: int, like: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from npa_envs.kernels.cuda.sort import BLOCKS, LARGEST_GRID, STATE_SHARE, sort_s
 from npa_envs.kernels.cuda.warps import WARP
 from npa_envs.kernels.domain import make_domain
 from npa_envs.kernels.portable.sort import cell_kernels
-from npa_envs.sph.bridge import channel_width, is_modern, lane_count, launch, scalar_type
+from npa_envs.ops.launch import channel_width, is_modern, lane_count, launch, scalar_type
 
 LARGEST_INDEX = 2**31 - 1
 """Kernels index with 32 bits."""

@@ -1,4 +1,4 @@
-"""Pictures of 3D Gaussians as a differentiable torch operator."""
+"""Checks at the door of `render_gaussians`."""
 
 from __future__ import annotations
 
@@ -9,13 +9,236 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.kernels.pictures.gaussians import FOOTPRINT, gaussian_kernels, make_frame, tile_total
-from npa_envs.sph.bridge import launch, scalar_type
-from npa_envs.sph.cameras import Cameras
-from npa_envs.sph.cells import LARGEST_INDEX
-from npa_envs.sph.checks import checked_count, checked_number
-from npa_envs.sph.gaussian_checks import check_cameras, check_gaussians
-from npa_envs.sph.gaussian_tiles import blend, pull_back_tiles, sort_pairs
+from npa_envs.kernels.pictures.blending import TILE_PIXELS, block_kernels, tile_kernels
+from npa_envs.kernels.pictures.gaussians import (
+    CHANNELS,
+    FOOTPRINT,
+    PULLS,
+    gaussian_kernels,
+    make_frame,
+    tile_total,
+)
+from npa_envs.ops.checks import DTYPES, check_dense, checked_count, checked_number
+from npa_envs.ops.launch import launch, scalar_type
+from npa_envs.ops.pictures.cameras import Cameras
+from npa_envs.ops.sort import LARGEST_INDEX
+
+
+def check_gaussians(
+    means: Tensor, scales: Tensor, quaternions: Tensor, opacities: Tensor, colours: Tensor
+) -> None:
+    """Check shapes, dtypes and devices of Gaussians; on the CPU also the scales' signs.
+
+    Raises:
+        NPAError: They do not fit.
+    """
+    _check_tensor("means", means, means, "[B, N, 3]")
+    lead = tuple(means.shape[:2])
+    if means.ndim != 3 or means.shape[2] != 3 or 0 in lead:
+        cure = "add a world dimension with means[None]" if means.ndim == 2 else "reshape it"
+        raise NPAError(
+            f"means must have shape [B, N, 3] with at least one world and one particle, "
+            f"got {tuple(means.shape)}: {cure}"
+        )
+    shapes = (
+        ("scales", scales, "[B, N, 3]", ((3,),)),
+        ("quaternions", quaternions, "[B, N, 4]", ((4,),)),
+        ("opacities", opacities, "[B, N]", ((),)),
+        (
+            "colours",
+            colours,
+            f"[B, N, K] with K from 1 to {CHANNELS}, or [B, N, 4, 3]",
+            (*((k,) for k in range(1, CHANNELS + 1)), (4, 3)),
+        ),
+    )
+    for name, tensor, shape, ends in shapes:
+        _check_tensor(name, tensor, means, shape)
+        if tuple(tensor.shape) not in [(*lead, *end) for end in ends]:
+            raise NPAError(
+                f"{name} must have shape {shape} with [B, N] = {list(lead)} as means has, "
+                f"got {tuple(tensor.shape)}"
+            )
+    if scales.device.type == "cpu" and not torch.compiler.is_compiling():
+        negative = scales.detach() < 0.0
+        if bool(negative.any()):
+            world, particle, _ = (int(k) for k in negative.nonzero()[0])
+            raise NPAError(
+                f"scales must not be negative [length units], got "
+                f"{scales[world, particle].tolist()} at world {world}, particle {particle} "
+                f"({int(negative.any(-1).sum())} such particles): make them with exp or softplus"
+            )
+
+
+def _check_tensor(name: str, tensor: Tensor, means: Tensor, shape: str) -> None:
+    if not isinstance(tensor, Tensor):
+        raise NPAError(
+            f"{name} must be a torch tensor of shape {shape}, got {type(tensor).__name__}: "
+            f"convert it with torch.as_tensor"
+        )
+    if tensor.dtype not in DTYPES:
+        raise NPAError(
+            f"{name} must be float32 or float64, got {tensor.dtype}: convert it with .float()"
+        )
+    check_dense(name, tensor)
+    if tensor.dtype != means.dtype or tensor.device != means.device:
+        raise NPAError(
+            f"{name} and means must share dtype and device, got {tensor.dtype} on {tensor.device} "
+            f"and {means.dtype} on {means.device}: convert one with .to(other)"
+        )
+
+
+def check_cameras(
+    cameras: Cameras, means: Tensor, background: Tensor | None, channels: int
+) -> None:
+    """Check that cameras and a background fit the worlds.
+
+    Raises:
+        NPAError: They do not.
+    """
+    if not isinstance(cameras, Cameras):
+        raise NPAError(
+            f"cameras must be Cameras, got {type(cameras).__name__}: "
+            f"make them with orbit, or Cameras(world_to_camera=..., intrinsics=..., ...)"
+        )
+    if cameras.world_to_camera.device != means.device:
+        raise NPAError(
+            f"cameras and means must share a device, got {cameras.world_to_camera.device} and "
+            f"{means.device}: move them with cameras.to(means.device)"
+        )
+    if cameras.world_count not in (None, means.shape[0]):
+        raise NPAError(
+            f"cameras of their own must be there for each of {means.shape[0]} worlds, got "
+            f"world_to_camera of shape {tuple(cameras.world_to_camera.shape)}: share cameras with "
+            f"shape [V, 4, 4]"
+        )
+    image = (means.shape[0], cameras.count, cameras.height, cameras.width, channels)
+    entries = means.shape[0] * cameras.count * max(means.shape[1], cameras.height * cameras.width)
+    if entries * 12 > LARGEST_INDEX:
+        raise NPAError(
+            f"pictures and footprints must stay below {LARGEST_INDEX // 12} in one batch, got "
+            f"{entries}, of {image[0]} worlds and {image[1]} views: split the batch"
+        )
+    if background is None:
+        return
+    _check_tensor("background", background, means, "that broadcasts to [B, V, H, W, K]")
+    try:
+        joined = torch.broadcast_shapes(background.shape, image)  # type: ignore[no-untyped-call]
+        fits = tuple(joined) == image
+    except RuntimeError:
+        fits = False
+    if not fits:
+        raise NPAError(
+            f"background must broadcast to [B, V, H, W, K] = {list(image)}, "
+            f"got {tuple(background.shape)}: for example one colour of shape [{channels}]"
+        )
+
+
+# Pairs of tiles and Gaussians: sorted, drawn, and what tiles pull at them.
+
+
+def _room(ends: Tensor, pairs_per_particle: int) -> int:
+    """Return how many pairs a picture has room for."""
+    if pairs_per_particle:
+        return ends.shape[1] * pairs_per_particle
+    return max(int(ends[:, -1].max()), 1)
+
+
+class Pairs(NamedTuple):
+    """Pairs of a tile and a Gaussian that covers it: by tile, near Gaussians first."""
+
+    overflow: Tensor
+    """Whether pairs of a picture found no room, shape [B V]."""
+    slots: Tensor
+    """First slot of each Gaussian in each picture, -1 without one, int32, shape [B V N]."""
+    starts: Tensor
+    """First pair of each tile of each picture, and the end, int32."""
+    owners: Tensor
+    """Picture and Gaussian of each pair, counted through, int32, shape [slots]."""
+    places: Tensor
+    """Slot of each pair, int64, shape [slots]."""
+
+
+def sort_pairs(
+    frame: Any, footprints: Tensor, depths: Tensor, counts: Tensor, pairs_per_particle: int
+) -> Pairs:
+    """Sort the pairs of pictures, whose depths and counts of tiles have shape [B V, N].
+
+    Both sorts are stable: Gaussians of the same depth stay in the order of their indices.
+    """
+    device, images = depths.device, depths.shape[0]
+    order = torch.sort(depths, dim=1, stable=True).indices
+    ends = torch.cumsum(counts.gather(1, order), 1, dtype=torch.int64)
+    room = _room(ends, pairs_per_particle)
+    if images * room * PULLS > LARGEST_INDEX:
+        raise NPAError(
+            f"pairs of tiles and Gaussians must stay below {LARGEST_INDEX // PULLS} in one batch, "
+            f"got room for {room} in each of {images} pictures: split the batch or lower "
+            f"pairs_per_particle"
+        )
+    tile_end = images * frame.tile_count
+    tiles = torch.full((images * room,), tile_end, dtype=torch.int32, device=device)
+    owners = torch.zeros_like(tiles)
+    slots = torch.empty_like(counts)
+    arguments = (footprints, order.view(-1), ends.view(-1), room, tiles, owners, slots.view(-1))
+    kernels = gaussian_kernels(scalar_type(depths.dtype))
+    launch(kernels.list_pairs, counts.numel(), device, frame, *arguments)
+    tiles, places = torch.sort(tiles, stable=True)
+    starts = torch.searchsorted(
+        tiles, torch.arange(tile_end + 1, dtype=torch.int32, device=device), out_int32=True
+    )
+    return Pairs(ends[:, -1] > room, slots.view(-1), starts, owners[places], places)
+
+
+def blend(frame: Any, footprints: Tensor, pairs: Pairs, images: int) -> tuple[Tensor, ...]:
+    """Return colours [B V H W, K], what passes and where a pixel stops, [B V H W]."""
+    device, pixels = footprints.device, images * frame.width * frame.height
+    scalar = scalar_type(footprints.dtype)
+    listed = (pairs.starts, pairs.owners, footprints)
+    if device.type == "cuda":
+        picture = footprints.new_empty(pixels, frame.channels)
+        passing = footprints.new_empty(pixels)
+        stops = torch.empty(pixels, dtype=torch.int32, device=device)
+        threads = images * frame.tile_count * TILE_PIXELS
+        drawn = (*listed, picture, passing, stops)
+        kernel = block_kernels(scalar).draw_blocks
+        launch(kernel, threads, device, frame, *drawn, block_dim=TILE_PIXELS)
+    else:
+        picture = footprints.new_zeros(pixels, frame.channels)
+        passing = footprints.new_ones(pixels)
+        stops = torch.full((pixels,), LARGEST_INDEX, dtype=torch.int32, device=device)
+        drawn = (*listed, picture, passing, stops)
+        launch(tile_kernels(scalar).draw_tiles, images * frame.tile_count, device, frame, *drawn)
+    return picture, passing, stops
+
+
+def pull_back_tiles(
+    frame: Any,
+    footprints: Tensor,
+    pairs: tuple[Tensor, ...],
+    drawn: tuple[Tensor, Tensor],
+    bars: tuple[Tensor, Tensor],
+) -> Tensor:
+    """Return what tiles pull at Gaussians, a row for each slot; empty slots are undefined."""
+    device = footprints.device
+    starts, owners, places = pairs
+    passing, stops = drawn
+    picture_bar, passing_bar = bars
+    pulls = footprints.new_empty(owners.shape[0], PULLS)
+    tiles = starts.shape[0] - 1
+    listed = (starts, owners, places, footprints, stops, picture_bar)
+    scalar = scalar_type(footprints.dtype)
+    if device.type == "cuda":
+        kernel = block_kernels(scalar).pull_back_blocks
+        pulled = (*listed, passing, passing_bar, pulls.view(-1))
+        launch(kernel, tiles * TILE_PIXELS, device, frame, *pulled, block_dim=TILE_PIXELS)
+    else:
+        pulled = (*listed, passing.clone(), passing * passing_bar, pulls)
+        launch(tile_kernels(scalar).pull_back_tiles, tiles, device, frame, *pulled)
+    return pulls
+
+
+# Pictures of 3D Gaussians as a differentiable torch operator.
+
 
 PAIRS_PER_PARTICLE = 8
 """Tiles of a picture that its Gaussians cover on average, at most: what CUDA has room for."""

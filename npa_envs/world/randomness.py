@@ -13,9 +13,9 @@ from torch import Tensor
 
 from npa_envs.devices import check_device
 from npa_envs.errors import NPAError
-from npa_envs.sph.cells import LARGEST_INDEX
-from npa_envs.sph.checks import DTYPES, check_dense, checked_count, checked_number
-from npa_envs.sph.draws import bernoulli_draw, integer_draw, normal_draw, uniform_draw
+from npa_envs.ops.checks import DTYPES, check_dense, checked_count, checked_number
+from npa_envs.ops.draws import bernoulli_draw, integer_draw, normal_draw, uniform_draw
+from npa_envs.ops.sort import LARGEST_INDEX
 
 
 class Purpose(enum.IntEnum):

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.sph.checks import (
+from npa_envs.ops.checks import (
     DTYPES,
     LARGEST_SIDE,
     check_dense,

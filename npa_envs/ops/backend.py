@@ -11,8 +11,8 @@ from npa_envs.kernels.cuda.density import listed_density
 from npa_envs.kernels.cuda.perceive import listed_perception
 from npa_envs.kernels.cuda.warps import WARP
 from npa_envs.kernels.portable.perceive import perception_kernels
-from npa_envs.sph.bridge import launch
-from npa_envs.sph.cells import Plan, SortedWorlds, density_scale
+from npa_envs.ops.launch import launch
+from npa_envs.ops.sort import Plan, SortedWorlds, density_scale
 
 CAPACITY, LARGE_CAPACITY, HUGE_CAPACITY = 64, 128, 96
 """Neighbours that lists have room for: in small worlds of a batch, elsewhere, in huge worlds."""

@@ -11,10 +11,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from npa_envs.errors import NPAError
-from npa_envs.guards import OnDivergence, make_watch
-from npa_envs.randomness import Randomness, WorldRandom, check_generator
-from npa_envs.rule.rule import FoldedRule, NPARule, check_rule
-from npa_envs.sph.checks import (
+from npa_envs.ops.checks import (
     Box,
     check_finite_positions,
     check_scale,
@@ -25,11 +22,19 @@ from npa_envs.sph.checks import (
     checked_flag,
     checked_number,
 )
-from npa_envs.sph.operators import Terms, perceive_rows
-from npa_envs.sph.settled import SettledWorlds, settle
-from npa_envs.sph.settled_states import settled_states, unsettled_states
-from npa_envs.sph.settled_steps import advance_settled, drawn_rows
-from npa_envs.sph.update import update_particles, wrapped
+from npa_envs.ops.perceive import Terms, perceive_rows
+from npa_envs.ops.static import (
+    SettledWorlds,
+    advance_settled,
+    drawn_rows,
+    settle,
+    settled_states,
+    unsettled_states,
+)
+from npa_envs.ops.update import update_particles, wrapped
+from npa_envs.rule.rule import FoldedRule, NPARule, check_rule
+from npa_envs.world.divergence import OnDivergence, make_watch
+from npa_envs.world.randomness import Randomness, WorldRandom, check_generator
 
 Memory = Literal["store", "recompute", "minimal"]
 

@@ -14,7 +14,7 @@ from npa_envs.kernels.portable.draws import (
     draw_integers,
     draw_kernels,
 )
-from npa_envs.sph.bridge import launch, scalar_type
+from npa_envs.ops.launch import launch, scalar_type
 
 WORD_COUNT = 2**32
 """Values of a word of the generator."""

@@ -1,0 +1,479 @@
+"""Perception of the active particles as an opaque torch operator with its gathered adjoints.
+
+A `torch.library` operator keeps Warp out of torch.compile's sight; the autograd function over it
+saves only what the adjoint of the case at hand reads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from npa_envs.ops.adjoint import SavedPerception, perceive_rows_backward
+from npa_envs.ops.backend import (
+    Terms,
+    batch_listing,
+    compute_densities,
+    compute_density_gradients,
+    perception_launch,
+    plain_kernels,
+    rollout_listing,
+)
+from npa_envs.ops.checks import (
+    Box,
+    MomentInverse,
+    check_finite_positions,
+    check_scale,
+    check_world,
+    checked_box,
+    checked_eps,
+    checked_flag,
+    checked_moment_inverse,
+)
+from npa_envs.ops.launch import Repeated, launch
+from npa_envs.ops.sort import make_plan, sort_worlds
+
+__all__ = ["Rows", "Terms", "perceive_rows"]
+
+
+class Rows(NamedTuple):
+    """Which particles a batch of rows stands for: rows follow the sorted order of the particles."""
+
+    row_of: Tensor
+    """Row of each particle, -1 where it has none, int32, shape [B N]."""
+    row_source: Tensor
+    """Particle of each row, int32, shape [K]; undefined beyond the last active row."""
+    starts: Tensor
+    """Cell starts; the last entry minus `row_base` is the number of active rows."""
+    row_base: int
+
+
+@torch.library.custom_op("npa::perceive_rows", mutates_args=())
+def _perceive_rows(
+    x: Tensor,
+    s: Tensor,
+    mask: Tensor | None,
+    row_capacity: int,
+    row_width: int,
+    eps: float,
+    scale: float,
+    box: list[float] | None,
+    state_gradient: bool,
+    moment_inverse: str | None,
+    density_gradient: bool,
+    for_adjoint: bool,
+) -> list[Tensor]:
+    """Return the particles of the rows, `row_source`, and then what a `SavedPerception` holds."""
+    plan = make_plan(x, x.shape, s.shape[2], row_capacity, mask is not None, eps, box)
+    terms = Terms(state_gradient, moment_inverse, density_gradient)
+    ordered = sort_worlds(plan, x, s, mask)
+    densities = compute_densities(
+        plan, ordered, terms, rollout_listing(plan), with_particles=for_adjoint
+    )
+    perception = x.new_empty(row_capacity, row_width)
+    row_kernel_sum = x.new_empty(row_capacity if for_adjoint else 0, plan.space_dim)
+    launch(
+        *perception_launch(
+            plan,
+            ordered,
+            densities,
+            terms,
+            scale,
+            perception,
+            row_kernel_sum=row_kernel_sum if for_adjoint else None,
+        )
+    )
+    saved = SavedPerception(
+        perception=perception,
+        row_of=ordered.row_of,
+        starts=ordered.starts,
+        source=ordered.source,
+        particles=densities.particles,
+        row_positions=ordered.row_positions,
+        row_kernel_sum=row_kernel_sum,
+        states=ordered.states,
+    )
+    return [ordered.row_source, *saved.tensors()]
+
+
+@_perceive_rows.register_fake
+def _(
+    x: Tensor,
+    s: Tensor,
+    mask: Tensor | None,
+    row_capacity: int,
+    row_width: int,
+    eps: float,
+    scale: float,
+    box: list[float] | None,
+    *options: bool,
+) -> list[Tensor]:
+    plan = make_plan(x, x.shape, s.shape[2], row_capacity, mask is not None, eps, box)
+    for_adjoint = options[-1]
+    particle_count = plan.total if for_adjoint or not plan.listed else 0
+    integers = torch.int32
+    saved = SavedPerception(
+        perception=x.new_empty(row_capacity, row_width),
+        row_of=x.new_empty(plan.total, dtype=integers),
+        starts=x.new_empty(plan.start_count, dtype=integers),
+        source=x.new_empty(plan.total, dtype=integers),
+        particles=x.new_empty(particle_count, plan.space_dim + 1),
+        row_positions=x.new_empty(row_capacity, plan.space_dim),
+        row_kernel_sum=x.new_empty(row_capacity if for_adjoint else 0, plan.space_dim),
+        states=s.new_empty(plan.total * plan.group_count, plan.width),
+    )
+    return [x.new_empty(row_capacity, dtype=integers), *saved.tensors()]
+
+
+class _PerceiveRows(torch.autograd.Function):
+    """Perception of the active particles, with gathered adjoints for states and positions."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        x: Tensor,
+        s: Tensor,
+        mask: Tensor | None,
+        row_capacity: int,
+        row_width: int,
+        eps: float,
+        scale: float,
+        box: list[float] | None,
+        terms: Terms,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        row_source, *tensors = _perceive_rows(
+            x,
+            s,
+            mask,
+            row_capacity,
+            row_width,
+            eps,
+            scale,
+            box,
+            *terms,
+            for_adjoint=any(ctx.needs_input_grad),
+        )
+        saved = SavedPerception(*tensors)
+        ctx.mark_non_differentiable(saved.row_of, row_source, saved.starts)
+        ctx.set_materialize_grads(False)
+        if any(ctx.needs_input_grad):
+            ctx.options = (eps, scale, box, terms)
+            ctx.shapes = (x.shape, s.shape, mask is not None)
+            ctx.save_for_backward(*(saved if ctx.needs_input_grad[0] else saved[:-1]))
+        return saved.perception, saved.row_of, row_source, saved.starts
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *bars: Tensor | None) -> tuple[Tensor | None, ...]:
+        if bars[0] is None:
+            return (None,) * 9
+        eps, scale, box, terms = ctx.options
+        x_shape, s_shape, masked = ctx.shapes
+        states_bar, positions_bar = perceive_rows_backward(
+            bars[0],
+            list(ctx.saved_tensors),
+            particle_count=x_shape[1],
+            state_dim=s_shape[2],
+            masked=masked,
+            eps=eps,
+            scale=scale,
+            box=box,
+            state_gradient=terms.state_gradient,
+            density_gradient=terms.density_gradient,
+        )
+        x_bar = positions_bar.view(x_shape) if ctx.needs_input_grad[0] else None
+        return (x_bar, states_bar.view(s_shape), None, None, None, None, None, None, None)
+
+
+def perceive_rows(
+    x: Tensor,
+    s: Tensor,
+    *,
+    mask: Tensor | None,
+    row_capacity: int,
+    row_width: int,
+    eps: float,
+    eps0: float,
+    box: tuple[float, ...] | None,
+    terms: Terms,
+) -> tuple[Tensor, Rows]:
+    """Perceive the active particles of checked worlds.
+
+    Args:
+        x: Positions [length units], shape [B, N, D]; gradients flow into it if it requires them.
+        s: States, dimensionless, shape [B, N, C].
+        mask: Which particles are active, uint8, shape [B, N], or None for all.
+        row_capacity: Rows K of the result; active particles beyond it are left out.
+        row_width: Columns of a row, at least P: a one follows the perception vector, then zeros.
+        eps: Perception radius [length units].
+        eps0: Radius at which the rule was trained [length units].
+        box: Sides of the periodic box [length units], or None in open space.
+        terms: Groups of the perception vector.
+
+    Returns:
+        Rows of perception, dimensionless, shape [K, row_width], zero beyond the last active row,
+        and which particles they stand for.
+    """
+    perception, row_of, row_source, starts = _PerceiveRows.apply(  # type: ignore[no-untyped-call]
+        x.contiguous(),
+        s.contiguous(),
+        mask,
+        row_capacity,
+        row_width,
+        eps,
+        eps / eps0,
+        None if box is None else list(box),
+        terms,
+    )
+    row_base = 0 if mask is None else x.shape[0] * x.shape[1]
+    return perception, Rows(row_of, row_source, starts, row_base)
+
+
+# Perception of every particle, in the caller's order and clipped; without gradients.
+
+
+class SurveyedWorlds:
+    """Worlds made ready for perception: sorted, their densities known; `survey` makes it.
+
+    Args:
+        launch_of: Returns what to give to a launch that writes rows into a tensor, [B N, P].
+        shape: Shape of what is perceived, [B, N, P].
+        like: A tensor of its dtype and on its device.
+    """
+
+    def __init__(
+        self, launch_of: Callable[[Tensor], tuple[Any, ...]], shape: tuple[int, ...], like: Tensor
+    ) -> None:
+        self._launch_of = launch_of
+        self._shape = shape
+        self._like = like
+        self._repeated: Repeated | None = None
+
+    def perceive(self, out: Tensor | None = None) -> Tensor:
+        """Return what every particle perceives, clipped, in the caller's order, shape [B, N, P].
+
+        Later calls, after the tensors read have got other numbers, take less of the host's time.
+
+        Args:
+            out: Where to write it, contiguous; a new tensor otherwise. Where the worlds have places
+                in a larger batch it must be given, of that batch's shape.
+        """
+        if out is None:
+            out = self._like.new_empty(self._shape)
+        rows = out.view(-1, self._shape[-1])
+        if self._repeated is None:
+            self._repeated = Repeated(*self._launch_of(rows), changing=rows)
+        self._repeated(rows)
+        return out
+
+
+def survey(
+    x: Tensor,
+    s: Tensor,
+    *,
+    eps: float,
+    eps0: float,
+    box: tuple[float, ...] | None,
+    terms: Terms,
+    limit: float,
+    places: Tensor | None = None,
+) -> SurveyedWorlds:
+    """Sort checked worlds and compute their densities.
+
+    The result may read `s` where it is: it serves until the states change.
+
+    Args:
+        x: Positions [length units], shape [B, N, D].
+        s: States, dimensionless, shape [B, N, C].
+        eps: Perception radius [length units].
+        eps0: Radius at which the rule was trained [length units].
+        box: Sides of the periodic box [length units], or None in open space.
+        terms: Groups of the perception vector.
+        limit: Entries are clipped to plus and minus this, positive.
+        places: Which worlds of a larger batch these are, in whose rows their perception is written,
+            int64, shape [B]; default: a batch of their own.
+    """
+    x, s = x.contiguous(), s.contiguous()
+    plan = make_plan(x, x.shape, s.shape[2], x.shape[0] * x.shape[1], False, eps, box)
+    in_place = plan.listed and plan.state_dim % plan.width == 0 and s.data_ptr() % 16 == 0
+    ordered = sort_worlds(plan, x, None if in_place else s, None, with_rows=not plan.listed)
+    # World k of a batch perceives what it would alone, bit for bit: nothing here may follow from
+    # the number of worlds.
+    densities = compute_densities(
+        plan,
+        ordered,
+        terms,
+        batch_listing(plan),
+        state_place=ordered.source if in_place else None,
+        with_particles=False,
+    )
+    destination = ordered.source
+    if places is not None:
+        shift = (places - torch.arange(len(places), device=x.device)) * plan.particle_count
+        destination = (destination.view(plan.world_count, -1) + shift.int()[:, None]).view(-1)
+
+    def launch_of(rows: Tensor) -> tuple[Any, ...]:
+        return perception_launch(
+            plan,
+            ordered,
+            densities,
+            terms,
+            eps / eps0,
+            rows,
+            states=s if in_place else None,
+            destination=destination,
+            limit=limit,
+        )
+
+    perception_dim = terms.perception_dim(plan.space_dim, plan.state_dim)
+    return SurveyedWorlds(launch_of, (*x.shape[:2], perception_dim), x)
+
+
+# The public SPH operators over whole worlds: perception vectors and the fields behind them.
+
+
+class PerceptionFields(NamedTuple):
+    """The unscaled SPH fields at every particle (arXiv 2601.16096, section 3)."""
+
+    rho: Tensor
+    """Density [1 / length^D], shape [B, N]."""
+    blur: Tensor
+    """Smoothed states, dimensionless, shape [B, N, C]."""
+    grad0: Tensor
+    """State gradients without correction [1 / length], shape [B, N, C, D]."""
+    moment: Tensor
+    """Moment matrices M, dimensionless, shape [B, N, D, D]."""
+    grad1: Tensor
+    """State gradients corrected by the inverse of M [1 / length], shape [B, N, C, D]."""
+    drho: Tensor
+    """Density gradients [1 / length^(D+1)], shape [B, N, D]."""
+
+
+def perceive(
+    x: Tensor,
+    s: Tensor,
+    eps: float,
+    eps0: float | None = None,
+    box: Box = None,
+    detach_positions: bool = True,
+    *,
+    state_gradient: bool = True,
+    moment_correction: bool = True,
+    density_gradient: bool = True,
+    moment_inverse: MomentInverse = "threshold",
+) -> Tensor:
+    """Perceive every particle's neighbourhood: z = [s ; smoothed s ; L(c ∇s) ; L(c^(1+D) ∇ρ / N)].
+
+    c = eps / eps0, L(v) = log(1 + |v|) v / |v|. Differentiable in s, and in x where
+    `detach_positions` is False; the moment correction of ∇s is a stopped gradient, as in the paper
+    (arXiv 2601.16096, section 3). Bit-identical from run to run; world k of B equals that world
+    alone.
+
+    Args:
+        x: Particle positions [length units], shape [B, N, D], D = 2 or 3, anywhere in open space.
+        s: Particle states, dimensionless, shape [B, N, C], any C; dtype and device of x.
+        eps: Perception radius [length units].
+        eps0: Radius at which the rule was trained [length units]; default: eps.
+        box: Sides of a periodic box centred on the origin [length units], a number for equal
+            sides, or None for open space.
+        detach_positions: Do not back-propagate into x.
+        state_gradient: Include the state gradient in z.
+        moment_correction: Correct the state gradient by the inverse moment matrix.
+        density_gradient: Include the density gradient in z.
+        moment_inverse: How the moment matrix M is inverted: "threshold", M⁻¹ where
+            |det M| >= 1e-3 and not at all below, as in the paper, which jumps there; or "smooth",
+            (det M adj M + τ² I) / (det² M + τ²), τ = 1e-2, which nears both and never jumps.
+
+    Returns:
+        Perception vectors z, dimensionless, shape [B, N, P], P = C(2+D)+D with every group.
+
+    Raises:
+        NPAError: Shapes, dtypes or devices do not fit, a position is not finite, eps or eps0 is
+            not positive and finite, a box side is below 2 eps, or `moment_inverse` is another word.
+    """
+    check_world(x, s)
+    radius = checked_eps("eps", eps, x.dtype)
+    radius0 = radius if eps0 is None else checked_eps("eps0", eps0, x.dtype)
+    check_scale(radius, radius0, x.shape[2], x.dtype)
+    sides = checked_box(box, x.shape[2], radius)
+    check_finite_positions(x)
+    inverse = checked_moment_inverse(moment_inverse)
+    terms = Terms(
+        checked_flag("state_gradient", state_gradient),
+        inverse if checked_flag("moment_correction", moment_correction) else None,
+        checked_flag("density_gradient", density_gradient),
+    )
+    perception, rows = perceive_rows(
+        x.detach() if checked_flag("detach_positions", detach_positions) else x,
+        s,
+        mask=None,
+        row_capacity=x.shape[0] * x.shape[1],
+        row_width=terms.perception_dim(x.shape[2], s.shape[2]),
+        eps=radius,
+        eps0=radius0,
+        box=sides,
+        terms=terms,
+    )
+    return perception.index_select(0, rows.row_of).view(*x.shape[:2], -1)
+
+
+@torch.no_grad()
+def perception_fields(
+    x: Tensor,
+    s: Tensor,
+    eps: float,
+    box: Box = None,
+    *,
+    moment_inverse: MomentInverse = "threshold",
+) -> PerceptionFields:
+    """Return the unscaled SPH fields of every particle; not differentiable (`perceive` is).
+
+    Args:
+        x: Particle positions [length units], shape [B, N, D].
+        s: Particle states, dimensionless, shape [B, N, C].
+        eps: Perception radius [length units].
+        box: Sides of a periodic box centred on the origin [length units], or None for open space.
+        moment_inverse: How `grad1` is corrected, as in `perceive`.
+
+    Raises:
+        NPAError: As `perceive`.
+    """
+    terms = Terms(moment_inverse=checked_moment_inverse(moment_inverse))
+    check_world(x, s)
+    radius = checked_eps("eps", eps, x.dtype)
+    sides = checked_box(box, x.shape[2], radius)
+    check_finite_positions(x)
+    x, s = x.contiguous(), s.contiguous()
+    world_count, particle_count, space_dim = x.shape
+    state_dim = s.shape[2]
+    plan = make_plan(x, x.shape, state_dim, x.shape[0] * x.shape[1], False, radius, sides)
+    ordered = sort_worlds(plan, x, s, None)
+    particles, row_density_gradient, _ = compute_density_gradients(plan, ordered, terms)
+    fields = PerceptionFields(
+        rho=x.new_empty(plan.total),
+        blur=x.new_empty(plan.total, state_dim),
+        grad0=x.new_empty(plan.total, state_dim, space_dim),
+        moment=x.new_empty(plan.total, space_dim, space_dim),
+        grad1=x.new_empty(plan.total, state_dim, space_dim),
+        drho=row_density_gradient[ordered.row_of].to(x.dtype),
+    )
+    launch(
+        plain_kernels(plan, terms).gather_fields,
+        (plan.total, plan.group_count, plan.lanes),
+        x.device,
+        plan.domain,
+        particle_count,
+        state_dim,
+        plan.group_count,
+        ordered.starts,
+        particles,
+        ordered.states,
+        ordered.source,
+        *fields[:-1],
+    )
+    return PerceptionFields(
+        *(field.view(world_count, particle_count, *field.shape[1:]) for field in fields)
+    )

@@ -1,0 +1,1 @@
+"""Pictures of particles as differentiable torch operators."""

@@ -1,0 +1,1 @@
+"""Worlds in time: rollouts, several species, actions from outside, divergence, random streams."""
