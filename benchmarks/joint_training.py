@@ -32,8 +32,7 @@ from npa_envs.files import write_text
 from npa_envs.render import draw_worlds, write_filmstrip
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2D
-from npa_envs.tasks.co_morphogenesis2d_config import CoMorphogenesis2DConfig
+from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2D, CoMorphogenesis2DConfig
 from npa_envs.training import RunFolder, TrainConfig, override, preset, train, train_together
 from npa_envs.training.checkpoint import check_same_run, load_checkpoint
 from npa_envs.world.randomness import WorldRandom

@@ -22,8 +22,8 @@ from torch import Tensor
 
 import npa_envs
 from npa_envs.bench.session import relative_error
-from npa_envs.tasks.renderers import RENDERERS
-from npa_envs.tasks.views import some_views
+from npa_envs.tasks.appearance import RENDERERS
+from npa_envs.tasks.targets.views import some_views
 from npa_envs.trained_tasks import task_of_rule
 from npa_envs.world.cuda_graph import capture
 

@@ -24,8 +24,8 @@ from npa_envs.errors import NPAError
 from npa_envs.files import write_text
 from npa_envs.render import to_uint8, write_filmstrip
 from npa_envs.rule.rule import NPARule
+from npa_envs.tasks.losses.texture import TEXTURE_LOSSES
 from npa_envs.tasks.texture import Texture
-from npa_envs.tasks.texture_losses import TEXTURE_LOSSES
 from npa_envs.training import TrainConfig, preset, train
 from npa_envs.world.rollout import rollout
 

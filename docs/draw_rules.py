@@ -18,7 +18,7 @@ from torch import Tensor
 import npa_envs
 from npa_envs.render import to_uint8, write_filmstrip
 from npa_envs.rule.files import shipped_rules
-from npa_envs.tasks.views import over
+from npa_envs.tasks.targets.views import over
 from npa_envs.trained_tasks import task_of_rule
 
 IMAGES = Path(__file__).resolve().parent / "images"

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from npa_envs.render import to_uint8, write_filmstrip
-from npa_envs.tasks.textures import builtin_textures, load_texture
+from npa_envs.tasks.targets.textures import builtin_textures, load_texture
 
 PICTURE = Path(__file__).resolve().parent / "images" / "textures.png"
 RESOLUTION = 128

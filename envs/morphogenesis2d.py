@@ -15,8 +15,7 @@ from npa_envs.envs.task import EnvTask
 from npa_envs.envs.vector import NPAVectorEnv
 from npa_envs.errors import NPAError
 from npa_envs.tasks.checks import check_non_negative, check_positive
-from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
-from npa_envs.tasks.morphogenesis2d_config import Morphogenesis2DConfig
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.world.randomness import WorldRandom
 
 

@@ -20,8 +20,7 @@ from npa_envs.render import turntable_frames
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.checks import check_fraction, check_positive
-from npa_envs.tasks.morphogenesis3d import Morphogenesis3D
-from npa_envs.tasks.morphogenesis3d_config import Morphogenesis3DConfig
+from npa_envs.tasks.morphogenesis3d import Morphogenesis3D, Morphogenesis3DConfig
 from npa_envs.world.randomness import WorldRandom
 
 PIXEL_BYTES = 200

@@ -19,10 +19,12 @@ from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
 from npa_envs.tasks.checks import check_non_negative, check_positive
-from npa_envs.tasks.digits import Split
-from npa_envs.tasks.point_classification import PointClassification
-from npa_envs.tasks.point_classification_config import PointClassificationConfig
-from npa_envs.tasks.votes import class_colours
+from npa_envs.tasks.point_classification import (
+    PointClassification,
+    PointClassificationConfig,
+    class_colours,
+)
+from npa_envs.tasks.targets.clouds import Split
 from npa_envs.world.randomness import WorldRandom
 
 

@@ -14,9 +14,8 @@ from npa_envs.envs.task import EnvTask
 from npa_envs.envs.vector import NPAVectorEnv
 from npa_envs.errors import NPAError
 from npa_envs.tasks.checks import check_non_negative, check_positive
-from npa_envs.tasks.texture import Texture
-from npa_envs.tasks.texture_config import TextureConfig
-from npa_envs.tasks.texture_losses import DEFAULT_LOSS, check_loss_name
+from npa_envs.tasks.losses.texture import DEFAULT_LOSS, check_loss_name
+from npa_envs.tasks.texture import Texture, TextureConfig
 from npa_envs.world.randomness import WorldRandom
 
 LOSS_BYTES = 4000
@@ -84,7 +83,7 @@ class TextureEnvConfig(EnvConfig):
 
 
 class TextureTask(EnvTask[TextureEnvConfig]):
-    """A texture, compared by a loss of `npa_envs.tasks.texture_losses`.
+    """A texture, compared by a loss of `npa_envs.tasks.losses.texture`.
 
     Args:
         config: The environment's configuration.

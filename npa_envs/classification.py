@@ -12,8 +12,7 @@ from torch import Tensor
 from npa_envs.errors import NPAError
 from npa_envs.evaluation import check_steps
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.point_classification import PointClassification
-from npa_envs.tasks.votes import majority, particle_classes
+from npa_envs.tasks.point_classification import PointClassification, majority, particle_classes
 from npa_envs.world.rollout import rollout
 
 CLOUD_CHECKPOINTS = (8, 16, 24, 32, 64, 128)

@@ -143,7 +143,7 @@ def _kernel_cache() -> list[Finding]:
 
 
 def _emoji_font() -> list[Finding]:
-    from npa_envs.tasks.emoji import find_emoji_fonts
+    from npa_envs.tasks.targets.emoji import find_emoji_fonts
 
     fonts = find_emoji_fonts()
     if fonts:

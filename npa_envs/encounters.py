@@ -16,7 +16,7 @@ from npa_envs.errors import NPAError
 from npa_envs.interaction import InteractionRow, InteractionSettings, mixing_index, verdict
 from npa_envs.render import draw_worlds
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.task import PictureTask
+from npa_envs.tasks.base import PictureTask
 from npa_envs.world.randomness import Purpose, WorldRandom
 from npa_envs.world.species import rollout_species
 

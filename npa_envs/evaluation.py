@@ -14,8 +14,8 @@ from npa_envs.devices import check_device
 from npa_envs.errors import NPAError
 from npa_envs.render.tables import table_text, tables_json
 from npa_envs.rule.rule import NPARule
+from npa_envs.tasks.base import PictureTask, ViewTask, task_for_rule
 from npa_envs.tasks.damage import cut, erase_state, random_particle
-from npa_envs.tasks.task import PictureTask, ViewTask, task_for_rule
 from npa_envs.world.rollout import rollout
 
 __all__ = [

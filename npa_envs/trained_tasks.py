@@ -15,7 +15,7 @@ from npa_envs.rule.files import rule_metadata, shipped_rules
 from npa_envs.rule.rule import NPARule
 
 if TYPE_CHECKING:
-    from npa_envs.tasks.task import PictureTask
+    from npa_envs.tasks.base import PictureTask
 
 
 @dataclass(frozen=True)
@@ -53,8 +53,8 @@ def task_of_rule(
     Raises:
         NPAError: The rule does not fit the task, or a field is wrong.
     """
+    from npa_envs.tasks.base import task_for_rule
     from npa_envs.tasks.point_classification import PointClassification
-    from npa_envs.tasks.task import task_for_rule
     from npa_envs.training import override, preset, task_entry
 
     path = shipped_rules().get(source, Path(source))

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.morphogenesis2d_config import Morphogenesis2DConfig
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
 from npa_envs.training import TrainConfig
 from npa_envs.world.rollout import Memory
 

@@ -12,7 +12,7 @@ from npa_envs.render import to_uint8, write_gif
 from npa_envs.scores import scores
 from npa_envs.tasks.damage import damage_worlds, parse_damage
 from npa_envs.tasks.seeds import uniform_ball, uniform_box
-from npa_envs.tasks.texture_config import TextureConfig
+from npa_envs.tasks.texture import TextureConfig
 from npa_envs.training import preset
 from npa_envs.wrappers import TorchNormalizeReward
 

@@ -12,8 +12,14 @@ import torch
 from small_digits import COUNTS, idx, pictures, write_idx
 
 from npa_envs.errors import MissingDependencyError, NPAError
-from npa_envs.tasks.clouds import _farthest_points, load_clouds, sample_ink, varied
-from npa_envs.tasks.digits import load_pictures, read_idx
+from npa_envs.tasks.targets.clouds import (
+    _farthest_points,
+    load_clouds,
+    load_pictures,
+    read_idx,
+    sample_ink,
+    varied,
+)
 from npa_envs.world.randomness import WorldRandom
 
 
@@ -161,7 +167,7 @@ def test_a_cloud_does_not_depend_on_the_others_nor_on_the_device(device, monkeyp
     x, _ = sample_ink(images, 100, sample_seed=5)
     for k in (0, 1, 11):
         assert torch.equal(sample_ink(images[k : k + 1], 100, sample_seed=5)[0][0], x[k])
-    monkeypatch.setattr("npa_envs.tasks.clouds.CHUNK", {"cpu": 5, "cuda": 5})
+    monkeypatch.setattr("npa_envs.tasks.targets.clouds.CHUNK", {"cpu": 5, "cuda": 5})
     assert torch.equal(sample_ink(images, 100, sample_seed=5, device=device)[0].cpu(), x)
     assert not torch.equal(sample_ink(images, 100, sample_seed=6)[0], x)
 

@@ -6,8 +6,8 @@ import pytest
 from PIL import ImageFont
 
 from npa_envs.errors import MissingDependencyError, NPAError
-from npa_envs.tasks import emoji
-from npa_envs.tasks.targets import load_target
+from npa_envs.tasks.targets import emoji
+from npa_envs.tasks.targets.points import load_target
 
 
 @pytest.mark.parametrize("text", ["🦎", "❤", "❤️", "👩‍🚀", "🇨🇭", "1️⃣", "👍🏽", "☀"])

@@ -11,7 +11,7 @@ from npa_envs.cli import main
 from npa_envs.cli.train import parse, starting_configuration
 from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule, rule_metadata
-from npa_envs.tasks.co_morphogenesis2d_config import CoMorphogenesis2DConfig
+from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig
 from npa_envs.training import RunFolder, load_config, preset, train
 
 TINY = ("co_morphogenesis2d", "--preset", "tiny", "--iterations", "4", "--no-progress")

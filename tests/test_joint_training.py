@@ -8,9 +8,8 @@ import torch
 from npa_envs.errors import NPAError
 from npa_envs.evaluation import evaluate
 from npa_envs.rule.files import load_rule, rule_metadata
-from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2D
-from npa_envs.tasks.co_morphogenesis2d_config import CoMorphogenesis2DConfig
-from npa_envs.tasks.morphogenesis2d_config import Morphogenesis2DConfig
+from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2D, CoMorphogenesis2DConfig
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
 from npa_envs.training import TrainConfig, train_together
 from npa_envs.training.checkpoint import load_checkpoint
 from npa_envs.world.species import rollout_species

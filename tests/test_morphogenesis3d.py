@@ -19,14 +19,11 @@ from npa_envs.ops import orbit
 from npa_envs.render import turntable_frames, write_gaussians, write_points, write_splat
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.appearance import FLAT, OUTPUTS, Appearance
-from npa_envs.tasks.meshes import load_mesh
-from npa_envs.tasks.morphogenesis3d import Morphogenesis3D
-from npa_envs.tasks.morphogenesis3d_config import Morphogenesis3DConfig
-from npa_envs.tasks.raster import AMBIENT, LIGHT
-from npa_envs.tasks.renderers import gsplat_renderer, own_renderer
-from npa_envs.tasks.task import ReadOutTask, ScheduledTask, ViewTask
-from npa_envs.tasks.views import ANGLE, DISTANCE, load_views, over, some_views
+from npa_envs.tasks.appearance import FLAT, OUTPUTS, Appearance, gsplat_renderer, own_renderer
+from npa_envs.tasks.base import ReadOutTask, ScheduledTask, ViewTask
+from npa_envs.tasks.morphogenesis3d import Morphogenesis3D, Morphogenesis3DConfig
+from npa_envs.tasks.targets.meshes import AMBIENT, LIGHT, load_mesh
+from npa_envs.tasks.targets.views import ANGLE, DISTANCE, load_views, over, some_views
 from npa_envs.training import JsonlLog, Trainer, preset, train
 from npa_envs.world.randomness import WorldRandom
 

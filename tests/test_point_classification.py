@@ -15,10 +15,15 @@ from npa_envs.classification import _chimera, _cut, _partners, accuracies, chang
 from npa_envs.cli import main
 from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule
-from npa_envs.tasks.point_classification import PointClassification
-from npa_envs.tasks.point_classification_config import PointClassificationConfig
-from npa_envs.tasks.task import task_for_rule
-from npa_envs.tasks.votes import PALETTE, UNDECIDED, class_colours, majority
+from npa_envs.tasks.base import task_for_rule
+from npa_envs.tasks.point_classification import (
+    PALETTE,
+    UNDECIDED,
+    PointClassification,
+    PointClassificationConfig,
+    class_colours,
+    majority,
+)
 from npa_envs.training import Trainer, preset, train
 from npa_envs.world.rollout import rollout
 

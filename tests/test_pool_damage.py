@@ -5,10 +5,9 @@ from dataclasses import dataclass
 import pytest
 import torch
 
-from npa_envs.tasks.morphogenesis2d_config import Morphogenesis2DConfig
-from npa_envs.tasks.pool_damage import SHARE, hurt
+from npa_envs.tasks.damage import FARTHEST, NEAREST, SHARE, hurt, tear
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
 from npa_envs.tasks.seeds import uniform_ball
-from npa_envs.tasks.strays import FARTHEST, NEAREST, tear
 from npa_envs.world.randomness import WorldRandom
 
 

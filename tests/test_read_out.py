@@ -10,8 +10,7 @@ from circle_task import STATE_DIM, CircleTask, circle_config, plain_rollout
 
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
-from npa_envs.tasks.rules import untrained_rule
-from npa_envs.tasks.task import task_for_rule
+from npa_envs.tasks.base import task_for_rule, untrained_rule
 from npa_envs.training import DivergedError, Trainer
 from npa_envs.training.divergence import bad_worlds
 

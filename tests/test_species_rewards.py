@@ -17,9 +17,8 @@ from crowds import (
 )
 
 from npa_envs.envs.species.account import Account
-from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
-from npa_envs.tasks.morphogenesis2d_config import Morphogenesis2DConfig
-from npa_envs.tasks.targets import load_target
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
+from npa_envs.tasks.targets.points import load_target
 
 quick_targets = pytest.fixture(scope="module", autouse=True)(targets_made_once)
 

@@ -6,9 +6,8 @@ import pytest
 import torch
 
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
-from npa_envs.tasks.morphogenesis2d_config import Morphogenesis2DConfig
-from npa_envs.tasks.strays import FARTHEST, NEAREST, scatter, stray_motion
+from npa_envs.tasks.damage import FARTHEST, NEAREST, scatter, stray_motion
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.training import TrainConfig, train
 from npa_envs.world.randomness import WorldRandom
 from npa_envs.world.rollout import rollout

@@ -9,8 +9,8 @@ import torch
 from PIL import Image, ImageDraw
 
 from npa_envs.errors import NPAError
-from npa_envs.tasks.images import read_image, resample
-from npa_envs.tasks.targets import load_target, target_from_image
+from npa_envs.tasks.targets.images import read_image, resample
+from npa_envs.tasks.targets.points import load_target, target_from_image
 
 RED, BLUE = (255, 0, 0), (0, 0, 255)
 

@@ -8,7 +8,12 @@ import torch
 from PIL import Image, ImageDraw
 
 from npa_envs.errors import NPAError
-from npa_envs.tasks.targets import PointTarget, builtin_targets, load_target, target_from_image
+from npa_envs.tasks.targets.points import (
+    PointTarget,
+    builtin_targets,
+    load_target,
+    target_from_image,
+)
 
 RED, GREEN, BLUE = (255, 0, 0), (0, 160, 0), (0, 0, 255)
 

@@ -5,10 +5,15 @@ import pytest
 import torch
 
 from npa_envs.errors import NPAError
-from npa_envs.tasks import sliced
-from npa_envs.tasks.sliced import FilterDescriptor, PatchDescriptor, SlicedWasserstein, quantiles
-from npa_envs.tasks.texture_losses import TEXTURE_LOSSES, LossOptions, make_texture_loss
-from npa_envs.tasks.textures import load_texture
+from npa_envs.tasks.losses import sliced
+from npa_envs.tasks.losses.sliced import (
+    FilterDescriptor,
+    PatchDescriptor,
+    SlicedWasserstein,
+    quantiles,
+)
+from npa_envs.tasks.losses.texture import TEXTURE_LOSSES, LossOptions, make_texture_loss
+from npa_envs.tasks.targets.textures import load_texture
 
 SLICED = ("patch_swd", "filter_swd")
 

@@ -10,9 +10,8 @@ from npa_envs.cli import main
 from npa_envs.errors import NPAError
 from npa_envs.evaluation import evaluate
 from npa_envs.rule.files import load_rule
-from npa_envs.tasks.texture import Texture, colour_image, density_image
-from npa_envs.tasks.texture_config import TextureConfig
-from npa_envs.tasks.textures import load_texture
+from npa_envs.tasks.targets.textures import load_texture
+from npa_envs.tasks.texture import Texture, TextureConfig, colour_image, density_image
 from npa_envs.training import JsonlLog, Trainer, preset, train
 from npa_envs.world.randomness import WorldRandom
 

@@ -6,10 +6,17 @@ import pytest
 import torch
 
 from npa_envs.errors import NPAError
-from npa_envs.tasks.optimal_transport import LAYERS, moment_distance, relaxed_transport
-from npa_envs.tasks.texture_losses import LossOptions, make_texture_loss
-from npa_envs.tasks.textures import load_texture
-from npa_envs.tasks.vgg import WEIGHTS_FILE, WIDTHS, VGGFeatures, load_vgg_weights
+from npa_envs.tasks.losses.optimal_transport import (
+    LAYERS,
+    WEIGHTS_FILE,
+    WIDTHS,
+    VGGFeatures,
+    load_vgg_weights,
+    moment_distance,
+    relaxed_transport,
+)
+from npa_envs.tasks.losses.texture import LossOptions, make_texture_loss
+from npa_envs.tasks.targets.textures import load_texture
 
 
 def random_weights():

@@ -6,8 +6,7 @@ import torch
 from PIL import Image
 
 from npa_envs.errors import NPAError
-from npa_envs.tasks.patterns import PATTERNS, draw_pattern
-from npa_envs.tasks.textures import builtin_textures, load_texture
+from npa_envs.tasks.targets.textures import PATTERNS, builtin_textures, draw_pattern, load_texture
 
 
 def roughness(picture, dim):

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from npa_envs.errors import NPAError
-from npa_envs.tasks.morphogenesis2d_config import Morphogenesis2DConfig
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
 from npa_envs.training import (
     TASKS,
     TrainConfig,

@@ -13,18 +13,19 @@ from PIL import Image
 
 from npa_envs.errors import MissingDependencyError, NPAError
 from npa_envs.ops import Cameras, orbit
-from npa_envs.tasks.meshes import (
+from npa_envs.tasks.losses.ms_ssim import MultiScaleSimilarity
+from npa_envs.tasks.morphogenesis3d import ViewSchedule, blurred
+from npa_envs.tasks.targets.meshes import (
+    AMBIENT,
     MESHES,
     RADIUS,
     Mesh,
     builtin_meshes,
+    draw_mesh,
     ellipsoid,
     load_mesh,
 )
-from npa_envs.tasks.raster import AMBIENT, draw_mesh
-from npa_envs.tasks.structure import MultiScaleSimilarity
-from npa_envs.tasks.view_schedule import ViewSchedule, blurred
-from npa_envs.tasks.views import ANGLE, DISTANCE, load_views, surrounding_cameras
+from npa_envs.tasks.targets.views import ANGLE, DISTANCE, load_views, surrounding_cameras
 
 
 def ball(radius=0.5, colour=(0.2, 0.6, 1.0)):

@@ -26,7 +26,7 @@ KEY_RANGE = -(2**63), 2**63 - 1
 class EpisodeTask:
     """Worlds as a problem's episodes start, and their loss; worlds move by the problem's physics.
 
-    It is a `npa_envs.tasks.task.Task` as far as the training cycle asks for one.
+    It is a `npa_envs.tasks.base.Task` as far as the training cycle asks for one.
 
     Args:
         problem: The environment.

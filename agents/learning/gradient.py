@@ -12,8 +12,8 @@ from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Progress, annealed
 from npa_envs.agents.learning.rules import RuleSet, starting_rules
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.task import Task
-from npa_envs.training.config import TrainConfig
+from npa_envs.tasks.base import Task
+from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.cycle import TrainingCycle
 from npa_envs.world.rollout import Memory
 

@@ -9,8 +9,7 @@ from torch import Tensor
 
 from npa_envs.envs.species.config import SpeciesConfig
 from npa_envs.tasks.checks import check_non_negative, check_positive
-from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
-from npa_envs.tasks.morphogenesis2d_config import Morphogenesis2DConfig
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,8 +12,7 @@ from torch import Tensor
 
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
-from npa_envs.tasks.morphogenesis2d_config import Morphogenesis2DConfig
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.world.rollout import rollout
 
 SQUARE_HALF_WIDTH = 0.7

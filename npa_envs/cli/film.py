@@ -29,7 +29,7 @@ from npa_envs.tasks.damage import DamageEvent, damage_worlds
 from npa_envs.world.rollout import rollout
 
 if TYPE_CHECKING:
-    from npa_envs.tasks.task import PictureTask, ViewTask
+    from npa_envs.tasks.base import PictureTask, ViewTask
 
 EARLY_STEPS = (0, 16, 32, 64, 128)
 """Steps that a filmstrip shows, or the frames nearest to them: most of the growth is there."""

@@ -9,8 +9,8 @@ from typing import Any, TypeVar
 import tyro
 
 from npa_envs.errors import NPAError
-from npa_envs.tasks.co_morphogenesis2d_config import CoMorphogenesis2DConfig
-from npa_envs.tasks.morphogenesis2d_config import Morphogenesis2DConfig
+from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
 from npa_envs.training import JointTrainConfig
 
 LaunchT = TypeVar("LaunchT")

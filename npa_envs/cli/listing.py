@@ -26,8 +26,8 @@ def main(arguments: Sequence[str]) -> int:
     from npa_envs.registration import ENVIRONMENTS
     from npa_envs.rule.files import load_rule, shipped_rules
     from npa_envs.scores import score_line, scores
-    from npa_envs.tasks.digits import BUILT_IN
-    from npa_envs.tasks.texture_losses import TEXTURE_LOSSES
+    from npa_envs.tasks.losses.texture import TEXTURE_LOSSES
+    from npa_envs.tasks.targets.clouds import BUILT_IN
     from npa_envs.training import TASKS
 
     print("tasks (npa-envs train TASK --preset PRESET)")

@@ -127,10 +127,9 @@ def run(options: RolloutOptions) -> int:
     from npa_envs.cli.progress import StepBar
     from npa_envs.evaluation import measure
     from npa_envs.rule.files import load_rule
+    from npa_envs.tasks.base import ViewTask, seed_worlds, task_toward
     from npa_envs.tasks.damage import parse_damage
-    from npa_envs.tasks.point_classification import PointClassification
-    from npa_envs.tasks.task import ViewTask, seed_worlds, task_toward
-    from npa_envs.tasks.votes import majority
+    from npa_envs.tasks.point_classification import PointClassification, majority
     from npa_envs.trained_tasks import task_of_rule
     from npa_envs.training import check_device
     from npa_envs.training.interrupt import stop_flag

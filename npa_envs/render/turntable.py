@@ -12,7 +12,7 @@ from torch import Tensor
 from npa_envs.ops import Cameras, orbit
 from npa_envs.ops.checks import checked_count, checked_finite
 from npa_envs.render.picture import Background, to_uint8
-from npa_envs.tasks.views import ANGLE, DISTANCE
+from npa_envs.tasks.targets.views import ANGLE, DISTANCE
 
 
 def turntable_frames(

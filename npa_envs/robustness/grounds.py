@@ -14,12 +14,11 @@ from npa_envs.robustness.shapes import SHAPES
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.stress.habitats import SMALLEST_VIEWS, Habitat, LongRun, task_name
+from npa_envs.tasks.base import Task, seed_worlds, task_for_rule, task_toward
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D
-from npa_envs.tasks.point_classification import PointClassification
-from npa_envs.tasks.task import Task, seed_worlds, task_for_rule, task_toward
+from npa_envs.tasks.point_classification import PointClassification, particle_classes
 from npa_envs.tasks.texture import Texture
-from npa_envs.tasks.votes import particle_classes
 from npa_envs.trained_tasks import task_of_rule
 from npa_envs.world.randomness import Purpose, WorldRandom
 

@@ -1,15 +1,74 @@
-"""2D morphogenesis of several species in one world, each beside the others."""
+"""What 2D morphogenesis of several species can be told."""
 
 from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.co_morphogenesis2d_config import CoMorphogenesis2DConfig
-from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
+from npa_envs.tasks.checks import check_non_negative
+from npa_envs.tasks.morphogenesis2d import (
+    MORPHOGENESIS2D_PRESETS,
+    Morphogenesis2D,
+    Morphogenesis2DConfig,
+    Morphogenesis2DTrainConfig,
+)
+from npa_envs.tasks.train_config import JointTrainConfig
 from npa_envs.world.randomness import Randomness
+
+
+@dataclass(frozen=True, kw_only=True)
+class CoMorphogenesis2DConfig:
+    """Several pictures that grow in one world, each by a rule of its own."""
+
+    species: tuple[Morphogenesis2DConfig, ...] = (
+        Morphogenesis2DConfig(),
+        Morphogenesis2DConfig(target="heart"),
+    )
+    """What each species grows, and of how many particles. All have the same eps, update_prob and
+    state_dim."""
+
+    distance: float = 0.0
+    """Distance between the centres of neighbouring seeds, which lie in a row [length units]."""
+
+    def __post_init__(self) -> None:
+        """Check every field.
+
+        Raises:
+            NPAError: There are fewer than two species, they do not agree, or the distance is wrong.
+        """
+        species = self.species if isinstance(self.species, tuple | list) else ()
+        if len(species) < 2 or not all(isinstance(s, Morphogenesis2DConfig) for s in species):
+            came = ", ".join(type(config).__name__ for config in species) or "nothing"
+            raise NPAError(
+                f"species must hold two Morphogenesis2DConfig or more, got {came}: one for each "
+                "species"
+            )
+        for name in ("eps", "update_prob", "state_dim"):
+            values = [getattr(config, name) for config in species]
+            if len(set(values)) > 1:
+                raise NPAError(f"species must agree in {name}, got {values}: change one of them")
+        check_non_negative(self, "distance")
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """Particles of each species."""
+        return tuple(config.particle_count for config in self.species)
+
+    @property
+    def centres(self) -> tuple[float, ...]:
+        """First coordinate of each seed's centre [length units]; their mean is 0."""
+        middle = 0.5 * (len(self.species) - 1)
+        return tuple(self.distance * (k - middle) for k in range(len(self.species)))
+
+
+# 2D morphogenesis of several species in one world, each beside the others.
 
 
 class CoMorphogenesis2D:
@@ -131,3 +190,26 @@ class CoMorphogenesis2D:
     def _split(self, *tensors: Tensor) -> list[tuple[Tensor, ...]]:
         """Return each tensor's parts, species by species."""
         return [torch.split(tensor, list(self.config.counts), dim=1) for tensor in tensors]
+
+
+# Presets of 2D morphogenesis of two species that are trained together.
+
+
+DISTANCE = 0.8
+"""Distance between the seeds' centres in every preset [length units]: the pictures overlap."""
+
+
+def _beside(
+    alone: Morphogenesis2DTrainConfig, neighbour: str
+) -> JointTrainConfig[CoMorphogenesis2DConfig]:
+    """Return a run of one species, with another one of the same kind beside it."""
+    species = (alone.task, dataclasses.replace(alone.task, target=neighbour))
+    run = {field.name: getattr(alone, field.name) for field in dataclasses.fields(alone)}
+    run["task"] = CoMorphogenesis2DConfig(species=species, distance=DISTANCE)
+    return JointTrainConfig(**run | {"out": Path("runs/co_morphogenesis2d")})
+
+
+CO_MORPHOGENESIS2D_PRESETS: Mapping[str, JointTrainConfig[CoMorphogenesis2DConfig]] = {
+    name: _beside(alone, "heart") for name, alone in MORPHOGENESIS2D_PRESETS.items()
+}
+"""Each preset of 2D morphogenesis, with as many particles of a second species: same schedule."""

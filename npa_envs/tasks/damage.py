@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -16,7 +17,14 @@ from npa_envs.errors import NPAError, suggest
 from npa_envs.ops import world_mean
 from npa_envs.ops.checks import DTYPES, check_dense, checked_number
 from npa_envs.tasks.checks import is_real, is_whole
-from npa_envs.world.randomness import Randomness, WorldRandom, check_generator, normal_draws
+from npa_envs.tasks.seeds import uniform_ball
+from npa_envs.world.randomness import (
+    Randomness,
+    WorldRandom,
+    check_generator,
+    normal_draws,
+    uniform_draws,
+)
 
 DAMAGE_SIZES = {"erase": 0.2, "cut": 0.1, "clump": 0.2, "noise": 0.05}
 """Kinds of damage with their usual size: radius, gap, radius, standard deviation [length units]."""
@@ -306,3 +314,146 @@ def _check_vector(name: str, vector: Tensor, x: Tensor) -> None:
             f"{name} must be {x.dtype} on {x.device} like x, got {vector.dtype} on "
             f"{vector.device}: convert it with {name}.to(x)"
         )
+
+
+# Particles that have lost the others: they see nobody, so nothing says where to stay.
+#
+# A rule that was trained in whole worlds alone may let a lone particle walk on for ever, too
+# slowly to be seen in a picture. Throwing some out, and counting how far they walk, teaches it to
+# rest.
+
+
+NEAREST, FARTHEST = 2.0, 4.0
+"""Distances from the origin between which particles are thrown [length units]."""
+
+
+def scatter(x: Tensor, *, share: float, generator: Randomness | None = None) -> Tensor:
+    """Return the positions with some particles thrown out, far from the others, on all sides.
+
+    Nothing waits for the device.
+
+    Args:
+        x: Particle positions [length units], shape [B, N, D].
+        share: Probability of each particle to be thrown out (dimensionless).
+        generator: Source of randomness, on the device of `x`; a `WorldRandom` of B worlds throws in
+            each world what it would throw alone.
+
+    Raises:
+        NPAError: The generator is on another device or for another number of worlds.
+    """
+    world_count, particle_count, space_dim = x.shape
+    check_generator(generator, x.device, world_count)
+    chance = uniform_draws(generator, (world_count, particle_count, 1), x)
+    ball = uniform_ball(
+        world_count, particle_count, space_dim, 1.0,
+        generator=generator, device=x.device, dtype=x.dtype,
+    )  # fmt: skip
+    return torch.where(chance < share, _outside(ball), x)
+
+
+def tear(x: Tensor, *, radius: float, chance: float, generator: Randomness | None = None) -> Tensor:
+    """Return the positions with a flake of some worlds torn off and thrown out, as a whole.
+
+    Particles that leave together see each other, and may walk on where a lone one has learned to
+    rest. Nothing waits for the device.
+
+    Args:
+        x: Particle positions [length units], shape [B, N, D].
+        radius: Flakes are disks (balls in 3D) around random particles, of any radius up to this
+            [length units].
+        chance: Probability of a world to lose one (dimensionless).
+        generator: Source of randomness, as for `scatter`.
+
+    Raises:
+        NPAError: The generator is on another device or for another number of worlds.
+    """
+    world_count, _, space_dim = x.shape
+    centre = random_particle(x, generator)
+    draws = uniform_draws(generator, (world_count, 2), x)
+    reach = torch.where(draws[:, :1] < chance, radius * draws[:, 1:], -1.0)
+    place = uniform_ball(
+        world_count, 1, space_dim, 1.0, generator=generator, device=x.device, dtype=x.dtype
+    )[:, 0]
+    torn = (x - centre[:, None]).norm(dim=-1) <= reach
+    return torch.where(torn[..., None], x + (_outside(place) - centre)[:, None], x)
+
+
+def _outside(ball: Tensor) -> Tensor:
+    """Return places between `NEAREST` and `FARTHEST` for places in the unit ball, [..., D]."""
+    length: Tensor = ball.norm(dim=-1, keepdim=True)
+    return ball * ((NEAREST + (FARTHEST - NEAREST) * length) / length.clamp_min(1e-12))
+
+
+def stray_motion(x: Tensor, path_length: Tensor) -> Tensor:
+    """Return how far particles travelled that are outside of [-1, 1]^D, mean [length units], [].
+
+    It is 0 where there are none.
+
+    Args:
+        x: Particle positions [length units], shape [B, N, D].
+        path_length: How far each particle travelled [length units], shape [B, N].
+    """
+    outside = (x.detach().abs().amax(dim=-1) > 1.0).to(x.dtype)
+    return (outside * path_length).sum() / outside.sum().clamp_min(1.0)
+
+
+# What is done to worlds of the pool before a rollout, so that a rule learns to heal it.
+
+
+SHARE = 0.25
+"""Share of the worlds that are clumped, that are cut, that lose a flake (dimensionless)."""
+
+
+class PoolDamage(Protocol):
+    """What a task's configuration says of it; 0 is none."""
+
+    @property
+    def damage_radius(self) -> float:
+        """Radius of the ball whose states become zero, in every world [length units]."""
+
+    @property
+    def clump_radius(self) -> float:
+        """Radius of the ball whose particles are pulled to one point [length units]."""
+
+    @property
+    def cut_gap(self) -> float:
+        """Width of the slit through the middle [length units]."""
+
+    @property
+    def flake_radius(self) -> float:
+        """Largest radius of the flake that is torn off and thrown out [length units]."""
+
+    @property
+    def stray_share(self) -> float:
+        """Probability of each particle to be thrown out (dimensionless)."""
+
+
+def hurt(
+    x: Tensor, s: Tensor, damage: PoolDamage, *, generator: Randomness
+) -> tuple[Tensor, Tensor]:
+    """Return worlds that are damaged at random places; nothing waits for the device.
+
+    Args:
+        x: Particle positions [length units], shape [B, N, D].
+        s: Particle states (dimensionless), shape [B, N, C].
+        damage: What is done.
+        generator: Source of randomness, on the device of `x`; a `WorldRandom` of B worlds does to
+            each world what it would do to it alone.
+    """
+    if damage.damage_radius > 0.0:
+        centre = random_particle(x, generator)
+        s = erase_state(x, s, centre=centre, radius=damage.damage_radius)
+    if damage.clump_radius > 0.0:
+        centre = random_particle(x, generator)
+        hit = (uniform_draws(generator, (len(x), 1), x)[:, 0] < SHARE).to(x.dtype)
+        x, s = clump(x, s, centre=centre, radius=damage.clump_radius * hit, factor=1.0)
+    if damage.cut_gap > 0.0:
+        # Directions need not be spread evenly, and of a zero vector nothing is cut.
+        normal = 2.0 * uniform_draws(generator, (len(x), x.shape[2]), x) - 1.0
+        hit = (uniform_draws(generator, (len(x), 1), x)[:, 0] < SHARE).to(x.dtype)
+        x, s = cut(x, s, centre=world_mean(x), normal=normal, gap=damage.cut_gap * hit)
+    if damage.flake_radius > 0.0:
+        x = tear(x, radius=damage.flake_radius, chance=SHARE, generator=generator)
+    if damage.stray_share > 0.0:
+        x = scatter(x, share=damage.stray_share, generator=generator)
+    return x, s

@@ -1,10 +1,13 @@
-"""Self-classifying point clouds: particles that never move agree on what they form."""
+"""What the classification of point clouds can be told: data, variation, world, rule's size."""
 
 from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Self
 
 import torch
@@ -13,12 +16,177 @@ from torch import Tensor
 from npa_envs.errors import NPAError
 from npa_envs.ops import splat, world_mean
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.clouds import PointClouds, drawn_indices, load_clouds, share_of_worlds, varied
-from npa_envs.tasks.digits import Split
-from npa_envs.tasks.point_classification_config import PointClassificationConfig
-from npa_envs.tasks.rules import untrained_rule
-from npa_envs.tasks.votes import class_colours
+from npa_envs.tasks.base import untrained_rule
+from npa_envs.tasks.checks import check_fraction, check_non_negative, check_positive, is_whole
+from npa_envs.tasks.targets.clouds import (
+    PointClouds,
+    Split,
+    drawn_indices,
+    load_clouds,
+    share_of_worlds,
+    varied,
+)
+from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.world.randomness import Randomness
+
+
+@dataclass(frozen=True, kw_only=True)
+class PointClassificationConfig:
+    """Particles that stay where they are agree on what their cloud shows (arXiv 2601.16096).
+
+    The defaults are the paper's, but for the data, which are small. Lengths are in length units;
+    a cloud fills about [0, 1]².
+    """
+
+    data: str = "digits"
+    """The pictures: "digits" (scikit-learn), "mnist" (torchvision), or a folder of IDX files."""
+
+    data_folder: str = "data"
+    """Where torchvision keeps "mnist"."""
+
+    class_count: int = 10
+    """Classes that there are."""
+
+    sample_seed: int = 0
+    """What the places are drawn from that farthest points are chosen among, once."""
+
+    rotation: float = 0.0
+    """Fresh clouds are turned by up to this, either way [degrees]."""
+
+    stretch: float = 0.0
+    """Fresh clouds are stretched and sheared by up to this share (dimensionless)."""
+
+    jitter: float = 0.0
+    """Standard deviation of what is added to fresh clouds' coordinates [length units]."""
+
+    mutated_share: float = 0.0
+    """Share of the worlds from the pool that become other clouds, with their states as they are,
+    where the run has `damage`."""
+
+    particle_count: int = 512
+    """Particles in a world, N: points of a cloud."""
+
+    state_dim: int = 16
+    """State channels of a particle, C."""
+
+    hidden_dim: int = 256
+    """Width of the rule's hidden layer."""
+
+    readout_hidden_dim: int = 256
+    """Width of the hidden layer of the read-out, from states to one number for each class."""
+
+    eps: float = 0.1
+    """Perception radius ε [length units]; the rule is trained at it, so it is also its ε0."""
+
+    update_prob: float = 0.5
+    """Probability p that a particle is updated in a step (dimensionless)."""
+
+    overflow_weight: float = 1.0
+    """Weight of mean |s − clip(s, −1, 1)| (dimensionless)."""
+
+    resolution: int = 128
+    """Pixels on each side of pictures, R."""
+
+    def __post_init__(self) -> None:
+        """Check every field.
+
+        Raises:
+            NPAError: A field has the wrong type or lies outside its range.
+        """
+        for name in ("data", "data_folder"):
+            value = getattr(self, name)
+            if not isinstance(value, str) or not value:
+                raise NPAError(
+                    f"{name} must be a name or a path, got {value!r}: for example {name}='digits'"
+                )
+        if not is_whole(self.sample_seed) or not 0 <= self.sample_seed < 2**63:
+            raise NPAError(
+                f"sample_seed must be a whole number of at least 0 and below 2**63, got "
+                f"{self.sample_seed!r}: for example sample_seed=0"
+            )
+        check_positive(self, int, "particle_count", "state_dim", "hidden_dim", "readout_hidden_dim")
+        check_positive(self, int, "class_count", "resolution", at_least=2)
+        check_positive(self, float, "eps")
+        check_fraction(self, "update_prob")
+        check_non_negative(self, "rotation", "stretch", "jitter", "mutated_share")
+        check_non_negative(self, "overflow_weight")
+        for name in ("stretch", "mutated_share"):
+            if getattr(self, name) > 1.0:
+                raise NPAError(f"{name} must be at most 1, got {getattr(self, name)}: try 0.1")
+
+    def with_particle_count(self, particle_count: int) -> PointClassificationConfig:
+        """Return the same task with another number of particles: clouds are sampled anew."""
+        return replace(self, particle_count=particle_count)
+
+
+# What particles say of their world's class: votes, accuracies, colours.
+
+
+PALETTE = (
+    (0.90, 0.10, 0.29),
+    (0.24, 0.71, 0.29),
+    (1.00, 0.85, 0.10),
+    (0.26, 0.39, 0.85),
+    (0.96, 0.51, 0.19),
+    (0.57, 0.12, 0.71),
+    (0.27, 0.80, 0.85),
+    (0.94, 0.20, 0.90),
+    (0.50, 0.35, 0.14),
+    (0.05, 0.05, 0.05),
+)
+"""Red, green and blue of class 0, 1, ...; classes beyond begin anew."""
+
+UNDECIDED = (0.6, 0.6, 0.6)
+"""Colour of a particle that says nothing."""
+
+
+def particle_classes(outputs: Tensor) -> Tensor:
+    """Return the class that each particle says, int64, shape [B, N].
+
+    Args:
+        outputs: One number for each class, shape [B, N, K].
+    """
+    return outputs.argmax(-1)
+
+
+def majority(outputs: Tensor) -> Tensor:
+    """Return the class that most particles of each world say, int64, shape [B].
+
+    Of several with as many votes it is the one with the larger sum of outputs.
+
+    Args:
+        outputs: One number for each class, shape [B, N, K].
+    """
+    particle_count, class_count = outputs.shape[1:]
+    classes = torch.arange(class_count, device=outputs.device)
+    votes = (particle_classes(outputs)[..., None] == classes).sum(1)
+    sums = outputs.double().sum(1)
+    # Less than one vote, whatever the outputs.
+    tie_breaker = 0.5 * torch.softmax(sums / particle_count, dim=-1)
+    return (votes + tie_breaker).argmax(-1)
+
+
+def class_colours(outputs: Tensor) -> Tensor:
+    """Return each particle's colour, its class's, greyer the less it is sure of it; [B, N, 3].
+
+    Args:
+        outputs: One number for each class, shape [B, N, K]; 1 is sure.
+    """
+    rows = [PALETTE[k % len(PALETTE)] for k in range(outputs.shape[-1])]
+    sure, chosen = outputs.max(-1, keepdim=True)
+    sure = sure.clamp(0.0, 1.0)
+    colours = []
+    for channel, grey in enumerate(UNDECIDED):
+        # Scalar by scalar: a tensor of the palette would be a copy to the device in each picture.
+        colour = torch.zeros_like(sure)
+        for number, row in enumerate(rows):
+            colour = torch.where(chosen == number, row[channel], colour)
+        colours.append(grey + sure * (colour - grey))
+    return torch.cat(colours, dim=-1)
+
+
+# Self-classifying point clouds: particles that never move agree on what they form.
+
 
 SIGMA = 0.7
 """Standard deviation of a particle's splat, in distances between particles (dimensionless)."""
@@ -289,3 +457,75 @@ def channel_mean(values: Tensor) -> Tensor:
     for term in rest:
         total = total + term
     return total / values.shape[-1]
+
+
+# Presets of the classification of point clouds.
+
+
+_OUT = Path("runs/point_classification")
+
+POINT_CLASSIFICATION_PRESETS: Mapping[str, TrainConfig[PointClassificationConfig]] = {
+    "paper": TrainConfig(
+        task=PointClassificationConfig(),
+        iterations=50_000,
+        repeats=1,
+        world_count=64,
+        pool_size=1024,
+        steps=(12, 24),
+        learning_rate=1e-3,
+        weight_decay=0.1,
+        milestones=(20_000, 40_000),
+        seed_interval=1,
+        fresh_share=0.5,
+        out=_OUT,
+    ),
+    # Of clouds never seen 91 % are classified rightly, after some four minutes on one core.
+    "fast": TrainConfig(
+        task=PointClassificationConfig(
+            stretch=0.1,
+            mutated_share=0.25,
+            particle_count=128,
+            hidden_dim=128,
+            readout_hidden_dim=64,
+            eps=0.2,
+            resolution=64,
+        ),
+        iterations=1500,
+        repeats=1,
+        world_count=32,
+        pool_size=256,
+        steps=(12, 20),
+        learning_rate=2e-3,
+        milestones=(1100, 1400),
+        seed_interval=1,
+        fresh_share=0.5,
+        out=_OUT,
+        picture_interval=500,
+        checkpoint_interval=300,
+        tensorboard=False,
+    ),
+    "tiny": TrainConfig(
+        task=PointClassificationConfig(
+            particle_count=64,
+            hidden_dim=32,
+            readout_hidden_dim=32,
+            eps=0.25,
+            resolution=32,
+        ),
+        iterations=60,
+        repeats=1,
+        world_count=8,
+        pool_size=32,
+        steps=(6, 10),
+        learning_rate=5e-3,
+        milestones=(45,),
+        seed_interval=1,
+        fresh_share=0.5,
+        out=_OUT,
+        log_interval=1,
+        picture_interval=20,
+        checkpoint_interval=20,
+        tensorboard=False,
+    ),
+}
+"""Classification of point clouds: `paper` (arXiv 2601.16096), `fast` (on one core), `tiny`."""

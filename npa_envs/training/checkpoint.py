@@ -11,7 +11,7 @@ import torch
 
 from npa_envs.errors import NPAError
 from npa_envs.files import atomic_path
-from npa_envs.training.config import TrainConfig
+from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.overrides import config_to_dict
 
 FORMAT = "npa-envs checkpoint"

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.task import GoalTask, ScheduledTask, Task, seed_worlds, task_for_rule
-from npa_envs.training.config import TrainConfig
+from npa_envs.tasks.base import GoalTask, ScheduledTask, Task, seed_worlds, task_for_rule
+from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.graphs import EagerIteration, GraphedIteration, Rollout
 from npa_envs.training.meter import LossMeter
 from npa_envs.training.optimiser import RuleOptimiser

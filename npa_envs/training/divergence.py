@@ -12,7 +12,7 @@ from torch import nn
 
 from npa_envs.errors import DivergedError
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.task import Task, task_for_rule, task_toward
+from npa_envs.tasks.base import Task, task_for_rule, task_toward
 
 
 def divergence_error(

@@ -9,8 +9,8 @@ from torch import Tensor
 
 import npa_envs.world.rollout
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.task import Task, task_toward
-from npa_envs.training.config import TrainConfig
+from npa_envs.tasks.base import Task, task_toward
+from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.world.cuda_graph import capture
 from npa_envs.world.rollout import Memory
 

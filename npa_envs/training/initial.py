@@ -7,8 +7,8 @@ from typing import Any
 from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.rules import differing_fields
-from npa_envs.training.config import TrainConfig
+from npa_envs.tasks.base import differing_fields
+from npa_envs.tasks.train_config import TrainConfig
 
 
 def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:

@@ -14,11 +14,9 @@ from npa_envs.devices import check_device
 from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule, save_rule
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2D
-from npa_envs.tasks.co_morphogenesis2d_config import CoMorphogenesis2DConfig
-from npa_envs.tasks.rules import differing_fields
-from npa_envs.training.config import TrainConfig
-from npa_envs.training.joint_config import JointTrainConfig
+from npa_envs.tasks.base import differing_fields
+from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2D, CoMorphogenesis2DConfig
+from npa_envs.tasks.train_config import JointTrainConfig, TrainConfig
 from npa_envs.training.trainer import Trainer, TrainResult
 from npa_envs.world.rollout import Memory
 from npa_envs.world.species import rollout_species

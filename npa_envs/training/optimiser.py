@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from npa_envs.training.config import TrainConfig
+from npa_envs.tasks.train_config import TrainConfig
 
 NORM_FLOOR = 1e-8
 """Added to a gradient's norm before it is divided by it: a zero gradient stays zero."""

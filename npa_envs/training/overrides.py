@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from npa_envs.errors import MissingDependencyError, NPAError, suggest
-from npa_envs.training.config import TrainConfig
+from npa_envs.tasks.train_config import TrainConfig
 
 TaskConfigT = TypeVar("TaskConfigT")
 

@@ -9,19 +9,17 @@ from typing import Any, cast
 import torch
 
 from npa_envs.errors import NPAError, suggest
-from npa_envs.tasks.co_morphogenesis2d_config import CoMorphogenesis2DConfig
-from npa_envs.tasks.morphogenesis2d_config import Morphogenesis2DConfig
-from npa_envs.tasks.morphogenesis3d_config import Morphogenesis3DConfig
-from npa_envs.tasks.point_classification_config import PointClassificationConfig
-from npa_envs.tasks.task import PictureTask
-from npa_envs.tasks.texture_config import TextureConfig
-from npa_envs.training.config import TrainConfig
+from npa_envs.tasks.base import PictureTask
+from npa_envs.tasks.co_morphogenesis2d import CO_MORPHOGENESIS2D_PRESETS, CoMorphogenesis2DConfig
+from npa_envs.tasks.morphogenesis2d import MORPHOGENESIS2D_PRESETS, Morphogenesis2DConfig
+from npa_envs.tasks.morphogenesis3d import MORPHOGENESIS3D_PRESETS, Morphogenesis3DConfig
+from npa_envs.tasks.point_classification import (
+    POINT_CLASSIFICATION_PRESETS,
+    PointClassificationConfig,
+)
+from npa_envs.tasks.texture import TEXTURE_PRESETS, TextureConfig
+from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.overrides import override
-from npa_envs.training.presets2d import MORPHOGENESIS2D_PRESETS
-from npa_envs.training.presets3d import MORPHOGENESIS3D_PRESETS
-from npa_envs.training.presets_joint import CO_MORPHOGENESIS2D_PRESETS
-from npa_envs.training.presets_points import POINT_CLASSIFICATION_PRESETS
-from npa_envs.training.presets_texture import TEXTURE_PRESETS
 
 
 @dataclass(frozen=True)
@@ -55,7 +53,7 @@ def _make_morphogenesis2d(config: Morphogenesis2DConfig, device: torch.device) -
 
 
 def _morphogenesis2d_targets() -> tuple[str, ...]:
-    from npa_envs.tasks.targets import builtin_targets
+    from npa_envs.tasks.targets.points import builtin_targets
 
     return builtin_targets()
 
@@ -67,7 +65,7 @@ def _make_texture(config: TextureConfig, device: torch.device) -> PictureTask:
 
 
 def _texture_targets() -> tuple[str, ...]:
-    from npa_envs.tasks.textures import builtin_textures
+    from npa_envs.tasks.targets.textures import builtin_textures
 
     return builtin_textures()
 
@@ -87,7 +85,7 @@ def _make_morphogenesis3d(config: Morphogenesis3DConfig, device: torch.device) -
 
 
 def _morphogenesis3d_targets() -> tuple[str, ...]:
-    from npa_envs.tasks.meshes import builtin_meshes
+    from npa_envs.tasks.targets.meshes import builtin_meshes
 
     return builtin_meshes()
 

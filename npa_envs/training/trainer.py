@@ -16,9 +16,9 @@ from npa_envs.errors import NPAError
 from npa_envs.files import write_text
 from npa_envs.rule.files import save_rule
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.task import Task
+from npa_envs.tasks.base import Task
+from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.checkpoint import check_same_run, load_checkpoint, save_checkpoint
-from npa_envs.training.config import TrainConfig
 from npa_envs.training.cycle import TrainingCycle
 from npa_envs.training.divergence import divergence_error
 from npa_envs.training.folder import JsonlLog, RunFolder, open_tensorboard

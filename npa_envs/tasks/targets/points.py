@@ -13,9 +13,9 @@ from PIL import Image
 from torch import Tensor
 
 from npa_envs.errors import NPAError, suggest
-from npa_envs.tasks.drawings import DRAWINGS
-from npa_envs.tasks.emoji import is_emoji, render_emoji
-from npa_envs.tasks.images import OPAQUE, read_image, require_opaque_pixels, resample
+from npa_envs.tasks.targets.drawings import DRAWINGS
+from npa_envs.tasks.targets.emoji import is_emoji, render_emoji
+from npa_envs.tasks.targets.images import OPAQUE, read_image, require_opaque_pixels, resample
 
 
 @dataclass(frozen=True, eq=False)

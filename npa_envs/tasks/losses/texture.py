@@ -9,8 +9,8 @@ from typing import Protocol
 from torch import Tensor
 
 from npa_envs.errors import NPAError, suggest
-from npa_envs.tasks.optimal_transport import VGGTransport
-from npa_envs.tasks.sliced import FilterDescriptor, PatchDescriptor, SlicedWasserstein
+from npa_envs.tasks.losses.optimal_transport import VGGTransport
+from npa_envs.tasks.losses.sliced import FilterDescriptor, PatchDescriptor, SlicedWasserstein
 
 DEFAULT_LOSS = "patch_swd"
 """The loss that needs nothing but what is here."""

@@ -1,0 +1,1 @@
+"""Losses that compare pictures: textures by several statistics, structure by MS-SSIM."""
