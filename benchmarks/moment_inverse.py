@@ -18,7 +18,7 @@ from torch import Tensor
 
 import npa_envs
 from npa_envs.bench.timing import Sampled, compare
-from npa_envs.trained_tasks import task_of_rule
+from npa_envs.training.trained_tasks import task_of_rule
 
 INVERSES = ("threshold", "smooth")
 SMALL_DETERMINANTS = (1e-3, 1e-2, 1e-1)

@@ -24,7 +24,7 @@ import npa_envs
 from npa_envs.bench.session import relative_error
 from npa_envs.tasks.appearance import RENDERERS
 from npa_envs.tasks.targets.views import some_views
-from npa_envs.trained_tasks import task_of_rule
+from npa_envs.training.trained_tasks import task_of_rule
 from npa_envs.world.cuda_graph import capture
 
 DEVICE = torch.device("cuda")

@@ -19,7 +19,7 @@ import npa_envs
 from npa_envs.render import to_uint8, write_filmstrip
 from npa_envs.rule.files import shipped_rules
 from npa_envs.tasks.targets.views import over
-from npa_envs.trained_tasks import task_of_rule
+from npa_envs.training.trained_tasks import task_of_rule
 
 IMAGES = Path(__file__).resolve().parent / "images"
 SEED = 1_000_000

@@ -82,7 +82,7 @@ LADDER = {
     "npa_envs.diagnostics": rung(8, "torch PIL imageio_ffmpeg", never=INSIDES),
     "npa_envs.api": rung(8, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
     "npa_envs": rung(9, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
-    "npa_envs.trained_tasks": rung(9, "torch", never=INSIDES),
+    "npa_envs.training.trained_tasks": rung(9, "torch", never=INSIDES),
     "npa_envs.stress": rung(10, "torch matplotlib", never=("npa_envs.kernels",)),
     "npa_envs.robustness": rung(
         11, "torch matplotlib", never=("npa_envs.kernels", "npa_envs.reference")

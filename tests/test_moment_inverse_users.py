@@ -12,7 +12,7 @@ from npa_envs import reference as oracle
 from npa_envs.agents import RulePolicy
 from npa_envs.envs import multispecies_v0
 from npa_envs.training import Trainer, load_config
-from npa_envs.training.initial import initial_rule
+from npa_envs.training.trainer import initial_rule
 
 # Rules
 

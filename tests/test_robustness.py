@@ -24,7 +24,7 @@ from npa_envs.robustness.shapes import BLOB_DISTANCE, SHAPES, SIZE_FACTOR, disk
 from npa_envs.robustness.tables import recovered_share, tables
 from npa_envs.rule.files import rule_metadata, shipped_rules
 from npa_envs.stress.habitats import rule_names, task_name
-from npa_envs.trained_tasks import trained_config
+from npa_envs.training.trained_tasks import trained_config
 from npa_envs.world.randomness import WorldRandom
 
 SIDE = 2.0

@@ -13,7 +13,7 @@ from npa_envs.errors import NPAError
 from npa_envs.evaluation import evaluate
 from npa_envs.rule.files import rule_metadata, shipped_rules
 from npa_envs.scores import score_line, scores
-from npa_envs.trained_tasks import task_of_rule
+from npa_envs.training.trained_tasks import task_of_rule
 
 UNSEEN = range(1_000_000, 1_000_001)
 RULES = shipped_rules()

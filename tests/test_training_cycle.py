@@ -10,7 +10,7 @@ from torch.utils._pytree import tree_leaves
 
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
 from npa_envs.training import preset
-from npa_envs.training.cycle import TrainingCycle
+from npa_envs.training.iteration import TrainingCycle
 
 needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 

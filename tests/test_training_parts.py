@@ -13,12 +13,11 @@ from torch import nn
 from npa_envs.devices import check_device, parse_device
 from npa_envs.errors import NPAError
 from npa_envs.training.checkpoint import check_same_run, load_checkpoint, save_checkpoint
-from npa_envs.training.folder import JsonlLog
-from npa_envs.training.graphs import EagerIteration, GraphedIteration
-from npa_envs.training.meter import Interval, LossMeter
+from npa_envs.training.iteration import EagerIteration, GraphedIteration, Interval, LossMeter
 from npa_envs.training.optimiser import RuleOptimiser, clear_non_finite, normalise_gradients
 from npa_envs.training.overrides import config_to_dict
 from npa_envs.training.pool import WorldPool
+from npa_envs.training.run_folder import JsonlLog
 
 
 def make_pool(pool_size=6, particle_count=4, limit=10.0, device="cpu"):

@@ -523,7 +523,7 @@ def test_folder_without_write_permission_is_named_before_training(tmp_path):
 
 def test_disk_without_room_is_noticed_before_training(tmp_path, monkeypatch):
     usage = type("Usage", (), {"free": 100})
-    monkeypatch.setattr("npa_envs.training.folder.shutil.disk_usage", lambda path: usage)
+    monkeypatch.setattr("npa_envs.training.run_folder.shutil.disk_usage", lambda path: usage)
     with pytest.raises(NPAError, match="must have room for two checkpoints"):
         trainer_of(circle_config(tmp_path))
     assert not (tmp_path / "checkpoint.pt").exists()

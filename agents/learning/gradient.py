@@ -14,7 +14,7 @@ from npa_envs.agents.learning.rules import RuleSet, starting_rules
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task
 from npa_envs.tasks.train_config import TrainConfig
-from npa_envs.training.cycle import TrainingCycle
+from npa_envs.training.iteration import TrainingCycle
 from npa_envs.world.rollout import Memory
 
 LONGEST = 96

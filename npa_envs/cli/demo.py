@@ -182,8 +182,8 @@ def grow_and_heal(options: DemoOptions, report: Report) -> None:
     from npa_envs.evaluation import measure
     from npa_envs.rule.files import load_rule
     from npa_envs.tasks.damage import DamageEvent, damage_worlds
-    from npa_envs.trained_tasks import task_of_rule
     from npa_envs.training import check_device
+    from npa_envs.training.trained_tasks import task_of_rule
 
     device = check_device(options.device)
     rule = load_rule(options.rule, device=device).float()

@@ -103,8 +103,8 @@ def run(options: EvaluateOptions) -> int:
     from npa_envs.evaluation import CHECKPOINTS, check_steps, evaluate, healing, table_text
     from npa_envs.rule.files import load_rule
     from npa_envs.tasks.point_classification import PointClassification
-    from npa_envs.trained_tasks import task_of_rule
     from npa_envs.training import check_device
+    from npa_envs.training.trained_tasks import task_of_rule
 
     checkpoints = options.checkpoints or CHECKPOINTS
     check_steps("checkpoints", checkpoints)

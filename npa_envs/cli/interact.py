@@ -151,7 +151,7 @@ def _organisms(
     from npa_envs.interaction import InteractionSettings
     from npa_envs.rule.files import load_rule, shipped_rules
     from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
-    from npa_envs.trained_tasks import task_of_rule
+    from npa_envs.training.trained_tasks import task_of_rule
 
     sources = list(dict.fromkeys(options.rules)) or list(shipped_rules(TASK))
     organisms: list[Organism] = []
@@ -182,7 +182,7 @@ def _organisms(
 
 
 def _task_of(source: str, rule: NPARule, device: torch.device, count: int) -> Any:
-    from npa_envs.trained_tasks import task_of_rule
+    from npa_envs.training.trained_tasks import task_of_rule
 
     return task_of_rule(source, rule, device, particle_count=count).task
 

@@ -130,9 +130,9 @@ def run(options: RolloutOptions) -> int:
     from npa_envs.tasks.base import ViewTask, seed_worlds, task_toward
     from npa_envs.tasks.damage import parse_damage
     from npa_envs.tasks.point_classification import PointClassification, majority
-    from npa_envs.trained_tasks import task_of_rule
     from npa_envs.training import check_device
-    from npa_envs.training.interrupt import stop_flag
+    from npa_envs.training.trained_tasks import task_of_rule
+    from npa_envs.training.trainer import stop_flag
 
     device = check_device(options.device)
     damages = [parse_damage(text) for words in options.damage for text in words]

@@ -21,8 +21,13 @@ from npa_envs.ops.checks import (
     number_tensor,
 )
 from npa_envs.ops.pictures.splat import checked_window
-from npa_envs.render.colours import density_colours, state_colours
-from npa_envs.render.picture import Background, background_colour, to_uint8
+from npa_envs.render.colours import (
+    Background,
+    background_colour,
+    density_colours,
+    state_colours,
+    to_uint8,
+)
 from npa_envs.rule.rule import COLOUR_OFFSET
 
 STYLES = ("particles", "density", "states")

@@ -19,7 +19,7 @@ from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D
 from npa_envs.tasks.point_classification import PointClassification, particle_classes
 from npa_envs.tasks.texture import Texture
-from npa_envs.trained_tasks import task_of_rule
+from npa_envs.training.trained_tasks import task_of_rule
 from npa_envs.world.randomness import Purpose, WorldRandom
 
 SEEN_AT_ONCE = 1 << 17

@@ -13,7 +13,7 @@ from npa_envs.rule.files import load_rule, rule_metadata, shipped_rules
 from npa_envs.rule.rule import NPARule
 from npa_envs.stress.checks import Session
 from npa_envs.tasks.base import Task, seed_worlds, task_toward
-from npa_envs.trained_tasks import task_of_rule, trained_config
+from npa_envs.training.trained_tasks import task_of_rule, trained_config
 from npa_envs.world.cuda_graph import capture
 from npa_envs.world.randomness import Randomness
 from npa_envs.world.rollout import rollout

@@ -9,10 +9,10 @@ from npa_envs.errors import DivergedError
 from npa_envs.tasks.base import PictureTask, Task
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DTrainConfig
 from npa_envs.tasks.train_config import JointTrainConfig, TrainConfig
-from npa_envs.training.folder import JsonlLog, RunFolder
 from npa_envs.training.joint import JointRules, train_together
 from npa_envs.training.overrides import config_to_dict, load_config, override
 from npa_envs.training.presets import TASKS, TaskEntry, preset, task_entry
+from npa_envs.training.run_folder import JsonlLog, RunFolder
 from npa_envs.training.trainer import Trainer, TrainResult
 
 __all__ = [

@@ -1,32 +1,199 @@
-"""The trainer: one iteration after another, and everything that a run leaves behind."""
+"""What the rule of a run is before its first iteration."""
 
 from __future__ import annotations
 
+import copy
 import json
+import math
+import signal
+import sys
+import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
 from tqdm import tqdm
 
 from npa_envs.devices import check_device
-from npa_envs.errors import NPAError
-from npa_envs.files import write_text
-from npa_envs.rule.files import save_rule
+from npa_envs.errors import DivergedError, NPAError
+from npa_envs.files import write_bytes, write_text
+from npa_envs.render.colours import to_uint8
+from npa_envs.render.film import encode_frame
+from npa_envs.rule.files import load_rule, save_rule
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.base import Task
+from npa_envs.tasks.base import Task, differing_fields, task_for_rule, task_toward
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.checkpoint import check_same_run, load_checkpoint, save_checkpoint
-from npa_envs.training.cycle import TrainingCycle
-from npa_envs.training.divergence import divergence_error
-from npa_envs.training.folder import JsonlLog, RunFolder, open_tensorboard
-from npa_envs.training.graphs import Rollout
-from npa_envs.training.initial import initial_rule
-from npa_envs.training.interrupt import stop_flag
+from npa_envs.training.iteration import Rollout, TrainingCycle
 from npa_envs.training.overrides import config_to_dict
-from npa_envs.training.pictures import write_batch_picture
+from npa_envs.training.run_folder import JsonlLog, RunFolder, open_tensorboard
+
+
+def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
+    """Return the rule that a run starts from, with the configuration's `moment_inverse`.
+
+    Args:
+        config: The run's configuration.
+        untrained: The task's own rule, whose shape the rule must have.
+
+    Raises:
+        NPAError: The configuration's rule cannot be loaded, has another shape, or was trained with
+            another `moment_inverse` than the paper's and the configuration's.
+    """
+    untrained.moment_inverse = config.moment_inverse
+    if not config.initial_rule:
+        return untrained
+    source = config.initial_rule
+    rule = load_rule(source)
+    wrong = differing_fields(rule, untrained)
+    if wrong:
+        raise NPAError(
+            f"initial_rule must be a rule of the task's shape, but {source!r} differs in "
+            f"{', '.join(wrong)}: change those fields, or start from another rule"
+        )
+    rule.moment_inverse = config.moment_inverse
+    return rule
+
+
+# Stop between two iterations, not in the middle of one.
+
+
+class StopFlag:
+    """Set once the user (Ctrl-C) or the system (SIGTERM) asks for the end."""
+
+    def __init__(self) -> None:
+        self.requested = False
+        """Whether to stop after the iteration at hand."""
+
+
+@contextmanager
+def stop_flag() -> Iterator[StopFlag]:
+    """Within the block, the first SIGINT or SIGTERM sets the flag; the next one acts as usual.
+
+    In a thread other than the main one, where signals cannot be caught, the flag stays unset.
+    """
+    flag = StopFlag()
+    if threading.current_thread() is not threading.main_thread():
+        yield flag
+        return
+    previous: dict[signal.Signals, Any] = {}
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        flag.requested = True
+        print("\nstopping after this iteration; once more to stop at once", file=sys.stderr)
+        for signal_number, handler in previous.items():
+            signal.signal(signal_number, handler)
+
+    for signal_number in (signal.SIGINT, signal.SIGTERM):
+        previous[signal_number] = signal.signal(signal_number, stop)
+    try:
+        yield flag
+    finally:
+        for signal_number, handler in previous.items():
+            signal.signal(signal_number, handler)
+
+
+# Pictures of a batch.
+
+
+def write_batch_picture(path: Path, picture: Tensor, board: Any, iteration: int) -> None:
+    """Write the worlds of a batch side by side as a PNG, and as a JPEG to TensorBoard.
+
+    Args:
+        path: The file to write.
+        picture: rgb sums and density of each world, shape [B, R, R, 4].
+        board: TensorBoard's writer (`open_tensorboard`), or None.
+        iteration: Iterations done so far.
+
+    Raises:
+        NPAError: The file cannot be written.
+    """
+    frame = np.concatenate(list(to_uint8(picture)), axis=1)
+    write_bytes(path, encode_frame(frame, "PNG"))
+    if board is not None:
+        _add_picture(board, frame, iteration)
+
+
+def _add_picture(board: Any, frame: NDArray[np.uint8], iteration: int) -> None:
+    # Imported late: only runs with TensorBoard need it.
+    from tensorboard.compat.proto.summary_pb2 import Summary
+
+    # The writer's own add_image makes a PNG, and TensorBoard takes a checksum of it in Python, byte
+    # by byte, which holds up the interpreter for longer than all the rest takes.
+    height, width, channels = frame.shape
+    image = Summary.Image(
+        height=height,
+        width=width,
+        colorspace=channels,
+        encoded_image_string=encode_frame(frame, "JPEG"),
+    )
+    summary = Summary(value=[Summary.Value(tag="batch", image=image)])
+    board.file_writer.add_summary(summary, iteration)
+
+
+# The report of a loss that is not finite.
+
+
+def divergence_error(
+    task: Task, rule: NPARule, snapshot: dict[str, Any], diagnosis: Path
+) -> DivergedError:
+    """Return the error that ends a run whose loss is not finite.
+
+    Args:
+        task: The run's task, to find the worlds at fault.
+        rule: The run's rule; its parameters may have changed since.
+        snapshot: `LossMeter.snapshot()`.
+        diagnosis: Where the snapshot was written.
+    """
+    terms = [name for name, value in snapshot["terms"].items() if not math.isfinite(value)]
+    shown = [name for name in terms if name != "loss"] or terms
+    worlds = bad_worlds(task, rule, snapshot)
+    where = f"world{'s' * (len(worlds) > 1)} {', '.join(map(str, worlds))}" if worlds else "no one"
+    return DivergedError(
+        f"the loss must stay finite, but {' and '.join(shown)} was not in iteration "
+        f"{snapshot['iteration']} ({snapshot['steps']} steps, {where} of the batch): lower "
+        f"learning_rate, or use fewer steps; the worlds and the rule are in {str(diagnosis)!r}, "
+        "the last good checkpoint is untouched"
+    )
+
+
+def bad_worlds(task: Task, rule: NPARule, snapshot: dict[str, Any]) -> list[int]:
+    """Return which worlds of the batch alone give a loss that is not finite.
+
+    Args:
+        task: The run's task.
+        rule: The run's rule.
+        snapshot: `LossMeter.snapshot()`, with `x` [B, N, D] and `s` [B, N, C] after the rollout,
+            the `parameters` at that time, and `goal` [B] where the task has goals.
+    """
+    rule = copy.deepcopy(rule).cpu()
+    trained = [parameter for parameter in rule.parameters() if parameter.requires_grad]
+    nn.utils.vector_to_parameters(snapshot["parameters"], trained)
+    task = task_for_rule(task, rule)
+    x, s, goal = snapshot["x"], snapshot["s"], snapshot.get("goal")
+    found = []
+    for world in range(len(x)):
+        one = slice(world, world + 1)
+        finite = bool(torch.isfinite(x[one]).all() and torch.isfinite(s[one]).all())
+        if finite:
+            with torch.no_grad():
+                aimed = task_toward(task, None if goal is None else goal[one])
+                total, parts = aimed.loss(x[one], s[one], torch.zeros_like(x[one][..., 0]))
+            finite = all(bool(torch.isfinite(v).all()) for v in (total, *parts.values()))
+        if not finite:
+            found.append(world)
+    return found
+
+
+# The trainer: one iteration after another, and everything that a run leaves behind.
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,465 @@
+"""Rollout, loss and backward pass of one iteration: run eagerly, or replayed as CUDA graphs."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+import torch
+from torch import Tensor
+
+import npa_envs.world.rollout
+from npa_envs.rule.rule import NPARule
+from npa_envs.tasks.base import (
+    GoalTask,
+    ScheduledTask,
+    Task,
+    seed_worlds,
+    task_for_rule,
+    task_toward,
+)
+from npa_envs.tasks.train_config import TrainConfig
+from npa_envs.training.optimiser import RuleOptimiser
+from npa_envs.training.pool import WorldPool
+from npa_envs.world.cuda_graph import Replayed, capture
+from npa_envs.world.rollout import Memory
+
+WARM_UP_STEPS = 2
+"""Steps of the eager rollout that loads every kernel before the first capture."""
+
+
+class Rollout(Protocol):
+    """`npa_envs.rollout` as the trainer calls it."""
+
+    def __call__(
+        self,
+        rule: NPARule,
+        x: Tensor,
+        s: Tensor,
+        steps: int,
+        /,
+        *,
+        eps: float,
+        box: tuple[float, ...] | None,
+        update_prob: float,
+        memory: Memory,
+        generator: torch.Generator,
+        return_path_length: Literal[True],
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return positions, states and path lengths after `steps` steps."""
+
+
+class EagerIteration:
+    """One iteration up to the gradients, launched kernel by kernel.
+
+    Reads `x0`, `s0`; writes `x`, `s`, `terms` and the `.grad` of every parameter. All of these
+    are the same tensors in every iteration: fill them with `copy_`.
+
+    Args:
+        task: Gives the loss and the world's constants.
+        rule: The rule to differentiate.
+        config: Gives the batch size and the rollout's memory mode.
+        x: Positions of any batch [length units], shape [B, N, D]: shape, dtype and device count.
+        s: States of any batch, shape [B, N, C], likewise.
+        generator: Randomness of the update masks, on the worlds' device.
+        rollout: The rollout to run; another one only in tests.
+        goal: The worlds' goals, int64, shape [B], where the task has such.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        rule: NPARule,
+        config: TrainConfig[Any],
+        x: Tensor,
+        s: Tensor,
+        generator: torch.Generator,
+        rollout: Rollout | None = None,
+        *,
+        goal: Tensor | None = None,
+    ) -> None:
+        self.goal = None if goal is None else goal.clone()
+        """Goals of the worlds, int64, shape [B], or None; filled like `x0`."""
+        task = task_toward(task, self.goal)
+        self.x0, self.s0 = x.clone(), s.clone()
+        """Worlds before the rollout."""
+        self.x, self.s = torch.empty_like(x), torch.empty_like(s)
+        """Worlds after the rollout."""
+        with torch.no_grad():
+            total, parts = task.loss(x, s, torch.zeros_like(x[..., 0]))
+        self.term_names: tuple[str, ...] = ("loss", *parts)
+        """Names of `terms`."""
+        self.terms = total.new_zeros(len(self.term_names))
+        """The loss and then its named parts, shape [K]."""
+        self.parameters = [p for p in rule.parameters() if p.requires_grad]
+        """What the gradients are for."""
+        self._gradients = [torch.zeros_like(p) for p in self.parameters]
+        for parameter, buffer in zip(self.parameters, self._gradients, strict=True):
+            parameter.grad = buffer
+        self._task = task
+        self._rule = rule
+        self._memory = config.memory
+        self._generator = generator
+        self._rollout: Rollout = npa_envs.world.rollout.rollout if rollout is None else rollout
+
+    def aim(self, goal: Tensor) -> None:
+        """Give the worlds their goals, int64, shape [B]."""
+        assert self.goal is not None, "made with goals"
+        self.goal.copy_(goal)
+
+    def run(self, steps: int) -> None:
+        """Run the rollout, the loss and the backward pass.
+
+        Args:
+            steps: Steps of the rollout, T.
+        """
+        self._forward_backward(steps)
+
+    def _forward_backward(self, steps: int) -> None:
+        x, s, path_length = self._rollout(
+            self._rule,
+            self.x0,
+            self.s0,
+            steps,
+            eps=self._task.eps,
+            box=self._task.box,
+            update_prob=self._task.update_prob,
+            memory=self._memory,
+            generator=self._generator,
+            return_path_length=True,
+        )
+        total, parts = self._task.loss(x, s, path_length)
+        # Not backward(): its accumulation nodes remember the stream they were first used on,
+        # which a capture on another stream must not touch.
+        gradients = torch.autograd.grad(
+            total, self.parameters, allow_unused=True, materialize_grads=True
+        )
+        for buffer, gradient in zip(self._gradients, gradients, strict=True):
+            buffer.copy_(gradient)
+        self.terms.copy_(torch.stack([total, *parts.values()]).detach())
+        self.x.copy_(x.detach())
+        self.s.copy_(s.detach())
+
+
+class GraphedIteration(EagerIteration):
+    """The same on CUDA, captured once for every number of steps and replayed from then on.
+
+    Launches of thousands of short kernels would otherwise take longer than the kernels do. All
+    graphs share one memory pool: they never run at the same time, and everything that outlives a
+    replay lies in buffers outside that pool.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._graphs: dict[int, torch.cuda.CUDAGraph] = {}
+        self._memory_pool = torch.cuda.graph_pool_handle()
+
+    def run(self, steps: int) -> None:
+        """Replay the graph for this number of steps, capturing it when it is first asked for.
+
+        Args:
+            steps: Steps of the rollout, T.
+        """
+        with torch.cuda.device(self.x0.device):
+            if steps not in self._graphs:
+                self._graphs[steps] = capture(
+                    lambda: self._forward_backward(steps),
+                    self.x0.device,
+                    pool=self._memory_pool,
+                    generator=self._generator,
+                    warm_up=None if self._graphs else self._warm_up,
+                )
+            self._graphs[steps].replay()
+
+    def _warm_up(self) -> None:
+        """Run eagerly once: load kernels and allocate workspaces, which no capture may do."""
+        # A resumed run warms up again: the masks that follow must not depend on that.
+        state = self._generator.get_state()
+        self._forward_backward(WARM_UP_STEPS)
+        self._generator.set_state(state)
+
+
+# What happened on the device between two log lines, kept there until it is asked for.
+
+
+NONE_YET = -1
+"""Marks that no loss was infinite or NaN so far."""
+
+
+@dataclass(frozen=True)
+class Interval:
+    """What happened between two log lines."""
+
+    means: dict[str, float]
+    """The mean terms by name, the mean `steps`, and how many `replaced_worlds` there were."""
+
+    bad_iteration: int | None
+    """The first iteration of the run whose loss was not finite, or None."""
+
+
+class LossMeter:
+    """Sums of the loss terms, and a snapshot of the first iteration whose loss is not finite.
+
+    `begin`, `observe` and `send` launch kernels and wait for nothing. `observe` can be captured
+    in a CUDA graph: the same tensors are read and written in each iteration.
+
+    Args:
+        iteration: The iteration's buffers.
+    """
+
+    def __init__(self, iteration: EagerIteration) -> None:
+        self._iteration = iteration
+        device = iteration.terms.device
+        # In one tensor, so that one copy brings all to the host. In float64, because a float32 sum
+        # over a long interval would lose digits of the mean; whole numbers are exact in it.
+        numbers = torch.zeros(len(iteration.terms) + 3, dtype=torch.float64, device=device)
+        self._numbers = numbers
+        self._sums, self._replaced, self._bad = numbers[:-3], numbers[-3], numbers[-2:]
+        self._bad[0] = NONE_YET
+        self._now = torch.zeros_like(self._bad)
+        self._snapshot = {name: value.clone() for name, value in self._observed().items()}
+        self._count = 0
+        self._step_sum = 0
+        on_cuda = device.type == "cuda"
+        self._sent = torch.zeros(numbers.shape, dtype=numbers.dtype, pin_memory=on_cuda)
+        self._sent_counts = (0, 0)
+        self._arrival = torch.cuda.Event() if on_cuda else None  # type: ignore[no-untyped-call]
+
+    def begin(self, number: int, steps: int) -> None:
+        """Say which iteration is observed next.
+
+        Args:
+            number: The iteration's number, counted from 1.
+            steps: Steps of its rollout, T.
+        """
+        self._now[0].fill_(number)
+        self._now[1].fill_(steps)
+        self._count += 1
+        self._step_sum += steps
+
+    def observe(self, replaced: Tensor) -> None:
+        """Take note of an iteration, before the optimiser changes the parameters.
+
+        Args:
+            replaced: Which of its worlds left the pool, shape [B], bool.
+        """
+        terms = self._iteration.terms
+        self._sums += terms
+        self._replaced += replaced.sum()
+        # A comparison with NaN is false: one reduction finds both NaN and infinity.
+        finite = torch.linalg.vector_norm(terms, math.inf) < math.inf
+        first = ~finite & (self._bad[0] == NONE_YET)
+        torch.where(first, self._now, self._bad, out=self._bad)
+        for name, value in self._observed().items():
+            torch.where(first, value, self._snapshot[name], out=self._snapshot[name])
+
+    def send(self) -> None:
+        """Let the interval's numbers go to the host, and start the next interval."""
+        self._sent.copy_(self._numbers, non_blocking=True)
+        if self._arrival is not None:
+            self._arrival.record(torch.cuda.current_stream(self._numbers.device))
+        self._sent_counts = self._count, self._step_sum
+        self._numbers[:-2].zero_()
+        self._count = 0
+        self._step_sum = 0
+
+    def receive(self) -> Interval:
+        """Return what `send` sent last; waits for that, and not for what was launched since."""
+        if self._arrival is not None:
+            self._arrival.synchronize()
+        count, step_sum = self._sent_counts
+        count = max(count, 1)
+        means = (self._sent[:-3] / count).tolist()
+        replaced, bad_iteration, _ = map(int, self._sent[-3:].tolist())
+        result = dict(zip(self._iteration.term_names, means, strict=True))
+        result |= {"steps": step_sum / count, "replaced_worlds": replaced}
+        return Interval(result, None if bad_iteration == NONE_YET else bad_iteration)
+
+    def bad_iteration(self) -> int | None:
+        """Return the first iteration whose loss was not finite, or None; waits for the device."""
+        number = int(self._bad[0].item())
+        return None if number == NONE_YET else number
+
+    def snapshot(self) -> dict[str, Any]:
+        """Return what the first iteration with a bad loss saw, on the CPU.
+
+        Returns:
+            `iteration`, `steps`, `terms` (by name), `x0`, `s0` (before the rollout), `x`, `s`
+            (after it), `parameters` (one flat vector), and `goal` where the task has goals.
+        """
+        kept = {name: value.cpu() for name, value in self._snapshot.items()}
+        terms = kept.pop("terms").tolist()
+        iteration, steps = map(int, self._bad.tolist())
+        return {
+            "iteration": iteration,
+            "steps": steps,
+            "terms": dict(zip(self._iteration.term_names, terms, strict=True)),
+            **kept,
+        }
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the open interval, for a checkpoint."""
+        return {
+            "sums": self._sums,
+            "replaced": self._replaced,
+            "count": self._count,
+            "step_sum": self._step_sum,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on with the interval that `state_dict` returned."""
+        self._sums.copy_(state["sums"])
+        self._replaced.copy_(state["replaced"])
+        self._count = state["count"]
+        self._step_sum = state["step_sum"]
+
+    def _observed(self) -> dict[str, Tensor]:
+        iteration = self._iteration
+        goals = {} if iteration.goal is None else {"goal": iteration.goal}
+        return goals | {
+            "terms": iteration.terms,
+            "x0": iteration.x0,
+            "s0": iteration.s0,
+            "x": iteration.x,
+            "s": iteration.s,
+            "parameters": torch.nn.utils.parameters_to_vector(iteration.parameters).detach(),
+        }
+
+
+# One iteration after another: worlds from the pool, rollout, worlds back, optimiser's step.
+
+
+class TrainingCycle:
+    """All that changes while a rule is trained; nothing in it waits for the device.
+
+    Args:
+        task: What to learn.
+        rule: The rule, on the device, in the run's dtype.
+        config: How.
+        device: Where the worlds are.
+        schedule: Randomness of the numbers of steps, on the CPU.
+        rollout: The rollout to train through; None is the engine's.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        rule: NPARule,
+        config: TrainConfig[Any],
+        device: torch.device,
+        schedule: torch.Generator,
+        rollout: Rollout | None = None,
+    ) -> None:
+        self.task = task_for_rule(task, rule)
+        """The task, as it is for worlds of this rule."""
+        self._config = config
+        worlds = torch.Generator(device).manual_seed(config.seed + 1)
+        masks = torch.Generator(device).manual_seed(config.seed + 2)
+        self.generators = {"schedule": schedule, "worlds": worlds, "masks": masks}
+        """Randomness of the steps' numbers, of the worlds, and of the update masks."""
+        x, s, goal = self._seeds(config.pool_size)
+        self.pool = WorldPool(x, s, goal, runaway_limit=config.runaway_limit)
+        """Worlds that live on between batches."""
+        batch = x[: config.world_count], s[: config.world_count]
+        goals = None if goal is None else goal[: config.world_count]
+        graphed = device.type == "cuda" and config.cuda_graph
+        iteration = GraphedIteration if graphed else EagerIteration
+        self.batch = iteration(self.task, rule, config, *batch, masks, rollout, goal=goals)
+        """Worlds before and after the last rollout, the loss and its gradients."""
+        self.optimiser = RuleOptimiser(self.batch.parameters, config)
+        """Changes the rule."""
+        self.meter = LossMeter(self.batch)
+        """What happened since the last line of the log."""
+        self._index = torch.zeros(config.world_count, dtype=torch.int64, device=device)
+        self._fresh_x, self._fresh_s = (torch.empty_like(t) for t in batch)
+        self._fresh_goal = None if goals is None else torch.empty_like(goals)
+        self._draw = Replayed(self._draw_worlds, device, worlds) if graphed else self._draw_worlds
+        self._keep = Replayed(self._keep_worlds, device) if graphed else self._keep_worlds
+
+    def run(self, iteration: int) -> int:
+        """Train for one iteration, and return the steps of its rollout, T.
+
+        Args:
+            iteration: Iterations done so far in the run.
+        """
+        config, batch = self._config, self.batch
+        lo, hi = config.steps
+        steps = int(torch.randint(lo, hi, (), generator=self.generators["schedule"]))
+        if isinstance(self.task, ScheduledTask):
+            self.task.begin(iteration)
+        self._draw()
+        if iteration % config.seed_interval == 0:
+            self._begin_anew(config.fresh_count)
+        batch.run(steps)
+        self.meter.begin(iteration + 1, steps)
+        self._keep()
+        self.optimiser.step(iteration)
+        return steps
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return all that changes but the rule, for a checkpoint."""
+        return {
+            "optimiser": self.optimiser.state_dict(),
+            "pool": {name: tensor for name, tensor in self._pooled() if tensor is not None},
+            "meter": self.meter.state_dict(),
+            "random_states": {name: g.get_state() for name, g in self.generators.items()},
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from what `state_dict` returned; before the first iteration."""
+        self.optimiser.load_state_dict(state["optimiser"])
+        for name, tensor in self._pooled():
+            if tensor is not None:
+                tensor.copy_(state["pool"][name])
+        self.meter.load_state_dict(state["meter"])
+        for name, generator in self.generators.items():
+            generator.set_state(state["random_states"][name])
+
+    @torch.no_grad()
+    def _draw_worlds(self) -> None:
+        """Fill the batch from the pool, and have seeds at hand."""
+        config, worlds = self._config, self.generators["worlds"]
+        self._index.copy_(self.pool.sample(config.world_count, worlds))
+        x0, s0 = self.pool.read(self._index)
+        if isinstance(self.task, GoalTask):
+            goal = self.pool.read_goals(self._index)
+            if config.damage:
+                x0, s0, goal = self.task.damage_with_goals(x0, s0, goal, worlds)
+            self.batch.aim(goal)
+        elif config.damage:
+            x0, s0 = self.task.damage(x0, s0, worlds)
+        self.batch.x0.copy_(x0)
+        self.batch.s0.copy_(s0)
+        # Drawn in every iteration, needed or not: nobody on the host knows which worlds run away.
+        fresh_x, fresh_s, fresh_goal = self._seeds(config.world_count)
+        self._fresh_x.copy_(fresh_x)
+        self._fresh_s.copy_(fresh_s)
+        if self._fresh_goal is not None and fresh_goal is not None:
+            self._fresh_goal.copy_(fresh_goal)
+
+    def _begin_anew(self, count: int) -> None:
+        """Let the first worlds of the batch be fresh seeds."""
+        batch = self.batch
+        batch.x0[:count], batch.s0[:count] = self._fresh_x[:count], self._fresh_s[:count]
+        if batch.goal is not None and self._fresh_goal is not None:
+            batch.goal[:count] = self._fresh_goal[:count]
+
+    @torch.no_grad()
+    def _keep_worlds(self) -> None:
+        """Put the batch back into the pool, and take note of what it came to."""
+        batch = self.batch
+        fresh = self._fresh_x, self._fresh_s
+        replaced = self.pool.write(self._index, batch.x, batch.s, *fresh)
+        if batch.goal is not None and self._fresh_goal is not None:
+            self.pool.write_goals(self._index, batch.goal, self._fresh_goal, replaced)
+        self.meter.observe(replaced)
+        self.optimiser.prepare_gradients()
+
+    def _seeds(self, world_count: int) -> tuple[Tensor, Tensor, Tensor | None]:
+        worlds, dtype = self.generators["worlds"], self._config.torch_dtype
+        x, s, goal = seed_worlds(self.task, world_count, generator=worlds, device=worlds.device)
+        return x.to(dtype), s.to(dtype), goal
+
+    def _pooled(self) -> list[tuple[str, Tensor | None]]:
+        return [("x", self.pool.x), ("s", self.pool.s), ("goal", self.pool.goal)]
