@@ -31,7 +31,7 @@ import torch
 from torch.autograd import DeviceType
 from torch.profiler import ProfilerActivity, profile
 
-from npa_envs.bench.timing import synchronize
+from npa_envs.measure.speed.timing import synchronize
 
 
 class Case(NamedTuple):

@@ -26,9 +26,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from npa_envs.bench.report import script_facts
 from npa_envs.devices import check_device
 from npa_envs.files import write_text
+from npa_envs.measure.speed.report import script_facts
 from npa_envs.render import draw_worlds, write_filmstrip
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 import npa_envs
-from npa_envs.bench.timing import Sampled, compare
+from npa_envs.measure.speed.timing import Sampled, compare
 from npa_envs.training.trained_tasks import task_of_rule
 
 INVERSES = ("threshold", "smooth")

@@ -16,7 +16,7 @@ from typing import Any
 import gymnasium
 import torch
 
-from npa_envs.bench.timing import synchronize
+from npa_envs.measure.speed.timing import synchronize
 
 GYMNASIUM_WORLDS, GYMNASIUM_PARTICLES = 8, 1024
 EPISODE_STEPS = 64

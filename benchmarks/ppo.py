@@ -22,7 +22,7 @@ from npa_envs.agents.learning import Budget, Problem, train
 from npa_envs.agents.learning.ppo import Learner
 from npa_envs.agents.learning.ppo_settings import Settings
 from npa_envs.agents.learning.ppo_worlds import world_bytes
-from npa_envs.bench.report import script_facts
+from npa_envs.measure.speed.report import script_facts
 
 FORMS = ("ppo", "ppo_rows", "ppo_world")
 """Methods of npa_envs.agents.learning; the first is the device's own."""

@@ -27,7 +27,7 @@ from npa_envs.agents import (
     ZeroPolicy,
     evaluate_policy,
 )
-from npa_envs.bench.report import script_facts
+from npa_envs.measure.speed.report import script_facts
 from npa_envs.registration import ENVIRONMENTS
 
 TARGET = "gecko"

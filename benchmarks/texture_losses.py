@@ -19,9 +19,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from npa_envs.bench.report import script_facts
 from npa_envs.errors import NPAError
 from npa_envs.files import write_text
+from npa_envs.measure.speed.report import script_facts
 from npa_envs.render import to_uint8, write_filmstrip
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.losses.texture import TEXTURE_LOSSES

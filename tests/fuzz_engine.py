@@ -15,10 +15,10 @@ from fuzz_values import Target
 from torch import Tensor
 
 import npa_envs
+from npa_envs.measure.quality.scores import scores
 from npa_envs.ops import Cameras, orbit, periodic_splat, render_gaussians, splat
 from npa_envs.ops.pictures.cameras import cameras_of_poses, look_at
 from npa_envs.render import draw_worlds, to_uint8, turntable_frames, write_gif, write_png
-from npa_envs.scores import scores
 from npa_envs.tasks.damage import damage_worlds, parse_damage
 from npa_envs.tasks.seeds import uniform_ball, uniform_box
 

@@ -11,24 +11,29 @@ import pytest
 import torch
 
 from npa_envs import reference
-from npa_envs.bench import ratios, scaling, suites
-from npa_envs.bench.drift import drift_rows
-from npa_envs.bench.explain import Question, explain
-from npa_envs.bench.hash_grid import grid_fields
-from npa_envs.bench.launches import recorded_launches
-from npa_envs.bench.peers import PEERS, peer_rows
-from npa_envs.bench.perception import perception_rows
-from npa_envs.bench.plots import Point, front, pictures
-from npa_envs.bench.precisions import PRECISIONS, MixedRule
-from npa_envs.bench.report import Report
-from npa_envs.bench.rollouts import RolloutRow, composed_step, drawn_mask, mask_source, rollout_rows
-from npa_envs.bench.scaling import scaling_rows, slope_rows, varied
-from npa_envs.bench.session import LeftOut, Session
-from npa_envs.bench.strategies import NEIGHBOUR_CAP, STRATEGIES, nearest
-from npa_envs.bench.throughput import PAPER, aim_rows, throughput_rows
-from npa_envs.bench.timing import Timing, measure
-from npa_envs.bench.workloads import Workload, gecko
 from npa_envs.cli import main
+from npa_envs.measure.speed import ratios, scaling, suites
+from npa_envs.measure.speed.drift import drift_rows
+from npa_envs.measure.speed.explain import Question, explain, recorded_launches
+from npa_envs.measure.speed.hash_grid import grid_fields
+from npa_envs.measure.speed.paper import PAPER, aim_rows, throughput_rows
+from npa_envs.measure.speed.peers import PEERS, peer_rows
+from npa_envs.measure.speed.perception import perception_rows
+from npa_envs.measure.speed.plots import Point, front, pictures
+from npa_envs.measure.speed.precisions import PRECISIONS, MixedRule
+from npa_envs.measure.speed.report import Report
+from npa_envs.measure.speed.rollouts import (
+    RolloutRow,
+    composed_step,
+    drawn_mask,
+    mask_source,
+    rollout_rows,
+)
+from npa_envs.measure.speed.scaling import scaling_rows, slope_rows, varied
+from npa_envs.measure.speed.session import LeftOut, Session
+from npa_envs.measure.speed.strategies import NEIGHBOUR_CAP, STRATEGIES, nearest
+from npa_envs.measure.speed.timing import Timing, measure
+from npa_envs.measure.speed.workloads import Workload, gecko
 from npa_envs.ops import perceive
 from npa_envs.world.rollout import rollout, step
 

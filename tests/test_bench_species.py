@@ -5,11 +5,11 @@ from functools import partial
 
 import torch
 
-from npa_envs.bench import suites
-from npa_envs.bench.session import Session
-from npa_envs.bench.species import roll_one_species
-from npa_envs.bench.timing import compare
-from npa_envs.bench.workloads import Workload
+from npa_envs.measure.speed import suites
+from npa_envs.measure.speed.session import Session
+from npa_envs.measure.speed.skips import roll_one_species
+from npa_envs.measure.speed.timing import compare
+from npa_envs.measure.speed.workloads import Workload
 from npa_envs.world.rollout import rollout
 
 

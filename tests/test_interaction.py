@@ -10,10 +10,18 @@ import torch
 from PIL import Image, ImageDraw
 
 from npa_envs.cli import main
-from npa_envs.encounters import FRAME_SHARES, Encounters, Organism
 from npa_envs.errors import NPAError
-from npa_envs.interaction import MIXED, InteractionRow, InteractionSettings, mixing_index, verdict
-from npa_envs.interaction_plots import heat_map
+from npa_envs.measure.interaction import (
+    FRAME_SHARES,
+    MIXED,
+    Encounters,
+    InteractionRow,
+    InteractionSettings,
+    Organism,
+    heat_map,
+    mixing_index,
+    verdict,
+)
 from npa_envs.rule.files import save_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig

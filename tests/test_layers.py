@@ -50,7 +50,7 @@ LADDER = {
     "npa_envs.rule.rule": rung(3, "torch"),
     "npa_envs.rule": rung(4, "torch", never=INSIDES),
     "npa_envs.rule.files": rung(4, "torch safetensors", never=INSIDES),
-    "npa_envs.scores": rung(5, "", never=INSIDES),
+    "npa_envs.measure.quality.scores": rung(5, "", never=INSIDES),
     "npa_envs.world.divergence": rung(3, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
     "npa_envs.world.actions": rung(4, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
     "npa_envs.world.rollout": rung(4, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
@@ -65,15 +65,13 @@ LADDER = {
         "torch numpy PIL imageio imageio_ffmpeg pygame",
         never=("npa_envs.kernels", "npa_envs.reference"),
     ),
-    "npa_envs.classification": rung(8, "torch", never=INSIDES),
-    "npa_envs.evaluation": rung(7, "torch numpy tqdm", never=INSIDES),
-    "npa_envs.interaction": rung(7, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
-    "npa_envs.encounters": rung(8, "torch numpy", never=INSIDES),
-    "npa_envs.interaction_plots": rung(8, "matplotlib", never=INSIDES),
-    "npa_envs.bench.grid_kernels": rung(2, "warp"),
-    "npa_envs.bench.hash_grid": rung(3, "warp torch", never=("npa_envs.reference",)),
-    "npa_envs.bench.launches": rung(3, "warp"),
-    "npa_envs.bench": rung(
+    "npa_envs.measure.quality.classification": rung(8, "torch", never=INSIDES),
+    "npa_envs.measure.quality.evaluation": rung(7, "torch numpy tqdm", never=INSIDES),
+    "npa_envs.measure.interaction": rung(8, "matplotlib", never=INSIDES),
+    "npa_envs.measure.speed.grid_kernels": rung(2, "warp"),
+    "npa_envs.measure.speed.hash_grid": rung(3, "warp torch", never=("npa_envs.reference",)),
+    "npa_envs.measure.speed.explain": rung(3, "warp"),
+    "npa_envs.measure.speed": rung(
         9, "torch numpy matplotlib scipy warpSPHCore", never=("npa_envs.kernels",)
     ),
     "npa_envs.training": rung(
@@ -83,8 +81,8 @@ LADDER = {
     "npa_envs.api": rung(8, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
     "npa_envs": rung(9, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
     "npa_envs.training.trained_tasks": rung(9, "torch", never=INSIDES),
-    "npa_envs.stress": rung(10, "torch matplotlib", never=("npa_envs.kernels",)),
-    "npa_envs.robustness": rung(
+    "npa_envs.measure.accuracy": rung(10, "torch matplotlib", never=("npa_envs.kernels",)),
+    "npa_envs.measure.robustness": rung(
         11, "torch matplotlib", never=("npa_envs.kernels", "npa_envs.reference")
     ),
     "npa_envs.envs": rung(12, "torch numpy gymnasium pettingzoo", never=INSIDES),
@@ -101,7 +99,7 @@ LADDER = {
         16, "torch numpy tqdm tyro", never=("npa_envs.kernels", "npa_envs.reference")
     ),
 }
-WARP_AND_TORCH = {"npa_envs.ops", "npa_envs.bench.hash_grid"}
+WARP_AND_TORCH = {"npa_envs.ops", "npa_envs.measure.speed.hash_grid"}
 
 
 def source_files() -> list[Path]:

@@ -14,7 +14,7 @@ import torch
 
 from npa_envs.cli import main
 from npa_envs.errors import MissingDependencyError, NPAError
-from npa_envs.evaluation import evaluate, measure
+from npa_envs.measure.quality.evaluation import evaluate, measure
 from npa_envs.ops import orbit
 from npa_envs.render import turntable_frames, write_gaussians, write_points, write_splat
 from npa_envs.rule.files import load_rule

@@ -11,9 +11,15 @@ from small_digits import write_idx
 from test_training_cycle import Recording, assert_same, make_cycle
 
 from npa_envs.agents import RulePolicy
-from npa_envs.classification import _chimera, _cut, _partners, accuracies, changes_of_mind
 from npa_envs.cli import main
 from npa_envs.errors import NPAError
+from npa_envs.measure.quality.classification import (
+    _chimera,
+    _cut,
+    _partners,
+    accuracies,
+    changes_of_mind,
+)
 from npa_envs.rule.files import load_rule
 from npa_envs.tasks.base import task_for_rule
 from npa_envs.tasks.point_classification import (

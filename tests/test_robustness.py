@@ -12,18 +12,22 @@ import torch
 
 from npa_envs.cli import main
 from npa_envs.errors import NPAError
-from npa_envs.robustness.conditions import Response, grow, responses
-from npa_envs.robustness.damages import DAMAGES, STATE_NOISE, wrapped
-from npa_envs.robustness.grounds import Ground, courses
-from npa_envs.robustness.plans import CONDITIONS, PLANS, Plan, quick_plan, trained_value
-from npa_envs.robustness.plots import mark_decades, pictures
-from npa_envs.robustness.ranges import where_it_works, working_range
-from npa_envs.robustness.record import RuleRecord, read_record
-from npa_envs.robustness.recovery import CONTROL, Course, healing, recovery_step
-from npa_envs.robustness.shapes import BLOB_DISTANCE, SHAPES, SIZE_FACTOR, disk
-from npa_envs.robustness.tables import recovered_share, tables
+from npa_envs.measure.accuracy.habitats import rule_names, task_name
+from npa_envs.measure.robustness.conditions import Response, grow, responses
+from npa_envs.measure.robustness.damages import DAMAGES, STATE_NOISE, wrapped
+from npa_envs.measure.robustness.grounds import Ground, courses
+from npa_envs.measure.robustness.plans import CONDITIONS, PLANS, Plan, quick_plan, trained_value
+from npa_envs.measure.robustness.plots import mark_decades, pictures
+from npa_envs.measure.robustness.record import RuleRecord, read_record
+from npa_envs.measure.robustness.recovery import CONTROL, Course, healing, recovery_step
+from npa_envs.measure.robustness.shapes import BLOB_DISTANCE, SHAPES, SIZE_FACTOR, disk
+from npa_envs.measure.robustness.tables import (
+    recovered_share,
+    tables,
+    where_it_works,
+    working_range,
+)
 from npa_envs.rule.files import rule_metadata, shipped_rules
-from npa_envs.stress.habitats import rule_names, task_name
 from npa_envs.training.trained_tasks import trained_config
 from npa_envs.world.randomness import WorldRandom
 
@@ -443,7 +447,9 @@ def test_the_command_measures_writes_and_goes_on(tmp_path, capsys, monkeypatch):
     assert all(math.isfinite(v) for row in held["responses"] for v in row["losses"])
     assert (tmp_path / "robustness.md").read_text() in first
     # Nothing is measured again.
-    monkeypatch.setattr("npa_envs.robustness.study.grow", lambda *_: pytest.fail("measured"))
+    monkeypatch.setattr(
+        "npa_envs.measure.robustness.study.grow", lambda *_: pytest.fail("measured")
+    )
     assert main(words) == 0
     assert capsys.readouterr().out == first
 
@@ -467,7 +473,9 @@ def test_a_stopped_run_goes_on_where_it_was(tmp_path, capsys, monkeypatch):
     assert not part["done"]
     assert part["responses"] == whole["responses"][:3]
     monkeypatch.undo()
-    monkeypatch.setattr("npa_envs.robustness.study.healing", lambda *_: pytest.fail("measured"))
+    monkeypatch.setattr(
+        "npa_envs.measure.robustness.study.healing", lambda *_: pytest.fail("measured")
+    )
     assert "Where rules work" in measured(*words)
     both = json.loads(path.read_text())
     assert both["done"]

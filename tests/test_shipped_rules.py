@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 
 import npa_envs
-from npa_envs.classification import accuracies
 from npa_envs.cli import main
 from npa_envs.errors import NPAError
-from npa_envs.evaluation import evaluate
+from npa_envs.measure.quality.classification import accuracies
+from npa_envs.measure.quality.evaluation import evaluate
+from npa_envs.measure.quality.scores import score_line, scores
 from npa_envs.rule.files import rule_metadata, shipped_rules
-from npa_envs.scores import score_line, scores
 from npa_envs.training.trained_tasks import task_of_rule
 
 UNSEEN = range(1_000_000, 1_000_001)

@@ -13,14 +13,15 @@ import torch
 from npa_envs import reference
 from npa_envs.cli import main
 from npa_envs.errors import NPAError
+from npa_envs.measure.accuracy import endurance, geometry, gradients, precision, suite
+from npa_envs.measure.accuracy import errors as accuracy
+from npa_envs.measure.accuracy.checks import GROUPS, Check, Finding, Session, Skipped
+from npa_envs.measure.accuracy.habitats import habitat
+from npa_envs.measure.accuracy.plots import heat_maps
+from npa_envs.measure.accuracy.record import Entry, Record, in_order, read_record
+from npa_envs.measure.accuracy.scenes import EPS, scenes, threshold_scenes
+from npa_envs.measure.accuracy.suite import chosen_checks, run_check, run_checks
 from npa_envs.rule.rule import NPARule
-from npa_envs.stress import accuracy, endurance, geometry, gradients, precision, suite
-from npa_envs.stress.checks import GROUPS, Check, Finding, Session, Skipped
-from npa_envs.stress.habitats import habitat
-from npa_envs.stress.plots import heat_maps
-from npa_envs.stress.record import Entry, Record, in_order, read_record
-from npa_envs.stress.runner import chosen_checks, run_check, run_checks
-from npa_envs.stress.scenes import EPS, scenes, threshold_scenes
 
 CHECKS = {check.name: check for check in suite.all_checks(quick=True)}
 FACTS = {"device": "cpu", "commit": "0"}

@@ -8,7 +8,7 @@ import torch
 
 from npa_envs.cli import main
 from npa_envs.errors import NPAError
-from npa_envs.evaluation import evaluate
+from npa_envs.measure.quality.evaluation import evaluate
 from npa_envs.rule.files import load_rule
 from npa_envs.tasks.targets.textures import load_texture
 from npa_envs.tasks.texture import Texture, TextureConfig, colour_image, density_image

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from npa_envs.errors import NPAError
-from npa_envs.evaluation import evaluate
+from npa_envs.measure.quality.evaluation import evaluate
 from npa_envs.rule.files import load_rule
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
 from npa_envs.training import JsonlLog, Trainer, preset, train

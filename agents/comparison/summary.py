@@ -12,8 +12,8 @@ from npa_envs.agents.comparison.plan import Plan
 from npa_envs.agents.comparison.plots import pictures
 from npa_envs.agents.comparison.record import RunRecord
 from npa_envs.agents.comparison.tables import as_json, curves, rows, text
-from npa_envs.bench.plots import write_plots
 from npa_envs.files import write_text
+from npa_envs.measure.speed.plots import write_plots
 
 TABLE, FIGURES, CURVES = "comparison.md", "comparison.json", "comparison.csv"
 """Names of the files of the table, and of the curves."""

@@ -16,7 +16,7 @@ from npa_envs.errors import NPAError
 if TYPE_CHECKING:
     import torch
 
-    from npa_envs.bench.report import Report
+    from npa_envs.measure.speed.report import Report
 
 CHECK_FAILED = 1
 
@@ -118,9 +118,9 @@ def run(options: BenchOptions, command: str = "npa-envs bench") -> int:
     Raises:
         NPAError: As for `main`.
     """
-    from npa_envs.bench.ratios import missed_ratios, stored_ratios
-    from npa_envs.bench.suites import suite_of
     from npa_envs.devices import check_device
+    from npa_envs.measure.speed.ratios import missed_ratios, stored_ratios
+    from npa_envs.measure.speed.suites import suite_of
 
     _check(options)
     device = check_device(options.device)
@@ -134,7 +134,7 @@ def run(options: BenchOptions, command: str = "npa-envs bench") -> int:
 
         check_writable(make_folder(options.output))
     if options.plots:
-        from npa_envs.bench.plots import check_matplotlib
+        from npa_envs.measure.speed.plots import check_matplotlib
 
         check_matplotlib()
     stored = {} if options.check is None else stored_ratios(options.check, device)
@@ -174,12 +174,12 @@ def measured_report(options: BenchOptions, device: torch.device, command: str) -
     Raises:
         NPAError: There is no such suite, strategy or precision.
     """
-    from npa_envs.bench.precisions import chosen_precisions
-    from npa_envs.bench.report import Report, current_commit
-    from npa_envs.bench.session import Session
-    from npa_envs.bench.strategies import chosen_strategies
-    from npa_envs.bench.suites import suite_of
     from npa_envs.cli.progress import StepBar
+    from npa_envs.measure.speed.precisions import chosen_precisions
+    from npa_envs.measure.speed.report import Report, current_commit
+    from npa_envs.measure.speed.session import Session
+    from npa_envs.measure.speed.strategies import chosen_strategies
+    from npa_envs.measure.speed.suites import suite_of
 
     name = options.suite or QUICK
     suite = suite_of(name)
@@ -230,7 +230,7 @@ def _write(report: Report, folder: Path, *, plots: bool) -> None:
     write_text(path, report.json())
     print(f"wrote {path}")
     if plots:
-        from npa_envs.bench.plots import pictures
+        from npa_envs.measure.speed.plots import pictures
 
         for name, data in pictures(report).items():
             path = folder / f"{stem}_{name}.png"
@@ -241,8 +241,8 @@ def _write(report: Report, folder: Path, *, plots: bool) -> None:
 def _explanation(options: BenchOptions, device: torch.device) -> str:
     import torch
 
-    from npa_envs.bench.explain import Question, explain
-    from npa_envs.bench.workloads import Workload
+    from npa_envs.measure.speed.explain import Question, explain
+    from npa_envs.measure.speed.workloads import Workload
 
     workload = Workload(
         options.space_dim,

@@ -263,9 +263,9 @@ def _jobs(options: CompareOptions) -> int:
 
 def _settings(options: CompareOptions) -> dict[str, Any]:
     """Return what figures follow from besides problems, budgets and options."""
-    from npa_envs.bench.report import current_commit, machine, versions
     from npa_envs.devices import check_device
     from npa_envs.diagnostics import installed_version
+    from npa_envs.measure.speed.report import current_commit, machine, versions
 
     places = [check_device(name) for name in _devices(options)]
     kinds = {(place.type, machine(place)) for place in places}

@@ -100,7 +100,13 @@ def run(options: EvaluateOptions) -> int:
         NPAError: As for `main`.
     """
     from npa_envs.cli.progress import StepBar
-    from npa_envs.evaluation import CHECKPOINTS, check_steps, evaluate, healing, table_text
+    from npa_envs.measure.quality.evaluation import (
+        CHECKPOINTS,
+        check_steps,
+        evaluate,
+        healing,
+        table_text,
+    )
     from npa_envs.rule.files import load_rule
     from npa_envs.tasks.point_classification import PointClassification
     from npa_envs.training import check_device
@@ -156,9 +162,13 @@ def run(options: EvaluateOptions) -> int:
 
 def _evaluate_clouds(options: EvaluateOptions, rule: NPARule, task: PointClassification) -> int:
     """Measure and print what a rule says of the clouds of a task."""
-    from npa_envs.classification import CLOUD_CHECKPOINTS, accuracies, changes_of_mind
     from npa_envs.cli.progress import StepBar
-    from npa_envs.evaluation import table_text
+    from npa_envs.measure.quality.classification import (
+        CLOUD_CHECKPOINTS,
+        accuracies,
+        changes_of_mind,
+    )
+    from npa_envs.measure.quality.evaluation import table_text
 
     with StepBar(None, show=options.progress) as bar:
         told: dict[str, Any] = {"seed": options.first_seed, "progress": bar.advance}
@@ -173,8 +183,8 @@ def _evaluate_clouds(options: EvaluateOptions, rule: NPARule, task: PointClassif
 
 
 def _write(options: EvaluateOptions, tables: dict[str, Sequence[Any]], measure: str) -> None:
-    from npa_envs.evaluation import tables_json
     from npa_envs.files import write_text
+    from npa_envs.measure.quality.evaluation import tables_json
 
     if options.json is not None:
         write_text(options.json, tables_json(tables, metric=measure))

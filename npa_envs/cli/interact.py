@@ -18,8 +18,7 @@ from npa_envs.errors import MissingDependencyError, NPAError
 if TYPE_CHECKING:
     import torch
 
-    from npa_envs.encounters import Organism
-    from npa_envs.interaction import InteractionRow, InteractionSettings
+    from npa_envs.measure.interaction import InteractionRow, InteractionSettings, Organism
     from npa_envs.rule.rule import NPARule
 
 RESULTS = "interactions.json"
@@ -106,9 +105,9 @@ def run(options: InteractOptions) -> int:
     from npa_envs.cli.folder import make_folder
     from npa_envs.cli.progress import StepBar
     from npa_envs.cli.rollout import check_writable
-    from npa_envs.encounters import Encounters
+    from npa_envs.measure.interaction import Encounters
+    from npa_envs.measure.tables import table_text
     from npa_envs.render import write_filmstrip
-    from npa_envs.render.tables import table_text
     from npa_envs.training import check_device
 
     if options.seed_count < 1:
@@ -147,8 +146,7 @@ def _organisms(
     options: InteractOptions, device: torch.device
 ) -> tuple[list[Organism], InteractionSettings]:
     """Load the rules, with what each grows, and settle how they meet."""
-    from npa_envs.encounters import Organism
-    from npa_envs.interaction import InteractionSettings
+    from npa_envs.measure.interaction import InteractionSettings, Organism
     from npa_envs.rule.files import load_rule, shipped_rules
     from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
     from npa_envs.training.trained_tasks import task_of_rule
@@ -201,7 +199,7 @@ def _told(organisms: Sequence[Organism], settings: InteractionSettings) -> dict[
 
 def _finished(path: Path, told: dict[str, Any]) -> list[InteractionRow]:
     """Return the rows that an earlier run left, if it ran alike."""
-    from npa_envs.interaction import InteractionRow
+    from npa_envs.measure.interaction import InteractionRow
 
     if not path.exists():
         return []
@@ -254,9 +252,9 @@ def _write(path: Path, told: dict[str, Any], rows: Sequence[InteractionRow]) -> 
 
 
 def _draw(path: Path, rows: Sequence[InteractionRow]) -> None:
-    from npa_envs.bench.plots import check_matplotlib
     from npa_envs.files import write_bytes
-    from npa_envs.interaction_plots import heat_map
+    from npa_envs.measure.interaction import heat_map
+    from npa_envs.measure.speed.plots import check_matplotlib
 
     try:
         check_matplotlib()

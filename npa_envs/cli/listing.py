@@ -23,9 +23,9 @@ def main(arguments: Sequence[str]) -> int:
         0.
     """
     tyro.cli(ListOptions, prog="npa-envs list", args=arguments)
+    from npa_envs.measure.quality.scores import score_line, scores
     from npa_envs.registration import ENVIRONMENTS
     from npa_envs.rule.files import load_rule, shipped_rules
-    from npa_envs.scores import score_line, scores
     from npa_envs.tasks.losses.texture import TEXTURE_LOSSES
     from npa_envs.tasks.targets.clouds import BUILT_IN
     from npa_envs.training import TASKS

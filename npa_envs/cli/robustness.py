@@ -18,8 +18,8 @@ from npa_envs.errors import NPAError, suggest
 if TYPE_CHECKING:
     import torch
 
-    from npa_envs.robustness.grounds import Ground
-    from npa_envs.robustness.record import RuleRecord
+    from npa_envs.measure.robustness.grounds import Ground
+    from npa_envs.measure.robustness.record import RuleRecord
 
 QUICK_SEEDS, QUICK_PARTICLES = 2, 256
 """Seeds and particles of a quick run."""
@@ -102,10 +102,10 @@ def run(options: RobustnessOptions, command: str = "") -> int:
     from npa_envs.cli.progress import StepBar
     from npa_envs.cli.rollout import check_writable
     from npa_envs.devices import check_device
-    from npa_envs.robustness.conditions import MOST_PARTICLES
-    from npa_envs.robustness.record import read_record
-    from npa_envs.robustness.study import measure_rule
-    from npa_envs.robustness.tables import tables
+    from npa_envs.measure.robustness.conditions import MOST_PARTICLES
+    from npa_envs.measure.robustness.record import read_record
+    from npa_envs.measure.robustness.study import measure_rule
+    from npa_envs.measure.robustness.tables import tables
 
     for name, least in {
         "seed_count": 1,
@@ -174,7 +174,7 @@ def _keep(path: Path | None, record: RuleRecord) -> None:
 
 
 def _chosen(names: Sequence[str]) -> list[str]:
-    from npa_envs.stress.habitats import rule_names
+    from npa_envs.measure.accuracy.habitats import rule_names
 
     known = rule_names()
     for name in names:
@@ -189,9 +189,9 @@ def _seeds(options: RobustnessOptions) -> range:
 
 
 def _ground(options: RobustnessOptions, name: str, device: torch.device) -> Ground:
-    from npa_envs.robustness.grounds import Ground
-    from npa_envs.robustness.plans import PLANS, quick_plan
-    from npa_envs.stress.habitats import task_name
+    from npa_envs.measure.accuracy.habitats import task_name
+    from npa_envs.measure.robustness.grounds import Ground
+    from npa_envs.measure.robustness.plans import PLANS, quick_plan
 
     task = task_name(name)
     plan = quick_plan(task) if options.quick else PLANS[task]
@@ -201,7 +201,7 @@ def _ground(options: RobustnessOptions, name: str, device: torch.device) -> Grou
 
 def _facts(options: RobustnessOptions, device: torch.device, most: int) -> dict[str, Any]:
     """Return what figures follow from."""
-    from npa_envs.bench.report import current_commit, machine, versions
+    from npa_envs.measure.speed.report import current_commit, machine, versions
 
     return {
         "device": device.type,
@@ -216,9 +216,9 @@ def _facts(options: RobustnessOptions, device: torch.device, most: int) -> dict[
 
 def _write(folder: Path, text: str, records: Sequence[RuleRecord]) -> list[str]:
     """Write the tables and, where matplotlib is installed, the curves; return what was done."""
-    from npa_envs.bench.plots import write_plots
     from npa_envs.files import write_text
-    from npa_envs.robustness.plots import pictures
+    from npa_envs.measure.robustness.plots import pictures
+    from npa_envs.measure.speed.plots import write_plots
 
     write_text(folder / "robustness.md", text)
     done = [f"wrote {folder}: robustness.md and a record for each rule"]

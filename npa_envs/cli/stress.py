@@ -14,8 +14,8 @@ from npa_envs.errors import NPAError
 if TYPE_CHECKING:
     import torch
 
-    from npa_envs.stress.checks import Check
-    from npa_envs.stress.record import Record
+    from npa_envs.measure.accuracy.checks import Check
+    from npa_envs.measure.accuracy.record import Record
 
 FAILED = 1
 
@@ -89,10 +89,9 @@ def run(options: StressOptions) -> int:
     from npa_envs.cli.bench import torch_threads
     from npa_envs.cli.progress import StepBar
     from npa_envs.devices import check_device
-    from npa_envs.stress.checks import Session
-    from npa_envs.stress.record import Record, in_order, read_record
-    from npa_envs.stress.runner import chosen_checks, run_checks
-    from npa_envs.stress.suite import all_checks
+    from npa_envs.measure.accuracy.checks import Session
+    from npa_envs.measure.accuracy.record import Record, in_order, read_record
+    from npa_envs.measure.accuracy.suite import all_checks, chosen_checks, run_checks
 
     if options.max_seconds is not None and not options.max_seconds > 0.0:
         raise NPAError(
@@ -139,7 +138,7 @@ def run(options: StressOptions) -> int:
 
 
 def _listing(checks: Sequence[Check]) -> str:
-    from npa_envs.stress.checks import GROUPS
+    from npa_envs.measure.accuracy.checks import GROUPS
 
     lines = []
     for group, summary in GROUPS.items():
@@ -151,7 +150,7 @@ def _listing(checks: Sequence[Check]) -> str:
 
 def _facts(options: StressOptions, device: torch.device) -> dict[str, Any]:
     """Return what figures follow from."""
-    from npa_envs.bench.report import current_commit, machine, versions
+    from npa_envs.measure.speed.report import current_commit, machine, versions
 
     return {
         "device": device.type,
@@ -176,8 +175,8 @@ def _path(options: StressOptions, device: torch.device) -> Path | None:
 
 def _draw(path: Path, record: Record) -> None:
     """Draw heat maps beside the record, where matplotlib is installed."""
-    from npa_envs.bench.plots import write_plots
-    from npa_envs.stress.plots import heat_maps
+    from npa_envs.measure.accuracy.plots import heat_maps
+    from npa_envs.measure.speed.plots import write_plots
 
     maps = path.with_name(f"{path.stem}_*.png")
     for line in write_plots(lambda: heat_maps(record), maps, "heat maps"):

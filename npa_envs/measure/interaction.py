@@ -1,0 +1,431 @@
+"""What trained rules do to each other, in numbers: what is measured, and what it is called.
+
+Independently trained rules can share a world (arXiv 2601.16096). Whether one disrupts another is
+measured by the other's own task, on its own particles, against the same seeds grown alone.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from npa_envs.errors import NPAError
+from npa_envs.ops import species_fields
+from npa_envs.render import draw_worlds
+from npa_envs.rule.rule import NPARule
+from npa_envs.tasks.base import PictureTask
+from npa_envs.world.randomness import Purpose, WorldRandom
+from npa_envs.world.species import rollout_species
+
+MARGIN = 0.2
+"""A loss that changes by less than this share of itself counts as undisturbed."""
+
+MIXED = 0.25
+"""Mixing index from which on two species mix (dimensionless)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class InteractionSettings:
+    """How rules are brought together."""
+
+    particle_count: int
+    """Particles of a world with two species, N."""
+
+    distances: tuple[float, ...] = (0.0, 0.5, 1.0)
+    """Distances between the centres of the two seeds [length units]."""
+
+    ratios: tuple[float, ...] = (0.5,)
+    """Shares of the particles that are of the measured species, in (0, 1)."""
+
+    steps: int = 512
+    """Steps from the seeds."""
+
+    seeds: tuple[int, ...] = tuple(range(8))
+    """One number for each world; the same numbers give the same table."""
+
+    update_prob: float | None = None
+    """Probability of each particle's update in a step; None: of each species as trained."""
+
+    margin: float = MARGIN
+    """Share by which a loss must change to count as changed, in (0, 1)."""
+
+    def __post_init__(self) -> None:
+        """Check every field.
+
+        Raises:
+            NPAError: A field lies outside its range.
+        """
+        for name, count, least in (
+            ("particle_count", self.particle_count, 2),
+            ("steps", self.steps, 1),
+            ("seed count", len(self.seeds), 1),
+        ):
+            if count < least:
+                raise NPAError(f"{name} must be at least {least}, got {count}")
+        if not self.distances or not all(0.0 <= d < math.inf for d in self.distances):
+            raise NPAError(
+                f"distances must be finite and not negative, got {self.distances}: try 0 0.5 1"
+            )
+        for name, shares in (("ratios", self.ratios), ("margin", (self.margin,))):
+            if not shares or not all(0.0 < share < 1.0 for share in shares):
+                raise NPAError(f"{name} must lie in (0, 1), got {shares}")
+        if self.update_prob is not None and not 0.0 < self.update_prob <= 1.0:
+            raise NPAError(f"update_prob must lie in (0, 1], got {self.update_prob}")
+
+    def counts(self, ratio: float) -> tuple[int, int]:
+        """Return the particles of the measured species and of the one beside it."""
+        own = min(max(round(ratio * self.particle_count), 1), self.particle_count - 1)
+        return own, self.particle_count - own
+
+
+@dataclass(frozen=True)
+class InteractionRow:
+    """One rule, grown beside another."""
+
+    rule: str
+    """The rule that is measured, A."""
+
+    beside: str
+    """The rule beside it, B."""
+
+    distance: float
+    """Distance between the centres of their seeds [length units]."""
+
+    ratio: float
+    """A's share of the particles (dimensionless)."""
+
+    alone: float
+    """A's task metric where it grows alone, mean of the worlds."""
+
+    together: float
+    """A's task metric of its own particles where it grows beside B, mean of the worlds."""
+
+    change: float
+    """together / alone (dimensionless)."""
+
+    mixing: float
+    """`mixing_index` at the end, mean of the worlds (dimensionless)."""
+
+    displacement: float
+    """How far A's centroid ends from where it ends alone, mean of the worlds [length units]."""
+
+    verdict: str
+    """`verdict` of `change` and `mixing`."""
+
+
+def verdict(change: float, mixing: float, margin: float = MARGIN) -> str:
+    """Return what a neighbour does to a rule, in a word or two.
+
+    "cooperates" where the loss falls below 1 - margin of what it is alone, "disrupted" where it
+    rises above 1 + margin or is no number, else "undisturbed"; and ", mixes" where the mixing index
+    is at least `MIXED`.
+
+    Args:
+        change: Loss together over loss alone (dimensionless).
+        mixing: The mixing index (dimensionless).
+        margin: Share by which the loss must change.
+    """
+    word = "disrupted"
+    if change < 1.0 - margin:
+        word = "cooperates"
+    elif change <= 1.0 + margin:
+        word = "undisturbed"
+    return f"{word}, mixes" if mixing >= MIXED else word
+
+
+def mixing_index(x: Tensor, counts: Sequence[int], *, eps: float) -> Tensor:
+    """Return how much the species of each world are mixed, in [0, 1], shape [B].
+
+    The mean over the particles of the entropy of the species around each, in units of log K: the
+    shares are those of each species in the density at the particle, itself included. 0: nobody
+    sees another species; 1: everybody sees all alike.
+
+    Args:
+        x: Positions [length units], shape [B, N, D], species after species.
+        counts: Particles of each of K species, K at least 2.
+        eps: Perception radius [length units].
+
+    Raises:
+        NPAError: Positions or counts do not fit, or there is one species only.
+    """
+    rho = species_fields(x, counts, eps=eps).rho
+    if rho.shape[2] < 2:
+        raise NPAError("counts must name at least two species that can mix, got one")
+    shares = rho / rho.sum(dim=2, keepdim=True)
+    entropy: Tensor = torch.special.entr(shares).sum(dim=2)
+    return entropy.mean(dim=1) / math.log(rho.shape[2])
+
+
+# Rules grown alone and beside each other, from the same seeds.
+
+
+PROGRESS_STEPS = 32
+"""Steps between two reports of progress."""
+
+FRAME_SHARES = (0.0, 0.125, 0.25, 0.5, 1.0)
+"""When pictures are taken, as shares of the run."""
+
+FRAME_RESOLUTION = 160
+"""Pixels on each side of a picture."""
+
+
+@dataclass(frozen=True)
+class Organism:
+    """A trained rule that grows in 2D, and what it grows."""
+
+    name: str
+    """What tables call it."""
+
+    rule: NPARule
+    """The rule, on the device to run on."""
+
+    task_of: Callable[[int], PictureTask]
+    """Returns its task with a number of particles, of which seeds are made and losses taken."""
+
+    update_prob: float
+    """Probability of a particle's update in a step, as trained (dimensionless)."""
+
+
+@dataclass
+class Scenes:
+    """Pictures of the first world of each encounter."""
+
+    frames: list[NDArray[np.uint8]] = field(default_factory=list)
+    """Pictures, uint8, shape [R, R, 3] each; `len(FRAME_SHARES)` of each encounter."""
+
+    captions: list[str] = field(default_factory=list)
+    """One for each frame."""
+
+
+class _Solo(NamedTuple):
+    """A rule grown alone."""
+
+    losses: Tensor
+    """Its metric, shape [B]; infinite where a world blew up."""
+    centroids: Tensor
+    """Where it ends [length units], shape [B, 2]."""
+
+
+class Encounters:
+    """Grows rules alone and beside each other; what was grown alone is kept.
+
+    Args:
+        settings: How rules are brought together.
+        device: Where to run.
+        progress: Called with the number of steps done since its last call.
+    """
+
+    def __init__(
+        self,
+        settings: InteractionSettings,
+        *,
+        device: torch.device,
+        progress: Callable[[int], None] = lambda _: None,
+    ) -> None:
+        self.settings = settings
+        self._device = device
+        self._progress = progress
+        self._solos: dict[tuple[str, int], _Solo] = {}
+
+    def check(self, organisms: Sequence[Organism]) -> None:
+        """Check that any two of the rules can share a world.
+
+        Raises:
+            NPAError: They cannot.
+        """
+        for other in organisms:
+            weight = other.rule.hidden.weight
+            x, s = weight.new_zeros(1, 2, 2), weight.new_zeros(1, 2, other.rule.state_dim)
+            try:
+                rollout_species([organisms[0].rule, other.rule], x, s, 0, counts=[1, 1])
+            except NPAError as error:
+                raise NPAError(
+                    f"{organisms[0].name} and {other.name} cannot share a world: {error}"
+                ) from error
+
+    @torch.no_grad()
+    def meet(self, first: Organism, second: Organism) -> tuple[list[InteractionRow], Scenes]:
+        """Grow one rule beside another, at every distance and ratio.
+
+        Args:
+            first: The rule that is measured.
+            second: The rule beside it; it may be the same.
+
+        Returns:
+            One row for each ratio and distance, and pictures.
+        """
+        rows, scenes = [], Scenes()
+        for ratio in self.settings.ratios:
+            solo = self._solo(first, self.settings.counts(ratio)[0])
+            for distance in self.settings.distances:
+                rows.append(self._row(first, second, ratio, distance, solo, scenes))
+        return rows, scenes
+
+    def _row(
+        self,
+        first: Organism,
+        second: Organism,
+        ratio: float,
+        distance: float,
+        solo: _Solo,
+        scenes: Scenes,
+    ) -> InteractionRow:
+        counts = self.settings.counts(ratio)
+        task = first.task_of(counts[0])
+        half_width = 1.2 + 0.5 * distance
+
+        def shoot(x: Tensor, s: Tensor, step: int) -> None:
+            spacing = math.sqrt(4.0 / self.settings.particle_count)
+            (picture,) = draw_worlds(
+                x[:1],
+                s[:1],
+                resolution=FRAME_RESOLUTION,
+                pixel_size=0.5 * spacing,
+                half_width=half_width,
+            )
+            scenes.frames.append(picture)
+            scenes.captions.append(f"d {distance:g}, r {ratio:g}, step {step}")
+
+        x, s, lost = self._grow([first, second], counts, distance, shoot)
+        own = x[:, : counts[0]]
+        losses = task.metric(own, s[:, : counts[0]]).masked_fill(lost, math.inf)
+        away = (own.mean(dim=1) - solo.centroids).norm(dim=-1)
+        alone, together = solo.losses.mean().item(), losses.mean().item()
+        change = together / alone if alone > 0.0 else math.inf
+        mixing = mixing_index(x, counts, eps=first.rule.eps0).mean().item()
+        return InteractionRow(
+            rule=first.name,
+            beside=second.name,
+            distance=distance,
+            ratio=ratio,
+            alone=alone,
+            together=together,
+            change=change,
+            mixing=mixing,
+            displacement=away.mean().item(),
+            verdict=verdict(change, mixing, self.settings.margin),
+        )
+
+    def _solo(self, organism: Organism, count: int) -> _Solo:
+        key = organism.name, count
+        if key not in self._solos:
+            x, s, lost = self._grow([organism], (count,), 0.0)
+            losses = organism.task_of(count).metric(x, s).masked_fill(lost, math.inf)
+            self._solos[key] = _Solo(losses, x.mean(dim=1))
+        return self._solos[key]
+
+    def _grow(
+        self,
+        organisms: Sequence[Organism],
+        counts: tuple[int, ...],
+        distance: float,
+        shoot: Callable[[Tensor, Tensor, int], None] = lambda x, s, step: None,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Grow one or two species from their seeds; also say which worlds blew up on the way.
+
+        The first species is seeded around the origin, the second one `distance` from it along the
+        first axis. The first draws what it draws alone.
+        """
+        settings = self.settings
+        random = WorldRandom(settings.seeds, device=self._device)
+        streams = (random, random.beside(Purpose.SPECIES))
+        parts = [
+            organism.task_of(count).seed(len(settings.seeds), generator=stream, device=self._device)
+            for organism, count, stream in zip(organisms, counts, streams, strict=False)
+        ]
+        for number, (place, _) in enumerate(parts):
+            place[..., 0] += number * distance
+        like = organisms[0].rule.hidden.weight
+        x, s = (torch.cat(of_all, dim=1).to(like) for of_all in zip(*parts, strict=True))
+        lost = torch.zeros(len(x), dtype=torch.bool, device=x.device)
+        frames = {round(share * settings.steps) for share in FRAME_SHARES}
+        stops = sorted({*range(0, settings.steps, PROGRESS_STEPS), *frames})
+        for now, then in zip([0, *stops], stops, strict=False):
+            new_x, new_s = rollout_species(
+                [organism.rule for organism in organisms],
+                x,
+                s,
+                then - now,
+                counts=counts,
+                update_prob=[settings.update_prob or own.update_prob for own in organisms],
+                generator=random,
+                density_counts=counts,
+            )
+            # A world that blew up must not keep the others from being measured.
+            fine = new_x.isfinite().all(dim=(1, 2)) & new_s.isfinite().all(dim=(1, 2))
+            x = torch.where(fine[:, None, None], new_x, x)
+            s = torch.where(fine[:, None, None], new_s, s)
+            lost |= ~fine
+            self._progress(then - now)
+            if then in frames:
+                # The middle of the two seeds is the middle of the picture.
+                shift = x.new_zeros(x.shape[2])
+                shift[0] = 0.5 * distance
+                shoot(x - shift, s, then)
+        return x, s, lost
+
+
+# Heat maps of what rules do to each other.
+
+
+LARGEST_CHANGE = 4.0
+"""Colours end at this many times the loss alone, and at its inverse."""
+
+
+def heat_map(rows: Sequence[InteractionRow]) -> bytes:
+    """Return a PNG: how each rule's loss changes beside each other one, and how much they mix.
+
+    One pair of panels for each distance and ratio; rows are the measured rules. Needs matplotlib.
+
+    Args:
+        rows: What was measured; pairs that are missing stay blank.
+    """
+    from matplotlib.colors import LogNorm
+    from matplotlib.figure import Figure
+
+    names = list(dict.fromkeys([row.rule for row in rows] + [row.beside for row in rows]))
+    settings = list(dict.fromkeys((row.ratio, row.distance) for row in rows))
+    side = 1.6 + 0.55 * len(names)
+    figure = Figure(figsize=(2 * side + 2.0, side * len(settings)), layout="constrained")
+    panels = figure.subplots(len(settings), 2, squeeze=False)
+    norm = LogNorm(1.0 / LARGEST_CHANGE, LARGEST_CHANGE)
+    for (ratio, distance), (left, right) in zip(settings, panels, strict=True):
+        some = [row for row in rows if (row.ratio, row.distance) == (ratio, distance)]
+        where = f"distance {distance:g}, ratio {ratio:g}"
+        change = _draw_matrix(left, names, some, "change", cmap="RdBu_r", norm=norm)
+        left.set(title=f"loss together / alone\n{where}", ylabel="rule", xlabel="beside")
+        mixing = _draw_matrix(right, names, some, "mixing", cmap="viridis", vmin=0.0, vmax=1.0)
+        right.set(title=f"mixing index\n{where}", xlabel="beside")
+        ticks = [0.25, 0.5, 1.0, 2.0, 4.0]
+        figure.colorbar(change, ax=left, ticks=ticks, format="%g").minorticks_off()
+        figure.colorbar(mixing, ax=right)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=90)
+    return buffer.getvalue()
+
+
+def _draw_matrix(
+    panel: Any, names: list[str], rows: Sequence[InteractionRow], what: str, **colours: Any
+) -> Any:
+    """Draw one number of each pair, and write it into its cell."""
+    values = [[math.nan] * len(names) for _ in names]
+    for row in rows:
+        value = getattr(row, what)
+        down, across = names.index(row.rule), names.index(row.beside)
+        # Infinities have no colour of their own.
+        values[down][across] = min(value, 1e6)
+        label = panel.text(across, down, f"{value:.2g}", ha="center", va="center", fontsize=7)
+        label.set_bbox({"facecolor": "white", "alpha": 0.6, "linewidth": 0.0, "pad": 1.5})
+    image = panel.imshow(values, **colours)
+    places = range(len(names))
+    panel.set_xticks(places, names, rotation=45, ha="right", fontsize=8)
+    panel.set_yticks(places, names, fontsize=8)
+    return image

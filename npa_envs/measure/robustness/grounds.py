@@ -1,0 +1,220 @@
+"""Where a rule is tried: worlds of its task, from unseen seeds, each with streams of its own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from npa_envs.errors import NPAError
+from npa_envs.measure.accuracy.habitats import SMALLEST_VIEWS, Habitat, LongRun, task_name
+from npa_envs.measure.robustness.plans import Plan
+from npa_envs.measure.robustness.shapes import SHAPES
+from npa_envs.rule.files import load_rule
+from npa_envs.rule.rule import NPARule
+from npa_envs.tasks.base import Task, seed_worlds, task_for_rule, task_toward
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
+from npa_envs.tasks.morphogenesis3d import Morphogenesis3D
+from npa_envs.tasks.point_classification import PointClassification, particle_classes
+from npa_envs.tasks.texture import Texture
+from npa_envs.training.trained_tasks import task_of_rule
+from npa_envs.world.randomness import Purpose, WorldRandom
+
+SEEN_AT_ONCE = 1 << 17
+"""Particles of the worlds whose loss is taken at once: many views of many Gaussians take room."""
+
+BOX_SHARE = 0.25
+"""Radius of seeds of another shape, over the side of a box that is full when trained."""
+
+
+@dataclass(frozen=True)
+class Home(Habitat):
+    """A rule in worlds of its task, and what these worlds are to show."""
+
+    goal: Tensor | None = None
+    """Goals of the worlds, int64, shape [B], where the task has such."""
+
+    def with_worlds(self, x: Tensor, s: Tensor) -> Home:
+        """Return the same worlds with other particles, or copies of all of them, one by one.
+
+        Args:
+            x: Positions [length units], shape [K B, N, D].
+            s: States, shape [K B, N, C].
+        """
+        goal = None if self.goal is None else self.goal.repeat(len(x) // len(self.goal))
+        return replace(self, x=x, s=s, goal=goal)
+
+    def losses(self, x: Tensor, s: Tensor) -> Tensor:
+        """Return how far each world is from the goal, shape [B]; lower is better.
+
+        That is the task's metric; of clouds, the share of particles that say the wrong class.
+        """
+        some = max(1, SEEN_AT_ONCE // x.shape[1])
+        found = []
+        with torch.no_grad():
+            for start in range(0, len(x), some):
+                worlds = slice(start, start + some)
+                found.append(self._losses(x[worlds], s[worlds], worlds))
+        return torch.cat(found)
+
+    def _losses(self, x: Tensor, s: Tensor, worlds: slice) -> Tensor:
+        if isinstance(self.task, PointClassification):
+            assert self.goal is not None, "clouds are made with their classes"
+            says = particle_classes(self.task.outputs(s))
+            return (says != self.goal[worlds, None]).to(s.dtype).mean(1)
+        return self.task.metric(x, s)
+
+
+class Ground:
+    """A rule and the tasks that it is tried in, one for each number of particles.
+
+    Args:
+        name: A shipped rule.
+        device: Where to run.
+        plan: What is measured.
+        seeds: Numbers of the seeds; none that a rule was trained with.
+        particle_count: Particles N that count as trained; default: as trained.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        device: torch.device,
+        plan: Plan,
+        seeds: range,
+        particle_count: int | None = None,
+    ) -> None:
+        self.rule: NPARule = load_rule(name, device=device).float().requires_grad_(False)
+        self.task_name = task_name(name)
+        self.plan, self.seeds, self._device = plan, seeds, device
+        # Losses are those of held-out views.
+        fields = {"training_views": SMALLEST_VIEWS["training_views"]}
+        found = task_of_rule(
+            name,
+            self.rule,
+            device,
+            particle_count=particle_count,
+            **(fields if self.rule.space_dim == 3 else {}),
+        )
+        if found.doubt is not None:
+            raise NPAError(f"cannot measure {name!r}: {found.doubt}: choose another rule")
+        self.task: Any = found.task
+        """The task as trained."""
+        self.metric_name = found.task.metric_name
+        """What losses are."""
+        if isinstance(found.task, PointClassification):
+            self.metric_name = "share of particles that are wrong"
+        self._tasks: dict[int, Task] = {self.particle_count: self.task}
+
+    @property
+    def particle_count(self) -> int:
+        """Particles in a world as trained."""
+        return int(self.task.config.particle_count)
+
+    @property
+    def world_count(self) -> int:
+        """Worlds B of all seeds."""
+        return len(self.seeds) * self.plan.worlds_per_seed
+
+    def random(self, purpose: int) -> WorldRandom:
+        """Return streams of all worlds, at their beginning.
+
+        Args:
+            purpose: What they are for; those of others are independent.
+        """
+        each = self.plan.worlds_per_seed
+        numbers = [seed * each + k for seed in self.seeds for k in range(each)]
+        return WorldRandom(numbers, device=self._device).beside(purpose)
+
+    def particles(self, share: float) -> int:
+        """Return how many particles a share of the trained number is."""
+        return max(2, round(share * self.particle_count))
+
+    def home(self, share: float = 1.0, shape: str = "trained") -> Home:
+        """Return fresh worlds.
+
+        Args:
+            share: Particles over the trained number.
+            shape: Shape of the seeds: "trained", or one of `SHAPES`.
+        """
+        count = self.particles(share)
+        if count not in self._tasks:
+            self._tasks[count] = task_for_rule(_resized(self.task, count, self._device), self.rule)
+        task = self._tasks[count]
+        random = self.random(Purpose.GROWTH)
+        x, s, goal = seed_worlds(task, self.world_count, generator=random, device=self._device)
+        if shape != "trained":
+            x = SHAPES[shape](count, self.rule.space_dim, self._seed_radius(), random)
+        return Home(
+            self.rule, task_toward(task, goal), x.float(), s.float(), self.plan.grow_steps, goal
+        )
+
+    def run(self, home: Home, random: WorldRandom, **changed: Any) -> LongRun:
+        """Return what runs worlds.
+
+        Args:
+            home: The worlds.
+            random: Streams of masks and noise.
+            changed: Options of `rollout` that are not as trained.
+        """
+        return LongRun(home, random, home.options(**changed), chunk=self.plan.chunk)
+
+    def by_seed(self, losses: Tensor) -> Tensor:
+        """Return the mean loss of each seed's worlds, shape [..., seeds].
+
+        Args:
+            losses: That of each world, shape [..., B].
+        """
+        return losses.double().reshape(*losses.shape[:-1], len(self.seeds), -1).mean(-1)
+
+    def _seed_radius(self) -> float:
+        config = self.task.config
+        if isinstance(self.task, Texture):
+            return BOX_SHARE * float(config.box_size)
+        return float(config.seed_radius)
+
+
+def _resized(task: Any, particle_count: int, device: torch.device) -> Task:
+    """Return a task for another number of particles; views and textures are made once."""
+    config = task.config.with_particle_count(particle_count)
+    if isinstance(task, Morphogenesis2D):
+        return Morphogenesis2D(config, device=device)
+    if isinstance(task, PointClassification):
+        return PointClassification(config, device=device, split=task.split)
+    if isinstance(task, Texture):
+        return Texture(config, target=task.target, device=device)
+    assert isinstance(task, Morphogenesis3D), "tasks of shipped rules are these four"
+    return Morphogenesis3D(config, target=task.target, device=device)
+
+
+def finite_worlds(x: Tensor, s: Tensor) -> Tensor:
+    """Return in which worlds all is finite, shape [B].
+
+    Args:
+        x: Positions [length units], shape [B, N, D].
+        s: States, shape [B, N, C].
+    """
+    return x.isfinite().flatten(1).all(1) & s.isfinite().flatten(1).all(1)
+
+
+def courses(home: Home, run: LongRun, steps: tuple[int, ...]) -> Tensor:
+    """Run worlds and return their losses after numbers of steps, shape [len(steps), B].
+
+    A world that is not finite has the loss NaN from then on, and does not disturb the others.
+
+    Args:
+        home: Where the run began.
+        run: Runs them.
+        steps: Numbers of steps, increasing.
+    """
+    lost = torch.zeros(len(home.x), dtype=torch.bool, device=home.x.device)
+    found = []
+    for _, x, s in run.marks(list(steps)):
+        lost |= ~finite_worlds(x, s)
+        for worlds, fresh in ((x, home.x), (s, home.s)):
+            worlds.copy_(torch.where(lost[:, None, None], fresh, worlds))
+        losses = home.losses(home.at_trained_size(x, run.eps), s)
+        found.append(torch.where(lost, torch.nan, losses))
+    return torch.stack(found)

@@ -1,0 +1,107 @@
+"""How much is measured of a rule: steps, values, numbers of worlds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+from npa_envs.measure.robustness.shapes import SHAPES
+
+CONDITIONS = {
+    "eps": "perception radius ε over the trained one",
+    "particles": "particles N over the trained number",
+    "update_prob": "probability p of an update, for as many updates in all",
+    "dt": "time step, for as much time in all",
+    "noise": "noise of every position in each step, over the perception radius",
+    "shape": "shape of the seed",
+}
+"""What is varied, one at a time, with a summary."""
+
+TRAINED: Mapping[str, float | str] = {
+    "eps": 1.0,
+    "particles": 1.0,
+    "dt": 1.0,
+    "noise": 0.0,
+    "shape": "trained",
+}
+"""The value of each condition as trained; that of `update_prob` is the task's."""
+
+
+def trained_value(condition: str, update_prob: float) -> float | str:
+    """Return the value of a condition that a rule was trained at.
+
+    Args:
+        condition: One of `CONDITIONS`.
+        update_prob: Probability of an update in the rule's task.
+    """
+    return update_prob if condition == "update_prob" else TRAINED[condition]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """What is measured of one rule."""
+
+    grow_steps: int
+    """Steps from the seed to the damage, and to the loss under each condition: whole chunks."""
+    heal_steps: tuple[int, ...]
+    """Steps after the damage at which the loss is taken, increasing from 0, in whole chunks."""
+    chunk: int
+    """Steps that are recorded in one CUDA graph."""
+    worlds_per_seed: int = 1
+    """Worlds whose mean loss is that of a seed."""
+    values: Mapping[str, tuple[float | str, ...]]
+    """Values of each condition, numbers increasing, the trained one among them."""
+
+
+_HEAL_STEPS = (0, 16, 32, 48, 64, 96, 128, 192, 256, 384, 512, 768, 1024)
+
+_VALUES: dict[str, tuple[float | str, ...]] = {
+    "eps": (0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.4, 1.7, 2.0),
+    "particles": (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0, 2.0, 4.0, 8.0, 16.0),
+    "update_prob": (0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 1.0),
+    "dt": (0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0),
+    "noise": (0.0, 1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.3, 1.0),
+    "shape": ("trained", *SHAPES),
+}
+
+_MOVING = Plan(grow_steps=512, heal_steps=_HEAL_STEPS, chunk=16, values=_VALUES)
+
+PLANS = {
+    "morphogenesis2d": _MOVING,
+    "morphogenesis3d": replace(_MOVING, grow_steps=128, heal_steps=_HEAL_STEPS[:-2]),
+    "texture": replace(_MOVING, grow_steps=1024),
+    "point_classification": Plan(
+        grow_steps=64,
+        heal_steps=(0, 8, 16, 24, 32, 48, 64, 96, 128),
+        chunk=8,
+        # Few clouds are wrong, and of one that is nearly all particles are.
+        worlds_per_seed=128,
+        # Clouds are what they are: their shape is what is to be told.
+        values={name: values for name, values in _VALUES.items() if name != "shape"},
+    ),
+}
+"""What is measured of the rules of each task."""
+
+
+def quick_plan(task_name: str) -> Plan:
+    """Return a plan that takes seconds: few steps, few values.
+
+    Args:
+        task_name: A task of `PLANS`.
+    """
+    values: dict[str, tuple[float | str, ...]] = {
+        "eps": (0.7, 1.0, 1.4),
+        "particles": (0.5, 1.0),
+        "update_prob": (0.2, 0.5, 1.0),
+        "dt": (0.5, 1.0),
+        "noise": (0.0, 1e-2),
+        "shape": ("trained", "ring"),
+    }
+    full = PLANS[task_name]
+    return replace(
+        full,
+        grow_steps=min(full.grow_steps, 48),
+        heal_steps=(0, 16, 32),
+        worlds_per_seed=min(full.worlds_per_seed, 4),
+        values={name: values[name] for name in full.values},
+    )

@@ -1,0 +1,280 @@
+"""Which Warp kernels a call launches."""
+
+from __future__ import annotations
+
+import contextlib
+import inspect
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+import warp as wp
+from torch.autograd import DeviceType  # type: ignore[attr-defined]
+from torch.profiler import ProfilerActivity, profile
+
+from npa_envs.errors import NPAError, suggest
+from npa_envs.measure.speed.session import Session
+from npa_envs.measure.speed.workloads import Workload, rollout_call
+from npa_envs.ops.backend import rollout_listing
+from npa_envs.ops.sort import Plan, make_plan
+from npa_envs.world.rollout import row_capacity, step
+
+
+class Launch(NamedTuple):
+    """One launch of a Warp kernel."""
+
+    kernel: str
+    """The kernel's name."""
+    module: str
+    """The Warp module of its variant, without the package's name."""
+    threads: str
+    """Threads along each dimension."""
+    purpose: str
+    """First line of its docstring."""
+
+
+@contextlib.contextmanager
+def recorded_launches() -> Iterator[list[Launch]]:
+    """Yield a list to which every launch in the block is added."""
+    launches: list[Launch] = []
+    launch = wp.launch
+
+    def noted(kernel: Any, dim: Any, *arguments: Any, **options: Any) -> Any:
+        launches.append(_described(kernel, dim))
+        return launch(kernel, dim, *arguments, **options)
+
+    wp.launch = noted
+    try:
+        yield launches
+    finally:
+        wp.launch = launch
+
+
+def _described(kernel: Any, dim: Any) -> Launch:
+    sizes = dim if isinstance(dim, tuple | list) else (dim,)
+    purpose = (inspect.getdoc(kernel.func) or "").split("\n")[0]
+    module = kernel.module.name.removeprefix("npa_envs.").removeprefix("kernels.")
+    return Launch(kernel.func.__name__, module, " x ".join(str(size) for size in sizes), purpose)
+
+
+# Suite `kernels`: which CUDA kernels a step of a rollout takes, and how long each.
+
+
+LEAST_SHARE = 0.005
+"""Kernels that take less of a step are left out."""
+
+LONGEST_NAME = 72
+"""Letters of a kernel's name."""
+
+
+@dataclass(frozen=True)
+class KernelRow:
+    """One kernel in one workload."""
+
+    workload: str
+    """Dimension and (worlds B, particles N, steps T), and whether it trains."""
+    us: float
+    """Its time in a step, all launches together [µs]."""
+    launches: float
+    """Its launches in a step."""
+    kernel: str
+    """Its name."""
+
+
+def kernel_rows(session: Session, workloads: Sequence[Workload]) -> list[KernelRow]:
+    """Return the kernels of inference and of training; none on a CPU."""
+    if not session.cuda:
+        session.leave_out("kernels", "CUDA only")
+        return []
+    rows: list[KernelRow] = []
+    for workload in workloads:
+        x, s = workload.worlds(session.device)
+        for train in (False, True):
+            run, _ = rollout_call(workload, x, s, train=train)
+            run()
+            torch.cuda.synchronize(session.device)
+            with profile(activities=[ProfilerActivity.CUDA]) as profiler:
+                run()
+                torch.cuda.synchronize(session.device)
+            name = f"{workload.name} {'training' if train else 'inference'}"
+            rows += _kernel_rows(name, profiler, workload.steps)
+            session.progress(1)
+    return rows
+
+
+def _kernel_rows(workload: str, profiler: profile, steps: int) -> list[KernelRow]:
+    rows = [
+        KernelRow(
+            workload,
+            round(entry.self_device_time_total / steps, 2),
+            round(entry.count / steps, 1),
+            entry.key[:LONGEST_NAME],
+        )
+        for entry in profiler.key_averages()
+        if entry.device_type == DeviceType.CUDA
+    ]
+    rows.sort(key=lambda row: -row.us)
+    least = LEAST_SHARE * sum(row.us for row in rows)
+    return [row for row in rows if row.us >= least]
+
+
+# `--explain`: the kernels that a step of a rule takes, and why these.
+
+
+GRADIENTS = ("none", "weights", "positions")
+"""What is differentiated: nothing; by weights and states; by positions as well."""
+
+
+@dataclass(frozen=True)
+class Question:
+    """A step to explain."""
+
+    workload: Workload
+    """Worlds, rule, radius, probability of an update."""
+    device: torch.device
+    """Where it runs."""
+    dtype: torch.dtype
+    """Precision."""
+    periodic: bool
+    """The box is periodic."""
+    gradients: str
+    """One of `GRADIENTS`."""
+
+    def __post_init__(self) -> None:
+        """Check the name.
+
+        Raises:
+            NPAError: `gradients` is none of `GRADIENTS`.
+        """
+        if self.gradients not in GRADIENTS:
+            raise NPAError(
+                f"gradients must be one of {GRADIENTS}, got {self.gradients!r}: "
+                f"{suggest(self.gradients, GRADIENTS)}"
+            )
+
+    @property
+    def box(self) -> float | None:
+        """Side of the periodic box [length units], None in open space."""
+        return 2.0 * self.workload.half_width if self.periodic else None
+
+
+def explain(question: Question) -> str:
+    """Run a step, and return which kernels it launched and what decided on them."""
+    forward, backward = _launches(question)
+    lines = [*_reasons(question), "", "forward:", *_listed(forward)]
+    if question.gradients != "none":
+        lines += ["", "backward:", *_listed(backward)]
+    lines += ["", "Torch's own operations are not listed."]
+    return "\n".join(lines)
+
+
+def _launches(question: Question) -> tuple[list[Launch], list[Launch]]:
+    """Return the launches of a step's forward and backward pass."""
+    workload = question.workload
+    x, s = (tensor.to(question.dtype) for tensor in workload.worlds(question.device))
+    rule = workload.rule(question.device).to(question.dtype)
+    needed = question.gradients != "none"
+    x.requires_grad_(question.gradients == "positions")
+    s.requires_grad_(needed)
+    with torch.set_grad_enabled(needed), recorded_launches() as forward:
+        new_x, new_s = step(
+            rule,
+            x,
+            s,
+            eps=workload.eps,
+            box=question.box,
+            update_prob=workload.update_prob,
+            detach_positions=question.gradients != "positions",
+            generator=torch.Generator(question.device).manual_seed(0),
+        )
+    with recorded_launches() as backward:
+        if needed:
+            torch.autograd.backward(new_x.sum() + new_s.sum())
+    return forward, backward
+
+
+def _listed(launches: list[Launch]) -> list[str]:
+    """Return a line for each launch, in columns."""
+    columns = list(zip(*launches, strict=True))
+    widths = [max(map(len, column)) for column in columns[:-1]]
+    return [
+        "  "
+        + "  ".join(cell.ljust(width) for cell, width in zip(launch, [*widths, 0], strict=True))
+        for launch in launches
+    ]
+
+
+def _reasons(question: Question) -> list[str]:
+    """Return what decides on the kernels, a line each."""
+    workload = question.workload
+    total = workload.world_count * workload.particle_count
+    masked = workload.update_prob < 1.0
+    rows = row_capacity(total, workload.update_prob) if masked else total
+    box = None if question.box is None else (question.box,) * workload.space_dim
+    like = torch.empty(0, dtype=question.dtype, device=question.device)
+    shape = (workload.world_count, workload.particle_count, workload.space_dim)
+    plan = make_plan(like, shape, workload.state_dim, rows, masked, workload.eps, box)
+    number = str(question.dtype).removeprefix("torch.")
+    return [
+        f"One step of {shape[0]} x {shape[1]} particles in {shape[2]}D, C {workload.state_dim}, "
+        f"{number} on {question.device}",
+        f"  boundary    {_boundary(question)}",
+        f"  cells       {plan.domain.cell_count} a world, eps / {plan.domain.reach} wide: "
+        "a neighbourhood is a few ranges of sorted particles",
+        f"  channels    {plan.group_count} group(s) of {plan.width}, "
+        f"{workload.state_dim} used: a kernel is compiled for a group's width",
+        f"  threads     {_threads(plan)}",
+        f"  neighbours  {_neighbours(plan, question)}",
+        f"  rows        {_rows(plan, question)}",
+        f"  gradients   {_gradients(question)}",
+    ]
+
+
+def _boundary(question: Question) -> str:
+    if question.box is None:
+        return "open: positions anywhere, the grid of cells wraps around"
+    return f"periodic, side {question.box:g}: nearest images, positions are wrapped"
+
+
+def _threads(plan: Plan) -> str:
+    if plan.lanes == 1:
+        return "one a particle: a CPU runs them in ranges, on as many threads as torch uses"
+    if not plan.listed:
+        return f"{plan.lanes} share a particle and split its candidates"
+    listing = rollout_listing(plan)
+    return (
+        f"{listing.lanes} list a particle's neighbours, {listing.teams} x {plan.lanes} sum a row: "
+        "small worlds fill a device with more for each"
+    )
+
+
+def _neighbours(plan: Plan, question: Question) -> str:
+    if not plan.listed:
+        why = "on a CPU" if question.device.type == "cpu" else "in float64"
+        return f"searched for in each pass: lists are kept in float32 on CUDA, this is {why}"
+    room = rollout_listing(plan).capacity
+    return (
+        f"listed by the density pass for the perception pass, with room for {room} each: longer "
+        "lists are searched for again"
+    )
+
+
+def _rows(plan: Plan, question: Question) -> str:
+    if not plan.masked:
+        return "every particle is perceived and updated"
+    prob = question.workload.update_prob
+    if question.device.type == "cpu":
+        return f"p {prob:g}: the particles drawn are counted, only they are perceived"
+    return (
+        f"p {prob:g}: only drawn particles are perceived; {plan.row_capacity} rows of {plan.total} "
+        "hold them with probability 1 - 1e-15, and no count is read back"
+    )
+
+
+def _gradients(question: Question) -> str:
+    return {
+        "none": "none: nothing is kept for a backward pass",
+        "weights": "weights and states: the adjoint gathers state cotangents, positions detached",
+        "positions": "positions too: density and kernel slopes get cotangents of their own",
+    }[question.gradients]
