@@ -24,11 +24,11 @@ import species_pages
 from draw_environment_pictures import FILMS, picture_path
 from page_parts import NOTE, default_text, field_meanings, kind_text, sections, table
 
-from npa_envs.envs.config import EnvConfig
-from npa_envs.envs.single import NPAEnv
-from npa_envs.envs.spaces import action_space, observation_space
-from npa_envs.envs.vector import NPAVectorEnv
-from npa_envs.envs.worlds import make_physics
+from npa_envs.envs.core.config import EnvConfig
+from npa_envs.envs.core.single import NPAEnv
+from npa_envs.envs.core.spaces import action_space, observation_space
+from npa_envs.envs.core.vector import NPAVectorEnv
+from npa_envs.envs.core.worlds import make_physics
 from npa_envs.registration import ENVIRONMENTS, Registration
 
 DOCS = Path(__file__).resolve().parent

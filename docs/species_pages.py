@@ -9,8 +9,8 @@ from draw_species_pictures import CAPTION, IMAGE
 from page_parts import NOTE, default_text, field_meanings, kind_text, sections, table
 
 from npa_envs.envs import multispecies_v0, particles_v0
-from npa_envs.envs.species import TASKS, SpeciesConfig
-from npa_envs.envs.species.crowd import CrowdEnv
+from npa_envs.envs.multi import TASKS, SpeciesConfig
+from npa_envs.envs.multi.parallel import CrowdEnv
 
 MODULES = {"MultiSpecies": multispecies_v0, "Particles": particles_v0}
 """Modules by the names of their pages."""

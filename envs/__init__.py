@@ -6,9 +6,9 @@ say where worlds start and how far they are from the goal, `npa_envs.world.actio
 particles.
 """
 
-from npa_envs.envs.config import EnvConfig
-from npa_envs.envs.single import NPAEnv
-from npa_envs.envs.task import EnvTask, Start
-from npa_envs.envs.vector import NPAVectorEnv
+from npa_envs.envs.core.config import EnvConfig
+from npa_envs.envs.core.single import NPAEnv
+from npa_envs.envs.core.task import EnvTask, Start
+from npa_envs.envs.core.vector import NPAVectorEnv
 
 __all__ = ["EnvConfig", "EnvTask", "NPAEnv", "NPAVectorEnv", "Start"]

@@ -9,10 +9,10 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from npa_envs.envs.config import EnvConfig
-from npa_envs.envs.single import NPAEnv
-from npa_envs.envs.task import EnvTask
-from npa_envs.envs.vector import NPAVectorEnv
+from npa_envs.envs.core.config import EnvConfig
+from npa_envs.envs.core.single import NPAEnv
+from npa_envs.envs.core.task import EnvTask
+from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.errors import NPAError
 from npa_envs.tasks.checks import check_non_negative, check_positive
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig

@@ -11,10 +11,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.envs.config import EnvConfig
-from npa_envs.envs.single import NPAEnv
-from npa_envs.envs.task import TURN, EnvTask
-from npa_envs.envs.vector import NPAVectorEnv
+from npa_envs.envs.core.config import EnvConfig
+from npa_envs.envs.core.single import NPAEnv
+from npa_envs.envs.core.task import TURN, EnvTask
+from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.errors import NPAError
 from npa_envs.render import turntable_frames
 from npa_envs.rule.files import load_rule

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from npa_envs.envs.species.agents import MultiSpeciesEnv
-from npa_envs.envs.species.tables import ENVIRONMENTS
-from npa_envs.envs.species.vector import MultiSpeciesVectorEnv
-from npa_envs.envs.species.zoo import aec_env, clipped, register
+from npa_envs.envs.multi.parallel import MultiSpeciesEnv
+from npa_envs.envs.multi.pettingzoo import aec_env, clipped, register
+from npa_envs.envs.multi.tasks.table import ENVIRONMENTS
+from npa_envs.envs.multi.vector import MultiSpeciesVectorEnv
 
 
 def parallel_env(task: str = "mixing", species_count: int = 2, **config: Any) -> MultiSpeciesEnv:

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from npa_envs.envs.species.agents import ParticlesEnv
-from npa_envs.envs.species.config import plain
-from npa_envs.envs.species.zoo import aec_env, clipped, register
+from npa_envs.envs.multi.config import plain
+from npa_envs.envs.multi.parallel import ParticlesEnv
+from npa_envs.envs.multi.pettingzoo import aec_env, clipped, register
 
 ENVIRONMENTS = {
     "npa/MixingParticles-v0": "mixing",

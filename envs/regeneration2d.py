@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from npa_envs.envs.core.single import NPAEnv
+from npa_envs.envs.core.task import Start
+from npa_envs.envs.core.vector import NPAVectorEnv
+from npa_envs.envs.core.worlds import total
 from npa_envs.envs.morphogenesis2d import Morphogenesis2DEnvConfig, PictureTask
-from npa_envs.envs.single import NPAEnv
-from npa_envs.envs.task import Start
-from npa_envs.envs.vector import NPAVectorEnv
-from npa_envs.envs.worlds import total
 from npa_envs.errors import NPAError, suggest
 from npa_envs.rule.files import load_rule, shipped_rules
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule

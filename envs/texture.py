@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from npa_envs.envs.config import Boundary, EnvConfig
-from npa_envs.envs.single import NPAEnv
-from npa_envs.envs.task import EnvTask
-from npa_envs.envs.vector import NPAVectorEnv
+from npa_envs.envs.core.config import Boundary, EnvConfig
+from npa_envs.envs.core.single import NPAEnv
+from npa_envs.envs.core.task import EnvTask
+from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.errors import NPAError
 from npa_envs.tasks.checks import check_non_negative, check_positive
 from npa_envs.tasks.losses.texture import DEFAULT_LOSS, check_loss_name

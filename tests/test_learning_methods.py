@@ -15,7 +15,7 @@ from npa_envs.agents.learning.clone import Demonstrations, unexplained
 from npa_envs.agents.learning.episode_task import EpisodeTask, episode_task
 from npa_envs.agents.learning.held import HeldRule, hold
 from npa_envs.envs.morphogenesis2d import PictureTask
-from npa_envs.envs.species.task import Population
+from npa_envs.envs.multi.task import Population
 from npa_envs.errors import NPAError
 
 GRADIENT_TOLERANCE = 1e-6

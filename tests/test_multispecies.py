@@ -19,8 +19,8 @@ from pettingzoo.test.state_test import state_test
 import npa_envs
 from npa_envs.agents import RulePolicy
 from npa_envs.envs import multispecies_v0
-from npa_envs.envs.species import TASKS as TABLE
-from npa_envs.envs.species import cohort as cohort_module
+from npa_envs.envs.multi import TASKS as TABLE
+from npa_envs.envs.multi import worlds as cohort_module
 from npa_envs.errors import NPAError
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:pettingzoo")
@@ -379,7 +379,7 @@ def test_the_registry_of_pettingzoo_makes_every_task(kind, name):
 def test_the_package_is_imported_without_pettingzoo_which_is_asked_for_by_name():
     program = (
         "import sys\n"
-        "import npa_envs, npa_envs.envs, npa_envs.envs.species\n"
+        "import npa_envs, npa_envs.envs, npa_envs.envs.multi\n"
         "print('pettingzoo' in sys.modules)\n"
         "sys.modules['pettingzoo'] = None\n"
         "try:\n"

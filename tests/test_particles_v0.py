@@ -12,7 +12,7 @@ from pettingzoo.test.seed_test import parallel_seed_test
 from pettingzoo.test.state_test import state_test
 
 from npa_envs.envs import multispecies_v0, particles_v0
-from npa_envs.envs.species import TASKS as TABLE
+from npa_envs.envs.multi import TASKS as TABLE
 from npa_envs.errors import NPAError
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:pettingzoo")

@@ -11,7 +11,7 @@ import pytest
 from crowds import TASKS, small, still
 
 from npa_envs.envs import multispecies_v0, particles_v0
-from npa_envs.envs.species import TASKS as TABLE
+from npa_envs.envs.multi import TASKS as TABLE
 
 PAGES = Path(__file__).resolve().parent.parent / "docs" / "environments"
 MODULES = {"MultiSpecies": multispecies_v0, "Particles": particles_v0}

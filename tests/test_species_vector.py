@@ -9,8 +9,9 @@ import pytest
 import torch
 from crowds import TASKS, make, small, targets_made_once
 
-from npa_envs.envs import memory, multispecies_v0
-from npa_envs.envs.species import cohort as cohort_module
+from npa_envs.envs import multispecies_v0
+from npa_envs.envs.core import worlds as memory
+from npa_envs.envs.multi import worlds as cohort_module
 from npa_envs.errors import DivergedError, NPAError
 
 quick_targets = pytest.fixture(scope="module", autouse=True)(targets_made_once)

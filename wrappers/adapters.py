@@ -9,7 +9,7 @@ import torch
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 
-from npa_envs.envs.vector import NPAVectorEnv
+from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.errors import NPAError
 from npa_envs.wrappers.moments import as_tensor
 

@@ -14,8 +14,8 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.envs.single import NPAEnv
-from npa_envs.envs.vector import NPAVectorEnv
+from npa_envs.envs.core.single import NPAEnv
+from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.errors import NPAError
 
 if TYPE_CHECKING:

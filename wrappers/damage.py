@@ -12,9 +12,9 @@ from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.envs.arrays import to_output
-from npa_envs.envs.single import NPAEnv
-from npa_envs.envs.vector import NPAVectorEnv
+from npa_envs.envs.core.single import NPAEnv
+from npa_envs.envs.core.spaces import to_output
+from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.errors import NPAError
 from npa_envs.tasks.checks import is_whole
 from npa_envs.tasks.damage import DamageEvent, damage_worlds, parse_damage

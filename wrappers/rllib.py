@@ -7,7 +7,7 @@ from typing import Any
 import gymnasium
 
 from npa_envs.envs import multispecies_v0, particles_v0
-from npa_envs.envs.vector_options import checked_count
+from npa_envs.envs.core.vector import checked_count
 from npa_envs.errors import MissingDependencyError, NPAError, suggest
 from npa_envs.registration import ENVIRONMENTS, register_environments
 from npa_envs.wrappers.row_vector import ParticleRows

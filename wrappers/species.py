@@ -12,7 +12,7 @@ from gymnasium.spaces import Box, Space
 from gymnasium.utils import RecordConstructorArgs
 from torch import Tensor
 
-from npa_envs.envs.arrays import to_output
+from npa_envs.envs.core.spaces import to_output
 from npa_envs.errors import NPAError, suggest
 from npa_envs.tasks.checks import is_real, is_whole
 from npa_envs.world.randomness import Purpose, WorldRandom

@@ -11,7 +11,7 @@ from gymnasium.spaces import Box
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.envs.species.vector import MultiSpeciesVectorEnv
+from npa_envs.envs.multi.vector import MultiSpeciesVectorEnv
 from npa_envs.errors import NPAError, suggest
 from npa_envs.wrappers.adapters import check_same_step, row_space
 from npa_envs.wrappers.moments import as_tensor

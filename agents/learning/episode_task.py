@@ -12,9 +12,9 @@ import npa_envs
 from npa_envs.agents.learning.held import HeldRule
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.rules import RuleSet
-from npa_envs.envs.species.config import SpeciesConfig
-from npa_envs.envs.species.task import Population, SpeciesTask
-from npa_envs.envs.task import EnvTask
+from npa_envs.envs.core.task import EnvTask
+from npa_envs.envs.multi.config import SpeciesConfig
+from npa_envs.envs.multi.task import Population, SpeciesTask
 from npa_envs.errors import NPAError
 from npa_envs.world.randomness import WorldRandom
 from npa_envs.world.rollout import Memory

@@ -12,8 +12,8 @@ from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
-from npa_envs.envs.species.vector import MultiSpeciesVectorEnv
-from npa_envs.envs.vector_options import worlds_to_reset
+from npa_envs.envs.core.vector import worlds_to_reset
+from npa_envs.envs.multi.vector import MultiSpeciesVectorEnv
 from npa_envs.world.actions import Physics
 
 TIME_LIMIT, LEFT = "time limit", "left the world"
@@ -52,7 +52,7 @@ class JoinedSpeciesEnv:
     | `particle_terminated` | whether that species ended by itself now, bool, shape [B, N] |
 
     Args:
-        task: A name from `npa_envs.envs.species.TASKS`.
+        task: A name from `npa_envs.envs.multi.TASKS`.
         num_envs: Worlds B.
         episode_steps: Steps after which an episode is cut off.
         device: Where the worlds live.

@@ -8,7 +8,7 @@ from npa_envs.agents.learning.ppo_settings import Settings
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Budget
 from npa_envs.agents.learning.seeds import WORLDS_PER_SEED
-from npa_envs.envs.memory import free_bytes, needed_bytes
+from npa_envs.envs.core.worlds import free_bytes, needed_bytes
 
 MANY_PARTICLES = 2**17
 """Particles of all worlds together on a GPU: a round of fewer takes hardly less time."""

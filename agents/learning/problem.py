@@ -14,14 +14,14 @@ import torch
 from npa_envs.agents.learning.joined import JoinedSpeciesEnv
 from npa_envs.agents.policy import Interface
 from npa_envs.devices import check_device
-from npa_envs.envs.config import EnvConfig
-from npa_envs.envs.species.config import SpeciesConfig
-from npa_envs.envs.species.tables import ENVIRONMENTS as SPECIES
-from npa_envs.envs.species.tables import task_type as species_task_type
-from npa_envs.envs.species.task import SpeciesTask
-from npa_envs.envs.task import EnvTask
-from npa_envs.envs.vector import NPAVectorEnv
-from npa_envs.envs.worlds import make_physics
+from npa_envs.envs.core.config import EnvConfig
+from npa_envs.envs.core.task import EnvTask
+from npa_envs.envs.core.vector import NPAVectorEnv
+from npa_envs.envs.core.worlds import make_physics
+from npa_envs.envs.multi.config import SpeciesConfig
+from npa_envs.envs.multi.task import SpeciesTask
+from npa_envs.envs.multi.tasks.table import ENVIRONMENTS as SPECIES
+from npa_envs.envs.multi.tasks.table import task_type as species_task_type
 from npa_envs.errors import NPAError, suggest
 from npa_envs.registration import ENVIRONMENTS
 from npa_envs.tasks.checks import check_positive

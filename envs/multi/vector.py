@@ -15,14 +15,12 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.envs.arrays import to_output
-from npa_envs.envs.screen import Screen
-from npa_envs.envs.species.actions import joined_actions
-from npa_envs.envs.species.episodes import Episodes, Outcome
-from npa_envs.envs.species.pictures import SpeciesView
-from npa_envs.envs.species.spaces import agent_spaces, state_space
-from npa_envs.envs.vector_options import autoreset_mode as checked_mode
-from npa_envs.envs.vector_options import checked_count, world_keys, worlds_to_reset
+from npa_envs.envs.core.screen import Screen
+from npa_envs.envs.core.spaces import to_output
+from npa_envs.envs.core.vector import checked_count, checked_mode, world_keys, worlds_to_reset
+from npa_envs.envs.multi.episodes import Episodes, Outcome
+from npa_envs.envs.multi.pictures import SpeciesView
+from npa_envs.envs.multi.spaces import agent_spaces, joined_actions, state_space
 from npa_envs.errors import NPAError
 from npa_envs.world.cuda_graph import sent
 
@@ -57,7 +55,7 @@ class MultiSpeciesVectorEnv:
     | `_final_obs` | likewise | which worlds restarted |
 
     Args:
-        task: A name from `npa_envs.envs.species.TASKS`.
+        task: A name from `npa_envs.envs.multi.TASKS`.
         world_count: Worlds B.
         autoreset_mode: "same-step": the step that ends a world's episode returns the next one's
             first observation, and the last one is in `infos[species]["final_obs"]`; "disabled":

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.envs.config import EnvConfig
+from npa_envs.envs.core.config import EnvConfig
 from npa_envs.errors import NPAError
 from npa_envs.render import draw_worlds
 from npa_envs.world.randomness import Purpose, WorldRandom

@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from npa_envs.envs.worlds import Worlds
+from npa_envs.envs.core.worlds import Worlds
 from npa_envs.render import Window
 
 SHOWN_ACROSS = 4

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, NamedTuple
 import torch
 from torch import Tensor
 
-from npa_envs.envs.species.config import SpeciesConfig
+from npa_envs.envs.multi.config import SpeciesConfig
 from npa_envs.errors import NPAError
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.world.randomness import WorldRandom

@@ -7,8 +7,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.envs.report import DIVERGED
-from npa_envs.envs.worlds import Worlds
+from npa_envs.envs.core.report import DIVERGED
+from npa_envs.envs.core.worlds import Worlds
 from npa_envs.errors import DivergedError
 from npa_envs.world.actions import Physics
 from npa_envs.world.divergence import LARGEST_REPORT, term_name

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from npa_envs.envs.species.co_morphogenesis import CoMorphogenesisTask
-from npa_envs.envs.species.invasion import InvasionTask
-from npa_envs.envs.species.mixing import MixingTask
-from npa_envs.envs.species.segregation import SegregationTask
-from npa_envs.envs.species.symbiosis import SymbiosisTask
-from npa_envs.envs.species.task import SpeciesTask
+from npa_envs.envs.multi.task import SpeciesTask
+from npa_envs.envs.multi.tasks.co_morphogenesis import CoMorphogenesisTask
+from npa_envs.envs.multi.tasks.invasion import InvasionTask
+from npa_envs.envs.multi.tasks.mixing import MixingTask, SegregationTask
+from npa_envs.envs.multi.tasks.symbiosis import SymbiosisTask
 from npa_envs.errors import NPAError, suggest
 
 TASKS: dict[str, type[SpeciesTask]] = {

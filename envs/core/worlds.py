@@ -1,13 +1,11 @@
-"""The batch of worlds behind every environment: steps, losses, endings, restarts.
-
-Gymnasium is not known here. A single environment is a batch of one; world k of a batch is, bit for
-bit, that world alone.
-"""
+"""Whether worlds fit into memory, asked before anything is allocated."""
 
 from __future__ import annotations
 
 import contextlib
 import os
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,15 +13,173 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.envs.config import EnvConfig
-from npa_envs.envs.memory import check_memory
-from npa_envs.envs.report import DIVERGED, SUCCESS, TIME_LIMIT, Report
-from npa_envs.envs.restarts import Restarts
-from npa_envs.envs.task import EnvTask, Start
-from npa_envs.errors import DivergedError
+from npa_envs.envs.core.config import EnvConfig
+from npa_envs.envs.core.report import DIVERGED, SUCCESS, TIME_LIMIT, Report
+from npa_envs.envs.core.task import EnvTask, Start
+from npa_envs.errors import DivergedError, NPAError
 from npa_envs.world.actions import Actions, Physics, SurveyedWorlds, survey_worlds
-from npa_envs.world.cuda_graph import Beside, Replayed, sent
+from npa_envs.world.cuda_graph import Beside, Replayed, WeakFunction, sent
 from npa_envs.world.randomness import WorldRandom
+
+OBSERVATION_COPIES = 4
+"""Observations alive at once: the rows, the arrays handed out, the last ones, one to spare."""
+
+LARGEST_INDEX = 2**31 - 1
+"""Kernels index the particles' states with 32 bits."""
+
+
+LISTED_BYTES = 320
+"""What CUDA keeps of a particle's neighbours, at most: a list of 128, and what is sorted."""
+
+RECORDED_STARTS = 4 / 3
+"""Particles of all recorded restarts together, which have lists of their own, to those of a batch:
+1 + 1/4 + 1/16 + ..."""
+
+
+def needed_bytes(
+    world_count: int, particle_count: int, physics: Physics, device: torch.device
+) -> int:
+    """Return about how much memory worlds take while they are stepped [bytes]."""
+    particles = world_count * particle_count
+    worlds = 6 * (physics.space_dim + physics.state_dim)
+    numbers = OBSERVATION_COPIES * physics.perception_dim + 2 * physics.action_dim + worlds + 16
+    listed = LISTED_BYTES * (1.0 + RECORDED_STARTS) if device.type == "cuda" else 0.0
+    return int(particles * (4 * numbers + listed))
+
+
+def free_bytes(device: torch.device) -> int | None:
+    """Return the memory that is free on a device [bytes], or None where nobody says."""
+    if device.type == "cuda":
+        free, _ = torch.cuda.mem_get_info(device)
+        cached = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+        return int(free) + cached
+    try:
+        for line in Path("/proc/meminfo").read_text().splitlines():
+            if line.startswith("MemAvailable:"):
+                return int(line.split()[1]) * 1024
+    except (OSError, ValueError, IndexError):
+        pass
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):
+        return None
+
+
+def check_memory(
+    world_count: int,
+    particle_count: int,
+    physics: Physics,
+    device: torch.device,
+    extra_bytes: int = 0,
+) -> None:
+    """Check that worlds fit into a device's memory and into the kernels' indices.
+
+    Args:
+        world_count: Worlds B.
+        particle_count: Particles in each, N.
+        physics: The worlds' constants.
+        device: Where they shall live.
+        extra_bytes: What the task needs besides.
+
+    Raises:
+        NPAError: They do not.
+    """
+    what = f"{world_count} world(s) of {particle_count} particles"
+    cure = "choose a smaller particle_count or fewer worlds"
+    if world_count * particle_count * (1 + physics.state_dim) > LARGEST_INDEX:
+        raise NPAError(f"particle_count is too large: {what} exceed 32-bit indices: {cure}")
+    needed = needed_bytes(world_count, particle_count, physics, device) + extra_bytes
+    free = free_bytes(device)
+    if free is not None and needed > free:
+        raise NPAError(
+            f"particle_count must fit into memory: {what} need about {needed / 2**30:.1f} GiB "
+            f"with pictures and pool, and {device} has {free / 2**30:.1f} GiB free: {cure}"
+        )
+
+
+# Next episodes for some worlds of a batch.
+
+
+GROWTH = 4
+"""Each recorded size is so many times the one before it."""
+
+
+class Restarts:
+    """Starts of next episodes, on CUDA as one graph and one launch instead of some hundred.
+
+    A recorded start serves a fixed number of worlds. Fewer are filled up by repeating the last one:
+    it is then started twice in the same way, which is the same as once.
+
+    Args:
+        start: Starts the next episodes of worlds (indices, int64, shape [M]) and returns them made
+            ready for perception in the rows of the whole batch. A method's object has to be kept
+            by others.
+        world_count: Worlds B.
+        device: Where they live.
+        recorded: Whether `start` may be recorded: it never waits for the device.
+    """
+
+    def __init__(
+        self,
+        start: Callable[[Tensor], SurveyedWorlds],
+        world_count: int,
+        device: torch.device,
+        *,
+        recorded: bool,
+    ) -> None:
+        self._start = WeakFunction(start)
+        self._world_count = world_count
+        self._device = device
+        self._recorded = recorded and device.type == "cuda"
+        self._chunks: dict[int, _Chunk] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out recorded starts, which cannot be pickled."""
+        return self.__dict__ | {"_chunks": {}}
+
+    def __call__(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
+        """Start the next episodes of some worlds.
+
+        Args:
+            worlds: Which, shape [M].
+            observation: Where to write what is perceived in them, shape [B, N, P].
+        """
+        if not self._recorded:
+            self._start()(sent(worlds, self._device)).perceive(observation)
+            return
+        size = 1
+        while size < len(worlds):
+            size = min(size * GROWTH, self._world_count)
+        if size not in self._chunks:
+            self._chunks[size] = _Chunk(self._start, size, self._device)
+        filled = np.full(size, worlds[-1])
+        filled[: len(worlds)] = worlds
+        self._chunks[size].restart(sent(filled, self._device), observation)
+
+
+class _Chunk:
+    """The recorded start of a fixed number of worlds."""
+
+    def __init__(self, start: WeakFunction, size: int, device: torch.device) -> None:
+        self._start = start
+        self._index = torch.zeros(size, dtype=torch.int64, device=device)
+        self._replayed = Replayed(self._run, device)
+
+    def restart(self, worlds: Tensor, observation: Tensor) -> None:
+        """Start the next episodes of as many worlds as the chunk is for."""
+        self._index.copy_(worlds)
+        self._replayed()
+        self._surveyed.perceive(observation)
+
+    def _run(self) -> None:
+        self._surveyed: SurveyedWorlds = self._start()(self._index)
+
+
+# The batch of worlds behind every environment: steps, losses, endings, restarts.
+#
+# Gymnasium is not known here. A single environment is a batch of one; world k of a batch is, bit
+# for bit, that world alone.
+
 
 # Torch's pool of threads does not survive a fork: a forked worker, as Gymnasium's AsyncVectorEnv
 # starts them, would wait for it for ever.

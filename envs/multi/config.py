@@ -10,7 +10,7 @@ from typing import Any, Literal, Self
 import numpy as np
 from torch import Tensor
 
-from npa_envs.envs.config import LARGEST, Boundary, EnvConfig, Output
+from npa_envs.envs.core.config import LARGEST, Boundary, EnvConfig, Output
 from npa_envs.errors import NPAError, suggest
 from npa_envs.render import STYLES
 from npa_envs.tasks.checks import check_non_negative, check_positive, is_whole

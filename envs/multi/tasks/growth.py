@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from npa_envs.envs.species.config import SpeciesConfig
+from npa_envs.envs.multi.config import SpeciesConfig
 from npa_envs.tasks.checks import check_non_negative, check_positive
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 

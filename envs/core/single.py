@@ -11,14 +11,20 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.envs.arrays import checked_action, checked_particles, number_tensor, to_output
-from npa_envs.envs.divergence import guarded
-from npa_envs.envs.report import DIVERGED, SUCCESS, reason
-from npa_envs.envs.screen import Screen, WorldsView
-from npa_envs.envs.spaces import action_space, observation_space
-from npa_envs.envs.task import EnvTask
-from npa_envs.envs.vector_options import world_keys
-from npa_envs.envs.worlds import Worlds
+from npa_envs.envs.core.divergence import guarded
+from npa_envs.envs.core.report import DIVERGED, SUCCESS, reason
+from npa_envs.envs.core.screen import Screen, WorldsView
+from npa_envs.envs.core.spaces import (
+    action_space,
+    checked_action,
+    checked_particles,
+    number_tensor,
+    observation_space,
+    to_output,
+)
+from npa_envs.envs.core.task import EnvTask
+from npa_envs.envs.core.vector import world_keys
+from npa_envs.envs.core.worlds import Worlds
 from npa_envs.errors import NPAError
 
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from npa_envs.envs.species.growth import GrowthConfig, make_goal, picture_parts
-from npa_envs.envs.species.task import Population, SpeciesTask
+from npa_envs.envs.multi.task import Population, SpeciesTask
+from npa_envs.envs.multi.tasks.growth import GrowthConfig, make_goal, picture_parts
 from npa_envs.errors import NPAError
 
 

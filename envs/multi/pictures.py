@@ -9,10 +9,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.envs.species.config import SPECIES_STYLE
-from npa_envs.envs.species.task import Population
-from npa_envs.envs.species.worlds import SpeciesWorlds
-from npa_envs.envs.task import SHARPNESS
+from npa_envs.envs.core.task import SHARPNESS
+from npa_envs.envs.multi.config import SPECIES_STYLE
+from npa_envs.envs.multi.task import Population
+from npa_envs.envs.multi.worlds import SpeciesWorlds
 from npa_envs.render import draw_worlds
 from npa_envs.rule.rule import COLOUR_OFFSET
 

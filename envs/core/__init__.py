@@ -1,0 +1,1 @@
+"""What every environment of one rule's worlds shares: configuration, worlds, spaces, views."""

@@ -1,0 +1,1 @@
+"""The tasks of several species, one file each."""
