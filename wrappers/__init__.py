@@ -11,19 +11,19 @@ if TYPE_CHECKING:
     from npa_envs.wrappers.damage import DamageEvents, VectorDamageEvents
     from npa_envs.wrappers.normalize import NormalizePerception, VectorNormalizePerception
     from npa_envs.wrappers.numeric_infos import NumericInfos as NumericInfos
-    from npa_envs.wrappers.particles import ParticleVecEnv as ParticleVecEnv
     from npa_envs.wrappers.row_vector import ParticleRows
     from npa_envs.wrappers.rsl_rl import RslRlParticleEnv as RslRlParticleEnv
+    from npa_envs.wrappers.sb3 import ParticleVecEnv as ParticleVecEnv
+    from npa_envs.wrappers.sb3 import RowPolicy as RowPolicy
+    from npa_envs.wrappers.sb3 import SpeciesVecEnv as SpeciesVecEnv
+    from npa_envs.wrappers.sb3 import WorldVecEnv as WorldVecEnv
     from npa_envs.wrappers.species import SpeciesTags, VectorSpeciesTags
-    from npa_envs.wrappers.species_rows import RowPolicy as RowPolicy
-    from npa_envs.wrappers.species_rows import SpeciesVecEnv as SpeciesVecEnv
     from npa_envs.wrappers.statistics import (
         TorchNormalizeObservation,
         TorchNormalizeReward,
         TorchRecordEpisodeStatistics,
     )
     from npa_envs.wrappers.torchrl import NPATorchRLEnv as NPATorchRLEnv
-    from npa_envs.wrappers.world_rows import WorldVecEnv as WorldVecEnv
 
 __all__ = [
     "DamageEvents",
@@ -50,14 +50,8 @@ ON_REQUEST = (
 
 
 def __getattr__(name: str) -> Any:
-    if name == "ParticleVecEnv":
-        from npa_envs.wrappers import particles
-
-        return particles.ParticleVecEnv
-    if name == "NumericInfos":
-        from npa_envs.wrappers import numeric_infos
-
-        return numeric_infos.NumericInfos
+    if name not in __all__ and name not in ON_REQUEST:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     if name == "NPATorchRLEnv":
         from npa_envs.wrappers import torchrl
 
@@ -66,16 +60,14 @@ def __getattr__(name: str) -> Any:
         from npa_envs.wrappers import rsl_rl
 
         return rsl_rl.RslRlParticleEnv
-    if name == "WorldVecEnv":
-        from npa_envs.wrappers import world_rows
+    if name in ("ParticleVecEnv", "RowPolicy", "SpeciesVecEnv", "WorldVecEnv"):
+        from npa_envs.wrappers import sb3
 
-        return world_rows.WorldVecEnv
-    if name in ON_REQUEST:
-        from npa_envs.wrappers import species_rows
+        return getattr(sb3, name)
+    if name == "NumericInfos":
+        from npa_envs.wrappers import numeric_infos
 
-        return getattr(species_rows, name)
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return numeric_infos.NumericInfos
     from npa_envs.wrappers import damage, normalize, row_vector, species, statistics
 
     holders = (damage, normalize, row_vector, species, statistics)

@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode
 
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.errors import NPAError
-from npa_envs.wrappers.moments import as_tensor
+from npa_envs.wrappers.statistics import as_tensor
 
 
 def check_same_step(mode: AutoresetMode) -> None:

@@ -22,7 +22,7 @@ from npa_envs.wrappers.base import (
     single_env,
     vector_env,
 )
-from npa_envs.wrappers.moments import RunningMoments, as_tensor, like
+from npa_envs.wrappers.statistics import RunningMoments, as_tensor, like
 
 DEFAULT_CLIP, DEFAULT_EPSILON = 10.0, 1e-8
 

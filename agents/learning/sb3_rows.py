@@ -27,9 +27,7 @@ from npa_envs.agents.learning.sb3_common import (
 from npa_envs.agents.learning.sb3_imports import VecEnvWrapper
 from npa_envs.agents.learning.sb3_policy import RuleActorCritic
 from npa_envs.errors import NPAError
-from npa_envs.wrappers.particles import ParticleVecEnv
-from npa_envs.wrappers.rows import RowVecEnv
-from npa_envs.wrappers.species_rows import SpeciesVecEnv
+from npa_envs.wrappers.sb3 import ParticleVecEnv, RowVecEnv, SpeciesVecEnv
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,7 +16,7 @@ from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.agents.learning.sb3_common import SB3Settings, learn
 from npa_envs.agents.learning.sb3_policy import EXCESS, RuleActorCritic
-from npa_envs.wrappers.world_rows import WorldVecEnv
+from npa_envs.wrappers.sb3 import WorldVecEnv
 
 
 @dataclass(frozen=True, kw_only=True)

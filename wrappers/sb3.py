@@ -1,0 +1,598 @@
+"""Particles as rows of a Stable-Baselines3 `VecEnv`: what all such environments share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, NoReturn
+
+import numpy as np
+import torch
+from gymnasium.spaces import Box
+from gymnasium.vector import VectorWrapper
+from numpy.typing import NDArray
+from torch import Tensor
+
+from npa_envs.envs.multi.vector import MultiSpeciesVectorEnv
+from npa_envs.errors import MissingDependencyError, NPAError, suggest
+from npa_envs.wrappers.adapters import check_same_step, own_rewards, row_space
+from npa_envs.wrappers.base import AnyVectorEnv, autoreset_mode, vector_env
+from npa_envs.wrappers.statistics import as_tensor
+
+try:
+    from stable_baselines3.common.vec_env import VecEnv
+except ImportError as error:
+    raise MissingDependencyError(
+        "particles as rows need Stable-Baselines3: pip install 'npa-envs[sb3]'"
+    ) from error
+
+
+class SharedInfo(dict[str, Any]):
+    """The empty info that all rows in the midst of their episodes share, so it stays empty."""
+
+    def _refuse(self, *_: Any, **__: Any) -> NoReturn:
+        raise NPAError(
+            "info of a row in the midst of its episode is shared by all such rows: "
+            "put a copy into the list, infos[row] = dict(infos[row])"
+        )
+
+    __setitem__ = __ior__ = setdefault = update = _refuse
+
+
+class RowVecEnv(VecEnv):
+    """Rows of a batch of worlds, as many of each; subclasses say what a row sees, does and gets.
+
+    Args:
+        env: The environment of many worlds.
+        world_count: Worlds B.
+        row_count: Rows of a world, R.
+        observation_space: Space of a row's observations.
+        action_space: Space of its actions.
+    """
+
+    def __init__(
+        self,
+        env: Any,
+        world_count: int,
+        row_count: int,
+        observation_space: Box,
+        action_space: Box,
+    ) -> None:
+        self.vector_env = env
+        """The environment whose particles these are."""
+        self.world_count = world_count
+        """Worlds B."""
+        self.row_count = row_count
+        """Rows of a world, R."""
+        self.spec = getattr(env, "spec", None)
+        """What Gymnasium knows of the environment."""
+        self.nothing = SharedInfo()
+        """The info of all rows in the midst of their episodes."""
+        self._seed: int | None = None
+        self._actions: NDArray[np.float32] | None = None
+        super().__init__(world_count * row_count, observation_space, action_space)
+
+    def begin(self) -> tuple[Any, Any]:
+        """Reset the environment with what `seed` and `set_options` left for it."""
+        outcome: tuple[Any, Any] = self.vector_env.reset(
+            seed=self._seed, options=self._options[0] or None
+        )
+        self._seed = None
+        self._reset_seeds()
+        self._reset_options()
+        return outcome
+
+    def step_async(self, actions: NDArray[Any]) -> None:
+        """Keep the actions for `step_wait`.
+
+        Args:
+            actions: Of each row, shape [B R, A].
+
+        Raises:
+            NPAError: They have another shape, which could be read as that of other rows.
+        """
+        wanted = (self.num_envs, *(self.action_space.shape or ()))
+        if np.shape(actions) != wanted:
+            raise NPAError(
+                f"actions must have shape [B R, A] = {wanted}, got {np.shape(actions)}: "
+                "one for each row"
+            )
+        self._actions = actions.reshape(self.world_count, self.row_count, -1)
+
+    def taken_actions(self) -> NDArray[np.float32]:
+        """Return the actions that were kept, shape [B, R, A]; they are taken once.
+
+        Raises:
+            NPAError: There are none.
+        """
+        if self._actions is None:
+            raise NPAError("step_wait needs actions: call step_async, or step")
+        actions, self._actions = self._actions, None
+        return actions
+
+    def close(self) -> None:
+        """Close the environment."""
+        self.vector_env.close()
+
+    def seed(self, seed: int | None = None) -> list[int | None]:
+        """Let the next reset begin the sequences of episodes of seed, seed + 1, ..., one a world.
+
+        Args:
+            seed: None: any.
+
+        Returns:
+            The seed of each row's world.
+        """
+        if seed is None:
+            seed = int(np.random.default_rng().integers(2**32))
+        self._seed = int(seed)
+        worlds = np.arange(self.world_count).repeat(self.row_count)
+        return [self._seed + world for world in worlds.tolist()]
+
+    def get_images(self) -> list[NDArray[np.uint8] | None]:
+        """Return a picture of each world, shape [R, R, 3], or nothing without a render mode."""
+        pictures: Any = self.vector_env.render()
+        return list(pictures or ())
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """Return an attribute of the environment, once for each row.
+
+        Args:
+            attr_name: Its name; wrappers are asked first.
+            indices: Which rows; None: all of them.
+
+        Raises:
+            AttributeError: There is none of that name.
+        """
+        return [getattr(self._holder(attr_name), attr_name)] * len(self._chosen(indices))
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Set an attribute of the environment.
+
+        Args:
+            attr_name: Its name; set where it is found, else in the innermost environment.
+            value: The value.
+            indices: None, or all rows: they share the environment.
+
+        Raises:
+            NPAError: Only some rows are chosen.
+        """
+        if len(set(self._chosen(indices))) != self.num_envs:
+            raise NPAError("indices must be all rows, which share one environment: give None")
+        try:
+            holder = self._holder(attr_name)
+        except AttributeError:
+            holder = getattr(self.vector_env, "unwrapped", self.vector_env)
+        setattr(holder, attr_name, value)
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """Call a method of the environment once, and return its result for each row.
+
+        Args:
+            method_name: Its name; wrappers are asked first.
+            method_args: Its arguments.
+            indices: Which rows; None: all of them.
+            method_kwargs: Its keyword arguments.
+
+        Raises:
+            AttributeError: There is none of that name.
+        """
+        result = getattr(self._holder(method_name), method_name)(*method_args, **method_kwargs)
+        return [result] * len(self._chosen(indices))
+
+    def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
+        """Return for each row whether the environment is wrapped with a class.
+
+        Args:
+            wrapper_class: The class.
+            indices: Which rows; None: all of them.
+        """
+        wrapped = any(isinstance(layer, wrapper_class) for layer in self._layers())
+        return [wrapped] * len(self._chosen(indices))
+
+    def _chosen(self, indices: Any) -> list[int]:
+        return list(self._get_indices(indices))
+
+    def _layers(self) -> Iterator[Any]:
+        layer: Any = self.vector_env
+        while isinstance(layer, VectorWrapper):
+            yield layer
+            layer = layer.env
+        yield layer
+
+    def _holder(self, name: str) -> Any:
+        for layer in self._layers():
+            if hasattr(layer, name):
+                return layer
+        raise AttributeError(f"{self.vector_env} has no attribute {name!r}")
+
+
+def on_host(*given: Any) -> list[NDArray[Any]]:
+    """Return new arrays with what arrays or tensors hold, after one wait for the device.
+
+    Args:
+        given: Arrays or tensors.
+    """
+    copies = []
+    for values in given:
+        tensor = as_tensor(values)
+        # Pinned memory comes from torch's cache and goes back to it with the array.
+        copy = torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=tensor.is_cuda)
+        copies.append(copy.copy_(tensor, non_blocking=tensor.is_cuda))
+    for device in {v.device for v in given if isinstance(v, Tensor) and v.is_cuda}:
+        torch.cuda.current_stream(device).synchronize()
+    return [copy.numpy() for copy in copies]
+
+
+# Each particle as one environment of Stable-Baselines3: many small agents that share a policy.
+
+
+class ParticleVecEnv(RowVecEnv):
+    """The particles of a vector environment as the rows of a Stable-Baselines3 `VecEnv`.
+
+    Row w N + i is particle i of world w: it observes that particle's perception, shape [P], gives
+    its action, shape [A], and gets its own reward where the environment was made with
+    `reward="particle"`; with any other reward each row gets its world's. So a policy of any
+    algorithm is shared by all particles, and sees what a rule sees. A step stays one batched step,
+    and costs one copy of the observations to the host (on CUDA make the environment with
+    `output="torch"`: the copy is then pinned).
+
+    Rows of a finished world have an info of their own, with `terminal_observation`,
+    `TimeLimit.truncated` and `is_success`; the others share an empty one, which cannot be written
+    to. Attributes and methods belong to the whole environment: each row gives the same.
+
+    Stable-Baselines3 counts rows: 8 worlds of 1024 particles are 8192 steps at once. Its defaults
+    are made for a few rows; with PPO set for example `n_steps=32, batch_size=4096`.
+
+    Args:
+        env: A vector environment of this package, wrapped or not, with same-step autoreset.
+        bootstrap: Whether rows cut off by the step limit say so, from which Stable-Baselines3
+            estimates what they would still have got. On-policy algorithms do that row by row, which
+            for many thousand rows takes seconds; False: such an end counts as any other.
+
+    Raises:
+        NPAError: The environment is none of this package, or has another autoreset mode.
+        MissingDependencyError: Stable-Baselines3 is not installed (on import).
+    """
+
+    def __init__(self, env: AnyVectorEnv, *, bootstrap: bool = True) -> None:
+        base = vector_env(env, type(self).__name__)
+        check_same_step(autoreset_mode(env))
+        self.bootstrap = bootstrap
+        """Whether rows cut off by the step limit say so."""
+        self.particle_count = base.config.particle_count
+        """Particles N of a world."""
+        super().__init__(
+            env,
+            base.num_envs,
+            self.particle_count,
+            row_space(env.single_observation_space),
+            row_space(env.single_action_space),
+        )
+
+    def reset(self) -> NDArray[np.float32]:
+        """Start episodes in all worlds and return the rows' observations, shape [B N, P]."""
+        observations, _ = self.begin()
+        return on_host(observations)[0].reshape(self.num_envs, -1)
+
+    def step_wait(
+        self,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
+        """Step all worlds.
+
+        Returns:
+            Of each row: observation [B N, P], reward [B N], whether its episode is over [B N], and
+            infos.
+
+        Raises:
+            DivergedError: An action is not finite; the worlds are then as they were.
+        """
+        observations, rewards, terminations, truncations, infos = self.vector_env.step(
+            self.taken_actions()
+        )
+        own = own_rewards(infos)
+        shown, paid, ended, cut = on_host(
+            observations, rewards if own is None else own, terminations, truncations
+        )
+        if own is None:
+            paid = np.repeat(paid, self.particle_count)
+        rows: list[dict[str, Any]] = [self.nothing] * self.num_envs
+        done = ended | cut
+        if done.any():
+            self._write_infos(rows, infos, np.flatnonzero(done), cut & ~ended)
+        return (
+            shown.reshape(self.num_envs, -1),
+            paid.reshape(self.num_envs).astype(np.float32, copy=False),
+            np.repeat(done, self.particle_count),
+            rows,
+        )
+
+    def _write_infos(
+        self,
+        rows: list[dict[str, Any]],
+        infos: dict[str, Any],
+        worlds: NDArray[np.int64],
+        cut: NDArray[np.bool_],
+    ) -> None:
+        """Give each row of some worlds an info about its episode's end."""
+        count = self.particle_count
+        success = on_host(infos["final_info"]["success"])[0]
+        final = as_tensor(infos["final_obs"])
+        chosen = torch.from_numpy(worlds).to(final.device)
+        last = on_host(final[chosen])[0] if self.bootstrap else None
+        for k, world in enumerate(worlds.tolist()):
+            common = {"is_success": bool(success[world])}
+            first = world * count
+            if last is None:
+                rows[first : first + count] = [dict(common) for _ in range(count)]
+                continue
+            common["TimeLimit.truncated"] = bool(cut[world])
+            rows[first : first + count] = [
+                {**common, "terminal_observation": observation} for observation in last[k]
+            ]
+
+
+# Each world as one environment of Stable-Baselines3: a policy that acts for all its particles.
+
+
+class WorldVecEnv(RowVecEnv):
+    """The worlds of a vector environment as the rows of a Stable-Baselines3 `VecEnv`.
+
+    A row observes what all particles of its world perceive, shape [N, P], and gives all their
+    actions, [N, A]. Stable-Baselines3's own policies draw those from one Gaussian of N A columns,
+    which cannot learn: after the smallest update the ratio of two likelihoods is near zero or
+    beyond all bounds. Take a policy that means over particles instead of summing, such as
+    `npa_envs.agents.learning.sb3_world.WorldRulePolicy`.
+
+    Rows of a finished world have an info of their own, with `terminal_observation`,
+    `TimeLimit.truncated` and, where there is one, `is_success`; the others share an empty one.
+
+    Args:
+        env: A vector environment whose worlds are particles, [B, N, P] and [B, N, A], wrapped or
+            not, with same-step autoreset.
+
+    Raises:
+        NPAError: The environment has other spaces, or another autoreset mode.
+        MissingDependencyError: Stable-Baselines3 is not installed (on import).
+    """
+
+    def __init__(self, env: Any) -> None:
+        spaces = [
+            _flat_float(getattr(env, name, None), name)
+            for name in ("single_observation_space", "single_action_space")
+        ]
+        check_same_step(autoreset_mode(env))
+        super().__init__(env, env.num_envs, 1, *spaces)
+
+    def reset(self) -> NDArray[np.float32]:
+        """Start episodes in all worlds and return their observations, shape [B, N, P]."""
+        observations, _ = self.begin()
+        return on_host(observations)[0]
+
+    def step_wait(
+        self,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
+        """Step all worlds.
+
+        Returns:
+            Of each world: observation [B, N, P], reward [B], whether its episode is over [B], and
+            infos.
+
+        Raises:
+            DivergedError: An action is not finite; the worlds are then as they were.
+        """
+        actions = self.taken_actions().reshape(self.world_count, *(self.action_space.shape or ()))
+        observations, rewards, terminations, truncations, infos = self.vector_env.step(actions)
+        shown, paid, ended, cut = on_host(observations, rewards, terminations, truncations)
+        done = ended | cut
+        rows: list[dict[str, Any]] = [self.nothing] * self.num_envs
+        if done.any():
+            (last,) = on_host(infos["final_obs"])
+            success = infos["final_info"].get("success")
+            told = None if success is None else on_host(success)[0]
+            for row in np.flatnonzero(done).tolist():
+                rows[row] = {
+                    "TimeLimit.truncated": bool(cut[row] and not ended[row]),
+                    "terminal_observation": last[row],
+                }
+                if told is not None:
+                    rows[row]["is_success"] = bool(told[row])
+        return shown, paid.astype(np.float32, copy=False), done, rows
+
+
+def _flat_float(space: Any, name: str) -> Box:
+    """Return the space of a world's particles, a row of numbers for each."""
+    if not (isinstance(space, Box) and len(space.shape) == 2):
+        raise NPAError(
+            f"{name} of env must be a box with a row for each particle, got {space}: make the "
+            "environment with gym.make_vec(..., vectorization_mode='vector_entry_point')"
+        )
+    return Box(space.low, space.high, dtype=np.float32)
+
+
+# Particles of several species as rows of Stable-Baselines3: a policy for all, or for each.
+
+
+SpeciesPolicy = Callable[[Any], Any]
+"""Takes a species' observations, shape [B, N_k, P], and returns its actions, [B, N_k, A]."""
+
+
+class RowPolicy:
+    """A Stable-Baselines3 model that was trained on rows, as the policy of a species or a world.
+
+    Args:
+        model: The model; the policy follows when it is trained on.
+        deterministic: Whether it acts by its mean instead of a draw.
+        tag: What the model was told of the species behind each row, shape [K]; None: nothing.
+    """
+
+    def __init__(
+        self, model: Any, *, deterministic: bool = False, tag: NDArray[np.float32] | None = None
+    ) -> None:
+        self.model = model
+        self.deterministic = deterministic
+        self.tag = tag
+
+    def __call__(self, observations: Any) -> NDArray[np.float32]:
+        """Return actions, shape [B, N, A].
+
+        Args:
+            observations: Shape [B, N, P].
+        """
+        (seen,) = on_host(observations)
+        rows = seen.reshape(-1, seen.shape[-1])
+        if self.tag is not None:
+            rows = np.hstack((rows, np.broadcast_to(self.tag, (len(rows), len(self.tag)))))
+        actions, _ = self.model.predict(rows, deterministic=self.deterministic)
+        return np.asarray(actions, np.float32).reshape(*seen.shape[:-1], -1)
+
+
+class SpeciesVecEnv(RowVecEnv):
+    """Particles of several species as the rows of a Stable-Baselines3 `VecEnv`.
+
+    Without `others` all particles of all species are rows and share one policy; each is told its
+    species by a one-hot tag behind what it perceives. With `others` the particles of those species
+    are played by the policies given, and the remaining species' particles are the rows, without
+    tags: for policies of their own, train them in turn, each beside the others as they are.
+
+    A world's rows follow each other, species after species. Each row is paid what its species is.
+    Where a species ends, its rows end; until the world's next episode they see zeros,
+    are paid nothing, and their actions are not read. With the world they end once more.
+
+    Args:
+        env: What `multispecies_v0.batched` returns, with same-step autoreset.
+        others: Policies of species that are not to be rows, by name.
+
+    Raises:
+        NPAError: `env` is another environment, or does not restart worlds by itself, or there is no
+            species of a name, or none left to be rows, or a policy is no function.
+        MissingDependencyError: Stable-Baselines3 is not installed (on import).
+    """
+
+    def __init__(
+        self,
+        env: MultiSpeciesVectorEnv,
+        *,
+        others: Mapping[str, SpeciesPolicy] | None = None,
+    ) -> None:
+        if not isinstance(env, MultiSpeciesVectorEnv):
+            raise NPAError(
+                f"env must be a batch of worlds of several species, got {type(env).__name__}: "
+                "make one with npa_envs.envs.multispecies_v0.batched"
+            )
+        check_same_step(env.autoreset_mode)
+        self.others = dict(others or {})
+        """Policies of species that are not rows."""
+        for name, policy in self.others.items():
+            if not callable(policy):
+                raise NPAError(
+                    f"others must hold functions of observations, got {type(policy).__name__} for "
+                    f"{name!r}: RowPolicy(model) makes one of a model"
+                )
+            if name not in env.possible_agents:
+                raise NPAError(
+                    f"others must name species, got {name!r}: "
+                    f"{suggest(str(name), env.possible_agents)}"
+                )
+        self.rows_of = [name for name in env.possible_agents if name not in self.others]
+        """Species whose particles are rows, in order."""
+        if not self.rows_of:
+            raise NPAError("others must leave at least one species to be rows, got all of them")
+        spaces = env.single_observation_spaces
+        self._counts = np.array([spaces[name].shape[0] for name in self.rows_of])
+        observed = row_space(spaces[self.rows_of[0]])
+        self._tags = None
+        if not self.others:
+            kinds = np.eye(len(self._counts), dtype=np.float32).repeat(self._counts, axis=0)
+            self._tags = torch.from_numpy(kinds).to(env.worlds.device)
+            tag = np.ones(len(self._counts), np.float32)
+            observed = Box(np.append(observed.low, 0.0 * tag), np.append(observed.high, tag))
+        self._seen: dict[str, Any] = {}
+        acted = row_space(env.single_action_spaces[self.rows_of[0]])
+        super().__init__(env, env.world_count, int(self._counts.sum()), observed, acted)
+
+    def reset(self) -> NDArray[np.float32]:
+        """Start episodes in all worlds and return the rows' observations, shape [B R, P]."""
+        self._seen, _ = self.begin()
+        return on_host(self._joined(self._seen))[0].reshape(self.num_envs, -1)
+
+    def step_wait(
+        self,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
+        """Step all worlds, the other species by their policies.
+
+        Returns:
+            Of each row: observation [B R, P], reward [B R], whether its episode is over [B R], and
+            infos.
+
+        Raises:
+            NPAError: There are no worlds yet.
+            DivergedError: An action is not finite; the worlds are then as they were.
+        """
+        if not self._seen:
+            raise NPAError("step needs worlds: call reset first")
+        own = np.split(self.taken_actions(), np.cumsum(self._counts)[:-1], axis=1)
+        actions: dict[str, Any] = dict(zip(self.rows_of, own, strict=True))
+        actions |= {name: policy(self._seen[name]) for name, policy in self.others.items()}
+        seen, rewards, terminations, truncations, infos = self.vector_env.step(actions)
+        self._seen = seen
+        live = {name: as_tensor(infos[name]["live"]) for name in self.rows_of}
+        shown, paid, ended, cut = on_host(
+            torch.where(self._repeated(live)[..., None], self._joined(seen), 0.0),
+            self._repeated(rewards),
+            self._repeated(terminations),
+            self._repeated(truncations),
+        )
+        over = ended | cut
+        first = infos[self.rows_of[0]]
+        if "final_obs" in first:
+            (restarted,) = on_host(first["_final_obs"])
+            over |= restarted[:, None]
+        rows: list[dict[str, Any]] = [self.nothing] * self.num_envs
+        if over.any():
+            last = {name: infos[name].get("final_obs", seen[name]) for name in self.rows_of}
+            final = on_host(self._joined(last))[0].reshape(self.num_envs, -1)
+            late = (cut & ~ended).reshape(-1)
+            for row in np.flatnonzero(over):
+                rows[row] = {
+                    "TimeLimit.truncated": bool(late[row]),
+                    "terminal_observation": final[row],
+                }
+        return shown.reshape(self.num_envs, -1), paid.reshape(-1), over.reshape(-1), rows
+
+    def policy(self, model: Any, species: str, *, deterministic: bool = False) -> RowPolicy:
+        """Return a model that was trained on these rows as the policy of one species.
+
+        Args:
+            model: The model.
+            species: Its name, one of `rows_of`.
+            deterministic: Whether it acts by its mean instead of a draw.
+
+        Raises:
+            NPAError: The species' particles are not among the rows.
+        """
+        if species not in self.rows_of:
+            raise NPAError(
+                f"species must be one whose particles are rows, got {species!r}: "
+                f"{suggest(str(species), self.rows_of)}"
+            )
+        tag = None
+        if self._tags is not None:
+            tag = np.eye(len(self.rows_of), dtype=np.float32)[self.rows_of.index(species)]
+        return RowPolicy(model, deterministic=deterministic, tag=tag)
+
+    def _joined(self, by_species: Mapping[str, Any]) -> Tensor:
+        """Return what rows observe, with tags where all species are rows, shape [B, R, P]."""
+        rows = torch.cat([as_tensor(by_species[name]) for name in self.rows_of], dim=1)
+        if self._tags is None:
+            return rows
+        return torch.cat((rows, self._tags.to(rows.device).expand(len(rows), -1, -1)), dim=2)
+
+    def _repeated(self, by_species: Mapping[str, Any]) -> Tensor:
+        """Return what species have in each world, [B], for each of their rows, shape [B, R]."""
+        values = [as_tensor(by_species[name]) for name in self.rows_of]
+        return torch.cat(
+            [value[:, None].expand(-1, n) for value, n in zip(values, self._counts, strict=True)],
+            dim=1,
+        )
