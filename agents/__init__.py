@@ -5,15 +5,17 @@ use the public API only.
 """
 
 from npa_envs.agents.evaluation import Episodes, evaluate_policy
-from npa_envs.agents.policy import Interface, Policy, interface_of
-from npa_envs.agents.rule_policy import RulePolicy
-from npa_envs.agents.scripted import (
+from npa_envs.agents.policies import (
+    Interface,
     MendPolicy,
     PaintPolicy,
+    Policy,
     RandomPolicy,
     SpreadPolicy,
     ZeroPolicy,
+    interface_of,
 )
+from npa_envs.agents.rule_policy import RulePolicy
 
 __all__ = [
     "Episodes",

@@ -11,7 +11,7 @@ import torch
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from npa_envs.agents.policy import unwrapped
+from npa_envs.agents.policies import unwrapped
 from npa_envs.errors import NPAError
 from npa_envs.world.randomness import WorldRandom
 

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from npa_envs.agents.policy import Interface, Policy, interface_of, unwrapped
+from npa_envs.agents.policies import Interface, Policy, interface_of, unwrapped
 from npa_envs.errors import NPAError
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.checks import is_real

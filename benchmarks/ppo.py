@@ -19,9 +19,8 @@ from typing import Any
 import torch
 
 from npa_envs.agents.learning import Budget, Problem, train
-from npa_envs.agents.learning.ppo import Learner
+from npa_envs.agents.learning.ppo import Learner, world_bytes
 from npa_envs.agents.learning.ppo_settings import Settings
-from npa_envs.agents.learning.ppo_worlds import world_bytes
 from npa_envs.measure.speed.report import script_facts
 
 FORMS = ("ppo", "ppo_rows", "ppo_world")

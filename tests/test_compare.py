@@ -18,13 +18,20 @@ from npa_envs.agents import RandomPolicy, ZeroPolicy
 from npa_envs.agents.comparison import run as one_run
 from npa_envs.agents.comparison import scheduler
 from npa_envs.agents.comparison.pictures import PICTURE, SIZE, final_picture, write_strips
-from npa_envs.agents.comparison.plan import Job, Plan
-from npa_envs.agents.comparison.plots import curve, pictures
-from npa_envs.agents.comparison.problems import LEFT_OUT, PROBLEMS, make_problem
+from npa_envs.agents.comparison.plan import LEFT_OUT, PROBLEMS, Job, Plan, make_problem
 from npa_envs.agents.comparison.record import Point, RunRecord, read_record
+from npa_envs.agents.comparison.report import (
+    Estimate,
+    curve,
+    curves,
+    estimate,
+    fraction,
+    pictures,
+    rows,
+    text,
+    write_table,
+)
 from npa_envs.agents.comparison.scheduler import Places, held_records, run_jobs
-from npa_envs.agents.comparison.summary import write_table
-from npa_envs.agents.comparison.tables import Estimate, curves, estimate, fraction, rows, text
 from npa_envs.agents.learning import METHODS, Problem, RuleSet
 from npa_envs.cli import main
 from npa_envs.cli.compare import CompareOptions, make_plan

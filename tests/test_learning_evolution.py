@@ -10,8 +10,7 @@ import torch
 
 from npa_envs.agents import evaluate_policy
 from npa_envs.agents.learning import Budget, Problem, RuleSet, train
-from npa_envs.agents.learning.evolution import _costs, fitness
-from npa_envs.agents.learning.population import Population
+from npa_envs.agents.learning.evolution import Population, _costs, fitness
 from npa_envs.errors import MissingDependencyError, NPAError
 
 GROWTH = {
@@ -108,7 +107,7 @@ def test_candidates_act_alike_however_many_are_computed_at_once(monkeypatch, dev
     population, weights = candidates_of(problem, device, 5)
     observation, _ = problem.make_envs(10, device=device).reset(seed=3)
     together = population.actions(weights, observation)
-    monkeypatch.setattr("npa_envs.agents.learning.population.MOST_HIDDEN", 2 * 2 * 24 * 12)
+    monkeypatch.setattr("npa_envs.agents.learning.evolution.MOST_HIDDEN", 2 * 2 * 24 * 12)
     assert torch.allclose(population.actions(weights, observation), together, atol=1e-6)
 
 

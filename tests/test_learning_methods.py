@@ -12,8 +12,7 @@ import npa_envs
 from npa_envs.agents import MendPolicy, PaintPolicy, RandomPolicy, SpreadPolicy, evaluate_policy
 from npa_envs.agents.learning import Budget, Problem, RuleSet, train
 from npa_envs.agents.learning.clone import Demonstrations, unexplained
-from npa_envs.agents.learning.episode_task import EpisodeTask, episode_task
-from npa_envs.agents.learning.held import HeldRule, hold
+from npa_envs.agents.learning.gradient import EpisodeTask, HeldRule, episode_task, hold
 from npa_envs.envs.morphogenesis2d import PictureTask
 from npa_envs.envs.multi.task import Population
 from npa_envs.errors import NPAError

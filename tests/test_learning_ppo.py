@@ -11,25 +11,16 @@ import pytest
 import torch
 
 from npa_envs.agents import RandomPolicy, evaluate_policy
-from npa_envs.agents.learning import (
-    Budget,
-    Problem,
-    Progress,
-    RuleSet,
-    method_options,
-    ppo,
-    ppo_worlds,
-    train,
-)
-from npa_envs.agents.learning.advantages import (
+from npa_envs.agents.learning import Budget, Problem, Progress, RuleSet, method_options, ppo, train
+from npa_envs.agents.learning import ppo as ppo_worlds
+from npa_envs.agents.learning.actor_critic import Critic, GaussianRules
+from npa_envs.agents.learning.ppo import (
+    Learner,
     clipped_gain,
     generalised_advantages,
     over_particles,
     standardised,
 )
-from npa_envs.agents.learning.critics import Critic
-from npa_envs.agents.learning.gaussian import GaussianRules
-from npa_envs.agents.learning.ppo import Learner
 from npa_envs.agents.learning.ppo_settings import Settings, filled, noise_left
 from npa_envs.errors import NPAError
 from npa_envs.rule.rule import NPARule
@@ -135,7 +126,8 @@ def test_every_form_trains_a_rule_for_each_species(form):
 @pytest.mark.parametrize("problem", [HEART, MIXING], ids=["heart", "mixing"])
 def test_the_deterministic_policy_of_either_row_form_is_the_exported_rules(problem):
     pytest.importorskip("stable_baselines3")
-    from npa_envs.agents.learning import sb3_rows, sb3_world
+    from npa_envs.agents.learning import sb3 as sb3_rows
+    from npa_envs.agents.learning import sb3_world
     from npa_envs.wrappers import WorldVecEnv
 
     rules = problem.new_rules(1)
@@ -263,8 +255,7 @@ def test_a_world_s_policy_in_stable_baselines_means_over_particles():
 
 def test_every_form_of_stable_baselines_ends_a_round_at_the_same_divergence():
     sb3 = pytest.importorskip("stable_baselines3")
-    from npa_envs.agents.learning.sb3_policy import EXCESS
-    from npa_envs.agents.learning.sb3_rows import RowRulePolicy
+    from npa_envs.agents.learning.sb3 import EXCESS, RowRulePolicy
     from npa_envs.agents.learning.sb3_world import WorldRulePolicy
 
     assert f"approx_kl_div > {EXCESS} * self.target_kl" in inspect.getsource(sb3.PPO.train)
@@ -492,7 +483,7 @@ def test_a_critic_that_learns_alone_leaves_the_rules_as_they_are():
 
 def test_rows_that_are_cut_off_are_paid_what_the_critic_still_expects():
     pytest.importorskip("stable_baselines3")
-    from npa_envs.agents.learning.sb3_rows import RowSettings, make_rows
+    from npa_envs.agents.learning.sb3 import RowSettings, make_rows
 
     class Constant:
         device = torch.device("cpu")

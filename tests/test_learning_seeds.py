@@ -6,7 +6,7 @@ import pytest
 from learning_problems import heart
 
 from npa_envs.agents.learning import EVALUATION_SEEDS, Budget, train
-from npa_envs.agents.learning.seeds import FIRST_EVALUATION_SEED, world_seeds
+from npa_envs.agents.learning.problem import FIRST_EVALUATION_SEED, world_seeds
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.errors import NPAError
 

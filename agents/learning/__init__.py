@@ -14,10 +14,9 @@ from typing import Any, NamedTuple
 
 import torch
 
-from npa_envs.agents.learning.problem import Problem
+from npa_envs.agents.learning.problem import EVALUATION_SEEDS, Problem
 from npa_envs.agents.learning.progress import Budget, Entry, Progress, check_finite
 from npa_envs.agents.learning.rules import RuleSet, RuleSetPolicy, starting_rules
-from npa_envs.agents.learning.seeds import EVALUATION_SEEDS
 from npa_envs.devices import check_device
 from npa_envs.errors import NPAError, suggest
 from npa_envs.tasks.checks import is_whole
@@ -39,7 +38,7 @@ __all__ = [
 METHODS: dict[str, str] = {
     "gradient": "npa_envs.agents.learning.gradient:train",
     "ppo": "npa_envs.agents.learning.ppo:train",
-    "ppo_rows": "npa_envs.agents.learning.sb3_rows:train",
+    "ppo_rows": "npa_envs.agents.learning.sb3:train",
     "ppo_world": "npa_envs.agents.learning.sb3_world:train",
     "evolution": "npa_envs.agents.learning.evolution:train",
     "clone": "npa_envs.agents.learning.clone:train",

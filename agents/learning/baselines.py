@@ -8,14 +8,13 @@ from typing import Any
 import torch
 
 from npa_envs.agents.evaluation import evaluate_policy
-from npa_envs.agents.learning.problem import Problem
+from npa_envs.agents.learning.problem import Problem, world_seeds
 from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rules import RuleSet
-from npa_envs.agents.learning.seeds import world_seeds
-from npa_envs.agents.policy import Policy
-from npa_envs.agents.scripted import (
+from npa_envs.agents.policies import (
     MendPolicy,
     PaintPolicy,
+    Policy,
     RandomPolicy,
     SpreadPolicy,
     ZeroPolicy,

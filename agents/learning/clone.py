@@ -8,10 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from npa_envs.agents.learning.problem import Problem
+from npa_envs.agents.learning.problem import Problem, world_seeds
 from npa_envs.agents.learning.progress import Progress, annealed
 from npa_envs.agents.learning.rules import RuleSet, Source, starting_rules
-from npa_envs.agents.learning.seeds import world_seeds
 from npa_envs.errors import NPAError
 from npa_envs.tasks.checks import is_real, is_whole
 

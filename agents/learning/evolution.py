@@ -1,11 +1,4 @@
-"""Evolution strategies over rules' weights: sep-CMA-ES, all candidates in one batch of worlds.
-
-The library `cma` (pycma) proposes candidates and learns from their fitness; it is asked for a
-diagonal covariance, as rules have thousands of weights (Ros and Hansen, A Simple Modification in
-CMA-ES Achieving Linear Time and Space Complexity, 2008). A candidate's fitness is the mean return
-of its worlds, which start from the same seeds for all candidates of a generation, and from new ones
-in the next: differences between candidates are theirs and not their luck's.
-"""
+"""Many sets of rules at once: every world is acted in by the weights of its own candidate."""
 
 from __future__ import annotations
 
@@ -16,15 +9,127 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
-from npa_envs.agents.learning.population import Population
-from npa_envs.agents.learning.problem import Problem
+from npa_envs.agents.learning.problem import FIRST_EVALUATION_SEED, Problem
 from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rules import RuleSet, starting_rules
-from npa_envs.agents.learning.seeds import FIRST_EVALUATION_SEED
-from npa_envs.errors import MissingDependencyError
+from npa_envs.agents.rule_policy import bounded, perceived
+from npa_envs.errors import MissingDependencyError, NPAError
+from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.checks import check_positive
+
+MOST_HIDDEN = 2**27
+"""Numbers of hidden layers that are held at once, at most: 512 MiB of float32."""
+
+
+class Population:
+    """Rules of one architecture whose weights are the rows of a matrix.
+
+    A row holds the weights of the update networks, one species after the other: W1, b1, W2. What
+    else a rule has (its read-out) is not changed.
+
+    Args:
+        rules: Gives the architecture, and the weights to begin with.
+
+    Raises:
+        NPAError: A rule is more than its two layers.
+    """
+
+    def __init__(self, rules: RuleSet) -> None:
+        self._rules = rules
+        self._parts = [part for rule in rules for part in _weights(rule)]
+        for rule in rules:
+            if not rule.is_plain():
+                raise NPAError(
+                    "rules must be plain NPARules, whose networks are their two layers, got one "
+                    "that overrides its network: evolve it by its own code"
+                )
+
+    def vector(self) -> NDArray[np.float64]:
+        """Return the weights of the rules as they are, shape [W]."""
+        with torch.no_grad():
+            return nn.utils.parameters_to_vector(self._parts).double().cpu().numpy()
+
+    def put(self, vector: NDArray[np.float64]) -> None:
+        """Give the rules these weights.
+
+        Args:
+            vector: Shape [W].
+        """
+        first = self._parts[0]
+        with torch.no_grad():
+            nn.utils.vector_to_parameters(
+                torch.as_tensor(vector, dtype=first.dtype, device=first.device), self._parts
+            )
+
+    def scales(self) -> NDArray[np.float64]:
+        """Return the size that each weight would be drawn with, by Xavier and at a gain of 1.
+
+        Layers of different width take steps of different size; biases that of their layer.
+        """
+        sizes = []
+        for rule in self._rules:
+            hidden, bias, output = _weights(rule)
+            first = math.sqrt(2.0 / sum(hidden.shape))
+            sizes += [np.full(hidden.numel() + bias.numel(), first)]
+            sizes += [np.full(output.numel(), math.sqrt(2.0 / sum(output.shape)))]
+        return np.concatenate(sizes)
+
+    @torch.no_grad()
+    def actions(self, weights: Tensor, observation: Tensor) -> Tensor:
+        """Return what each candidate does in its own worlds.
+
+        Args:
+            weights: Of K candidates, shape [K, W].
+            observation: Of all worlds, candidate by candidate, shape [K * M, N, P].
+
+        Returns:
+            Actions, shape [K * M, N, A].
+        """
+        candidates = len(weights)
+        parts, at = [], 0
+        for rule, span in zip(self._rules, self._rules.spans, strict=True):
+            size = sum(part.numel() for part in _weights(rule))
+            seen = observation[:, span]
+            rows = perceived(rule, seen.flatten(0, 1))
+            rows = rows.view(candidates, -1, rows.shape[1])
+            update = _updates(rule, weights[:, at : at + size], rows).flatten(0, 1)
+            action = self._rules.interface.action(*bounded(rule, update))
+            parts.append(action.view(*seen.shape[:2], -1))
+            at += size
+        return torch.cat(parts, dim=1)
+
+
+def _weights(rule: NPARule) -> tuple[Tensor, Tensor, Tensor]:
+    """Return W1 [H, P], b1 [H] and W2 [A, H]."""
+    return rule.hidden.weight, rule.hidden.bias, rule.output.weight
+
+
+def _updates(rule: NPARule, weights: Tensor, rows: Tensor) -> Tensor:
+    """Return raw updates, [K, R, A], of K candidates' weights for their own rows, [K, R, P]."""
+    shapes = [tuple(part.shape) for part in _weights(rule)]
+    sizes = [math.prod(shape) for shape in shapes]
+    first, bias, second = (
+        part.reshape(-1, *shape)
+        for part, shape in zip(torch.split(weights, sizes, dim=1), shapes, strict=True)
+    )
+    at_once = max(1, MOST_HIDDEN // (rows.shape[1] * rule.hidden_dim))
+    updates = []
+    for k in range(0, len(weights), at_once):
+        some = slice(k, k + at_once)
+        hidden = torch.baddbmm(bias[some, None], rows[some], first[some].mT).relu_()
+        updates.append(torch.bmm(hidden, second[some].mT))
+    return torch.cat(updates)
+
+
+# Evolution strategies over rules' weights: sep-CMA-ES, all candidates in one batch of worlds.
+#
+# The library `cma` (pycma) proposes candidates and learns from their fitness; it is asked for a
+# diagonal covariance, as rules have thousands of weights (Ros and Hansen, A Simple Modification
+# in CMA-ES Achieving Linear Time and Space Complexity, 2008). A candidate's fitness is the mean
+# return of its worlds, which start from the same seeds for all candidates of a generation, and
+# from new ones in the next: differences between candidates are theirs and not their luck's.
 
 
 @dataclass(frozen=True, kw_only=True)

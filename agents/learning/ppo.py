@@ -1,11 +1,4 @@
-"""Proximal policy optimisation that stays on the device, from the first world to the last gradient.
-
-Source: Schulman et al., arXiv 1707.06347, in the manner of CleanRL: one file, read from the top. A
-round is `steps` steps of all worlds, then `epochs` passes over them in minibatches of particles.
-The host reads one byte a world in each step (has its episode ended?), and one number a pass. On
-CUDA what is drawn, judged and learned is recorded once and replayed: a round is thousands of short
-kernels, which a host takes longer to launch than a GPU to run.
-"""
+"""What PPO maximises: how much better actions were than foreseen, and are now likelier."""
 
 from __future__ import annotations
 
@@ -16,23 +9,167 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from npa_envs.agents.learning.advantages import (
-    clipped_gain,
-    generalised_advantages,
-    over_particles,
-    standardised,
+from npa_envs.agents.learning.actor_critic import Critic, GaussianRules
+from npa_envs.agents.learning.ppo_settings import (
+    Settings,
+    beginning,
+    filled,
+    noise_left,
+    takes_fields_of,
 )
-from npa_envs.agents.learning.critics import Critic
-from npa_envs.agents.learning.gaussian import GaussianRules
-from npa_envs.agents.learning.options import takes_fields_of
-from npa_envs.agents.learning.ppo_settings import Settings, beginning, filled, noise_left
-from npa_envs.agents.learning.ppo_worlds import world_count
-from npa_envs.agents.learning.problem import Problem
-from npa_envs.agents.learning.progress import Progress
+from npa_envs.agents.learning.problem import WORLDS_PER_SEED, Problem, world_seeds
+from npa_envs.agents.learning.progress import Budget, Progress
 from npa_envs.agents.learning.rules import RuleSet
-from npa_envs.agents.learning.seeds import world_seeds
+from npa_envs.envs.core.worlds import free_bytes, needed_bytes
 from npa_envs.world.cuda_graph import Replayed
 from npa_envs.wrappers.adapters import own_rewards
+
+
+def generalised_advantages(
+    rewards: Tensor,
+    values: Tensor,
+    following: Tensor,
+    terminated: Tensor,
+    ended: Tensor,
+    *,
+    gamma: float,
+    gae_lambda: float,
+) -> Tensor:
+    """Return advantages, shape [T, ...]: discounted sums of what the critic did not foresee.
+
+    An episode that terminated is worth nothing more; one that was cut off would have gone on, and
+    is worth what the critic says of where it was cut. No sum goes on into the next episode.
+    Source: Schulman et al., arXiv 1506.02438, equation 16.
+
+    Args:
+        rewards: Of each step, shape [T, ...].
+        values: What the critic says of the states before each step, likewise.
+        following: What it says of the states after each step, before any restart, likewise.
+        terminated: Whether the episode ended by itself in the step, bool, likewise.
+        ended: Whether it ended or was cut off, bool, likewise.
+        gamma: Discount of a reward one step later (dimensionless).
+        gae_lambda: Discount of what was not foreseen, besides (dimensionless).
+    """
+    surprises = rewards + gamma * following.masked_fill(terminated, 0.0) - values
+    discounts = (gamma * gae_lambda) * (~ended).to(rewards.dtype)
+    advantages = torch.empty_like(surprises)
+    later = torch.zeros_like(surprises[0])
+    for step in reversed(range(len(surprises))):
+        later = surprises[step] + discounts[step] * later
+        advantages[step] = later
+    return advantages
+
+
+def over_particles(values: Tensor, weights: Tensor) -> Tensor:
+    """Return weighted means over the particles of worlds, 0 where nothing has weight, [..., 1].
+
+    Args:
+        values: Shape [..., N].
+        weights: Likewise, not negative.
+    """
+    total = (values * weights).sum(dim=-1, keepdim=True)
+    return total / weights.sum(dim=-1, keepdim=True).clamp(min=1e-8)
+
+
+def standardised(values: Tensor, weights: Tensor) -> Tensor:
+    """Return numbers less each step's weighted mean, in units of the standard deviation of all.
+
+    A step's mean over all worlds is what it is worth whatever is done: how far an episode has come,
+    which a critic learns only with time. A single world is compared with its own other steps.
+
+    Args:
+        values: Shape [T, B, N], or [T, B, 1] for one number a world.
+        weights: Shape [T, B, N], not negative.
+    """
+    shares = weights if values.shape == weights.shape else weights.amax(-1, True)
+    alike = (1, 2) if values.shape[1] > 1 else (0, 1, 2)
+    total = shares.sum(alike, keepdim=True).clamp(min=1e-8)
+    centred = shares * (values - (values * shares).sum(alike, keepdim=True) / total)
+    return centred / (centred.square().sum() / shares.sum().clamp(min=1e-8) + 1e-16).sqrt()
+
+
+def clipped_gain(log_ratio: Tensor, advantages: Tensor, weights: Tensor, *, clip: float) -> Tensor:
+    """Return the weighted mean of min(r A, clip(r) A), for r the ratio of likelihoods to before.
+
+    Source: Schulman et al., arXiv 1707.06347, equation 7.
+
+    Args:
+        log_ratio: Logarithms of the ratios, one a particle or one a world, shape [M, N] or [M, 1].
+        advantages: Likewise.
+        weights: Likewise, not negative.
+        clip: Ratios count up to 1 plus or minus this (dimensionless).
+    """
+    ratio = log_ratio.exp()
+    clipped = ratio.clamp(1.0 - clip, 1.0 + clip)
+    gain = torch.minimum(ratio * advantages, clipped * advantages)
+    return (weights * gain).sum() / weights.sum().clamp(min=1.0)
+
+
+# In how many worlds the device's own PPO acts: as many as keep a GPU busy, where there is room.
+
+
+MANY_PARTICLES = 2**17
+"""Particles of all worlds together on a GPU: a round of fewer takes hardly less time."""
+
+FEWEST_ROUNDS = 128
+"""Rounds that a budget of particle-steps is to be enough for."""
+
+ROOM = 0.25
+"""Share of the free memory that is taken; other runs may share the device."""
+
+
+def world_count(problem: Problem, settings: Settings, device: torch.device, budget: Budget) -> int:
+    """Return the worlds B to act in.
+
+    They are what the options say; where those say nothing, the problem's on the CPU, and on a GPU
+    about `MANY_PARTICLES` particles' worth, if memory and budget allow, never fewer than the
+    problem's.
+
+    Args:
+        problem: What is to be learned.
+        settings: Options.
+        device: Where the worlds live.
+        budget: What may be spent.
+    """
+    if settings.worlds is not None:
+        return settings.worlds
+    if device.type != "cuda":
+        return problem.num_envs
+    counts = [MANY_PARTICLES // problem.particle_count, WORLDS_PER_SEED]
+    free = free_bytes(device)
+    if free is not None:
+        counts.append(int(ROOM * free) // world_bytes(problem, settings, device))
+    if budget.particle_steps is not None:
+        round_size = settings.steps * problem.particle_count
+        counts.append(budget.particle_steps // (FEWEST_ROUNDS * round_size))
+    return max(problem.num_envs, min(counts))
+
+
+def world_bytes(problem: Problem, settings: Settings, device: torch.device) -> int:
+    """Return about how much memory a world takes: itself, its rounds and what is learned [bytes].
+
+    Args:
+        problem: What is to be learned.
+        settings: Options.
+        device: Where it lives.
+    """
+    interface, count = problem.interface, problem.particle_count
+    columns = interface.perception_dim + interface.action_dim
+    # Of each step what was seen, done and paid; of a minibatch's besides what gradients need.
+    kept = (settings.steps + 1) * (columns + interface.action_dim + 16)
+    hidden = 4 * problem.hidden_dim + 8 * settings.critic_width
+    learned = -(-settings.steps // settings.minibatches) * (2 * columns + hidden)
+    return needed_bytes(1, count, problem.physics, device) + 4 * count * (kept + learned)
+
+
+# Proximal policy optimisation that stays on the device, from the first world to the last
+# gradient.
+#
+# Source: Schulman et al., arXiv 1707.06347, in the manner of CleanRL: one file, read from the
+# top. A round is `steps` steps of all worlds, then `epochs` passes over them in minibatches of
+# particles. The host reads one byte a world in each step (has its episode ended?), and one number
+# a pass. On CUDA what is drawn, judged and learned is recorded once and replayed: a round is
+# thousands of short kernels, which a host takes longer to launch than a GPU to run.
 
 
 class Round(NamedTuple):

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from npa_envs.agents.learning.problem import Problem
-from npa_envs.agents.policy import Interface, Policy
+from npa_envs.agents.policies import Interface, Policy
 from npa_envs.agents.rule_policy import bounded_update, check_rule_fits
 from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule, save_rule

@@ -8,14 +8,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from npa_envs.agents.learning.critics import Critic, CriticKind
-from npa_envs.agents.learning.gaussian import gaussian_log_prob
-from npa_envs.agents.learning.options import takes_fields_of
+from npa_envs.agents.learning.actor_critic import Critic, CriticKind, gaussian_log_prob
+from npa_envs.agents.learning.ppo_settings import takes_fields_of
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rules import RuleSet
-from npa_envs.agents.learning.sb3_common import SB3Settings, learn
-from npa_envs.agents.learning.sb3_policy import EXCESS, RuleActorCritic
+from npa_envs.agents.learning.sb3 import EXCESS, RuleActorCritic, SB3Settings, learn
 from npa_envs.wrappers.sb3 import WorldVecEnv
 
 

@@ -117,8 +117,8 @@ def run(options: CompareOptions, command: str = "") -> int:
     Raises:
         NPAError: As for `main`.
     """
+    from npa_envs.agents.comparison.report import write_pictures, write_table
     from npa_envs.agents.comparison.scheduler import Places, held_records, run_jobs
-    from npa_envs.agents.comparison.summary import write_pictures, write_table
     from npa_envs.cli.folder import make_folder
     from npa_envs.cli.progress import StepBar
     from npa_envs.cli.rollout import check_writable
@@ -168,8 +168,7 @@ def make_plan(options: CompareOptions) -> Plan:
     Raises:
         NPAError: As for `main`.
     """
-    from npa_envs.agents.comparison.plan import Plan
-    from npa_envs.agents.comparison.problems import LEFT_OUT, PROBLEMS, make_problem
+    from npa_envs.agents.comparison.plan import LEFT_OUT, PROBLEMS, Plan, make_problem
     from npa_envs.agents.learning import METHODS
 
     for name in ("seeds", "episodes", "jobs", "threads"):
