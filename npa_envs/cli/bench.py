@@ -129,7 +129,7 @@ def run(options: BenchOptions, command: str = "npa-envs bench") -> int:
         print(_explanation(options, device))
         return 0
     if options.output is not None:
-        from npa_envs.cli.folder import make_folder
+        from npa_envs.cli.output import make_folder
         from npa_envs.cli.rollout import check_writable
 
         check_writable(make_folder(options.output))
@@ -174,7 +174,7 @@ def measured_report(options: BenchOptions, device: torch.device, command: str) -
     Raises:
         NPAError: There is no such suite, strategy or precision.
     """
-    from npa_envs.cli.progress import StepBar
+    from npa_envs.cli.output import StepBar
     from npa_envs.measure.speed.precisions import chosen_precisions
     from npa_envs.measure.speed.report import Report, current_commit
     from npa_envs.measure.speed.session import Session

@@ -119,8 +119,7 @@ def run(options: CompareOptions, command: str = "") -> int:
     """
     from npa_envs.agents.comparison.report import write_pictures, write_table
     from npa_envs.agents.comparison.scheduler import Places, held_records, run_jobs
-    from npa_envs.cli.folder import make_folder
-    from npa_envs.cli.progress import StepBar
+    from npa_envs.cli.output import StepBar, make_folder
     from npa_envs.cli.rollout import check_writable
 
     plan = make_plan(options)

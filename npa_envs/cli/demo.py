@@ -78,7 +78,7 @@ def main(arguments: Sequence[str]) -> int:
         NPAError: A value is wrong, or a file cannot be written.
     """
     options = tyro.cli(DemoOptions, prog="npa-envs demo", args=arguments)
-    from npa_envs.cli.folder import make_folder
+    from npa_envs.cli.output import make_folder
 
     if not 1.0 <= options.train_seconds <= 3600.0:
         raise NPAError(f"train_seconds must lie in [1, 3600], got {options.train_seconds}")
@@ -178,7 +178,7 @@ def grow_and_heal(options: DemoOptions, report: Report) -> None:
     import torch
 
     from npa_envs.cli.film import film_world, write_film
-    from npa_envs.cli.progress import StepBar
+    from npa_envs.cli.output import StepBar
     from npa_envs.measure.quality.evaluation import measure
     from npa_envs.rule.files import load_rule
     from npa_envs.tasks.damage import DamageEvent, damage_worlds
@@ -241,7 +241,7 @@ def train_small(options: DemoOptions, report: Report) -> None:
     import torch
 
     from npa_envs.cli.film import film_world, write_film
-    from npa_envs.cli.progress import StepBar
+    from npa_envs.cli.output import StepBar
     from npa_envs.measure.quality.evaluation import measure
     from npa_envs.render import to_uint8, write_filmstrip
     from npa_envs.training import (

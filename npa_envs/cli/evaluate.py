@@ -99,7 +99,7 @@ def run(options: EvaluateOptions) -> int:
     Raises:
         NPAError: As for `main`.
     """
-    from npa_envs.cli.progress import StepBar
+    from npa_envs.cli.output import StepBar
     from npa_envs.measure.quality.evaluation import (
         CHECKPOINTS,
         check_steps,
@@ -162,7 +162,7 @@ def run(options: EvaluateOptions) -> int:
 
 def _evaluate_clouds(options: EvaluateOptions, rule: NPARule, task: PointClassification) -> int:
     """Measure and print what a rule says of the clouds of a task."""
-    from npa_envs.cli.progress import StepBar
+    from npa_envs.cli.output import StepBar
     from npa_envs.measure.quality.classification import (
         CLOUD_CHECKPOINTS,
         accuracies,

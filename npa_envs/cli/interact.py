@@ -102,8 +102,7 @@ def run(options: InteractOptions) -> int:
     Raises:
         NPAError: As for `main`.
     """
-    from npa_envs.cli.folder import make_folder
-    from npa_envs.cli.progress import StepBar
+    from npa_envs.cli.output import StepBar, make_folder
     from npa_envs.cli.rollout import check_writable
     from npa_envs.measure.interaction import Encounters
     from npa_envs.measure.tables import table_text

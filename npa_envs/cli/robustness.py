@@ -98,8 +98,7 @@ def run(options: RobustnessOptions, command: str = "") -> int:
         NPAError: As for `main`.
     """
     from npa_envs.cli.bench import torch_threads
-    from npa_envs.cli.folder import make_folder
-    from npa_envs.cli.progress import StepBar
+    from npa_envs.cli.output import StepBar, make_folder
     from npa_envs.cli.rollout import check_writable
     from npa_envs.devices import check_device
     from npa_envs.measure.robustness.conditions import MOST_PARTICLES

@@ -123,8 +123,7 @@ def run(options: RolloutOptions) -> int:
     import torch
 
     from npa_envs.cli.film import film_world, write_film, write_solid
-    from npa_envs.cli.folder import make_folder
-    from npa_envs.cli.progress import StepBar
+    from npa_envs.cli.output import StepBar, make_folder
     from npa_envs.measure.quality.evaluation import measure
     from npa_envs.rule.files import load_rule
     from npa_envs.tasks.base import ViewTask, seed_worlds, task_toward

@@ -87,7 +87,7 @@ def run(options: StressOptions) -> int:
         NPAError: As for `main`.
     """
     from npa_envs.cli.bench import torch_threads
-    from npa_envs.cli.progress import StepBar
+    from npa_envs.cli.output import StepBar
     from npa_envs.devices import check_device
     from npa_envs.measure.accuracy.checks import Session
     from npa_envs.measure.accuracy.record import Record, in_order, read_record
@@ -164,7 +164,7 @@ def _facts(options: StressOptions, device: torch.device) -> dict[str, Any]:
 
 def _path(options: StressOptions, device: torch.device) -> Path | None:
     """Return the file to write, None where none is asked for."""
-    from npa_envs.cli.folder import make_folder
+    from npa_envs.cli.output import make_folder
     from npa_envs.cli.rollout import check_writable
 
     if options.output is None:
