@@ -7,6 +7,7 @@ used, so that the import starts neither torch nor Warp, and the command line ans
 from typing import TYPE_CHECKING, Any
 
 from npa_envs._checkout import extend_path as _extend_path
+from npa_envs._moved import keep_old_names as _keep_old_names
 from npa_envs.registration import register_environments as _register_environments
 
 if TYPE_CHECKING:
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     )
 
 _extend_path(__path__, __file__)
+_keep_old_names()
 _register_environments()
 
 __version__ = "0.1.0"

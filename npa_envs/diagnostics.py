@@ -117,7 +117,7 @@ def _torch_devices() -> list[Finding]:
 def _warp_devices() -> list[Finding]:
     import torch
 
-    from npa_envs.kernels.runtime import warp_devices
+    from npa_envs.runtime import warp_devices
 
     lines = warp_devices()
     sees_cuda = any(line.startswith("cuda") for line in lines)
@@ -128,7 +128,7 @@ def _warp_devices() -> list[Finding]:
 
 
 def _kernel_cache() -> list[Finding]:
-    from npa_envs.kernels.runtime import kernel_cache_folder
+    from npa_envs.runtime import kernel_cache_folder
 
     folder = kernel_cache_folder()
     if not os.access(folder, os.W_OK):

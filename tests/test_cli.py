@@ -106,7 +106,7 @@ def test_doctor_goes_on_where_a_check_breaks(
     def broken() -> list[str]:
         raise OSError("no driver")
 
-    monkeypatch.setattr("npa_envs.kernels.runtime.warp_devices", broken)
+    monkeypatch.setattr("npa_envs.runtime.warp_devices", broken)
     assert main(["doctor"]) == 1
     text = capsys.readouterr().out
     assert "! warp devices" in text

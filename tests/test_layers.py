@@ -31,73 +31,59 @@ def rung(level: int, libraries: str = "", never: tuple[str, ...] = ()) -> Rung:
     return Rung(level, frozenset(libraries.split()), never)
 
 
+COMPUTED_NAME = "<imported by a computed name>"
 INSIDES = ("npa_envs.kernels", "npa_envs.ops", "npa_envs.reference")
+"""For who uses worlds and operators through `npa_envs.world` and the public names alone."""
+ORACLES = ("npa_envs.kernels", "npa_envs.reference")
 LADDER = {
     "npa_envs._checkout": rung(0),
+    "npa_envs._moved": Rung(0, frozenset({COMPUTED_NAME})),
     "npa_envs.errors": rung(0),
-    "npa_envs.devices": rung(1, "torch"),
     "npa_envs.registration": rung(0, "gymnasium"),
+    "npa_envs.devices": rung(1, "torch"),
     "npa_envs.files": rung(1),
-    "npa_envs.kernels": rung(1, "warp"),
+    "npa_envs.runtime": rung(1, "warp"),
     "npa_envs.reference": rung(1, "torch"),
     "npa_envs.reference_gaussians": rung(1, "torch"),
+    "npa_envs.kernels": rung(1, "warp"),
     "npa_envs.world.cuda_graph": rung(1, "torch numpy"),
-    "npa_envs.kernels.runtime": rung(1, "warp"),
     "npa_envs.ops": rung(2, "warp torch", never=("npa_envs.reference",)),
-    "npa_envs.world.randomness": rung(
-        3, "torch numpy", never=("npa_envs.kernels", "npa_envs.reference")
-    ),
+    "npa_envs.world.randomness": rung(3, "torch numpy", never=ORACLES),
+    "npa_envs.world.divergence": rung(3, "torch", never=ORACLES),
     "npa_envs.rule.rule": rung(3, "torch"),
-    "npa_envs.rule": rung(4, "torch", never=INSIDES),
-    "npa_envs.rule.files": rung(4, "torch safetensors", never=INSIDES),
-    "npa_envs.measure.quality.scores": rung(5, "", never=INSIDES),
-    "npa_envs.world.divergence": rung(3, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
-    "npa_envs.world.actions": rung(4, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
-    "npa_envs.world.rollout": rung(4, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
-    "npa_envs.world.species": rung(6, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
+    "npa_envs.rule": rung(4, "torch safetensors", never=INSIDES),
+    "npa_envs.world": rung(5, "torch", never=ORACLES),
     "npa_envs.tasks": rung(
-        5,
-        "torch numpy PIL sklearn torchvision trimesh pytorch_msssim gsplat",
-        never=("npa_envs.kernels", "npa_envs.reference"),
+        6, "torch numpy PIL sklearn torchvision trimesh pytorch_msssim gsplat", never=ORACLES
     ),
-    "npa_envs.render": rung(
-        6,
-        "torch numpy PIL imageio imageio_ffmpeg pygame",
-        never=("npa_envs.kernels", "npa_envs.reference"),
-    ),
-    "npa_envs.measure.quality.classification": rung(8, "torch", never=INSIDES),
-    "npa_envs.measure.quality.evaluation": rung(7, "torch numpy tqdm", never=INSIDES),
-    "npa_envs.measure.interaction": rung(8, "matplotlib", never=INSIDES),
+    "npa_envs.render": rung(7, "torch numpy PIL imageio imageio_ffmpeg pygame", never=ORACLES),
+    "npa_envs.training": rung(8, "torch numpy tqdm yaml tensorboard", never=ORACLES),
+    "npa_envs.diagnostics": rung(8, "torch PIL imageio_ffmpeg", never=INSIDES),
+    "npa_envs.api": rung(8, "torch", never=ORACLES),
+    "npa_envs": rung(9, "torch", never=ORACLES),
     "npa_envs.measure.speed.grid_kernels": rung(2, "warp"),
     "npa_envs.measure.speed.hash_grid": rung(3, "warp torch", never=("npa_envs.reference",)),
-    "npa_envs.measure.speed.explain": rung(3, "warp"),
+    "npa_envs.measure.speed.launches": rung(3, "warp"),
+    "npa_envs.measure.tables": rung(1),
+    "npa_envs.measure.quality": rung(9, "torch numpy tqdm", never=INSIDES),
+    "npa_envs.measure.interaction": rung(10, "torch numpy matplotlib", never=ORACLES),
     "npa_envs.measure.speed": rung(
-        9, "torch numpy matplotlib scipy warpSPHCore", never=("npa_envs.kernels",)
+        12, "torch numpy matplotlib scipy warpSPHCore", never=("npa_envs.kernels",)
     ),
-    "npa_envs.training": rung(
-        8, "torch numpy tqdm yaml tensorboard", never=("npa_envs.kernels", "npa_envs.reference")
-    ),
-    "npa_envs.diagnostics": rung(8, "torch PIL imageio_ffmpeg", never=INSIDES),
-    "npa_envs.api": rung(8, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
-    "npa_envs": rung(9, "torch", never=("npa_envs.kernels", "npa_envs.reference")),
-    "npa_envs.training.trained_tasks": rung(9, "torch", never=INSIDES),
-    "npa_envs.measure.accuracy": rung(10, "torch matplotlib", never=("npa_envs.kernels",)),
-    "npa_envs.measure.robustness": rung(
-        11, "torch matplotlib", never=("npa_envs.kernels", "npa_envs.reference")
-    ),
-    "npa_envs.envs": rung(12, "torch numpy gymnasium pettingzoo", never=INSIDES),
+    "npa_envs.measure.accuracy": rung(13, "torch matplotlib", never=("npa_envs.kernels",)),
+    "npa_envs.measure.robustness": rung(14, "torch matplotlib", never=ORACLES),
+    "npa_envs.measure": rung(15),
+    "npa_envs.envs": rung(16, "torch numpy gymnasium pettingzoo", never=INSIDES),
     "npa_envs.wrappers": rung(
-        13,
+        17,
         "torch numpy gymnasium pettingzoo stable_baselines3 ray torchrl tensordict rsl_rl",
         never=INSIDES,
     ),
     "npa_envs.agents": rung(
-        14, "torch numpy tqdm gymnasium pettingzoo stable_baselines3 cma", never=INSIDES
+        18, "torch numpy tqdm gymnasium pettingzoo stable_baselines3 cma", never=INSIDES
     ),
-    "npa_envs.agents.comparison": rung(15, "torch numpy PIL matplotlib", never=INSIDES),
-    "npa_envs.cli": rung(
-        16, "torch numpy tqdm tyro", never=("npa_envs.kernels", "npa_envs.reference")
-    ),
+    "npa_envs.agents.comparison": rung(19, "torch numpy PIL matplotlib", never=INSIDES),
+    "npa_envs.cli": rung(20, "torch numpy tqdm tyro", never=ORACLES),
 }
 WARP_AND_TORCH = {"npa_envs.ops", "npa_envs.measure.speed.hash_grid"}
 
@@ -146,7 +132,7 @@ def imported_modules(module: str, source: str, *, is_package: bool) -> set[str]:
             if called in {"__import__", "import_module", "importlib.import_module"}:
                 argument = node.args[0] if node.args else None
                 is_text = isinstance(argument, ast.Constant) and isinstance(argument.value, str)
-                found.add(str(argument.value) if is_text else "<imported by a computed name>")  # type: ignore[union-attr]
+                found.add(str(argument.value) if is_text else COMPUTED_NAME)  # type: ignore[union-attr]
     return found
 
 
@@ -180,7 +166,7 @@ def test_every_source_file_keeps_to_the_ladder(path: Path) -> None:
     assert violations(module_name(path), path.read_text(), is_package=is_package) == []
 
 
-def test_only_sph_and_the_benchmarked_hash_grid_know_both_warp_and_torch() -> None:
+def test_only_the_operators_and_the_benchmarked_hash_grid_know_both_warp_and_torch() -> None:
     both = {name for name, here in LADDER.items() if {"warp", "torch"} <= here.libraries}
     assert both == WARP_AND_TORCH
 
@@ -193,15 +179,15 @@ def test_only_sph_and_the_benchmarked_hash_grid_know_both_warp_and_torch() -> No
         ("npa_envs.reference", "import warp as wp"),
         ("npa_envs.rule.rule", "import warp"),
         ("npa_envs.world.rollout", "def f():\n    import warp"),
-        ("npa_envs.world.rollout", "from npa_envs.kernels import cells"),
+        ("npa_envs.world.rollout", "from npa_envs.kernels import domain"),
         ("npa_envs.ops.new", "from npa_envs.reference_gaussians import draw"),
-        ("npa_envs.world.rollout", "from .tasks import targets"),
+        ("npa_envs.world.rollout", "from ..tasks import targets"),
         ("npa_envs.tasks.new", "from npa_envs.training import trainer"),
         ("npa_envs.tasks.new", "import matplotlib.pyplot"),
         ("npa_envs.training.new", "import importlib\nimportlib.import_module('warp')"),
         ("npa_envs.training.new", "import npa_envs"),
         ("npa_envs.envs.new", "from npa_envs.ops.pictures.splat import splat"),
-        ("npa_envs.envs.new", "from ..kernels import cells"),
+        ("npa_envs.envs.new", "from ..kernels import domain"),
         ("npa_envs.envs.new", "import stable_baselines3"),
         ("npa_envs.unheard_of", ""),
     ],
@@ -214,8 +200,8 @@ def test_the_checker_refuses_a_wrong_import(module: str, source: str) -> None:
     ("module", "source"),
     [
         ("npa_envs.kernels.portable.sort", "import math\nimport warp as wp\nfrom . import domain"),
-        ("npa_envs.ops.launch", "import torch\nimport warp\nfrom npa_envs.kernels import cells"),
-        ("npa_envs.envs.new", "import gymnasium\nfrom npa_envs import dynamics, tasks"),
+        ("npa_envs.ops.launch", "import torch\nimport warp\nfrom npa_envs.kernels import domain"),
+        ("npa_envs.envs.new", "import gymnasium\nfrom npa_envs import tasks, world"),
         ("npa_envs.agents.new", "import npa_envs\nfrom npa_envs.envs import new"),
     ],
 )

@@ -41,8 +41,8 @@ def main(arguments: Sequence[str]) -> int:
     options = tyro.cli(WarmupOptions, prog="npa-envs warmup", args=arguments)
     import torch
 
-    from npa_envs.kernels.runtime import kernel_cache_folder
     from npa_envs.ops import warmup
+    from npa_envs.runtime import kernel_cache_folder
     from npa_envs.training import check_device
 
     if not options.space_dims or not options.dtypes or not set(options.space_dims) <= {2, 3}:

@@ -24,8 +24,8 @@ from torch import Tensor
 
 from npa_envs.kernels.cpu import SMALLEST_RANGES
 from npa_envs.kernels.cuda.warps import CUDA_BLOCK
-from npa_envs.kernels.runtime import quiet_warp, start_warp
 from npa_envs.kernels.wide import CUDA_LANES
+from npa_envs.runtime import quiet_warp, start_warp
 
 SHARES = 4
 """Ranges of a thread, at most: one that is held up, as by another process, runs fewer."""

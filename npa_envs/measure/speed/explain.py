@@ -1,65 +1,21 @@
-"""Which Warp kernels a call launches."""
+"""The CUDA kernels of a step: their times in suite `kernels`, and why these, by `--explain`."""
 
 from __future__ import annotations
 
-import contextlib
-import inspect
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
 
 import torch
-import warp as wp
 from torch.autograd import DeviceType  # type: ignore[attr-defined]
 from torch.profiler import ProfilerActivity, profile
 
 from npa_envs.errors import NPAError, suggest
+from npa_envs.measure.speed.launches import Launch, recorded_launches
 from npa_envs.measure.speed.session import Session
 from npa_envs.measure.speed.workloads import Workload, rollout_call
 from npa_envs.ops.backend import rollout_listing
 from npa_envs.ops.sort import Plan, make_plan
 from npa_envs.world.rollout import row_capacity, step
-
-
-class Launch(NamedTuple):
-    """One launch of a Warp kernel."""
-
-    kernel: str
-    """The kernel's name."""
-    module: str
-    """The Warp module of its variant, without the package's name."""
-    threads: str
-    """Threads along each dimension."""
-    purpose: str
-    """First line of its docstring."""
-
-
-@contextlib.contextmanager
-def recorded_launches() -> Iterator[list[Launch]]:
-    """Yield a list to which every launch in the block is added."""
-    launches: list[Launch] = []
-    launch = wp.launch
-
-    def noted(kernel: Any, dim: Any, *arguments: Any, **options: Any) -> Any:
-        launches.append(_described(kernel, dim))
-        return launch(kernel, dim, *arguments, **options)
-
-    wp.launch = noted
-    try:
-        yield launches
-    finally:
-        wp.launch = launch
-
-
-def _described(kernel: Any, dim: Any) -> Launch:
-    sizes = dim if isinstance(dim, tuple | list) else (dim,)
-    purpose = (inspect.getdoc(kernel.func) or "").split("\n")[0]
-    module = kernel.module.name.removeprefix("npa_envs.").removeprefix("kernels.")
-    return Launch(kernel.func.__name__, module, " x ".join(str(size) for size in sizes), purpose)
-
-
-# Suite `kernels`: which CUDA kernels a step of a rollout takes, and how long each.
-
 
 LEAST_SHARE = 0.005
 """Kernels that take less of a step are left out."""
