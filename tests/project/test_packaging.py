@@ -14,7 +14,7 @@ import pytest
 import npa_envs
 from npa_envs._checkout import MAPPED_PACKAGES, extend_path
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 SHIPPED = ("pyproject.toml", "README.md", "LICENSE", "npa_envs", *MAPPED_PACKAGES)
 IGNORE = shutil.ignore_patterns("__pycache__", "*.egg-info")
 PRINT_FILES = (

@@ -17,7 +17,7 @@ import npa_envs
 from npa_envs.agents.learning import METHODS, Budget, train
 from npa_envs.registration import ENVIRONMENTS
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
 OWN = DOCS / "own_environment.md"
 PAGES = [DOCS / "environments" / f"{registration.name}.md" for registration in ENVIRONMENTS]

@@ -14,7 +14,7 @@ from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2D
 from npa_envs.training import RunFolder, preset
 from npa_envs.training.checkpoint import load_checkpoint
 
-SCRIPT = Path(__file__).resolve().parents[1] / "benchmarks" / "joint_training.py"
+SCRIPT = Path(__file__).resolve().parents[2] / "benchmarks" / "joint_training.py"
 
 
 @pytest.fixture

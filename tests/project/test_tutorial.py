@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-TUTORIAL = Path(__file__).resolve().parent.parent / "docs" / "tutorial.md"
+TUTORIAL = Path(__file__).resolve().parents[2] / "docs" / "tutorial.md"
 ROUNDS = "model.learn(100 * 16"
 
 pytest.importorskip("stable_baselines3")

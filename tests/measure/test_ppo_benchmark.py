@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-SCRIPT = Path(__file__).resolve().parents[1] / "benchmarks" / "ppo.py"
+SCRIPT = Path(__file__).resolve().parents[2] / "benchmarks" / "ppo.py"
 
 
 def test_time_that_several_kernels_share_is_counted_once():

@@ -13,7 +13,7 @@ from crowds import TASKS, small, still
 from npa_envs.envs import multispecies_v0, particles_v0
 from npa_envs.envs.multi import TASKS as TABLE
 
-PAGES = Path(__file__).resolve().parent.parent / "docs" / "environments"
+PAGES = Path(__file__).resolve().parents[2] / "docs" / "environments"
 MODULES = {"MultiSpecies": multispecies_v0, "Particles": particles_v0}
 every_page = pytest.mark.parametrize("name", MODULES)
 

@@ -31,7 +31,7 @@ from npa_envs.training import (
 )
 from npa_envs.training.checkpoint import load_checkpoint, save_checkpoint
 
-TESTS = Path(__file__).parent
+TESTS = Path(__file__).resolve().parents[1]
 
 
 def trainer_of(config, task=None, **options):
@@ -144,7 +144,8 @@ train(circle_config(out), KilledTask(iteration, end), resume=resume)
 
 def run_script(*arguments):
     # The package first: its root may hold only a part of it, where it was copied from a checkout.
-    paths = [Path(npa_envs.__file__).parent.parent, TESTS, os.environ.get("PYTHONPATH", "")]
+    folders = (TESTS, Path(__file__).parent)
+    paths = [Path(npa_envs.__file__).parent.parent, *folders, os.environ.get("PYTHONPATH", "")]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, paths))}
     command = [sys.executable, "-c", SCRIPT, *map(str, arguments)]
     return subprocess.run(command, env=environment, capture_output=True, timeout=120, check=False)

@@ -391,7 +391,7 @@ def test_devices_agree_and_a_rollout_can_be_captured(perception):
 
 
 def test_the_code_about_species_runs():
-    page = Path(__file__).resolve().parent.parent / "docs" / "species.md"
+    page = Path(__file__).resolve().parents[2] / "docs" / "species.md"
     rolled, trained, *_ = re.findall(r"^```python\n(.*?)^```", page.read_text(), re.M | re.S)
     names = {}
     exec(rolled, names)

@@ -19,7 +19,7 @@ from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule, rule_metadata, save_rule, shipped_rules
 from npa_envs.rule.rule import NPARule
 
-REFERENCE = Path(__file__).resolve().parent.parent.parent / "shared" / "reference"
+REFERENCE = Path(__file__).resolve().parents[3] / "shared" / "reference"
 AUBERGINE = REFERENCE / "authors_demo_aubergine.json"
 needs_reference = pytest.mark.skipif(
     not AUBERGINE.is_file(), reason="the reference numbers are not beside the checkout"

@@ -13,7 +13,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from npa_envs import wrappers
 from npa_envs.errors import MissingDependencyError
 
-PAGE = Path(__file__).resolve().parent.parent / "docs" / "integrations.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "integrations.md"
 RANDOM, RANDOM_ERROR = 0.143, 0.018
 """Return of random actions in the worlds of the tutorial, by its table."""
 
