@@ -1,15 +1,21 @@
-"""What the trainer asks of a task: a seed, a loss, a picture. Any object with these will do."""
+"""Tasks: what the trainer asks of one, and what most of them have in common.
+
+Any object with the methods of `Task` can be trained on; `ParticleTask` has those that are alike.
+"""
 
 from __future__ import annotations
 
-from typing import Protocol, TypeVar, cast, runtime_checkable
+from dataclasses import dataclass, replace
+from typing import Any, Generic, Protocol, Self, TypeVar, cast, runtime_checkable
 
 import torch
 from torch import Tensor
 
-from npa_envs.ops import Cameras
+from npa_envs.errors import NPAError
+from npa_envs.ops import Cameras, world_mean
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.appearance import Gaussians
+from npa_envs.tasks.checks import check_fraction, check_non_negative, check_positive
 from npa_envs.world.randomness import Randomness
 
 
@@ -118,6 +124,173 @@ class GoalTask(Protocol):
         """
 
 
+@runtime_checkable
+class ScheduledTask(Protocol):
+    """A task whose loss changes from iteration to iteration: by a curriculum, or by draws.
+
+    It has all that `Task` has besides.
+    """
+
+    def begin(self, iteration: int) -> None:
+        """Prepare the loss of an iteration, without waiting for the device.
+
+        Recorded graphs read what is written here: always into the same tensors. What is written
+        must follow from the iteration alone, so that a resumed run goes on as it would have.
+
+        Args:
+            iteration: Iterations done so far in the run.
+        """
+
+
+@runtime_checkable
+class ViewTask(Protocol):
+    """A task of 3D worlds that cameras see as Gaussians, from several sides.
+
+    It has all that `PictureTask` has besides.
+    """
+
+    def view_psnr(self, x: Tensor, s: Tensor) -> Tensor:
+        """Return each world's mean PSNR over the views that it is measured by [dB], shape [B]."""
+
+    def views(self, x: Tensor, s: Tensor, cameras: Cameras) -> Tensor:
+        """Return what cameras see: colours times alpha, and alpha, shape [B, V, H, W, 4]."""
+
+    def gaussians(self, s: Tensor) -> Gaussians:
+        """Return how particles of states s [B, N, C] look."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskConfig:
+    """World and rule of a task; the configurations of tasks add what they are told besides."""
+
+    particle_count: int = 4096
+    """Particles in a world, N."""
+
+    state_dim: int = 16
+    """State channels of a particle, C; the last three are its colour (less 0.5)."""
+
+    hidden_dim: int = 128
+    """Width of the rule's hidden layer."""
+
+    eps: float = 0.1
+    """Perception radius ε [length units]; the rule is trained at it, so it is also its ε0."""
+
+    update_prob: float = 0.5
+    """Probability p that a particle is updated in a step (dimensionless)."""
+
+    resolution: int = 128
+    """Pixels on each side of a world's picture, R."""
+
+    overflow_weight: float = 100.0
+    """Weight of mean |s − clip(s, −1, 1)| (dimensionless)."""
+
+    def __post_init__(self) -> None:
+        """Check every field.
+
+        Raises:
+            NPAError: A field has the wrong type or lies outside its range.
+        """
+        check_positive(self, int, "particle_count", "state_dim", "hidden_dim")
+        check_positive(self, int, "resolution", at_least=2)
+        check_positive(self, float, "eps")
+        check_fraction(self, "update_prob")
+        check_non_negative(self, "overflow_weight")
+
+    def with_particle_count(self, particle_count: int) -> Self:
+        """Return the same task with another number of particles."""
+        return replace(self, particle_count=particle_count)
+
+
+ConfigT = TypeVar("ConfigT", bound=TaskConfig)
+
+
+class ParticleTask(Generic[ConfigT]):
+    """A task of one rule: world, untrained rule, fresh worlds, and the penalties of the loss.
+
+    A task says where particles begin (`places`) and what is compared (`compare`), and has a
+    picture and a metric besides. In all methods x are positions [length units], shape [B, N, D],
+    s states (dimensionless), shape [B, N, C], and path_length is how far each particle travelled
+    in the rollout [length units], shape [B, N].
+    """
+
+    config: ConfigT
+    """What the task was told."""
+
+    @property
+    def eps(self) -> float:
+        """Perception radius [length units]."""
+        return self.config.eps
+
+    @property
+    def box(self) -> tuple[float, ...] | None:
+        """Sides of the periodic box [length units]; None: open space."""
+        return None
+
+    @property
+    def update_prob(self) -> float:
+        """Probability of a particle's update in a step (dimensionless)."""
+        return self.config.update_prob
+
+    @property
+    def rule_shape(self) -> dict[str, Any]:
+        """What `NPARule` takes besides the channels, the hidden width and ε0."""
+        raise NotImplementedError
+
+    def make_rule(self, generator: torch.Generator) -> NPARule:
+        """Return an untrained rule on the CPU; its weights are drawn from `generator`."""
+        return untrained_rule(
+            generator,
+            state_dim=self.config.state_dim,
+            hidden_dim=self.config.hidden_dim,
+            eps0=self.config.eps,
+            **self.rule_shape,
+        )
+
+    def places(self, world_count: int, generator: Randomness, device: torch.device) -> Tensor:
+        """Return the positions of fresh worlds."""
+        raise NotImplementedError
+
+    def seed(
+        self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
+    ) -> tuple[Tensor, Tensor]:
+        """Return fresh worlds: positions of `places`, all states zero.
+
+        Args:
+            world_count: Worlds B.
+            generator: Source of the positions, on `device`.
+            device: Where the worlds are made.
+        """
+        x = self.places(world_count, generator, torch.device(device))
+        return x, x.new_zeros(*x.shape[:2], self.config.state_dim)
+
+    def compare(self, x: Tensor, s: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return how far worlds are from the goal, weighted, and its named parts, unweighted."""
+        raise NotImplementedError
+
+    def penalties(
+        self, x: Tensor, s: Tensor, path_length: Tensor
+    ) -> dict[str, tuple[float, Tensor]]:
+        """Return what the loss adds to `compare`: weight and term by name."""
+        overflow = (s - s.clamp(-1.0, 1.0)).abs().mean()
+        return {"overflow": (self.config.overflow_weight, overflow)}
+
+    def loss(self, x: Tensor, s: Tensor, path_length: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the training loss and its named parts, unweighted.
+
+        Raises:
+            NPAError: The shapes do not fit each other.
+        """
+        if path_length.shape != x.shape[:2]:
+            raise NPAError(
+                f"path_length must have shape {tuple(x.shape[:2])}, got {tuple(path_length.shape)}"
+            )
+        total, parts = self.compare(x, s)
+        for name, (weight, term) in self.penalties(x, s, path_length).items():
+            parts[name] = term
+            total = total + weight * term
+        return total, parts
+
+
 TaskT = TypeVar("TaskT", bound=Task)
 
 
@@ -159,89 +332,34 @@ def seed_worlds(
     return *task.seed(world_count, generator=generator, device=device), None
 
 
-@runtime_checkable
-class ScheduledTask(Protocol):
-    """A task whose loss changes from iteration to iteration: by a curriculum, or by draws.
+def shares_of_loss(loss: Tensor, amounts: Tensor) -> Tensor:
+    """Return each particle's share of its world's loss, times N; shape [B, N].
 
-    It has all that `Task` has besides.
+    To first order, the loss changes by some amount with what a particle adds to the world. Its
+    share is the loss plus N times what its amount exceeds the mean by; so the mean of the shares is
+    the loss, up to rounding.
+
+    Args:
+        loss: Each world's loss, shape [B].
+        amounts: The change that each particle brings, shape [B, N].
     """
-
-    def begin(self, iteration: int) -> None:
-        """Prepare the loss of an iteration, without waiting for the device.
-
-        Recorded graphs read what is written here: always into the same tensors. What is written
-        must follow from the iteration alone, so that a resumed run goes on as it would have.
-
-        Args:
-            iteration: Iterations done so far in the run.
-        """
+    worse = amounts - world_mean(amounts[..., None])
+    return loss[:, None] + amounts.shape[1] * worse
 
 
-@runtime_checkable
-class ViewTask(Protocol):
-    """A task of 3D worlds that cameras see as Gaussians, from several sides.
-
-    It has all that `PictureTask` has besides.
-    """
-
-    def view_psnr(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return each world's mean PSNR over the views that it is measured by [dB], shape [B]."""
-
-    def views(self, x: Tensor, s: Tensor, cameras: Cameras) -> Tensor:
-        """Return what cameras see: colours times alpha, and alpha, shape [B, V, H, W, 4]."""
-
-    def gaussians(self, s: Tensor) -> Gaussians:
-        """Return how particles of states s [B, N, C] look."""
-
-
-# Rules of tasks: untrained ones, and whether others have their shape.
-
-
-def untrained_rule(
-    generator: torch.Generator,
-    *,
-    state_dim: int,
-    hidden_dim: int,
-    eps0: float,
-    alpha: float,
-    space_dim: int = 2,
-    static: bool = False,
-    readout_dim: int = 0,
-    readout_hidden_dim: int = 0,
-) -> NPARule:
+def untrained_rule(generator: torch.Generator, **hyper_parameters: Any) -> NPARule:
     """Return a rule on the CPU whose weights are drawn from `generator` alone.
 
     Args:
         generator: On the CPU; torch's own randomness is left as it is.
-        state_dim: State channels C.
-        hidden_dim: Width of the hidden layer.
-        eps0: Perception radius that the rule is trained at [length units].
-        alpha: Largest displacement in one step, as a fraction of ε (dimensionless).
-        space_dim: Space dimension D.
-        static: Particles never move.
-        readout_dim: Outputs of the read-out network; 0 for none.
-        readout_hidden_dim: Width of its hidden layer.
+        hyper_parameters: What `NPARule` takes.
     """
     with torch.random.fork_rng(devices=()):
         torch.manual_seed(int(torch.randint(2**31, (), generator=generator)))
-        return NPARule(
-            space_dim,
-            state_dim,
-            hidden_dim,
-            eps0=eps0,
-            alpha=alpha,
-            static=static,
-            readout_dim=readout_dim,
-            readout_hidden_dim=readout_hidden_dim,
-        )
+        return NPARule(**hyper_parameters)
 
 
 def differing_fields(given: NPARule, wanted: NPARule) -> list[str]:
-    """Return the names of the hyper-parameters in which a rule differs from one of a task.
-
-    Args:
-        given: The rule.
-        wanted: A rule that the task has made.
-    """
+    """Return the names of the hyper-parameters in which a rule differs from one of a task."""
     own = wanted.hyper_parameters()
     return [name for name, value in given.hyper_parameters().items() if value != own.get(name)]

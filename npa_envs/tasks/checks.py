@@ -73,6 +73,44 @@ def check_fraction(config: object, *names: str) -> None:
             )
 
 
+def check_text(config: object, name: str, what: str) -> None:
+    """Check that a field is text and not empty.
+
+    Args:
+        config: The dataclass that holds the field.
+        name: The field.
+        what: What the text may be, for the error.
+
+    Raises:
+        NPAError: It is not.
+    """
+    value = getattr(config, name)
+    if not isinstance(value, str) or not value:
+        raise NPAError(
+            f"{name} must be {what}, got {value!r}: "
+            f"for example {name}={_example(config, name, 'name')!r}"
+        )
+
+
+def check_seed(config: object, name: str, *, bits: int = 63) -> None:
+    """Check that a field can seed a random generator: a whole number in [0, 2**bits).
+
+    Args:
+        config: The dataclass that holds the field.
+        name: The field.
+        bits: Bits that the generator takes.
+
+    Raises:
+        NPAError: It cannot.
+    """
+    value = getattr(config, name)
+    if not is_whole(value) or not 0 <= value < 2**bits:
+        raise NPAError(
+            f"{name} must be a whole number of at least 0 and below 2**{bits}, got {value!r}: "
+            f"for example {name}=0"
+        )
+
+
 def is_whole(value: Any) -> bool:
     """Return whether `value` is an int (a bool is not)."""
     return isinstance(value, int) and not isinstance(value, bool)
@@ -85,5 +123,5 @@ def is_real(value: Any) -> bool:
     return real and -sys.float_info.max <= value <= sys.float_info.max
 
 
-def _example(config: object, name: str, otherwise: float) -> object:
+def _example(config: object, name: str, otherwise: object) -> object:
     return getattr(type(config), name, otherwise)

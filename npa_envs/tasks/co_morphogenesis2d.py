@@ -1,4 +1,4 @@
-"""What 2D morphogenesis of several species can be told."""
+"""2D morphogenesis of several species in one world, each beside the others."""
 
 from __future__ import annotations
 
@@ -68,9 +68,6 @@ class CoMorphogenesis2DConfig:
         return tuple(self.distance * (k - middle) for k in range(len(self.species)))
 
 
-# 2D morphogenesis of several species in one world, each beside the others.
-
-
 class CoMorphogenesis2D:
     """`Morphogenesis2D` of every species, each on its own particles; satisfies `Task`.
 
@@ -127,16 +124,7 @@ class CoMorphogenesis2D:
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
     ) -> tuple[Tensor, Tensor]:
-        """Return fresh worlds: each species uniform in a disk of its own, all states zero.
-
-        Args:
-            world_count: Worlds B.
-            generator: Source of the positions, on `device`.
-            device: Where the worlds are made.
-
-        Returns:
-            Positions [length units], shape [B, N, 2]; states, dimensionless, shape [B, N, C].
-        """
+        """Return fresh worlds: each species uniform in a disk of its own, all states zero."""
         seeds = [task.seed(world_count, generator=generator, device=device) for task in self.tasks]
         positions = [
             torch.stack((x[..., 0] + centre, x[..., 1]), dim=-1)
@@ -153,13 +141,7 @@ class CoMorphogenesis2D:
         return torch.cat([x for x, _ in hurt], dim=1), torch.cat([s for _, s in hurt], dim=1)
 
     def loss(self, x: Tensor, s: Tensor, path_length: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the sum of the species' training losses and its parts, named "k.part".
-
-        Args:
-            x: Positions [length units], shape [B, N, 2].
-            s: States, dimensionless, shape [B, N, C].
-            path_length: How far each particle travelled in the rollout [length units], [B, N].
-        """
+        """Return the sum of the species' training losses and its parts, named "k.part"."""
         total = x.new_zeros(())
         parts: dict[str, Tensor] = {}
         split = zip(self.tasks, self.config.centres, *self._split(x, s, path_length), strict=True)
@@ -172,27 +154,24 @@ class CoMorphogenesis2D:
         return total, parts
 
     def picture(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return each world's picture with all species, shape [B, R, R, 4]; arguments as `loss`.
+        """Return each world's picture with all species, shape [B, R, R, 4].
 
         It spans [-1, 1] x [-1, 1]; its resolution is the first species' own.
         """
         return self.tasks[0].picture(x, s, centred=False)
 
     def metrics(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return each species' splat loss in each world, shape [B, K]; arguments as `loss`."""
+        """Return each species' splat loss in each world, shape [B, K]."""
         split = zip(self.tasks, *self._split(x, s), strict=True)
         return torch.stack([task.metric(own_x, own_s) for task, own_x, own_s in split], dim=1)
 
     def metric(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return each world's mean splat loss of its species, shape [B]; arguments as `loss`."""
+        """Return each world's mean splat loss of its species, shape [B]."""
         return self.metrics(x, s).mean(dim=1)
 
     def _split(self, *tensors: Tensor) -> list[tuple[Tensor, ...]]:
         """Return each tensor's parts, species by species."""
         return [torch.split(tensor, list(self.config.counts), dim=1) for tensor in tensors]
-
-
-# Presets of 2D morphogenesis of two species that are trained together.
 
 
 DISTANCE = 0.8

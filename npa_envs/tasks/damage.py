@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -16,7 +15,7 @@ from torch import Tensor
 from npa_envs.errors import NPAError, suggest
 from npa_envs.ops import world_mean
 from npa_envs.ops.checks import DTYPES, check_dense, checked_number
-from npa_envs.tasks.checks import is_real, is_whole
+from npa_envs.tasks.checks import check_non_negative, is_real, is_whole
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.world.randomness import (
     Randomness,
@@ -404,28 +403,36 @@ SHARE = 0.25
 """Share of the worlds that are clumped, that are cut, that lose a flake (dimensionless)."""
 
 
-class PoolDamage(Protocol):
-    """What a task's configuration says of it; 0 is none."""
+@dataclass(frozen=True, kw_only=True)
+class PoolDamage:
+    """How much worlds of the pool are damaged; 0 is none."""
 
-    @property
-    def damage_radius(self) -> float:
-        """Radius of the ball whose states become zero, in every world [length units]."""
+    damage_radius: float = 0.0
+    """Radius of the ball whose state is erased in worlds from the pool [length units]; 0: none."""
 
-    @property
-    def clump_radius(self) -> float:
-        """Radius of the ball whose particles are pulled to one point [length units]."""
+    clump_radius: float = 0.0
+    """Radius of the ball whose particles are pulled to one point, in a quarter of the worlds from
+    the pool [length units]; 0: none."""
 
-    @property
-    def cut_gap(self) -> float:
-        """Width of the slit through the middle [length units]."""
+    cut_gap: float = 0.0
+    """Width of the slit through a quarter of the worlds from the pool [length units]; 0: none."""
 
-    @property
-    def flake_radius(self) -> float:
-        """Largest radius of the flake that is torn off and thrown out [length units]."""
+    flake_radius: float = 0.0
+    """Radius up to which a ball of particles is torn off and thrown out, in a quarter of the worlds
+    from the pool [length units]; 0: none."""
 
-    @property
-    def stray_share(self) -> float:
-        """Probability of each particle to be thrown out (dimensionless)."""
+    stray_share: float = 0.0
+    """Probability of each particle to be thrown out of worlds from the pool (dimensionless)."""
+
+    def __post_init__(self) -> None:
+        """Check every field.
+
+        Raises:
+            NPAError: A field is no finite number of at least 0.
+        """
+        check_non_negative(
+            self, "damage_radius", "clump_radius", "cut_gap", "flake_radius", "stray_share"
+        )
 
 
 def hurt(

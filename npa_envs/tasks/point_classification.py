@@ -1,14 +1,14 @@
-"""What the classification of point clouds can be told: data, variation, world, rule's size."""
+"""Self-classifying point clouds: particles that never move agree on what they form."""
 
 from __future__ import annotations
 
 import copy
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -16,8 +16,8 @@ from torch import Tensor
 from npa_envs.errors import NPAError
 from npa_envs.ops import splat, world_mean
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.base import untrained_rule
-from npa_envs.tasks.checks import check_fraction, check_non_negative, check_positive, is_whole
+from npa_envs.tasks.base import ParticleTask, TaskConfig
+from npa_envs.tasks.checks import check_non_negative, check_positive, check_seed, check_text
 from npa_envs.tasks.targets.clouds import (
     PointClouds,
     Split,
@@ -26,12 +26,12 @@ from npa_envs.tasks.targets.clouds import (
     share_of_worlds,
     varied,
 )
-from npa_envs.tasks.train_config import TrainConfig
+from npa_envs.tasks.train_config import TrainConfig, fast_run, tiny_run
 from npa_envs.world.randomness import Randomness
 
 
 @dataclass(frozen=True, kw_only=True)
-class PointClassificationConfig:
+class PointClassificationConfig(TaskConfig):
     """Particles that stay where they are agree on what their cloud shows (arXiv 2601.16096).
 
     The defaults are the paper's, but for the data, which are small. Lengths are in length units;
@@ -66,26 +66,14 @@ class PointClassificationConfig:
     particle_count: int = 512
     """Particles in a world, N: points of a cloud."""
 
-    state_dim: int = 16
-    """State channels of a particle, C."""
-
     hidden_dim: int = 256
     """Width of the rule's hidden layer."""
 
     readout_hidden_dim: int = 256
     """Width of the hidden layer of the read-out, from states to one number for each class."""
 
-    eps: float = 0.1
-    """Perception radius ε [length units]; the rule is trained at it, so it is also its ε0."""
-
-    update_prob: float = 0.5
-    """Probability p that a particle is updated in a step (dimensionless)."""
-
     overflow_weight: float = 1.0
     """Weight of mean |s − clip(s, −1, 1)| (dimensionless)."""
-
-    resolution: int = 128
-    """Pixels on each side of pictures, R."""
 
     def __post_init__(self) -> None:
         """Check every field.
@@ -93,106 +81,23 @@ class PointClassificationConfig:
         Raises:
             NPAError: A field has the wrong type or lies outside its range.
         """
-        for name in ("data", "data_folder"):
-            value = getattr(self, name)
-            if not isinstance(value, str) or not value:
-                raise NPAError(
-                    f"{name} must be a name or a path, got {value!r}: for example {name}='digits'"
-                )
-        if not is_whole(self.sample_seed) or not 0 <= self.sample_seed < 2**63:
-            raise NPAError(
-                f"sample_seed must be a whole number of at least 0 and below 2**63, got "
-                f"{self.sample_seed!r}: for example sample_seed=0"
-            )
-        check_positive(self, int, "particle_count", "state_dim", "hidden_dim", "readout_hidden_dim")
-        check_positive(self, int, "class_count", "resolution", at_least=2)
-        check_positive(self, float, "eps")
-        check_fraction(self, "update_prob")
+        super().__post_init__()
+        check_text(self, "data", "a name or a path")
+        check_text(self, "data_folder", "a path")
+        check_seed(self, "sample_seed")
+        check_positive(self, int, "readout_hidden_dim")
+        check_positive(self, int, "class_count", at_least=2)
         check_non_negative(self, "rotation", "stretch", "jitter", "mutated_share")
-        check_non_negative(self, "overflow_weight")
         for name in ("stretch", "mutated_share"):
             if getattr(self, name) > 1.0:
                 raise NPAError(f"{name} must be at most 1, got {getattr(self, name)}: try 0.1")
-
-    def with_particle_count(self, particle_count: int) -> PointClassificationConfig:
-        """Return the same task with another number of particles: clouds are sampled anew."""
-        return replace(self, particle_count=particle_count)
-
-
-# What particles say of their world's class: votes, accuracies, colours.
-
-
-PALETTE = (
-    (0.90, 0.10, 0.29),
-    (0.24, 0.71, 0.29),
-    (1.00, 0.85, 0.10),
-    (0.26, 0.39, 0.85),
-    (0.96, 0.51, 0.19),
-    (0.57, 0.12, 0.71),
-    (0.27, 0.80, 0.85),
-    (0.94, 0.20, 0.90),
-    (0.50, 0.35, 0.14),
-    (0.05, 0.05, 0.05),
-)
-"""Red, green and blue of class 0, 1, ...; classes beyond begin anew."""
-
-UNDECIDED = (0.6, 0.6, 0.6)
-"""Colour of a particle that says nothing."""
-
-
-def particle_classes(outputs: Tensor) -> Tensor:
-    """Return the class that each particle says, int64, shape [B, N].
-
-    Args:
-        outputs: One number for each class, shape [B, N, K].
-    """
-    return outputs.argmax(-1)
-
-
-def majority(outputs: Tensor) -> Tensor:
-    """Return the class that most particles of each world say, int64, shape [B].
-
-    Of several with as many votes it is the one with the larger sum of outputs.
-
-    Args:
-        outputs: One number for each class, shape [B, N, K].
-    """
-    particle_count, class_count = outputs.shape[1:]
-    classes = torch.arange(class_count, device=outputs.device)
-    votes = (particle_classes(outputs)[..., None] == classes).sum(1)
-    sums = outputs.double().sum(1)
-    # Less than one vote, whatever the outputs.
-    tie_breaker = 0.5 * torch.softmax(sums / particle_count, dim=-1)
-    return (votes + tie_breaker).argmax(-1)
-
-
-def class_colours(outputs: Tensor) -> Tensor:
-    """Return each particle's colour, its class's, greyer the less it is sure of it; [B, N, 3].
-
-    Args:
-        outputs: One number for each class, shape [B, N, K]; 1 is sure.
-    """
-    rows = [PALETTE[k % len(PALETTE)] for k in range(outputs.shape[-1])]
-    sure, chosen = outputs.max(-1, keepdim=True)
-    sure = sure.clamp(0.0, 1.0)
-    colours = []
-    for channel, grey in enumerate(UNDECIDED):
-        # Scalar by scalar: a tensor of the palette would be a copy to the device in each picture.
-        colour = torch.zeros_like(sure)
-        for number, row in enumerate(rows):
-            colour = torch.where(chosen == number, row[channel], colour)
-        colours.append(grey + sure * (colour - grey))
-    return torch.cat(colours, dim=-1)
-
-
-# Self-classifying point clouds: particles that never move agree on what they form.
 
 
 SIGMA = 0.7
 """Standard deviation of a particle's splat, in distances between particles (dimensionless)."""
 
 
-class PointClassification:
+class PointClassification(ParticleTask[PointClassificationConfig]):
     """The classification task of arXiv 2601.16096; satisfies `PictureTask` and `GoalTask`.
 
     The goal of a world is its cloud's class. A rule's read-out gives one number for each class;
@@ -249,21 +154,6 @@ class PointClassification:
         return clouds
 
     @property
-    def eps(self) -> float:
-        """Perception radius [length units]."""
-        return self.config.eps
-
-    @property
-    def box(self) -> None:
-        """Clouds lie in open space."""
-        return None
-
-    @property
-    def update_prob(self) -> float:
-        """Probability of a particle's update in a step, dimensionless."""
-        return self.config.update_prob
-
-    @property
     def target_picture(self) -> Tensor:
         """Nothing: there is no picture to match; shape [R, R, 4]."""
         return torch.zeros(self.config.resolution, self.config.resolution, 4, device=self._device)
@@ -273,18 +163,15 @@ class PointClassification:
         """Side of the square that a particle fills [length units]."""
         return math.sqrt(self.clouds.coverage / self.config.particle_count)
 
-    def make_rule(self, generator: torch.Generator) -> NPARule:
-        """Return an untrained rule on the CPU; its weights are drawn from `generator`."""
-        return untrained_rule(
-            generator,
-            state_dim=self.config.state_dim,
-            hidden_dim=self.config.hidden_dim,
-            eps0=self.config.eps,
-            alpha=1.0,
-            static=True,
-            readout_dim=self.config.class_count,
-            readout_hidden_dim=self.config.readout_hidden_dim,
-        )
+    @property
+    def rule_shape(self) -> dict[str, Any]:
+        """What `NPARule` takes besides the channels, the hidden width and ε0."""
+        config = self.config
+        readout = {
+            "readout_dim": config.class_count,
+            "readout_hidden_dim": config.readout_hidden_dim,
+        }
+        return {"alpha": 1.0, "static": True, **readout}
 
     def for_rule(self, rule: NPARule) -> Self:
         """Return the task with losses and pictures that read states through `rule`."""
@@ -353,9 +240,6 @@ class PointClassification:
     def outputs(self, s: Tensor) -> Tensor:
         """Return what each particle says of each class, dimensionless, shape [B, N, K].
 
-        Args:
-            s: States, dimensionless, shape [B, N, C].
-
         Raises:
             NPAError: There are fewer outputs than classes.
         """
@@ -370,9 +254,6 @@ class PointClassification:
     def errors(self, s: Tensor) -> Tensor:
         """Return each particle's mean squared error to the one-hot of its world's class, [B, N].
 
-        Args:
-            s: States, dimensionless, shape [B, N, C].
-
         Raises:
             NPAError: The classes have not been said by `toward`.
         """
@@ -384,47 +265,35 @@ class PointClassification:
         return channel_mean((outputs - wanted[:, None]).square())
 
     def metric(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return each world's mean squared error, shape [B]; for `x` and `s` as in `loss`."""
+        """Return each world's mean squared error, shape [B]."""
         return world_mean(self.errors(s)[..., None])[:, 0]
 
     def overflows(self, s: Tensor) -> Tensor:
-        """Return each particle's mean |s − clip(s, −1, 1)|, [B, N]; for `s` as in `errors`."""
+        """Return each particle's mean |s − clip(s, −1, 1)|, [B, N]."""
         return channel_mean((s - s.clamp(-1.0, 1.0)).abs())
 
     def overflow(self, s: Tensor) -> Tensor:
-        """Return each world's mean |s − clip(s, −1, 1)|, shape [B]; for `s` as in `errors`."""
+        """Return each world's mean |s − clip(s, −1, 1)|, shape [B]."""
         return world_mean(self.overflows(s)[..., None])[:, 0]
+
+    def compare(self, x: Tensor, s: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the batch's mean squared error, and it by name."""
+        error = self.errors(s).mean()
+        return error, {"error": error}
 
     def loss(self, x: Tensor, s: Tensor, path_length: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the training loss and its named parts, unweighted, and the share that is right.
 
-        Args:
-            x: Positions [length units], shape [B, N, 2].
-            s: States, dimensionless, shape [B, N, C].
-            path_length: How far each particle travelled, [B, N]: not at all.
-
         Raises:
             NPAError: The classes have not been said by `toward`.
         """
-        parts = {
-            "error": self.errors(s).mean(),
-            "overflow": (s - s.clamp(-1.0, 1.0)).abs().mean(),
-        }
+        total, parts = super().loss(x, s, path_length)
         assert self._goal is not None, "asked for by errors()"
         right = self.outputs(s.detach()).argmax(-1) == self._goal[:, None]
-        total = parts["error"] + self.config.overflow_weight * parts["overflow"]
         return total, {**parts, "accuracy": right.to(s.dtype).mean().detach()}
 
     def picture(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return the picture of each world, coloured by class: colour sums and density.
-
-        Args:
-            x: Positions [length units], shape [B, N, 2].
-            s: States, dimensionless, shape [B, N, C].
-
-        Returns:
-            Shape [B, R, R, 4].
-        """
+        """Return each world's picture, coloured by class: colour sums, density, [B, R, R, 4]."""
         return splat(
             x,
             class_colours(self.outputs(s)),
@@ -446,6 +315,69 @@ class PointClassification:
         return bound
 
 
+PALETTE = (
+    (0.90, 0.10, 0.29),
+    (0.24, 0.71, 0.29),
+    (1.00, 0.85, 0.10),
+    (0.26, 0.39, 0.85),
+    (0.96, 0.51, 0.19),
+    (0.57, 0.12, 0.71),
+    (0.27, 0.80, 0.85),
+    (0.94, 0.20, 0.90),
+    (0.50, 0.35, 0.14),
+    (0.05, 0.05, 0.05),
+)
+"""Red, green and blue of class 0, 1, ...; classes beyond begin anew."""
+
+UNDECIDED = (0.6, 0.6, 0.6)
+"""Colour of a particle that says nothing."""
+
+
+def particle_classes(outputs: Tensor) -> Tensor:
+    """Return the class that each particle says, int64, shape [B, N].
+
+    Args:
+        outputs: One number for each class, shape [B, N, K].
+    """
+    return outputs.argmax(-1)
+
+
+def majority(outputs: Tensor) -> Tensor:
+    """Return the class that most particles of each world say, int64, shape [B].
+
+    Of several with as many votes it is the one with the larger sum of outputs.
+
+    Args:
+        outputs: One number for each class, shape [B, N, K].
+    """
+    particle_count, class_count = outputs.shape[1:]
+    classes = torch.arange(class_count, device=outputs.device)
+    votes = (particle_classes(outputs)[..., None] == classes).sum(1)
+    sums = outputs.double().sum(1)
+    # Less than one vote, whatever the outputs.
+    tie_breaker = 0.5 * torch.softmax(sums / particle_count, dim=-1)
+    return (votes + tie_breaker).argmax(-1)
+
+
+def class_colours(outputs: Tensor) -> Tensor:
+    """Return each particle's colour, its class's, greyer the less it is sure of it; [B, N, 3].
+
+    Args:
+        outputs: One number for each class, shape [B, N, K]; 1 is sure.
+    """
+    rows = [PALETTE[k % len(PALETTE)] for k in range(outputs.shape[-1])]
+    sure, chosen = outputs.max(-1, keepdim=True)
+    sure = sure.clamp(0.0, 1.0)
+    colours = []
+    for channel, grey in enumerate(UNDECIDED):
+        # Scalar by scalar: a tensor of the palette would be a copy to the device in each picture.
+        colour = torch.zeros_like(sure)
+        for number, row in enumerate(rows):
+            colour = torch.where(chosen == number, row[channel], colour)
+        colours.append(grey + sure * (colour - grey))
+    return torch.cat(colours, dim=-1)
+
+
 def channel_mean(values: Tensor) -> Tensor:
     """Return the mean over the last dimension, rounded alike in every batch.
 
@@ -457,9 +389,6 @@ def channel_mean(values: Tensor) -> Tensor:
     for term in rest:
         total = total + term
     return total / values.shape[-1]
-
-
-# Presets of the classification of point clouds.
 
 
 _OUT = Path("runs/point_classification")
@@ -480,8 +409,8 @@ POINT_CLASSIFICATION_PRESETS: Mapping[str, TrainConfig[PointClassificationConfig
         out=_OUT,
     ),
     # Of clouds never seen 91 % are classified rightly, after some four minutes on one core.
-    "fast": TrainConfig(
-        task=PointClassificationConfig(
+    "fast": fast_run(
+        PointClassificationConfig(
             stretch=0.1,
             mutated_share=0.25,
             particle_count=128,
@@ -491,41 +420,30 @@ POINT_CLASSIFICATION_PRESETS: Mapping[str, TrainConfig[PointClassificationConfig
             resolution=64,
         ),
         iterations=1500,
-        repeats=1,
         world_count=32,
         pool_size=256,
         steps=(12, 20),
-        learning_rate=2e-3,
         milestones=(1100, 1400),
         seed_interval=1,
         fresh_share=0.5,
         out=_OUT,
         picture_interval=500,
         checkpoint_interval=300,
-        tensorboard=False,
     ),
-    "tiny": TrainConfig(
-        task=PointClassificationConfig(
+    "tiny": tiny_run(
+        PointClassificationConfig(
             particle_count=64,
             hidden_dim=32,
             readout_hidden_dim=32,
             eps=0.25,
             resolution=32,
         ),
-        iterations=60,
-        repeats=1,
         world_count=8,
         pool_size=32,
         steps=(6, 10),
-        learning_rate=5e-3,
-        milestones=(45,),
         seed_interval=1,
         fresh_share=0.5,
         out=_OUT,
-        log_interval=1,
-        picture_interval=20,
-        checkpoint_interval=20,
-        tensorboard=False,
     ),
 }
 """Classification of point clouds: `paper` (arXiv 2601.16096), `fast` (on one core), `tiny`."""

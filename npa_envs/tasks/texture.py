@@ -1,20 +1,21 @@
-"""What the texture task can be told: the target, the world, the rule's size, the loss."""
+"""Textures: particles all over a periodic box arrange and colour themselves like a target."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.ops import periodic_splat, world_mean
-from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
-from npa_envs.tasks.base import untrained_rule
-from npa_envs.tasks.checks import check_fraction, check_non_negative, check_positive, is_whole
+from npa_envs.ops import periodic_splat
+from npa_envs.rule.rule import COLOUR_OFFSET
+from npa_envs.tasks.base import ParticleTask, TaskConfig, shares_of_loss
+from npa_envs.tasks.checks import check_non_negative, check_positive, check_seed, check_text
 from npa_envs.tasks.damage import erase_state, random_particle
 from npa_envs.tasks.losses.texture import (
     DEFAULT_LOSS,
@@ -25,12 +26,12 @@ from npa_envs.tasks.losses.texture import (
 )
 from npa_envs.tasks.seeds import uniform_box
 from npa_envs.tasks.targets.textures import TextureTarget, load_texture
-from npa_envs.tasks.train_config import TrainConfig
+from npa_envs.tasks.train_config import TrainConfig, fast_run, tiny_run
 from npa_envs.world.randomness import Randomness
 
 
 @dataclass(frozen=True, kw_only=True)
-class TextureConfig:
+class TextureConfig(TaskConfig):
     """Particles all over a periodic box arrange themselves to a texture (arXiv 2601.16096).
 
     The defaults are the paper's, but for the loss, which needs no download. Lengths are in length
@@ -52,32 +53,17 @@ class TextureConfig:
     vgg_weights: str = ""
     """File of VGG16's weights for "vgg_ot"; empty: torch's usual folder of downloads."""
 
-    particle_count: int = 4096
-    """Particles in a world, N."""
-
-    state_dim: int = 16
-    """State channels of a particle, C; the last three are its colour (less 0.5)."""
-
-    hidden_dim: int = 128
-    """Width of the rule's hidden layer."""
-
     eps: float = 0.2
     """Perception radius ε [length units]; the rule is trained at it, so it is also its ε0."""
 
     alpha: float = 0.5
     """Largest displacement in one step, as a fraction of ε (dimensionless)."""
 
-    update_prob: float = 0.5
-    """Probability p that a particle is updated in a step (dimensionless)."""
-
     box_size: float = 2.0
     """Side of the periodic box around the origin, which the target fills [length units]."""
 
     damage_radius: float = 0.1
     """Radius of the disk whose state is erased in worlds from the pool [length units]; 0: none."""
-
-    resolution: int = 128
-    """Pixels on each side of the pictures that the loss compares, R."""
 
     sigma: float = 0.7
     """Standard deviation of a particle's splat, in distances between particles (dimensionless)."""
@@ -91,53 +77,29 @@ class TextureConfig:
     motion_weight: float = 0.1
     """Weight of the path length Σ|Δx| of a rollout (per length unit)."""
 
-    overflow_weight: float = 100.0
-    """Weight of mean |s − clip(s, −1, 1)| (dimensionless)."""
-
     def __post_init__(self) -> None:
         """Check every field.
 
         Raises:
             NPAError: A field has the wrong type or lies outside its range.
         """
-        if not isinstance(self.target, str) or not self.target:
-            raise NPAError(
-                f"target must be a built-in texture or a path, got {self.target!r}: "
-                "for example target='cells'"
-            )
+        super().__post_init__()
+        check_text(self, "target", "a built-in texture or a path")
         check_loss_name(self.loss)
-        if not is_whole(self.loss_seed) or not 0 <= self.loss_seed < 2**63:
-            raise NPAError(
-                f"loss_seed must be a whole number of at least 0 and below 2**63, got "
-                f"{self.loss_seed!r}: for example loss_seed=0"
-            )
+        check_seed(self, "loss_seed")
         if not isinstance(self.vgg_weights, str):
             raise NPAError(f"vgg_weights must be a path as a string, got {self.vgg_weights!r}")
-        check_positive(self, int, "particle_count", "hidden_dim")
         check_positive(self, int, "state_dim", at_least=3)
         check_positive(self, int, "resolution", at_least=12)
-        check_positive(self, float, "eps", "alpha", "box_size", "sigma")
-        check_fraction(self, "update_prob")
+        check_positive(self, float, "alpha", "box_size", "sigma")
         check_non_negative(
-            self,
-            "damage_radius",
-            "colour_weight",
-            "density_weight",
-            "motion_weight",
-            "overflow_weight",
+            self, "damage_radius", "colour_weight", "density_weight", "motion_weight"
         )
         if self.box_size < 2.0 * self.eps:
             raise NPAError(
                 f"box_size must be at least 2 eps = {2.0 * self.eps:g}, got {self.box_size}: "
                 "enlarge the box or perceive at a smaller eps"
             )
-
-    def with_particle_count(self, particle_count: int) -> TextureConfig:
-        """Return the same task with another number of particles."""
-        return replace(self, particle_count=particle_count)
-
-
-# Textures: particles all over a periodic box arrange and colour themselves like a target.
 
 
 DENSITY_FLOOR = 1e-6
@@ -147,7 +109,7 @@ DENSITY_POWER = 0.1
 """Power that densities are compared in: what is empty differs most from what is not."""
 
 
-class Texture:
+class Texture(ParticleTask[TextureConfig]):
     """The texture task of arXiv 2601.16096, with its loss; satisfies `PictureTask`.
 
     Args:
@@ -158,6 +120,9 @@ class Texture:
     Raises:
         NPAError: The target cannot be loaded.
     """
+
+    aligned = False
+    """A texture may lie anywhere: pixels are not compared one by one."""
 
     def __init__(
         self,
@@ -188,19 +153,9 @@ class Texture:
         mean density."""
 
     @property
-    def eps(self) -> float:
-        """Perception radius [length units]."""
-        return self.config.eps
-
-    @property
     def box(self) -> tuple[float, float]:
         """Sides of the periodic box [length units]."""
         return (self.config.box_size, self.config.box_size)
-
-    @property
-    def update_prob(self) -> float:
-        """Probability of a particle's update in a step, dimensionless."""
-        return self.config.update_prob
 
     @property
     def metric_name(self) -> str:
@@ -208,36 +163,14 @@ class Texture:
         return self.config.loss
 
     @property
-    def aligned(self) -> bool:
-        """A texture may lie anywhere: pixels are not compared one by one."""
-        return False
+    def rule_shape(self) -> dict[str, Any]:
+        """What `NPARule` takes besides the channels, the hidden width and ε0."""
+        return {"alpha": self.config.alpha}
 
-    def make_rule(self, generator: torch.Generator) -> NPARule:
-        """Return an untrained rule on the CPU; its weights are drawn from `generator`."""
-        return untrained_rule(
-            generator,
-            state_dim=self.config.state_dim,
-            hidden_dim=self.config.hidden_dim,
-            eps0=self.config.eps,
-            alpha=self.config.alpha,
-        )
-
-    def seed(
-        self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
-    ) -> tuple[Tensor, Tensor]:
-        """Return fresh worlds: particles uniform in the box, all states zero.
-
-        Args:
-            world_count: Worlds B.
-            generator: Source of the positions, on `device`.
-            device: Where the worlds are made.
-
-        Returns:
-            Positions [length units], shape [B, N, 2]; states, dimensionless, shape [B, N, C].
-        """
+    def places(self, world_count: int, generator: Randomness, device: torch.device) -> Tensor:
+        """Return positions uniform in the box."""
         count = self.config.particle_count
-        x = uniform_box(world_count, count, self.box, generator=generator, device=device)
-        return x, x.new_zeros(world_count, count, self.config.state_dim)
+        return uniform_box(world_count, count, self.box, generator=generator, device=device)
 
     def damage(self, x: Tensor, s: Tensor, generator: Randomness) -> tuple[Tensor, Tensor]:
         """Return the worlds with the states in a disk around one random particle set to zero."""
@@ -250,12 +183,7 @@ class Texture:
         return x, erase_state(away, s, centre=centre, radius=self.config.damage_radius)
 
     def picture(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return the picture of each world: colour sums and density, shape [B, R, R, 4].
-
-        Args:
-            x: Positions [length units], shape [B, N, 2].
-            s: States, dimensionless, shape [B, N, C].
-        """
+        """Return the picture of each world: colour sums and density, shape [B, R, R, 4]."""
         return self._splat(x, s[..., -3:] + COLOUR_OFFSET)
 
     def texture_losses(self, x: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
@@ -263,10 +191,6 @@ class Texture:
 
         Losses that look at some places only see each world as its first particle does, in the
         middle: which places these are then differs from world to world and from step to step.
-
-        Args:
-            x: Positions [length units], shape [B, N, 2].
-            s: States, dimensionless, shape [B, N, C].
 
         Raises:
             NPAError: The loss needs weights that are missing.
@@ -280,13 +204,7 @@ class Texture:
     def particle_shares(self, x: Tensor, s: Tensor) -> Tensor:
         """Return each particle's share of its world's texture loss, times N; [B, N].
 
-        To first order, the loss changes by some amount with what a particle adds to the picture.
-        Its share is the loss plus N times the amount by which it does worse there than the mean of
-        all; so the mean of the shares is `metric`, up to rounding.
-
-        Args:
-            x: Positions [length units], shape [B, N, 2].
-            s: States, dimensionless, shape [B, N, C].
+        By `shares_of_loss`, from how the loss changes with what a particle adds to the picture.
         """
         x, s = x.detach(), s.detach()
         x = x - x[:, :1]
@@ -302,39 +220,20 @@ class Texture:
             by_density[..., 0] = slope[..., 3]
             (density,) = torch.autograd.grad(drawn, blank, by_density)
         red, green, blue = ((s[..., -3:] + COLOUR_OFFSET) * pulled).unbind(dim=-1)
-        amounts = (red + green + blue + density[..., 0])[..., None]
-        worse = amounts - world_mean(amounts)[:, None]
-        return loss.detach()[:, None] + x.shape[1] * worse[..., 0]
+        amounts = red + green + blue + density[..., 0]
+        return shares_of_loss(loss.detach(), amounts)
 
-    def loss(self, x: Tensor, s: Tensor, path_length: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the training loss and its named parts, unweighted.
-
-        Args:
-            x: Positions [length units], shape [B, N, 2].
-            s: States, dimensionless, shape [B, N, C].
-            path_length: How far each particle travelled in the rollout [length units], [B, N].
-
-        Raises:
-            NPAError: The shapes do not fit each other, or the loss needs weights that are missing.
-        """
-        if path_length.shape != x.shape[:2]:
-            raise NPAError(
-                f"path_length must have shape {tuple(x.shape[:2])}, got {tuple(path_length.shape)}"
-            )
-        config = self.config
+    def compare(self, x: Tensor, s: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the batch's texture loss, weighted, and its colour and density terms."""
         colour, density = (term.mean() for term in self.texture_losses(x, s))
-        parts = {
-            "colour": colour,
-            "density": density,
-            "motion": path_length.mean(),
-            "overflow": (s - s.clamp(-1.0, 1.0)).abs().mean(),
-        }
-        total = (
-            self._weighted(colour, density)
-            + config.motion_weight * parts["motion"]
-            + config.overflow_weight * parts["overflow"]
-        )
-        return total, parts
+        return self._weighted(colour, density), {"colour": colour, "density": density}
+
+    def penalties(
+        self, x: Tensor, s: Tensor, path_length: Tensor
+    ) -> dict[str, tuple[float, Tensor]]:
+        """Return motion and overflow."""
+        motion = self.config.motion_weight, path_length.mean()
+        return {"motion": motion, **super().penalties(x, s, path_length)}
 
     def _splat(self, x: Tensor, colour: Tensor) -> Tensor:
         half = 0.5 * self.config.box_size
@@ -388,59 +287,37 @@ def density_image(density: Tensor) -> Tensor:
     return (density + DENSITY_FLOOR) ** DENSITY_POWER
 
 
-# Presets of textures.
-
-
 _OUT = Path("runs/texture")
 
-_PAPER_TEXTURE: TrainConfig[TextureConfig] = TrainConfig(
-    task=TextureConfig(loss="vgg_ot"),
-    iterations=12_000,
-    repeats=1,
-    steps=(16, 32),
-    learning_rate=1e-4,
-    weight_decay=0.1,
-    milestones=(3_000, 6_000, 9_000),
-    out=_OUT,
-)
-
 TEXTURE_PRESETS: Mapping[str, TrainConfig[TextureConfig]] = {
-    "paper": _PAPER_TEXTURE,
+    "paper": TrainConfig(
+        task=TextureConfig(loss="vgg_ot"),
+        iterations=12_000,
+        repeats=1,
+        steps=(16, 32),
+        learning_rate=1e-4,
+        weight_decay=0.1,
+        milestones=(3_000, 6_000, 9_000),
+        out=_OUT,
+    ),
     # Dots of both colours after some three minutes on one core.
-    "fast": TrainConfig(
-        task=TextureConfig(
+    "fast": fast_run(
+        TextureConfig(
             target="dots", particle_count=1024, hidden_dim=64, resolution=64, damage_radius=0.2
         ),
         iterations=1200,
-        repeats=1,
-        world_count=2,
         pool_size=32,
         steps=(12, 24),
-        learning_rate=2e-3,
         milestones=(800, 1050),
         seed_interval=4,
-        out=_OUT,
         picture_interval=100,
-        checkpoint_interval=200,
-        tensorboard=False,
+        out=_OUT,
     ),
-    "tiny": TrainConfig(
-        task=TextureConfig(
-            target="dots", particle_count=256, hidden_dim=32, eps=0.3, resolution=24
-        ),
-        iterations=60,
-        repeats=1,
-        world_count=2,
-        pool_size=8,
+    "tiny": tiny_run(
+        TextureConfig(target="dots", particle_count=256, hidden_dim=32, eps=0.3, resolution=24),
         steps=(8, 16),
-        learning_rate=5e-3,
-        milestones=(45,),
         seed_interval=4,
         out=_OUT,
-        log_interval=1,
-        picture_interval=20,
-        checkpoint_interval=20,
-        tensorboard=False,
     ),
 }
 """Textures: `paper` (arXiv 2601.16096, needs VGG16's weights), `fast` (on one core), `tiny`."""

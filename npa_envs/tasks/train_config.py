@@ -1,17 +1,24 @@
-"""What a training run can be told."""
+"""Configurations of training runs: of one rule, of several rules in one world; small runs."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Generic, Literal, TypeVar, get_args
+from typing import Any, Generic, Literal, TypeVar, get_args
 
 import torch
 
 from npa_envs.devices import parse_device
 from npa_envs.errors import NPAError
 from npa_envs.ops.checks import MomentInverse
-from npa_envs.tasks.checks import check_fraction, check_non_negative, check_positive, is_whole
+from npa_envs.tasks.checks import (
+    check_fraction,
+    check_non_negative,
+    check_positive,
+    check_seed,
+    is_whole,
+)
 from npa_envs.world.rollout import Memory
 
 TaskConfigT = TypeVar("TaskConfigT")
@@ -124,11 +131,7 @@ class TrainConfig(Generic[TaskConfigT]):
             raise NPAError(
                 f"picture_interval must be a whole number of at least 0, got {interval!r}"
             )
-        if not is_whole(self.seed) or not 0 <= self.seed < 2**63:
-            raise NPAError(
-                f"seed must be a whole number of at least 0 and below 2**63, got {self.seed!r}: "
-                "for example seed=0"
-            )
+        check_seed(self, "seed")
         if not isinstance(self.initial_rule, str):
             raise NPAError(
                 f"initial_rule must be the name of a rule or of a file, or '' for none, got "
@@ -205,9 +208,6 @@ class TrainConfig(Generic[TaskConfigT]):
         return float(self.learning_rate * self.decay**passed)
 
 
-# What a run that trains several rules together can be told besides.
-
-
 @dataclass(frozen=True, kw_only=True)
 class JointTrainConfig(TrainConfig[TaskConfigT]):
     """A training run of several rules in one world: what they start from, and which ones learn.
@@ -242,3 +242,27 @@ class JointTrainConfig(TrainConfig[TaskConfigT]):
         frozen = self.frozen
         if not isinstance(frozen, tuple) or not all(is_whole(n) and n >= 0 for n in frozen):
             raise NPAError(f"frozen must be a tuple of species' numbers from 0, got {frozen!r}")
+
+
+SMALL: Mapping[str, Any] = {"repeats": 1, "world_count": 2, "tensorboard": False}
+FAST = {**SMALL, "learning_rate": 2e-3, "checkpoint_interval": 200}
+TINY = {
+    **SMALL,
+    "iterations": 60,
+    "pool_size": 8,
+    "learning_rate": 5e-3,
+    "milestones": (45,),
+    "log_interval": 1,
+    "picture_interval": 20,
+    "checkpoint_interval": 20,
+}
+
+
+def fast_run(task: TaskConfigT, **fields: Any) -> TrainConfig[TaskConfigT]:
+    """Return a run of minutes on one core that learns something to look at."""
+    return TrainConfig(task=task, **{**FAST, **fields})
+
+
+def tiny_run(task: TaskConfigT, **fields: Any) -> TrainConfig[TaskConfigT]:
+    """Return a run of seconds, for tests."""
+    return TrainConfig(task=task, **{**TINY, **fields})

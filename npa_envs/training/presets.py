@@ -10,14 +10,14 @@ import torch
 
 from npa_envs.errors import NPAError, suggest
 from npa_envs.tasks.base import PictureTask
-from npa_envs.tasks.co_morphogenesis2d import CO_MORPHOGENESIS2D_PRESETS, CoMorphogenesis2DConfig
-from npa_envs.tasks.morphogenesis2d import MORPHOGENESIS2D_PRESETS, Morphogenesis2DConfig
-from npa_envs.tasks.morphogenesis3d import MORPHOGENESIS3D_PRESETS, Morphogenesis3DConfig
-from npa_envs.tasks.point_classification import (
-    POINT_CLASSIFICATION_PRESETS,
-    PointClassificationConfig,
-)
-from npa_envs.tasks.texture import TEXTURE_PRESETS, TextureConfig
+from npa_envs.tasks.co_morphogenesis2d import CO_MORPHOGENESIS2D_PRESETS, CoMorphogenesis2D
+from npa_envs.tasks.morphogenesis2d import MORPHOGENESIS2D_PRESETS, Morphogenesis2D
+from npa_envs.tasks.morphogenesis3d import MORPHOGENESIS3D_PRESETS, Morphogenesis3D
+from npa_envs.tasks.point_classification import POINT_CLASSIFICATION_PRESETS, PointClassification
+from npa_envs.tasks.targets.meshes import builtin_meshes
+from npa_envs.tasks.targets.points import builtin_targets
+from npa_envs.tasks.targets.textures import builtin_textures
+from npa_envs.tasks.texture import TEXTURE_PRESETS, Texture
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.overrides import override
 
@@ -45,89 +45,38 @@ class TaskEntry:
     """Whether several rules are trained, one for each species, by `train_together`."""
 
 
-def _make_morphogenesis2d(config: Morphogenesis2DConfig, device: torch.device) -> PictureTask:
-    # Imported late: a task brings the kernels along, which a list of presets does not need.
-    from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
-
-    return Morphogenesis2D(config, device=device)
-
-
-def _morphogenesis2d_targets() -> tuple[str, ...]:
-    from npa_envs.tasks.targets.points import builtin_targets
-
-    return builtin_targets()
-
-
-def _make_texture(config: TextureConfig, device: torch.device) -> PictureTask:
-    from npa_envs.tasks.texture import Texture
-
-    return Texture(config, device=device)
-
-
-def _texture_targets() -> tuple[str, ...]:
-    from npa_envs.tasks.targets.textures import builtin_textures
-
-    return builtin_textures()
-
-
-def _make_point_classification(
-    config: PointClassificationConfig, device: torch.device
-) -> PictureTask:
-    from npa_envs.tasks.point_classification import PointClassification
-
-    return PointClassification(config, device=device)
-
-
-def _make_morphogenesis3d(config: Morphogenesis3DConfig, device: torch.device) -> PictureTask:
-    from npa_envs.tasks.morphogenesis3d import Morphogenesis3D
-
-    return Morphogenesis3D(config, device=device)
-
-
-def _morphogenesis3d_targets() -> tuple[str, ...]:
-    from npa_envs.tasks.targets.meshes import builtin_meshes
-
-    return builtin_meshes()
-
-
-def _make_co_morphogenesis2d(config: CoMorphogenesis2DConfig, device: torch.device) -> PictureTask:
-    from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2D
-
-    # Films and the evaluation take its rules one by one, as rules of their own task.
-    return cast(PictureTask, CoMorphogenesis2D(config, device=device))
-
-
 TASKS: Mapping[str, TaskEntry] = {
     "morphogenesis2d": TaskEntry(
         summary="grow a picture from a disk of blank particles",
         presets=MORPHOGENESIS2D_PRESETS,
-        make=_make_morphogenesis2d,
-        targets=_morphogenesis2d_targets,
+        make=lambda config, device: Morphogenesis2D(config, device=device),
+        targets=builtin_targets,
     ),
     "co_morphogenesis2d": TaskEntry(
         summary="grow pictures in one world, each by a rule of its own",
         presets=CO_MORPHOGENESIS2D_PRESETS,
-        make=_make_co_morphogenesis2d,
+        # Films and the evaluation take its rules one by one, as rules of their own task.
+        make=lambda config, device: cast(PictureTask, CoMorphogenesis2D(config, device=device)),
         targets=tuple,
         joint=True,
     ),
     "morphogenesis3d": TaskEntry(
         summary="grow a thing seen from all sides from a ball of blank particles",
         presets=MORPHOGENESIS3D_PRESETS,
-        make=_make_morphogenesis3d,
-        targets=_morphogenesis3d_targets,
+        make=lambda config, device: Morphogenesis3D(config, device=device),
+        targets=builtin_meshes,
         space_dim=3,
     ),
     "texture": TaskEntry(
         summary="arrange particles all over a periodic box to a texture",
         presets=TEXTURE_PRESETS,
-        make=_make_texture,
-        targets=_texture_targets,
+        make=lambda config, device: Texture(config, device=device),
+        targets=builtin_textures,
     ),
     "point_classification": TaskEntry(
         summary="particles that stay where they are agree on which digit they form",
         presets=POINT_CLASSIFICATION_PRESETS,
-        make=_make_point_classification,
+        make=lambda config, device: PointClassification(config, device=device),
         targets=tuple,
     ),
 }

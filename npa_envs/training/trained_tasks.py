@@ -6,16 +6,17 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
 from npa_envs.errors import NPAError
 from npa_envs.rule.files import rule_metadata, shipped_rules
 from npa_envs.rule.rule import NPARule
-
-if TYPE_CHECKING:
-    from npa_envs.tasks.base import PictureTask
+from npa_envs.tasks.base import PictureTask, task_for_rule
+from npa_envs.tasks.point_classification import PointClassification
+from npa_envs.training.overrides import override
+from npa_envs.training.presets import preset, task_entry
 
 
 @dataclass(frozen=True)
@@ -53,10 +54,6 @@ def task_of_rule(
     Raises:
         NPAError: The rule does not fit the task, or a field is wrong.
     """
-    from npa_envs.tasks.base import task_for_rule
-    from npa_envs.tasks.point_classification import PointClassification
-    from npa_envs.training import override, preset, task_entry
-
     path = shipped_rules().get(source, Path(source))
     metadata = rule_metadata(path) if path.suffix == ".safetensors" else {}
     task_name = metadata.get("task", "morphogenesis2d")
@@ -101,8 +98,6 @@ def trained_config(path: Path, metadata: Mapping[str, str]) -> Any:
     Raises:
         NPAError: What it says is damaged or of another version.
     """
-    from npa_envs.training import preset
-
     try:
         fields = json.loads(metadata["config"])
         if not isinstance(fields, dict):
