@@ -1,4 +1,4 @@
-"""The tasks that methods are compared on, in sizes at which all of them have a chance.
+"""The plan of a comparison: tasks in sizes at which all methods have a chance, jobs and budgets.
 
 Worlds are smaller and episodes shorter than the paper's, so that reinforcement learning and
 evolution see many of them within a minute; states have few channels and change in small steps,
@@ -92,11 +92,7 @@ QUICK_STEPS = 16
 
 
 def make_problem(name: str, *, quick: bool = False) -> Problem:
-    """Return a task of the comparison.
-
-    Args:
-        name: One of `PROBLEMS`.
-        quick: A tiny one, for a test that everything runs.
+    """Return one of `PROBLEMS`; a quick one is tiny, for a test that everything runs.
 
     Raises:
         NPAError: There is no such task.
@@ -113,7 +109,7 @@ def make_problem(name: str, *, quick: bool = False) -> Problem:
     )
 
 
-# What a comparison runs: every method on every task, from every seed, within every budget.
+# Every method on every task, from every seed, within every budget.
 
 
 Axis = Literal["seconds", "particle-steps"]
@@ -177,11 +173,7 @@ class Plan:
         ]
 
     def facts(self, job: Job) -> dict[str, Any]:
-        """Return what the figures of a run follow from, as JSON has it.
-
-        Args:
-            job: One of `jobs()`.
-        """
+        """Return what the figures of one of `jobs()` follow from, as JSON has it."""
         return {
             "problem": dict(self.tasks[job.task]),
             "budget": self.budgets[job.axis],

@@ -1,10 +1,7 @@
-"""Records as a table: what each method reached on each task, and the gradient beside it."""
+"""The report of a comparison: tables of what each method reached, curves, pictures, files."""
 
 from __future__ import annotations
 
-import csv
-import io
-import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, astuple, dataclass, fields
@@ -13,12 +10,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
-from npa_envs.agents.comparison.pictures import write_strips
 from npa_envs.agents.comparison.plan import AXES, Axis, Plan
-from npa_envs.agents.comparison.record import Point, RunRecord
+from npa_envs.agents.comparison.run import PICTURE, SIZE, Point, RunRecord
 from npa_envs.files import write_text
-from npa_envs.measure.speed.plots import write_plots
+from npa_envs.measure.plots import draw_band, legend_of, new_figure, png, write_plots
+from npa_envs.measure.record import write_record
+from npa_envs.measure.tables import NONE, csv_text, markdown_table, mean_with_error, short
+from npa_envs.render import write_filmstrip
 
 YARDSTICK, NOTHING = "gradient", "zero"
 """Methods whose returns count as 1 and as 0."""
@@ -26,13 +26,58 @@ YARDSTICK, NOTHING = "gradient", "zero"
 LOST = ("diverged", "left the world")
 """Endings of episodes that diverged: of worlds, and of species."""
 
-NONE = "–"
-"""What is not known."""
-
 HEADINGS: Mapping[Axis, str] = {
     "seconds": "Equal wall time",
     "particle-steps": "Equal particle-steps",
 }
+
+TABLE, FIGURES, CURVES = "comparison.md", "comparison.json", "comparison.csv"
+"""Names of the files of the table, and of the curves."""
+
+
+def write_table(plan: Plan, records: Sequence[RunRecord], folder: Path, command: str) -> str:
+    """Write the table, in Markdown and as JSON, and all curves; return the table in Markdown.
+
+    Args:
+        plan: What was compared.
+        records: Those of the runs that are over.
+        folder: The comparison's folder.
+        command: The command line.
+
+    Raises:
+        NPAError: A file cannot be written.
+    """
+    table = rows(records)
+    told = text(table) + _sharing(plan)
+    facts = {"command": command, **asdict(plan), "left_out": sorted(map(list, plan.left_out))}
+    write_text(folder / TABLE, f"`{command}`\n\n{told}")
+    write_record(folder / FIGURES, {"facts": facts, "rows": [row.as_object() for row in table]})
+    write_text(folder / CURVES, curves(records))
+    return told
+
+
+def _sharing(plan: Plan) -> str:
+    """Return what is to be said where runs of equal wall time were not alone; else nothing."""
+    at_once = plan.settings.get("runs_at_once", 1)
+    if "seconds" not in plan.budgets or at_once == 1:
+        return ""
+    return (
+        f"\nUp to {at_once} runs at once shared a device: what each had of it in its wall time is "
+        "not controlled.\n"
+    )
+
+
+def write_pictures(records: Sequence[RunRecord], folder: Path) -> list[str]:
+    """Write what was grown and, where matplotlib is installed, the curves; return what was done.
+
+    Raises:
+        NPAError: A file cannot be written.
+    """
+    strips = [f"wrote {path}" for path in write_strips(records, folder)]
+    return [*strips, *write_plots(lambda: pictures(records), folder / "curves_*.png", "curves")]
+
+
+# Rows: what a method reached on a task
 
 
 class Estimate(NamedTuple):
@@ -44,21 +89,17 @@ class Estimate(NamedTuple):
     """Its standard error; NaN where there are fewer than two seeds."""
 
     def __str__(self) -> str:
-        if math.isnan(self.mean):
-            return NONE
-        told = f"{self.mean:.3f}"
-        return told if math.isnan(self.error) else f"{told} ± {self.error:.3f}"
+        return mean_with_error(*self)
+
+
+UNKNOWN = Estimate(math.nan, math.nan)
 
 
 def estimate(values: Iterable[float]) -> Estimate:
-    """Return the mean of values and its standard error.
-
-    Args:
-        values: One for each seed; what is not finite is left out.
-    """
+    """Return the mean of the finite ones of values, one for each seed, and its standard error."""
     kept = [value for value in values if math.isfinite(value)]
     if not kept:
-        return Estimate(math.nan, math.nan)
+        return UNKNOWN
     mean = sum(kept) / len(kept)
     if len(kept) < 2:
         return Estimate(mean, math.nan)
@@ -102,25 +143,30 @@ class Row:
         """All runs, whatever became of them."""
         return self.done + self.diverged + self.failed
 
+    def as_object(self) -> dict[str, Any]:
+        """Return the row as a JSON object."""
+        found = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {
+            name: {"mean": value.mean, "standard_error": value.error}
+            if isinstance(value, Estimate)
+            else value
+            for name, value in found.items()
+        }
+
 
 def rows(records: Iterable[RunRecord]) -> list[Row]:
-    """Return a row for each method on each task for each axis, in the order of the records.
-
-    Args:
-        records: Those of the runs.
-    """
+    """Return a row for each method on each task for each axis, in the order of the records."""
     groups: dict[tuple[Axis, str, str], list[RunRecord]] = {}
     for record in records:
         job = record.job
         groups.setdefault((job.axis, job.task, job.method), []).append(record)
-    returns = {key: _returns(some) for key, some in groups.items()}
-    empty = Estimate(math.nan, math.nan)
+    returns = {key: estimate(r.mean_return for r in some) for key, some in groups.items()}
     return [
         _row(
             some,
             returns[key],
-            nothing=returns.get((*key[:2], NOTHING), empty),
-            yardstick=returns.get((*key[:2], YARDSTICK), empty),
+            nothing=returns.get((*key[:2], NOTHING), UNKNOWN),
+            yardstick=returns.get((*key[:2], YARDSTICK), UNKNOWN),
         )
         for key, some in groups.items()
     ]
@@ -139,13 +185,9 @@ def fraction(reached: Estimate, nothing: Estimate, yardstick: Estimate) -> Estim
     """
     gain = yardstick.mean - nothing.mean
     if not gain > 0.0 or math.isnan(reached.mean):
-        return Estimate(math.nan, math.nan)
+        return UNKNOWN
     share = (reached.mean - nothing.mean) / gain
     return Estimate(share, math.hypot(reached.error, share * yardstick.error) / gain)
-
-
-def _returns(records: Sequence[RunRecord]) -> Estimate:
-    return estimate(record.mean_return for record in records)
 
 
 def _row(
@@ -177,12 +219,11 @@ def _row(
     )
 
 
-def text(table: Sequence[Row]) -> str:
-    """Return rows as tables in Markdown, one for each axis and task.
+# Rows in words
 
-    Args:
-        table: The rows.
-    """
+
+def text(table: Sequence[Row]) -> str:
+    """Return rows as tables in Markdown, one for each axis and task."""
     parts = []
     for axis in AXES:
         found = [row for row in table if row.axis == axis]
@@ -203,26 +244,27 @@ def _table(table: Sequence[Row]) -> str:
         "method", "runs", "return", "final loss", f"fraction of {YARDSTICK}", "seconds",
         "particle-steps",
     )  # fmt: skip
-    lines: list[Sequence[str]] = [heads, ["---"] * len(heads)]
-    for row in sorted(table, key=lambda row: -_rank(row.final_return.mean)):
+
+    def rank(row: Row) -> float:
+        mean = row.final_return.mean
+        return math.inf if math.isnan(mean) else -mean
+
+    def cells(row: Row) -> list[str]:
+        partial = f" (of {row.counted} of {row.runs})" if row.counted < row.runs else ""
         numbers = (row.final_return, row.final_loss, row.fraction)
-        spent = (_short(row.seconds), _short(row.particle_steps))
-        shown = (_marked(number, row) for number in numbers)
-        lines.append((row.method, _told(row), *shown, *spent))
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+        shown = [str(n) if math.isnan(n.mean) else f"{n}{partial}" for n in numbers]
+        spent = (row.seconds, row.particle_steps)
+        return [
+            row.method,
+            _runs(row),
+            *shown,
+            *(NONE if math.isnan(value) else short(value) for value in spent),
+        ]
+
+    return markdown_table(heads, map(cells, sorted(table, key=rank)))
 
 
-def _marked(number: Estimate, row: Row) -> str:
-    """Return a mean, and of how many runs it is where not of all."""
-    partial = row.counted < row.runs and not math.isnan(number.mean)
-    return f"{number} (of {row.counted} of {row.runs})" if partial else str(number)
-
-
-def _rank(value: float) -> float:
-    return -math.inf if math.isnan(value) else value
-
-
-def _told(row: Row) -> str:
+def _runs(row: Row) -> str:
     """Return how many runs there are, and what went wrong."""
     parts = [f"{row.done}"]
     if row.diverged:
@@ -234,50 +276,21 @@ def _told(row: Row) -> str:
     return ", ".join(parts)
 
 
-def _short(value: float) -> str:
-    return NONE if math.isnan(value) else f"{value:.3g}"
-
-
-def as_json(table: Sequence[Row], facts: Mapping[str, Any]) -> str:
-    """Return rows and what they follow from as JSON; a number that is not finite becomes null.
-
-    Args:
-        table: The rows.
-        facts: What they follow from, as JSON has it.
-    """
-
-    def plain(value: Any) -> Any:
-        if isinstance(value, Mapping):
-            return {key: plain(inner) for key, inner in value.items()}
-        if isinstance(value, Estimate):
-            return {"mean": plain(value.mean), "standard_error": plain(value.error)}
-        return None if isinstance(value, float) and not math.isfinite(value) else value
-
-    own = [{field.name: plain(getattr(row, field.name)) for field in fields(row)} for row in table]
-    content = {"facts": dict(facts), "rows": own}
-    return json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+# Learning curves
 
 
 def curves(records: Iterable[RunRecord]) -> str:
     """Return all learning curves as comma-separated values, a line for each point.
 
-    Args:
-        records: Those of the runs; of those that failed, the curves up to there.
+    Of runs that failed these are the curves up to there.
     """
-    written = io.StringIO()
-    writer = csv.writer(written, lineterminator="\n")
-    runs = ("axis", "task", "method", "seed", "status")
-    writer.writerow((*runs, *(field.name for field in fields(Point))))
-    for record in records:
-        job = record.job
-        named = (job.axis, job.task, job.method, job.seed, record.status)
-        for point in record.curve:
-            numbers = (f"{value:.12g}" for value in astuple(point))
-            writer.writerow((*named, *numbers))
-    return written.getvalue()
-
-
-# Learning curves with bands over the seeds: a picture for each task.
+    heads = ["axis", "task", "method", "seed", "status", *(field.name for field in fields(Point))]
+    lines = [
+        [*(r.job.axis, r.job.task, r.job.method, r.job.seed, r.status), *astuple(point)]
+        for r in records
+        for point in r.curve
+    ]
+    return csv_text(heads, lines)
 
 
 ACROSS: dict[str, Callable[[Point], float]] = {
@@ -285,9 +298,6 @@ ACROSS: dict[str, Callable[[Point], float]] = {
     "particle-steps": lambda point: point.particle_steps,
 }
 """What curves are drawn against."""
-
-BAND = 0.2
-"""Opacity of the band of one standard error on either side."""
 
 PLACES = 64
 """Places along a curve at which seeds are averaged."""
@@ -315,7 +325,7 @@ def curve(records: Sequence[RunRecord], across: Callable[[Point], float]) -> Cur
         across: What curves are drawn against.
     """
     lines = []
-    for record in _whole(records):
+    for record in [record for record in records if record.status == "done"] or records:
         kept = [point for point in record.curve if np.isfinite(point.mean_return)]
         if kept:
             lines.append(([across(point) for point in kept], [point.mean_return for point in kept]))
@@ -332,43 +342,27 @@ def curve(records: Sequence[RunRecord], across: Callable[[Point], float]) -> Cur
     return Curve(grid, values.mean(axis=0), error)
 
 
-def _whole(records: Sequence[RunRecord]) -> Sequence[RunRecord]:
-    """Return the runs that came to their end, all where none did."""
-    return [record for record in records if record.status == "done"] or records
-
-
 def pictures(records: Sequence[RunRecord]) -> dict[str, bytes]:
-    """Return PNG files by their tasks' names. Needs matplotlib.
-
-    Args:
-        records: Those of the runs.
-    """
+    """Return PNG files of the curves by their tasks' names. Needs matplotlib."""
     tasks = dict.fromkeys(record.job.task for record in records)
     return {task: _draw([r for r in records if r.job.task == task]) for task in tasks}
 
 
 def _draw(records: Sequence[RunRecord]) -> bytes:
-    from matplotlib.figure import Figure
-
     axes = [axis for axis in AXES if any(record.job.axis == axis for record in records)]
     methods = list(dict.fromkeys(record.job.method for record in records))
-    figure = Figure(figsize=(10.0, 3.4 * len(axes)), layout="constrained")
-    grid = figure.subplots(len(axes), len(ACROSS), squeeze=False)
+    figure, grid = new_figure(len(axes), len(ACROSS), (10.0, 3.4 * len(axes)))
     for axis, panels in zip(axes, grid, strict=True):
         for (label, across), panel in zip(ACROSS.items(), panels, strict=True):
             for number, method in enumerate(methods):
                 some = [r for r in records if (r.job.axis, r.job.method) == (axis, method)]
                 _draw_method(panel, curve(some, across), f"C{number}", _name(method, records))
-            panel.set_xlabel(label)
-            panel.set_ylabel("return of held-out episodes")
+            panel.set(xlabel=label, ylabel="return of held-out episodes")
             panel.set_title(HEADINGS[axis], fontsize=9, loc="left")
             panel.grid(alpha=0.3)
-    handles, labels = grid[0][0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside right center", fontsize=8)
+    legend_of(figure, grid[0][0], "right center", fontsize=8)
     figure.suptitle(records[0].job.task)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=90)
-    return buffer.getvalue()
+    return png(figure)
 
 
 def _name(method: str, records: Sequence[RunRecord]) -> str:
@@ -381,71 +375,53 @@ def _name(method: str, records: Sequence[RunRecord]) -> str:
 def _draw_method(panel: Any, found: Curve | None, colour: str, name: str) -> None:
     if found is None:
         panel.plot([], [], color=colour, label=name)
-        return
-    if len(found.across) == 1:
+    elif len(found.across) == 1:
         # It does not learn: what it gets, it gets for nothing.
         (mean,), (error,) = found.mean, found.error
         panel.axhline(mean, color=colour, lw=1.0, ls="--", label=name)
-        panel.axhspan(mean - error, mean + error, color=colour, alpha=BAND, lw=0)
-        return
-    panel.plot(found.across, found.mean, color=colour, lw=1.5, label=name)
-    low, high = found.mean - found.error, found.mean + found.error
-    panel.fill_between(found.across, low, high, color=colour, alpha=BAND, lw=0)
+        panel.axhspan(mean - error, mean + error, color=colour, alpha=0.2, lw=0)
+    else:
+        lines = (found.mean - found.error, found.mean, found.mean + found.error)
+        draw_band(panel, found.across, lines, colour, name, lw=1.5)
 
 
-# The files that show a whole comparison, written anew whenever a run is over.
+# What each method grew: the last picture of a held-out episode
 
 
-TABLE, FIGURES, CURVES = "comparison.md", "comparison.json", "comparison.csv"
-"""Names of the files of the table, and of the curves."""
+def write_strips(records: Sequence[RunRecord], folder: Path) -> list[Path]:
+    """Write a filmstrip for each task and axis: a column for each method, a row for each seed.
 
-
-def write_table(plan: Plan, records: Sequence[RunRecord], folder: Path, command: str) -> str:
-    """Write the table, in Markdown and as JSON, and all curves; return the table in Markdown.
-
-    Args:
-        plan: What was compared.
-        records: Those of the runs that are over.
-        folder: The comparison's folder.
-        command: The command line.
+    The pictures of the runs are read from below the comparison's folder.
 
     Raises:
         NPAError: A file cannot be written.
     """
-    table = rows(records)
-    told = text(table) + _sharing(plan)
-    write_text(folder / TABLE, f"`{command}`\n\n{told}")
-    write_text(folder / FIGURES, as_json(table, _facts(plan, command)))
-    write_text(folder / CURVES, curves(records))
-    return told
+    written = []
+    for axis in AXES:
+        for task in dict.fromkeys(r.job.task for r in records if r.job.axis == axis):
+            some = [r for r in records if (r.job.axis, r.job.task) == (axis, task)]
+            found = {(record.job.method, record.job.seed): record for record in some}
+            methods = list(dict.fromkeys(method for method, _ in found))
+            seeds = sorted({seed for _, seed in found})
+            places = [(method, seed) for seed in seeds for method in methods]
+            frames = [_frame(found.get(place), folder) for place in places]
+            captions = [_caption(*place, found.get(place)) for place in places]
+            written.append(folder / f"grown_{task}_{axis}.png")
+            write_filmstrip(written[-1], frames, captions, columns=len(methods))
+    return written
 
 
-def _sharing(plan: Plan) -> str:
-    """Return what is to be said where runs of equal wall time were not alone; else nothing."""
-    at_once = plan.settings.get("runs_at_once", 1)
-    if "seconds" not in plan.budgets or at_once == 1:
-        return ""
-    return (
-        f"\nUp to {at_once} runs at once shared a device: what each had of it in its wall time is "
-        "not controlled.\n"
-    )
+def _frame(record: RunRecord | None, folder: Path) -> NDArray[np.uint8]:
+    """Return a run's picture, or an empty one where it has none."""
+    path = None if record is None else folder / record.job.folder / PICTURE
+    if path is None or not path.exists():
+        return np.full((SIZE, SIZE, 3), 255, np.uint8)
+    with Image.open(path) as picture:
+        return np.asarray(picture.convert("RGB"))
 
 
-def _facts(plan: Plan, command: str) -> dict[str, Any]:
-    """Return what a table follows from, as JSON has it."""
-    fields = asdict(plan) | {"left_out": sorted(map(list, plan.left_out))}
-    return {"command": command, **fields}
-
-
-def write_pictures(records: Sequence[RunRecord], folder: Path) -> list[str]:
-    """Write what was grown and, where matplotlib is installed, the curves; return what was done.
-
-    Args:
-        records: Those of the runs that are over.
-        folder: The comparison's folder.
-
-    Raises:
-        NPAError: A file cannot be written.
-    """
-    strips = [f"wrote {path}" for path in write_strips(records, folder)]
-    return [*strips, *write_plots(lambda: pictures(records), folder / "curves_*.png", "curves")]
+def _caption(method: str, seed: int, record: RunRecord | None) -> str:
+    told = "not run" if record is None else record.status
+    if record is not None and told == "done":
+        told = f"loss {record.mean_loss:.3f}"
+    return f"{method}, seed {seed}: {told}"

@@ -1,9 +1,8 @@
-"""Runs spread over cores or GPUs: one process a run, each of which may fail by itself."""
+"""Scheduler of runs over cores or GPUs: one process a run, each of which may fail by itself."""
 
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 import os
 import secrets
@@ -17,21 +16,18 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from npa_envs.agents.comparison.plan import Job, Plan
-from npa_envs.agents.comparison.record import (
-    MEASURED,
-    OUTPUT,
-    REQUEST,
-    RunRecord,
-    read_record,
-)
-from npa_envs.files import write_text
+from npa_envs.agents.comparison.run import OUTPUT, REQUEST, RunRecord
+from npa_envs.measure.record import time_limit, write_record
 
-PROGRAM = (sys.executable, "-m", "npa_envs.agents.comparison")
+PROGRAM = (sys.executable, "-m", "npa_envs.agents.comparison.run")
 """What a run's process is, before the folder of the run: it gets ready, begins when a line of its
 input names a device, and ends when its input does."""
 
 LOOK_SECONDS = 0.1
 """Pause between two looks at the processes [s]."""
+
+MEASURED = ("done", "diverged")
+"""Runs that a resumed comparison does not repeat."""
 
 TOLD = 2000
 """Characters at most that are told of what a dead process said last."""
@@ -49,11 +45,7 @@ class Places:
     """CPU threads of each."""
 
     def device(self, number: int) -> str:
-        """Return the device of one of the processes at once.
-
-        Args:
-            number: Its number, below `jobs`.
-        """
+        """Return the device of the process of a number below `jobs`."""
         return self.devices[number % len(self.devices)]
 
     @property
@@ -70,11 +62,7 @@ class _Process:
     begin: float = 0.0
 
     def go(self, device: str) -> None:
-        """Let it begin.
-
-        Args:
-            device: Where it runs.
-        """
+        """Let it begin on a device."""
         assert self.process.stdin is not None, "asked for at its start"
         self.begin = time.perf_counter()
         # One that has died is found dead, and recorded, by whoever looks next.
@@ -92,14 +80,10 @@ class _Process:
 def held_records(plan: Plan, folder: Path) -> dict[Job, RunRecord]:
     """Return what an earlier comparison left in a folder, but for runs that failed.
 
-    Args:
-        plan: What is to be compared.
-        folder: The comparison's folder.
-
     Raises:
         NPAError: A record cannot be read, or follows from other settings.
     """
-    found = {job: read_record(folder / job.folder, plan.facts(job)) for job in plan.jobs()}
+    found = {job: RunRecord.read(folder / job.folder, plan.facts(job)) for job in plan.jobs()}
     return {
         job: record
         for job, record in found.items()
@@ -141,12 +125,15 @@ def run_jobs(
     def start() -> _Process:
         return _start(plan, waiting.popleft(), folder, places, command)
 
+    # What a killed comparison left of runs half-way.
     for job in jobs:
-        _sweep(folder, job)
-    begin = time.perf_counter()
+        target = folder / job.folder
+        for left in target.parent.glob(f".{target.name}.*"):
+            shutil.rmtree(left, ignore_errors=True)
+    time_is_up = time_limit(max_seconds)
     try:
         while waiting or ready or running:
-            if time.perf_counter() - begin >= max_seconds:
+            if time_is_up():
                 waiting.clear()
                 while ready:
                     ready.pop().end()
@@ -166,13 +153,6 @@ def run_jobs(
             one.end()
 
 
-def _sweep(folder: Path, job: Job) -> None:
-    """Remove what a killed comparison left of a run half-way."""
-    target = folder / job.folder
-    for left in target.parent.glob(f".{target.name}.*"):
-        shutil.rmtree(left, ignore_errors=True)
-
-
 def _start(plan: Plan, job: Job, folder: Path, places: Places, command: str) -> _Process:
     target = folder / job.folder
     part = target.parent / f".{target.name}.{secrets.token_hex(4)}"
@@ -183,7 +163,7 @@ def _start(plan: Plan, job: Job, folder: Path, places: Places, command: str) -> 
         "threads": places.threads,
         "command": command,
     }
-    write_text(part / REQUEST, json.dumps(request, indent=1) + "\n")
+    write_record(part / REQUEST, request)
     environment = os.environ | {"OMP_NUM_THREADS": str(places.threads)}
     with (part / OUTPUT).open("wb") as output:
         process = subprocess.Popen(
@@ -200,7 +180,7 @@ def _finish(plan: Plan, one: _Process, folder: Path, command: str) -> RunRecord:
     """Put the results of a process that is over into their place, and return its record."""
     one.process.communicate()
     facts = plan.facts(one.job)
-    record = read_record(one.folder, facts)
+    record = RunRecord.read(one.folder, facts)
     if record is None:
         code = one.process.returncode
         told = (one.folder / OUTPUT).read_text("utf-8", errors="replace").strip()[-TOLD:]

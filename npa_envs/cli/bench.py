@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -16,7 +15,7 @@ from npa_envs.errors import NPAError
 if TYPE_CHECKING:
     import torch
 
-    from npa_envs.measure.speed.report import Report
+    from npa_envs.measure.speed.suites import Report
 
 CHECK_FAILED = 1
 
@@ -93,7 +92,7 @@ class BenchOptions:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the command.
+    """Measure, print, write and check.
 
     Args:
         arguments: The words after `npa-envs bench`.
@@ -105,40 +104,30 @@ def main(arguments: Sequence[str]) -> int:
         NPAError: There is no such suite, device, strategy or precision, or a file is wrong.
     """
     options = tyro.cli(BenchOptions, prog="npa-envs bench", args=arguments)
-    return run(options, shlex.join(["npa-envs", "bench", *arguments]))
-
-
-def run(options: BenchOptions, command: str = "npa-envs bench") -> int:
-    """Measure, print, write and check.
-
-    Args:
-        options: What the command line said.
-        command: The command line, for the record.
-
-    Raises:
-        NPAError: As for `main`.
-    """
+    from npa_envs.cli.output import check_numbers, chosen_names, writable_folder
     from npa_envs.devices import check_device
-    from npa_envs.measure.speed.ratios import missed_ratios, stored_ratios
-    from npa_envs.measure.speed.suites import suite_of
+    from npa_envs.measure.plots import check_matplotlib
+    from npa_envs.measure.speed.suites import SUITES, missed_ratios, stored_ratios
 
-    _check(options)
+    check_numbers(options, repeats=1, threads=1, world_count=1, particle_count=1, state_dim=1)
+    if options.plots and options.output is None:
+        raise NPAError("plots need a folder to be written to: give --output DIR as well")
+    if options.check is not None and options.suite not in (None, QUICK):
+        raise NPAError(
+            f"check compares ratios of the suite quick, got suite {options.suite!r}: "
+            "leave --suite out"
+        )
     device = check_device(options.device)
-    suite_of(options.suite or QUICK)
+    chosen_names("suite", [options.suite or QUICK], SUITES)
     if options.explain:
         print(_explanation(options, device))
         return 0
     if options.output is not None:
-        from npa_envs.cli.output import make_folder
-        from npa_envs.cli.rollout import check_writable
-
-        check_writable(make_folder(options.output))
+        writable_folder(options.output)
     if options.plots:
-        from npa_envs.measure.speed.plots import check_matplotlib
-
         check_matplotlib()
     stored = {} if options.check is None else stored_ratios(options.check, device)
-    report = measured_report(options, device, command)
+    report = measured_report(options, device, shlex.join(["npa-envs", "bench", *arguments]))
     print(report.text())
     if options.output is not None:
         _write(report, options.output, plots=options.plots)
@@ -149,47 +138,29 @@ def run(options: BenchOptions, command: str = "npa-envs bench") -> int:
     return CHECK_FAILED if missed else 0
 
 
-def _check(options: BenchOptions) -> None:
-    """Check the numbers that nothing else checks, and which options go together."""
-    for name in ("repeats", "threads", "world_count", "particle_count", "state_dim"):
-        if getattr(options, name) < 1:
-            raise NPAError(f"{name} must be at least 1, got {getattr(options, name)}")
-    if options.plots and options.output is None:
-        raise NPAError("plots need a folder to be written to: give --output DIR as well")
-    if options.check is not None and options.suite not in (None, QUICK):
-        raise NPAError(
-            f"check compares ratios of the suite quick, got suite {options.suite!r}: "
-            "leave --suite out"
-        )
-
-
 def measured_report(options: BenchOptions, device: torch.device, command: str) -> Report:
-    """Run a suite.
-
-    Args:
-        options: What the command line said.
-        device: Where to run.
-        command: The command line, for the record.
+    """Run a suite and return its report, with the command line in it.
 
     Raises:
-        NPAError: There is no such suite, strategy or precision.
+        NPAError: There is no such strategy or precision.
     """
-    from npa_envs.cli.output import StepBar
-    from npa_envs.measure.speed.precisions import chosen_precisions
-    from npa_envs.measure.speed.report import Report, current_commit
-    from npa_envs.measure.speed.session import Session
-    from npa_envs.measure.speed.strategies import chosen_strategies
-    from npa_envs.measure.speed.suites import suite_of
+    from npa_envs.cli.output import StepBar, chosen_names, torch_threads
+    from npa_envs.measure.record import current_commit
+    from npa_envs.measure.speed.strategies import PRECISIONS, STRATEGIES
+    from npa_envs.measure.speed.suites import SUITES, Report
+    from npa_envs.measure.speed.timing import Session
 
     name = options.suite or QUICK
-    suite = suite_of(name)
+    suite = SUITES[name]
+    strategies = chosen_names("strategy", options.strategies, STRATEGIES)
+    precisions = chosen_names("precision", options.precisions, PRECISIONS)
     with StepBar(None, show=options.progress, unit="row") as bar, torch_threads(options.threads):
         session = Session(
             device=device,
             repeats=options.repeats,
             small=options.quick,
-            strategies=chosen_strategies(options.strategies),
-            precisions=chosen_precisions(options.precisions),
+            strategies=[STRATEGIES[name] for name in strategies],
+            precisions=[PRECISIONS[name] for name in precisions],
             progress=bar.advance,
         )
         tables, ratios = suite.run(session), suite.ratios(session)
@@ -205,37 +176,17 @@ def measured_report(options: BenchOptions, device: torch.device, command: str) -
     )
 
 
-@contextlib.contextmanager
-def torch_threads(count: int) -> Iterator[None]:
-    """Let torch use so many CPU threads while a block runs.
-
-    Args:
-        count: Threads, at least 1.
-    """
-    import torch
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
 def _write(report: Report, folder: Path, *, plots: bool) -> None:
-    from npa_envs.files import write_bytes, write_text
+    from npa_envs.files import write_text
+    from npa_envs.measure.plots import write_plots
+    from npa_envs.measure.speed.plots import pictures
 
-    stem = f"{report.suite}_{report.device.type}"
-    path = folder / f"{stem}.json"
+    path = folder / f"{report.suite}_{report.device.type}.json"
     write_text(path, report.json())
-    print(f"wrote {path}")
+    done = [f"wrote {path}"]
     if plots:
-        from npa_envs.measure.speed.plots import pictures
-
-        for name, data in pictures(report).items():
-            path = folder / f"{stem}_{name}.png"
-            write_bytes(path, data)
-            print(f"wrote {path}")
+        done += write_plots(lambda: pictures(report), path.with_name(f"{path.stem}_*.png"), "plots")
+    print("\n".join(done))
 
 
 def _explanation(options: BenchOptions, device: torch.device) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import shlex
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -16,7 +16,7 @@ from npa_envs.errors import NPAError, suggest
 
 if TYPE_CHECKING:
     from npa_envs.agents.comparison.plan import Axis, Plan
-    from npa_envs.agents.comparison.record import RunRecord
+    from npa_envs.agents.comparison.run import RunRecord
 
 RUN_FAILED = 1
 
@@ -89,7 +89,7 @@ class CompareOptions:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the command.
+    """Run what is missing, print and write.
 
     Args:
         arguments: The words after `npa-envs compare`.
@@ -102,29 +102,15 @@ def main(arguments: Sequence[str]) -> int:
             folder cannot be written to or holds figures of other settings.
     """
     options = tyro.cli(CompareOptions, prog="npa-envs compare", args=arguments)
-    # Records are not to tell where on which machine they were written.
-    words = ["OUT" if word == str(options.output) else word for word in arguments]
-    return run(options, shlex.join(["npa-envs", "compare", *words]))
-
-
-def run(options: CompareOptions, command: str = "") -> int:
-    """Run what is missing, print and write.
-
-    Args:
-        options: What the command line said.
-        command: The command line, for the records.
-
-    Raises:
-        NPAError: As for `main`.
-    """
     from npa_envs.agents.comparison.report import write_pictures, write_table
     from npa_envs.agents.comparison.scheduler import Places, held_records, run_jobs
-    from npa_envs.cli.output import StepBar, make_folder
-    from npa_envs.cli.rollout import check_writable
+    from npa_envs.cli.output import StepBar, writable_folder
 
+    # Records are not to tell where on which machine they were written.
+    words = ["OUT" if word == str(options.output) else word for word in arguments]
+    command = shlex.join(["npa-envs", "compare", *words])
     plan = make_plan(options)
-    folder = options.output
-    check_writable(make_folder(folder))
+    folder = writable_folder(options.output)
     # All are read first: a record of other settings is refused before any work is done.
     records = held_records(plan, folder)
     jobs = plan.jobs()
@@ -161,21 +147,16 @@ def run(options: CompareOptions, command: str = "") -> int:
 def make_plan(options: CompareOptions) -> Plan:
     """Return what the command line asks for.
 
-    Args:
-        options: What it said.
-
     Raises:
         NPAError: As for `main`.
     """
     from npa_envs.agents.comparison.plan import LEFT_OUT, PROBLEMS, Plan, make_problem
     from npa_envs.agents.learning import METHODS
+    from npa_envs.cli.output import check_numbers, chosen_names
 
-    for name in ("seeds", "episodes", "jobs", "threads"):
-        value = getattr(options, name)
-        if value is not None and value < 1:
-            raise NPAError(f"{name} must be at least 1, got {value}")
-    tasks = _chosen("task", options.tasks, PROBLEMS)
-    methods = _chosen("method", options.methods, METHODS)
+    check_numbers(options, seeds=1, episodes=1, jobs=1, threads=1)
+    tasks = chosen_names("task", options.tasks, PROBLEMS)
+    methods = chosen_names("method", options.methods, METHODS)
     if not options.methods:
         methods = [name for name in methods if name not in NEED_MORE]
     problems = {name: make_problem(name, quick=options.quick) for name in tasks}
@@ -189,14 +170,6 @@ def make_plan(options: CompareOptions) -> Plan:
         episodes=options.episodes or (QUICK_EPISODES if options.quick else 32),
         settings=_settings(options),
     )
-
-
-def _chosen(kind: str, names: Sequence[str], known: Iterable[str]) -> list[str]:
-    """Return those known names that were asked for, all where none was."""
-    for name in names:
-        if name not in known:
-            raise NPAError(f"unknown {kind} {name!r}: {suggest(name, known)}")
-    return [name for name in known if not names or name in names]
 
 
 def _budgets(options: CompareOptions) -> dict[Axis, float]:
@@ -262,8 +235,7 @@ def _jobs(options: CompareOptions) -> int:
 def _settings(options: CompareOptions) -> dict[str, Any]:
     """Return what figures follow from besides problems, budgets and options."""
     from npa_envs.devices import check_device
-    from npa_envs.diagnostics import installed_version
-    from npa_envs.measure.speed.report import current_commit, machine, versions
+    from npa_envs.measure.record import installed_version, machine, measured_facts
 
     places = [check_device(name) for name in _devices(options)]
     kinds = {(place.type, machine(place)) for place in places}
@@ -271,13 +243,11 @@ def _settings(options: CompareOptions) -> dict[str, Any]:
         raise NPAError(
             f"devices must be of one kind, as times are compared, got {sorted(kinds)}: choose some"
         )
-    ((kind, name),) = kinds
-    others = {library: installed_version(library) for library in ("stable-baselines3", "cma")}
-    return {
-        "device": kind,
-        "machine": name,
-        "runs_at_once": -(-_jobs(options) // len(places)),
-        "threads": options.threads,
-        "commit": options.commit or current_commit(),
-        "versions": versions() | others,
-    }
+    facts = measured_facts(
+        places[0],
+        options.commit,
+        runs_at_once=-(-_jobs(options) // len(places)),
+        threads=options.threads,
+    )
+    facts["versions"] |= {name: installed_version(name) for name in ("stable-baselines3", "cma")}
+    return facts

@@ -74,7 +74,7 @@ class EvaluateOptions:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the command.
+    """Measure and print.
 
     Args:
         arguments: The words after `npa-envs evaluate`.
@@ -87,35 +87,17 @@ def main(arguments: Sequence[str]) -> int:
             be written.
     """
     options = tyro.cli(EvaluateOptions, prog="npa-envs evaluate", args=arguments)
-    return run(options)
-
-
-def run(options: EvaluateOptions) -> int:
-    """Measure and print.
-
-    Args:
-        options: What the command line said.
-
-    Raises:
-        NPAError: As for `main`.
-    """
-    from npa_envs.cli.output import StepBar
-    from npa_envs.measure.quality.evaluation import (
-        CHECKPOINTS,
-        check_steps,
-        evaluate,
-        healing,
-        table_text,
-    )
+    from npa_envs.cli.output import StepBar, check_numbers
+    from npa_envs.devices import check_device
+    from npa_envs.measure.quality.evaluation import CHECKPOINTS, check_steps, evaluate, healing
+    from npa_envs.measure.tables import table_text
     from npa_envs.rule.files import load_rule
     from npa_envs.tasks.point_classification import PointClassification
-    from npa_envs.training import check_device
     from npa_envs.training.trained_tasks import task_of_rule
 
     checkpoints = options.checkpoints or CHECKPOINTS
     check_steps("checkpoints", checkpoints)
-    if options.seed_count < 1:
-        raise NPAError(f"seed_count must be at least 1, got {options.seed_count}")
+    check_numbers(options, seed_count=1)
     device = check_device(options.device)
     rule = load_rule(options.rule, device=device).float()
     trained = task_of_rule(
@@ -168,7 +150,7 @@ def _evaluate_clouds(options: EvaluateOptions, rule: NPARule, task: PointClassif
         accuracies,
         changes_of_mind,
     )
-    from npa_envs.measure.quality.evaluation import table_text
+    from npa_envs.measure.tables import table_text
 
     with StepBar(None, show=options.progress) as bar:
         told: dict[str, Any] = {"seed": options.first_seed, "progress": bar.advance}
@@ -184,7 +166,7 @@ def _evaluate_clouds(options: EvaluateOptions, rule: NPARule, task: PointClassif
 
 def _write(options: EvaluateOptions, tables: dict[str, Sequence[Any]], measure: str) -> None:
     from npa_envs.files import write_text
-    from npa_envs.measure.quality.evaluation import tables_json
+    from npa_envs.measure.tables import tables_json
 
     if options.json is not None:
         write_text(options.json, tables_json(tables, metric=measure))

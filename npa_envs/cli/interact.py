@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import functools
 import hashlib
-import json
-import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -13,12 +11,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from npa_envs.errors import MissingDependencyError, NPAError
+from npa_envs.errors import NPAError
 
 if TYPE_CHECKING:
     import torch
 
-    from npa_envs.measure.interaction import InteractionRow, InteractionSettings, Organism
+    from npa_envs.measure.interaction import InteractionSettings, Organism
     from npa_envs.rule.rule import NPARule
 
 RESULTS = "interactions.json"
@@ -78,7 +76,7 @@ class InteractOptions:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the command.
+    """Bring together, measure, write.
 
     Args:
         arguments: The words after `npa-envs interact`.
@@ -90,33 +88,20 @@ def main(arguments: Sequence[str]) -> int:
         NPAError: A rule or a value is wrong, rules cannot share a world, or the folder cannot be
             written to or holds results of other settings.
     """
-    return run(tyro.cli(InteractOptions, prog="npa-envs interact", args=arguments))
-
-
-def run(options: InteractOptions) -> int:
-    """Bring together, measure, write.
-
-    Args:
-        options: What the command line said.
-
-    Raises:
-        NPAError: As for `main`.
-    """
-    from npa_envs.cli.output import StepBar, make_folder
-    from npa_envs.cli.rollout import check_writable
-    from npa_envs.measure.interaction import Encounters
+    options = tyro.cli(InteractOptions, prog="npa-envs interact", args=arguments)
+    from npa_envs.cli.output import StepBar, check_numbers, writable_folder
+    from npa_envs.devices import check_device
+    from npa_envs.measure.interaction import Encounters, heat_map, read_rows, write_rows
+    from npa_envs.measure.plots import write_plots
     from npa_envs.measure.tables import table_text
     from npa_envs.render import write_filmstrip
-    from npa_envs.training import check_device
 
-    if options.seed_count < 1:
-        raise NPAError(f"seed_count must be at least 1, got {options.seed_count}")
+    check_numbers(options, seed_count=1)
     device = check_device(options.device)
     organisms, settings = _organisms(options, device)
-    folder = make_folder(options.out)
-    check_writable(folder)
+    folder = writable_folder(options.out)
     told = _told(organisms, settings)
-    rows = _finished(folder / RESULTS, told)
+    rows = read_rows(folder / RESULTS, told)
     pairs = [(first, second) for first in organisms for second in organisms]
     done = {(row.rule, row.beside) for row in rows}
     missing = [pair for pair in pairs if (pair[0].name, pair[1].name) not in done]
@@ -134,10 +119,11 @@ def run(options: InteractOptions) -> int:
             columns = len(scenes.frames) // len(fresh)
             write_filmstrip(path, scenes.frames, scenes.captions, columns=columns)
             rows += fresh
-            _write(folder / RESULTS, told, rows)
+            write_rows(folder / RESULTS, told, rows)
     print(table_text(rows))
     print(f"wrote {folder / RESULTS} and a filmstrip of each pair")
-    _draw(folder / "interactions.png", rows)
+    maps = write_plots(lambda: {"": heat_map(rows)}, folder / "interactions.png", "heat map")
+    print("\n".join(maps))
     return 0
 
 
@@ -186,79 +172,12 @@ def _task_of(source: str, rule: NPARule, device: torch.device, count: int) -> An
 
 def _told(organisms: Sequence[Organism], settings: InteractionSettings) -> dict[str, Any]:
     """Return what rows follow from, as JSON can hold it."""
+    from npa_envs.files import plain_numbers
+
     weights = {}
     for organism in organisms:
         digest = hashlib.sha256()
         for parameter in organism.rule.state_dict().values():
             digest.update(parameter.cpu().numpy().tobytes())
         weights[organism.name] = digest.hexdigest()[:16]
-    told: dict[str, Any] = json.loads(json.dumps(asdict(settings)))
-    return {**told, "rules": weights}
-
-
-def _finished(path: Path, told: dict[str, Any]) -> list[InteractionRow]:
-    """Return the rows that an earlier run left, if it ran alike."""
-    from npa_envs.measure.interaction import InteractionRow
-
-    if not path.exists():
-        return []
-    try:
-        held = json.loads(path.read_text("utf-8"))
-        before = held["settings"]
-        rows = []
-        for row in held["rows"]:
-            fields: dict[str, Any] = {k: math.inf if v is None else v for k, v in row.items()}
-            rows.append(InteractionRow(**fields))
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        raise NPAError(
-            f"{str(path)!r} must hold results of npa-envs interact, but cannot be read "
-            f"({error}): remove it, or choose another folder with --out"
-        ) from error
-    other = [name for name in told if before.get(name) != told[name]]
-    if other:
-        raise NPAError(
-            f"{str(path)!r} holds results of other settings: {other[0]} was "
-            f"{before.get(other[0])}, now {told[other[0]]}: choose another folder with --out"
-        )
-    return rows
-
-
-def _write(path: Path, told: dict[str, Any], rows: Sequence[InteractionRow]) -> None:
-    """Write settings, rows, and each number of them as matrices."""
-    from npa_envs.files import write_text
-
-    def plain(value: Any) -> Any:
-        return None if isinstance(value, float) and not math.isfinite(value) else value
-
-    names = list(told["rules"])
-    matrices = []
-    for ratio, distance in dict.fromkeys((row.ratio, row.distance) for row in rows):
-        found = {
-            (row.rule, row.beside): row
-            for row in rows
-            if (row.ratio, row.distance) == (ratio, distance)
-        }
-        matrix: dict[str, Any] = {"ratio": ratio, "distance": distance}
-        for what in ("change", "mixing", "displacement", "verdict"):
-            matrix[what] = [
-                [plain(getattr(found.get((down, across)), what, None)) for across in names]
-                for down in names
-            ]
-        matrices.append(matrix)
-    objects = [{k: plain(v) for k, v in asdict(row).items()} for row in rows]
-    held = {"settings": told, "rows": objects, "matrices": matrices}
-    write_text(path, json.dumps(held, indent=2, allow_nan=False) + "\n")
-
-
-def _draw(path: Path, rows: Sequence[InteractionRow]) -> None:
-    from npa_envs.files import write_bytes
-    from npa_envs.measure.interaction import heat_map
-    from npa_envs.measure.speed.plots import check_matplotlib
-
-    try:
-        check_matplotlib()
-    except MissingDependencyError as error:
-        print(f"no heat map: {error}")
-        return
-    write_bytes(path, heat_map(rows))
-    print(f"wrote {path}")
+    return {**plain_numbers(asdict(settings)), "rules": weights}

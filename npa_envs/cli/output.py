@@ -1,13 +1,17 @@
-"""Where commands write."""
+"""Common parts of the commands: folders to write to, numbers and names to check, progress bars."""
 
 from __future__ import annotations
 
+import contextlib
+import tempfile
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 from tqdm import tqdm
 
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, suggest
 
 
 def make_folder(path: Path) -> Path:
@@ -29,7 +33,70 @@ def make_folder(path: Path) -> Path:
     return path
 
 
-# The progress bar of the commands.
+def writable_folder(path: Path) -> Path:
+    """Create a folder where missing, and check that files can be made in it, before work is done.
+
+    Args:
+        path: The folder.
+
+    Raises:
+        NPAError: It cannot be created, or files in it cannot.
+    """
+    make_folder(path)
+    try:
+        with tempfile.TemporaryFile(dir=path):
+            pass
+    except OSError as error:
+        raise NPAError(
+            f"out must be a folder that can be written to, got {str(path)!r} "
+            f"({error.strerror or error}): choose another one"
+        ) from error
+    return path
+
+
+def check_numbers(options: Any, **least: int) -> None:
+    """Check that options of a command, where given, are at least so large, and its time limit.
+
+    Raises:
+        NPAError: One is smaller, or `max_seconds` is not positive.
+    """
+    for name, smallest in least.items():
+        value = getattr(options, name)
+        if value is not None and value < smallest:
+            raise NPAError(f"{name} must be at least {smallest}, got {value}")
+    seconds = getattr(options, "max_seconds", None)
+    if seconds is not None and not seconds > 0.0:
+        raise NPAError(f"max_seconds must be positive, got {seconds}: leave it out for no limit")
+
+
+def chosen_names(kind: str, names: Sequence[str], known: Iterable[str]) -> list[str]:
+    """Return those known names that were asked for, in their own order; all where none was.
+
+    Raises:
+        NPAError: A name is not known.
+    """
+    known = list(known)
+    for name in names:
+        if name not in known:
+            raise NPAError(f"unknown {kind} {name!r}: {suggest(name, known)}")
+    return [name for name in known if not names or name in names]
+
+
+@contextlib.contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """Let torch use so many CPU threads while a block runs.
+
+    Args:
+        count: Threads, at least 1.
+    """
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 class StepBar:

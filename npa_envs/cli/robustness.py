@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-import math
 import shlex
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
-
-from npa_envs.errors import NPAError, suggest
 
 if TYPE_CHECKING:
     import torch
 
     from npa_envs.measure.robustness.grounds import Ground
-    from npa_envs.measure.robustness.record import RuleRecord
+    from npa_envs.measure.robustness.study import RuleRecord
 
 QUICK_SEEDS, QUICK_PARTICLES = 2, 256
 """Seeds and particles of a quick run."""
@@ -71,7 +66,7 @@ class RobustnessOptions:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the command.
+    """Measure, print and write.
 
     Args:
         arguments: The words after `npa-envs robustness`.
@@ -84,52 +79,34 @@ def main(arguments: Sequence[str]) -> int:
             written to or holds figures of other settings.
     """
     options = tyro.cli(RobustnessOptions, prog="npa-envs robustness", args=arguments)
-    return run(options, shlex.join(["npa-envs", "robustness", *arguments]))
-
-
-def run(options: RobustnessOptions, command: str = "") -> int:
-    """Measure, print and write.
-
-    Args:
-        options: What the command line said.
-        command: The command line, for the records.
-
-    Raises:
-        NPAError: As for `main`.
-    """
-    from npa_envs.cli.bench import torch_threads
-    from npa_envs.cli.output import StepBar, make_folder
-    from npa_envs.cli.rollout import check_writable
+    from npa_envs.cli.output import (
+        StepBar,
+        check_numbers,
+        chosen_names,
+        torch_threads,
+        writable_folder,
+    )
     from npa_envs.devices import check_device
-    from npa_envs.measure.robustness.conditions import MOST_PARTICLES
-    from npa_envs.measure.robustness.record import read_record
-    from npa_envs.measure.robustness.study import measure_rule
+    from npa_envs.measure.accuracy.habitats import rule_names
+    from npa_envs.measure.record import measured_facts, time_limit
+    from npa_envs.measure.robustness.study import MOST_PARTICLES, RuleRecord, measure_rule
     from npa_envs.measure.robustness.tables import tables
 
-    for name, least in {
-        "seed_count": 1,
-        "first_seed": 0,
-        "most_particles": 1,
-        "threads": 1,
-    }.items():
-        value = getattr(options, name)
-        if value is not None and value < least:
-            raise NPAError(f"{name} must be at least {least}, got {value}")
-    if options.max_seconds is not None and not options.max_seconds > 0.0:
-        raise NPAError(
-            f"max_seconds must be positive, got {options.max_seconds}: leave it out for no limit"
-        )
-    end = math.inf if options.max_seconds is None else time.monotonic() + options.max_seconds
-    names = _chosen(options.rules)
+    check_numbers(options, seed_count=1, first_seed=0, most_particles=1, threads=1)
+    enough = time_limit(options.max_seconds)
+    names = chosen_names("rule", options.rules, rule_names())
     device = check_device(options.device)
     most = options.most_particles or MOST_PARTICLES[device.type]
-    facts = _facts(options, device, most)
+    seeds = _seeds(options)
+    facts = measured_facts(
+        device, options.commit, quick=options.quick, seeds=list(seeds), most_particles=most
+    )
     folder = options.output
     if folder is not None:
-        check_writable(make_folder(folder))
+        writable_folder(folder)
     paths = {name: folder / f"robustness_{name}.json" for name in names} if folder else {}
     # All are read first: a file of other settings is refused before any work is done.
-    before = {name: read_record(path, facts) for name, path in paths.items()}
+    before = {name: RuleRecord.read(path, facts) for name, path in paths.items()}
     records = []
     with (
         StepBar(len(names), show=options.progress, unit="rule") as bar,
@@ -137,16 +114,16 @@ def run(options: RobustnessOptions, command: str = "") -> int:
     ):
         for name in names:
             record = before.get(name)
-            if (record is None or not record.done) and not _enough(end):
+            if (record is None or not record.done) and not enough():
                 record = measure_rule(
                     name,
                     _ground(options, name, device),
                     most,
                     facts=facts,
-                    command=command,
+                    command=shlex.join(["npa-envs", "robustness", *arguments]),
                     before=record,
-                    keep=partial(_keep, paths.get(name)),
-                    enough=partial(_enough, end),
+                    path=paths.get(name),
+                    enough=enough,
                 )
             if record is not None and record.done:
                 records.append(record)
@@ -161,25 +138,6 @@ def run(options: RobustnessOptions, command: str = "") -> int:
         lines.append(f"{left} rules are left: call again with the same options")
     print("\n".join(lines))
     return 0
-
-
-def _enough(end: float) -> bool:
-    return time.monotonic() > end
-
-
-def _keep(path: Path | None, record: RuleRecord) -> None:
-    if path is not None:
-        record.write(path)
-
-
-def _chosen(names: Sequence[str]) -> list[str]:
-    from npa_envs.measure.accuracy.habitats import rule_names
-
-    known = rule_names()
-    for name in names:
-        if name not in known:
-            raise NPAError(f"unknown rule {name!r}: {suggest(name, known)}")
-    return [name for name in known if not names or name in names]
 
 
 def _seeds(options: RobustnessOptions) -> range:
@@ -198,28 +156,12 @@ def _ground(options: RobustnessOptions, name: str, device: torch.device) -> Grou
     return Ground(name, device, plan, _seeds(options), small)
 
 
-def _facts(options: RobustnessOptions, device: torch.device, most: int) -> dict[str, Any]:
-    """Return what figures follow from."""
-    from npa_envs.measure.speed.report import current_commit, machine, versions
-
-    return {
-        "device": device.type,
-        "machine": machine(device),
-        "quick": options.quick,
-        "seeds": list(_seeds(options)),
-        "most_particles": most,
-        "commit": options.commit or current_commit(),
-        "versions": versions(),
-    }
-
-
 def _write(folder: Path, text: str, records: Sequence[RuleRecord]) -> list[str]:
     """Write the tables and, where matplotlib is installed, the curves; return what was done."""
     from npa_envs.files import write_text
-    from npa_envs.measure.robustness.plots import pictures
-    from npa_envs.measure.speed.plots import write_plots
+    from npa_envs.measure.plots import write_plots
+    from npa_envs.measure.robustness.tables import pictures
 
     write_text(folder / "robustness.md", text)
     done = [f"wrote {folder}: robustness.md and a record for each rule"]
-    curves = folder / "robustness_*.png"
-    return [*done, *write_plots(lambda: pictures(records), curves, "curves")]
+    return [*done, *write_plots(lambda: pictures(records), folder / "robustness_*.png", "curves")]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -123,7 +122,7 @@ def run(options: RolloutOptions) -> int:
     import torch
 
     from npa_envs.cli.film import film_world, write_film, write_solid
-    from npa_envs.cli.output import StepBar, make_folder
+    from npa_envs.cli.output import StepBar, writable_folder
     from npa_envs.measure.quality.evaluation import measure
     from npa_envs.rule.files import load_rule
     from npa_envs.tasks.base import ViewTask, seed_worlds, task_toward
@@ -155,8 +154,7 @@ def run(options: RolloutOptions) -> int:
     task = shown = trained.task
     if options.resolution is None and len(task.target_picture) < SCREEN:
         shown = task_of_rule(options.rule, rule, device, **fields, resolution=SCREEN).task
-    folder = make_folder(options.out)
-    check_writable(folder)
+    folder = writable_folder(options.out)
     generator = torch.Generator(device).manual_seed(options.seed)
     x, s, goal = seed_worlds(task, 1, generator=generator, device=device)
     task = task_toward(task, goal)
@@ -193,22 +191,3 @@ def run(options: RolloutOptions) -> int:
     for path in paths:
         print(f"wrote {path}")
     return 0
-
-
-def check_writable(folder: Path) -> None:
-    """Check that files can be made in a folder, before work is done that would be lost.
-
-    Args:
-        folder: An existing folder.
-
-    Raises:
-        NPAError: They cannot.
-    """
-    try:
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise NPAError(
-            f"out must be a folder that can be written to, got {str(folder)!r} "
-            f"({error.strerror or error}): choose another one"
-        ) from error

@@ -5,17 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import tyro
 
-from npa_envs.errors import NPAError
-
 if TYPE_CHECKING:
-    import torch
-
     from npa_envs.measure.accuracy.checks import Check
-    from npa_envs.measure.accuracy.record import Record
 
 FAILED = 1
 
@@ -62,7 +57,7 @@ class StressOptions:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the command.
+    """Check, print and write.
 
     Args:
         arguments: The words after `npa-envs stress`.
@@ -74,66 +69,57 @@ def main(arguments: Sequence[str]) -> int:
         NPAError: There is no such check or device, or the folder cannot be written to or holds
             figures of other settings.
     """
-    return run(tyro.cli(StressOptions, prog="npa-envs stress", args=arguments))
-
-
-def run(options: StressOptions) -> int:
-    """Check, print and write.
-
-    Args:
-        options: What the command line said.
-
-    Raises:
-        NPAError: As for `main`.
-    """
-    from npa_envs.cli.bench import torch_threads
-    from npa_envs.cli.output import StepBar
+    options = tyro.cli(StressOptions, prog="npa-envs stress", args=arguments)
+    from npa_envs.cli.output import StepBar, check_numbers, torch_threads, writable_folder
     from npa_envs.devices import check_device
+    from npa_envs.measure.accuracy import suite
     from npa_envs.measure.accuracy.checks import Session
-    from npa_envs.measure.accuracy.record import Record, in_order, read_record
-    from npa_envs.measure.accuracy.suite import all_checks, chosen_checks, run_checks
+    from npa_envs.measure.plots import write_plots
+    from npa_envs.measure.record import measured_facts
 
-    if options.max_seconds is not None and not options.max_seconds > 0.0:
-        raise NPAError(
-            f"max_seconds must be positive, got {options.max_seconds}: leave it out for no limit"
-        )
-    for name, least in (("seed", 0), ("threads", 1)):
-        if getattr(options, name) < least:
-            raise NPAError(f"{name} must be at least {least}, got {getattr(options, name)}")
-    checks = all_checks(quick=options.quick, seed=options.seed)
-    chosen = chosen_checks(checks, options.only)
+    check_numbers(options, seed=0, threads=1)
+    checks = suite.all_checks(quick=options.quick, seed=options.seed)
+    names = [check.name for check in checks]
+    chosen = suite.chosen_checks(checks, options.only)
     if options.list:
         print(_listing(chosen))
         return 0
     device = check_device(options.device)
-    facts = _facts(options, device)
-    path = _path(options, device)
-    record = Record(facts) if path is None else read_record(path, facts)
+    facts = measured_facts(device, options.commit, quick=options.quick, seed=options.seed)
+    record, path = suite.Record(facts), None
+    if options.output is not None:
+        name = f"stress_{device.type}{'_quick' * options.quick}.json"
+        path = writable_folder(options.output) / name
+        record = suite.Record.read(path, facts)
     before = sum(record.done(check.name) for check in chosen)
     if before:
         print(f"{before} of {len(chosen)} checks were done before")
 
-    def written(record: Record) -> None:
+    def written(record: suite.Record) -> None:
         if path is not None:
-            in_order(record, [check.name for check in checks]).write(path)
+            record.in_order(names).write(path)
 
     with (
         StepBar(len(chosen), show=options.progress, unit="check") as bar,
         torch_threads(options.threads),
     ):
-        run_checks(
+        suite.run_checks(
             chosen,
             Session(device, quick=options.quick, seed=options.seed),
             record,
-            max_seconds=float("inf") if options.max_seconds is None else options.max_seconds,
+            max_seconds=options.max_seconds,
             written=written,
             progress=bar.advance,
         )
-    record = in_order(record, [check.name for check in checks])
+    record = record.in_order(names)
     print(record.text())
     if path is not None:
-        print(f"wrote {path}")
-        _draw(path, record)
+        maps = path.with_name(f"{path.stem}_*.png")
+        print(
+            "\n".join(
+                [f"wrote {path}", *write_plots(lambda: suite.heat_maps(record), maps, "heat maps")]
+            )
+        )
     return FAILED if record.failed() else 0
 
 
@@ -146,38 +132,3 @@ def _listing(checks: Sequence[Check]) -> str:
         if some:
             lines += [f"{group}: {summary}", *(f"  {c.name}: {c.expected}" for c in some)]
     return "\n".join(lines)
-
-
-def _facts(options: StressOptions, device: torch.device) -> dict[str, Any]:
-    """Return what figures follow from."""
-    from npa_envs.measure.speed.report import current_commit, machine, versions
-
-    return {
-        "device": device.type,
-        "machine": machine(device),
-        "quick": options.quick,
-        "seed": options.seed,
-        "commit": options.commit or current_commit(),
-        "versions": versions(),
-    }
-
-
-def _path(options: StressOptions, device: torch.device) -> Path | None:
-    """Return the file to write, None where none is asked for."""
-    from npa_envs.cli.output import make_folder
-    from npa_envs.cli.rollout import check_writable
-
-    if options.output is None:
-        return None
-    check_writable(make_folder(options.output))
-    return options.output / f"stress_{device.type}{'_quick' * options.quick}.json"
-
-
-def _draw(path: Path, record: Record) -> None:
-    """Draw heat maps beside the record, where matplotlib is installed."""
-    from npa_envs.measure.accuracy.plots import heat_maps
-    from npa_envs.measure.speed.plots import write_plots
-
-    maps = path.with_name(f"{path.stem}_*.png")
-    for line in write_plots(lambda: heat_maps(record), maps, "heat maps"):
-        print(line)

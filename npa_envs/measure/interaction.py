@@ -1,4 +1,4 @@
-"""What trained rules do to each other, in numbers: what is measured, and what it is called.
+"""Interaction of trained rules that share a world, in numbers.
 
 Independently trained rules can share a world (arXiv 2601.16096). Whether one disrupts another is
 measured by the other's own task, on its own particles, against the same seeds grown alone.
@@ -6,10 +6,10 @@ measured by the other's own task, on its own particles, against the same seeds g
 
 from __future__ import annotations
 
-import io
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +18,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.errors import NPAError
+from npa_envs.measure.plots import draw_matrix, new_figure, png
+from npa_envs.measure.record import read_record, write_record
+from npa_envs.measure.tables import as_objects
 from npa_envs.ops import species_fields
 from npa_envs.render import draw_worlds
 from npa_envs.rule.rule import NPARule
@@ -373,59 +376,90 @@ class Encounters:
         return x, s, lost
 
 
-# Heat maps of what rules do to each other.
+# Records and heat maps of what rules do to each other.
 
 
 LARGEST_CHANGE = 4.0
 """Colours end at this many times the loss alone, and at its inverse."""
 
 
+def read_rows(path: Path, settings: Mapping[str, Any]) -> list[InteractionRow]:
+    """Return the rows that an earlier run of the same settings left; infinite ones are null there.
+
+    Raises:
+        NPAError: As for `read_record`.
+    """
+
+    def made(held: dict[str, Any]) -> list[InteractionRow]:
+        rows = [{k: math.inf if v is None else v for k, v in row.items()} for row in held["rows"]]
+        return [InteractionRow(**row) for row in rows]
+
+    found = read_record(path, settings, made, command="interact", key="settings", option="--out")
+    return found or []
+
+
+def write_rows(path: Path, settings: Mapping[str, Any], rows: Sequence[InteractionRow]) -> None:
+    """Write settings, rows, and each number of them as matrices over the rules of the settings.
+
+    Raises:
+        NPAError: They cannot be written.
+    """
+    names = list(settings["rules"])
+    matrices = [
+        {
+            "ratio": ratio,
+            "distance": distance,
+            **{
+                what: _matrix(some, names, what)
+                for what in ("change", "mixing", "displacement", "verdict")
+            },
+        }
+        for (ratio, distance), some in _by_setting(rows).items()
+    ]
+    content = {"settings": settings, "rows": as_objects(rows), "matrices": matrices}
+    write_record(path, content)
+
+
+def _by_setting(rows: Sequence[InteractionRow]) -> dict[tuple[float, float], list[InteractionRow]]:
+    found: dict[tuple[float, float], list[InteractionRow]] = {}
+    for row in rows:
+        found.setdefault((row.ratio, row.distance), []).append(row)
+    return found
+
+
+def _matrix(rows: Sequence[InteractionRow], names: Sequence[str], what: str) -> list[list[Any]]:
+    """Return one field of each pair of rules; None where it is missing."""
+    found = {(row.rule, row.beside): getattr(row, what) for row in rows}
+    return [[found.get((down, across)) for across in names] for down in names]
+
+
 def heat_map(rows: Sequence[InteractionRow]) -> bytes:
     """Return a PNG: how each rule's loss changes beside each other one, and how much they mix.
 
-    One pair of panels for each distance and ratio; rows are the measured rules. Needs matplotlib.
-
-    Args:
-        rows: What was measured; pairs that are missing stay blank.
+    One pair of panels for each distance and ratio; rows are the measured rules. Pairs that are
+    missing stay blank. Needs matplotlib.
     """
-    from matplotlib.colors import LogNorm
-    from matplotlib.figure import Figure
+    from matplotlib.colors import LogNorm, Normalize
 
     names = list(dict.fromkeys([row.rule for row in rows] + [row.beside for row in rows]))
-    settings = list(dict.fromkeys((row.ratio, row.distance) for row in rows))
+    settings = _by_setting(rows)
     side = 1.6 + 0.55 * len(names)
-    figure = Figure(figsize=(2 * side + 2.0, side * len(settings)), layout="constrained")
-    panels = figure.subplots(len(settings), 2, squeeze=False)
-    norm = LogNorm(1.0 / LARGEST_CHANGE, LARGEST_CHANGE)
-    for (ratio, distance), (left, right) in zip(settings, panels, strict=True):
-        some = [row for row in rows if (row.ratio, row.distance) == (ratio, distance)]
-        where = f"distance {distance:g}, ratio {ratio:g}"
-        change = _draw_matrix(left, names, some, "change", cmap="RdBu_r", norm=norm)
-        left.set(title=f"loss together / alone\n{where}", ylabel="rule", xlabel="beside")
-        mixing = _draw_matrix(right, names, some, "mixing", cmap="viridis", vmin=0.0, vmax=1.0)
-        right.set(title=f"mixing index\n{where}", xlabel="beside")
-        ticks = [0.25, 0.5, 1.0, 2.0, 4.0]
-        figure.colorbar(change, ax=left, ticks=ticks, format="%g").minorticks_off()
-        figure.colorbar(mixing, ax=right)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=90)
-    return buffer.getvalue()
-
-
-def _draw_matrix(
-    panel: Any, names: list[str], rows: Sequence[InteractionRow], what: str, **colours: Any
-) -> Any:
-    """Draw one number of each pair, and write it into its cell."""
-    values = [[math.nan] * len(names) for _ in names]
-    for row in rows:
-        value = getattr(row, what)
-        down, across = names.index(row.rule), names.index(row.beside)
-        # Infinities have no colour of their own.
-        values[down][across] = min(value, 1e6)
-        label = panel.text(across, down, f"{value:.2g}", ha="center", va="center", fontsize=7)
-        label.set_bbox({"facecolor": "white", "alpha": 0.6, "linewidth": 0.0, "pad": 1.5})
-    image = panel.imshow(values, **colours)
-    places = range(len(names))
-    panel.set_xticks(places, names, rotation=45, ha="right", fontsize=8)
-    panel.set_yticks(places, names, fontsize=8)
-    return image
+    figure, grid = new_figure(len(settings), 2, (2 * side + 2.0, side * len(settings)))
+    drawn: tuple[tuple[str, str, str, Any, dict[str, Any]], ...] = (
+        (
+            "change",
+            "loss together / alone",
+            "RdBu_r",
+            LogNorm(1.0 / LARGEST_CHANGE, LARGEST_CHANGE),
+            {"ticks": [0.25, 0.5, 1.0, 2.0, 4.0], "format": "%g"},
+        ),
+        ("mixing", "mixing index", "viridis", Normalize(0.0, 1.0), {}),
+    )
+    for ((ratio, distance), some), panels in zip(settings.items(), grid, strict=True):
+        for panel, (what, title, colours, norm, bar) in zip(panels, drawn, strict=True):
+            values = _matrix(some, names, what)
+            scale = draw_matrix(panel, names, names, values, colours=colours, norm=norm)
+            panel.set(xlabel="beside", title=f"{title}\ndistance {distance:g}, ratio {ratio:g}")
+            figure.colorbar(scale, ax=panel, **bar).minorticks_off()
+        panels[0].set_ylabel("rule")
+    return png(figure)

@@ -1,12 +1,18 @@
-"""Results as tables: rows of one dataclass as plain text or as JSON."""
+"""Tables of measurements: plain text, Markdown, comma-separated values, JSON."""
 
 from __future__ import annotations
 
+import csv
 import dataclasses
-import json
+import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
+
+from npa_envs.files import json_text
+
+NONE = "–"
+"""What Markdown shows where nothing was measured."""
 
 
 def table_text(rows: Sequence[Any], *, missing: str = "never") -> str:
@@ -21,11 +27,17 @@ def table_text(rows: Sequence[Any], *, missing: str = "never") -> str:
     names = [field.name for field in dataclasses.fields(rows[0])]
     cells = [[name.replace("_", " ") for name in names]]
     cells += [[_cell(getattr(row, name), missing) for name in names] for row in rows]
-    widths = [max(len(line[column]) for line in cells) for column in range(len(names))]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     return "\n".join(
         "  ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True))
         for line in cells
     )
+
+
+def _cell(value: object, missing: str) -> str:
+    if value is None:
+        return missing
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def tables_json(tables: Mapping[str, Sequence[Any]], **facts: str) -> str:
@@ -35,18 +47,37 @@ def tables_json(tables: Mapping[str, Sequence[Any]], **facts: str) -> str:
         tables: Rows, instances of dataclasses, by the table's name.
         facts: What else the object says, by name.
     """
-
-    def plain(value: Any) -> Any:
-        return None if isinstance(value, float) and not math.isfinite(value) else value
-
-    objects: dict[str, Any] = {
-        name: [{k: plain(v) for k, v in dataclasses.asdict(row).items()} for row in rows]
-        for name, rows in tables.items()
-    }
-    return json.dumps({**facts, **objects}, indent=2, allow_nan=False) + "\n"
+    return json_text({**facts, **{name: as_objects(rows) for name, rows in tables.items()}})
 
 
-def _cell(value: object, missing: str) -> str:
-    if value is None:
-        return missing
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+def as_objects(rows: Iterable[Any]) -> list[dict[str, Any]]:
+    """Return instances of dataclasses as JSON objects."""
+    return [dataclasses.asdict(row) for row in rows]
+
+
+def markdown_table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table in Markdown."""
+    lines = [heads, ["---"] * len(heads), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def csv_text(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Return comma-separated values; floats have 12 digits."""
+    written = io.StringIO()
+    writer = csv.writer(written, lineterminator="\n")
+    writer.writerow(heads)
+    for row in rows:
+        writer.writerow([f"{v:.12g}" if isinstance(v, float) else v for v in row])
+    return written.getvalue()
+
+
+def short(value: float | str) -> str:
+    """Return a number with three digits, a word as it is."""
+    return value if isinstance(value, str) else f"{value:.3g}"
+
+
+def mean_with_error(mean: float, error: float, digits: int = 3) -> str:
+    """Return a mean with its standard error; either may be NaN, for not known."""
+    if math.isnan(mean):
+        return NONE
+    return f"{mean:.{digits}f}" + ("" if math.isnan(error) else f" ± {error:.{digits}f}")

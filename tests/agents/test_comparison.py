@@ -17,9 +17,7 @@ from PIL import Image
 from npa_envs.agents import RandomPolicy, ZeroPolicy
 from npa_envs.agents.comparison import run as one_run
 from npa_envs.agents.comparison import scheduler
-from npa_envs.agents.comparison.pictures import PICTURE, SIZE, final_picture, write_strips
 from npa_envs.agents.comparison.plan import LEFT_OUT, PROBLEMS, Job, Plan, make_problem
-from npa_envs.agents.comparison.record import Point, RunRecord, read_record
 from npa_envs.agents.comparison.report import (
     Estimate,
     curve,
@@ -29,8 +27,10 @@ from npa_envs.agents.comparison.report import (
     pictures,
     rows,
     text,
+    write_strips,
     write_table,
 )
+from npa_envs.agents.comparison.run import PICTURE, SIZE, Point, RunRecord, final_picture
 from npa_envs.agents.comparison.scheduler import Places, held_records, run_jobs
 from npa_envs.agents.learning import METHODS, Problem, RuleSet
 from npa_envs.cli import main
@@ -182,14 +182,14 @@ def scheduled(**changes) -> tuple[int, int]:
 def test_a_record_comes_back_as_it_was_written(tmp_path):
     written = record("one", 0, (0.25, 0.5), curve=points((0.0, 0.0), (1.0, 0.25)))
     written.write(tmp_path)
-    assert read_record(tmp_path, FACTS) == written
-    assert read_record(tmp_path / "elsewhere", FACTS) is None
+    assert RunRecord.read(tmp_path, FACTS) == written
+    assert RunRecord.read(tmp_path / "elsewhere", FACTS) is None
 
 
 def test_what_is_not_finite_comes_back_as_not_a_number(tmp_path):
     record("one", 0, (0.25, math.inf), status="diverged").write(tmp_path)
     assert json.loads((tmp_path / "run.json").read_text())["returns"] == [0.25, None]
-    again = read_record(tmp_path, FACTS)
+    again = RunRecord.read(tmp_path, FACTS)
     assert again.returns[0] == 0.25
     assert math.isnan(again.mean_return)
 
@@ -197,10 +197,10 @@ def test_what_is_not_finite_comes_back_as_not_a_number(tmp_path):
 def test_records_of_other_settings_and_other_files_are_refused(tmp_path):
     record("one", 0, (0.25,)).write(tmp_path)
     with pytest.raises(NPAError, match=r"other settings: budget was 1\.0, now 2\.0"):
-        read_record(tmp_path, FACTS | {"budget": 2.0})
+        RunRecord.read(tmp_path, FACTS | {"budget": 2.0})
     (tmp_path / "run.json").write_text('{"job": 3}')
     with pytest.raises(NPAError, match="must hold a record of npa-envs compare"):
-        read_record(tmp_path, FACTS)
+        RunRecord.read(tmp_path, FACTS)
 
 
 # Processes
@@ -274,7 +274,7 @@ def test_a_process_that_dies_is_recorded_the_others_go_on_and_it_is_run_again(tm
     assert (first.status, second.status) == ("failed", "done")
     assert first.error == "its process ended with code 3: out of luck"
     assert list(held_records(made, tmp_path)) == [second.job]
-    assert read_record(tmp_path / first.job.folder, made.facts(first.job)) == first
+    assert RunRecord.read(tmp_path / first.job.folder, made.facts(first.job)) == first
     child("")
     run_jobs(made, [first.job], tmp_path, Places(("cpu",)))
     assert list(held_records(made, tmp_path)) == made.jobs()
@@ -284,7 +284,8 @@ def test_a_process_that_dies_is_recorded_the_others_go_on_and_it_is_run_again(tm
 def test_an_interrupted_comparison_ends_its_processes_and_goes_on_where_it_was(
     tmp_path, child, device
 ):
-    child("time.sleep(60 if seed else 0)", before=WRITE_PID.format(tmp_path))
+    both = f"while len(list(Path({str(tmp_path)!r}).glob('pid-*'))) < 2: time.sleep(0.01)"
+    child(f"if seed: time.sleep(60)\n{both}", before=WRITE_PID.format(tmp_path))
     made = plan(methods=["one"], seeds=(0, 1, 2, 3))
 
     def interrupt(_):
@@ -595,5 +596,5 @@ def test_a_policy_whose_actions_are_not_finite_has_diverged(tmp_path, monkeypatc
         request = {"job": dataclasses.asdict(job), "facts": made.facts(job)}
         (tmp_path / "request.json").write_text(json.dumps(request))
         one_run.run(tmp_path, "cpu")
-        found = read_record(tmp_path, made.facts(job))
+        found = RunRecord.read(tmp_path, made.facts(job))
         assert (found.status, "must be finite" in found.error) == ("diverged", True)

@@ -14,13 +14,18 @@ from npa_envs import reference
 from npa_envs.cli import main
 from npa_envs.errors import NPAError
 from npa_envs.measure.accuracy import endurance, geometry, gradients, precision, suite
-from npa_envs.measure.accuracy import errors as accuracy
+from npa_envs.measure.accuracy import scenes as accuracy
 from npa_envs.measure.accuracy.checks import GROUPS, Check, Finding, Session, Skipped
 from npa_envs.measure.accuracy.habitats import habitat
-from npa_envs.measure.accuracy.plots import heat_maps
-from npa_envs.measure.accuracy.record import Entry, Record, in_order, read_record
 from npa_envs.measure.accuracy.scenes import EPS, scenes, threshold_scenes
-from npa_envs.measure.accuracy.suite import chosen_checks, run_check, run_checks
+from npa_envs.measure.accuracy.suite import (
+    Entry,
+    Record,
+    chosen_checks,
+    heat_maps,
+    run_check,
+    run_checks,
+)
 from npa_envs.rule.rule import NPARule
 
 CHECKS = {check.name: check for check in suite.all_checks(quick=True)}
@@ -127,17 +132,17 @@ def test_a_record_comes_back_as_it_was_written(tmp_path: Path):
         "fail": 1,
         "skipped": 0,
     }
-    entry = read_record(path, FACTS).entries["x/y"]
+    entry = Record.read(path, FACTS).entries["x/y"]
     assert math.isnan(entry.figures["c"])
     assert dataclasses.replace(entry, figures={**entry.figures, "c": 0.0}) == dataclasses.replace(
         record.entries["x/y"], figures={**figures, "c": 0.0}
     )
     with pytest.raises(NPAError, match="other settings: commit was '0', now '1'"):
-        read_record(path, FACTS | {"commit": "1"})
+        Record.read(path, FACTS | {"commit": "1"})
     path.write_text("{}")
     with pytest.raises(NPAError, match="must hold a record of npa-envs stress"):
-        read_record(path, FACTS)
-    assert read_record(tmp_path / "none.json", FACTS).entries == {}
+        Record.read(path, FACTS)
+    assert Record.read(tmp_path / "none.json", FACTS).entries == {}
 
 
 def test_a_run_goes_on_where_it_was_and_repeats_what_did_not_pass():
@@ -165,7 +170,7 @@ def test_a_run_goes_on_where_it_was_and_repeats_what_did_not_pass():
     # No time is no reason to forget that something failed.
     run_checks(checks, session(), late, max_seconds=0.0)
     assert [entry.verdict for entry in late.entries.values()] == ["pass", "fail", "range"]
-    assert list(in_order(late, ["a/3", "a/1"]).entries) == ["a/3", "a/1", "a/2"]
+    assert list(late.in_order(["a/3", "a/1"]).entries) == ["a/3", "a/1", "a/2"]
 
 
 # What the checks find

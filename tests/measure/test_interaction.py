@@ -289,13 +289,15 @@ class TestCommand:
         assert main(self.words(rules, tmp_path)) == 0
         assert main(self.words(rules, tmp_path, "--update-prob", "0.9")) == 2
         error = capsys.readouterr().err
-        assert "update_prob was None, now 0.9: choose another folder with --out" in error
+        assert (
+            "update_prob was None, now 0.9: remove it, or choose another folder with --out" in error
+        )
         save_rule(make_rule(5), rules / "two.safetensors", metadata=rules_metadata(rules))
         assert main(self.words(rules, tmp_path)) == 2
-        assert "holds results of other settings: rules was" in capsys.readouterr().err
+        assert "holds figures of other settings: rules was" in capsys.readouterr().err
         (tmp_path / "interactions.json").write_text("{}")
         assert main(self.words(rules, tmp_path)) == 2
-        assert "must hold results of npa-envs interact" in capsys.readouterr().err
+        assert "must hold a record of npa-envs interact" in capsys.readouterr().err
 
     def test_without_matplotlib_only_the_heat_map_is_missing(
         self, rules, tmp_path, capsys, monkeypatch

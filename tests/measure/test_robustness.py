@@ -13,15 +13,32 @@ import torch
 from npa_envs.cli import main
 from npa_envs.errors import NPAError
 from npa_envs.measure.accuracy.habitats import rule_names, task_name
-from npa_envs.measure.robustness.conditions import Response, grow, responses
-from npa_envs.measure.robustness.damages import DAMAGES, STATE_NOISE, wrapped
+from npa_envs.measure.plots import mark_decades
+from npa_envs.measure.robustness import study
 from npa_envs.measure.robustness.grounds import Ground, courses
-from npa_envs.measure.robustness.plans import CONDITIONS, PLANS, Plan, quick_plan, trained_value
-from npa_envs.measure.robustness.plots import mark_decades, pictures
-from npa_envs.measure.robustness.record import RuleRecord, read_record
-from npa_envs.measure.robustness.recovery import CONTROL, Course, healing, recovery_step
-from npa_envs.measure.robustness.shapes import BLOB_DISTANCE, SHAPES, SIZE_FACTOR, disk
+from npa_envs.measure.robustness.plans import (
+    BLOB_DISTANCE,
+    CONDITIONS,
+    PLANS,
+    SHAPES,
+    SIZE_FACTOR,
+    Plan,
+    disk,
+    quick_plan,
+    trained_value,
+)
+from npa_envs.measure.robustness.recovery import (
+    CONTROL,
+    DAMAGES,
+    STATE_NOISE,
+    Course,
+    healing,
+    recovery_step,
+    wrapped,
+)
+from npa_envs.measure.robustness.study import Response, RuleRecord, grow, responses
 from npa_envs.measure.robustness.tables import (
+    pictures,
     recovered_share,
     tables,
     where_it_works,
@@ -377,18 +394,18 @@ def test_plans_are_whole_chunks_and_hold_what_was_trained():
 
 def test_a_record_comes_back_and_one_of_other_settings_is_refused(tmp_path: Path):
     path = tmp_path / "robustness_heart.json"
-    assert read_record(path, {"a": 1}) is None
+    assert RuleRecord.read(path, {"a": 1}) is None
     course = Course("erase", (0, 16), ((2.0, 1.0), (math.nan, 3.0)), ((1.0, 1.0), (1.0, 1.0)))
     written = record(course)
     written.write(path)
     assert json.loads(path.read_text())["courses"][0]["recovery_steps"] == [16, None]
-    back = read_record(path, {"a": 1})
+    back = RuleRecord.read(path, {"a": 1})
     assert repr(back) == repr(written)
     with pytest.raises(NPAError, match="other settings: a was 1, now 2"):
-        read_record(path, {"a": 2})
+        RuleRecord.read(path, {"a": 2})
     path.write_text("{}")
     with pytest.raises(NPAError, match="must hold a record of npa-envs robustness"):
-        read_record(path, {"a": 1})
+        RuleRecord.read(path, {"a": 1})
 
 
 def test_tables_say_who_recovered_when_and_what_was_not_measured():
@@ -438,49 +455,37 @@ def test_axes_of_few_decades_are_marked_within_them(low, high, marks):
 def test_the_command_measures_writes_and_goes_on(tmp_path, capsys, monkeypatch):
     words = ["robustness", "heart", "--quick", "--no-progress", "--commit", "0"]
     words += ["--output", str(tmp_path)]
+    path = tmp_path / "robustness_heart.json"
+    # No time is left after the damages and three values.
+    asked = iter([False] * 4)
+    monkeypatch.setattr("npa_envs.measure.record.time_limit", lambda _: lambda: next(asked, True))
+    assert main(words) == 0
+    assert capsys.readouterr().out == "1 rules are left: call again with the same options\n"
+    part = json.loads(path.read_text())
+    assert (part["done"], len(part["responses"])) == (False, 3)
+    monkeypatch.undo()
+    # The damages are not measured again.
+    monkeypatch.setattr(study, "healing", lambda *_: pytest.fail("measured"))
     assert main(words) == 0
     first = capsys.readouterr().out
-    held = json.loads((tmp_path / "robustness_heart.json").read_text())
+    held = json.loads(path.read_text())
     assert held["command"].startswith("npa-envs robustness heart --quick")
     assert held["facts"]["seeds"] == [1_000_000, 1_000_001]
     assert {row["condition"] for row in held["responses"]} == set(CONDITIONS)
     assert all(math.isfinite(v) for row in held["responses"] for v in row["losses"])
+    assert (held["courses"], held["responses"][:3]) == (part["courses"], part["responses"])
     assert (tmp_path / "robustness.md").read_text() in first
     # Nothing is measured again.
-    monkeypatch.setattr(
-        "npa_envs.measure.robustness.study.grow", lambda *_: pytest.fail("measured")
-    )
+    monkeypatch.setattr(study, "grow", lambda *_: pytest.fail("measured"))
     assert main(words) == 0
     assert capsys.readouterr().out == first
-
-
-def test_a_stopped_run_goes_on_where_it_was(tmp_path, capsys, monkeypatch):
-    def measured(*words):
-        assert (
-            main(["robustness", "heart", "--quick", "--no-progress", "--commit", "0", *words]) == 0
-        )
-        return capsys.readouterr().out
-
-    measured("--output", str(tmp_path / "whole"))
-    whole = json.loads((tmp_path / "whole" / "robustness_heart.json").read_text())
-    # Time is up after the damages and three values.
-    words = ["--output", str(tmp_path / "parts")]
-    path = tmp_path / "parts" / "robustness_heart.json"
-    asked = iter([False] * 4)
-    monkeypatch.setattr("npa_envs.cli.robustness._enough", lambda _: next(asked, True))
-    assert measured(*words) == "1 rules are left: call again with the same options\n"
-    part = json.loads(path.read_text())
-    assert not part["done"]
-    assert part["responses"] == whole["responses"][:3]
     monkeypatch.undo()
-    monkeypatch.setattr(
-        "npa_envs.measure.robustness.study.healing", lambda *_: pytest.fail("measured")
-    )
-    assert "Where rules work" in measured(*words)
-    both = json.loads(path.read_text())
-    assert both["done"]
-    assert both["responses"] == whole["responses"]
-    assert both["courses"] == part["courses"] == whole["courses"]
+    # What was stopped ends as what was not.
+    whole = tmp_path / "whole"
+    assert main([*words[:-1], str(whole)]) == 0
+    (path,) = whole.glob("*.json")
+    whole = json.loads(path.read_text())
+    assert (whole["courses"], whole["responses"]) == (held["courses"], held["responses"])
 
 
 def test_the_command_refuses_mistakes(capsys):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import time
+from functools import partial
 from itertools import product
 from pathlib import Path
 
@@ -12,27 +14,33 @@ import torch
 
 from npa_envs import reference
 from npa_envs.cli import main
-from npa_envs.measure.speed import ratios, scaling, suites
-from npa_envs.measure.speed.drift import drift_rows
-from npa_envs.measure.speed.explain import Question, explain, recorded_launches
-from npa_envs.measure.speed.hash_grid import grid_fields
-from npa_envs.measure.speed.paper import PAPER, aim_rows, throughput_rows
-from npa_envs.measure.speed.peers import PEERS, peer_rows
-from npa_envs.measure.speed.perception import perception_rows
-from npa_envs.measure.speed.plots import Point, front, pictures
-from npa_envs.measure.speed.precisions import PRECISIONS, MixedRule
-from npa_envs.measure.speed.report import Report
-from npa_envs.measure.speed.rollouts import (
+from npa_envs.measure.speed import suites, throughput
+from npa_envs.measure.speed.errors import (
     RolloutRow,
     composed_step,
     drawn_mask,
+    drift_rows,
     mask_source,
+    perception_rows,
     rollout_rows,
 )
-from npa_envs.measure.speed.scaling import scaling_rows, slope_rows, varied
-from npa_envs.measure.speed.session import LeftOut, Session
-from npa_envs.measure.speed.strategies import NEIGHBOUR_CAP, STRATEGIES, nearest
-from npa_envs.measure.speed.timing import Timing, measure
+from npa_envs.measure.speed.explain import Question, explain, recorded_launches
+from npa_envs.measure.speed.hash_grid import grid_fields
+from npa_envs.measure.speed.peers import PEERS, peer_rows
+from npa_envs.measure.speed.plots import Point, front, pictures
+from npa_envs.measure.speed.strategies import NEIGHBOUR_CAP, PRECISIONS, STRATEGIES, nearest
+from npa_envs.measure.speed.suites import Report
+from npa_envs.measure.speed.throughput import (
+    PAPER,
+    aim_rows,
+    roll_one_species,
+    scaling_rows,
+    skip_rows,
+    slope_rows,
+    throughput_rows,
+    varied,
+)
+from npa_envs.measure.speed.timing import LeftOut, Session, Timing, compare, measure
 from npa_envs.measure.speed.workloads import Workload, gecko
 from npa_envs.ops import perceive
 from npa_envs.world.rollout import rollout, step
@@ -58,7 +66,7 @@ def tiny_suite(monkeypatch: pytest.MonkeyPatch) -> None:
         "tiny", lambda here: {"perception": perception_rows(here, TINY)}, guarded=True
     )
     monkeypatch.setitem(suites.SUITES, "quick", suite)
-    monkeypatch.setattr(ratios, "WORKLOAD", Workload(2, 1, 100, 1, hidden_dim=16))
+    monkeypatch.setattr(suites, "WORKLOAD", Workload(2, 1, 100, 1, hidden_dim=16))
 
 
 # Strategies and precisions
@@ -115,7 +123,6 @@ def test_a_step_composed_in_torch_is_that_of_the_library():
 def test_the_mixed_rule_is_the_rule_in_bfloat16():
     rule = gecko(1, 64, torch.device("cpu")).rule
     mixed = PRECISIONS["mixed"].rule(rule)
-    assert isinstance(mixed, MixedRule)
     z = torch.randn(40, rule.perception_dim, generator=torch.Generator().manual_seed(0))
     expected, value = rule(z).detach(), mixed(z).detach()
     error = float((value - expected).norm() / expected.norm())
@@ -257,13 +264,13 @@ def test_an_aim_takes_the_faster_training_and_the_smaller_memory():
 
 
 def test_scaling_varies_one_number_at_a_time(monkeypatch):
-    monkeypatch.setattr(scaling, "_values", lambda _: ((100, 200), (8, 16), (1, 2), (4, 20)))
+    monkeypatch.setattr(throughput, "_values", lambda _: ((100, 200), (8, 16), (1, 2), (4, 20)))
     here = session()
     rows = scaling_rows(here)
     assert [row.value for row in rows] == [100, 200, 8, 16, 1, 2, 4, 20]
     assert [round(row.neighbours) for row in rows] == [67, 67, 8, 16, 67, 67, 67, 67]
     assert [row.channels for row in rows] == [16] * 6 + [4, 20]
-    assert {slope.axis for slope in slope_rows(rows)} == set(scaling.AXES)
+    assert {slope.axis for slope in slope_rows(rows)} == set(throughput.AXES)
 
 
 def test_what_does_not_fit_into_memory_is_left_out():
@@ -279,12 +286,12 @@ def test_what_does_not_fit_into_memory_is_left_out():
 
 
 def test_a_slope_is_that_of_the_logarithms():
-    row = scaling._row(session(), "particles", 64)
+    row = throughput._scaling_row(session(), "particles", 64)
     rows = [
         type(row)(**vars(row) | {"value": n, "infer_us": timing(3 * n), "train_us": timing(n**2)})
         for n in (16, 64, 256, 1024)
     ]
-    slope = scaling._slope_row("particles", rows)
+    slope = throughput._slope_row("particles", rows)
     assert (slope.infer_slope, slope.train_slope) == pytest.approx((1.0, 2.0))
 
 
@@ -305,7 +312,7 @@ def test_peers_that_are_there_are_right_and_others_are_left_out_with_a_reason(mo
 def test_each_skip_is_measured_with_and_without():
     here = session()
     here.small = True
-    rows = suites.skipped(here)["skips"]
+    rows = skip_rows(here)
     assert here.left_out == []
     assert len({row.condition for row in rows}) == len(rows) == 10
     assert all(row.done_us.median > 0 and row.skipped_us.median > 0 for row in rows)
@@ -314,7 +321,7 @@ def test_each_skip_is_measured_with_and_without():
 
 def test_kernels_are_cudas(device):
     here = Session(device, repeats=1, small=True)
-    rows = suites.kernels(here)["kernels"]
+    rows = suites.SUITES["kernels"].run(here)["kernels"]
     if device.type == "cuda":
         assert any("perceive" in row.kernel for row in rows)
     else:
@@ -329,6 +336,50 @@ def test_the_suites_measure_all_their_tables():
     assert all(tables.values())
     assert here.small
     assert list(suites.paper(here)) == ["throughput", "drift"]
+
+
+# One species beside `rollout`
+
+
+def test_calls_are_compared_in_turn_and_each_pair_the_other_way_round(device):
+    calls = []
+
+    def call(name, seconds):
+        calls.append(name)
+        time.sleep(seconds)
+
+    source = torch.Generator(device)
+    first, second = partial(call, "a", 0.01), partial(call, "b", 0.02)
+    # A graph holds nothing of a call that launches nothing.
+    compared = compare((first, source), (second, source), device, repeats=4, graph=False)
+    assert "".join(calls)[4:] == "abbaabba"
+    # Who sleeps on a busy machine oversleeps, but never wakes early.
+    assert 10_000 <= compared.first.median < compared.second.median
+    assert compared.second.median >= 20_000
+    assert 1.2 < compared.ratio < 3.5
+
+
+def test_one_species_is_compared_with_the_rollout_that_it_is():
+    here = Session(torch.device("cpu"), repeats=1, small=True)
+    rows = suites.SUITES["species"].run(here)["one_species"]
+    assert [(row.what, row.calls) for row in rows] == [
+        ("inference", "eager"),
+        ("training", "eager"),
+    ]
+    for row in rows:
+        assert row.workload == "2D (1, 256, 2)"
+        assert row.rollout_us.median > 0
+        # What it costs is measured; that it is not another rollout is known.
+        assert 1 / 3 < row.ratio < 3
+    workload = Workload(2, 2, 150, 2, hidden_dim=16, eps=0.2)
+    x, s = workload.worlds(here.device)
+    rule = workload.rule(here.device)
+    outcomes = [
+        roll(rule, x, s, 2, update_prob=0.5, generator=torch.Generator().manual_seed(1))
+        for roll in (rollout, roll_one_species)
+    ]
+    for value, expected in zip(*outcomes, strict=True):
+        assert torch.equal(value, expected)
 
 
 # Plots, report
@@ -426,15 +477,15 @@ def stored(tmp_path: Path, **values: float) -> Path:
 
 def test_a_ratio_is_held_down_to_a_third_and_missed_below(tmp_path):
     path = stored(tmp_path, dense=30.0, grid=3.0)
-    wanted = ratios.stored_ratios(path, torch.device("cpu"))
-    assert ratios.missed_ratios({"dense": 10.1, "grid": 5.0}, wanted) == []
-    (line,) = ratios.missed_ratios({"dense": 9.9, "grid": 5.0}, wanted)
+    wanted = suites.stored_ratios(path, torch.device("cpu"))
+    assert suites.missed_ratios({"dense": 10.1, "grid": 5.0}, wanted) == []
+    (line,) = suites.missed_ratios({"dense": 9.9, "grid": 5.0}, wanted)
     assert line == "dense: 9.9, stored 30, at least 10 wanted"
-    assert len(ratios.missed_ratios({"dense": math.nan}, wanted)) == 2
+    assert len(suites.missed_ratios({"dense": math.nan}, wanted)) == 2
 
 
 def test_the_library_is_faster_than_dense_torch():
-    measured = ratios.ratios(session())
+    measured = suites.ratios(session())
     assert measured["perceive: dense torch over library"] > 3.0
     assert all(value > 0.0 for value in measured.values())
 
@@ -442,7 +493,7 @@ def test_the_library_is_faster_than_dense_torch():
 def test_the_stored_ratios_are_those_that_are_measured():
     path = Path(__file__).resolve().parents[2] / "benchmarks" / "results" / "ratios.json"
     kept = json.loads(path.read_text())
-    measured = ratios.ratios(session())
+    measured = suites.ratios(session())
     assert sorted(kept["cpu"]) == sorted(measured)
 
 

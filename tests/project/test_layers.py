@@ -58,20 +58,20 @@ LADDER = {
     ),
     "npa_envs.render": rung(7, "torch numpy PIL imageio imageio_ffmpeg pygame", never=ORACLES),
     "npa_envs.training": rung(8, "torch numpy tqdm yaml tensorboard", never=ORACLES),
-    "npa_envs.diagnostics": rung(8, "torch PIL imageio_ffmpeg", never=INSIDES),
     "npa_envs.api": rung(8, "torch", never=ORACLES),
     "npa_envs": rung(9, "torch", never=ORACLES),
-    "npa_envs.measure.speed.grid_kernels": rung(2, "warp"),
+    "npa_envs.measure.record": rung(2, "torch", never=INSIDES),
+    "npa_envs.measure.tables": rung(2),
+    "npa_envs.measure.plots": rung(2, "matplotlib"),
     "npa_envs.measure.speed.hash_grid": rung(3, "warp torch", never=("npa_envs.reference",)),
     "npa_envs.measure.speed.launches": rung(3, "warp"),
-    "npa_envs.measure.tables": rung(1),
     "npa_envs.measure.quality": rung(9, "torch numpy tqdm", never=INSIDES),
     "npa_envs.measure.interaction": rung(10, "torch numpy matplotlib", never=ORACLES),
     "npa_envs.measure.speed": rung(
         12, "torch numpy matplotlib scipy warpSPHCore", never=("npa_envs.kernels",)
     ),
     "npa_envs.measure.accuracy": rung(13, "torch matplotlib", never=("npa_envs.kernels",)),
-    "npa_envs.measure.robustness": rung(14, "torch matplotlib", never=ORACLES),
+    "npa_envs.measure.robustness": rung(14, "torch", never=ORACLES),
     "npa_envs.measure": rung(15),
     "npa_envs.envs": rung(16, "torch numpy gymnasium pettingzoo", never=INSIDES),
     "npa_envs.wrappers": rung(
@@ -82,8 +82,8 @@ LADDER = {
     "npa_envs.agents": rung(
         18, "torch numpy tqdm gymnasium pettingzoo stable_baselines3 cma", never=INSIDES
     ),
-    "npa_envs.agents.comparison": rung(19, "torch numpy PIL matplotlib", never=INSIDES),
-    "npa_envs.cli": rung(20, "torch numpy tqdm tyro", never=ORACLES),
+    "npa_envs.agents.comparison": rung(19, "torch numpy PIL", never=INSIDES),
+    "npa_envs.cli": rung(20, "torch numpy tqdm tyro imageio_ffmpeg", never=ORACLES),
 }
 WARP_AND_TORCH = {"npa_envs.ops", "npa_envs.measure.speed.hash_grid"}
 

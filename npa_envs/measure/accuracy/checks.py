@@ -1,4 +1,4 @@
-"""What a check is, what it is given, and what it finds."""
+"""Checks of hard cases: what each is given and finds."""
 
 from __future__ import annotations
 
@@ -96,4 +96,9 @@ class Check:
     @property
     def group(self) -> str:
         """The group that it belongs to."""
-        return self.name.partition("/")[0]
+        return group_of(self.name)
+
+
+def group_of(name: str) -> str:
+    """Return the group of a check's name."""
+    return name.partition("/")[0]

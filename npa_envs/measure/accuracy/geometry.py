@@ -9,15 +9,20 @@ from torch import Tensor
 
 from npa_envs import reference
 from npa_envs.measure.accuracy.checks import Check, Finding, Session
-from npa_envs.measure.accuracy.errors import (
+from npa_envs.measure.accuracy.scenes import (
+    EPS,
     LIMITS,
     PRECISIONS,
+    SIDE,
+    STATE_DIM,
     Perceived,
+    Scene,
     error_limits,
     perceived,
     relative_error,
+    scenes,
+    threshold_scenes,
 )
-from npa_envs.measure.accuracy.scenes import EPS, SIDE, STATE_DIM, Scene, scenes, threshold_scenes
 from npa_envs.ops import perceive, perception_fields
 
 CROWD = {"quick": 2_000, "cpu": 20_000, "cuda": 1_000_000}

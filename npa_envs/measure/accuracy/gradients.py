@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 
 from npa_envs.measure.accuracy.checks import Check, Finding, Session
-from npa_envs.measure.accuracy.errors import relative_error
 from npa_envs.measure.accuracy.habitats import Habitat, habitat
-from npa_envs.measure.accuracy.scenes import EPS, SIDE, Scene, scenes
+from npa_envs.measure.accuracy.scenes import EPS, SIDE, Scene, relative_error, scenes
 from npa_envs.ops import perceive
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.rollout import rollout

@@ -9,17 +9,20 @@ import torch
 from torch import Tensor
 
 from npa_envs.measure.accuracy.checks import Check, Finding, Session, Skipped
-from npa_envs.measure.accuracy.errors import (
+from npa_envs.measure.accuracy.habitats import WORKS, Habitat, habitat
+from npa_envs.measure.accuracy.scenes import (
+    EPS,
+    STATE_DIM,
     Perceived,
+    Scene,
     error_limits,
     functional_weights,
     perceived,
     relative_error,
+    scenes,
 )
-from npa_envs.measure.accuracy.habitats import WORKS, Habitat, habitat
-from npa_envs.measure.accuracy.scenes import EPS, STATE_DIM, Scene, scenes
 from npa_envs.measure.accuracy.values import differing
-from npa_envs.measure.speed.precisions import PRECISIONS, Precision
+from npa_envs.measure.speed.strategies import PRECISIONS, Precision
 from npa_envs.ops import perceive
 from npa_envs.rule.files import load_rule
 from npa_envs.world.cuda_graph import capture

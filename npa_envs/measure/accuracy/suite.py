@@ -1,28 +1,46 @@
-"""Every check of `npa-envs stress`, in the order that it runs them in."""
+"""The suite of `npa-envs stress`: every check, how checks are run, and their record."""
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
 
 import torch
 
 from npa_envs.errors import NPAError, suggest
-from npa_envs.measure.accuracy.checks import GROUPS, Check, Session, Skipped, Verdict
+from npa_envs.measure.accuracy.checks import (
+    GROUPS,
+    Check,
+    Finding,
+    Session,
+    Skipped,
+    Verdict,
+    group_of,
+)
 from npa_envs.measure.accuracy.endurance import endurance_checks
 from npa_envs.measure.accuracy.geometry import geometry_checks
 from npa_envs.measure.accuracy.gradients import gradients_checks
 from npa_envs.measure.accuracy.precision import precision_checks
-from npa_envs.measure.accuracy.record import Entry, Record
 from npa_envs.measure.accuracy.values import values_checks
+from npa_envs.measure.plots import draw_matrix, new_figure, png
+from npa_envs.measure.record import read_record, time_limit, write_record
+from npa_envs.measure.tables import table_text
+
+MEASURED = ("pass", "range")
+"""Verdicts of checks that a resumed run does not repeat."""
+
+FAR = 1e3
+"""Colours of heat maps end at this many times a limit, and at its inverse."""
 
 
 def all_checks(*, quick: bool = False, seed: int = 0) -> list[Check]:
-    """Return every check, by group.
+    """Return every check in the order that they are run in; when quick, only of some of the rules.
 
-    Args:
-        quick: Only of some of the rules, where there is a check for each rule.
-        seed: What random places are drawn from.
+    Random places are drawn from the seed.
     """
     return [
         *geometry_checks(seed),
@@ -31,9 +49,6 @@ def all_checks(*, quick: bool = False, seed: int = 0) -> list[Check]:
         *gradients_checks(quick=quick),
         *precision_checks(quick=quick),
     ]
-
-
-# Runs checks one after the other: one that raises has failed, and the others go on.
 
 
 def chosen_checks(checks: Sequence[Check], names: Sequence[str]) -> list[Check]:
@@ -46,17 +61,182 @@ def chosen_checks(checks: Sequence[Check], names: Sequence[str]) -> list[Check]:
     Raises:
         NPAError: A name stands for none.
     """
+
+    def stands_for(name: str, check: Check) -> bool:
+        return f"{check.name}/".startswith(f"{name.rstrip('/')}/")
+
     for name in names:
-        if not any(_stands_for(name, check) for check in checks):
+        if not any(stands_for(name, check) for check in checks):
             known = [*GROUPS, *(check.name for check in checks)]
             raise NPAError(f"unknown check {name!r}: {suggest(name, known)}")
     return [
-        check for check in checks if not names or any(_stands_for(name, check) for name in names)
+        check for check in checks if not names or any(stands_for(name, check) for name in names)
     ]
 
 
-def _stands_for(name: str, check: Check) -> bool:
-    return f"{check.name}/".startswith(f"{name.rstrip('/')}/")
+@dataclass(frozen=True)
+class Entry:
+    """A check and what came of it."""
+
+    name: str
+    """Its name."""
+    expected: str
+    """What was expected."""
+    verdict: Verdict
+    """What came of it."""
+    figures: Mapping[str, float] = field(default_factory=dict)
+    """What was measured, by name."""
+    limits: Mapping[str, float] = field(default_factory=dict)
+    """Largest values allowed, by the figure's name."""
+    holds: str = ""
+    """For a range: where it holds."""
+    note: str = ""
+    """The reason to skip it, the message of its error, or what else there is to know."""
+    seconds: float = 0.0
+    """How long it took [s]."""
+
+    @classmethod
+    def of(cls, check: Check, finding: Finding, seconds: float) -> Entry:
+        """Return the entry of a check that ran to its end."""
+        return cls(
+            check.name,
+            check.expected,
+            finding.verdict,
+            dict(finding.figures),
+            dict(finding.limits),
+            finding.holds,
+            finding.note,
+            seconds,
+        )
+
+    @property
+    def group(self) -> str:
+        """The group that the check belongs to."""
+        return group_of(self.name)
+
+    def share(self, name: str) -> float:
+        """Return a figure over its limit: above 1, or not a number, it is exceeded.
+
+        A limit of 0 allows nothing but 0.
+        """
+        value, limit = self.figures.get(name, math.nan), self.limits[name]
+        if limit == 0.0:
+            return value if value == 0.0 or math.isnan(value) else math.inf
+        return value / limit
+
+    def worst(self) -> str:
+        """Return the figure that is nearest to its limit, or furthest above it, in words."""
+        if not self.limits:
+            return ""
+        shares = {name: self.share(name) for name in self.limits}
+        name = max(shares, key=lambda name: (math.isnan(shares[name]), shares[name]))
+        value = self.figures.get(name, math.nan)
+        return f"{name} {value:.2g} (at most {self.limits[name]:.2g})"
+
+
+@dataclass(frozen=True)
+class Row:
+    """A line of the printed tables."""
+
+    check: str
+    verdict: str
+    seconds: float
+    found: str
+
+
+@dataclass
+class Record:
+    """All that a run found."""
+
+    facts: dict[str, Any]
+    """What its figures follow from: device, machine, size, seed, commit, versions."""
+    entries: dict[str, Entry] = field(default_factory=dict)
+    """What came of each check, by its name."""
+
+    @classmethod
+    def read(cls, path: Path, facts: Mapping[str, Any]) -> Record:
+        """Return the record that a run left, an empty one where there is none.
+
+        Raises:
+            NPAError: As for `read_record`.
+        """
+
+        def made(held: dict[str, Any]) -> dict[str, Entry]:
+            return {fields["name"]: _entry(fields) for fields in held["checks"]}
+
+        return cls(dict(facts), read_record(path, facts, made, command="stress") or {})
+
+    def write(self, path: Path) -> None:
+        """Write everything as JSON; numbers that are not finite become "nan", "inf" and "-inf".
+
+        Raises:
+            NPAError: It cannot be written.
+        """
+        entries = [asdict(entry) for entry in self.entries.values()]
+        content = {"facts": self.facts, "counts": self.counts(), "checks": entries}
+        write_record(path, _with_words(content))
+
+    def done(self, name: str) -> bool:
+        """Return whether a check need not be run again."""
+        return name in self.entries and self.entries[name].verdict in MEASURED
+
+    def counts(self) -> dict[str, int]:
+        """Return how many checks came to each verdict."""
+        found = [entry.verdict for entry in self.entries.values()]
+        return {verdict: found.count(verdict) for verdict in ("pass", "range", "fail", "skipped")}
+
+    def failed(self) -> list[Entry]:
+        """Return the entries of the checks that failed."""
+        return [entry for entry in self.entries.values() if entry.verdict == "fail"]
+
+    def by_group(self) -> dict[str, list[Entry]]:
+        """Return the entries of each group."""
+        groups: dict[str, list[Entry]] = {}
+        for entry in self.entries.values():
+            groups.setdefault(entry.group, []).append(entry)
+        return groups
+
+    def in_order(self, names: Iterable[str]) -> Record:
+        """Return the same with entries in the order of these names, others last."""
+        order = {name: place for place, name in enumerate(names)}
+        entries = sorted(self.entries.items(), key=lambda item: order.get(item[0], len(order)))
+        return Record(self.facts, dict(entries))
+
+    def text(self) -> str:
+        """Return a table of each group, and what is to be known of those that failed."""
+        parts = [_group_text(entries) for entries in self.by_group().values()]
+        parts += [
+            f"{entry.name} failed: {entry.worst() or entry.note}\n  expected: {entry.expected}"
+            + (f"\n  {entry.note}" if entry.note and entry.worst() else "")
+            for entry in self.failed()
+        ]
+        told = ", ".join(f"{count} {verdict}" for verdict, count in self.counts().items())
+        return "\n\n".join([*parts, told])
+
+
+def _group_text(entries: Sequence[Entry]) -> str:
+    found = [entry.holds or entry.worst() or entry.note for entry in entries]
+    width = max(map(len, found))
+    rows = [
+        Row(entry.name, entry.verdict, round(entry.seconds, 2), words.ljust(width))
+        for entry, words in zip(entries, found, strict=True)
+    ]
+    return "\n".join(line.rstrip() for line in table_text(rows).splitlines())
+
+
+def _with_words(value: Any) -> Any:
+    """Return a tree of values in which numbers that are not finite are words."""
+    if isinstance(value, Mapping):
+        return {key: _with_words(inner) for key, inner in value.items()}
+    if isinstance(value, list):
+        return [_with_words(inner) for inner in value]
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _entry(fields: dict[str, Any]) -> Entry:
+    for name in ("figures", "limits"):
+        fields[name] = {key: float(value) for key, value in fields[name].items()}
+    return Entry(**fields)
 
 
 def run_checks(
@@ -64,7 +244,7 @@ def run_checks(
     session: Session,
     record: Record,
     *,
-    max_seconds: float = float("inf"),
+    max_seconds: float | None = None,
     written: Callable[[Record], None] = lambda record: None,
     progress: Callable[[int], None] = lambda done: None,
 ) -> None:
@@ -79,28 +259,20 @@ def run_checks(
         written: Called with the record after each check.
         progress: Called with 1 after each check.
     """
-    begin = time.monotonic()
+    time_is_up = time_limit(max_seconds)
     for check in checks:
         if not record.done(check.name):
-            if time.monotonic() - begin < max_seconds:
-                record.entries[check.name] = run_check(check, session)
+            if time_is_up():
+                left = Entry(check.name, check.expected, "skipped", note="no time was left for it")
+                record.entries.setdefault(check.name, left)
             else:
-                record.entries.setdefault(check.name, _left_out(check))
+                record.entries[check.name] = run_check(check, session)
             written(record)
         progress(1)
 
 
-def _left_out(check: Check) -> Entry:
-    return Entry(check.name, check.expected, "skipped", note="no time was left for it")
-
-
 def run_check(check: Check, session: Session) -> Entry:
-    """Return what comes of a check; an error of its own is a failure, and memory a reason to skip.
-
-    Args:
-        check: What to run.
-        session: Where and how.
-    """
+    """Return what comes of a check: raising is a failure, lack of memory a reason to skip."""
     begin = time.perf_counter()
     verdict: Verdict
     try:
@@ -115,3 +287,31 @@ def run_check(check: Check, session: Session) -> Entry:
         verdict, note = "fail", f"{type(error).__name__}: {' '.join(str(error).split())}"
     seconds = time.perf_counter() - begin
     return Entry(check.name, check.expected, verdict, note=note, seconds=seconds)
+
+
+def heat_maps(record: Record) -> dict[str, bytes]:
+    """Return PNG files by their groups: every figure over its limit; below 1 it is kept.
+
+    Groups without figures that have limits get none.
+    """
+    drawn = {}
+    for group, entries in record.by_group().items():
+        limited = [entry for entry in entries if entry.figures and entry.limits]
+        if limited:
+            drawn[group] = _heat_map(group, limited)
+    return drawn
+
+
+def _heat_map(group: str, entries: Sequence[Entry]) -> bytes:
+    from matplotlib.colors import LogNorm
+
+    columns = list(dict.fromkeys(name for entry in entries for name in entry.limits))
+    shares = [
+        [entry.share(name) if name in entry.limits else None for name in columns]
+        for entry in entries
+    ]
+    rows = [entry.name.partition("/")[2] for entry in entries]
+    figure, ((panel,),) = new_figure(1, 1, (3.0 + 0.6 * len(columns), 1.6 + 0.26 * len(rows)))
+    draw_matrix(panel, rows, columns, shares, colours="RdYlGn_r", norm=LogNorm(1.0 / FAR, FAR))
+    panel.set_title(f"{group}: figures over their limits")
+    return png(figure, 110)

@@ -12,8 +12,7 @@ from torch import Tensor
 
 from npa_envs.errors import NPAError
 from npa_envs.measure.accuracy.checks import Check, Finding, Session
-from npa_envs.measure.accuracy.errors import LIMITS, perceived, relative_error
-from npa_envs.measure.accuracy.scenes import EPS, STATE_DIM
+from npa_envs.measure.accuracy.scenes import EPS, LIMITS, STATE_DIM, perceived, relative_error
 from npa_envs.ops import perceive
 from npa_envs.rule.files import load_rule
 from npa_envs.world.rollout import rollout

@@ -1,4 +1,4 @@
-"""Where a rule is tried: worlds of its task, from unseen seeds, each with streams of its own."""
+"""Grounds that a rule is tried on: worlds of its task, from unseen seeds, each with own streams."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from torch import Tensor
 
 from npa_envs.errors import NPAError
 from npa_envs.measure.accuracy.habitats import SMALLEST_VIEWS, Habitat, LongRun, task_name
-from npa_envs.measure.robustness.plans import Plan
-from npa_envs.measure.robustness.shapes import SHAPES
+from npa_envs.measure.robustness.plans import SHAPES, Plan
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task, seed_worlds, task_for_rule, task_toward
@@ -37,12 +36,7 @@ class Home(Habitat):
     """Goals of the worlds, int64, shape [B], where the task has such."""
 
     def with_worlds(self, x: Tensor, s: Tensor) -> Home:
-        """Return the same worlds with other particles, or copies of all of them, one by one.
-
-        Args:
-            x: Positions [length units], shape [K B, N, D].
-            s: States, shape [K B, N, C].
-        """
+        """Return the same with particles x [K B, N, D], s [K B, N, C]: K copies of all worlds."""
         goal = None if self.goal is None else self.goal.repeat(len(x) // len(self.goal))
         return replace(self, x=x, s=s, goal=goal)
 
@@ -119,11 +113,7 @@ class Ground:
         return len(self.seeds) * self.plan.worlds_per_seed
 
     def random(self, purpose: int) -> WorldRandom:
-        """Return streams of all worlds, at their beginning.
-
-        Args:
-            purpose: What they are for; those of others are independent.
-        """
+        """Return streams of all worlds for a purpose, at their beginning."""
         each = self.plan.worlds_per_seed
         numbers = [seed * each + k for seed in self.seeds for k in range(each)]
         return WorldRandom(numbers, device=self._device).beside(purpose)
@@ -133,12 +123,7 @@ class Ground:
         return max(2, round(share * self.particle_count))
 
     def home(self, share: float = 1.0, shape: str = "trained") -> Home:
-        """Return fresh worlds.
-
-        Args:
-            share: Particles over the trained number.
-            shape: Shape of the seeds: "trained", or one of `SHAPES`.
-        """
+        """Return fresh worlds: a share of the trained number of particles, a shape of `SHAPES`."""
         count = self.particles(share)
         if count not in self._tasks:
             self._tasks[count] = task_for_rule(_resized(self.task, count, self._device), self.rule)
@@ -152,21 +137,11 @@ class Ground:
         )
 
     def run(self, home: Home, random: WorldRandom, **changed: Any) -> LongRun:
-        """Return what runs worlds.
-
-        Args:
-            home: The worlds.
-            random: Streams of masks and noise.
-            changed: Options of `rollout` that are not as trained.
-        """
+        """Return what runs worlds; `changed` are options of `rollout` that are not as trained."""
         return LongRun(home, random, home.options(**changed), chunk=self.plan.chunk)
 
     def by_seed(self, losses: Tensor) -> Tensor:
-        """Return the mean loss of each seed's worlds, shape [..., seeds].
-
-        Args:
-            losses: That of each world, shape [..., B].
-        """
+        """Return the mean loss of each seed's worlds, shape [..., seeds], from [..., B]."""
         return losses.double().reshape(*losses.shape[:-1], len(self.seeds), -1).mean(-1)
 
     def _seed_radius(self) -> float:
@@ -190,12 +165,7 @@ def _resized(task: Any, particle_count: int, device: torch.device) -> Task:
 
 
 def finite_worlds(x: Tensor, s: Tensor) -> Tensor:
-    """Return in which worlds all is finite, shape [B].
-
-    Args:
-        x: Positions [length units], shape [B, N, D].
-        s: States, shape [B, N, C].
-    """
+    """Return in which worlds x [B, N, D], s [B, N, C] all is finite, shape [B]."""
     return x.isfinite().flatten(1).all(1) & s.isfinite().flatten(1).all(1)
 
 
@@ -203,11 +173,6 @@ def courses(home: Home, run: LongRun, steps: tuple[int, ...]) -> Tensor:
     """Run worlds and return their losses after numbers of steps, shape [len(steps), B].
 
     A world that is not finite has the loss NaN from then on, and does not disturb the others.
-
-    Args:
-        home: Where the run began.
-        run: Runs them.
-        steps: Numbers of steps, increasing.
     """
     lost = torch.zeros(len(home.x), dtype=torch.bool, device=home.x.device)
     found = []

@@ -1,11 +1,84 @@
-"""How much is measured of a rule: steps, values, numbers of worlds."""
+"""Plans of what is measured of a rule: conditions and their values, steps, shapes of seeds."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
-from npa_envs.measure.robustness.shapes import SHAPES
+import torch
+from torch import Tensor
+
+from npa_envs.tasks.seeds import uniform_ball, uniform_box
+from npa_envs.world.randomness import WorldRandom
+
+# Seeds of other shapes than the trained one, as dense where their size allows it.
+
+SIZE_FACTOR = 1.5
+"""By how much a larger disk's radius is larger, and a smaller one's smaller."""
+
+BLOB_DISTANCE = 1.25
+"""From the origin to the centre of each of two blobs, in their radii (dimensionless)."""
+
+Shape = Callable[[int, int, float, WorldRandom], Tensor]
+"""Makes positions [length units], shape [B, N, D], of N, D, the disk's radius and randomness."""
+
+
+def disk(particle_count: int, space_dim: int, radius: float, random: WorldRandom) -> Tensor:
+    """Return a disk, a ball in 3D, of radius R."""
+    sizes = (random.world_count, particle_count, space_dim, radius)
+    return uniform_ball(*sizes, generator=random, device=random.device)
+
+
+def ring(particle_count: int, space_dim: int, radius: float, random: WorldRandom) -> Tensor:
+    """Return a ring around a disk of radius R, a hollow ball in 3D, of that disk's size."""
+    x = disk(particle_count, space_dim, radius, random)
+    distance: Tensor = torch.linalg.vector_norm(x, dim=-1, keepdim=True).clamp_min(1e-12)
+    # What area the disk has within a particle's distance, the ring has as well.
+    outer = (distance**space_dim + radius**space_dim) ** (1.0 / space_dim)
+    return x * (outer / distance)
+
+
+def square(particle_count: int, space_dim: int, radius: float, random: WorldRandom) -> Tensor:
+    """Return a square of the disk's area, in 3D a cube of its volume."""
+    side = radius * (math.sqrt(math.pi) if space_dim == 2 else (4.0 * math.pi / 3.0) ** (1.0 / 3.0))
+    sizes = (random.world_count, particle_count, (side,) * space_dim)
+    return uniform_box(*sizes, generator=random, device=random.device)
+
+
+def two_blobs(particle_count: int, space_dim: int, radius: float, random: WorldRandom) -> Tensor:
+    """Return two disks beside each other with the area of one, balls in 3D.
+
+    Every other particle is in the left one.
+    """
+    small = radius * 0.5 ** (1.0 / space_dim)
+    x = disk(particle_count, space_dim, small, random)
+    side = torch.arange(particle_count, device=x.device) % 2 * 2 - 1
+    shift = torch.zeros_like(x)
+    shift[..., 0] = BLOB_DISTANCE * small * side
+    return x + shift
+
+
+def larger(particle_count: int, space_dim: int, radius: float, random: WorldRandom) -> Tensor:
+    """Return a disk, a ball in 3D, of `SIZE_FACTOR` times the radius."""
+    return disk(particle_count, space_dim, SIZE_FACTOR * radius, random)
+
+
+def smaller(particle_count: int, space_dim: int, radius: float, random: WorldRandom) -> Tensor:
+    """Return a disk, a ball in 3D, whose radius is divided by `SIZE_FACTOR`."""
+    return disk(particle_count, space_dim, radius / SIZE_FACTOR, random)
+
+
+SHAPES: dict[str, Shape] = {
+    "ring": ring,
+    "square": square,
+    "two blobs": two_blobs,
+    "larger": larger,
+    "smaller": smaller,
+}
+"""Every other shape by its name."""
+
+# Conditions and plans
 
 CONDITIONS = {
     "eps": "perception radius ε over the trained one",
@@ -28,12 +101,7 @@ TRAINED: Mapping[str, float | str] = {
 
 
 def trained_value(condition: str, update_prob: float) -> float | str:
-    """Return the value of a condition that a rule was trained at.
-
-    Args:
-        condition: One of `CONDITIONS`.
-        update_prob: Probability of an update in the rule's task.
-    """
+    """Return the value of a condition at which a rule whose task has `update_prob` was trained."""
     return update_prob if condition == "update_prob" else TRAINED[condition]
 
 
@@ -84,11 +152,7 @@ PLANS = {
 
 
 def quick_plan(task_name: str) -> Plan:
-    """Return a plan that takes seconds: few steps, few values.
-
-    Args:
-        task_name: A task of `PLANS`.
-    """
+    """Return a plan of a task of `PLANS` that takes seconds: few steps, few values."""
     values: dict[str, tuple[float | str, ...]] = {
         "eps": (0.7, 1.0, 1.4),
         "particles": (0.5, 1.0),

@@ -1,17 +1,129 @@
-"""How worlds heal: the loss after damage beside that of twins that nothing was done to."""
+"""Damage and recovery: the loss after damage beside that of twins that nothing was done to.
+
+Damage is batched, around a random place of each world, across the seam of a box.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from statistics import median
 
 import torch
+from torch import Tensor
 
-from npa_envs.measure.robustness.damages import DAMAGES, Damage
 from npa_envs.measure.robustness.grounds import Ground, Home, courses
+from npa_envs.ops import world_mean
+from npa_envs.tasks.damage import DAMAGE_SIZES, clump, cut, erase_state, random_particle
 from npa_envs.world.randomness import Purpose, WorldRandom
+
+STATE_NOISE = 0.3
+"""Standard deviation of what is added to every state (dimensionless)."""
+
+Box = tuple[float, ...] | None
+Change = Callable[[Tensor, Tensor, WorldRandom, Box], tuple[Tensor, Tensor]]
+"""Makes other worlds of positions [B, N, D], states [B, N, C], randomness and sides of the box."""
+
+
+@dataclass(frozen=True)
+class Damage:
+    """Something done to worlds."""
+
+    name: str
+    """What it is called."""
+    summary: str
+    """What it is, in a few words."""
+    apply: Change
+    """Does it, to copies."""
+    static: bool
+    """Whether it can be done to worlds whose particles do not move by themselves."""
+    halves: bool = False
+    """Whether half of the particles are left; else all are."""
+    beyond: bool = False
+    """Whether it is beyond what rules are asked to heal."""
+
+
+def wrapped(x: Tensor, box: Box) -> Tensor:
+    """Return positions [B, N, D] where a periodic box around the origin has them.
+
+    In open space they are as they are.
+    """
+    if box is None:
+        return x
+    sides = x.new_tensor(box)
+    return x - sides * torch.round(x / sides)
+
+
+def erase(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, Tensor]:
+    """Set all states in a disk around a random particle to zero, a ball in 3D."""
+    away = wrapped(x - random_particle(x, random)[:, None], box)
+    centre = torch.zeros_like(x[:, 0])
+    return x, erase_state(away, s, centre=centre, radius=DAMAGE_SIZES["erase"])
+
+
+def slit(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, Tensor]:
+    """Open a slit at a random angle: through the middle, in a box through a random particle."""
+    centre = world_mean(x) if box is None else random_particle(x, random)
+    normal = random.normal(x.shape[2], dtype=x.dtype)
+    away = wrapped(x - centre[:, None], box)
+    origin = torch.zeros_like(centre)
+    away, s = cut(away, s, centre=origin, normal=normal, gap=DAMAGE_SIZES["cut"])
+    return wrapped(away + centre[:, None], box), s
+
+
+def pull_together(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, Tensor]:
+    """Pull all particles in a disk around a random one to its place."""
+    centre = random_particle(x, random)
+    away = wrapped(x - centre[:, None], box)
+    origin = torch.zeros_like(centre)
+    away, s = clump(away, s, centre=origin, radius=DAMAGE_SIZES["clump"], factor=1.0)
+    return wrapped(away + centre[:, None], box), s
+
+
+def add_state_noise(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, Tensor]:
+    """Add normal noise to all states."""
+    return x, s + STATE_NOISE * random.normal(*s.shape[1:], dtype=s.dtype)
+
+
+def remove_half(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, Tensor]:
+    """Leave N // 2 particles, chosen at random."""
+    return _lowest_half(x, s, random.uniform(x.shape[1]))
+
+
+def remove_side(x: Tensor, s: Tensor, random: WorldRandom, box: Box) -> tuple[Tensor, Tensor]:
+    """Leave the N // 2 particles on one side of a line at a random angle, a plane in 3D.
+
+    In a box the line runs through its middle, up to rounding.
+    """
+    normal = random.normal(x.shape[2], dtype=x.dtype)
+    return _lowest_half(x, s, (x * normal[:, None]).sum(-1))
+
+
+def _lowest_half(x: Tensor, s: Tensor, key: Tensor) -> tuple[Tensor, Tensor]:
+    """Leave the particles with the lower keys [B, N], in the order that they have."""
+    kept = key.argsort(dim=1)[:, : x.shape[1] // 2].sort(dim=1).values[..., None]
+    return x.take_along_dim(kept, dim=1), s.take_along_dim(kept, dim=1)
+
+
+DAMAGES = {
+    damage.name: damage
+    for damage in (
+        Damage("erase", "states in a disk of radius 0.2 set to 0", erase, static=True),
+        Damage("cut", "a slit of width 0.1", slit, static=False),
+        Damage("clump", "a disk of radius 0.2 pulled to a point", pull_together, static=False),
+        Damage("noise", "noise of 0.3 on every state", add_state_noise, static=True, beyond=True),
+        Damage("half", "half of the particles removed", remove_half, static=True, halves=True),
+        Damage(
+            "side", "all on one side removed", remove_side, static=True, halves=True, beyond=True
+        ),
+    )
+}
+"""Every damage by its name."""
+
+
+# Recovery
+
 
 RECOVERED = 1.1
 """A world has recovered once its loss is at most this many times its twin's at the same step."""
@@ -53,11 +165,7 @@ class Course:
         return median(found) if found else None
 
     def ratios(self, place: int) -> list[float]:
-        """Return for each seed the loss over its twin's.
-
-        Args:
-            place: Index into `steps`: 0 is right after the damage, -1 the end.
-        """
+        """Return for each seed the loss over its twin's at a place of `steps`: -1 is the end."""
         pairs = zip(self.losses, self.twins, strict=True)
         return [ratio(loss[place], twin[place]) for loss, twin in pairs]
 
@@ -76,13 +184,7 @@ def ratio(loss: float, twin: float) -> float:
 def recovery_step(
     steps: Sequence[int], losses: Sequence[float], twins: Sequence[float]
 ) -> int | None:
-    """Return the first step at which a loss is at most `RECOVERED` times the twin's.
-
-    Args:
-        steps: Steps since the damage, increasing.
-        losses: The loss at each.
-        twins: The twin's.
-    """
+    """Return the first step at which a loss is at most `RECOVERED` times the twin's."""
     # Comparisons with NaN are false.
     rows = zip(steps, losses, twins, strict=True)
     return next((step for step, loss, twin in rows if loss <= RECOVERED * twin), None)
@@ -91,10 +193,6 @@ def recovery_step(
 @torch.no_grad()
 def healing(ground: Ground, home: Home) -> list[Course]:
     """Damage grown worlds in every way, and watch them beside their twins.
-
-    Args:
-        ground: The rule, and how long to watch.
-        home: Its worlds, grown.
 
     Returns:
         A course for the control and for each damage that can be done. Where half of the particles

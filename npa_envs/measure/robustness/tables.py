@@ -1,26 +1,23 @@
-"""Where rules work: the values of a condition at which the loss stays near that as trained."""
+"""Tables and curves of robustness: where rules work, how they recover, losses by condition."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Iterable, Sequence
+from typing import Any
 
 from npa_envs.measure.accuracy.habitats import WORKS
-from npa_envs.measure.robustness.conditions import Response
-from npa_envs.measure.robustness.damages import DAMAGES
+from npa_envs.measure.plots import draw_band, legend_of, mark_decades, new_figure, png
 from npa_envs.measure.robustness.plans import CONDITIONS, trained_value
-from npa_envs.measure.robustness.record import RuleRecord
-from npa_envs.measure.robustness.recovery import CONTROL, RECOVERED, Course, ratio
+from npa_envs.measure.robustness.recovery import CONTROL, DAMAGES, RECOVERED, Course, ratio
+from npa_envs.measure.robustness.study import Response, RuleRecord
+from npa_envs.measure.tables import NONE, markdown_table, short
 
 
 def where_it_works(record: RuleRecord, condition: str) -> str:
     """Return the values of a condition at which a rule works, in words; "" where there are none.
 
     It works where all seeds are finite and the mean loss is at most `WORKS` times that as trained.
-
-    Args:
-        record: The rule's.
-        condition: One of `CONDITIONS`.
     """
     found = [response for response in record.responses if response.condition == condition]
     if not found:
@@ -35,18 +32,10 @@ def where_it_works(record: RuleRecord, condition: str) -> str:
     return text + _left_out(found)
 
 
-def short(value: float | str) -> str:
-    """Return a number with three digits, a word as it is."""
-    return value if isinstance(value, str) else f"{value:.3g}"
-
-
 def working_range(values: Sequence[float], ratios: Sequence[float], trained: float) -> str:
     """Return the values around the trained one at which a rule works, in words.
 
-    Args:
-        values: Values tried, increasing.
-        ratios: The loss at each over that as trained; NaN where a seed is not finite.
-        trained: The value that the rule was trained at.
+    Values increase; ratios are the loss at each over that as trained, NaN where a seed is lost.
     """
     works = [value <= WORKS for value in ratios]
     low = high = min(range(len(values)), key=lambda k: abs(values[k] - trained))
@@ -74,11 +63,7 @@ def _left_out(found: Sequence[Response]) -> str:
     return f" (not measured: {', '.join(values)})" if values else ""
 
 
-# Records as tables in Markdown: for the eye, and for the documentation.
-
-
-NONE = "–"
-"""What was not measured."""
+# Tables in Markdown
 
 
 SHARES = {
@@ -91,12 +76,7 @@ SHARES = {
 def recovered_share(
     records: Iterable[RuleRecord], damages: Collection[str]
 ) -> tuple[int, int, int]:
-    """Return how many of all rules' damages and seeds recovered, are so at the end, and there are.
-
-    Args:
-        records: Those of the rules.
-        damages: Names of the damages that count.
-    """
+    """Return how many seeds of all rules recovered of damages, are so at the end, and there are."""
     courses = [c for record in records for c in record.courses if c.damage in damages]
     recovered = sum(course.recovered() for course in courses)
     at_end = sum(course.within_at_end() for course in courses)
@@ -104,11 +84,7 @@ def recovered_share(
 
 
 def tables(records: Sequence[RuleRecord]) -> str:
-    """Return all tables and, last, the shares that recovered.
-
-    Args:
-        records: Those of the rules.
-    """
+    """Return all tables in Markdown and, last, the shares that recovered."""
     parts = [
         "Where rules work: values around the trained one, without a gap, at which the mean loss is "
         f"at most {WORKS:g} times that as trained and all seeds are finite; others that work stand "
@@ -153,7 +129,7 @@ def _median(values: Sequence[float]) -> float:
 def _by_condition(records: Sequence[RuleRecord]) -> str:
     """Return a table of where each rule works."""
     rows = [[r.rule, *(where_it_works(r, name) or NONE for name in CONDITIONS)] for r in records]
-    return _table(["rule", *CONDITIONS], rows)
+    return markdown_table(["rule", *CONDITIONS], rows)
 
 
 def _by_damage(records: Sequence[RuleRecord], cell: Callable[[Course], str]) -> str:
@@ -163,7 +139,7 @@ def _by_damage(records: Sequence[RuleRecord], cell: Callable[[Course], str]) -> 
     for record in records:
         found = {course.damage: course for course in record.courses}
         rows.append([record.rule, *(cell(found[n]) if n in found else NONE for n in names)])
-    return _table(["rule", *names], rows)
+    return markdown_table(["rule", *names], rows)
 
 
 def _by_value(records: Sequence[RuleRecord], condition: str) -> str:
@@ -184,7 +160,7 @@ def _by_value(records: Sequence[RuleRecord], condition: str) -> str:
         for record in records
         if any((record.rule, value) in found for value in values)
     ]
-    return _table(["rule", "loss as trained", *map(short, values)], rows) if rows else ""
+    return markdown_table(["rule", "loss as trained", *map(short, values)], rows) if rows else ""
 
 
 def _change(record: RuleRecord, response: Response | None) -> str:
@@ -194,6 +170,75 @@ def _change(record: RuleRecord, response: Response | None) -> str:
     return short(mean / trained) if trained else short(mean)
 
 
-def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [heads, ["---"] * len(heads), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+# Curves with bands over the seeds: a picture for each task, a row for each of its rules.
+
+
+DRAWN = {
+    "eps": "ε over the trained one",
+    "particles": "N over the trained one",
+    "update_prob": "p",
+}
+"""Conditions that are drawn, and what their axes are called."""
+
+
+def pictures(records: Sequence[RuleRecord]) -> dict[str, bytes]:
+    """Return PNG files by their tasks' names. Needs matplotlib."""
+    tasks = dict.fromkeys(record.task for record in records)
+    return {task: _draw([r for r in records if r.task == task]) for task in tasks}
+
+
+def _draw(records: Sequence[RuleRecord]) -> bytes:
+    columns = 1 + len(DRAWN)
+    figure, grid = new_figure(len(records), columns, (3.1 * columns, 2.3 * len(records)))
+    for record, panels in zip(records, grid, strict=True):
+        _draw_courses(panels[0], record)
+        for condition, panel in zip(DRAWN, panels[1:], strict=True):
+            _draw_responses(panel, record, condition)
+    for panel, condition in zip(grid[-1], ("", *DRAWN), strict=True):
+        panel.set_xlabel(DRAWN.get(condition, "steps after the damage"), fontsize=8)
+    legend_of(figure, grid[0][0], ncols=1 + len(DAMAGES), fontsize=7)
+    return png(figure, 75)
+
+
+def _draw_courses(panel: Any, record: RuleRecord) -> None:
+    """Draw losses over the twins' after each damage."""
+    for place, course in enumerate(record.courses):
+        colour = "0.5" if course.damage == CONTROL else f"C{place}"
+        columns = [course.ratios(k) for k in range(len(course.steps))]
+        _draw_seeds(panel, course.steps, columns, colour, course.damage)
+    panel.axhline(RECOVERED, color="black", lw=0.7, ls=":")
+    steps = record.courses[0].steps
+    panel.set_xscale("symlog", linthresh=max(1, steps[1]))
+    panel.set_xlim(0, steps[-1])
+    ticks = [step for step in steps if step & (step - 1) == 0]
+    panel.set_xticks(ticks, [str(step) for step in ticks], rotation=45)
+    panel.set_yscale("log")
+    panel.set_ylabel("loss over the twin's", fontsize=8)
+    panel.set_title(record.rule, fontsize=9, loc="left")
+    mark_decades(panel)
+
+
+def _draw_responses(panel: Any, record: RuleRecord, condition: str) -> None:
+    """Draw losses by the values of a condition."""
+    found = [r for r in record.responses if r.condition == condition and r.losses]
+    values = [float(response.value) for response in found]
+    _draw_seeds(panel, values, [response.losses for response in found], "C0", CONDITIONS[condition])
+    trained = sorted(record.trained().losses)
+    panel.axhline(trained[len(trained) // 2], color="black", lw=0.7, ls=":")
+    panel.set(xscale="log", yscale="log")
+    panel.set_ylabel("loss", fontsize=8)
+    panel.set_xticks(values, [f"{value:.2g}" for value in values], rotation=45)
+    mark_decades(panel)
+
+
+def _draw_seeds(
+    panel: Any, across: Sequence[float], columns: Sequence[Sequence[float]], colour: str, name: str
+) -> None:
+    """Draw the median of the seeds, and a band from the least to the most; gaps at NaN."""
+    lost = [any(map(math.isnan, column)) for column in columns]
+    # Of an even number the upper one in the middle.
+    low, middle, high = (
+        [math.nan if gone else sorted(c)[place] for c, gone in zip(columns, lost, strict=True)]
+        for place in (0, len(columns[0]) // 2, -1)
+    )
+    draw_band(panel, across, (low, middle, high), colour, name, marker=".", ms=3, lw=1)

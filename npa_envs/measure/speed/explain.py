@@ -11,7 +11,7 @@ from torch.profiler import ProfilerActivity, profile
 
 from npa_envs.errors import NPAError, suggest
 from npa_envs.measure.speed.launches import Launch, recorded_launches
-from npa_envs.measure.speed.session import Session
+from npa_envs.measure.speed.timing import Session
 from npa_envs.measure.speed.workloads import Workload, rollout_call
 from npa_envs.ops.backend import rollout_listing
 from npa_envs.ops.sort import Plan, make_plan

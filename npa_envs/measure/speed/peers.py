@@ -15,8 +15,7 @@ from torch import Tensor
 
 from npa_envs import reference
 from npa_envs.measure.speed.hash_grid import grid_fields
-from npa_envs.measure.speed.session import Session, relative_error
-from npa_envs.measure.speed.timing import Timing
+from npa_envs.measure.speed.timing import Session, Timing, relative_error
 from npa_envs.measure.speed.workloads import Workload
 from npa_envs.ops import perception_fields
 from npa_envs.runtime import quiet_warp, start_warp

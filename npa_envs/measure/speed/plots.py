@@ -1,18 +1,14 @@
-"""Pictures of a report: fronts of run time against error, and how times grow."""
+"""Plots of `npa-envs bench`: fronts of run time against error, and how times grow."""
 
 from __future__ import annotations
 
-import io
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
-from npa_envs.errors import MissingDependencyError
-from npa_envs.files import write_bytes
-from npa_envs.measure.speed.precisions import PRECISIONS
-from npa_envs.measure.speed.report import Report
-from npa_envs.measure.speed.scaling import AXES, ScalingRow
-from npa_envs.measure.speed.strategies import STRATEGIES
+from npa_envs.measure.plots import check_matplotlib, new_figure, number_plainly, png
+from npa_envs.measure.speed.strategies import PRECISIONS, STRATEGIES
+from npa_envs.measure.speed.suites import Report
+from npa_envs.measure.speed.throughput import AXES, ScalingRow
 
 FLOOR = 1e-16
 """Errors below this, as that of the float64 reference itself, are drawn here."""
@@ -33,53 +29,12 @@ AXIS_LABELS = {
 
 
 class Point(NamedTuple):
-    """One way to compute something."""
+    """One way to compute something: its error (dimensionless) and its time [µs]."""
 
     error: float
-    """Its error (dimensionless)."""
     time: float
-    """Its time [µs]."""
     strategy: str
-    """Strategy or library."""
     precision: str
-    """Precision."""
-
-
-def check_matplotlib() -> None:
-    """Check that pictures can be drawn.
-
-    Raises:
-        MissingDependencyError: matplotlib is not installed.
-    """
-    try:
-        import matplotlib  # noqa: F401
-    except ImportError as error:
-        raise MissingDependencyError(
-            "plots need matplotlib, which is not installed: pip install 'npa-envs[bench]'"
-        ) from error
-
-
-def write_plots(draw: Callable[[], Mapping[str, bytes]], path: Path, what: str) -> list[str]:
-    """Write pictures where matplotlib is installed, and return what was done, in sentences.
-
-    Args:
-        draw: Returns pictures by name, as bytes of PNG files.
-        path: Their place; "*" in its name stands for each one's.
-        what: What they are, for the sentence that there are none.
-
-    Raises:
-        NPAError: A file cannot be written.
-    """
-    try:
-        check_matplotlib()
-    except MissingDependencyError as error:
-        return [f"no {what}: {error}"]
-    done = []
-    for name, picture in draw().items():
-        place = path.with_name(path.name.replace("*", name))
-        write_bytes(place, picture)
-        done.append(f"wrote {place}")
-    return done
 
 
 def pictures(report: Report) -> dict[str, bytes]:
@@ -91,11 +46,11 @@ def pictures(report: Report) -> dict[str, bytes]:
     check_matplotlib()
     drawn = {}
     if "perception" in report.tables:
-        drawn["pareto"] = _png(_draw_fronts(report))
+        drawn["pareto"] = png(_draw_fronts(report))
     if "scaling" in report.tables:
-        drawn["scaling"] = _png(_draw_scaling(report, "time"))
+        drawn["scaling"] = png(_draw_scaling(report, "time"))
         if any(row.infer_mib is not None for row in report.tables["scaling"]):
-            drawn["memory"] = _png(_draw_scaling(report, "memory"))
+            drawn["memory"] = png(_draw_scaling(report, "memory"))
     return drawn
 
 
@@ -106,20 +61,6 @@ def front(points: Iterable[Point]) -> list[Point]:
         if not best or point.time < best[-1].time:
             best.append(point)
     return best
-
-
-def _png(figure: Any) -> bytes:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=90)
-    return buffer.getvalue()
-
-
-def _new_figure(columns: int, rows: int = 1) -> tuple[Any, Any]:
-    """Return a figure and its axes, without a window and without pyplot's global state."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(4.6 * columns, 3.8 * rows), layout="constrained")
-    return figure, figure.subplots(rows, columns, squeeze=False).ravel()
 
 
 def _draw_fronts(report: Report) -> Any:
@@ -136,7 +77,7 @@ def _draw_fronts(report: Report) -> Any:
         for row in rollouts
         if row.particles == most
     ]
-    figure, axes = _new_figure(2)
+    figure, (axes,) = new_figure(1, 2, (9.2, 3.8))
     _draw_front(axes[0], perception, "relative error of perception z", "time [µs]")
     axes[0].set_title(f"one perception, N {largest}")
     _draw_front(axes[1], steps, "relative error of states after 8 steps", "time of a step [µs]")
@@ -196,40 +137,9 @@ def _add_legend(figure: Any, points: Sequence[Point]) -> None:
     figure.legend(handles=marks, loc="outside lower center", ncols=5, fontsize=8)
 
 
-def number_plainly(
-    axis: Any,
-    values: Sequence[float] | None = None,
-    *,
-    within: Sequence[float] = (1, 2, 5),
-    text: Callable[[float], str] | None = None,
-) -> None:
-    """Label a logarithmic axis at 1, 2, 5, 10 ... or at some values, without powers of ten.
-
-    Args:
-        axis: Matplotlib's.
-        values: The values; None: some in each decade.
-        within: Which, as multiples of the power of ten.
-        text: What a value's label is; None: with k or M for thousands and millions.
-    """
-    from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocator
-
-    axis.set_major_locator(
-        LogLocator(subs=within) if values is None else FixedLocator(values, nbins=9)
-    )
-    axis.set_minor_locator(NullLocator())
-    axis.set_major_formatter(FuncFormatter(lambda value, _: (text or _short)(value)))
-
-
-def _short(value: float) -> str:
-    """Return a number with k or M for thousands and millions."""
-    for unit, letter in ((1e6, "M"), (1e3, "k")):
-        if value >= unit:
-            return f"{value / unit:.3g}{letter}"
-    return f"{value:.3g}"
-
-
 def _draw_scaling(report: Report, what: str) -> Any:
-    figure, panels = _new_figure(2, 2)
+    figure, grid = new_figure(2, 2, (9.2, 7.6))
+    panels = grid.ravel()
     for name, panel in zip(AXES, panels, strict=True):
         rows: list[ScalingRow] = [row for row in report.tables["scaling"] if row.axis == name]
         for label, values in _curves(rows, what).items():

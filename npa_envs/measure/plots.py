@@ -1,0 +1,173 @@
+"""Plots of measurements: figures without a window, bands, matrices, logarithmic axes, PNG files.
+
+Needs matplotlib, which the extra `bench` brings; `write_plots` says so where it is missing.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from npa_envs.errors import MissingDependencyError
+from npa_envs.files import write_bytes
+
+FEW_DECADES = 100.0
+"""Logarithmic axes whose ends are fewer times apart have marks within decades."""
+
+
+def check_matplotlib() -> None:
+    """Check that pictures can be drawn.
+
+    Raises:
+        MissingDependencyError: matplotlib is not installed.
+    """
+    try:
+        import matplotlib  # noqa: F401
+    except ImportError as error:
+        raise MissingDependencyError(
+            "plots need matplotlib, which is not installed: pip install 'npa-envs[bench]'"
+        ) from error
+
+
+def write_plots(draw: Callable[[], Mapping[str, bytes]], path: Path, what: str) -> list[str]:
+    """Write pictures where matplotlib is installed, and return what was done, in sentences.
+
+    Args:
+        draw: Returns pictures by name, as bytes of PNG files.
+        path: Their place; "*" in its name stands for each one's.
+        what: What they are, for the sentence that there are none.
+
+    Raises:
+        NPAError: A file cannot be written.
+    """
+    try:
+        check_matplotlib()
+    except MissingDependencyError as error:
+        return [f"no {what}: {error}"]
+    done = []
+    for name, picture in draw().items():
+        place = path.with_name(path.name.replace("*", name))
+        write_bytes(place, picture)
+        done.append(f"wrote {place}")
+    return done
+
+
+def new_figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, Any]:
+    """Return a figure of a size in inches and its grid of panels, without pyplot's global state."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, layout="constrained")
+    return figure, figure.subplots(rows, columns, squeeze=False)
+
+
+def png(figure: Any, dpi: int = 90) -> bytes:
+    """Return a figure as a PNG file."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=dpi)
+    return buffer.getvalue()
+
+
+def legend_of(figure: Any, panel: Any, place: str = "lower center", **options: Any) -> None:
+    """Give a figure one legend, outside of its panels: that of one of them."""
+    handles, labels = panel.get_legend_handles_labels()
+    figure.legend(handles, labels, loc=f"outside {place}", **options)
+
+
+def draw_band(
+    panel: Any,
+    across: Sequence[float],
+    lines: tuple[Sequence[float], Sequence[float], Sequence[float]],
+    colour: str,
+    label: str,
+    **options: Any,
+) -> None:
+    """Draw a curve and a band around it: its lower end, its middle and its upper end."""
+    low, middle, high = lines
+    panel.plot(across, middle, color=colour, label=label, **options)
+    panel.fill_between(across, low, high, color=colour, alpha=0.2, lw=0)
+
+
+def draw_matrix(
+    panel: Any,
+    rows: Sequence[str],
+    columns: Sequence[str],
+    values: Sequence[Sequence[float | None]],
+    *,
+    colours: str,
+    norm: Any,
+) -> Any:
+    """Draw a matrix and write each number into its cell.
+
+    Args:
+        panel: Matplotlib's axes.
+        rows: Names of the rows.
+        columns: Names of the columns.
+        values: The numbers; NaN is black, None stays blank.
+        colours: Name of matplotlib's colour map.
+        norm: Maps numbers to [0, 1]; what is beyond has the colour of the end.
+
+    Returns:
+        What `figure.colorbar` takes.
+    """
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.patches import Rectangle
+
+    scale = ScalarMappable(norm, colours)
+    panel.set(xlim=(-0.5, len(columns) - 0.5), ylim=(len(rows) - 0.5, -0.5), aspect="auto")
+    for down, line in enumerate(values):
+        for across, value in enumerate(line):
+            if value is None:
+                continue
+            wrong = math.isnan(value)
+            colour: Any = "black" if wrong else scale.to_rgba(min(max(value, norm.vmin), norm.vmax))
+            corner = (across - 0.5, down - 0.5)
+            panel.add_patch(Rectangle(corner, 1.0, 1.0, facecolor=colour, edgecolor="white"))
+            dark = wrong or sum(colour[:3]) < 1.2
+            ink = {"color": "white" if dark else "black", "ha": "center", "va": "center"}
+            panel.text(across, down, f"{value:.2g}", fontsize=6, **ink)
+    panel.set_xticks(range(len(columns)), columns, rotation=45, ha="right", fontsize=7)
+    panel.set_yticks(range(len(rows)), rows, fontsize=7)
+    return scale
+
+
+def number_plainly(
+    axis: Any,
+    values: Sequence[float] | None = None,
+    *,
+    within: Sequence[float] = (1, 2, 5),
+    text: Callable[[float], str] | None = None,
+) -> None:
+    """Label a logarithmic axis at 1, 2, 5, 10 ... or at some values, without powers of ten.
+
+    Args:
+        axis: Matplotlib's.
+        values: The values; None: some in each decade.
+        within: Which, as multiples of the power of ten.
+        text: What a value's label is; None: with k or M for thousands and millions.
+    """
+    from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocator
+
+    axis.set_major_locator(
+        LogLocator(subs=within) if values is None else FixedLocator(values, nbins=9)
+    )
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter(FuncFormatter(lambda value, _: (text or _with_unit)(value)))
+
+
+def _with_unit(value: float) -> str:
+    for unit, letter in ((1e6, "M"), (1e3, "k")):
+        if value >= unit:
+            return f"{value / unit:.3g}{letter}"
+    return f"{value:.3g}"
+
+
+def mark_decades(panel: Any) -> None:
+    """Mark 1, 2 and 5 of each decade of a logarithmic axis y; where they are many, the decades."""
+    low, high = panel.get_ylim()
+    fine = high < FEW_DECADES * low
+    panel.minorticks_off()
+    number_plainly(panel.yaxis, within=(1, 2, 5) if fine else (1,), text="{:g}".format)
+    panel.tick_params(labelsize=7)

@@ -1,0 +1,174 @@
+"""The record of a measurement: JSON written whole, with the facts that its figures follow from.
+
+A record is written after every entry, so that a run that was stopped goes on from it; figures that
+follow from other facts (device, machine, commit, versions, settings) are refused.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.metadata
+import json
+import math
+import platform
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from datetime import date
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+
+from npa_envs.errors import NPAError
+from npa_envs.files import json_text, plain_numbers, write_text
+
+LIBRARIES = ("npa-envs", "torch", "warp-lang", "numpy", "scipy", "warpSPHCore")
+"""Distributions whose versions are recorded."""
+
+Kept = TypeVar("Kept")
+
+
+def write_record(path: Path, content: Any) -> None:
+    """Write JSON, whole or not at all; numbers that are not finite become null.
+
+    Raises:
+        NPAError: It cannot be written.
+    """
+    write_text(path, json_text(content))
+
+
+def read_record(
+    path: Path,
+    facts: Mapping[str, Any],
+    make: Callable[[dict[str, Any]], Kept],
+    *,
+    command: str,
+    key: str = "facts",
+    option: str = "--output",
+) -> Kept | None:
+    """Return the record that a stopped run left; None where there is none.
+
+    Args:
+        path: The file that it wrote.
+        facts: What figures follow from now.
+        make: Makes the record of the JSON object.
+        command: Name of the command that writes such records, for the errors.
+        key: Where the object says what its figures follow from.
+        option: The command's option for another folder.
+
+    Raises:
+        NPAError: The file is no such record, or its figures follow from something else.
+    """
+    if not path.exists():
+        return None
+    cure = f"remove it, or choose another folder with {option}"
+    try:
+        held = json.loads(path.read_text("utf-8"))
+        before = dict(held[key])
+        record = make(held)
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+        raise NPAError(
+            f"{str(path)!r} must hold a record of npa-envs {command}, but cannot be read "
+            f"({error}): {cure}"
+        ) from error
+    for name, value in plain_numbers(facts).items():
+        if before.get(name) != value:
+            raise NPAError(
+                f"{str(path)!r} holds figures of other settings: {name} was {before.get(name)!r}, "
+                f"now {value!r}: {cure}"
+            )
+    return record
+
+
+def number(value: float | None) -> float:
+    """Return a number that was read from a record; null is NaN."""
+    return math.nan if value is None else float(value)
+
+
+def time_limit(max_seconds: float | None) -> Callable[[], bool]:
+    """Return what says whether so long [s] has passed since now; never for None."""
+    end = math.inf if max_seconds is None else time.monotonic() + max_seconds
+    return lambda: time.monotonic() >= end
+
+
+# Facts
+
+
+def measured_facts(device: torch.device, commit: str | None, **settings: Any) -> dict[str, Any]:
+    """Return what figures follow from: device, machine, settings, commit and versions.
+
+    Args:
+        device: Where they are measured.
+        commit: Commit that is measured; None: that of the checkout.
+        settings: What else they follow from.
+    """
+    return {
+        "device": device.type,
+        "machine": machine(device),
+        **settings,
+        "commit": commit or current_commit(),
+        "versions": versions(),
+    }
+
+
+def script_parser(description: str | None) -> argparse.ArgumentParser:
+    """Return a parser of the options that all scripts in `benchmarks/` have."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    parser.add_argument("--threads", type=int, default=1, help="CPU threads of torch")
+    parser.add_argument("--commit", help="commit that is measured; default: that of the checkout")
+    parser.add_argument("--output", type=Path, help="JSON file to write")
+    return parser
+
+
+def script_facts(arguments: argparse.Namespace) -> dict[str, str]:
+    """Return what the record of a script begins with, for arguments of `script_parser`."""
+    return {
+        "command": " ".join(["python", *sys.argv]),
+        "commit": arguments.commit or current_commit(),
+        "date": date.today().isoformat(),
+        "machine": machine(torch.device(arguments.device)),
+        "torch": torch.__version__,
+    }
+
+
+def machine(device: torch.device) -> str:
+    """Return the name of a device's hardware."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return f"CPU ({names[0] if names else platform.processor() or platform.machine()})"
+
+
+def installed_version(name: str) -> str | None:
+    """Return the version of a distribution, None where it is not installed."""
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def versions() -> dict[str, str | None]:
+    """Return versions of Python and of `LIBRARIES`; None: not installed."""
+    return {
+        "python": platform.python_version(),
+        **{name: installed_version(name) for name in LIBRARIES},
+    }
+
+
+def current_commit() -> str:
+    """Return the short hash of the checkout that this file lies in, "unknown" without one."""
+    command = ["git", "describe", "--always", "--dirty", "--exclude=*"]
+    try:
+        done = subprocess.run(
+            command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return done.stdout.strip()

@@ -1,0 +1,465 @@
+"""Errors of strategies and precisions beside their times: of perception, of rollouts, of drift.
+
+Errors of perception are against the library in float64 on the same device; `dense` in float64 is an
+independent implementation and shows how far that can be trusted. Worlds are chaotic: two that
+differ in the last bit drift apart, and after enough steps distances say how long they have run, not
+how well each was computed. The picture grown says that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from npa_envs.measure.quality.evaluation import psnr
+from npa_envs.measure.speed.strategies import PRECISIONS, STRATEGIES, Precision, Strategy
+from npa_envs.measure.speed.timing import Cost, Session, Timing, relative_error
+from npa_envs.measure.speed.workloads import Gecko, Workload, gecko
+from npa_envs.rule.rule import NPARule
+from npa_envs.world.rollout import rollout
+
+# One perception of every particle.
+
+
+@dataclass(frozen=True)
+class PerceptionRow:
+    """One perception of every particle: times [µs], peak of memory [MiB], relative errors.
+
+    Errors are in the Euclidean norm: of the density, the smoothed states, the state and density
+    gradients as they are perceived (on a logarithmic scale), and of all of z. `cotangent` is the
+    error of the gradient of a random linear functional of z by the states.
+    """
+
+    strategy: str
+    precision: str
+    space_dim: int
+    worlds: int
+    particles: int
+    forward_us: Timing
+    gradient_us: Timing | None
+    peak_mib: float | None
+    density: float
+    smoothed: float
+    state_gradient: float
+    density_gradient: float
+    perception: float
+    cotangent: float | None
+
+
+class Perceived(NamedTuple):
+    """Densities [B, N], perception z [B, N, P], gradient of a functional of z by the states."""
+
+    density: Tensor
+    perception: Tensor
+    cotangent: Tensor | None
+
+
+def perception_rows(session: Session, workload: Workload) -> list[PerceptionRow]:
+    """Return a row for each strategy and for each precision that perception knows of."""
+    x, s = workload.worlds(session.device)
+    exact = perceived(STRATEGIES["library"], x.double(), s.double(), workload.eps)
+    rows: list[PerceptionRow] = []
+    for precision in session.usable_precisions():
+        if not precision.reaches_perception:
+            session.leave_out(f"perception in {precision.name}", "only the rule's products differ")
+            continue
+        places, states = x.to(precision.dtype), precision.kept(s.to(precision.dtype))
+        for strategy in session.usable_strategies(places):
+            name = precision.name
+            rows += session.attempt(
+                f"{strategy.name} in {name}, {workload.name}",
+                partial(
+                    _perception_row, session, workload, strategy, name, places, states, exact=exact
+                ),
+            )
+    return rows
+
+
+def perceived(strategy: Strategy, x: Tensor, s: Tensor, eps: float) -> Perceived:
+    """Return what a strategy makes of worlds x [B, N, D] and s [B, N, C]."""
+    z = strategy.perceive(x, s, eps)
+    cotangent = None
+    if strategy.differentiable:
+        cotangent = _cotangent(strategy, x, s, eps, functional_weights(z))
+    return Perceived(strategy.density(x, s, eps), z, cotangent)
+
+
+def functional_weights(like: Tensor) -> Tensor:
+    """Return the weights of a random linear functional, the same numbers in every dtype."""
+    generator = torch.Generator(like.device).manual_seed(2)
+    return torch.randn(like.shape, generator=generator, device=like.device).to(like.dtype)
+
+
+def _cotangent(strategy: Strategy, x: Tensor, s: Tensor, eps: float, weights: Tensor) -> Tensor:
+    states = s.detach().requires_grad_()
+    loss = (strategy.perceive(x, states, eps) * weights).sum()
+    return torch.autograd.grad(loss, states)[0]
+
+
+def _perception_row(
+    session: Session,
+    workload: Workload,
+    strategy: Strategy,
+    precision: str,
+    x: Tensor,
+    s: Tensor,
+    *,
+    exact: Perceived,
+) -> PerceptionRow:
+    eps = workload.eps
+    found = perceived(strategy, x, s, eps)
+    graph = strategy.capturable
+    costs = [session.cost(lambda: strategy.perceive(x, s, eps), graph=graph)]
+    if strategy.differentiable:
+        weights = functional_weights(found.perception)
+        costs.append(session.cost(lambda: _cotangent(strategy, x, s, eps, weights), graph=graph))
+    peaks = [cost.peak_mib for cost in costs if cost.peak_mib is not None]
+    _, smoothed, state_gradient, density_gradient = group_errors(
+        found.perception, exact.perception, workload.space_dim, workload.state_dim
+    )
+    return PerceptionRow(
+        strategy=strategy.name,
+        precision=precision,
+        space_dim=workload.space_dim,
+        worlds=workload.world_count,
+        particles=workload.particle_count,
+        forward_us=costs[0].time,
+        gradient_us=costs[1].time if strategy.differentiable else None,
+        peak_mib=max(peaks, default=None),
+        density=relative_error(found.density, exact.density),
+        smoothed=smoothed,
+        state_gradient=state_gradient,
+        density_gradient=density_gradient,
+        perception=relative_error(found.perception, exact.perception),
+        cotangent=None
+        if found.cotangent is None or exact.cotangent is None
+        else relative_error(found.cotangent, exact.cotangent),
+    )
+
+
+def group_errors(z: Tensor, exact: Tensor, space_dim: int, state_dim: int) -> list[float]:
+    """Return the relative errors of the four groups of perception vectors, [B, N, P].
+
+    They are states, smoothed states, state gradients and the density gradient.
+    """
+    widths = [state_dim, state_dim, state_dim * space_dim, space_dim]
+    pairs = zip(torch.split(z, widths, -1), torch.split(exact, widths, -1), strict=True)
+    return [relative_error(group, expected) for group, expected in pairs]
+
+
+# The shipped gecko in motion.
+
+MARKS = (1, 8, 64)
+"""Steps after which worlds are compared."""
+
+TIMED_STEPS = 8
+"""Steps of a timed rollout."""
+
+GROWN_STEPS = 64
+"""Age of the worlds that are compared: a gecko in the making."""
+
+TASK_STEPS = 512
+"""Age at which the gecko's picture is judged."""
+
+SLOW = ("dense", "neighbour_cap")
+"""Strategies whose rollouts small sessions leave out."""
+
+LARGEST_SLOW = 1024
+"""Particles of the largest gecko that they grow to its end."""
+
+
+@dataclass(frozen=True)
+class RolloutRow:
+    """The gecko's next steps: times of one step [µs], and errors after 1, 8 and 64 steps.
+
+    `x_8`: largest distance of a particle from where it should be, over eps; `s_8`: relative error
+    of the states; `weights`: that of a functional's gradient by the weights over `TIMED_STEPS`
+    steps; `psnr_512`: of the picture grown from the seed in 512 steps against the target [dB].
+    """
+
+    strategy: str
+    precision: str
+    particles: int
+    step_us: Timing
+    training_us: Timing | None
+    peak_mib: float | None
+    x_1: float
+    s_1: float
+    x_8: float
+    s_8: float
+    x_64: float
+    s_64: float
+    weights: float | None
+    psnr_512: float | None
+
+
+class Runner:
+    """Worlds of the gecko's rule, advanced by one strategy in one precision."""
+
+    def __init__(self, strategy: Strategy, precision: Precision, start: Gecko) -> None:
+        self.strategy = strategy
+        self.precision = precision
+        self.rule = precision.rule(start.rule)
+        self.task = start.task
+        self.x = start.x.to(precision.dtype)
+        self.s = precision.kept(start.s.to(precision.dtype))
+        # Drawn here: a graph of the functional holds no draws of its own.
+        self._x_weights = functional_weights(self.x)
+        self._s_weights = functional_weights(self.s)
+
+    def advanced(
+        self, x: Tensor, s: Tensor, steps: int, generator: torch.Generator
+    ) -> tuple[Tensor, Tensor]:
+        """Return worlds some steps later; differentiable in the rule where the strategy is.
+
+        The generator's update masks are the same draws for every strategy.
+        """
+        own = self.strategy.name == "library"
+        at_once = steps if own and not self.precision.short_states else 1
+        with self.precision.active():
+            for _ in range(steps // at_once):
+                if own:
+                    x, s = rollout(
+                        self.rule,
+                        x,
+                        s,
+                        at_once,
+                        update_prob=self.task.update_prob,
+                        generator=generator,
+                    )
+                else:
+                    mask = drawn_mask(x, self.task.update_prob, generator)
+                    x, s = composed_step(self.strategy, self.rule, x, s, mask)
+                s = self.precision.kept(s)
+        return x, s
+
+    @torch.no_grad()
+    def marks(self, marks: tuple[int, ...]) -> Iterator[tuple[Tensor, Tensor]]:
+        """Yield the worlds after each number of steps, increasing."""
+        generator = mask_source(self.x)
+        x, s = self.x, self.s
+        for before, mark in zip((0, *marks), marks, strict=False):
+            x, s = self.advanced(x, s, mark - before, generator)
+            yield x, s
+
+    def weight_gradient(self, generator: torch.Generator) -> Tensor:
+        """Return the gradient of a functional of the worlds `TIMED_STEPS` later by the weights."""
+        x, s = self.advanced(self.x, self.s, TIMED_STEPS, generator)
+        loss = (x * self._x_weights).sum() + (s * self._s_weights).sum()
+        gradients = torch.autograd.grad(loss, list(self.rule.parameters()))
+        return torch.cat([gradient.flatten() for gradient in gradients])
+
+    def costs(self, session: Session) -> list[Cost]:
+        """Return what a timed rollout costs: inference, then training where it can be trained."""
+        generator = mask_source(self.x)
+
+        @torch.no_grad()
+        def infer() -> None:
+            self.advanced(self.x, self.s, TIMED_STEPS, generator)
+
+        calls: list[Callable[[], object]] = [infer]
+        if self.strategy.differentiable:
+            calls.append(lambda: self.weight_gradient(generator))
+        graph = self.strategy.capturable
+        return [session.cost(call, graph=graph, generator=generator) for call in calls]
+
+    def psnr(self) -> float:
+        """Return the PSNR of the pictures against the target `TASK_STEPS` later [dB], mean."""
+        (worlds,) = self.marks((TASK_STEPS,))
+        picture = self.task.picture(*(tensor.float() for tensor in worlds))
+        return float(psnr(picture, self.task.target_picture).mean())
+
+
+def composed_step(
+    strategy: Strategy,
+    rule: NPARule,
+    x: Tensor,
+    s: Tensor,
+    mask: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Return worlds one step later, composed in torch: every particle perceives, some update.
+
+    They perceive at the rule's own radius; the mask, uint8 [B, N], says which are updated.
+    """
+    active = mask[..., None].to(x.dtype)
+    update = rule(strategy.perceive(x.detach(), s, rule.eps0))
+    delta = update[..., : rule.space_dim]
+    length = torch.linalg.vector_norm(delta, dim=-1, keepdim=True)
+    x = x + active * (rule.alpha * rule.eps0) * delta / (1.0 + length)
+    return x, s + active * update[..., rule.space_dim :]
+
+
+def rollout_rows(session: Session, particle_count: int) -> list[RolloutRow]:
+    """Return a row for each strategy and precision: the gecko's next steps, and its picture."""
+    seed = gecko(1, particle_count, session.device)
+    grown = seed.grown(GROWN_STEPS)
+    exact = Runner(STRATEGIES["library"], PRECISIONS["float64"], grown)
+    expected = list(exact.marks(MARKS)), exact.weight_gradient(mask_source(grown.x))
+    rows: list[RolloutRow] = []
+    for precision in session.usable_precisions():
+        for strategy in session.usable_strategies(grown.x.to(precision.dtype)):
+            if session.small and strategy.name in SLOW:
+                session.leave_out(f"rollouts of {strategy.name}", "64 steps of it take too long")
+                continue
+            runner = Runner(strategy, precision, grown)
+            task = _task_runner(session, strategy, precision, seed)
+            rows += session.attempt(
+                f"rollouts of {strategy.name} in {precision.name}, {particle_count} particles",
+                partial(_rollout_row, session, runner, expected, task),
+            )
+    return rows
+
+
+def drawn_mask(x: Tensor, update_prob: float, generator: torch.Generator) -> Tensor:
+    """Return a step's update mask, drawn as `npa_envs.rollout` draws it, uint8, shape [B, N]."""
+    mask = torch.empty(x.shape[:2], dtype=torch.uint8, device=x.device)
+    return mask.bernoulli_(update_prob, generator=generator)
+
+
+def mask_source(like: Tensor) -> torch.Generator:
+    """Return the generator of the update masks, on the device of a tensor, at its start."""
+    return torch.Generator(like.device).manual_seed(3)
+
+
+def _task_runner(
+    session: Session, strategy: Strategy, precision: Precision, seed: Gecko
+) -> Runner | None:
+    """Return what grows the picture; a run of 512 steps is left out where it takes too long."""
+    particle_count = seed.x.shape[1]
+    slow = strategy.name in SLOW and particle_count > LARGEST_SLOW
+    if slow or (strategy.name != "library" and (session.small or not session.cuda)):
+        why = f"{TASK_STEPS} steps of {particle_count} particles take too long"
+        session.leave_out(f"PSNR of {strategy.name}", why)
+        return None
+    return Runner(strategy, precision, seed)
+
+
+def _rollout_row(
+    session: Session,
+    runner: Runner,
+    expected: tuple[list[tuple[Tensor, Tensor]], Tensor],
+    task: Runner | None,
+) -> RolloutRow:
+    costs = runner.costs(session)
+    peaks = [cost.peak_mib for cost in costs if cost.peak_mib is not None]
+    worlds, weight_gradient = expected
+    errors = [
+        (_largest_distance(x, right_x) / runner.task.eps, relative_error(s, right_s))
+        for (x, s), (right_x, right_s) in zip(runner.marks(MARKS), worlds, strict=True)
+    ]
+    (x_1, s_1), (x_8, s_8), (x_64, s_64) = errors
+    weights = None
+    if runner.strategy.differentiable:
+        found = runner.weight_gradient(mask_source(runner.x))
+        weights = relative_error(found, weight_gradient)
+    return RolloutRow(
+        strategy=runner.strategy.name,
+        precision=runner.precision.name,
+        particles=runner.x.shape[1],
+        step_us=costs[0].time.divided(TIMED_STEPS),
+        training_us=costs[1].time.divided(TIMED_STEPS) if len(costs) > 1 else None,
+        peak_mib=max(peaks, default=None),
+        x_1=x_1,
+        s_1=s_1,
+        x_8=x_8,
+        s_8=s_8,
+        x_64=x_64,
+        s_64=s_64,
+        weights=weights,
+        psnr_512=None if task is None else task.psnr(),
+    )
+
+
+def _largest_distance(x: Tensor, expected: Tensor) -> float:
+    """Return the largest distance between two worlds' particles [length units]."""
+    return float((x.double() - expected.double()).norm(dim=-1).max())
+
+
+# How far float32 has drifted from float64 at the end of the paper's rollouts.
+
+PEER = STRATEGIES["dense"]
+"""What any float32 errs by: no approximation, one torch operator after the other."""
+
+
+@dataclass(frozen=True)
+class DriftRow:
+    """Relative errors of float32 after all steps of a workload, with float64's update masks.
+
+    Gradients are those of a random linear functional by the states at the start and the weights.
+    Their errors come from few particles: where the input of a hidden unit is nearly 0, the unit is
+    on in one precision and off in the other, and its gradient is there or is not.
+    `state_gradient_median` is the median over the particles, each relative to its own.
+    """
+
+    workload: str
+    strategy: str
+    positions: float
+    states: float
+    state_gradient: float
+    state_gradient_median: float
+    weight_gradient: float
+
+
+def drift_rows(session: Session, workloads: Iterable[Workload]) -> list[DriftRow]:
+    """Return a row for each workload, and one of dense torch where it can be."""
+    rows: list[DriftRow] = []
+    for workload in workloads:
+        what = f"drift of {workload.name}"
+        for exact in session.attempt(what, partial(_outcome, workload, session, torch.float64)):
+            rows += session.attempt(what, partial(_drift_row, workload, session, exact))
+            why = PEER.obstacle(workload.worlds(session.device)[0])
+            if session.small or why is not None:
+                session.leave_out(f"{what}, dense", why or "its steps take too long")
+            else:
+                rows += session.attempt(what, partial(_drift_row, workload, session, exact, PEER))
+    return rows
+
+
+def _drift_row(
+    workload: Workload, session: Session, exact: list[Tensor], peer: Strategy | None = None
+) -> DriftRow:
+    found = _outcome(workload, session, torch.float32, peer)
+    positions, states, by_states, by_weights = (
+        relative_error(a, b) for a, b in zip(found, exact, strict=True)
+    )
+    distance = (found[2].double() - exact[2]).norm(dim=-1)
+    median = float((distance / exact[2].norm(dim=-1)).median())
+    name = "library" if peer is None else peer.name
+    return DriftRow(workload.name, name, positions, states, by_states, median, by_weights)
+
+
+def _outcome(
+    workload: Workload, session: Session, dtype: torch.dtype, peer: Strategy | None = None
+) -> list[Tensor]:
+    """Return positions and states at the end, and gradients by states and by weights."""
+    device = session.device
+    rule = workload.rule(device).to(dtype)
+    start, states = (tensor.to(dtype) for tensor in workload.worlds(device))
+    states.requires_grad_()
+    generator = torch.Generator(device).manual_seed(1)
+    if peer is None:
+        x, s = rollout(
+            rule,
+            start,
+            states,
+            workload.steps,
+            eps=workload.eps,
+            update_prob=workload.update_prob,
+            generator=generator,
+            memory="recompute",
+        )
+    else:
+        x, s = start, states
+        for _ in range(workload.steps):
+            mask = drawn_mask(x, workload.update_prob, generator)
+            x, s = checkpoint(composed_step, peer, rule, x, s, mask, use_reentrant=False)
+    loss = (x * functional_weights(x)).sum() + (s * functional_weights(s)).sum()
+    by_states, *by_weights = torch.autograd.grad(loss, [states, *rule.parameters()])
+    weights = torch.cat([gradient.flatten() for gradient in by_weights])
+    return [tensor.detach() for tensor in (x, s, by_states, weights)]

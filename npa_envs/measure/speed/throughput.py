@@ -1,0 +1,447 @@
+"""Throughput: what a step costs in the paper's workloads, against N, neighbours, B and C.
+
+Also what it saves to leave out what a scene does not need, and what one species pays for others.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from torch import Tensor
+
+from npa_envs.measure.speed.timing import Session, Timing, compare
+from npa_envs.measure.speed.workloads import Workload, rollout_call
+from npa_envs.rule.rule import NPARule
+from npa_envs.world.rollout import Memory
+from npa_envs.world.species import rollout_species
+
+# Suite `paper`: inference and training, storing and recomputing.
+
+
+class Aim(NamedTuple):
+    """What a workload should cost on an H200: a step [µs], and memory with recomputing [MiB]."""
+
+    infer_us: float
+    train_us: float
+    train_mib: float | None
+
+
+EIGHT_WORLDS = Workload(2, 8, 4096, 64)
+ONE_WORLD = Workload(2, 1, 4096, 64)
+LARGE_WORLDS = Workload(2, 8, 65536, 8)
+CUBES = Workload(3, 4, 16384, 24, 256)
+MILLION = Workload(2, 1, 2**20, 8)
+SIXTEEN_MILLION = Workload(2, 1, 2**24, 4)
+
+PAPER = (EIGHT_WORLDS, ONE_WORLD, LARGE_WORLDS, CUBES, MILLION, SIXTEEN_MILLION)
+"""Workloads on CUDA."""
+
+PROFILED = PAPER[:4]
+"""Those of the authors' own table."""
+
+CPU = (Workload(2, 1, 4096, 16), Workload(2, 4, 1024, 16))
+"""Workloads on a CPU."""
+
+SMALL = (Workload(2, 1, 1024, 8),)
+"""Workloads of small sessions."""
+
+INFERENCE_ONLY = (SIXTEEN_MILLION,)
+"""Workloads that are not trained."""
+
+AIMS = {
+    EIGHT_WORLDS: Aim(72, 163, 395),
+    ONE_WORLD: Aim(50, 120, 64),
+    LARGE_WORLDS: Aim(700, 1450, 810),
+    CUBES: Aim(150, 310, 450),
+    MILLION: Aim(1500, 3500, None),
+}
+"""What is aimed at on an H200."""
+
+
+@dataclass(frozen=True)
+class ThroughputRow:
+    """A workload (worlds B, particles N, steps T) that stores or recomputes what training reads.
+
+    Times are those of one step [µs], peaks of memory are above the worlds [MiB].
+    """
+
+    workload: str
+    memory: str
+    infer_us: Timing
+    train_us: Timing | None
+    worlds_mib: float
+    infer_mib: float | None
+    train_mib: float | None
+
+
+@dataclass(frozen=True)
+class AimRow:
+    """A workload against what is aimed at on an H200; training by the faster way.
+
+    `recompute_slower`: training's time with recomputing over the faster one's.
+    """
+
+    workload: str
+    infer_us: float
+    infer_aim: float
+    train_us: float
+    train_aim: float
+    recompute_mib: float
+    mib_aim: float | None
+    recompute_slower: float
+
+
+def throughput_rows(session: Session, workloads: Sequence[Workload]) -> list[ThroughputRow]:
+    """Return two rows for each workload: storing and recomputing."""
+    rows: list[ThroughputRow] = []
+    for workload in workloads:
+        train = workload not in INFERENCE_ONLY
+        if not train:
+            session.leave_out(f"training of {workload.name}", "a workload of inference only")
+        modes: tuple[Memory, ...] = ("store", "recompute") if train else ("store",)
+        for memory in modes:
+            rows += session.attempt(
+                f"{workload.name}, {memory}",
+                partial(throughput_row, session, workload, memory, train=train),
+            )
+    return rows
+
+
+def throughput_row(
+    session: Session, workload: Workload, memory: Memory = "store", *, train: bool = True
+) -> ThroughputRow:
+    """Return what a step of a workload costs."""
+    x, s = workload.worlds(session.device)
+    roll, generator = rollout_call(workload, x, s)
+    infer, training = session.cost(roll, generator=generator), None
+    if train:
+        pull_back, generator = rollout_call(workload, x, s, train=True, memory=memory)
+        training = session.cost(pull_back, generator=generator)
+    return ThroughputRow(
+        workload=workload.name,
+        memory=memory,
+        infer_us=infer.time.divided(workload.steps),
+        train_us=training.time.divided(workload.steps) if training else None,
+        worlds_mib=(x.nbytes + s.nbytes) / 2**20,
+        infer_mib=infer.peak_mib,
+        train_mib=training.peak_mib if training else None,
+    )
+
+
+def aim_rows(rows: Sequence[ThroughputRow]) -> list[AimRow]:
+    """Return the workloads that have an aim against it; none where memory was not measured."""
+    aims = {workload.name: aim for workload, aim in AIMS.items()}
+    return [
+        _aim_row(store, recompute, aims[store.workload])
+        for store, recompute in itertools.pairwise(rows)
+        if store.workload == recompute.workload in aims
+    ]
+
+
+def _aim_row(store: ThroughputRow, recompute: ThroughputRow, aim: Aim) -> AimRow:
+    assert store.train_us is not None
+    assert recompute.train_us is not None
+    assert recompute.train_mib is not None
+    train_us = min(store.train_us.median, recompute.train_us.median)
+    return AimRow(
+        workload=store.workload,
+        infer_us=min(store.infer_us.median, recompute.infer_us.median),
+        infer_aim=aim.infer_us,
+        train_us=train_us,
+        train_aim=aim.train_us,
+        recompute_mib=recompute.train_mib,
+        mib_aim=aim.train_mib,
+        recompute_slower=recompute.train_us.median / train_us,
+    )
+
+
+# Suite `scaling`: N, neighbours, B and C, one of them at a time.
+
+AXES = ("particles", "neighbours", "worlds", "channels")
+"""What is varied: N at the same density, neighbours within eps, B, C."""
+
+
+@dataclass(frozen=True)
+class ScalingRow:
+    """One step of a 2D workload that differs from its neighbours in the table in one number.
+
+    `neighbours`: mean number of particles within eps of one, itself included, far from the edges.
+    """
+
+    axis: str
+    value: float
+    workload: str
+    neighbours: float
+    channels: int
+    infer_us: Timing
+    train_us: Timing | None
+    infer_mib: float | None
+    train_mib: float | None
+
+
+@dataclass(frozen=True)
+class SlopeRow:
+    """How time grows: the slope of log time over log value, fitted to an axis's larger half."""
+
+    axis: str
+    infer_slope: float
+    train_slope: float
+
+
+def scaling_rows(session: Session) -> list[ScalingRow]:
+    """Return the rows of all axes, increasing along each."""
+    rows: list[ScalingRow] = []
+    for axis, values in zip(AXES, _values(session), strict=True):
+        for value in values:
+            rows += session.attempt(f"{value} {axis}", partial(_scaling_row, session, axis, value))
+    return rows
+
+
+def _values(session: Session) -> tuple[Sequence[int], ...]:
+    """Return the values of each axis."""
+    if session.small:
+        return (256, 1024), (16, 64), (1, 2), (4, 16)
+    neighbours, channels = (8, 16, 32, 64, 128, 256), (4, 8, 16, 32, 64)
+    if session.cuda:
+        return [2**k for k in range(10, 21)], neighbours, [2**k for k in range(8)], channels
+    return [2**k for k in range(8, 17)], neighbours, (1, 2, 4, 8, 16), channels
+
+
+def varied(axis: str, value: int, *, small: bool = False) -> Workload:
+    """Return the workload in which the number of one of `AXES` has a value."""
+    usual = Workload(2, 1, 512 if small else 4096, 4 if small else 8)
+    if axis == "particles":
+        return replace(usual, particle_count=value)
+    if axis == "worlds":
+        return replace(usual, world_count=value, particle_count=min(usual.particle_count, 1024))
+    if axis == "channels":
+        return replace(usual, state_dim=value)
+    share = (value - 1) / (usual.neighbour_count - 1)
+    return replace(usual, eps=usual.eps * math.sqrt(share))
+
+
+def _scaling_row(session: Session, axis: str, value: int) -> ScalingRow:
+    workload = varied(axis, value, small=session.small)
+    cost = throughput_row(session, workload)
+    return ScalingRow(
+        axis=axis,
+        value=value,
+        workload=workload.name,
+        neighbours=workload.neighbour_count,
+        channels=workload.state_dim,
+        infer_us=cost.infer_us,
+        train_us=cost.train_us,
+        infer_mib=cost.infer_mib,
+        train_mib=cost.train_mib,
+    )
+
+
+def slope_rows(rows: Sequence[ScalingRow]) -> list[SlopeRow]:
+    """Return how the times of each axis grow."""
+    return [_slope_row(axis, [row for row in rows if row.axis == axis]) for axis in AXES]
+
+
+def _slope_row(axis: str, rows: Sequence[ScalingRow]) -> SlopeRow:
+    larger = rows[-max(2, math.ceil(len(rows) / 2)) :]
+    values = np.log([row.value for row in larger])
+    infer = np.log([row.infer_us.median for row in larger])
+    train = np.log([row.train_us.median for row in larger if row.train_us])
+    return SlopeRow(axis, *(float(np.polyfit(values, times, 1)[0]) for times in (infer, train)))
+
+
+# Suite `skips`: what it saves to leave out what a scene does not need.
+
+WORLDS, CPU_WORLDS, SMALL_WORLDS = (
+    Workload(2, 8, 4096, 16),
+    Workload(2, 1, 4096, 4),
+    Workload(2, 1, 256, 2),
+)
+"""Worlds to measure on: of CUDA, of a CPU, of small sessions."""
+
+STATIC_STEPS = 32
+"""Steps of a rollout that does once what never changes."""
+
+
+@dataclass(frozen=True)
+class SkipRow:
+    """Something that is left out; times of one step of a rollout with and without it [µs]."""
+
+    left_out: str
+    condition: str
+    done_us: Timing
+    skipped_us: Timing
+    saved: str
+
+
+@dataclass(frozen=True)
+class Skip:
+    """Two rollouts that differ in one condition alone, with options of `rollout_call`."""
+
+    left_out: str
+    condition: str
+    done: dict[str, Any]
+    skipped: dict[str, Any]
+    steps: int | None = None
+    """Steps of both; default: the workload's."""
+
+
+def skips(workload: Workload) -> list[Skip]:
+    """Return all that rollouts leave out."""
+    side = 2.0 * workload.half_width
+    training = {"train": True}
+    # What follows from positions is computed anew in each step if they may get a gradient.
+    rebuilt = {"detach_positions": False}
+    static = {"rule": {"static": True}}
+    return [
+        Skip(
+            "what a backward pass reads: signs of hidden units, volumes, kernel sums",
+            "no gradient is enabled",
+            {"gradients": True},
+            {},
+        ),
+        Skip(
+            "cotangents of positions and densities",
+            "detach_positions (default)",
+            {**training, "detach_positions": False},
+            training,
+        ),
+        Skip(
+            "perception, network and lists of inactive particles",
+            "update_prob < 1",
+            {"update_prob": 1.0},
+            {},
+        ),
+        *(
+            Skip(what, f"{option}=False", {}, {"rule": {option: False}})
+            for what, option in (
+                ("the state gradient", "state_gradient"),
+                ("the moment matrix and its inverse", "moment_correction"),
+                ("columns of the density gradient", "density_gradient"),
+            )
+        ),
+        Skip("displacements", "static=True", rebuilt, {**static, **rebuilt}),
+        Skip(
+            "cells, densities, moments and pair weights",
+            "static=True, without position_noise",
+            {**static, **rebuilt},
+            static,
+            STATIC_STEPS,
+        ),
+        Skip("periodic images", "box=None (default)", {"box": (side, side)}, {}),
+        Skip(
+            "a second forward pass, for the backward pass",
+            "memory='store' (default)",
+            {**training, "memory": "minimal"},
+            training,
+        ),
+    ]
+
+
+def skip_rows(session: Session) -> list[SkipRow]:
+    """Return what each omission saves, measured with and without it in one run."""
+    workload = SMALL_WORLDS if session.small else WORLDS if session.cuda else CPU_WORLDS
+    x, s = workload.worlds(session.device)
+
+    def cost(options: dict[str, Any], steps: int | None) -> Timing:
+        rolled = replace(workload, steps=steps or workload.steps)
+        run, generator = rollout_call(rolled, x, s, **options)
+        return session.cost(run, generator=generator).time.divided(rolled.steps)
+
+    rows: list[SkipRow] = []
+    for skip in skips(workload):
+        rows += session.attempt(skip.left_out, partial(_skip_row, skip, cost))
+    return rows
+
+
+def _skip_row(skip: Skip, cost: Callable[[dict[str, Any], int | None], Timing]) -> SkipRow:
+    done, skipped = cost(skip.done, skip.steps), cost(skip.skipped, skip.steps)
+    saved = 1.0 - skipped.median / done.median
+    return SkipRow(skip.left_out, skip.condition, done, skipped, f"{saved:.0%}")
+
+
+# Suite `species`: what a world of one species pays for the others that could be there: nothing.
+
+
+SPECIES_WORLDS, CPU_SPECIES_WORLDS, SMALL_SPECIES_WORLDS = (
+    (Workload(2, 8, 4096, 16), Workload(2, 1, 256, 16)),
+    (Workload(2, 1, 4096, 4), Workload(2, 1, 256, 4)),
+    (Workload(2, 1, 256, 2),),
+)
+"""Worlds to measure on: of CUDA, of a CPU, of small sessions. What is paid once shows in few steps
+of few particles."""
+
+PAIRS_PER_REPEAT = 3
+"""Pairs of readings for each reading of other tables: a ratio of nearly 1 needs more of them."""
+
+
+@dataclass(frozen=True)
+class OneSpeciesRow:
+    """The same rule and worlds by both rollouts; times are those of one step."""
+
+    workload: str
+    """Dimension and (worlds B, particles N, steps T)."""
+    what: str
+    """"inference", or "training": also a functional's gradient by the rule's weights."""
+    calls: str
+    """"eager", or "graph" where CUDA replays what was captured and the host does nothing."""
+    rollout_us: Timing
+    """A step of `rollout` [µs]."""
+    species_us: Timing
+    """A step of `rollout_species` with one species [µs]."""
+    ratio: float
+    """Median of species_us / rollout_us over pairs of readings in turn; aimed at: at most 1.03."""
+
+
+def one_species_rows(session: Session) -> list[OneSpeciesRow]:
+    """Return what one species costs beside `rollout`, inference and training."""
+    workloads = (
+        SMALL_SPECIES_WORLDS
+        if session.small
+        else SPECIES_WORLDS
+        if session.cuda
+        else CPU_SPECIES_WORLDS
+    )
+    rows: list[OneSpeciesRow] = []
+    for workload in workloads:
+        for train in (False, True):
+            for graph in (False, True) if session.cuda else (False,):
+                what = f"one species, {'training' if train else 'inference'} of {workload.name}"
+                rows += session.attempt(
+                    what, partial(_species_row, session, workload, train, graph)
+                )
+    return rows
+
+
+def _species_row(session: Session, workload: Workload, train: bool, graph: bool) -> OneSpeciesRow:
+    x, s = workload.worlds(session.device)
+    make: Callable[..., Any] = partial(rollout_call, workload, x, s, train=train)
+    # Each draws the same masks, as often as the other one is called.
+    alone, species = make(), make(roll=roll_one_species)
+    compared = compare(
+        alone, species, session.device, repeats=PAIRS_PER_REPEAT * session.repeats, graph=graph
+    )
+    return OneSpeciesRow(
+        workload.name,
+        "training" if train else "inference",
+        "graph" if graph else "eager",
+        compared.first.divided(workload.steps),
+        compared.second.divided(workload.steps),
+        compared.ratio,
+    )
+
+
+def roll_one_species(
+    rule: NPARule, x: Tensor, s: Tensor, steps: int, **options: Any
+) -> tuple[Tensor, Tensor]:
+    """Roll worlds out as those of one species that sees densities as it does alone."""
+    count = [x.shape[1]]
+    worlds: tuple[Tensor, Tensor] = rollout_species(
+        [rule], x, s, steps, counts=count, density_counts=count, **options
+    )
+    return worlds
