@@ -5,32 +5,32 @@ timing: all of them in one step, or (staggered) some in every step. Worlds start
 dense disk (Morphogenesis2D), or as grown and damaged pictures (Regeneration2D). On CUDA
 observations stay on the device and the host reads one byte a world; on a CPU they are NumPy's.
 
-Of a step's wall time, `wait` is what the host spent waiting for the device; the rest of it the host
-was busy. Where resets come together, `calm_step` is a step without any, and `queued` the same steps
-of the same worlds with the work queued on the device and nothing of Python's between: the
-difference is what Python costs.
-`device` is the sum of the kernels' times, `idle` the share of a step without any.
+Where resets come together, `calm_step` is a step without any, and `queued` the same steps of the
+same worlds with the work queued on the device and nothing of Python's between: the difference is
+what Python costs. `device` is the sum of the kernels' times, `idle` the share of a step without
+any.
+
+Peers: Gymnasium steps B of our single environments one after the other ("sync") or in B processes
+("async"). VMAS (github.com/proroklab/VectorizedMultiAgentSimulator), if installed, batches worlds
+of agents in torch; its scenarios with the most agents are counted in agent-steps a second, without
+resets.
 """
 
 from __future__ import annotations
 
-import argparse
 import gc
-import json
+import importlib.util
 import statistics
-import sys
 import time
-from collections.abc import Callable
-from datetime import date
-from pathlib import Path
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import gymnasium
-import peers
 import torch
 from torch.autograd import DeviceType
 from torch.profiler import ProfilerActivity, profile
 
+from npa_envs.measure.record import script_facts, script_parser, write_record
 from npa_envs.measure.speed.timing import synchronize
 
 
@@ -70,24 +70,6 @@ CALM_STEPS, COMPARISONS = 16, 9
 ENOUGH_SECONDS = 2.0
 MAX_EPISODES = 9
 LISTED_KERNELS = 12
-
-
-class TimedWait:
-    """Adds up how long the host waits for the device in the steps of some worlds.
-
-    Args:
-        worlds: The worlds of an environment on CUDA.
-    """
-
-    def __init__(self, worlds: Any) -> None:
-        self.waited = 0.0
-        self._wait = worlds._beside.wait
-        worlds._beside.wait = self._timed
-
-    def _timed(self) -> None:
-        start = time.perf_counter()
-        self._wait()
-        self.waited += time.perf_counter() - start
 
 
 def python_times(env: Any, actions: list[Any], device: torch.device) -> tuple[float, float]:
@@ -209,8 +191,7 @@ def measure(
 ) -> dict[str, Any]:
     """Return the row of one case."""
     env, run = prepare(case, start, staggered, device, quick)
-    worlds, scale = env.unwrapped.worlds, 1e6 / EPISODE_STEPS
-    wait = TimedWait(worlds) if device.type == "cuda" else None
+    scale, cuda = 1e6 / EPISODE_STEPS, device.type == "cuda"
     times = timed_episodes(run, quick)
     wall = statistics.median(times) * scale
     row = {
@@ -221,15 +202,13 @@ def measure(
         "step_us_range": [min(times) * scale, max(times) * scale],
         "particle_steps_per_s": case.world_count * case.particle_count / wall * 1e6,
     }
-    if wait is not None:
-        row["wait_us"] = wait.waited * scale / len(times)
-        row["host_us"] = statistics.mean(times) * scale - row["wait_us"]
+    if cuda:
         row["peak_allocated_mib"] = torch.cuda.max_memory_allocated(device) / 2**20
         row["peak_reserved_mib"] = torch.cuda.max_memory_reserved(device) / 2**20
     # Half-way through an episode worlds are as they typically are.
     run(EPISODE_STEPS // 2)
     row["neighbours"] = neighbour_count(env)
-    if wait is not None and not staggered:
+    if cuda and not staggered:
         calm, queued = python_times(env, random_actions(env, device), device)
         row["calm_step_us"], row["queued_us"] = calm * 1e6, queued * 1e6
     env.close()
@@ -275,6 +254,117 @@ def add_kernels(row: dict[str, Any], device: torch.device, quick: bool) -> None:
             print(f"  {spent:9.2f} µs {spent / total:6.1%} {count:6.1f} x  {kernel['name'][:80]}")
 
 
+# Peers
+
+GYMNASIUM_WORLDS, GYMNASIUM_PARTICLES = 8, 1024
+
+VMAS_WORLDS = (32, 1024)
+VMAS_SCENARIOS: tuple[tuple[str, dict[str, int]], ...] = (
+    ("dispersion", {"n_agents": 16, "n_food": 16}),
+    ("dispersion", {"n_agents": 64, "n_food": 64}),
+    ("flocking", {"n_agents": 16}),
+    ("flocking", {"n_agents": 64}),
+)
+VMAS_SECONDS = 3.0
+
+
+def median_time(run: Callable[[], None], device: torch.device, seconds: float) -> float:
+    """Return the median time of a call [s], from at least three and about `seconds`."""
+    times: list[float] = []
+    run()
+    while len(times) < 3 or sum(times) < seconds:
+        synchronize(device)
+        start = time.perf_counter()
+        run()
+        synchronize(device)
+        times.append(time.perf_counter() - start)
+    return statistics.median(times)
+
+
+def measure_gymnasium(mode: str, quick: bool) -> dict[str, Any]:
+    """Return the row of Gymnasium's own vectorisation of the single environment, on the CPU."""
+    world_count = 2 if quick else GYMNASIUM_WORLDS
+    particle_count = 64 if quick else GYMNASIUM_PARTICLES
+    # A process that is forked would share locks and a CUDA context with this one.
+    options = {"context": "spawn"} if mode == "async" else {}
+    env = gymnasium.make_vec(
+        "npa_envs:npa/Morphogenesis2D-v0",
+        num_envs=world_count,
+        vectorization_mode=mode,
+        vector_kwargs=options,
+        particle_count=particle_count,
+        max_episode_steps=EPISODE_STEPS,
+    )
+    env.action_space.seed(0)
+    sets = [CALM * env.action_space.sample() for _ in range(4)]
+    env.reset(seed=0)
+
+    def run() -> None:
+        for k in range(EPISODE_STEPS):
+            env.step(sets[k % len(sets)])
+
+    taken = median_time(run, torch.device("cpu"), 0.0 if quick else 2.0) / EPISODE_STEPS
+    env.close()
+    return {
+        "peer": f"gymnasium {mode}",
+        "world_count": world_count,
+        "particle_count": particle_count,
+        "step_us": taken * 1e6,
+        "particle_steps_per_s": world_count * particle_count / taken,
+    }
+
+
+def measure_vmas(
+    scenario: str, keywords: dict[str, int], world_count: int, device: torch.device, quick: bool
+) -> dict[str, Any]:
+    """Return the row of one of VMAS's scenarios."""
+    from vmas import make_env
+
+    env = make_env(
+        scenario=scenario,
+        num_envs=world_count,
+        device=str(device),
+        continuous_actions=True,
+        seed=0,
+        **keywords,
+    )
+    env.reset()
+    generator = torch.Generator(device).manual_seed(0)
+    actions = [
+        torch.rand(
+            world_count, env.get_agent_action_size(agent), generator=generator, device=device
+        )
+        * 2.0
+        - 1.0
+        for agent in env.agents
+    ]
+
+    def run() -> None:
+        env.step(actions)
+
+    taken = median_time(run, device, 0.0 if quick else VMAS_SECONDS)
+    return {
+        "peer": f"vmas {scenario}",
+        "world_count": world_count,
+        "agent_count": len(env.agents),
+        "step_us": taken * 1e6,
+        "agent_steps_per_s": world_count * len(env.agents) / taken,
+    }
+
+
+def peer_rows(device: torch.device, quick: bool) -> Iterator[dict[str, Any]]:
+    """Yield a row for each peer: Gymnasium's on a CPU, and VMAS's on the device."""
+    if device.type == "cpu":
+        for mode in ("sync", "async"):
+            yield measure_gymnasium(mode, quick)
+    if importlib.util.find_spec("vmas") is None:
+        print("vmas is not installed, and is left out: pip install vmas")
+        return
+    for scenario, keywords in VMAS_SCENARIOS[:1] if quick else VMAS_SCENARIOS:
+        for world_count in VMAS_WORLDS[:1] if quick else VMAS_WORLDS:
+            yield measure_vmas(scenario, keywords, world_count, device, quick)
+
+
 def show(row: dict[str, Any]) -> None:
     """Print a row, numbers shortened."""
     hidden = ("kernels", "step_us_range")
@@ -284,47 +374,32 @@ def show(row: dict[str, Any]) -> None:
 
 def main() -> None:
     """Measure, print and write JSON."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-    parser.add_argument("--threads", type=int, default=1, help="CPU threads of torch")
+    parser = script_parser(__doc__)
     parser.add_argument("--quick", action="store_true", help="tiny worlds: does it run?")
     parser.add_argument("--case", type=int, nargs=2, metavar=("B", "N"), help="only this one")
     parser.add_argument("--skip-peers", action="store_true", help="only these environments")
     parser.add_argument("--skip-own", action="store_true", help="only the peers")
-    parser.add_argument("--commit", default="unknown", help="commit that is measured")
-    parser.add_argument("--output", type=Path, help="JSON file to write")
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
-    device = torch.device(arguments.device)
+    device, quick = torch.device(arguments.device), arguments.quick
     cuda = device.type == "cuda"
-    rows: list[dict[str, Any]] = []
-    cases = QUICK if arguments.quick else CUDA if cuda else CPU
+    cases = QUICK if quick else CUDA if cuda else CPU
     if arguments.case:
         cases = (Case(*arguments.case),)
+    rows: list[dict[str, Any]] = []
     for case in () if arguments.skip_own else cases:
         for start in STARTS:
             for staggered in (False, True) if case.world_count > 1 else (False,):
-                rows.append(measure(case, start, staggered, device, arguments.quick))
+                rows.append(measure(case, start, staggered, device, quick))
                 show(rows[-1])
-    for row in rows if cuda or arguments.quick else ():
-        add_kernels(row, device, arguments.quick)
-    peer_rows = (
-        [] if arguments.skip_peers else list(peers.measure_all(device, arguments.quick, CALM))
-    )
-    for row in peer_rows:
+    for row in rows if cuda or quick else ():
+        add_kernels(row, device, quick)
+    peers = [] if arguments.skip_peers else list(peer_rows(device, quick))
+    for row in peers:
         show(row)
-    report = {
-        "command": " ".join(["python", *sys.argv]),
-        "commit": arguments.commit,
-        "date": date.today().isoformat(),
-        "machine": torch.cuda.get_device_name(device) if cuda else "CPU, 1 thread of kernels",
-        "torch": torch.__version__,
-        "episode_steps": EPISODE_STEPS,
-        "rows": rows,
-        "peers": peer_rows,
-    }
     if arguments.output:
-        arguments.output.write_text(json.dumps(report, indent=1) + "\n")
+        report = {"episode_steps": EPISODE_STEPS, "rows": rows, "peers": peers}
+        write_record(arguments.output, {**script_facts(arguments), **report})
 
 
 if __name__ == "__main__":

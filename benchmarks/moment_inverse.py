@@ -1,29 +1,32 @@
-"""What the smooth inverse of moment matrices changes in rules that were trained without it.
+"""The smooth inverse of moment matrices in rules that were trained without it; run with --help.
 
 Each rule grows worlds from the same seeds with the inverse by the threshold and with the smooth
-one, not trained again; then steps of a grown world are timed in turn. See --help.
+one, not trained again; then steps of a grown world are timed in turn. Rules that the JSON file has
+already are kept there.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import sys
-from datetime import date
-from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
 import npa_envs
+from npa_envs.measure.record import script_facts, script_parser, write_record
 from npa_envs.measure.speed.timing import Sampled, compare
+from npa_envs.measure.tables import markdown_table, mean_with_error
 from npa_envs.training.trained_tasks import task_of_rule
 
 INVERSES = ("threshold", "smooth")
 SMALL_DETERMINANTS = (1e-3, 1e-2, 1e-1)
 QUANTILES = (0.01, 0.05, 0.5)
 TIMED_STEPS = 8
+HEADS = (
+    "rule", *INVERSES, "det M: 1 %", "5 %", "median", "below 0.01", "ms", "ms", "ratio"
+)  # fmt: skip
 
 
 def with_inverse(rule: npa_envs.NPARule, inverse: str) -> npa_envs.NPARule:
@@ -72,13 +75,7 @@ def study(name: str, arguments: argparse.Namespace) -> dict[str, Any]:
     loaded = npa_envs.load_rule(name, device=device)
     task = task_of_rule(name, loaded, device).task
     rules = [with_inverse(loaded, inverse) for inverse in INVERSES]
-    result: dict[str, Any] = {
-        "rule": name,
-        "command": " ".join(["python", *sys.argv]),
-        "commit": arguments.commit,
-        "date": date.today().isoformat(),
-        "torch": torch.__version__,
-    }
+    result: dict[str, Any] = {"rule": name, **script_facts(arguments)}
     for inverse, rule in zip(INVERSES, rules, strict=True):
         x, s = grown(rule, task, arguments)
         losses = task.metric(x, s).double()
@@ -95,47 +92,41 @@ def study(name: str, arguments: argparse.Namespace) -> dict[str, Any]:
     return result
 
 
-def line(result: dict[str, Any]) -> str:
-    """Return a line of the table, in Markdown."""
-    cells = [f"`{result['rule']}`"]
-    cells += [
-        f"{result[inverse]['mean']:.4f} ± {result[inverse]['standard_error']:.4f}"
-        for inverse in INVERSES
-    ]
+def cells(result: dict[str, Any]) -> list[str]:
+    """Return a row of the table."""
     threshold = result["threshold"]
-    cells += [f"{threshold[f'quantile_{q:g}']:.2g}" for q in QUANTILES]
-    cells += [f"{threshold['share_below_0.01']:.2%}"]
-    cells += [*(f"{time / 1e3:.2f}" for time in result["step_us"]), f"{result['step_ratio']:.3f}"]
-    return "| " + " | ".join(cells) + " |"
+    both = [result[inverse] for inverse in INVERSES]
+    return [
+        f"`{result['rule']}`",
+        *(mean_with_error(found["mean"], found["standard_error"], 4) for found in both),
+        *(f"{threshold[f'quantile_{q:g}']:.2g}" for q in QUANTILES),
+        f"{threshold['share_below_0.01']:.2%}",
+        *(f"{time / 1e3:.2f}" for time in result["step_us"]),
+        f"{result['step_ratio']:.3f}",
+    ]
 
 
 def main() -> None:
     """Study rules, print a table and write JSON."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = script_parser(__doc__)
+    parser.set_defaults(device="cpu")
     parser.add_argument("rules", nargs="+", help="shipped rules")
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--threads", type=int, default=1, help="CPU threads of torch")
     parser.add_argument("--seeds", type=int, default=8, help="worlds of each rule")
     parser.add_argument("--first-seed", type=int, default=100)
     parser.add_argument("--steps", type=int, default=512)
     parser.add_argument("--repeats", type=int, default=15, help="readings of the time")
-    parser.add_argument("--commit", default="unknown", help="commit that is measured")
-    parser.add_argument("--output", type=Path, help="JSON file; rules there already are kept")
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
     kept = []
     if arguments.output and arguments.output.exists():
         kept = json.loads(arguments.output.read_text())["rules"]
-    print(
-        "| rule | threshold | smooth | det M: 1 % | 5 % | median | below 0.01 | ms | ms | ratio |"
-    )
-    print("|---" * 10 + "|")
+    results = []
     for name in arguments.rules:
-        result = study(name, arguments)
-        kept = [*(other for other in kept if other["rule"] != name), result]
-        print(line(result), flush=True)
+        results.append(study(name, arguments))
+        kept = [*(other for other in kept if other["rule"] != name), results[-1]]
         if arguments.output:
-            arguments.output.write_text(json.dumps({"rules": kept}, indent=1) + "\n")
+            write_record(arguments.output, {"rules": kept})
+    print(markdown_table(HEADS, map(cells, results)))
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 import npa_envs
-from npa_envs.measure.speed.session import relative_error
+from npa_envs.measure.speed.timing import relative_error
 from npa_envs.tasks.appearance import RENDERERS
 from npa_envs.tasks.targets.views import some_views
 from npa_envs.training.trained_tasks import task_of_rule

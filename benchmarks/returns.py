@@ -6,11 +6,8 @@ end say the same in the task's own unit. The rule is the shipped one that grows 
 
 from __future__ import annotations
 
-import argparse
-import json
 from collections import Counter
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -27,7 +24,7 @@ from npa_envs.agents import (
     ZeroPolicy,
     evaluate_policy,
 )
-from npa_envs.measure.speed.report import script_facts
+from npa_envs.measure.record import script_facts, script_parser, write_record
 from npa_envs.registration import ENVIRONMENTS
 
 TARGET = "gecko"
@@ -77,15 +74,11 @@ def print_row(row: dict[str, Any]) -> None:
 
 def main() -> None:
     """Let every policy play in every environment, print a table and write JSON."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-    parser.add_argument("--threads", type=int, default=1, help="CPU threads of torch")
+    parser = script_parser(__doc__)
     parser.add_argument("--episodes", type=int, default=32)
     parser.add_argument("--particle-count", type=int, default=1024)
     parser.add_argument("--max-episode-steps", type=int, help="default: the environment's own")
     parser.add_argument("--policies", nargs="+", choices=POLICIES, default=list(POLICIES))
-    parser.add_argument("--commit", default="unknown", help="commit that is measured")
-    parser.add_argument("--output", type=Path, help="JSON file to write")
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
     keywords: dict[str, Any] = {}
@@ -112,13 +105,9 @@ def main() -> None:
             rows.append(row_of(registration.id, name, episodes))
             print_row(rows[-1])
         env.close()
-    report = {
-        **script_facts(arguments.commit, torch.device(arguments.device)),
-        "particle_count": arguments.particle_count,
-        "rows": rows,
-    }
     if arguments.output:
-        arguments.output.write_text(json.dumps(report, indent=1) + "\n")
+        report = {"particle_count": arguments.particle_count, "rows": rows}
+        write_record(arguments.output, {**script_facts(arguments), **report})
 
 
 if __name__ == "__main__":
