@@ -14,6 +14,7 @@ from importlib.machinery import ModuleSpec
 from types import ModuleType
 
 MOVED = {
+    "npa_envs.agents.learning.sb3_world": "npa_envs.agents.learning.sb3",
     "npa_envs.classification": "npa_envs.measure.quality.classification",
     "npa_envs.envs.species": "npa_envs.envs.multi",
     "npa_envs.sph": "npa_envs.ops",

@@ -343,7 +343,7 @@ class WorldVecEnv(RowVecEnv):
     actions, [N, A]. Stable-Baselines3's own policies draw those from one Gaussian of N A columns,
     which cannot learn: after the smallest update the ratio of two likelihoods is near zero or
     beyond all bounds. Take a policy that means over particles instead of summing, such as
-    `npa_envs.agents.learning.sb3_world.WorldRulePolicy`.
+    `npa_envs.agents.learning.sb3.WorldRulePolicy`.
 
     Rows of a finished world have an info of their own, with `terminal_observation`,
     `TimeLimit.truncated` and, where there is one, `is_success`; the others share an empty one.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -12,10 +12,144 @@ from npa_envs.agents.learning.problem import Problem, world_seeds
 from npa_envs.agents.learning.progress import Progress, annealed
 from npa_envs.agents.learning.rules import RuleSet, Source, starting_rules
 from npa_envs.errors import NPAError
-from npa_envs.tasks.checks import is_real, is_whole
+from npa_envs.tasks.checks import check_positive, is_real
 
 VARIANCE_FLOOR = 1e-8
 """Added to the variance of the teacher's actions: what it never does is still to be learned."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CloneOptions:
+    """Options of `train`."""
+
+    teacher: Source | Sequence[Source] | RuleSet | None = None
+    """A rule, a shipped rule's name or a file, for all species or one for each, or a set of rules;
+    it must be given."""
+
+    student_share: float = 0.5
+    """Share of the worlds in which the student acts, in [0, 1]; 0: plain cloning."""
+
+    collect_steps: int = 8
+    """Steps of the worlds in an iteration."""
+
+    kept_steps: int = 64
+    """Steps of all worlds that are learned from, at least `collect_steps`."""
+
+    updates: int = 16
+    """Optimiser's steps in an iteration."""
+
+    batch_worlds: int = 4
+    """Worlds, with all of their particles, in each of them."""
+
+    learning_rate: float = 3e-3
+    """Adam's, at the beginning."""
+
+    last_rate: float = 0.02
+    """Learning rate at the end, as a share of the first."""
+
+    def __post_init__(self) -> None:
+        """Check every field but the teacher.
+
+        Raises:
+            NPAError: One lies outside its range.
+        """
+        if not (is_real(self.student_share) and 0.0 <= self.student_share <= 1.0):
+            raise NPAError(f"student_share must lie in [0, 1], got {self.student_share!r}: try 0.5")
+        check_positive(self, int, "collect_steps", "kept_steps", "updates", "batch_worlds")
+        check_positive(self, float, "learning_rate")
+        if self.kept_steps < self.collect_steps:
+            raise NPAError(
+                f"kept_steps must be at least collect_steps = {self.collect_steps}, got "
+                f"{self.kept_steps}: give {8 * self.collect_steps}"
+            )
+
+
+DEFAULTS = CloneOptions()
+
+
+def train(
+    problem: Problem,
+    progress: Progress,
+    seed: int,
+    *,
+    device: torch.device,
+    start: RuleSet | None = None,
+    options: CloneOptions = DEFAULTS,
+) -> RuleSet:
+    """Learn a teacher's actions in the worlds that it comes to, and in those of the student.
+
+    The loss is the squared error of actions over the variance of the teacher's, column by column:
+    the share of what it does that is not explained. The student acts in some of the worlds, and is
+    told what the teacher would have done there (dataset aggregation, Ross et al. 2011), as its
+    errors lead it to where the teacher never comes.
+
+    Args:
+        problem: Where teacher and student act.
+        progress: The budget and the learning curve.
+        seed: Of all draws, of worlds, and of new rules.
+        device: Where worlds and rules are.
+        start: Rules to begin with; copied.
+        options: How, and from whom.
+
+    Returns:
+        The rules.
+
+    Raises:
+        NPAError: There is no teacher, or it does not fit the problem.
+        DivergedError: The rules' weights are not finite.
+    """
+    teacher = _teacher(problem, options.teacher).to(device).policy()
+    rules = starting_rules(problem, seed, device, start)
+    student, envs = rules.policy(), problem.make_envs(device=device)
+    generator = torch.Generator(device).manual_seed(seed)
+    optimiser = torch.optim.Adam(
+        rules.parameters(), lr=options.learning_rate, fused=device.type == "cuda"
+    )
+    observation, _ = envs.reset(seed=world_seeds(seed, problem.num_envs))
+    shown = Demonstrations(options.kept_steps * problem.num_envs, observation, teacher(observation))
+    taught = problem.num_envs - round(options.student_share * problem.num_envs)
+
+    def iteration() -> int:
+        nonlocal observation
+        for _ in range(options.collect_steps):
+            action = teacher(observation)
+            shown.add(observation, action)
+            if taught < problem.num_envs:
+                action[taught:] = student(observation[taught:])
+            observation, *_ = envs.step(action)
+        rate = annealed(options.learning_rate, options.last_rate, progress.share)
+        for group in optimiser.param_groups:
+            group["lr"] = rate
+        for _ in range(options.updates):
+            loss = unexplained(rules, *shown.draw(options.batch_worlds, generator))
+            optimiser.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            optimiser.step()
+        return options.collect_steps * problem.num_envs * problem.particle_count
+
+    return progress.run(rules, iteration)
+
+
+def _teacher(problem: Problem, source: Source | Sequence[Source] | RuleSet | None) -> RuleSet:
+    if source is None:
+        raise NPAError("teacher must be given to clone: for example teacher='heart'")
+    return RuleSet.of(problem, list(source) if isinstance(source, RuleSet) else source)
+
+
+def unexplained(rules: RuleSet, observation: Tensor, action: Tensor) -> Tensor:
+    """Return the squared error of rules over the variance of the actions, a scalar.
+
+    Args:
+        rules: The student.
+        observation: What is perceived, shape [B, N, P].
+        action: What the teacher does, shape [B, N, A].
+    """
+    parts, errors = [], (rules.mean(observation) - action).square()
+    for span in rules.spans:
+        error = errors[:, span]
+        variance = action[:, span].flatten(0, 1).var(dim=0, correction=0)
+        parts.append((error.flatten(0, 1).mean(dim=0) / (variance + VARIANCE_FLOOR)).mean())
+    return torch.stack(parts).mean()
 
 
 class Demonstrations:
@@ -53,123 +187,3 @@ class Demonstrations:
         kept, device = min(self.count, len(self.observations)), self.observations.device
         chosen = torch.randint(kept, (world_count,), generator=generator, device=device)
         return self.observations[chosen], self.actions[chosen]
-
-
-def train(
-    problem: Problem,
-    progress: Progress,
-    seed: int,
-    *,
-    device: torch.device,
-    start: RuleSet | None = None,
-    teacher: Source | Sequence[Source] | RuleSet | None = None,
-    student_share: float = 0.5,
-    collect_steps: int = 8,
-    kept_steps: int = 64,
-    updates: int = 16,
-    batch_worlds: int = 4,
-    learning_rate: float = 3e-3,
-    last_rate: float = 0.02,
-) -> RuleSet:
-    """Learn a teacher's actions in the worlds that it comes to, and in those of the student.
-
-    The loss is the squared error of actions over the variance of the teacher's, column by column:
-    the share of what it does that is not explained. The student acts in some of the worlds, and is
-    told what the teacher would have done there (dataset aggregation, Ross et al. 2011), as its
-    errors lead it to where the teacher never comes.
-
-    Args:
-        problem: Where teacher and student act.
-        progress: The budget and the learning curve.
-        seed: Of all draws, of worlds, and of new rules.
-        device: Where worlds and rules are.
-        start: Rules to begin with; copied.
-        teacher: A rule, a shipped rule's name or a file, for all species or one for each, or a set
-            of rules; it must be given.
-        student_share: Share of the worlds in which the student acts, in [0, 1]; 0: plain cloning.
-        collect_steps: Steps of the worlds in an iteration.
-        kept_steps: Steps of all worlds that are learned from, at least `collect_steps`.
-        updates: Optimiser's steps in an iteration.
-        batch_worlds: Worlds, with all of their particles, in each of them.
-        learning_rate: Adam's, at the beginning.
-        last_rate: Learning rate at the end, as a share of the first.
-
-    Returns:
-        The rules.
-
-    Raises:
-        NPAError: There is no teacher, it does not fit the problem, or an option is out of its
-            range.
-        DivergedError: The rules' weights are not finite.
-    """
-    _check_options(student_share, collect_steps, kept_steps, updates, batch_worlds, learning_rate)
-    if teacher is None:
-        raise NPAError("teacher must be given to clone: for example teacher='heart'")
-    source = list(teacher) if isinstance(teacher, RuleSet) else teacher
-    wise = RuleSet.of(problem, source).to(device).policy()
-    rules = starting_rules(problem, seed, device, start)
-    student, envs = rules.policy(), problem.make_envs(device=device)
-    generator = torch.Generator(device).manual_seed(seed)
-    optimiser = torch.optim.Adam(rules.parameters(), lr=learning_rate, fused=device.type == "cuda")
-    observation, _ = envs.reset(seed=world_seeds(seed, problem.num_envs))
-    shown = Demonstrations(kept_steps * problem.num_envs, observation, wise(observation))
-    taught = problem.num_envs - round(student_share * problem.num_envs)
-    progress.start(rules)
-    while not progress.over:
-        for _ in range(collect_steps):
-            label = wise(observation)
-            shown.add(observation, label)
-            action = label.clone()
-            if taught < problem.num_envs:
-                action[taught:] = student(observation[taught:])
-            observation, *_ = envs.step(action)
-        for group in optimiser.param_groups:
-            group["lr"] = annealed(learning_rate, last_rate, progress.share)
-        for _ in range(updates):
-            _learn(rules, optimiser, *shown.draw(batch_worlds, generator))
-        progress.advance(collect_steps * problem.num_envs * problem.particle_count)
-        progress.look(rules)
-    progress.look(rules, force=True)
-    return rules
-
-
-def unexplained(rules: RuleSet, observation: Tensor, action: Tensor) -> Tensor:
-    """Return the squared error of rules over the variance of the actions, a scalar.
-
-    Args:
-        rules: The student.
-        observation: What is perceived, shape [B, N, P].
-        action: What the teacher does, shape [B, N, A].
-    """
-    parts, errors = [], (rules.mean(observation) - action).square()
-    for span in rules.spans:
-        error = errors[:, span]
-        variance = action[:, span].flatten(0, 1).var(dim=0, correction=0)
-        parts.append((error.flatten(0, 1).mean(dim=0) / (variance + VARIANCE_FLOOR)).mean())
-    return torch.stack(parts).mean()
-
-
-def _learn(
-    rules: RuleSet, optimiser: torch.optim.Optimizer, observation: Tensor, action: Tensor
-) -> None:
-    loss = unexplained(rules, observation, action)
-    optimiser.zero_grad()
-    loss.backward()  # type: ignore[no-untyped-call]
-    optimiser.step()
-
-
-def _check_options(student_share: Any, collect_steps: Any, kept_steps: Any, *others: Any) -> None:
-    *counts, learning_rate = others
-    if not (is_real(student_share) and 0.0 <= student_share <= 1.0):
-        raise NPAError(f"student_share must lie in [0, 1], got {student_share!r}: try 0.5")
-    names = ("collect_steps", "kept_steps", "updates", "batch_worlds")
-    for name, value in zip(names, (collect_steps, kept_steps, *counts), strict=True):
-        if not is_whole(value) or value < 1:
-            raise NPAError(f"{name} must be a whole number of at least 1, got {value!r}: try 8")
-    if kept_steps < collect_steps:
-        raise NPAError(
-            f"kept_steps must be at least collect_steps = {collect_steps}, got {kept_steps}: "
-            f"give {8 * collect_steps}"
-        )
-    if not (is_real(learning_rate) and learning_rate > 0.0):
-        raise NPAError(f"learning_rate must be positive, got {learning_rate!r}: try 1e-3")

@@ -1,4 +1,11 @@
-"""Many sets of rules at once: every world is acted in by the weights of its own candidate."""
+"""Evolution strategies over rules' weights: sep-CMA-ES, all candidates in one batch of worlds.
+
+The library `cma` (pycma) proposes candidates and learns from their fitness; it is asked for a
+diagonal covariance, as rules have thousands of weights (Ros and Hansen, A Simple Modification in
+CMA-ES Achieving Linear Time and Space Complexity, 2008). A candidate's fitness is the mean return
+of its worlds, which start from the same seeds for all candidates of a generation, and from new ones
+in the next: differences between candidates are theirs and not their luck's.
+"""
 
 from __future__ import annotations
 
@@ -21,6 +28,78 @@ from npa_envs.tasks.checks import check_positive
 
 MOST_HIDDEN = 2**27
 """Numbers of hidden layers that are held at once, at most: 512 MiB of float32."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvolutionOptions:
+    """Options of `train`."""
+
+    population: int = 32
+    """Candidates of a generation, at least 4."""
+
+    worlds_per_candidate: int = 1
+    """Worlds that each is tried in."""
+
+    sigma: float = 0.1
+    """Step size to begin with, as a fraction of the size that a layer's weights are drawn with
+    (Xavier, gain 1; dimensionless)."""
+
+    def __post_init__(self) -> None:
+        """Check every field.
+
+        Raises:
+            NPAError: One lies outside its range.
+        """
+        check_positive(self, int, "population", at_least=4)
+        check_positive(self, int, "worlds_per_candidate")
+        check_positive(self, float, "sigma")
+
+
+DEFAULTS = EvolutionOptions()
+
+
+def train(
+    problem: Problem,
+    progress: Progress,
+    seed: int,
+    *,
+    device: torch.device,
+    start: RuleSet | None = None,
+    options: EvolutionOptions = DEFAULTS,
+) -> RuleSet:
+    """Evolve rules until the budget is spent, and return the mean of the last generation.
+
+    Args:
+        problem: What is to be learned.
+        progress: The budget, and who looks on.
+        seed: Of the first weights, of candidates and of worlds.
+        device: Where worlds live and candidates are evaluated; candidates are drawn on the host.
+        start: The mean to begin with; None: a new rule.
+        options: How.
+
+    Returns:
+        The rules, on the device.
+
+    Raises:
+        MissingDependencyError: cma is not installed.
+    """
+    rules = starting_rules(problem, seed, device, start)
+    candidates = Population(rules)
+    world_count = options.population * options.worlds_per_candidate
+    envs = problem.make_envs(world_count, device=device, copy=False)
+    draws = np.random.default_rng(seed)
+    strategy = _strategy(candidates, options, draws)
+
+    def generation() -> int:
+        proposed = strategy.ask()
+        seeds = draws.integers(FIRST_EVALUATION_SEED, size=options.worlds_per_candidate).tolist()
+        weights = torch.as_tensor(np.stack(proposed), dtype=torch.float32).to(device)
+        found = fitness(envs, candidates, weights, seeds, problem.episode_steps)
+        strategy.tell(proposed, _costs(found.cpu().double().numpy()))
+        candidates.put(strategy.mean)
+        return world_count * problem.particle_count * problem.episode_steps
+
+    return progress.run(rules, generation)
 
 
 class Population:
@@ -123,81 +202,6 @@ def _updates(rule: NPARule, weights: Tensor, rows: Tensor) -> Tensor:
     return torch.cat(updates)
 
 
-# Evolution strategies over rules' weights: sep-CMA-ES, all candidates in one batch of worlds.
-#
-# The library `cma` (pycma) proposes candidates and learns from their fitness; it is asked for a
-# diagonal covariance, as rules have thousands of weights (Ros and Hansen, A Simple Modification
-# in CMA-ES Achieving Linear Time and Space Complexity, 2008). A candidate's fitness is the mean
-# return of its worlds, which start from the same seeds for all candidates of a generation, and
-# from new ones in the next: differences between candidates are theirs and not their luck's.
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Options:
-    population: int
-    worlds_per_candidate: int
-    sigma: float
-
-    def __post_init__(self) -> None:
-        check_positive(self, int, "population", at_least=4)
-        check_positive(self, int, "worlds_per_candidate")
-        check_positive(self, float, "sigma")
-
-
-def train(
-    problem: Problem,
-    progress: Progress,
-    seed: int,
-    *,
-    device: torch.device,
-    start: RuleSet | None = None,
-    population: int = 32,
-    worlds_per_candidate: int = 1,
-    sigma: float = 0.1,
-) -> RuleSet:
-    """Evolve rules until the budget is spent, and return the mean of the last generation.
-
-    Args:
-        problem: What is to be learned.
-        progress: The budget, and who looks on.
-        seed: Of the first weights, of candidates and of worlds.
-        device: Where worlds live and candidates are evaluated; candidates are drawn on the host.
-        start: The mean to begin with; None: a new rule.
-        population: Candidates of a generation, at least 4.
-        worlds_per_candidate: Worlds that each is tried in.
-        sigma: Step size to begin with, as a fraction of the size that a layer's weights are drawn
-            with (Xavier, gain 1; dimensionless).
-
-    Returns:
-        The rules, on the device.
-
-    Raises:
-        MissingDependencyError: cma is not installed.
-        NPAError: An option is out of its range.
-    """
-    options = _Options(
-        population=population, worlds_per_candidate=worlds_per_candidate, sigma=sigma
-    )
-    rules = starting_rules(problem, seed, device, start)
-    candidates = Population(rules)
-    envs = problem.make_envs(population * worlds_per_candidate, device=device, copy=False)
-    draws = np.random.default_rng(seed)
-    search = _search(candidates, options, draws)
-    steps = population * worlds_per_candidate * problem.particle_count * problem.episode_steps
-    progress.start(rules)
-    while not progress.over:
-        proposed = search.ask()
-        seeds = draws.integers(FIRST_EVALUATION_SEED, size=worlds_per_candidate).tolist()
-        weights = torch.as_tensor(np.stack(proposed), dtype=torch.float32).to(device)
-        found = fitness(envs, candidates, weights, seeds, problem.episode_steps)
-        search.tell(proposed, _costs(found.cpu().double().numpy()))
-        candidates.put(search.mean)
-        progress.advance(steps)
-        progress.look(rules)
-    progress.look(rules, force=True)
-    return rules
-
-
 def fitness(
     envs: Any, candidates: Population, weights: Tensor, seeds: list[int], episode_steps: int
 ) -> Tensor:
@@ -225,7 +229,7 @@ def fitness(
     return returns.view(len(weights), -1).mean(dim=1)
 
 
-def _search(candidates: Population, options: _Options, draws: np.random.Generator) -> Any:
+def _strategy(candidates: Population, options: EvolutionOptions, draws: np.random.Generator) -> Any:
     """Return the strategy: it proposes by `ask`, learns by `tell`, and its mean is `mean`."""
     try:
         import cma

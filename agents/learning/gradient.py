@@ -1,7 +1,8 @@
-"""Rules whose state steps are held within the action space, as environments hold them."""
+"""Learning by the gradient of the environment's loss, through the environment's own physics."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, Self, cast
@@ -24,91 +25,192 @@ from npa_envs.training.iteration import TrainingCycle
 from npa_envs.world.randomness import WorldRandom
 from npa_envs.world.rollout import Memory
 
+LONGEST = 96
+"""Rollouts are no longer than this unless asked for: longer episodes go on in a pool."""
 
-class _Hold(torch.autograd.Function):
-    """Numbers held within ± a limit; gradients that lead back inside go on as they are."""
-
-    @staticmethod
-    def forward(ctx: Any, values: Tensor, limit: float) -> Tensor:
-        ctx.save_for_backward(values)
-        ctx.limit = limit
-        return values.clamp(-limit, limit)
-
-    @staticmethod
-    def backward(ctx: Any, bar: Tensor) -> tuple[Tensor, None]:
-        (values,) = ctx.saved_tensors
-        # A loss falls against its gradient: beyond the limit only a fall towards it is let through.
-        leads_out = torch.where(values > 0.0, bar < 0.0, bar > 0.0)
-        return bar.masked_fill((values.abs() > ctx.limit) & leads_out, 0.0), None
-
-
-def hold(values: Tensor, limit: float) -> Tensor:
-    """Return values clipped to ± a limit, so that those beyond it can be learned to come back.
-
-    Args:
-        values: Any shape.
-        limit: Above 0.
-    """
-    held: Tensor = _Hold.apply(values, limit)  # type: ignore[no-untyped-call]
-    return held
-
-
-class HeldWeights(FoldedRule):
-    """The weights of a rule, run with its state steps held within a limit."""
-
-    displacement_dim: int
-    limit: float
-
-    def __call__(self, rows: Tensor) -> Tensor:
-        """Map rows [z | 1 | 0], shape [K, row_width], to updates [δ | held Δs | 0], [K, A']."""
-        update = super().__call__(rows)
-        first = self.displacement_dim
-        return torch.cat((update[:, :first], hold(update[:, first:], self.limit)), dim=1)
-
-
-class HeldRule(NPARule):
-    """A rule that shares another one's weights, with state steps within ± `limit`.
-
-    In a rollout it does what the other does in an environment with that `state_scale`.
-
-    Args:
-        rule: The other rule.
-        limit: Largest state step, dimensionless.
-    """
-
-    def __init__(self, rule: NPARule, limit: float) -> None:
-        # The very parameters: what changes one rule changes both.
-        vars(self).update(vars(rule))
-        self.limit = limit
-        self.rule_is_plain = rule.is_plain()
-
-    def forward(self, perception: Tensor) -> Tensor:
-        """Map perception vectors to updates with held state steps; as `NPARule`.
-
-        Args:
-            perception: Perception vectors z, dimensionless, shape [..., P].
-        """
-        update = super().forward(perception)
-        first = self.update_dim - self.state_dim
-        return torch.cat((update[..., :first], hold(update[..., first:], self.limit)), dim=-1)
-
-    def is_plain(self) -> bool:
-        """Return whether `folded` may stand in for the rule: where it may for the other one."""
-        return self.rule_is_plain
-
-    def folded(self) -> FoldedRule:
-        """Return the weights as two plain products with held state steps."""
-        held = HeldWeights(*super().folded())
-        held.displacement_dim = self.update_dim - self.state_dim
-        held.limit = self.limit
-        return held
-
-
-# An environment's own task as the gradient's trainer wants it: seeds, rollouts, a loss.
-
+POOL_SIZE = 64
+"""Worlds in a pool, unless asked for."""
 
 KEY_RANGE = -(2**63), 2**63 - 1
 """Keys of worlds' streams are drawn from here."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GradientOptions:
+    """Options of `train`; they are checked where the trainer's configuration is made of them."""
+
+    steps: tuple[int, int] | None = None
+    """Range [lo, hi) that the number of steps of each rollout is drawn from; None: whole episodes
+    of up to 96 steps, or 32 to 96 steps of longer ones."""
+
+    world_count: int = 8
+    """Worlds in a batch."""
+
+    pool_size: int | None = None
+    """Worlds that live on between rollouts; 0: none, all rollouts begin where episodes do. None: 64
+    where rollouts are shorter than episodes, else 0."""
+
+    fresh_share: float = 0.25
+    """Share of each batch from the pool that begins where episodes do, at least one world
+    (dimensionless)."""
+
+    learning_rate: float = 4e-3
+    """AdamW's, at the beginning."""
+
+    last_rate: float = 0.05
+    """Learning rate at the end, as a share of the first."""
+
+    normalise_gradients: bool = True
+    """Divide each parameter's gradient by its own norm."""
+
+    memory: Memory = "store"
+    """What the backward pass reads: "store", "recompute" or "minimal", as in `rollout`."""
+
+
+DEFAULTS = GradientOptions()
+
+
+def train(
+    problem: Problem,
+    progress: Progress,
+    seed: int,
+    *,
+    device: torch.device,
+    start: RuleSet | None = None,
+    options: GradientOptions = DEFAULTS,
+) -> RuleSet:
+    """Descend the loss at the end of rollouts, differentiated through all of their steps.
+
+    Rollouts begin where episodes do, or go on from where earlier ones ended, in a pool as in the
+    paper (arXiv 2601.16096). State steps are clamped to the action space, as environments clip
+    them; that environments clip observations is not seen.
+
+    Args:
+        problem: What is to be learned.
+        progress: The budget and the learning curve.
+        seed: Of all draws, and of new rules.
+        device: Where worlds and rules are.
+        start: Rules to begin with; copied.
+        options: How.
+
+    Returns:
+        The rules.
+
+    Raises:
+        NPAError: An option is out of its range, or the environment's loss has no gradient.
+        DivergedError: The rules' weights are not finite.
+    """
+    task = episode_task(problem, device)
+    rules = starting_rules(problem, seed, device, start)
+    config = _trainer_config(problem, progress, seed, device, options, task.can_be_recorded)
+    # The cycle asks of the rule what any module has, and of the task what it needs of one.
+    cycle = TrainingCycle(
+        cast(Task, task),
+        cast(NPARule, rules),
+        config,
+        device,
+        torch.Generator().manual_seed(seed),
+        task.rollout,
+    )
+    # On CUDA every number of steps is a recording of its own.
+    for length in range(*config.steps) if device.type == "cuda" else (config.steps[0],):
+        cycle.batch.run(length)
+    numbers = itertools.count()
+
+    def iteration() -> int:
+        steps = cycle.run(next(numbers))
+        return steps * config.world_count * problem.particle_count
+
+    return progress.run(rules, iteration)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Schedule(TrainConfig[Any]):
+    """A trainer's configuration whose learning rate follows the budget."""
+
+    progress: Progress
+    """The run's account."""
+
+    last_rate: float
+    """Learning rate at the end, as a share of the first (dimensionless)."""
+
+    def learning_rate_at(self, iteration: int) -> float:
+        """Return the learning rate now: half a cosine over the budget.
+
+        Args:
+            iteration: Iterations done so far; the budget counts, and not they.
+        """
+        return annealed(self.learning_rate, self.last_rate, self.progress.share)
+
+
+def _trainer_config(
+    problem: Problem,
+    progress: Progress,
+    seed: int,
+    device: torch.device,
+    options: GradientOptions,
+    cuda_graph: bool,
+) -> _Schedule:
+    """Return the trainer's configuration of a run, whose end is the budget's and not its own."""
+    length = problem.episode_steps
+    steps = options.steps
+    if steps is None:
+        steps = (length, length + 1) if length <= LONGEST else (LONGEST // 3, LONGEST + 1)
+    pool_size = options.pool_size
+    if pool_size is None:
+        pool_size = 0 if steps[0] >= length else max(POOL_SIZE, options.world_count)
+    return _Schedule(
+        task=problem.config,
+        progress=progress,
+        iterations=2**40,
+        repeats=1,
+        world_count=options.world_count,
+        pool_size=pool_size or options.world_count,
+        steps=steps,
+        learning_rate=options.learning_rate,
+        last_rate=options.last_rate,
+        milestones=(),
+        normalise_gradients=options.normalise_gradients,
+        seed_interval=1,
+        fresh_share=options.fresh_share if pool_size else 1.0,
+        damage=False,
+        seed=seed,
+        device=str(device),
+        memory=options.memory,
+        cuda_graph=cuda_graph,
+    )
+
+
+def episode_task(problem: Problem, device: torch.device) -> EpisodeTask:
+    """Return a problem's task for the gradient's trainer.
+
+    Args:
+        problem: The environment.
+        device: Where the worlds live.
+
+    Raises:
+        NPAError: The problem is a game or its species die, so that no gradient descends its loss.
+    """
+    made = EpisodeTask(problem, device)
+    generator = torch.Generator(device).manual_seed(0)
+    has_goals = not problem.is_species and made._start(1, generator, device)[3] is not None
+    return GoalEpisodeTask(problem, device) if has_goals else made
+
+
+def _check_rules_of_play(problem: Problem, task: EnvTask[Any] | SpeciesTask) -> None:
+    """Check that all rules want the same, and that nobody leaves a world."""
+    if not isinstance(task, SpeciesTask):
+        return
+    if type(task).settle is not SpeciesTask.settle:
+        raise NPAError(
+            f"method='gradient' must have one loss to descend, but in {problem.env_id} species are "
+            "paid at each other's expense: learn by 'ppo' with what each particle is paid"
+        )
+    if problem.keywords.get("deaths"):
+        raise NPAError(
+            f"method='gradient' must keep all particles, got deaths={problem.keywords['deaths']!r}:"
+            " leave deaths out, or learn by 'ppo' or 'evolution'"
+        )
 
 
 class EpisodeTask:
@@ -204,7 +306,7 @@ class EpisodeTask:
         """Run a set of rules as the environment would, differentiably; as `npa_envs.rollout`."""
         assert isinstance(rules, RuleSet), "the learner trains sets of rules"
         physics, config = self.physics, self.problem.config
-        held = [HeldRule(rule, physics.state_scale) for rule in rules]
+        clamped = [ClampedRule(rule, physics.state_scale) for rule in rules]
         common: dict[str, Any] = {
             "eps": eps,
             "box": box,
@@ -216,9 +318,9 @@ class EpisodeTask:
             "return_path_length": return_path_length,
         }
         if not isinstance(config, SpeciesConfig):
-            return npa_envs.rollout(held[0], x, s, steps, **common)
+            return npa_envs.rollout(clamped[0], x, s, steps, **common)
         common |= {"counts": config.counts, "perception": config.perception}
-        return npa_envs.rollout_species(held, x, s, steps, **common)
+        return npa_envs.rollout_species(clamped, x, s, steps, **common)
 
     def _start(
         self, world_count: int, generator: torch.Generator, device: torch.device
@@ -273,155 +375,82 @@ class GoalEpisodeTask(EpisodeTask):
         return aimed
 
 
-def episode_task(problem: Problem, device: torch.device) -> EpisodeTask:
-    """Return a problem's task for the gradient's trainer.
+class _ClampInward(torch.autograd.Function):
+    """Numbers clamped to ± a limit; gradients that lead back inside go on as they are."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, limit: float) -> Tensor:
+        ctx.save_for_backward(values)
+        ctx.limit = limit
+        return values.clamp(-limit, limit)
+
+    @staticmethod
+    def backward(ctx: Any, bar: Tensor) -> tuple[Tensor, None]:
+        (values,) = ctx.saved_tensors
+        # A loss falls against its gradient: beyond the limit only a fall towards it is let through.
+        leads_out = torch.where(values > 0.0, bar < 0.0, bar > 0.0)
+        return bar.masked_fill((values.abs() > ctx.limit) & leads_out, 0.0), None
+
+
+def clamp_inward(values: Tensor, limit: float) -> Tensor:
+    """Return values clipped to ± a limit, so that those beyond it can be learned to come back.
 
     Args:
-        problem: The environment.
-        device: Where the worlds live.
-
-    Raises:
-        NPAError: The problem is a game or its species die, so that no gradient descends its loss.
+        values: Any shape.
+        limit: Above 0.
     """
-    made = EpisodeTask(problem, device)
-    generator = torch.Generator(device).manual_seed(0)
-    has_goals = not problem.is_species and made._start(1, generator, device)[3] is not None
-    return GoalEpisodeTask(problem, device) if has_goals else made
+    clamped: Tensor = _ClampInward.apply(values, limit)  # type: ignore[no-untyped-call]
+    return clamped
 
 
-def _check_rules_of_play(problem: Problem, task: EnvTask[Any] | SpeciesTask) -> None:
-    """Check that all rules want the same, and that nobody leaves a world."""
-    if not isinstance(task, SpeciesTask):
-        return
-    if type(task).settle is not SpeciesTask.settle:
-        raise NPAError(
-            f"method='gradient' must have one loss to descend, but in {problem.env_id} species are "
-            "paid at each other's expense: learn by 'ppo' with what each particle is paid"
-        )
-    if problem.keywords.get("deaths"):
-        raise NPAError(
-            f"method='gradient' must keep all particles, got deaths={problem.keywords['deaths']!r}:"
-            " leave deaths out, or learn by 'ppo' or 'evolution'"
-        )
+class ClampedWeights(FoldedRule):
+    """The weights of a rule, run with its state steps clamped to a limit."""
+
+    displacement_dim: int
+    limit: float
+
+    def __call__(self, rows: Tensor) -> Tensor:
+        """Map rows [z | 1 | 0], shape [K, row_width], to updates [δ | clamped Δs | 0], [K, A']."""
+        update = super().__call__(rows)
+        first = self.displacement_dim
+        return torch.cat((update[:, :first], clamp_inward(update[:, first:], self.limit)), dim=1)
 
 
-# Learning by the gradient of the environment's loss, through the environment's own physics.
+class ClampedRule(NPARule):
+    """A rule that shares another one's weights, with state steps within ± `limit`.
 
+    In a rollout it does what the other does in an environment with that `state_scale`.
 
-LONGEST = 96
-"""Rollouts are no longer than this unless asked for: longer episodes go on in a pool."""
+    Args:
+        rule: The other rule.
+        limit: Largest state step, dimensionless.
+    """
 
-POOL_SIZE = 64
-"""Worlds in a pool, unless asked for."""
+    def __init__(self, rule: NPARule, limit: float) -> None:
+        # The very parameters: what changes one rule changes both.
+        vars(self).update(vars(rule))
+        self.limit = limit
+        self.rule_is_plain = rule.is_plain()
 
-
-@dataclass(frozen=True, kw_only=True)
-class _Schedule(TrainConfig[Any]):
-    """A trainer's configuration whose learning rate follows the budget."""
-
-    progress: Progress
-    """The run's account."""
-
-    last_rate: float
-    """Learning rate at the end, as a share of the first (dimensionless)."""
-
-    def learning_rate_at(self, iteration: int) -> float:
-        """Return the learning rate now: half a cosine over the budget.
+    def forward(self, perception: Tensor) -> Tensor:
+        """Map perception vectors to updates with clamped state steps; as `NPARule`.
 
         Args:
-            iteration: Iterations done so far; the budget counts, and not they.
+            perception: Perception vectors z, dimensionless, shape [..., P].
         """
-        return annealed(self.learning_rate, self.last_rate, self.progress.share)
+        update = super().forward(perception)
+        first = self.update_dim - self.state_dim
+        return torch.cat(
+            (update[..., :first], clamp_inward(update[..., first:], self.limit)), dim=-1
+        )
 
+    def is_plain(self) -> bool:
+        """Return whether `folded` may stand in for the rule: where it may for the other one."""
+        return self.rule_is_plain
 
-def train(
-    problem: Problem,
-    progress: Progress,
-    seed: int,
-    *,
-    device: torch.device,
-    start: RuleSet | None = None,
-    steps: tuple[int, int] | None = None,
-    world_count: int = 8,
-    pool_size: int | None = None,
-    fresh_share: float = 0.25,
-    learning_rate: float = 4e-3,
-    last_rate: float = 0.05,
-    normalise_gradients: bool = True,
-    memory: Memory = "store",
-) -> RuleSet:
-    """Descend the loss at the end of rollouts, differentiated through all of their steps.
-
-    Rollouts begin where episodes do, or go on from where earlier ones ended, in a pool as in the
-    paper (arXiv 2601.16096). State steps are held within the action space, as environments hold
-    them; that environments clip observations is not seen.
-
-    Args:
-        problem: What is to be learned.
-        progress: The budget and the learning curve.
-        seed: Of all draws, and of new rules.
-        device: Where worlds and rules are.
-        start: Rules to begin with; copied.
-        steps: Range [lo, hi) that the number of steps of each rollout is drawn from; None: whole
-            episodes of up to 96 steps, or 32 to 96 steps of longer ones.
-        world_count: Worlds in a batch.
-        pool_size: Worlds that live on between rollouts; 0: none, all rollouts begin where episodes
-            do. None: 64 where rollouts are shorter than episodes, else 0.
-        fresh_share: Share of each batch from the pool that begins where episodes do, at least one
-            world (dimensionless).
-        learning_rate: AdamW's, at the beginning.
-        last_rate: Learning rate at the end, as a share of the first.
-        normalise_gradients: Divide each parameter's gradient by its own norm.
-        memory: What the backward pass reads: "store", "recompute" or "minimal", as in `rollout`.
-
-    Returns:
-        The rules.
-
-    Raises:
-        NPAError: An option is out of its range, or the environment's loss has no gradient.
-        DivergedError: The rules' weights are not finite.
-    """
-    task = episode_task(problem, device)
-    rules = starting_rules(problem, seed, device, start)
-    length = problem.episode_steps
-    if steps is None:
-        steps = (length, length + 1) if length <= LONGEST else (LONGEST // 3, LONGEST + 1)
-    if pool_size is None:
-        pool_size = 0 if steps[0] >= length else max(POOL_SIZE, world_count)
-    config = _Schedule(
-        task=problem.config,
-        progress=progress,
-        iterations=2**40,
-        repeats=1,
-        world_count=world_count,
-        pool_size=pool_size or world_count,
-        steps=steps,
-        learning_rate=learning_rate,
-        last_rate=last_rate,
-        milestones=(),
-        normalise_gradients=normalise_gradients,
-        seed_interval=1,
-        fresh_share=fresh_share if pool_size else 1.0,
-        damage=False,
-        seed=seed,
-        device=str(device),
-        memory=memory,
-        cuda_graph=task.can_be_recorded,
-    )
-    schedule = torch.Generator().manual_seed(seed)
-    # The cycle asks of the rule what any module has, and of the task what it needs of one.
-    cycle = TrainingCycle(
-        cast(Task, task), cast(NPARule, rules), config, device, schedule, task.rollout
-    )
-    # On CUDA every number of steps is a recording of its own.
-    for length in range(*steps) if device.type == "cuda" else (steps[0],):
-        cycle.batch.run(length)
-    progress.start(rules)
-    iteration = 0
-    while not progress.over:
-        ran = cycle.run(iteration)
-        iteration += 1
-        progress.advance(ran * world_count * problem.particle_count)
-        progress.look(rules)
-    progress.look(rules, force=True)
-    return rules
+    def folded(self) -> FoldedRule:
+        """Return the weights as two plain products with clamped state steps."""
+        clamped = ClampedWeights(*super().folded())
+        clamped.displacement_dim = self.update_dim - self.state_dim
+        clamped.limit = self.limit
+        return clamped

@@ -1,28 +1,454 @@
-"""What PPO maximises: how much better actions were than foreseen, and are now likelier."""
+"""Proximal policy optimisation that stays on the device, from the first world to the last gradient.
+
+Source: Schulman et al., arXiv 1707.06347, in the manner of CleanRL: one file, read from the top.
+A round is `steps` steps of all worlds, then `epochs` passes over them in minibatches of particles.
+The host reads one byte a world in each step (has its episode ended?), and one number a pass. On
+CUDA what is drawn, judged and learned is recorded once as CUDA graphs: a round is thousands of
+short kernels, which a host takes longer to launch than a GPU to run.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from npa_envs.agents.learning.actor_critic import Critic, GaussianRules
-from npa_envs.agents.learning.ppo_settings import (
-    Settings,
-    beginning,
-    filled,
-    noise_left,
-    takes_fields_of,
+from npa_envs.agents.learning.ppo_common import (
+    CommonOptions,
+    Critic,
+    GaussianRules,
+    check_word,
+    first_rules,
 )
 from npa_envs.agents.learning.problem import WORLDS_PER_SEED, Problem, world_seeds
 from npa_envs.agents.learning.progress import Budget, Progress
 from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.envs.core.worlds import free_bytes, needed_bytes
+from npa_envs.errors import NPAError
+from npa_envs.tasks.checks import check_non_negative, check_positive
 from npa_envs.world.cuda_graph import Replayed
 from npa_envs.wrappers.adapters import own_rewards
+
+MANY_PARTICLES = 2**17
+"""Particles of all worlds together on a GPU: a round of fewer takes hardly less time."""
+
+FEWEST_ROUNDS = 128
+"""Rounds that a budget of particle-steps is to be enough for."""
+
+ROOM = 0.25
+"""Share of the free memory that is taken; other runs may share the device."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PPOOptions(CommonOptions):
+    """Options of `train`."""
+
+    worlds: int | None = None
+    """Worlds B to act in; None: the problem's `num_envs`, and on CUDA, where that is more, as many
+    as have 131 072 particles together, if memory has room for them and particle-steps are enough
+    for 128 rounds."""
+
+    critic_learning_rate: float = 1e-3
+    """The critic's step at the start, as `learning_rate` is the rules'."""
+
+    clip: float | None = None
+    """Ratios of likelihoods count up to 1 plus or minus this (dimensionless). None: 0.2, or 0.02
+    for a world's, whose logarithms are means over many particles."""
+
+    ratio: Literal["particle", "world"] = "particle"
+    """Each particle has a ratio of its own, or a world has one, of mean log-probabilities."""
+
+    credit: Literal["world", "particle"] = "world"
+    """Each particle is paid what its world is, or its own share."""
+
+    critic_width: int = 64
+    """Units in a hidden layer of the critic."""
+
+    def __post_init__(self) -> None:
+        """Check every field.
+
+        Raises:
+            NPAError: One lies outside its range.
+        """
+        super().__post_init__()
+        check_positive(self, int, "critic_width")
+        check_non_negative(self, "critic_learning_rate")
+        if self.clip is not None:
+            check_positive(self, float, "clip")
+        if self.worlds is not None:
+            check_positive(self, int, "worlds")
+        for name in ("ratio", "credit"):
+            check_word(name, getattr(self, name), ("particle", "world"))
+        if self.ratio == "world" and self.credit == "particle":
+            raise NPAError(
+                "credit='particle' needs ratio='particle': one ratio a world has one advantage"
+            )
+
+    @property
+    def largest_change(self) -> float:
+        """How far ratios count from 1."""
+        if self.clip is not None:
+            return self.clip
+        return 0.2 if self.ratio == "particle" else 0.02
+
+
+DEFAULTS = PPOOptions()
+
+
+def train(
+    problem: Problem,
+    progress: Progress,
+    seed: int,
+    *,
+    device: torch.device,
+    start: RuleSet | None = None,
+    options: PPOOptions = DEFAULTS,
+) -> RuleSet:
+    """Return the rules that proximal policy optimisation finds within a budget.
+
+    Args:
+        problem: What is to be learned.
+        progress: Keeps the budget, and looks at the rules now and then.
+        seed: Of all that is drawn.
+        device: Where everything lives.
+        start: Rules to begin with; None: fresh ones.
+        options: How.
+
+    Raises:
+        DivergedError: The policy has diverged.
+    """
+    options = replace(options, worlds=world_count(problem, options, device, progress.budget))
+    learner = Learner(problem, options, seed, device, start)
+
+    def round_of_ppo() -> int:
+        share_left = 1.0 - progress.share
+        learner.play()
+        learner.improve(share_left)
+        return learner.round_size
+
+    return progress.run(learner.actor.rules, round_of_ppo)
+
+
+class Learner:
+    """Rules, critic, worlds and what was seen of them.
+
+    Args:
+        problem: What is to be learned.
+        options: How.
+        seed: Of worlds, noise, shuffles and first weights.
+        device: Where everything lives.
+        start: Rules to begin with; None: fresh ones.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        options: PPOOptions,
+        seed: int,
+        device: torch.device,
+        start: RuleSet | None,
+    ) -> None:
+        self.options = options = options.filled(start)
+        self.envs = problem.make_envs(
+            options.worlds, device=device, row_rewards=options.credit == "particle", copy=False
+        )
+        self.generator = torch.Generator(device).manual_seed(seed)
+        rules = first_rules(problem, seed, start)
+        assert options.initial_std is not None, "filled in above"
+        self.actor = GaussianRules(rules, options.initial_std).to(device)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            critic = Critic(
+                problem.interface.perception_dim,
+                problem.counts,
+                options.critic,
+                options.critic_width,
+            )
+        self.critic = critic.to(device)
+        # Recorded steps read their length where it can be changed.
+        self.optimizer, self.critic_optimizer = (
+            torch.optim.Adam(
+                net.parameters(),
+                lr=torch.zeros((), device=device),
+                eps=1e-5,
+                fused=True,
+                capturable=device.type == "cuda",
+            )
+            for net in (self.actor, self.critic)
+        )
+        observation, _ = self.envs.reset(seed=world_seeds(seed, self.envs.num_envs))
+        self.memory = Memory(
+            options.steps,
+            observation,
+            problem.interface.action_dim,
+            own_advantages=options.ratio == "particle",
+        )
+        self.critic.observe(observation)
+        self.rounds = 0
+        """Rounds done."""
+        # What recorded work reads and writes besides.
+        self._now = observation.clone()
+        self._action, self._log_prob = (
+            part[0].clone() for part in (self.memory.actions, self.memory.log_probs)
+        )
+        self._near, self._rate, self._all_act = torch.ones(3, device=device)
+        played = options.steps * self.envs.num_envs
+        sizes = [played] if options.ratio == "world" else [played * n for n in problem.counts]
+        # Of what is shuffled for the rules, and of worlds for the critic.
+        self._orders = [
+            torch.zeros(size, dtype=torch.int64, device=device) for size in (*sizes, played)
+        ]
+        self._act = Replayed(self._draw_actions, device, self.generator)
+        self._value = Replayed(self._find_values, device)
+        self._judge = Replayed(self._find_advantages, device)
+        self._learn_values = Replayed(self._improve_critic, device)
+        self._learn = Replayed(self._improve_both, device)
+
+    @property
+    def round_size(self) -> int:
+        """Particle steps of a round, T B N."""
+        return self.memory.rewards.numel()
+
+    @torch.no_grad()
+    def play(self) -> Round:
+        """Act for T steps in all worlds, and judge what was done.
+
+        Returns:
+            The round, where the next one will be.
+        """
+        memory = self.memory
+        memory.seen[0].copy_(memory.seen[-1])
+        last_seen = {}
+        for step in range(self.options.steps):
+            self._now.copy_(memory.seen[step])
+            self._act()
+            memory.actions[step].copy_(self._action)
+            memory.log_probs[step].copy_(self._log_prob)
+            observation, reward, terminated, truncated, infos = self.envs.step(self._action)
+            memory.seen[step + 1].copy_(observation)
+            if "final_obs" in infos:
+                last_seen[step] = infos["final_obs"]
+            shared = self.options.credit == "world"
+            memory.rewards[step].copy_(reward[:, None] if shared else own_rewards(infos))
+            memory.acted[step].copy_(infos.get("acted", self._all_act))
+            # A species may end before its world does.
+            gone = infos.get("particle_terminated", terminated[:, None])
+            memory.terminated[step].copy_(terminated[:, None] | gone)
+            memory.ended[step].copy_((terminated | truncated)[:, None] | gone)
+        self._value()
+        for step, observation in last_seen.items():
+            memory.following[step].copy_(self.critic(observation))
+        self._judge()
+        return memory.round
+
+    @torch.no_grad()
+    def _draw_actions(self) -> None:
+        """Draw what particles do about what they perceive now."""
+        action, log_prob = self.actor.sample(self._now, self.generator)
+        self._action.copy_(action)
+        self._log_prob.copy_(log_prob)
+
+    @torch.no_grad()
+    def _find_values(self) -> None:
+        """Ask the critic about all that was seen, part by part to save memory."""
+        memory, seen = self.memory, self.memory.seen.flatten(0, 1)
+        size = -(-len(seen) // self.options.minibatches)
+        values = torch.cat([self.critic(part) for part in torch.split(seen, size)])
+        memory.values.copy_(values.view_as(memory.values))
+        memory.following.copy_(memory.values[1:])
+
+    @torch.no_grad()
+    def _find_advantages(self) -> None:
+        """Judge what was done by what was paid, and by what the critic had foreseen."""
+        memory, values = self.memory, self.memory.values[:-1]
+        advantages = generalised_advantages(
+            memory.rewards,
+            values,
+            memory.following,
+            memory.terminated,
+            memory.ended,
+            gamma=self.options.gamma,
+            gae_lambda=self.options.gae_lambda,
+        )
+        memory.targets.copy_(advantages + values)
+        if self.options.ratio == "world":
+            advantages = over_particles(advantages, memory.acted)
+        memory.advantages.copy_(standardised(advantages, memory.acted))
+
+    def improve(self, share_left: float) -> None:
+        """Let rules and critic learn from the last round.
+
+        Args:
+            share_left: Share of the budget that is left; learning rates are this part of what they
+                were at the start, and by it the noise of the next round is made less.
+        """
+        options = self.options
+        rules_learn = self.rounds >= options.critic_rounds
+        self.rounds += 1
+        self.critic.observe(self.memory.seen[:-1])
+        self.critic.rescale(self.memory.targets)
+        rate = self.critic_optimizer.param_groups[0]["lr"]
+        rate.fill_(options.critic_learning_rate * share_left)
+        self._rate.fill_(options.learning_rate * share_left)
+        self._near.fill_(1.0)
+        for _ in range(options.epochs):
+            for order in self._orders:
+                torch.randperm(len(order), generator=self.generator, out=order)
+            if not rules_learn:
+                self._learn_values()
+                continue
+            self._learn()
+            # All that the host waits for.
+            if not bool(self._near):
+                break
+        self.actor.leave_noise(options.noise_left(share_left))
+
+    def _improve_critic(self) -> None:
+        """Let the critic learn once from all of a round, in the order that was drawn."""
+        for worlds in self._shuffled([self.memory.round], self._orders[-1:]):
+            self._descend(self.critic_optimizer, self._critic_loss(*worlds))
+
+    def _improve_both(self) -> None:
+        """Let critic and rules learn once from all of a round, in the orders that were drawn."""
+        whole = self.memory.round
+        *orders, order = self._orders
+        parts = self._shuffled(self._groups(whole), orders)
+        for part, worlds in zip(parts, self._shuffled([whole], [order]), strict=True):
+            self._descend(self.critic_optimizer, self._critic_loss(*worlds))
+            gain, kl = self._surrogate(part)
+            # Rules that have gone too far stay, without a question to the host.
+            self._near *= kl.detach() <= self.options.target_kl
+            self.optimizer.param_groups[0]["lr"].copy_(self._near * self._rate)
+            self._descend(self.optimizer, -gain)
+
+    def _groups(self, batch: Round) -> list[Round]:
+        """Return what is shuffled when rules learn: whole worlds, or each species' particles."""
+        if self.options.ratio == "world":
+            return [batch]
+        spans = self.actor.rules.spans
+        return [Round(*(value[:, span].flatten(0, 1) for value in batch)) for span in spans]
+
+    def _shuffled(self, groups: list[Round], orders: list[Tensor]) -> Iterator[list[Round]]:
+        """Return minibatches: parts of each group, in an order of its own."""
+        count = min(self.options.minibatches, len(self._orders[-1]))
+        parts = [order.tensor_split(count) for order in orders]
+        for chosen in zip(*parts, strict=True):
+            yield [
+                Round(*(value[rows] for value in group))
+                for group, rows in zip(groups, chosen, strict=True)
+            ]
+
+    def _surrogate(self, part: list[Round]) -> tuple[Tensor, Tensor]:
+        """Return the clipped gain of the rules, and how far their actions have moved [nats]."""
+        options, actor = self.options, self.actor
+        if options.ratio == "world":
+            (worlds,) = part
+            changes = [actor.log_prob(worlds.observations, worlds.actions) - worlds.log_probs]
+        else:
+            changes = [
+                actor.row_log_prob(species, rows.observations, rows.actions) - rows.log_probs
+                for species, rows in enumerate(part)
+            ]
+        log_ratio, advantages, acted = (
+            torch.cat(values)
+            for values in (changes, [p.advantages for p in part], [p.acted for p in part])
+        )
+        kl = (acted * (torch.expm1(log_ratio) - log_ratio)).sum() / acted.sum().clamp(min=1.0)
+        if options.ratio == "world":
+            log_ratio = over_particles(log_ratio, acted)
+            acted = acted.amax(dim=1, keepdim=True)
+        gain = clipped_gain(log_ratio, advantages, acted, clip=options.largest_change)
+        if options.entropy_weight:
+            gain = gain + options.entropy_weight * actor.entropy()
+        return gain, kl
+
+    def _critic_loss(self, worlds: Round) -> Tensor:
+        error: Tensor = (self.critic(worlds.observations) - worlds.targets) / self.critic.scale
+        return 0.5 * (worlds.acted * error.square()).sum() / worlds.acted.sum().clamp(min=1.0)
+
+    def _descend(self, optimizer: torch.optim.Optimizer, loss: Tensor) -> None:
+        # A read-out does not act, and layers may be frozen.
+        parameters = [p for p in optimizer.param_groups[0]["params"] if p.requires_grad]
+        # Not backward(): its accumulation nodes remember the stream they were first used on, which
+        # a capture on another stream must not touch.
+        gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
+        for parameter, gradient in zip(parameters, gradients, strict=True):
+            if gradient is not None:
+                # Laid out like the parameter, as the fused optimizer takes for granted.
+                parameter.grad = torch.empty_like(parameter).copy_(gradient)
+        nn.utils.clip_grad_norm_(parameters, self.options.max_gradient_norm)
+        optimizer.step()
+
+
+class Round(NamedTuple):
+    """What T steps of B worlds of N particles gave, flat: M = T B worlds, one after the other."""
+
+    observations: Tensor
+    """What particles perceived, shape [M, N, P]."""
+    actions: Tensor
+    """What they did, not clipped, shape [M, N, A]."""
+    log_probs: Tensor
+    """Its log-probability then, shape [M, N]."""
+    advantages: Tensor
+    """How much better it was than foreseen, and than other worlds fared in the same step,
+    standardised, shape [M, N], or [M, 1] where a world has one."""
+    targets: Tensor
+    """What the critic should have said, shape [M, N]."""
+    acted: Tensor
+    """1 where a particle's species was alive, else 0, shape [M, N]."""
+
+
+class Memory:
+    """Where rounds are written, each over the one before, as what is recorded stays at its place.
+
+    Args:
+        steps: Steps T of a round.
+        observation: What is perceived at first, shape [B, N, P].
+        action_dim: Columns A of an action.
+        own_advantages: Each particle has an advantage of its own; else a world has one.
+    """
+
+    def __init__(
+        self, steps: int, observation: Tensor, action_dim: int, *, own_advantages: bool
+    ) -> None:
+        worlds, particles = observation.shape[:2]
+
+        def zeros(*shape: int, dtype: torch.dtype = observation.dtype) -> Tensor:
+            return observation.new_zeros(*shape, dtype=dtype)
+
+        single = (steps, worlds, particles)
+        self.seen = zeros(steps + 1, *observation.shape)
+        """What is perceived before each step, and after the last one, shape [T + 1, B, N, P]."""
+        self.seen[-1].copy_(observation)
+        self.actions = zeros(*single, action_dim)
+        """What is done, not clipped, shape [T, B, N, A]."""
+        self.log_probs = zeros(*single)
+        """Log-probabilities of that, shape [T, B, N]."""
+        self.acted = zeros(*single)
+        """1 where a particle's species is alive, else 0, likewise."""
+        self.rewards = zeros(*single)
+        """What each particle is paid, likewise."""
+        self.terminated = zeros(*single, dtype=torch.bool)
+        """Whether a particle's episode has ended by itself in a step, likewise."""
+        self.ended = zeros(*single, dtype=torch.bool)
+        """Whether it has ended or was cut off, likewise."""
+        self.values = zeros(steps + 1, worlds, particles)
+        """What the critic says of what is seen, shape [T + 1, B, N]."""
+        self.following = zeros(*single)
+        """What it says of the states after each step, before any restart, shape [T, B, N]."""
+        self.advantages = zeros(steps, worlds, particles if own_advantages else 1)
+        """As those of a `Round`, shape [T, B, N] or [T, B, 1]."""
+        self.targets = zeros(*single)
+        """What the critic should have said, shape [T, B, N]."""
+
+    @property
+    def round(self) -> Round:
+        """What is learned from, as views."""
+        kept = (self.actions, self.log_probs, self.advantages, self.targets, self.acted)
+        return Round(*(part.flatten(0, 1) for part in (self.seen[:-1], *kept)))
 
 
 def generalised_advantages(
@@ -105,20 +531,7 @@ def clipped_gain(log_ratio: Tensor, advantages: Tensor, weights: Tensor, *, clip
     return (weights * gain).sum() / weights.sum().clamp(min=1.0)
 
 
-# In how many worlds the device's own PPO acts: as many as keep a GPU busy, where there is room.
-
-
-MANY_PARTICLES = 2**17
-"""Particles of all worlds together on a GPU: a round of fewer takes hardly less time."""
-
-FEWEST_ROUNDS = 128
-"""Rounds that a budget of particle-steps is to be enough for."""
-
-ROOM = 0.25
-"""Share of the free memory that is taken; other runs may share the device."""
-
-
-def world_count(problem: Problem, settings: Settings, device: torch.device, budget: Budget) -> int:
+def world_count(problem: Problem, options: PPOOptions, device: torch.device, budget: Budget) -> int:
     """Return the worlds B to act in.
 
     They are what the options say; where those say nothing, the problem's on the CPU, and on a GPU
@@ -127,407 +540,36 @@ def world_count(problem: Problem, settings: Settings, device: torch.device, budg
 
     Args:
         problem: What is to be learned.
-        settings: Options.
+        options: How.
         device: Where the worlds live.
         budget: What may be spent.
     """
-    if settings.worlds is not None:
-        return settings.worlds
+    if options.worlds is not None:
+        return options.worlds
     if device.type != "cuda":
         return problem.num_envs
     counts = [MANY_PARTICLES // problem.particle_count, WORLDS_PER_SEED]
     free = free_bytes(device)
     if free is not None:
-        counts.append(int(ROOM * free) // world_bytes(problem, settings, device))
+        counts.append(int(ROOM * free) // world_bytes(problem, options, device))
     if budget.particle_steps is not None:
-        round_size = settings.steps * problem.particle_count
+        round_size = options.steps * problem.particle_count
         counts.append(budget.particle_steps // (FEWEST_ROUNDS * round_size))
     return max(problem.num_envs, min(counts))
 
 
-def world_bytes(problem: Problem, settings: Settings, device: torch.device) -> int:
+def world_bytes(problem: Problem, options: PPOOptions, device: torch.device) -> int:
     """Return about how much memory a world takes: itself, its rounds and what is learned [bytes].
 
     Args:
         problem: What is to be learned.
-        settings: Options.
+        options: How.
         device: Where it lives.
     """
     interface, count = problem.interface, problem.particle_count
     columns = interface.perception_dim + interface.action_dim
     # Of each step what was seen, done and paid; of a minibatch's besides what gradients need.
-    kept = (settings.steps + 1) * (columns + interface.action_dim + 16)
-    hidden = 4 * problem.hidden_dim + 8 * settings.critic_width
-    learned = -(-settings.steps // settings.minibatches) * (2 * columns + hidden)
+    kept = (options.steps + 1) * (columns + interface.action_dim + 16)
+    hidden = 4 * problem.hidden_dim + 8 * options.critic_width
+    learned = -(-options.steps // options.minibatches) * (2 * columns + hidden)
     return needed_bytes(1, count, problem.physics, device) + 4 * count * (kept + learned)
-
-
-# Proximal policy optimisation that stays on the device, from the first world to the last
-# gradient.
-#
-# Source: Schulman et al., arXiv 1707.06347, in the manner of CleanRL: one file, read from the
-# top. A round is `steps` steps of all worlds, then `epochs` passes over them in minibatches of
-# particles. The host reads one byte a world in each step (has its episode ended?), and one number
-# a pass. On CUDA what is drawn, judged and learned is recorded once and replayed: a round is
-# thousands of short kernels, which a host takes longer to launch than a GPU to run.
-
-
-class Round(NamedTuple):
-    """What T steps of B worlds of N particles gave, flat: M = T B worlds, one after the other."""
-
-    observations: Tensor
-    """What particles perceived, shape [M, N, P]."""
-    actions: Tensor
-    """What they did, not clipped, shape [M, N, A]."""
-    log_probs: Tensor
-    """Its log-probability then, shape [M, N]."""
-    advantages: Tensor
-    """How much better it was than foreseen, and than other worlds fared in the same step,
-    standardised, shape [M, N], or [M, 1] where a world has one."""
-    targets: Tensor
-    """What the critic should have said, shape [M, N]."""
-    acted: Tensor
-    """1 where a particle's species was alive, else 0, shape [M, N]."""
-
-
-class Memory:
-    """Where rounds are written, each over the one before, as what is recorded stays at its place.
-
-    Args:
-        steps: Steps T of a round.
-        observation: What is perceived at first, shape [B, N, P].
-        action_dim: Columns A of an action.
-        own_advantages: Each particle has an advantage of its own; else a world has one.
-    """
-
-    def __init__(
-        self, steps: int, observation: Tensor, action_dim: int, *, own_advantages: bool
-    ) -> None:
-        worlds, particles = observation.shape[:2]
-
-        def zeros(*shape: int, dtype: torch.dtype = observation.dtype) -> Tensor:
-            return observation.new_zeros(*shape, dtype=dtype)
-
-        single = (steps, worlds, particles)
-        self.seen = zeros(steps + 1, *observation.shape)
-        """What is perceived before each step, and after the last one, shape [T + 1, B, N, P]."""
-        self.seen[-1].copy_(observation)
-        self.actions = zeros(*single, action_dim)
-        """What is done, not clipped, shape [T, B, N, A]."""
-        self.log_probs = zeros(*single)
-        """Log-probabilities of that, shape [T, B, N]."""
-        self.acted = zeros(*single)
-        """1 where a particle's species is alive, else 0, likewise."""
-        self.rewards = zeros(*single)
-        """What each particle is paid, likewise."""
-        self.terminated = zeros(*single, dtype=torch.bool)
-        """Whether a particle's episode has ended by itself in a step, likewise."""
-        self.ended = zeros(*single, dtype=torch.bool)
-        """Whether it has ended or was cut off, likewise."""
-        self.values = zeros(steps + 1, worlds, particles)
-        """What the critic says of what is seen, shape [T + 1, B, N]."""
-        self.following = zeros(*single)
-        """What it says of the states after each step, before any restart, shape [T, B, N]."""
-        self.advantages = zeros(steps, worlds, particles if own_advantages else 1)
-        """As those of a `Round`, shape [T, B, N] or [T, B, 1]."""
-        self.targets = zeros(*single)
-        """What the critic should have said, shape [T, B, N]."""
-
-    @property
-    def round(self) -> Round:
-        """What is learned from, as views."""
-        kept = (self.actions, self.log_probs, self.advantages, self.targets, self.acted)
-        return Round(*(part.flatten(0, 1) for part in (self.seen[:-1], *kept)))
-
-
-class Learner:
-    """Rules, critic, worlds and what was seen of them.
-
-    Args:
-        problem: What is to be learned.
-        settings: How.
-        seed: Of worlds, noise, shuffles and first weights.
-        device: Where everything lives.
-        start: Rules to begin with; None: fresh ones.
-    """
-
-    def __init__(
-        self,
-        problem: Problem,
-        settings: Settings,
-        seed: int,
-        device: torch.device,
-        start: RuleSet | None,
-    ) -> None:
-        self.settings = settings = filled(settings, start)
-        self.envs = problem.make_envs(
-            settings.worlds, device=device, row_rewards=settings.credit == "particle", copy=False
-        )
-        self.generator = torch.Generator(device).manual_seed(seed)
-        rules = beginning(problem, seed, start)
-        assert settings.initial_std is not None, "filled in above"
-        self.actor = GaussianRules(rules, settings.initial_std).to(device)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
-            critic = Critic(
-                problem.interface.perception_dim,
-                problem.counts,
-                settings.critic,
-                settings.critic_width,
-            )
-        self.critic = critic.to(device)
-        # Recorded steps read their length where it can be changed.
-        self.optimizer, self.critic_optimizer = (
-            torch.optim.Adam(
-                net.parameters(),
-                lr=torch.zeros((), device=device),
-                eps=1e-5,
-                fused=True,
-                capturable=device.type == "cuda",
-            )
-            for net in (self.actor, self.critic)
-        )
-        observation, _ = self.envs.reset(seed=world_seeds(seed, self.envs.num_envs))
-        self.memory = Memory(
-            settings.steps,
-            observation,
-            problem.interface.action_dim,
-            own_advantages=settings.ratio == "particle",
-        )
-        self.critic.observe(observation)
-        self.rounds = 0
-        """Rounds done."""
-        # What recorded work reads and writes besides.
-        self._now = observation.clone()
-        self._action, self._log_prob = (
-            part[0].clone() for part in (self.memory.actions, self.memory.log_probs)
-        )
-        self._near, self._rate, self._all_act = torch.ones(3, device=device)
-        played = settings.steps * self.envs.num_envs
-        sizes = [played] if settings.ratio == "world" else [played * n for n in problem.counts]
-        # Of what is shuffled for the rules, and of worlds for the critic.
-        self._orders = [
-            torch.zeros(size, dtype=torch.int64, device=device) for size in (*sizes, played)
-        ]
-        self._act = Replayed(self._draw_actions, device, self.generator)
-        self._value = Replayed(self._find_values, device)
-        self._judge = Replayed(self._find_advantages, device)
-        self._learn_values = Replayed(self._improve_critic, device)
-        self._learn = Replayed(self._improve_both, device)
-
-    @property
-    def round_size(self) -> int:
-        """Particle steps of a round, T B N."""
-        return self.memory.rewards.numel()
-
-    @torch.no_grad()
-    def play(self) -> Round:
-        """Act for T steps in all worlds, and judge what was done.
-
-        Returns:
-            The round, where the next one will be.
-        """
-        memory = self.memory
-        memory.seen[0].copy_(memory.seen[-1])
-        last_seen = {}
-        for step in range(self.settings.steps):
-            self._now.copy_(memory.seen[step])
-            self._act()
-            memory.actions[step].copy_(self._action)
-            memory.log_probs[step].copy_(self._log_prob)
-            observation, reward, terminated, truncated, infos = self.envs.step(self._action)
-            memory.seen[step + 1].copy_(observation)
-            if "final_obs" in infos:
-                last_seen[step] = infos["final_obs"]
-            shared = self.settings.credit == "world"
-            memory.rewards[step].copy_(reward[:, None] if shared else own_rewards(infos))
-            memory.acted[step].copy_(infos.get("acted", self._all_act))
-            # A species may end before its world does.
-            gone = infos.get("particle_terminated", terminated[:, None])
-            memory.terminated[step].copy_(terminated[:, None] | gone)
-            memory.ended[step].copy_((terminated | truncated)[:, None] | gone)
-        self._value()
-        for step, observation in last_seen.items():
-            memory.following[step].copy_(self.critic(observation))
-        self._judge()
-        return memory.round
-
-    @torch.no_grad()
-    def _draw_actions(self) -> None:
-        """Draw what particles do about what they perceive now."""
-        action, log_prob = self.actor.sample(self._now, self.generator)
-        self._action.copy_(action)
-        self._log_prob.copy_(log_prob)
-
-    @torch.no_grad()
-    def _find_values(self) -> None:
-        """Ask the critic about all that was seen, part by part to save memory."""
-        memory, seen = self.memory, self.memory.seen.flatten(0, 1)
-        size = -(-len(seen) // self.settings.minibatches)
-        values = torch.cat([self.critic(part) for part in torch.split(seen, size)])
-        memory.values.copy_(values.view_as(memory.values))
-        memory.following.copy_(memory.values[1:])
-
-    @torch.no_grad()
-    def _find_advantages(self) -> None:
-        """Judge what was done by what was paid, and by what the critic had foreseen."""
-        memory, values = self.memory, self.memory.values[:-1]
-        advantages = generalised_advantages(
-            memory.rewards,
-            values,
-            memory.following,
-            memory.terminated,
-            memory.ended,
-            gamma=self.settings.gamma,
-            gae_lambda=self.settings.gae_lambda,
-        )
-        memory.targets.copy_(advantages + values)
-        if self.settings.ratio == "world":
-            advantages = over_particles(advantages, memory.acted)
-        memory.advantages.copy_(standardised(advantages, memory.acted))
-
-    def improve(self, share_left: float) -> None:
-        """Let rules and critic learn from the last round.
-
-        Args:
-            share_left: Share of the budget that is left; learning rates are this part of what they
-                were at the start, and by it the noise of the next round is made less.
-        """
-        settings = self.settings
-        rules_learn = self.rounds >= settings.critic_rounds
-        self.rounds += 1
-        self.critic.observe(self.memory.seen[:-1])
-        self.critic.rescale(self.memory.targets)
-        rate = self.critic_optimizer.param_groups[0]["lr"]
-        rate.fill_(settings.critic_learning_rate * share_left)
-        self._rate.fill_(settings.learning_rate * share_left)
-        self._near.fill_(1.0)
-        for _ in range(settings.epochs):
-            for order in self._orders:
-                torch.randperm(len(order), generator=self.generator, out=order)
-            if not rules_learn:
-                self._learn_values()
-                continue
-            self._learn()
-            # All that the host waits for.
-            if not bool(self._near):
-                break
-        assert settings.last_noise is not None, "filled in above"
-        self.actor.leave_noise(
-            noise_left(share_left, settings.last_noise, settings.noise_decay_share)
-        )
-
-    def _improve_critic(self) -> None:
-        """Let the critic learn once from all of a round, in the order that was drawn."""
-        for worlds in self._shuffled([self.memory.round], self._orders[-1:]):
-            self._descend(self.critic_optimizer, self._critic_loss(*worlds))
-
-    def _improve_both(self) -> None:
-        """Let critic and rules learn once from all of a round, in the orders that were drawn."""
-        whole = self.memory.round
-        *orders, order = self._orders
-        parts = self._shuffled(self._groups(whole), orders)
-        for part, worlds in zip(parts, self._shuffled([whole], [order]), strict=True):
-            self._descend(self.critic_optimizer, self._critic_loss(*worlds))
-            gain, kl = self._surrogate(part)
-            # Rules that have gone too far stay, without a question to the host.
-            self._near *= kl.detach() <= self.settings.target_kl
-            self.optimizer.param_groups[0]["lr"].copy_(self._near * self._rate)
-            self._descend(self.optimizer, -gain)
-
-    def _groups(self, batch: Round) -> list[Round]:
-        """Return what is shuffled when rules learn: whole worlds, or each species' particles."""
-        if self.settings.ratio == "world":
-            return [batch]
-        spans = self.actor.rules.spans
-        return [Round(*(value[:, span].flatten(0, 1) for value in batch)) for span in spans]
-
-    def _shuffled(self, groups: list[Round], orders: list[Tensor]) -> Iterator[list[Round]]:
-        """Return minibatches: parts of each group, in an order of its own."""
-        count = min(self.settings.minibatches, len(self._orders[-1]))
-        parts = [order.tensor_split(count) for order in orders]
-        for chosen in zip(*parts, strict=True):
-            yield [
-                Round(*(value[rows] for value in group))
-                for group, rows in zip(groups, chosen, strict=True)
-            ]
-
-    def _surrogate(self, part: list[Round]) -> tuple[Tensor, Tensor]:
-        """Return the clipped gain of the rules, and how far their actions have moved [nats]."""
-        settings, actor = self.settings, self.actor
-        if settings.ratio == "world":
-            (worlds,) = part
-            changes = [actor.log_prob(worlds.observations, worlds.actions) - worlds.log_probs]
-        else:
-            changes = [
-                actor.row_log_prob(species, rows.observations, rows.actions) - rows.log_probs
-                for species, rows in enumerate(part)
-            ]
-        log_ratio, advantages, acted = (
-            torch.cat(values)
-            for values in (changes, [p.advantages for p in part], [p.acted for p in part])
-        )
-        kl = (acted * (torch.expm1(log_ratio) - log_ratio)).sum() / acted.sum().clamp(min=1.0)
-        if settings.ratio == "world":
-            log_ratio = over_particles(log_ratio, acted)
-            acted = acted.amax(dim=1, keepdim=True)
-        gain = clipped_gain(log_ratio, advantages, acted, clip=settings.largest_change)
-        if settings.entropy_weight:
-            gain = gain + settings.entropy_weight * actor.entropy()
-        return gain, kl
-
-    def _critic_loss(self, worlds: Round) -> Tensor:
-        error: Tensor = (self.critic(worlds.observations) - worlds.targets) / self.critic.scale
-        return 0.5 * (worlds.acted * error.square()).sum() / worlds.acted.sum().clamp(min=1.0)
-
-    def _descend(self, optimizer: torch.optim.Optimizer, loss: Tensor) -> None:
-        # A read-out does not act, and layers may be frozen.
-        parameters = [p for p in optimizer.param_groups[0]["params"] if p.requires_grad]
-        # Not backward(): its accumulation nodes remember the stream they were first used on, which
-        # a capture on another stream must not touch.
-        gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
-        for parameter, gradient in zip(parameters, gradients, strict=True):
-            if gradient is not None:
-                # Laid out like the parameter, as the fused optimizer takes for granted.
-                parameter.grad = torch.empty_like(parameter).copy_(gradient)
-        nn.utils.clip_grad_norm_(parameters, self.settings.max_gradient_norm)
-        optimizer.step()
-
-
-@takes_fields_of(Settings)
-def train(
-    problem: Problem,
-    progress: Progress,
-    seed: int,
-    *,
-    device: torch.device | str = "cpu",
-    start: RuleSet | None = None,
-    settings: Settings,
-) -> RuleSet:
-    """Return the rules that proximal policy optimisation finds within a budget.
-
-    Args:
-        problem: What is to be learned.
-        progress: Keeps the budget, and looks at the rules now and then.
-        seed: Of all that is drawn.
-        device: Where everything lives.
-        start: Rules to begin with; None: fresh ones.
-        settings: Its fields, as keyword arguments.
-
-    Raises:
-        NPAError: There is no such option, or one is wrong.
-        DivergedError: The policy has diverged.
-    """
-    place = torch.device(device)
-    settings = replace(settings, worlds=world_count(problem, settings, place, progress.budget))
-    learner = Learner(problem, settings, seed, place, start)
-    rules = learner.actor.rules
-    progress.start(rules)
-    while not progress.over:
-        share_left = 1.0 - progress.share
-        learner.play()
-        progress.advance(learner.round_size)
-        learner.improve(share_left)
-        progress.look(rules)
-    progress.look(rules, force=True)
-    return rules

@@ -1,4 +1,4 @@
-"""How far a learner has come: what it may spend, what it has spent, and what that was good for."""
+"""The account of a learner: its budget, what it has spent, and its learning curve."""
 
 from __future__ import annotations
 
@@ -72,13 +72,12 @@ class Entry:
 class Progress:
     """Keeps a learner's account, and evaluates what it has learned every now and then.
 
-    A learner makes its worlds, compiles what it needs, and then:
+    A learner makes its worlds, compiles what it needs, and then leaves the loop to `run`, which is
 
     ```python
     progress.start(rules)
     while not progress.over:
-        ...  # learn for one iteration
-        progress.advance(particle_steps)
+        progress.advance(iteration())  # learns, and returns the particle-steps that it took
         progress.look(rules)
     progress.look(rules, force=True)
     ```
@@ -133,6 +132,24 @@ class Progress:
         self._seconds = 0.0
         self._looks = 0
         self._previous: torch.cuda.Event | None = None
+
+    def run(self, rules: RuleSet, iteration: Callable[[], int]) -> RuleSet:
+        """Learn until the budget is spent, and return the rules.
+
+        Args:
+            rules: What is learned, evaluated now and then.
+            iteration: Lets the rules learn a little, and returns the particle-steps that it took.
+
+        Raises:
+            NPAError: It has started before.
+            DivergedError: A weight of the rules is not finite, or an action.
+        """
+        self.start(rules)
+        while not self.over:
+            self.advance(iteration())
+            self.look(rules)
+        self.look(rules, force=True)
+        return rules
 
     def start(self, actor: RuleSet | Callable[[Any], Any]) -> None:
         """Evaluate what the learner begins with, and begin to count.

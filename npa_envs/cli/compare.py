@@ -151,11 +151,13 @@ def make_plan(options: CompareOptions) -> Plan:
         NPAError: As for `main`.
     """
     from npa_envs.agents.comparison.plan import LEFT_OUT, PROBLEMS, Plan, make_problem
-    from npa_envs.agents.learning import METHODS
+    from npa_envs.agents.learning import METHODS, REMOVED
     from npa_envs.cli.output import check_numbers, chosen_names
 
     check_numbers(options, seeds=1, episodes=1, jobs=1, threads=1)
     tasks = chosen_names("task", options.tasks, PROBLEMS)
+    for name in REMOVED.keys() & set(options.methods):
+        raise NPAError(f"method {name!r} is no more: {REMOVED[name]}")
     methods = chosen_names("method", options.methods, METHODS)
     if not options.methods:
         methods = [name for name in methods if name not in NEED_MORE]

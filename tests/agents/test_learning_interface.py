@@ -360,7 +360,7 @@ def test_a_species_that_left_its_world_is_the_reason_of_the_episode(deaths):
 # Rules to begin with
 
 
-@pytest.mark.parametrize("method", ["ppo", "ppo_rows", "ppo_world", "evolution", "gradient"])
+@pytest.mark.parametrize("method", ["ppo", "ppo_world", "evolution", "gradient"])
 def test_every_method_refuses_to_begin_with_what_does_not_fit(method):
     problem, budget = heart(), Budget(particle_steps=1)
     if method.startswith("ppo_"):
@@ -371,7 +371,7 @@ def test_every_method_refuses_to_begin_with_what_does_not_fit(method):
         train(method, problem, budget, 0, start=heart(state_dim=8).new_rules(0))
 
 
-@pytest.mark.parametrize("method", ["ppo", "ppo_rows", "ppo_world", "evolution"])
+@pytest.mark.parametrize("method", ["ppo", "ppo_world", "evolution"])
 def test_rules_of_other_numbers_of_particles_begin_with_those_of_the_problem(method):
     if method.startswith("ppo_"):
         pytest.importorskip("stable_baselines3")

@@ -10,9 +10,11 @@ from learning_problems import digits, heart, species, wild_rules
 
 import npa_envs
 from npa_envs.agents import MendPolicy, PaintPolicy, RandomPolicy, SpreadPolicy, evaluate_policy
-from npa_envs.agents.learning import Budget, Problem, RuleSet, train
+from npa_envs.agents.learning import EVALUATION_SEEDS, Budget, Problem, RuleSet, train
 from npa_envs.agents.learning.clone import Demonstrations, unexplained
-from npa_envs.agents.learning.gradient import EpisodeTask, HeldRule, episode_task, hold
+from npa_envs.agents.learning.gradient import ClampedRule, EpisodeTask, clamp_inward, episode_task
+from npa_envs.agents.learning.problem import FIRST_EVALUATION_SEED, world_seeds
+from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.envs.morphogenesis2d import PictureTask
 from npa_envs.envs.multi.task import Population
 from npa_envs.errors import NPAError
@@ -60,23 +62,23 @@ def test_the_entropy_of_species_has_the_gradient_of_its_differences(name, bounda
     assert abs((bar * along).sum() - difference) < GRADIENT_TOLERANCE
 
 
-def test_held_numbers_are_clipped_and_let_gradients_lead_back():
+def test_clamped_numbers_are_clipped_and_let_gradients_lead_back():
     values = torch.tensor([-3.0, -3.0, 0.5, 3.0, 3.0], requires_grad=True)
-    held = hold(values, 1.0)
-    assert held.tolist() == [-1.0, -1.0, 0.5, 1.0, 1.0]
-    held.backward(torch.tensor([2.0, -2.0, 2.0, 2.0, -2.0]))
+    clamped = clamp_inward(values, 1.0)
+    assert clamped.tolist() == [-1.0, -1.0, 0.5, 1.0, 1.0]
+    clamped.backward(torch.tensor([2.0, -2.0, 2.0, 2.0, -2.0]))
     # A step against the gradient would lead the first and the last further out.
     assert values.grad.tolist() == [0.0, -2.0, 2.0, 2.0, 0.0]
 
 
-def test_a_held_rule_shares_its_weights():
+def test_a_clamped_rule_shares_its_weights():
     (rule,) = wild_rules(heart())
-    held = HeldRule(rule, 0.1)
-    assert [id(p) for p in held.parameters()] == [id(p) for p in rule.parameters()]
+    clamped = ClampedRule(rule, 0.1)
+    assert [id(p) for p in clamped.parameters()] == [id(p) for p in rule.parameters()]
     z = torch.randn(50, rule.perception_dim)
-    torch.testing.assert_close(held(z)[:, :2], rule(z)[:, :2])
-    torch.testing.assert_close(held(z)[:, 2:], rule(z)[:, 2:].clamp(-0.1, 0.1))
-    assert (held(z)[:, 2:].abs() == 0.1).float().mean() > 0.3
+    torch.testing.assert_close(clamped(z)[:, :2], rule(z)[:, :2])
+    torch.testing.assert_close(clamped(z)[:, 2:], rule(z)[:, 2:].clamp(-0.1, 0.1))
+    assert (clamped(z)[:, 2:].abs() == 0.1).float().mean() > 0.3
 
 
 @pytest.mark.parametrize(
@@ -100,7 +102,7 @@ def test_what_is_differentiated_is_the_environments_own_episode(problem):
     for _ in range(steps):
         largest = max(largest, rules.mean(observation).abs().max().item())
         observation, _, _, _, infos = envs.step(rules.policy()(observation))
-    # State steps were clipped, and what follows is held alike.
+    # State steps were clipped, and what follows is clamped alike.
     assert largest > 1.5
     x, s, path_length = task.rollout(
         rules, x, s, steps,
@@ -332,3 +334,64 @@ def test_mending_is_known_where_pictures_are_damaged():
 def test_what_learns_nothing_starts_from_nothing():
     with pytest.raises(NPAError, match="start must be None"):
         run(heart(), "zero", start=heart().new_rules(0))
+
+
+# Seeds: every run learns in worlds of its own
+
+
+LEARNERS = {
+    "ppo": {"steps": 4},
+    "ppo_world": {"steps": 4, "minibatches": 4},
+    "clone": {"collect_steps": 4},
+    "scripted": {"gains": (0.03,)},
+    "evolution": {"population": 4},
+}
+
+
+@pytest.fixture
+def used(monkeypatch):
+    """The seeds of all worlds that were reset."""
+    seeds, reset = [], NPAVectorEnv.reset
+
+    def watched(self, *, seed=None, options=None):
+        single = isinstance(seed, int)
+        seeds.extend(range(seed, seed + self.num_envs) if single else seed or ())
+        return reset(self, seed=seed, options=options)
+
+    monkeypatch.setattr(NPAVectorEnv, "reset", watched)
+    return seeds
+
+
+@pytest.mark.parametrize("method", LEARNERS)
+def test_no_world_is_learned_in_from_two_seeds(method, used):
+    if method.startswith("ppo_"):
+        pytest.importorskip("stable_baselines3")
+    if method == "evolution":
+        pytest.importorskip("cma")
+    problem, options = heart(), LEARNERS[method]
+    if method == "clone":
+        options = options | {"teacher": problem.new_rules(7)}
+    learned_in = []
+    for seed in range(3):
+        used.clear()
+        budget = Budget(particle_steps=3 * 48 * 16)
+        train(method, problem, budget, seed, evaluation_seeds=EVALUATION_SEEDS[:3], **options)
+        worlds = {number for number in used if number not in EVALUATION_SEEDS}
+        assert worlds
+        assert max(worlds) < FIRST_EVALUATION_SEED
+        learned_in.append(worlds)
+    assert len(set.union(*learned_in)) == sum(map(len, learned_in))
+
+
+def test_worlds_of_one_seed_follow_each_other_and_end_before_those_of_the_next():
+    assert list(world_seeds(0, 3)) == [0, 1, 2]
+    assert world_seeds(3, 10_000).stop == world_seeds(4, 1).start
+    assert world_seeds(99, 10_000).stop == EVALUATION_SEEDS.start
+
+
+@pytest.mark.parametrize(
+    ("seed", "count", "words"), [(100, 1, "seed must be below 100"), (0, 10_001, "at most 10000")]
+)
+def test_seeds_that_reach_other_worlds_are_refused(seed, count, words):
+    with pytest.raises(NPAError, match=words):
+        world_seeds(seed, count)

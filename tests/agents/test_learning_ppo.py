@@ -1,27 +1,29 @@
-"""PPO in its forms: on the device, and Stable-Baselines3's over particles and over worlds."""
+"""PPO in its forms: on the device, and Stable-Baselines3's."""
 
 from __future__ import annotations
 
 import inspect
 import math
 import weakref
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from npa_envs.agents import RandomPolicy, evaluate_policy
-from npa_envs.agents.learning import Budget, Problem, Progress, RuleSet, method_options, ppo, train
-from npa_envs.agents.learning import ppo as ppo_worlds
-from npa_envs.agents.learning.actor_critic import Critic, GaussianRules
+from npa_envs.agents.learning import Budget, Problem, RuleSet, ppo, train
 from npa_envs.agents.learning.ppo import (
     Learner,
+    PPOOptions,
     clipped_gain,
     generalised_advantages,
     over_particles,
     standardised,
+    world_bytes,
+    world_count,
 )
-from npa_envs.agents.learning.ppo_settings import Settings, filled, noise_left
+from npa_envs.agents.learning.ppo_common import Critic, GaussianRules
 from npa_envs.errors import NPAError
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.cuda_graph import no_garbage_collection
@@ -48,30 +50,26 @@ MIXING = Problem(
     episode_steps=8,
     num_envs=4,
 )
-DYING = Problem(
-    env_id=MIXING.env_id,
-    keywords=dict(MIXING.keywords) | {"deaths": [[1, 5]]},
-    episode_steps=9,
-    num_envs=4,
-)
+DYING = replace(MIXING, keywords=dict(MIXING.keywords) | {"deaths": [[1, 5]]}, episode_steps=9)
 SEEDS = range(100, 116)
 
 FORMS = {
     "device": ("ppo", {}),
     "device, by worlds": ("ppo", {"ratio": "world", "critic": "central"}),
-    "rows": ("ppo_rows", {}),
-    "rows, central critic": ("ppo_rows", {"critic": "central"}),
-    "worlds": ("ppo_world", {}),
+    "Stable-Baselines3": ("ppo_world", {}),
+    "Stable-Baselines3, central critic": ("ppo_world", {"critic": "central"}),
 }
 EVERY_FORM = pytest.mark.parametrize("form", FORMS)
 
 
 def learner(problem=HEART, start=None, **options):
-    return Learner(problem, Settings(**options), 0, torch.device("cpu"), start)
+    return Learner(problem, PPOOptions(**options), 0, torch.device("cpu"), start)
 
 
 def run(form, problem, budget, seed=0, **keywords):
     method, options = FORMS[form]
+    if method == "ppo_world":
+        pytest.importorskip("stable_baselines3")
     return train(
         method,
         problem,
@@ -86,7 +84,6 @@ def run(form, problem, budget, seed=0, **keywords):
 
 @EVERY_FORM
 def test_every_form_learns_to_grow_and_colour_particles(form):
-    pytest.importorskip("stable_baselines3")
     rounds = 12 if form.startswith("device") else 8
     # In so few rounds small changes of the policy are the safer ones.
     first, last = run(form, HEART, rounds * ROUND, target_kl=0.05).log
@@ -116,40 +113,10 @@ def test_more_steps_bring_a_return_of_more_than_half_of_what_the_gradient_finds(
 
 @EVERY_FORM
 def test_every_form_trains_a_rule_for_each_species(form):
-    pytest.importorskip("stable_baselines3")
     trained = run(form, MIXING, 2 * 16 * 4 * 32)
     for rule in trained.rules:
         assert torch.isfinite(rule.output.weight).all()
         assert rule.output.weight.abs().max() > 0.0
-
-
-@pytest.mark.parametrize("problem", [HEART, MIXING], ids=["heart", "mixing"])
-def test_the_deterministic_policy_of_either_row_form_is_the_exported_rules(problem):
-    pytest.importorskip("stable_baselines3")
-    from npa_envs.agents.learning import sb3 as sb3_rows
-    from npa_envs.agents.learning import sb3_world
-    from npa_envs.wrappers import WorldVecEnv
-
-    rules = problem.new_rules(1)
-    with torch.no_grad():
-        for rule in rules:
-            rule.output.weight.mul_(20.0)
-    worlds = WorldVecEnv(problem.make_envs())
-    worlds.seed(3)
-    seen = worlds.reset()
-    wanted = rules.policy()(seen)
-    assert np.abs(wanted).max() > 0.1
-    spaces = (worlds.observation_space, worlds.action_space, lambda _: 1e-3)
-    policy = sb3_world.WorldRulePolicy(*spaces, rules=rules)
-    np.testing.assert_allclose(policy.predict(seen, deterministic=True)[0], wanted, atol=1e-6)
-    for critic in ("particle", "central"):
-        rows = sb3_rows.make_rows(problem, sb3_rows.RowSettings(critic=critic), "cpu")
-        rows.seed(3)
-        policy = sb3_rows.RowRulePolicy(
-            rows.observation_space, rows.action_space, lambda _: 1e-3, rules=rules
-        )
-        acted = policy.predict(rows.reset(), deterministic=True)[0]
-        np.testing.assert_allclose(acted.reshape(wanted.shape), wanted, atol=1e-6)
 
 
 def test_what_the_device_s_ppo_exports_is_the_mean_that_it_explores_around(tmp_path):
@@ -234,16 +201,37 @@ def test_likelihoods_are_those_of_gaussians_and_a_world_s_is_their_mean():
     torch.testing.assert_close(world, by_hand.sum(dim=1, keepdim=True) / 32.0)
 
 
-def test_a_world_s_policy_in_stable_baselines_means_over_particles():
+@pytest.fixture
+def world_policy():
+    """Makes the policy of Stable-Baselines3's form, and what its worlds show at first."""
     pytest.importorskip("stable_baselines3")
-    from npa_envs.agents.learning.sb3_world import WorldRulePolicy
+    from npa_envs.agents.learning.sb3 import WorldRulePolicy
     from npa_envs.wrappers import WorldVecEnv
 
-    worlds = WorldVecEnv(HEART.make_envs())
-    policy = WorldRulePolicy(
-        worlds.observation_space, worlds.action_space, lambda _: 1e-3, rules=HEART.new_rules(0)
-    )
-    seen = torch.from_numpy(worlds.reset())
+    def make(problem, rules):
+        worlds = WorldVecEnv(problem.make_envs())
+        worlds.seed(3)
+        spaces = (worlds.observation_space, worlds.action_space)
+        return WorldRulePolicy(*spaces, lambda _: 1e-3, rules=rules), worlds.reset()
+
+    return make
+
+
+@pytest.mark.parametrize("problem", [HEART, MIXING], ids=["heart", "mixing"])
+def test_the_deterministic_policy_of_stable_baselines_is_the_exported_rules(problem, world_policy):
+    rules = problem.new_rules(1)
+    with torch.no_grad():
+        for rule in rules:
+            rule.output.weight.mul_(20.0)
+    policy, seen = world_policy(problem, rules)
+    wanted = rules.policy()(seen)
+    assert np.abs(wanted).max() > 0.1
+    np.testing.assert_allclose(policy.predict(seen, deterministic=True)[0], wanted, atol=1e-6)
+
+
+def test_a_world_s_policy_in_stable_baselines_means_over_particles(world_policy):
+    policy, seen = world_policy(HEART, HEART.new_rules(0))
+    seen = torch.from_numpy(seen)
     action, value, told = policy(seen)
     normal = torch.distributions.Normal(policy.actor.rules.mean(seen), policy.actor.log_std.exp())
     torch.testing.assert_close(told, normal.log_prob(action).sum(dim=-1).mean(dim=-1))
@@ -253,17 +241,15 @@ def test_a_world_s_policy_in_stable_baselines_means_over_particles():
     torch.testing.assert_close(entropy, normal.entropy().sum(dim=-1).mean(dim=-1))
 
 
-def test_every_form_of_stable_baselines_ends_a_round_at_the_same_divergence():
+def test_stable_baselines_ends_a_round_at_the_divergence_of_particles():
     sb3 = pytest.importorskip("stable_baselines3")
-    from npa_envs.agents.learning.sb3 import EXCESS, RowRulePolicy
-    from npa_envs.agents.learning.sb3_world import WorldRulePolicy
+    from npa_envs.agents.learning.sb3 import EXCESS, world_kl
 
     assert f"approx_kl_div > {EXCESS} * self.target_kl" in inspect.getsource(sb3.PPO.train)
-    assert EXCESS * RowRulePolicy.row_kl(0.2) == pytest.approx(0.2)
     # A world's log-ratio is close to minus the divergence of its particles.
     log_ratio = -0.02
     estimated = math.expm1(log_ratio) - log_ratio
-    assert EXCESS * WorldRulePolicy.row_kl(0.02) == pytest.approx(estimated, rel=0.01)
+    assert EXCESS * world_kl(0.02) == pytest.approx(estimated, rel=0.01)
 
 
 def test_gains_are_clipped_where_the_ratio_has_gone_where_it_pays():
@@ -312,12 +298,7 @@ def test_a_critic_keeps_its_values_when_its_scale_changes_and_sees_its_world_if_
 
 
 def test_particles_of_a_species_that_is_gone_do_not_count():
-    dying = Problem(
-        env_id=MIXING.env_id,
-        keywords=dict(MIXING.keywords) | {"deaths": [[1, 3]]},
-        episode_steps=8,
-        num_envs=4,
-    )
+    dying = replace(MIXING, keywords=dict(MIXING.keywords) | {"deaths": [[1, 3]]})
     given = learner(dying, steps=8, critic="central", ratio="particle")
     batch = given.play()
     acted = batch.acted.view(8, 4, 32)
@@ -379,8 +360,8 @@ def test_recorded_rounds_are_those_of_kernels_one_by_one(
         pytest.skip("rounds are recorded on CUDA only")
 
     def learned():
-        settings = Settings(critic_rounds=3, **FORMS[form][1], **options)
-        given = Learner(problem, settings, 0, device, None)
+        how = PPOOptions(critic_rounds=3, **FORMS[form][1], **options)
+        given = Learner(problem, how, 0, device, None)
         # The third call of what is recorded is the first replay that nothing was recorded in.
         for share_left in (1.0, 0.9, 0.7, 0.5, 0.3, 0.1):
             batch = given.play()
@@ -410,7 +391,6 @@ def test_a_learner_and_its_memory_are_freed_at_once(problem):
 
 @EVERY_FORM
 def test_read_outs_and_frozen_layers_stay_as_they_are(form):
-    pytest.importorskip("stable_baselines3")
     rule = NPARule(2, 4, 16, readout_dim=10, readout_hidden_dim=8)
     rule.hidden.requires_grad_(False)
     with torch.no_grad():
@@ -425,7 +405,6 @@ def test_read_outs_and_frozen_layers_stay_as_they_are(form):
 
 @EVERY_FORM
 def test_fresh_rules_do_nothing_at_first_and_move_within_a_round(form):
-    pytest.importorskip("stable_baselines3")
     trained = run(form, HEART, ROUND)
     # A whole world is worth as much as before, to the last bit: nothing was done.
     assert trained.log[0].mean_return == 0.0
@@ -435,20 +414,20 @@ def test_fresh_rules_do_nothing_at_first_and_move_within_a_round(form):
 def test_a_gpu_is_kept_busy_where_neither_memory_nor_budget_forbids(monkeypatch):
     cuda, cpu, gib = torch.device("cuda", 0), torch.device("cpu"), 2**30
     free = {"bytes": 100 * gib}
-    monkeypatch.setattr(ppo_worlds, "free_bytes", lambda device: free["bytes"])
-    long, settings = Budget(seconds=1.0), Settings()
+    monkeypatch.setattr(ppo, "free_bytes", lambda device: free["bytes"])
+    long, options = Budget(seconds=1.0), PPOOptions()
     # 2^17 particles, 64 of them in each world.
-    assert ppo_worlds.world_count(HEART, settings, cuda, long) == 2048
-    assert ppo_worlds.world_count(HEART, settings, cpu, long) == 8
-    assert ppo_worlds.world_count(HEART, Settings(worlds=3), cuda, long) == 3
+    assert world_count(HEART, options, cuda, long) == 2048
+    assert world_count(HEART, options, cpu, long) == 8
+    assert world_count(HEART, PPOOptions(worlds=3), cuda, long) == 3
     rounds = Budget(particle_steps=128 * 16 * 64 * 100)
-    assert ppo_worlds.world_count(HEART, settings, cuda, rounds) == 100
+    assert world_count(HEART, options, cuda, rounds) == 100
     free["bytes"] = gib
-    fewer = ppo_worlds.world_count(HEART, settings, cuda, long)
+    fewer = world_count(HEART, options, cuda, long)
     assert 8 < fewer < 2048
-    assert fewer * ppo_worlds.world_bytes(HEART, settings, cuda) <= gib / 4
+    assert fewer * world_bytes(HEART, options, cuda) <= gib / 4
     free["bytes"] = 0
-    assert ppo_worlds.world_count(HEART, settings, cuda, long) == 8
+    assert world_count(HEART, options, cuda, long) == 8
 
 
 def test_the_option_worlds_says_in_how_many_worlds_is_acted():
@@ -463,9 +442,8 @@ def taught():
     return train("gradient", HEART, budget, 0, entries=1, evaluation_seeds=SEEDS).rules
 
 
-@pytest.mark.parametrize("form", ["device", "rows", "worlds"])
+@pytest.mark.parametrize("form", ["device", "Stable-Baselines3"])
 def test_fine_tuning_does_not_undo_what_rules_can_do(form, taught):
-    pytest.importorskip("stable_baselines3")
     given = [weight.clone() for weight in taught.parameters()]
     first, last = run(form, HEART, 6 * ROUND, start=taught).log
     assert first.mean_return > 0.5
@@ -476,34 +454,9 @@ def test_fine_tuning_does_not_undo_what_rules_can_do(form, taught):
 
 def test_a_critic_that_learns_alone_leaves_the_rules_as_they_are():
     start = HEART.new_rules(5)
-    for form in ("device", "rows"):
+    for form in ("device", "Stable-Baselines3"):
         trained = run(form, HEART, 2 * ROUND // 4, start=start, steps=4)
         assert all(map(torch.equal, trained.rules.parameters(), start.parameters()))
-
-
-def test_rows_that_are_cut_off_are_paid_what_the_critic_still_expects():
-    pytest.importorskip("stable_baselines3")
-    from npa_envs.agents.learning.sb3 import RowSettings, make_rows
-
-    class Constant:
-        device = torch.device("cpu")
-
-        def predict_values(self, obs):
-            return torch.full((len(obs), 1), 5.0)
-
-    actions = np.zeros((8 * 64, 6), np.float32)
-    paid = {}
-    for name in ("without", "with"):
-        rows = make_rows(HEART, RowSettings(gamma=0.5, critic="central"), "cpu")
-        rows.policy = Constant() if name == "with" else None
-        rows.seed(0)
-        rows.reset()
-        for _ in range(16):
-            seen, paid[name], done, infos = rows.step(actions)
-        assert done.all()
-        assert infos[0]["TimeLimit.truncated"] == (name == "without")
-        assert infos[0]["terminal_observation"].shape == seen[0].shape == (36,)
-    np.testing.assert_allclose(paid["with"] - paid["without"], 2.5, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -516,38 +469,38 @@ def test_rows_that_are_cut_off_are_paid_what_the_critic_still_expects():
         ({"noise_decay_share": 0.0}, r"noise_decay_share must lie in \(0, 1\], got 0.0"),
         ({"minibatches": 0}, "minibatches must be a whole number of at least 1"),
         ({"worlds": 0}, "worlds must be a whole number of at least 1"),
+        ({"critic": "all"}, "critic must be a known word, got 'all': known: central, particle"),
     ],
 )
 def test_options_out_of_their_range_are_named(options, message):
     with pytest.raises(NPAError, match=message):
-        Settings(**options)
+        PPOOptions(**options)
 
 
-def test_options_are_known_by_name_and_depend_on_a_start_where_they_are_none():
-    assert method_options("ppo")["ratio"] == "particle"
-    progress = Progress(HEART, Budget(particle_steps=1), device="cpu", evaluation_seeds=SEEDS)
-    from npa_envs.agents.learning import ppo
-
-    with pytest.raises(NPAError, match="unknown option 'step': did you mean 'steps'"):
-        ppo.train(HEART, progress, 0, step=3)
-    fresh, warm = filled(Settings(), None), filled(Settings(), HEART.new_rules(0))
+def test_options_that_are_none_depend_on_a_start():
+    fresh, warm = PPOOptions().filled(None), PPOOptions().filled(HEART.new_rules(0))
     assert fresh.initial_std > warm.initial_std
     assert fresh.learning_rate > warm.learning_rate
     assert fresh.last_noise < warm.last_noise == 1.0
-    assert filled(Settings(initial_std=0.7), None).initial_std == 0.7
+    assert PPOOptions(initial_std=0.7).filled(None).initial_std == 0.7
 
 
-def test_noise_is_kept_at_first_and_then_falls_by_equal_factors():
-    shares = [1.0, 0.75, 0.5, 0.25, 0.0]
-    assert [noise_left(left, 0.25, 0.5) for left in shares] == [1.0, 1.0, 1.0, 0.5, 0.25]
-    assert [noise_left(left, 1.0, 0.5) for left in shares] == [1.0] * 5
-    assert [noise_left(left, 1 / 16, 1.0) for left in shares] == [1.0, 0.5, 0.25, 0.125, 1 / 16]
+@pytest.mark.parametrize(
+    ("last_noise", "decay_share", "left"),
+    [
+        (0.25, 0.5, [1.0, 1.0, 1.0, 0.5, 0.25]),
+        (1.0, 0.5, [1.0] * 5),
+        (1 / 16, 1.0, [1.0, 0.5, 0.25, 0.125, 1 / 16]),
+    ],
+)
+def test_noise_is_kept_at_first_and_then_falls_by_equal_factors(last_noise, decay_share, left):
+    options = PPOOptions(last_noise=last_noise, noise_decay_share=decay_share)
+    assert [options.noise_left(share) for share in (1.0, 0.75, 0.5, 0.25, 0.0)] == left
 
 
 @pytest.mark.parametrize(("decay_share", "kept"), [(0.5, 4), (0.25, 6)])
 @EVERY_FORM
 def test_in_every_form_the_noise_falls_towards_the_end(form, decay_share, kept, monkeypatch):
-    pytest.importorskip("stable_baselines3")
     left = [1.0]
     leave = GaussianRules.leave_noise
 
@@ -566,9 +519,3 @@ def test_in_every_form_the_noise_falls_towards_the_end(form, decay_share, kept, 
     # The last of eight rounds begins with an eighth of the budget.
     assert left[7] == pytest.approx(0.1 ** (1.0 - 0.125 / decay_share))
     assert 0.1 <= left[-1] <= left[7]
-
-
-def test_species_as_rows_cannot_be_paid_by_worlds():
-    pytest.importorskip("stable_baselines3")
-    with pytest.raises(NPAError, match="credit must be 'particle' where several species are rows"):
-        run("rows", MIXING, 1, credit="world")

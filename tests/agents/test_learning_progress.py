@@ -30,12 +30,12 @@ def progress_of(problem, seeds=range(100, 103), **given):
 
 def learn_nothing(progress, rules, pause=0.0):
     """Spend a budget as a learner does."""
-    progress.start(rules)
-    while not progress.over:
+
+    def iteration():
         time.sleep(pause)
-        progress.advance(ITERATION)
-        progress.look(rules)
-    progress.look(rules, force=True)
+        return ITERATION
+
+    assert progress.run(rules, iteration) is rules
     return progress.log
 
 
@@ -155,6 +155,7 @@ def test_learning_rates_fall_from_the_first_to_the_last():
     ("method", "options", "message"),
     [
         ("gradients", {}, "did you mean 'gradient'"),
+        ("ppo_rows", {}, r"is no more: take 'ppo_world'.* 0\.615 instead of 0\.302 in growth"),
         ("gradient", {"learning_rat": 1.0}, "did you mean 'learning_rate'"),
         ("zero", {"learning_rate": 1.0}, "has no option 'learning_rate'"),
         ("zero", {"device": "tpu"}, "device"),
@@ -172,6 +173,10 @@ def test_a_seed_must_be_one():
 
 def test_options_are_named_with_their_defaults():
     assert method_options("gradient")["world_count"] == 8
+    assert method_options("ppo")["ratio"] == "particle"
+    assert method_options("scripted").keys() == {"gains"}
+    with pytest.raises(NPAError, match="'ppo_rows' is no more: take 'ppo_world'"):
+        method_options("ppo_rows")
     assert method_options("zero") == {}
 
 

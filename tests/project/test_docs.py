@@ -264,11 +264,11 @@ def test_the_code_about_learning_runs(tmp_path, monkeypatch, capsys):
 
 def test_the_code_about_ppo_runs(capsys):
     pytest.importorskip("stable_baselines3")
-    (block,) = [code for code in code_blocks(DOCS / "learning.md") if '"ppo_rows"' in code]
+    (block,) = [code for code in code_blocks(DOCS / "learning.md") if '"ppo_world"' in code]
     assert block.count("500_000") == 1
     exec(compile(block.replace("500_000", "1_000"), "learning.md", "exec"), {})
     told = capsys.readouterr().out.splitlines()
-    forms = ("ppo", "ppo_rows", "ppo_world")
+    forms = ("ppo", "ppo_world")
     assert [line.split(":")[0] for line in told] == [form for form in forms for _ in range(3)]
 
 

@@ -1,17 +1,169 @@
-"""Rules that explore: Gaussian actions around what the rules would do."""
+"""What the two forms of PPO share: options, rules that explore, and the critic."""
 
 from __future__ import annotations
 
 import copy
 import math
 from collections.abc import Sequence
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Literal, Self, get_args
 
 import torch
 from torch import Tensor, nn
 
+from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.errors import NPAError, suggest
+from npa_envs.tasks.checks import check_fraction, check_non_negative, check_positive
+
+FRESH = {
+    "learning_rate": 1e-3,
+    "initial_std": 0.2,
+    "last_noise": 0.25,
+    "critic_rounds": 0,
+    "target_kl": 0.2,
+}
+"""What options are where they are None, with fresh rules."""
+
+WARM = {
+    "learning_rate": 1e-4,
+    "initial_std": 0.05,
+    "last_noise": 1.0,
+    "critic_rounds": 4,
+    "target_kl": 0.05,
+}
+"""The same with rules to begin with: noise, haste and a raw critic would undo what they can do."""
+
+CriticKind = Literal["particle", "central"]
+"""What a value is told of: a "particle" alone, or its whole world besides ("central")."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CommonOptions:
+    """Options that the device's own PPO and Stable-Baselines3's share."""
+
+    steps: int = 16
+    """Steps of all worlds in a round, T."""
+
+    epochs: int = 4
+    """Passes over a round; fewer where `target_kl` is passed."""
+
+    learning_rate: float | None = None
+    """Adam's step at the start, from which it falls to zero over the budget; None: 0.001, or 0.0001
+    with a `start`."""
+
+    minibatches: int = 4
+    """Parts that a round is shuffled into in each pass."""
+
+    gamma: float = 0.5
+    """Discount of a reward one step later (dimensionless)."""
+
+    gae_lambda: float = 0.9
+    """Discount of what the critic did not foresee, besides `gamma` (dimensionless)."""
+
+    entropy_weight: float = 0.0
+    """Weight of the entropy of an action in what is maximised."""
+
+    max_gradient_norm: float = 0.5
+    """Gradients are shortened to this norm: those of rules and of the critic by themselves on the
+    device, taken together in Stable-Baselines3."""
+
+    target_kl: float | None = None
+    """The rules stay as they are for the rest of a round once particles' actions are farther than
+    this from those that were played [nats]; None: 0.2, or 0.05 with a `start`."""
+
+    initial_std: float | None = None
+    """Standard deviation of every action column at first; None: 0.2, or 0.05 with a `start`."""
+
+    last_noise: float | None = None
+    """What is left of the standard deviations at the end of the budget (dimensionless); None: 0.25,
+    or 1 with a `start`."""
+
+    noise_decay_share: float = 0.5
+    """Share of the budget, its last, in which standard deviations fall to that; 1: from the
+    start."""
+
+    critic_rounds: int | None = None
+    """Rounds in which the critic learns alone; None: 0, or 4 with a `start`."""
+
+    critic: CriticKind = "particle"
+    """A value follows from a particle's own perception, or from its whole world ("central")."""
+
+    def __post_init__(self) -> None:
+        """Check every field.
+
+        Raises:
+            NPAError: One lies outside its range.
+        """
+        check_positive(self, int, "steps", "epochs", "minibatches")
+        check_positive(self, float, "max_gradient_norm")
+        check_non_negative(self, "entropy_weight")
+        check_fraction(self, "gamma", "gae_lambda", "noise_decay_share")
+        for name in ("learning_rate", "initial_std", "target_kl"):
+            if getattr(self, name) is not None:
+                check_positive(self, float, name)
+        if self.last_noise is not None:
+            check_fraction(self, "last_noise")
+        if self.critic_rounds is not None:
+            check_positive(self, int, "critic_rounds", at_least=0)
+        check_word("critic", self.critic, get_args(CriticKind))
+
+    def filled(self, start: RuleSet | None) -> Self:
+        """Return the options with those of `FRESH` or `WARM` where they are None.
+
+        Args:
+            start: Rules to begin with; None: fresh ones.
+        """
+        defaults = FRESH if start is None else WARM
+        return replace(self, **{k: v for k, v in defaults.items() if getattr(self, k) is None})
+
+    def noise_left(self, share_left: float) -> float:
+        """Return what is left of the first noise: all at first, then it falls by equal factors.
+
+        What is learned is what is best with noise, and what counts is what it does without: towards
+        the end the two are to be the same.
+
+        Args:
+            share_left: Share of the budget that is left.
+        """
+        assert self.last_noise is not None, "filled in before"
+        return math.pow(self.last_noise, max(0.0, 1.0 - share_left / self.noise_decay_share))
+
+
+def check_word(name: str, word: object, words: Sequence[str]) -> None:
+    """Check that an option is one of a few words.
+
+    Args:
+        name: The option.
+        word: What it is.
+        words: What it can be.
+
+    Raises:
+        NPAError: It is none of them.
+    """
+    if word not in words:
+        raise NPAError(f"{name} must be a known word, got {word!r}: {suggest(str(word), words)}")
+
+
+def first_rules(problem: Problem, seed: int, start: RuleSet | None) -> RuleSet:
+    """Return the rules that PPO begins with: those given, or fresh ones that do nothing.
+
+    Fresh rules have random output layers, and what they do in each step adds up: in
+    `npa/Regeneration2D-v0` they take apart what is whole. Layers of zeros leave it alone, and learn
+    just as well, as what is hidden is random still.
+
+    Args:
+        problem: What is to be learned.
+        seed: Of the other weights.
+        start: Rules to begin with; None: fresh ones.
+    """
+    if start is not None:
+        return start
+    rules = problem.new_rules(seed)
+    for rule in rules:
+        nn.init.zeros_(rule.output.weight)
+    return rules
+
 
 HALF_LOG_TAU = 0.5 * math.log(2.0 * math.pi)
 """Constant of the logarithm of a Gaussian's density."""
@@ -98,15 +250,6 @@ class GaussianRules(nn.Module):
         """
         return gaussian_log_prob(self.rules.mean(observation), self.row_log_std(), action)
 
-    def row_mean(self, species: int, rows: Tensor) -> Tensor:
-        """Return what particles of one species would do without exploration, shape [K, A].
-
-        Args:
-            species: Its number.
-            rows: What they perceive, shape [K, P].
-        """
-        return self._each[species].mean(rows[:, None])[:, 0]
-
     def row_log_prob(self, species: int, rows: Tensor, action: Tensor) -> Tensor:
         """Return the log-probability of the actions of particles of one species, shape [K].
 
@@ -115,18 +258,13 @@ class GaussianRules(nn.Module):
             rows: What they perceive, shape [K, P].
             action: What they did, shape [K, A].
         """
-        return gaussian_log_prob(self.row_mean(species, rows), self.log_std[species], action)
+        mean = self._each[species].mean(rows[:, None])[:, 0]
+        return gaussian_log_prob(mean, self.log_std[species], action)
 
     def entropy(self) -> Tensor:
         """Return the mean entropy of a particle's action [nats]."""
         return (self.row_log_std() + HALF_LOG_TAU + 0.5).sum(dim=-1).mean()
 
-
-# What states are worth: a small network on each particle's perception, alone or in its world.
-
-
-CriticKind = Literal["particle", "central"]
-"""What a value is told of: a "particle" alone, or its whole world besides ("central")."""
 
 SLOWEST = 0.01
 """Share of the newest batch in the running moments, once they are no longer plain means."""
@@ -146,9 +284,6 @@ class Critic(nn.Module):
         kind: "particle": a value follows from the particle's own perception; "central": from that
             and from features of all particles of its world, averaged.
         width: Units of a hidden layer.
-
-    Raises:
-        NPAError: There is no such kind.
     """
 
     mean: Tensor
@@ -165,11 +300,6 @@ class Critic(nn.Module):
         width: int = 64,
     ) -> None:
         super().__init__()
-        if kind not in ("particle", "central"):
-            raise NPAError(
-                f"critic must be a known kind, got {kind!r}: "
-                f"{suggest(str(kind), ['particle', 'central'])}"
-            )
         self.features = nn.Linear(perception_dim, width)
         self.own = nn.Linear(width, width)
         self.pooled = nn.Linear(width, width, bias=False) if kind == "central" else None
