@@ -11,7 +11,8 @@ from typing import Any
 
 import warp as wp
 
-from npa_envs.kernels.domain import domain_types, scalar_name
+from npa_envs.kernels import native
+from npa_envs.kernels.domain import domain_types
 
 SMALLEST_RANGES: dict[Any, int] = {}
 """For each such kernel, how many indices of the first dimension are worth a thread of their own."""
@@ -50,23 +51,6 @@ def in_ranges(smallest: int) -> Callable[[Any], Any]:
 # Sums over groups of channels, in vector registers of the CPU where its compiler finds none.
 
 
-_ADD_SCALED = """
-#if defined(__CUDA_ARCH__)
-    return total + factor * value;
-#else
-    typedef {part} channels __attribute__((vector_size(sizeof(total))));
-    channels sum, product;
-    __builtin_memcpy(&sum, &total, sizeof(total));
-    __builtin_memcpy(&product, &value, sizeof(value));
-    product *= factor;
-    sum += product;
-    auto result = total;
-    __builtin_memcpy(&result, &sum, sizeof(result));
-    return result;
-#endif
-"""
-
-
 @functools.cache
 def make_add_scaled(group: type, scalar: type) -> Any:
     """Return a Warp function for total + factor * value, rounded after each operation on the CPU.
@@ -75,9 +59,8 @@ def make_add_scaled(group: type, scalar: type) -> Any:
         group: A vector type, of 4, 8 or 16 channels.
         scalar: The scalar type that it is made of.
     """
-    part = {"f32": "float", "f64": "double"}[scalar_name(scalar)]
 
-    @wp.func_native(_ADD_SCALED.format(part=part))
+    @native.func_native()
     def add_scaled(total: group, factor: scalar, value: group) -> group: ...
 
     return add_scaled

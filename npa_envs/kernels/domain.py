@@ -14,6 +14,8 @@ from typing import Any
 
 import warp as wp
 
+from npa_envs.kernels import native
+
 CELL_SLACK = 1.0 + 2.0**-20
 """Cells are this much larger than eps / reach: rounding a cell index cannot lose a neighbour."""
 
@@ -36,7 +38,7 @@ def kernel_module(
         variant += f"_w{width}"
     if lanes:
         variant += f"_l{lanes}"
-    return wp.get_module(f"npa_envs.kernels.{topic}_{variant}")
+    return native.module(f"npa_envs.kernels.{topic}_{variant}")
 
 
 @functools.cache

@@ -8,6 +8,8 @@ from typing import Any
 
 import warp as wp
 
+from npa_envs.kernels import native
+
 MOMENT_THRESHOLD = 1e-3
 """Smallest |det M| that is inverted, dimensionless; below it the gradient stays uncorrected."""
 
@@ -19,16 +21,27 @@ MOMENT_SOFTENING = 1e-2
 
 
 @wp.func
+def smoothing_falloff(squared_distance: Any, inverse_squared_eps: Any):
+    """1 - r^2 / eps^2, whose cube the smoothing kernel is; negative outside its support."""
+    return type(squared_distance)(1.0) - squared_distance * inverse_squared_eps
+
+
+@wp.func
+def smoothing_of(falloff: Any, norm: Any):
+    """Poly6 smoothing kernel W of a falloff [1 / length^D]."""
+    return norm * falloff * falloff * falloff
+
+
+@wp.func
 def smoothing(squared_distance: Any, inverse_squared_eps: Any, norm: Any):
     """Poly6 smoothing kernel W, inside its support [1 / length^D]."""
-    falloff = type(norm)(1.0) - squared_distance * inverse_squared_eps
-    return norm * falloff * falloff * falloff
+    return smoothing_of(smoothing_falloff(squared_distance, inverse_squared_eps), norm)
 
 
 @wp.func
 def smoothing_slope(squared_distance: Any, inverse_squared_eps: Any, norm: Any):
     """Factor g of the gradient dW/dr = g r of the smoothing kernel [1 / length^(D+2)]."""
-    falloff = type(norm)(1.0) - squared_distance * inverse_squared_eps
+    falloff = smoothing_falloff(squared_distance, inverse_squared_eps)
     return type(norm)(-6.0) * norm * inverse_squared_eps * falloff * falloff
 
 
@@ -40,6 +53,18 @@ def spiky_factor(distance: Any, inverse_eps: Any, norm: Any):
         falloff = type(norm)(1.0) - distance * inverse_eps
         factor = norm * falloff * falloff / distance
     return factor
+
+
+@wp.func
+def spiky_factor_wide(exact: wp.float64, start: Any, inverse_eps: Any, norm: Any):
+    """Spiky factor f in float64 from r . r: a Newton step refines a `start` of 1 / |r|.
+
+    Sums of spiky kernels, the density gradient, cancel almost fully where particles are dense.
+    """
+    inverse = wp.float64(start)
+    inverse *= wp.float64(1.5) - wp.float64(0.5) * exact * inverse * inverse
+    falloff = wp.float64(1.0) - exact * inverse * wp.float64(inverse_eps)
+    return wp.float64(norm) * falloff * falloff * inverse
 
 
 @wp.func
@@ -146,3 +171,71 @@ def make_smooth_inverse(space_dim: int, scalar: type) -> wp.Function:
         return result
 
     return smooth_inverse
+
+
+@functools.cache
+def make_corrected(space_dim: int, scalar: type, width: int, moment_inverse: str | None) -> Any:
+    """Return a Warp function that multiplies state gradients [D, width] by an inverse of M.
+
+    Args:
+        space_dim: Space dimension D, 2 or 3.
+        scalar: `wp.float32` or `wp.float64`.
+        width: Channels.
+        moment_inverse: "smooth", or "threshold": gradients stay as they are where M is singular.
+    """
+    square = wp.types.matrix((space_dim, space_dim), scalar)
+    gradient_type = wp.types.matrix((space_dim, width), scalar)
+    smooth_inverse = make_smooth_inverse(space_dim, scalar)
+
+    @wp.func
+    def corrected(gradient: gradient_type, moment: square):
+        result = gradient
+        if wp.static(moment_inverse == "smooth"):
+            result = smooth_inverse(moment) * gradient
+        elif wp.abs(wp.determinant(moment)) >= scalar(wp.static(MOMENT_THRESHOLD)):
+            result = wp.inverse(moment) * gradient
+        return result
+
+    return corrected
+
+
+# The same formulas in C++, of fewer instructions.
+
+
+@functools.cache
+def make_fast_exp2(scalar: type) -> Any:
+    """Return a Warp function for powers of two, in float32 on CUDA right to about 2e-7.
+
+    Args:
+        scalar: `wp.float32` or `wp.float64`.
+    """
+
+    @native.func_native()
+    def fast_exp2(value: scalar) -> scalar: ...
+
+    return fast_exp2
+
+
+@functools.cache
+def make_log_scale_pull(vector: type) -> Any:
+    """Return `log_scale_adjoint` on CUDA for a vector type of float32."""
+
+    @native.func_native()
+    def log_scale_pull(scaled: vector, cotangent: vector) -> vector: ...
+
+    return log_scale_pull
+
+
+@native.func_native()
+def log_scale_of_square(squared: wp.float32) -> wp.float32:
+    """L(v) / v on CUDA, from v . v: log(1 + |v|) / |v|."""
+
+
+@native.func_native()
+def inverse_root(value: wp.float32) -> wp.float32:
+    """1 / sqrt(value) on CUDA, two units in the last place off at most."""
+
+
+@native.func_native()
+def within(value: wp.float32, limit: wp.float32) -> wp.float32:
+    """The value on CUDA clipped to plus and minus a limit; as it is if the limit is NaN."""

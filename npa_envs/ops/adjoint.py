@@ -7,9 +7,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from npa_envs.kernels.cuda.adjoint import SHARE, listed_adjoint
-from npa_envs.kernels.cuda.tiles import TILE
-from npa_envs.kernels.cuda.warps import WARP
+from npa_envs.kernels.access import WARP
+from npa_envs.kernels.cuda.adjoint import SHARE, TILE, listed_adjoint
 from npa_envs.kernels.portable.adjoint import adjoint_kernels
 from npa_envs.ops.launch import launch
 from npa_envs.ops.sort import Plan, density_scale, make_plan

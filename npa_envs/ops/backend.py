@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from npa_envs.kernels.access import WARP
 from npa_envs.kernels.cuda.density import listed_density
 from npa_envs.kernels.cuda.perceive import listed_perception
-from npa_envs.kernels.cuda.warps import WARP
 from npa_envs.kernels.portable.perceive import perception_kernels
 from npa_envs.ops.launch import launch
 from npa_envs.ops.sort import Plan, SortedWorlds, density_scale

@@ -22,9 +22,8 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from npa_envs.kernels.access import CUDA_BLOCK, CUDA_LANES
 from npa_envs.kernels.cpu import SMALLEST_RANGES
-from npa_envs.kernels.cuda.warps import CUDA_BLOCK
-from npa_envs.kernels.wide import CUDA_LANES
 from npa_envs.runtime import quiet_warp, start_warp
 
 SHARES = 4

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from npa_envs.kernels.access import WARP
 from npa_envs.kernels.cuda.network import (
     UNIT_GROUP,
     WARP_UNITS,
@@ -15,7 +16,6 @@ from npa_envs.kernels.cuda.network import (
     two_layer_kernel,
     weight_gradient_kernels,
 )
-from npa_envs.kernels.cuda.warps import WARP
 from npa_envs.ops.launch import is_modern, launch
 
 LARGEST_ROW, LARGEST_UPDATE, LARGEST_HIDDEN = 128, 32, 512

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
+from npa_envs.kernels.access import WARP
 from npa_envs.kernels.cuda.sort import BLOCKS, LARGEST_GRID, STATE_SHARE, sort_small_worlds
-from npa_envs.kernels.cuda.warps import WARP
 from npa_envs.kernels.domain import make_domain
 from npa_envs.kernels.portable.sort import cell_kernels
 from npa_envs.ops.launch import channel_width, is_modern, lane_count, launch, scalar_type

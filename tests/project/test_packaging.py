@@ -70,7 +70,8 @@ def test_wheel_puts_one_name_into_site_packages(site: Path) -> None:
 
 
 def test_wheel_holds_every_source_file_and_the_rules(site: Path) -> None:
-    expected = {p.relative_to(ROOT).as_posix() for p in (ROOT / "npa_envs").rglob("*.py")}
+    sources = [p for kind in ("*.py", "*.cuh") for p in (ROOT / "npa_envs").rglob(kind)]
+    expected = {p.relative_to(ROOT).as_posix() for p in sources}
     for name in MAPPED_PACKAGES:
         expected |= {
             f"npa_envs/{p.relative_to(ROOT).as_posix()}" for p in (ROOT / name).rglob("*.py")

@@ -1,6 +1,6 @@
 """The adjoint of perception for states on CUDA in float32, by tiles of particles.
 
-The same sums as `gather_state_cotangents` of `adjoint`, in another order of work. A warp serves
+The same sums as the portable `gather_state_cotangents`, in another order of work. A warp serves
 eight particles that follow each other in the sorted order: it lists the rows within eps of the box
 around them, and multiplies the rows' cotangents by the weights of all eight on tensor cores. A
 row's cotangents are so read once for eight particles.
@@ -11,29 +11,18 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from npa_envs.kernels.cuda.slots import as_word, inverse_root
-from npa_envs.kernels.cuda.tiles import (
-    CHANNELS,
-    ENTRY,
-    LIST_ENTRIES,
-    TILE,
-    append_entry,
-    carry_rest,
-    make_read_columns,
-    make_tiles,
-    pad_list,
-    prefetch_columns,
-    share_tile,
-    smallest_in_tile,
-    write_columns,
-)
-from npa_envs.kernels.cuda.warps import (
+from npa_envs.kernels import native
+from npa_envs.kernels.access import (
+    CUDA_BLOCK,
     WARP,
     any_in_warp,
+    as_word,
     first_in_warp,
     largest_in_warp,
     load_integer,
     load_scalar,
+    make_wide_load,
+    make_wide_store,
     of_warp,
     scalar_of_warp,
     sum_up_to,
@@ -41,7 +30,19 @@ from npa_envs.kernels.cuda.warps import (
     vote_of_warp,
 )
 from npa_envs.kernels.domain import domain_types, kernel_module
-from npa_envs.kernels.wide import make_fast_exp2, make_wide_load, make_wide_store
+from npa_envs.kernels.mathematics import make_log_scale_pull
+
+TILE = 8
+"""Particles that a warp serves together, and rows of one product."""
+
+LIST_ENTRIES = 96
+"""Rows that a list has room for; longer ones are summed in several rounds."""
+
+ENTRY = wp.types.vector(4, wp.float32)
+"""A listed row: its position, and last the number of its channels' entry."""
+
+CHANNELS = wp.types.vector(4, wp.float32)
+"""Four adjacent channels."""
 
 CUDA_REGISTERS = 64
 """Registers of a thread that gathers state cotangents."""
@@ -59,29 +60,98 @@ LARGEST_LENGTH = 3e38
 SLACK = 1.0 + 1e-5
 """Rows are listed within this much more than eps^2, whatever was rounded on the way."""
 
-LOG2_E = 1.4426950408889634
-
 load_channels = make_wide_load(CHANNELS, wp.float32)
 store_channels = make_wide_store(CHANNELS, wp.float32)
-fast_exp2 = make_fast_exp2(wp.float32)
+
+
+@functools.cache
+def make_sum_listed(space_dim: int, width: int, kinds: int, periodic: bool) -> wp.Function:
+    """Return a Warp function that adds weighted channels of listed rows for a warp's particles.
+
+    Args:
+        space_dim: Space dimension D.
+        width: Channels of a group, W, at most 16.
+        kinds: Weights of a pair: 1 for the smoothing kernel, 1 + D with the spiky gradient kernel.
+        periodic: Whether space is a periodic box.
+    """
+    vector = wp.types.vector(space_dim, wp.float32)
+
+    @native.func_native(space_dim, width, kinds, periodic)
+    def sum_listed(
+        address: wp.uint32,
+        count: wp.int32,
+        position: vector,
+        inverse_eps: wp.float32,
+        inverse_squared_eps: wp.float32,
+        box: vector,
+        inverse_box: vector,
+        channels: wp.array(dtype=wp.float32),
+        value: CHANNELS,
+    ) -> CHANNELS: ...
+
+    return sum_listed
+
+
+@native.func_native(CUDA_BLOCK // WARP, LIST_ENTRIES)
+def row_list_address() -> wp.uint32:
+    """Where the warp's list of rows lies in fast memory."""
+
+
+@functools.cache
+def make_read_columns(count: int) -> wp.Function:
+    """Return a Warp function that reads some adjacent columns of a row, 0 from a last one on.
+
+    Args:
+        count: Columns to read, a multiple of 4.
+    """
+    result_type = wp.types.vector(count, wp.float32)
+
+    @native.func_native(count)
+    def read_columns(
+        values: wp.array(dtype=wp.float32, ndim=2), row: wp.int32, column: wp.int32, end: wp.int32
+    ) -> result_type: ...
+
+    return read_columns
+
+
+@native.func_native()
+def write_columns(
+    values: wp.array(dtype=wp.float32, ndim=2), row: wp.int32, column: wp.int32, entry: CHANNELS
+):
+    """Write four adjacent columns of a row, as far as there are so many."""
+
+
+@native.func_native()
+def append_entry(address: wp.uint32, count: wp.int32, accepted: wp.bool, entry: ENTRY) -> wp.int32:
+    """Append the entries of the threads that accept theirs; return the new length."""
+
+
+@native.func_native()
+def pad_list(address: wp.uint32, count: wp.int32, entry: ENTRY) -> wp.int32:
+    """Fill a list up to a multiple of a tile; return the new length."""
+
+
+@native.func_native()
+def carry_rest(address: wp.uint32, summed: wp.int32, count: wp.int32):
+    """Move what is not summed yet, less than a tile, to a list's beginning."""
+
+
+@native.func_native()
+def prefetch_columns(values: wp.array(dtype=wp.float32, ndim=2), row: wp.int32, column: wp.int32):
+    """Ask for a column of a row, to be read later."""
+
+
+@native.func_native()
+def share_tile(total: CHANNELS) -> CHANNELS:
+    """Return this thread's four channels of one particle, from the sums of `sum_listed`."""
+
+
+@native.func_native()
+def smallest_in_tile(value: wp.float32) -> wp.float32:
+    """The smallest value of the tile's particles, four threads each."""
+
+
 read_channels = make_read_columns(SHARE)
-
-
-@wp.func_native("return __fdividef(value, divisor);")
-def ratio(value: wp.float32, divisor: wp.float32) -> wp.float32:
-    """A quotient, two units in the last place off at most."""
-    ...
-
-
-@wp.func
-def tangential_of(length: wp.float32, radial: wp.float32):
-    """`log_scale_tangential` |L| / (exp|L| - 1), given exp(-|L|); by its series below 1."""
-    squared = length * length
-    series = squared * (wp.float32(1.0 / 30240.0) - squared * wp.float32(1.0 / 1209600.0))
-    series = squared * (wp.float32(1.0 / 12.0) - squared * (wp.float32(1.0 / 720.0) - series))
-    series = wp.float32(1.0) - wp.float32(0.5) * length + series
-    quotient = ratio(length * radial, wp.float32(1.0) - radial)
-    return wp.where(length < wp.float32(1.0), series, quotient)
 
 
 @functools.cache
@@ -110,20 +180,9 @@ def listed_adjoint(
     module = kernel_module(topic, space_dim, scalar, width)
     load_vector = make_wide_load(vector, scalar)
     parts = width // SHARE
-    tiles = make_tiles(space_dim, width, kinds, periodic)
-    list_address, sum_listed = tiles.list_address, tiles.sum_listed
+    sum_listed = make_sum_listed(space_dim, width, kinds, periodic)
+    log_scale_pull = make_log_scale_pull(vector)
     read_gradients = make_read_columns(SHARE * space_dim)
-
-    @wp.func
-    def log_scale_pull(scaled: vector, cotangent: vector):
-        """`log_scale_adjoint` in fewer instructions."""
-        squared = wp.dot(scaled, scaled) + scalar(1e-37)
-        inverse = inverse_root(squared)
-        length = squared * inverse
-        radial = fast_exp2(scalar(-LOG2_E) * length)
-        tangential = tangential_of(length, radial)
-        along = (radial - tangential) * inverse * (inverse * wp.dot(scaled, cotangent))
-        return tangential * cotangent + along * scaled
 
     @wp.kernel(enable_backward=False, module=module, grid_stride=False)
     def unscale_cotangents(
@@ -342,7 +401,7 @@ def listed_adjoint(
             prefetch_columns(perception_bar, own_row, channel)
         cell = cell_of(domain, position)
         line = line_of(domain, cell)
-        address = list_address()
+        address = row_list_address()
         total = CHANNELS()
         # A position that is not a number is near to nothing.
         waiting = k < end and is_finite(position)

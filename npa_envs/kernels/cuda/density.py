@@ -6,13 +6,21 @@ is known.
 """
 
 import functools
+from types import SimpleNamespace
 
 import warp as wp
 
-from npa_envs.kernels.cuda.slots import as_word, make_lists
-from npa_envs.kernels.cuda.warps import CUDA_BLOCK, load_integer
+from npa_envs.kernels import native
+from npa_envs.kernels.access import (
+    CUDA_BLOCK,
+    as_word,
+    load_integer,
+    make_lane_sum,
+    make_wide_load,
+    make_wide_store,
+)
 from npa_envs.kernels.domain import domain_types, kernel_module
-from npa_envs.kernels.wide import make_lane_sum, make_wide_load, make_wide_store
+from npa_envs.kernels.mathematics import smoothing_falloff, smoothing_of
 
 AHEAD, SHARED_AHEAD = 3, 5
 """Candidates that a thread looks at together: alone with a particle, and one of several lanes."""
@@ -23,6 +31,9 @@ RECORD = wp.types.vector(4, wp.float32)
 LONGEST_STEP = wp.constant(2**15 - 1)
 """Steps of a list's entry have 16 bits."""
 
+SHARE_OF_LIST = 2
+"""A lane of several has room for so many times its share of a list."""
+
 LIST_BYTES = 2 * CUDA_BLOCK
 """Bytes from one entry of a list to the next while it is made."""
 
@@ -31,6 +42,47 @@ BLOCK = 4096
 after the other, too much is rounded away."""
 
 store_record = make_wide_store(RECORD, wp.float32)
+
+
+@functools.cache
+def make_lists(capacity: int, lanes: int) -> SimpleNamespace:
+    """Return the Warp functions by which the lanes of a particle list its neighbours.
+
+    A list holds the steps to neighbours in the sorted order, in 16 bits. It is gathered in fast
+    memory and left in an array: 32 particles together, first entries first.
+
+    Args:
+        capacity: Neighbours that a list has room for; more are counted, but not all are kept.
+        lanes: Lanes of a particle; whole warps must leave their lists together.
+    """
+    room = min(capacity, SHARE_OF_LIST * capacity // lanes)
+
+    @native.func_native(room, CUDA_BLOCK)
+    def list_address() -> wp.uint32: ...
+
+    @native.func_native(room, CUDA_BLOCK)
+    def append_step(
+        first: wp.uint32, place: wp.uint32, weight: wp.float32, step: wp.int32
+    ) -> wp.uint32: ...
+
+    @native.func_native(room, CUDA_BLOCK, capacity, lanes)
+    def leave_list(
+        first: wp.uint32, place: wp.uint32, row: wp.int32, lists: wp.array(dtype=wp.int16)
+    ) -> wp.int32: ...
+
+    return SimpleNamespace(
+        list_address=list_address, append_step=append_step, leave_list=leave_list
+    )
+
+
+@functools.cache
+def make_step_at(capacity: int) -> wp.Function:
+    """Return a Warp function that reads an entry of a row's list, as `make_lists` leaves it."""
+
+    @native.func_native(capacity)
+    def step_at(lists: wp.array(dtype=wp.int16), row: wp.int32, entry: wp.int32) -> wp.int32: ...
+
+    return step_at
 
 
 @functools.cache
@@ -70,7 +122,7 @@ def listed_density(
         if wp.static(periodic):
             nearest = periodic_image(domain, nearest)
         squared = wp.dot(nearest, nearest)
-        return wp.max(scalar(1.0) - squared * domain.inverse_squared_eps, scalar(0.0))
+        return wp.max(smoothing_falloff(squared, domain.inverse_squared_eps), scalar(0.0))
 
     topic = "listed_density" + "_in_box" * periodic + f"_{capacity}" + "_of_rows" * masked
 
@@ -139,7 +191,7 @@ def listed_density(
                         step = j + a * wp.static(lanes) - k
                         falloff = falloff_at(domain, ahead[a] - position)
                         list_end = append_step(list_begin, list_end, falloff, step)
-                        total += falloff * falloff * falloff
+                        total += smoothing_of(falloff, scalar(1.0))
                     j += wp.static(many * lanes)
                 if crowded:
                     earlier += total
@@ -154,7 +206,7 @@ def listed_density(
                     falloff = falloff_at(domain, ahead[a] - position)
                     falloff = wp.where(candidate < end, falloff, scalar(0.0))
                     list_end = append_step(list_begin, list_end, falloff, candidate - k)
-                    total += falloff * falloff * falloff
+                    total += smoothing_of(falloff, scalar(1.0))
         # A particle always sees itself: a position that is not finite would otherwise have rho 0.
         total = wp.max(add_scalar(earlier + total), scalar(1.0))
         length = leave_list(list_begin, list_end, row, lists)

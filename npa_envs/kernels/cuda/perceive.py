@@ -1,78 +1,43 @@
-"""Spiky factors of pairs in float64 for positions in float32: density gradients cancel."""
+"""Perception on CUDA in float32, by the lists of neighbours that the density pass left.
+
+The same sums as the portable kernel, in another order of work. The lanes of a particle weigh the
+listed neighbours, one for each lane, and put the weights into fast memory; then they run through
+these together, a few channels for each lane: weights are computed once, and only for neighbours; a
+neighbour's state is read once, by adjacent lanes. Rows leave through fast memory too, in whole
+transactions. A list that is too long was not kept: its neighbours are searched for again.
+"""
 
 import functools
 import math
+from types import SimpleNamespace
 
 import warp as wp
 
-from npa_envs.kernels.cuda.density import RECORD
-from npa_envs.kernels.cuda.slots import (
-    SLOT_ENTRIES,
-    as_number,
-    inverse_root,
-    log_scale_of_square,
-    make_lists,
-    make_slots,
-    make_stage,
-    within,
-)
-from npa_envs.kernels.cuda.warps import (
+from npa_envs.kernels import native
+from npa_envs.kernels.access import (
+    CUDA_BLOCK,
     any_in_warp,
+    as_number,
     largest_in_warp,
     load_integer,
+    make_lane_sum,
+    make_wide_load,
     meet_warp,
     of_lane,
+    share_type,
     thread_number,
 )
+from npa_envs.kernels.cuda.density import RECORD, make_step_at
 from npa_envs.kernels.domain import domain_types, kernel_module
-from npa_envs.kernels.mathematics import MOMENT_THRESHOLD, log_scaled_huge, make_smooth_inverse
-from npa_envs.kernels.wide import make_lane_sum, make_wide_load, share_type
-
-
-@functools.cache
-def make_spiky_wide(space_dim: int, periodic: bool) -> wp.Function:
-    """Return the function of one variant.
-
-    Args:
-        space_dim: Space dimension D.
-        periodic: Whether space is a periodic box.
-    """
-    scalar = wp.float32
-    types = domain_types(space_dim, scalar)
-    vector, Domain = types.vector, types.Domain
-    wide = wp.types.vector(space_dim, wp.float64)
-
-    @wp.func
-    def spiky_wide(domain: Domain, centre: vector, neighbour: vector, squared: scalar):
-        """Spiky factor and distance vector of a pair in float64, as in `perception`."""
-        r = wide()
-        start = squared
-        for d in range(wp.static(space_dim)):
-            r[d] = wp.float64(neighbour[d]) - wp.float64(centre[d])
-        if wp.static(periodic):
-            for d in range(wp.static(space_dim)):
-                images = wp.round((neighbour[d] - centre[d]) * domain.inverse_box[d])
-                r[d] -= wp.float64(images) * wp.float64(domain.box[d])
-            start = scalar(wp.dot(r, r))
-        exact = wp.dot(r, r)
-        apart = wp.where(start > scalar(0.0), inverse_root(start), scalar(0.0))
-        inverse = wp.float64(apart)
-        inverse *= wp.float64(1.5) - wp.float64(0.5) * exact * inverse * inverse
-        falloff = wp.float64(1.0) - exact * inverse * wp.float64(domain.inverse_eps)
-        return wp.float64(domain.spiky_norm) * falloff * falloff * inverse, r
-
-    return spiky_wide
-
-
-# Perception on CUDA in float32, by the lists of neighbours that the density pass left.
-#
-# The same sums as `perception`, in another order of work. The lanes of a particle weigh the
-# listed neighbours, one for each lane, and put the weights into fast memory; then they run
-# through these together, a few channels for each lane: weights are computed once, and only for
-# neighbours; a neighbour's state is read once, by adjacent lanes. Rows leave through fast memory
-# too, in whole transactions. A list that is too long was not kept: its neighbours are searched
-# for again.
-
+from npa_envs.kernels.mathematics import (
+    inverse_root,
+    log_scale_of_square,
+    log_scaled_huge,
+    make_corrected,
+    smoothing,
+    spiky_factor_wide,
+    within,
+)
 
 CUDA_REGISTERS, TEAM_REGISTERS = 80, 96
 """Registers of a thread of the perception pass, of one team and of several."""
@@ -80,7 +45,82 @@ CUDA_REGISTERS, TEAM_REGISTERS = 80, 96
 AHEAD = 2
 """Listed neighbours that a lane asks for together."""
 
+SLOT_ENTRIES = 32
+"""Neighbours that a slot has room for; longer neighbourhoods are summed in several rounds."""
+
 load_record = make_wide_load(RECORD, wp.float32)
+
+
+@functools.cache
+def make_slots(
+    space_dim: int, width: int, lanes: int, state_gradient: bool, grouped: bool
+) -> SimpleNamespace:
+    """Return the Warp functions on slots of one variant.
+
+    Args:
+        space_dim: Space dimension D.
+        width: Channels of a group.
+        lanes: Lanes of a particle.
+        state_gradient: Whether a row holds the state gradient.
+        grouped: Whether channels come in several groups.
+    """
+    vector = wp.types.vector(space_dim, wp.float32)
+    entry_type = wp.types.vector(space_dim + 2, wp.float32)
+    row_words = width * (2 + space_dim * state_gradient)
+    # The odd 16 bytes spread the slots of a warp over the memory's banks.
+    slot_bytes = max(SLOT_ENTRIES * (16 if space_dim == 2 else 20), 4 * row_words) + 16
+
+    @native.func_native(slot_bytes, lanes, CUDA_BLOCK)
+    def slot_address() -> wp.uint32: ...
+
+    @native.func_native(space_dim, SLOT_ENTRIES, lanes)
+    def append_number(
+        slot: wp.uint32, count: wp.int32, accepted: wp.bool, number: wp.int32
+    ) -> wp.int32: ...
+
+    @native.func_native(space_dim, SLOT_ENTRIES)
+    def number_at(slot: wp.uint32, entry: wp.int32) -> wp.int32: ...
+
+    @native.func_native(space_dim, SLOT_ENTRIES)
+    def put_entry(
+        slot: wp.uint32, entry: wp.int32, smooth: wp.float32, kernel: vector, number: wp.int32
+    ): ...
+
+    @native.func_native(space_dim, SLOT_ENTRIES)
+    def entry_at(slot: wp.uint32, entry: wp.int32) -> entry_type: ...
+
+    @native.func_native(space_dim, width, lanes, row_words, slot_bytes, grouped)
+    def write_rows(
+        slot: wp.uint32,
+        destination: wp.int32,
+        group: wp.int32,
+        state_dim: wp.int32,
+        limit: wp.float32,
+        rows: wp.array(dtype=wp.float32, ndim=2),
+    ): ...
+
+    return SimpleNamespace(
+        slot_address=slot_address,
+        append_number=append_number,
+        number_at=number_at,
+        put_entry=put_entry,
+        entry_at=entry_at,
+        write_rows=write_rows,
+    )
+
+
+@functools.cache
+def make_stage(value_type: type) -> wp.Function:
+    """Return a Warp function that puts a value into a slot, a number of words from its beginning.
+
+    Args:
+        value_type: A vector or matrix type of float32.
+    """
+
+    @native.func_native()
+    def stage(slot: wp.uint32, word: wp.int32, value: value_type): ...
+
+    return stage
 
 
 @functools.cache
@@ -123,7 +163,6 @@ def listed_perception(
         types.segment_cells,
     )
     periodic_image = types.periodic_image
-    spiky_wide = make_spiky_wide(space_dim, periodic)
     wide = wp.types.vector(space_dim, wp.float64)
     group = wp.types.vector(width, scalar)
     share = share_type(group, scalar, lanes)
@@ -156,17 +195,33 @@ def listed_perception(
         slots.number_at,
     )
     put_entry, entry_at = slots.put_entry, slots.entry_at
-    step_at = make_lists(capacity).step_at
+    step_at = make_step_at(capacity)
     places_ahead = wp.types.vector(AHEAD, wp.int32)
     records_ahead = wp.types.matrix((AHEAD, 4), scalar)
     write_rows = slots.write_rows
-    smooth_inverse = make_smooth_inverse(space_dim, scalar)
+    corrected = make_corrected(space_dim, scalar, share_width, moment_inverse)
     stage_share, stage_rows = make_stage(share), make_stage(share_rows)
 
     @wp.func
     def padded(count: wp.int32):
         """A number of neighbours rounded up to a multiple of the lanes."""
         return (count + wp.static(lanes - 1)) & ~wp.int32(wp.static(lanes - 1))
+
+    @wp.func
+    def spiky_wide(domain: Domain, centre: vector, neighbour: vector, squared: scalar):
+        """Spiky factor and distance vector of a pair in float64."""
+        r = wide()
+        start = squared
+        for d in range(wp.static(space_dim)):
+            r[d] = wp.float64(neighbour[d]) - wp.float64(centre[d])
+        if wp.static(periodic):
+            for d in range(wp.static(space_dim)):
+                images = wp.round((neighbour[d] - centre[d]) * domain.inverse_box[d])
+                r[d] -= wp.float64(images) * wp.float64(domain.box[d])
+            start = scalar(wp.dot(r, r))
+        exact = wp.dot(r, r)
+        apart = wp.where(start > scalar(0.0), inverse_root(start), scalar(0.0))
+        return spiky_factor_wide(exact, apart, domain.inverse_eps, domain.spiky_norm), r
 
     @wp.func
     def weigh(
@@ -200,8 +255,7 @@ def listed_perception(
         if wp.static(periodic):
             offset = periodic_image(domain, offset)
         squared = wp.dot(offset, offset)
-        falloff = scalar(1.0) - squared * domain.inverse_squared_eps
-        weight = volume * domain.smoothing_norm * falloff * falloff * falloff
+        weight = smoothing(squared, domain.inverse_squared_eps, volume * domain.smoothing_norm)
         factor, r = spiky_wide(domain, position, neighbour, squared)
         density_gradient += factor * r
         weighted = vector()
@@ -507,10 +561,7 @@ def listed_perception(
             for r in range(1, wp.static(space_dim)):
                 for c in range(r):
                     moment[r, c] = moment[c, r]
-            if wp.static(smooth):
-                gradient = smooth_inverse(moment) * gradient
-            elif wp.abs(wp.determinant(moment)) >= scalar(wp.static(MOMENT_THRESHOLD)):
-                gradient = wp.inverse(moment) * gradient
+            gradient = corrected(gradient, moment)
         mine = (lane & wp.static(team - 1)) * wp.static(share_width)
         stage_share(slot, mine, wp.where(present, own, share()))
         stage_share(slot, wp.static(width) + mine, blur)

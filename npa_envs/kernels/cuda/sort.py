@@ -10,8 +10,16 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from npa_envs.kernels import native
+from npa_envs.kernels.access import (
+    block_number,
+    make_read_channels,
+    make_wide_load,
+    make_wide_store,
+    meet_block,
+    thread_of_block,
+)
 from npa_envs.kernels.domain import domain_types, kernel_module
-from npa_envs.kernels.wide import make_read_channels, make_wide_load, make_wide_store
 
 BLOCKS = {1024: 256, 4096: 1024}
 """Threads of a block by the particles that it has room for."""
@@ -25,201 +33,54 @@ LARGEST_GRID = 4096
 STATE_SHARE = 4
 """Adjacent channels that a thread moves."""
 
-# Counts, later starts, of cells: of all particles, and from bit 16 on of the active ones. Then of
-# each particle its cell and its arrival there, and of each provisional place its particle: arrivals
-# and members are doubled, plus one if the particle is active.
-_MEMORY = """
-    struct Memory {{
-        int starts[{grid} + 1];
-        int sums[{block} / 32];
-        int earlier;
-        unsigned short cells[{capacity}];
-        unsigned short arrivals[{capacity}];
-        unsigned short members[{capacity}];
-    }};
-"""
-
-_ALLOCATE = """
-    __shared__ Memory memory;
-    return (unsigned long long)&memory;
-"""
-
-_VIEW = """
-    Memory& memory = *reinterpret_cast<Memory*>(address);
-"""
-
-_COUNT_ACTIVE = """
-    int sum = 0;
-    const uint4* chunks = reinterpret_cast<const uint4*>(mask.data);
-    for (int chunk = threadIdx.x; chunk < count / 16; chunk += blockDim.x) {
-        const uint4 flags = chunks[chunk];
-        sum += __popc(__vsetne4(flags.x, 0)) + __popc(__vsetne4(flags.y, 0));
-        sum += __popc(__vsetne4(flags.z, 0)) + __popc(__vsetne4(flags.w, 0));
-    }
-    const int rest = count / 16 * 16 + threadIdx.x;
-    if (rest < count) sum += mask.data[rest] != 0;
-    return sum;
-"""
-
-_CLEAR = """
-    for (int cell = threadIdx.x; cell < cell_count; cell += blockDim.x) memory.starts[cell] = 0;
-    if (threadIdx.x == 0) memory.earlier = 0;
-    __syncthreads();
-    const int sum = __reduce_add_sync(~0u, earlier);
-    if ((threadIdx.x & 31u) == 0) atomicAdd(&memory.earlier, sum);
-"""
-
-_ARRIVE = """
-    const int before = atomicAdd(&memory.starts[cell], active ? 1 << 16 | 1 : 1);
-    memory.cells[particle] = cell;
-    memory.arrivals[particle] = (before & 0xffff) << 1 | active;
-"""
-
-# A thread adds up some adjacent cells, a warp its threads, and every thread the warps before it.
-_ADD_UP = """
-    __syncthreads();
-    const int share = (cell_count + blockDim.x - 1) / blockDim.x;
-    const int begin = min((int)threadIdx.x * share, cell_count);
-    const int end = min(begin + share, cell_count);
-    int sum = 0;
-    for (int cell = begin; cell < end; ++cell) sum += memory.starts[cell];
-    int before = sum;
-    #pragma unroll
-    for (unsigned offset = 1; offset < 32; offset <<= 1) {
-        const int other = __shfl_up_sync(~0u, before, offset);
-        if ((threadIdx.x & 31u) >= offset) before += other;
-    }
-    if ((threadIdx.x & 31u) == 31u) memory.sums[threadIdx.x / 32] = before;
-    before -= sum;
-    __syncthreads();
-    const unsigned lane = threadIdx.x & 31u;
-    before += __reduce_add_sync(~0u, lane < threadIdx.x / 32 ? memory.sums[lane] : 0);
-    for (int cell = begin; cell < end; ++cell) {
-        const int count = memory.starts[cell];
-        memory.starts[cell] = before;
-        before += count;
-    }
-    if (threadIdx.x == blockDim.x - 1) memory.starts[cell_count] = before;
-    __syncthreads();
-"""
-
-_START = """
-    const int start = memory.starts[cell];
-    return wp::vec_t<2, int>(start & 0xffff, memory.earlier + (start >> 16));
-"""
-
-_PLACE = """
-    const int arrival = memory.arrivals[particle];
-    const int place = (memory.starts[memory.cells[particle]] & 0xffff) + (arrival >> 1);
-    memory.members[place] = particle << 1 | arrival & 1;
-"""
-
-# From the start of the cell of the slice's first place to the end of the cell of its last one.
-_SPAN = """
-    const int first_cell = memory.cells[memory.members[begin] >> 1];
-    const int last_cell = memory.cells[memory.members[end - 1] >> 1];
-    return wp::vec_t<2, int>(
-        memory.starts[first_cell] & 0xffff, memory.starts[last_cell + 1] & 0xffff
-    );
-"""
-
-_RANKED = """
-    const int entry = memory.members[place];
-    const int cell = memory.cells[entry >> 1];
-    const int start = memory.starts[cell];
-    const int end = memory.starts[cell + 1] & 0xffff;
-    int ranked = start & 0xffff;
-    int row = start >> 16;
-    for (int other = start & 0xffff; other < end; ++other) {
-        const int member = memory.members[other];
-        ranked += member < entry;
-        row += member < entry & member;
-    }
-    row = entry & 1 ? memory.earlier + row : -1;
-    return wp::vec_t<3, int>(ranked, cell, row);
-"""
-
-_MEMBER = """
-    return memory.members[place] >> 1;
-"""
-
 store_integer = make_wide_store(wp.int32, wp.int32)
 
 
-@wp.func_native("__syncthreads();")
-def meet_block():
-    """Wait until the whole block is here, and sees what it wrote."""
-    ...
-
-
-@wp.func_native(_COUNT_ACTIVE)
+@native.func_native()
 def count_active(mask: wp.array(dtype=wp.uint8), count: wp.int32) -> wp.int32:
     """A thread's part in counting the active ones of the first `count` particles of all worlds."""
-    ...
-
-
-@wp.func_native("return blockIdx.x;")
-def block_number() -> wp.int32:
-    """Number of this block in its launch."""
-    ...
-
-
-@wp.func_native("return threadIdx.x;")
-def thread_of_block() -> wp.int32:
-    """Number of this thread in its block."""
-    ...
 
 
 @functools.cache
 def make_block_sort(capacity: int) -> SimpleNamespace:
     """Return the Warp functions by which a block sorts a world of up to `capacity` particles."""
-    memory = _MEMORY.format(grid=LARGEST_GRID, block=BLOCKS[capacity], capacity=capacity)
-    view = memory + _VIEW
+    sizes = capacity, BLOCKS[capacity], LARGEST_GRID
 
-    @wp.func_native(memory + _ALLOCATE)
+    @native.func_native(*sizes)
     def block_memory() -> wp.uint64:
         """The block's memory."""
-        ...
 
-    @wp.func_native(view + _CLEAR)
+    @native.func_native(*sizes)
     def clear_counts(address: wp.uint64, cell_count: wp.int32, earlier: wp.int32):
         """Set the counts of all cells to zero, and add up every thread's count of earlier rows."""
-        ...
 
-    @wp.func_native(view + _ARRIVE)
+    @native.func_native(*sizes)
     def arrive(address: wp.uint64, particle: wp.int32, cell: wp.int32, active: wp.bool):
         """Count a particle in its cell."""
-        ...
 
-    @wp.func_native(view + _ADD_UP)
+    @native.func_native(*sizes)
     def add_up_counts(address: wp.uint64, cell_count: wp.int32):
         """Turn counts into starts."""
-        ...
 
-    @wp.func_native(view + _START)
+    @native.func_native(*sizes)
     def start_of(address: wp.uint64, cell: wp.int32) -> wp.vec2i:
         """First place in the world, and first row of all worlds, of a cell."""
-        ...
 
-    @wp.func_native(view + _PLACE)
+    @native.func_native(*sizes)
     def place_arrived(address: wp.uint64, particle: wp.int32):
         """Give a particle its provisional place."""
-        ...
 
-    @wp.func_native(view + _SPAN)
+    @native.func_native(*sizes)
     def span_of_slice(address: wp.uint64, begin: wp.int32, end: wp.int32) -> wp.vec2i:
         """Provisional places, from and up to, of all that may belong into a slice of places."""
-        ...
 
-    @wp.func_native(view + _RANKED)
+    @native.func_native(*sizes)
     def ranked_at(address: wp.uint64, place: wp.int32) -> wp.vec3i:
         """Final place, cell and row (-1: none) of the particle at a provisional place."""
-        ...
 
-    @wp.func_native(view + _MEMBER)
+    @native.func_native(*sizes)
     def member_at(address: wp.uint64, place: wp.int32) -> wp.int32:
         """Number of the particle at a provisional place."""
-        ...
 
     return SimpleNamespace(
         block_memory=block_memory,

@@ -20,10 +20,18 @@ from typing import Any
 
 import warp as wp
 
+from npa_envs.kernels import native
+from npa_envs.kernels.access import (
+    WARP,
+    any_in_warp,
+    load_integer,
+    make_lane_sum,
+    make_wide_load,
+    meet_block,
+)
 from npa_envs.kernels.cpu import TILES, in_ranges
-from npa_envs.kernels.cuda.sort import meet_block
-from npa_envs.kernels.cuda.warps import WARP, any_in_warp, load_integer
 from npa_envs.kernels.domain import scalar_name
+from npa_envs.kernels.mathematics import make_fast_exp2
 from npa_envs.kernels.pictures.gaussians import (
     CHANNELS,
     PULLS,
@@ -32,7 +40,6 @@ from npa_envs.kernels.pictures.gaussians import (
     gaussian_types,
     projection_functions,
 )
-from npa_envs.kernels.wide import c_scalar, make_fast_exp2, make_lane_sum, make_wide_load
 
 LARGEST_ALPHA = 0.99
 """What a Gaussian covers of a pixel, at most: the adjoint divides by the rest."""
@@ -52,19 +59,6 @@ BATCH = 32
 TO_POWER_OF_TWO = -0.7213475204444817
 """-1/2 log2(e): of exp(-1/2 p) as a power of two."""
 
-_KEEP = """
-    __shared__ {part} kept[{batch}][{warps}][{pulls}];
-    {part} sum = 0;
-    if (!write) {{
-        #pragma unroll
-        for (unsigned warp = 0; warp < {warps}; ++warp) sum += kept[i][warp][entry];
-    }} else if ((threadIdx.x & 31u) == 0) {{
-        #pragma unroll
-        for (unsigned k = 0; k < {pulls}; ++k) kept[i][threadIdx.x / 32u][k] = value[k];
-    }}
-    return sum;
-"""
-
 
 @functools.cache
 def make_keep(value_type: type, scalar: type) -> Any:
@@ -77,11 +71,8 @@ def make_keep(value_type: type, scalar: type) -> Any:
         value_type: A vector type.
         scalar: The scalar type that it is made of.
     """
-    snippet = _KEEP.format(
-        part=c_scalar(scalar), batch=BATCH, warps=TILE_PIXELS // WARP, pulls=value_type._length_
-    )
 
-    @wp.func_native(snippet)
+    @native.func_native(BATCH, TILE_PIXELS // WARP)
     def keep(write: wp.bool, i: wp.int32, entry: wp.int32, value: value_type) -> scalar: ...
 
     return keep
@@ -182,7 +173,7 @@ def tile_kernels(scalar: type) -> SimpleNamespace:
         functions.middle_of,
     )
     covered = projection_functions(scalar).covered
-    module = wp.get_module(f"npa_envs.kernels.blending_tiles_{scalar_name(scalar)}")
+    module = native.module(f"npa_envs.kernels.blending_tiles_{scalar_name(scalar)}")
 
     @wp.func
     def shared_pixels(frame: Frame, tile: wp.int32, footprint: footprint_type):
@@ -301,8 +292,8 @@ def block_kernels(scalar: type) -> SimpleNamespace:
         functions.middle_of,
     )
     name = scalar_name(scalar)
-    drawing = wp.get_module(f"npa_envs.kernels.blending_blocks_{name}")
-    pulling = wp.get_module(f"npa_envs.kernels.blending_blocks_adjoint_{name}")
+    drawing = native.module(f"npa_envs.kernels.blending_blocks_{name}")
+    pulling = native.module(f"npa_envs.kernels.blending_blocks_adjoint_{name}")
     load_footprint = make_wide_load(footprint_type, scalar)
     add_warp = make_lane_sum(pulls_type, scalar, WARP, whole_warps=True)
     keep = make_keep(pulls_type, scalar)

@@ -13,9 +13,10 @@ from typing import Any
 
 import warp as wp
 
+from npa_envs.kernels import native
+from npa_envs.kernels.access import make_wide_load, make_wide_store
 from npa_envs.kernels.cpu import PAIRS, in_ranges
 from npa_envs.kernels.domain import scalar_name
-from npa_envs.kernels.wide import make_wide_load, make_wide_store
 
 TILE = 16
 """Pixels along each side of a tile."""
@@ -314,7 +315,7 @@ def gaussian_kernels(scalar: type) -> SimpleNamespace:
     limited_ratios, jacobian_of = functions.limited_ratios, functions.jacobian_of
     harmonics_at, harmonic_basis = functions.harmonics_at, functions.harmonic_basis
     colours_of, covered_tiles = functions.colours_of, functions.covered_tiles
-    module = wp.get_module(f"npa_envs.kernels.gaussians_{scalar_name(scalar)}")
+    module = native.module(f"npa_envs.kernels.gaussians_{scalar_name(scalar)}")
     load_footprint = make_wide_load(footprint_type, scalar)
     store_footprint = make_wide_store(footprint_type, scalar)
     load_pulls = make_wide_load(pulls_type, scalar)

@@ -7,16 +7,17 @@ from typing import Any
 
 import warp as wp
 
-from npa_envs.kernels.cpu import PAIRS, WORLDS, in_ranges
-from npa_envs.kernels.domain import scalar_name
-from npa_envs.kernels.wide import (
-    make_fast_exp2,
+from npa_envs.kernels import native
+from npa_envs.kernels.access import (
     make_lane_scatter,
     make_lane_sum,
     make_warp_sum,
     make_wide_load,
     make_wide_store,
 )
+from npa_envs.kernels.cpu import PAIRS, WORLDS, in_ranges
+from npa_envs.kernels.domain import scalar_name
+from npa_envs.kernels.mathematics import make_fast_exp2
 
 CHANNELS = 4
 """Red, green, blue and density."""
@@ -133,7 +134,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
     weights_type, tile_type = types.weights, types.tile
     group_tiles = GROUP_WIDTH * GROUP_HEIGHT
     share = TILE_WIDTH * TILE_HEIGHT // lanes
-    module = wp.get_module(f"npa_envs.kernels.splat_{scalar_name(scalar)}_l{lanes}")
+    module = native.module(f"npa_envs.kernels.splat_{scalar_name(scalar)}_l{lanes}")
     load_footprint = make_wide_load(footprint_type, scalar)
     store_footprint = make_wide_store(footprint_type, scalar)
     load_colour = make_wide_load(colour_type, scalar)

@@ -16,6 +16,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from npa_envs.kernels.access import make_lane_scatter, make_wide_load
 from npa_envs.kernels.cpu import PAIRS, in_ranges, make_add_scaled, make_sift
 from npa_envs.kernels.domain import domain_types, kernel_module
 from npa_envs.kernels.mathematics import (
@@ -25,7 +26,6 @@ from npa_envs.kernels.mathematics import (
     spiky_factor,
     spiky_radial_slope,
 )
-from npa_envs.kernels.wide import make_lane_scatter, make_wide_load
 
 CUDA_REGISTERS = 64
 """Registers of a thread that gathers state cotangents: it mostly waits for memory."""

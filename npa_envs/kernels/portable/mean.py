@@ -8,8 +8,9 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from npa_envs.kernels import native
+from npa_envs.kernels.access import make_warp_sum
 from npa_envs.kernels.domain import scalar_name
-from npa_envs.kernels.wide import make_warp_sum
 
 CHUNK = 256
 """Values whose sum is one partial sum."""
@@ -21,7 +22,7 @@ MEAN_LANES = 32
 @functools.cache
 def mean_kernels(scalar: type, lanes: int) -> SimpleNamespace:
     """Return the kernels of one scalar type; `lanes` threads share a sum."""
-    module = wp.get_module(f"npa_envs.kernels.worlds_{scalar_name(scalar)}_l{lanes}")
+    module = native.module(f"npa_envs.kernels.worlds_{scalar_name(scalar)}_l{lanes}")
     lane_sum = make_warp_sum(wp.float64)
 
     @wp.kernel(enable_backward=False, module=module)

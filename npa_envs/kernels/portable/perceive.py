@@ -12,16 +12,16 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from npa_envs.kernels.access import make_lane_scatter, make_lane_sum, make_wide_load, share_type
 from npa_envs.kernels.cpu import PAIRS, in_ranges, make_add_scaled, make_sift
 from npa_envs.kernels.domain import domain_types, kernel_module
 from npa_envs.kernels.mathematics import (
-    MOMENT_THRESHOLD,
     log_scaled,
-    make_smooth_inverse,
+    make_corrected,
     smoothing,
     spiky_factor,
+    spiky_factor_wide,
 )
-from npa_envs.kernels.wide import make_lane_scatter, make_lane_sum, make_wide_load, share_type
 
 CUDA_REGISTERS = 128
 """Registers of a thread of the perception pass: more threads in flight are worth a few spills."""
@@ -71,7 +71,7 @@ def perception_kernels(
     scatter_group = make_lane_scatter(group, scalar, lanes)
     scatter_gradient = make_lane_scatter(group_gradient, scalar, lanes)
     gradient_share = share_type(group_gradient, scalar, lanes)
-    smooth_inverse = make_smooth_inverse(space_dim, scalar)
+    corrected = make_corrected(space_dim, scalar, share, moment_inverse)
 
     @wp.func
     def spiky_wide(domain: Domain, centre: vector, neighbour: vector):
@@ -88,10 +88,8 @@ def perception_kernels(
         # may be off by a rounding of the box's size.
         rounded = scalar(exact)
         if rounded > scalar(0.0):
-            inverse = wp.float64(scalar(1.0) / wp.sqrt(rounded))
-            inverse *= wp.float64(1.5) - wp.float64(0.5) * exact * inverse * inverse
-            falloff = wp.float64(1.0) - exact * inverse * wp.float64(domain.inverse_eps)
-            kernel = (wp.float64(domain.spiky_norm) * falloff * falloff * inverse) * r
+            start = scalar(1.0) / wp.sqrt(rounded)
+            kernel = spiky_factor_wide(exact, start, domain.inverse_eps, domain.spiky_norm) * r
         return kernel
 
     @in_ranges(PAIRS)
@@ -199,16 +197,6 @@ def perception_kernels(
             if wp.static(moment_correction):
                 moment = add_square(moment)
         return scatter_group(blur), gradients, kernel_sum, moment
-
-    @wp.func
-    def corrected(gradient: gradient_share, moment: square):
-        """Apply the inverse moment matrix where it is safely invertible, or the smooth one."""
-        result = gradient
-        if wp.static(smooth):
-            result = smooth_inverse(moment) * gradient
-        elif wp.abs(wp.determinant(moment)) >= scalar(wp.static(MOMENT_THRESHOLD)):
-            result = wp.inverse(moment) * gradient
-        return result
 
     @wp.func
     def clipped(value: scalar, limit: scalar):

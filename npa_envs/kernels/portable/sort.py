@@ -12,10 +12,16 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from npa_envs.kernels.access import (
+    WARP,
+    load_integer,
+    make_read_channels,
+    make_wide_load,
+    make_wide_store,
+    of_warp,
+)
 from npa_envs.kernels.cpu import PARTICLES, in_ranges
-from npa_envs.kernels.cuda.warps import WARP, load_integer, of_warp
 from npa_envs.kernels.domain import domain_types, kernel_module
-from npa_envs.kernels.wide import make_read_channels, make_wide_load, make_wide_store
 
 store_integer = make_wide_store(wp.int32, wp.int32)
 load_pair = make_wide_load(wp.vec2i, wp.int32)

@@ -10,8 +10,14 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from npa_envs.kernels.access import (
+    load_integer,
+    make_read_channels,
+    make_wide_load,
+    make_wide_store,
+    make_write_at,
+)
 from npa_envs.kernels.cpu import PAIRS, PARTICLES, in_ranges, make_add_scaled, make_sift, of_groups
-from npa_envs.kernels.cuda.warps import load_integer
 from npa_envs.kernels.domain import domain_types, kernel_module, scalar_name
 from npa_envs.kernels.mathematics import (
     MOMENT_THRESHOLD,
@@ -21,7 +27,6 @@ from npa_envs.kernels.mathematics import (
     smoothing,
     spiky_factor,
 )
-from npa_envs.kernels.wide import make_read_channels, make_wide_load, make_wide_store, make_write_at
 
 ENTRY_SIZE = 4
 """Numbers of an entry: weights of values and of differences along each axis, in 2D a place."""

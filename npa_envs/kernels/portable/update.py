@@ -10,10 +10,10 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from npa_envs.kernels import native
+from npa_envs.kernels.access import load_integer, make_read_at, make_wide_load, make_write_at
 from npa_envs.kernels.cpu import ELEMENTS, in_ranges
-from npa_envs.kernels.cuda.warps import load_integer
 from npa_envs.kernels.domain import domain_types, kernel_module, scalar_name
-from npa_envs.kernels.wide import make_read_at, make_wide_load, make_write_at
 
 CHANNEL_SHARE = 4
 """Adjacent channels of a particle, or columns of a row, that one thread changes."""
@@ -342,7 +342,7 @@ VALUES_PER_THREAD = 8
 @functools.cache
 def find_not_finite(scalar: type) -> wp.Kernel:
     """Return the kernel of one scalar type."""
-    module = wp.get_module(f"npa_envs.kernels.finite_{scalar_name(scalar)}")
+    module = native.module(f"npa_envs.kernels.finite_{scalar_name(scalar)}")
     read_quad = make_read_at(wp.types.vector(QUAD, scalar), scalar, 16)
 
     @wp.kernel(enable_backward=False, module=module)

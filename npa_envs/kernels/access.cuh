@@ -1,0 +1,241 @@
+// Access to memory, up to 16 bytes at a time, and to what other threads have.
+//
+// The first half is there on the CPU too, where a particle has one thread and no wide access.
+
+namespace npa {
+
+// As many bytes as 16 that divide a size.
+CUDA_CALLABLE constexpr unsigned chunk_bytes(unsigned size)
+{
+    return size % 16 == 0 ? 16 : size % 8 == 0 ? 8 : 4;
+}
+
+template <unsigned BYTES> struct alignas(BYTES) Chunk {
+    unsigned part[BYTES / 4];
+};
+
+template <unsigned BYTES, typename Value>
+CUDA_CALLABLE inline void load_chunks(Value& value, const void* place)
+{
+    const Chunk<BYTES>* from = reinterpret_cast<const Chunk<BYTES>*>(place);
+    unsigned* to = reinterpret_cast<unsigned*>(&value);
+    #pragma unroll
+    for (unsigned i = 0; i < sizeof(value) / BYTES; ++i) {
+        const Chunk<BYTES> chunk = from[i];
+        #pragma unroll
+        for (unsigned k = 0; k < BYTES / 4; ++k) to[BYTES / 4 * i + k] = chunk.part[k];
+    }
+}
+
+template <unsigned BYTES, typename Value>
+CUDA_CALLABLE inline void store_chunks(void* place, const Value& value)
+{
+    Chunk<BYTES>* to = reinterpret_cast<Chunk<BYTES>*>(place);
+    const unsigned* from = reinterpret_cast<const unsigned*>(&value);
+    #pragma unroll
+    for (unsigned i = 0; i < sizeof(value) / BYTES; ++i) {
+        Chunk<BYTES> chunk;
+        #pragma unroll
+        for (unsigned k = 0; k < BYTES / 4; ++k) chunk.part[k] = from[BYTES / 4 * i + k];
+        to[i] = chunk;
+    }
+}
+
+template <typename Value>
+CUDA_CALLABLE inline Value wide_load(const wp::array_t<Value>& entries, int index)
+{
+#if defined(__CUDA_ARCH__)
+    Value result;
+    load_chunks<chunk_bytes(sizeof(Value))>(result, entries.data + index);
+    return result;
+#else
+    return entries.data[index];
+#endif
+}
+
+template <typename Value>
+CUDA_CALLABLE inline void wide_store(const wp::array_t<Value>& entries, int index, Value value)
+{
+#if defined(__CUDA_ARCH__)
+    store_chunks<chunk_bytes(sizeof(Value))>(entries.data + index, value);
+#else
+    entries.data[index] = value;
+#endif
+}
+
+template <typename Value, unsigned BYTES, typename Part>
+CUDA_CALLABLE inline Value read_at(const wp::array_t<Part>& values, int place)
+{
+    Value result;
+#if defined(__CUDA_ARCH__)
+    load_chunks<BYTES>(result, values.data + place);
+#else
+    for (unsigned k = 0; k < sizeof(Value) / sizeof(Part); ++k) result[k] = values.data[place + k];
+#endif
+    return result;
+}
+
+template <typename Value, typename Part>
+CUDA_CALLABLE inline void write_at(const wp::array_t<Part>& values, int place, Value value)
+{
+#if defined(__CUDA_ARCH__)
+    store_chunks<16>(values.data + place, value);
+#else
+    for (unsigned k = 0; k < sizeof(Value) / sizeof(Part); ++k) values.data[place + k] = value[k];
+#endif
+}
+
+#if defined(__CUDA_ARCH__)
+// The lanes of this thread's particle, as a mask of the warp's threads.
+template <int LANES> CUDA_CALLABLE inline unsigned lane_mask()
+{
+    const unsigned first = threadIdx.x & 31u & ~(LANES - 1u);
+    return (LANES == 32 ? ~0u : (1u << LANES % 32) - 1u) << first;
+}
+#endif
+
+// Part: the scalar type that the value is made of. STRIDE: every so-manyth lane is added.
+template <typename Part, int LANES, bool WHOLE_WARPS, int STRIDE, typename Value>
+CUDA_CALLABLE inline Value lane_sum(Value value)
+{
+#if defined(__CUDA_ARCH__)
+    const unsigned mask = WHOLE_WARPS ? ~0u : lane_mask<LANES>();
+    Part* sums = reinterpret_cast<Part*>(&value);
+    #pragma unroll
+    for (unsigned i = 0; i < sizeof(value) / sizeof(Part); ++i) {
+        #pragma unroll
+        for (unsigned offset = LANES / 2; offset >= STRIDE; offset >>= 1) {
+            sums[i] += __shfl_xor_sync(mask, sums[i], offset);
+        }
+    }
+#endif
+    return value;
+}
+
+// Share: one lane's share of the channels. Part: the scalar type. WIDTH: channels of each row.
+template <typename Share, typename Part, int ROWS, int WIDTH, int LANES, typename Value>
+CUDA_CALLABLE inline Share lane_scatter(Value value)
+{
+    Share result;
+    Part* own = reinterpret_cast<Part*>(&result);
+    Part* sums = reinterpret_cast<Part*>(&value);
+#if defined(__CUDA_ARCH__)
+    const unsigned mask = lane_mask<LANES>();
+    #pragma unroll
+    for (unsigned row = 0; row < ROWS; ++row) {
+        unsigned count = WIDTH;
+        // At each step a lane keeps the half of the channels on its side and gives the other away.
+        #pragma unroll
+        for (unsigned offset = LANES / 2; offset > 0; offset >>= 1) {
+            const bool upper = threadIdx.x & offset;
+            count /= 2;
+            #pragma unroll
+            for (unsigned c = 0; c < WIDTH / 2; ++c) {
+                if (c < count) {
+                    const Part low = sums[row * WIDTH + c];
+                    const Part high = sums[row * WIDTH + count + c];
+                    const Part given = __shfl_xor_sync(mask, upper ? low : high, offset);
+                    sums[row * WIDTH + c] = (upper ? high : low) + given;
+                }
+            }
+        }
+        #pragma unroll
+        for (unsigned c = 0; c < WIDTH / LANES; ++c) {
+            own[row * (WIDTH / LANES) + c] = sums[row * WIDTH + c];
+        }
+    }
+#else
+    for (unsigned i = 0; i < sizeof(result) / sizeof(Part); ++i) own[i] = sums[i];
+#endif
+    return result;
+}
+
+template <typename Value> CUDA_CALLABLE inline Value warp_sum(Value value)
+{
+    return lane_sum<double, 32, true, 1>(value);
+}
+
+template <typename Scalar> CUDA_CALLABLE inline Scalar shuffle(Scalar value, int thread)
+{
+#if defined(__CUDA_ARCH__)
+    return __shfl_sync(~0u, value, thread);
+#else
+    return value;
+#endif
+}
+
+// total + factor * value. The CPU's compiler finds no vector registers for it by itself.
+template <typename Group, typename Part>
+CUDA_CALLABLE inline Group add_scaled(Group total, Part factor, Group value)
+{
+#if defined(__CUDA_ARCH__)
+    return total + factor * value;
+#else
+    typedef Part channels __attribute__((vector_size(sizeof(Group))));
+    channels sum, product;
+    __builtin_memcpy(&sum, &total, sizeof(total));
+    __builtin_memcpy(&product, &value, sizeof(value));
+    product *= factor;
+    sum += product;
+    __builtin_memcpy(&total, &sum, sizeof(total));
+    return total;
+#endif
+}
+
+#if defined(__CUDA_ARCH__)
+
+// Beside `shuffle`, because which thread is asked differs among the particles of a warp.
+__device__ inline int of_lane(int value, int lane, unsigned lanes)
+{
+    return __shfl_sync(~0u, value, (threadIdx.x & 31u & ~(lanes - 1u)) + lane);
+}
+
+__device__ inline int thread_number() { return blockIdx.x * blockDim.x + threadIdx.x; }
+
+__device__ inline int block_number() { return blockIdx.x; }
+
+__device__ inline int thread_of_block() { return threadIdx.x; }
+
+__device__ inline void meet_block() { __syncthreads(); }
+
+__device__ inline void meet_warp() { __syncwarp(); }
+
+__device__ inline bool any_in_warp(bool condition) { return __any_sync(~0u, condition); }
+
+__device__ inline int first_in_warp(bool condition)
+{
+    return __ffs(__ballot_sync(~0u, condition)) - 1;
+}
+
+__device__ inline unsigned vote_of_warp(bool condition) { return __ballot_sync(~0u, condition); }
+
+__device__ inline int largest_in_warp(int value) { return __reduce_max_sync(~0u, value); }
+
+__device__ inline int sum_up_to(int value)
+{
+    const unsigned lane = threadIdx.x & 31u;
+    #pragma unroll
+    for (unsigned offset = 1; offset < 32; offset <<= 1) {
+        const int before = __shfl_up_sync(~0u, value, offset);
+        if (lane >= offset) value += before;
+    }
+    return value;
+}
+
+__device__ inline int thread_of(int ends, int number)
+{
+    unsigned found = 0;
+    #pragma unroll
+    for (unsigned step = 16; step > 0; step >>= 1) {
+        if (__shfl_sync(~0u, ends, found + step - 1) <= number) found += step;
+    }
+    return found;
+}
+
+__device__ inline int as_number(float word) { return __float_as_int(word); }
+
+__device__ inline float as_word(int number) { return __int_as_float(number); }
+
+#endif
+
+}  // namespace npa

@@ -1,0 +1,277 @@
+"""Access to memory and to other threads' values: wide loads and stores, sums over lanes, votes.
+
+On CUDA a few neighbouring threads, its lanes, may share one particle and split its candidates: each
+lane sums every so-many-th candidate, and warp shuffles then add the lanes in a fixed order. Short
+sums go to every lane; the sums over channels are scattered, so that each lane finishes its own
+share of the channels. On the CPU a particle has one lane and the same source runs without either.
+
+What the factories make is for both devices, as is `of_warp`; the rest is for whole warps of CUDA:
+all of a warp's threads must take the same way to it.
+"""
+
+import functools
+from typing import Any
+
+import warp as wp
+
+from npa_envs.kernels import native
+
+CUDA_LANES = 4
+"""Lanes of a particle on CUDA, a power of two; also the smallest channel group."""
+
+WARP = 32
+"""Threads of a warp."""
+
+CUDA_BLOCK = 128
+"""Threads of a block, where a launch does not say otherwise."""
+
+
+@functools.cache
+def make_wide_load(value_type: type, scalar: type) -> Any:
+    """Return a Warp function that reads an entry of a flat array, on CUDA in few, wide loads.
+
+    The array must be dense and its memory aligned to an entry, or to 16 bytes; the index must not
+    be negative. Warp's own indexing, which knows neither, takes several instructions more.
+
+    Args:
+        value_type: A scalar, vector or matrix type.
+        scalar: The scalar type that it is made of, `wp.int32` included.
+    """
+
+    @native.func_native()
+    def wide_load(entries: wp.array(dtype=value_type), index: wp.int32) -> value_type: ...
+
+    return wide_load
+
+
+load_integer = make_wide_load(wp.int32, wp.int32)
+load_scalar = make_wide_load(wp.float32, wp.float32)
+
+
+@functools.cache
+def make_wide_store(value_type: type, scalar: type) -> Any:
+    """Return a Warp function that writes an entry of a flat array, on CUDA in few, wide stores.
+
+    The array and the index are as those of `make_wide_load`.
+    """
+
+    @native.func_native()
+    def wide_store(entries: wp.array(dtype=value_type), index: wp.int32, value: value_type): ...
+
+    return wide_store
+
+
+@functools.cache
+def make_read_at(value_type: type, scalar: type, alignment: int) -> Any:
+    """Return a Warp function that reads a vector from a place of an array of scalars.
+
+    Args:
+        value_type: A vector type of a multiple of `alignment` bytes.
+        scalar: The scalar type that it is made of.
+        alignment: Bytes that the place is a multiple of in memory, and that a load takes: 4, 8
+            or 16.
+    """
+
+    @native.func_native(value_type, alignment)
+    def read_at(values: wp.array(dtype=scalar), place: wp.int32) -> value_type: ...
+
+    return read_at
+
+
+@functools.cache
+def make_read_channels(value_type: type, scalar: type) -> Any:
+    """Return a Warp function that reads adjacent channels of a particle, zeros beyond its last one.
+
+    Args:
+        value_type: A vector type.
+        scalar: The scalar type that it is made of.
+    """
+    count = value_type._length_
+    alignment = min(wp.types.type_size_in_bytes(value_type), 16)
+    read_at = make_read_at(value_type, scalar, alignment)
+
+    @wp.func
+    def read_channels(
+        states: wp.array(dtype=scalar),
+        state_dim: wp.int32,
+        aligned: wp.int32,
+        particle: wp.int32,
+        first: wp.int32,
+    ):
+        result = value_type()
+        place = particle * state_dim + first
+        if aligned == 0:
+            for k in range(wp.static(count)):
+                if first + k < state_dim:
+                    result[k] = states[place + k]
+        elif first < state_dim:
+            result = read_at(states, place)
+        return result
+
+    return read_channels
+
+
+@functools.cache
+def make_write_at(value_type: type, scalar: type) -> Any:
+    """Return a Warp function that writes a vector to a place of an array of scalars.
+
+    Args:
+        value_type: A vector type of a multiple of 16 bytes; the place is one, too, in memory.
+        scalar: The scalar type that it is made of.
+    """
+
+    @native.func_native()
+    def write_at(values: wp.array(dtype=scalar), place: wp.int32, value: value_type): ...
+
+    return write_at
+
+
+def share_type(value_type: type, scalar: type, lanes: int) -> type:
+    """Return the type of one lane's share of a vector [W] or matrix [D, W] of channels."""
+    *rows, width = value_type._shape_
+    share = width // lanes
+    if rows:
+        return wp.types.matrix((rows[0], share), scalar)
+    return wp.types.vector(share, scalar)
+
+
+@functools.cache
+def make_lane_sum(
+    value_type: type, scalar: type, lanes: int, whole_warps: bool = False, stride: int = 1
+) -> Any:
+    """Return a Warp function that adds a value over the lanes of a particle; each gets the sum.
+
+    Args:
+        value_type: A scalar, vector or matrix type.
+        scalar: The scalar type that it is made of.
+        lanes: Lanes of a particle, 1 on the CPU.
+        whole_warps: All threads of a warp call it together, which takes fewer instructions.
+        stride: Every so-manyth lane is added, a power of two.
+    """
+
+    @native.func_native(scalar, lanes, whole_warps, stride)
+    def lane_sum(value: value_type) -> value_type: ...
+
+    return lane_sum
+
+
+@functools.cache
+def make_lane_scatter(value_type: type, scalar: type, lanes: int) -> Any:
+    """Return a Warp function that adds a value over the lanes; each gets its share of channels.
+
+    Args:
+        value_type: A vector [W] or matrix [D, W] type; W is a multiple of `lanes`.
+        scalar: The scalar type that it is made of.
+        lanes: Lanes of a particle, 1 on the CPU.
+    """
+    *rows, width = value_type._shape_
+    share = share_type(value_type, scalar, lanes)
+
+    @native.func_native(share, scalar, rows[0] if rows else 1, width, lanes)
+    def lane_scatter(value: value_type) -> share: ...
+
+    return lane_scatter
+
+
+@functools.cache
+def make_warp_sum(value_type: type) -> Any:
+    """Return a Warp function that adds a value over the 32 threads of a warp; each gets the sum.
+
+    All 32 must call it. On the CPU it returns its argument.
+
+    Args:
+        value_type: `wp.float64` or a vector of it.
+    """
+
+    @native.func_native()
+    def warp_sum(value: value_type) -> value_type: ...
+
+    return warp_sum
+
+
+@functools.cache
+def make_shuffle(scalar: type) -> wp.Function:
+    """Return a Warp function for a value that a thread of the warp has; on the CPU, the argument.
+
+    Args:
+        scalar: `wp.int32` or `wp.float32`.
+    """
+
+    @native.func_native()
+    def shuffle(value: scalar, thread: wp.int32) -> scalar: ...
+
+    return shuffle
+
+
+of_warp = make_shuffle(wp.int32)
+scalar_of_warp = make_shuffle(wp.float32)
+
+
+@native.func_native()
+def of_lane(value: wp.int32, lane: wp.int32, lanes: wp.uint32) -> wp.int32:
+    """Another lane's value, of the same particle."""
+
+
+@native.func_native()
+def thread_number() -> wp.int32:
+    """Number of this thread in its launch, without the divisions of `wp.tid`."""
+
+
+@native.func_native()
+def block_number() -> wp.int32:
+    """Number of this block in its launch."""
+
+
+@native.func_native()
+def thread_of_block() -> wp.int32:
+    """Number of this thread in its block."""
+
+
+@native.func_native()
+def meet_block():
+    """Wait until the whole block is here, and sees what it wrote."""
+
+
+@native.func_native()
+def meet_warp():
+    """Wait until the whole warp is here, and sees what it wrote."""
+
+
+@native.func_native()
+def any_in_warp(condition: wp.bool) -> wp.bool:
+    """Whether a condition holds for some thread of the warp."""
+
+
+@native.func_native()
+def first_in_warp(condition: wp.bool) -> wp.int32:
+    """The first thread for which a condition holds, -1 if there is none."""
+
+
+@native.func_native()
+def vote_of_warp(condition: wp.bool) -> wp.uint32:
+    """For which threads a condition holds, a bit for each."""
+
+
+@native.func_native()
+def largest_in_warp(value: wp.int32) -> wp.int32:
+    """The largest value of the warp's threads."""
+
+
+@native.func_native()
+def sum_up_to(value: wp.int32) -> wp.int32:
+    """The sum of the values of this thread and of those before it in the warp."""
+
+
+@native.func_native()
+def thread_of(ends: wp.int32, number: wp.int32) -> wp.int32:
+    """The first thread whose end, one of an ascending order, is beyond a number."""
+
+
+@native.func_native()
+def as_number(word: wp.float32) -> wp.int32:
+    """The integer that was packed into a word."""
+
+
+@native.func_native()
+def as_word(number: wp.int32) -> wp.float32:
+    """An integer packed into a word."""

@@ -1,0 +1,131 @@
+// Slots: what the lanes of one particle share in a CUDA block's fast memory.
+//
+// A slot holds a short list of neighbours: first their numbers as they are found, then each with
+// its weights; at the end, the row of perception that came of them, on its way out. Votes are of
+// whole warps, all of whose threads must therefore take the same way: a vote of a few lanes would
+// make the groups of a warp run one after another.
+
+namespace npa {
+
+template <int BYTES, int LANES, int BLOCK> __device__ inline unsigned slot_address()
+{
+    __shared__ __align__(16) unsigned char slots[BLOCK / LANES * BYTES];
+    return (unsigned)__cvta_generic_to_shared(slots + threadIdx.x / LANES * BYTES);
+}
+
+// Four words of an entry lie together: in 2D the last is its number; in 3D numbers follow all.
+template <int DIMS, int ENTRIES> __device__ inline int* number_place(unsigned slot, int entry)
+{
+    const unsigned place = DIMS == 2 ? slot + 12 + 16 * entry : slot + 16 * ENTRIES + 4 * entry;
+    return reinterpret_cast<int*>(__cvta_shared_to_generic(place));
+}
+
+template <int DIMS, int ENTRIES, int LANES>
+__device__ inline int append_number(unsigned slot, int count, bool accepted, int number)
+{
+    const unsigned lanes = lane_mask<LANES>();
+    const unsigned before = lanes & ((1u << (threadIdx.x & 31u)) - 1u);
+    const unsigned votes = __ballot_sync(~0u, accepted);
+    if (accepted) *number_place<DIMS, ENTRIES>(slot, count + __popc(votes & before)) = number;
+    return count + __popc(votes & lanes);
+}
+
+template <int DIMS, int ENTRIES> __device__ inline int number_at(unsigned slot, int entry)
+{
+    return *number_place<DIMS, ENTRIES>(slot, entry);
+}
+
+template <int DIMS, int ENTRIES>
+__device__ inline void put_entry(
+    unsigned slot, int entry, float smooth, wp::vec_t<DIMS, float> kernel, int number)
+{
+    float4 packed;
+    packed.x = smooth;
+    packed.y = kernel[0];
+    packed.z = kernel[1];
+    packed.w = DIMS == 2 ? __int_as_float(number) : kernel[DIMS - 1];
+    *reinterpret_cast<float4*>(__cvta_shared_to_generic(slot + 16 * entry)) = packed;
+    if (DIMS == 3) *number_place<DIMS, ENTRIES>(slot, entry) = number;
+}
+
+template <int DIMS, int ENTRIES>
+__device__ inline wp::vec_t<DIMS + 2, float> entry_at(unsigned slot, int entry)
+{
+    const float4 packed =
+        *reinterpret_cast<const float4*>(__cvta_shared_to_generic(slot + 16 * entry));
+    wp::vec_t<DIMS + 2, float> result;
+    result[0] = packed.x;
+    result[1] = packed.y;
+    result[2] = packed.z;
+    result[3] = packed.w;
+    if (DIMS == 3) result[DIMS + 1] = __int_as_float(*number_place<DIMS, ENTRIES>(slot, entry));
+    return result;
+}
+
+template <typename Value> __device__ inline void stage(unsigned slot, int word, Value value)
+{
+    store_chunks<chunk_bytes(sizeof(Value))>(__cvta_shared_to_generic(slot + 4 * word), value);
+}
+
+// A whole warp writes one slot after another, so that a row leaves in few, full transactions; in
+// pairs where the channels fill their group, for then a slot holds what a row begins with.
+template <int DIMS, int WIDTH, int LANES, int ROW_WORDS, int BYTES, bool GROUPED>
+__device__ inline void write_rows(
+    unsigned slot, int destination, int group, int state_dim, float limit,
+    const wp::array_t<float>& rows)
+{
+    __syncwarp();
+    const unsigned lane = threadIdx.x & 31u;
+    const unsigned slots = slot - lane / LANES * BYTES;
+    const bool paired = ((size_t)rows.data | 4 * (size_t)rows.shape[1]) % 8 == 0;
+    if (!GROUPED && state_dim == WIDTH && paired) {
+        char* base = reinterpret_cast<char*>(rows.data + 2 * lane);
+        unsigned from = slots + 8 * lane;
+        // What all slots share is computed once, not again beside each.
+        asm volatile("" : "+l"(base), "+r"(from));
+        #pragma unroll
+        for (unsigned s = 0; s < 32 / LANES; ++s) {
+            const int row = __shfl_sync(~0u, destination, s * LANES);
+            float2* to = reinterpret_cast<float2*>(
+                base + (unsigned long long)(unsigned)row * (4u * rows.shape[1]));
+            #pragma unroll
+            for (unsigned part = 0; part < (ROW_WORDS + 63) / 64; ++part) {
+                float2 pair;
+                asm volatile("ld.shared.v2.f32 {%0, %1}, [%2];"
+                    : "=f"(pair.x), "=f"(pair.y) : "r"(from + s * BYTES + 256 * part));
+                pair.x = within(pair.x, limit);
+                pair.y = within(pair.y, limit);
+                if (row >= 0 && part * 64 + 2 * lane < ROW_WORDS) to[32 * part] = pair;
+            }
+        }
+        return;
+    }
+    #pragma unroll
+    for (unsigned s = 0; s < 32 / LANES; ++s) {
+        const int row = __shfl_sync(~0u, destination, s * LANES);
+        const int first = GROUPED ? __shfl_sync(~0u, group, s * LANES) * WIDTH : 0;
+        float* to = rows.data + (size_t)(unsigned)row * (unsigned)rows.shape[1];
+        #pragma unroll
+        for (unsigned part = 0; part < (ROW_WORDS + 31) / 32; ++part) {
+            const int word = part * 32 + lane;
+            int channel = word;
+            int column = word + first;
+            if (word >= WIDTH) {
+                channel = word - WIDTH;
+                column = state_dim + channel + first;
+            }
+            if (word >= 2 * WIDTH) {
+                const int component = word - 2 * WIDTH;
+                channel = component / DIMS;
+                column = 2 * state_dim + component + first * DIMS;
+            }
+            if (word < ROW_WORDS && row >= 0 && channel + first < state_dim) {
+                const float value = *reinterpret_cast<const float*>(
+                    __cvta_shared_to_generic(slots + s * BYTES + 4 * word));
+                to[column] = within(value, limit);
+            }
+        }
+    }
+}
+
+}  // namespace npa

@@ -1,0 +1,78 @@
+"""CUDA C++ beside Warp's Python: the `.cuh` files of this folder, as functions of Warp.
+
+A kernel module that comes from `module` begins with the text of those files. `@native.func_native`
+then makes a Warp function of a C++ function: plain Warp has no loads of 16 bytes, no votes of a
+warp, no memory shared by a few threads, and no tensor cores.
+"""
+
+import functools
+import inspect
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import warp as wp
+
+BOTH_DEVICES = ("access.cuh", "mathematics.cuh")
+"""Files that the CPU's compiler reads, too."""
+
+CUDA_ONLY = (
+    "cuda/sort.cuh",
+    "cuda/density.cuh",
+    "cuda/perceive.cuh",
+    "cuda/adjoint.cuh",
+    "cuda/network.cuh",
+    "pictures/blending.cuh",
+)
+"""The other files; what a file uses of another one stands before it."""
+
+
+@functools.cache
+def build_options() -> wp.ModuleBuildOptions:
+    """Return what puts the C++ functions into a module: their text, which its hash includes."""
+    folder = Path(__file__).parent
+    for_cpu = "".join((folder / name).read_text() for name in BOTH_DEVICES)
+    for_cuda = for_cpu + "".join((folder / name).read_text() for name in CUDA_ONLY)
+    return wp.ModuleBuildOptions(extra_cpu_preamble=for_cpu, extra_cuda_preamble=for_cuda)
+
+
+def module(name: str) -> wp.Module:
+    """Return the Warp module of a name, whose kernels may call native functions."""
+    result = wp.get_module(name)
+    wp.set_module_options({"extra_build_options": build_options()}, result)
+    return result
+
+
+def func_native(*parameters: Any) -> Callable[[Any], Any]:
+    """Return a decorator that makes a Warp function of the C++ function `npa::` of the same name.
+
+    What it decorates is a stub with the types of the arguments and of the result. Warp knows such a
+    stub by a decorator of this very name, an attribute of a module.
+
+    Args:
+        parameters: The template parameters that do not follow from the arguments: numbers, truth
+            values, names of `npa`'s constants, and Warp types.
+    """
+    template = f"<{', '.join(map(_in_cpp, parameters))}>" if parameters else ""
+
+    def make(stub: Any) -> Any:
+        signature = inspect.signature(stub)
+        call = f"npa::{stub.__name__}{template}({', '.join(signature.parameters)});"
+        returns = signature.return_annotation is not inspect.Signature.empty
+        return wp.func_native(f"    {'return ' * returns}{call}\n")(stub)
+
+    return make
+
+
+def _in_cpp(parameter: Any) -> str:
+    """Return a template parameter as C++ writes it."""
+    if isinstance(parameter, str):
+        return f"npa::{parameter}"
+    if isinstance(parameter, int):  # truth values too
+        return str(int(parameter))
+    scalar = getattr(parameter, "_wp_scalar_type_", parameter)
+    name = {wp.int32: "int", wp.float32: "float", wp.float64: "double"}[scalar]
+    shape = getattr(parameter, "_shape_", ())
+    if not shape:
+        return name
+    return f"wp::{'vec_t' if len(shape) == 1 else 'mat_t'}<{', '.join(map(str, shape))}, {name}>"
