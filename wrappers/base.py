@@ -1,4 +1,4 @@
-"""What the wrappers share: checks, and the episodes' clock."""
+"""Parts of wrappers and adapters: checks of environments, rows, clocks, changed observations."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 import numpy as np
 import torch
-from gymnasium.spaces import Space
+from gymnasium.spaces import Box, Space
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
@@ -69,6 +69,30 @@ def vector_env(env: Any, wrapper: str) -> NPAVectorEnv:
     return base
 
 
+def torch_env(env: Any, adapter: str) -> NPAVectorEnv:
+    """Return the vector environment under wrappers, for an adapter that keeps tensors it is given.
+
+    Args:
+        env: A Gymnasium vector environment.
+        adapter: Name of the adapter, for the error.
+
+    Raises:
+        NPAError: It is none of this package, hands out arrays, or overwrites what it handed out.
+    """
+    base = vector_env(env, adapter)
+    if base.config.output != "torch":
+        raise NPAError(
+            f"{adapter} needs torch tensors, got output={base.config.output!r}: "
+            "make the environment with output='torch'"
+        )
+    if not base.copies:
+        raise NPAError(
+            f"{adapter} needs new tensors in each step, got copy=False: "
+            "make the environment with copy=True, the default"
+        )
+    return base
+
+
 def check_vector_env(env: Any, wrapper: str) -> None:
     """Check that something is a vector environment of Gymnasium's.
 
@@ -114,6 +138,32 @@ def autoreset_mode(env: AnyVectorEnv) -> AutoresetMode:
     return AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
 
 
+def check_same_step(mode: AutoresetMode) -> None:
+    """Check that worlds restart by themselves, as rows have to.
+
+    Args:
+        mode: How the environment restarts worlds.
+
+    Raises:
+        NPAError: Not in the step that ends their episodes.
+    """
+    if mode is not AutoresetMode.SAME_STEP:
+        raise NPAError(
+            f"env must restart worlds in the step that ends their episodes, got {mode}: "
+            "make it with autoreset_mode='same-step'"
+        )
+
+
+def as_tensor(values: Any) -> Tensor:
+    """Return an array or tensor as a tensor, without a copy."""
+    return values if isinstance(values, Tensor) else torch.from_numpy(np.asarray(values))
+
+
+def like(result: Tensor, values: Any) -> Any:
+    """Return a tensor as what `values` is: an array or a tensor."""
+    return result if isinstance(values, Tensor) else result.numpy()
+
+
 def to_host(values: Any) -> NDArray[Any]:
     """Return an array or tensor as an array; a tensor on a device is waited for."""
     return values.cpu().numpy() if isinstance(values, Tensor) else np.asarray(values)
@@ -122,6 +172,48 @@ def to_host(values: Any) -> NDArray[Any]:
 def world_indices(mask: NDArray[np.bool_], device: torch.device) -> Tensor:
     """Return the numbers of the worlds where a mask of shape [B] is True, int64, shape [M]."""
     return torch.from_numpy(np.flatnonzero(mask)).to(device)
+
+
+def own_rewards(infos: dict[str, Any]) -> Any:
+    """Return each particle's reward of the last step, shape [B, N], or None where there is none.
+
+    Args:
+        infos: Of the step; with same-step autoreset worlds that restarted say in their final infos
+            what their last step was worth.
+    """
+    own = infos.get("particle_reward")
+    last = infos.get("final_info", {}).get("particle_reward")
+    if own is None or last is None:
+        return own
+    which = as_tensor(infos["_final_info"])[:, None]
+    return torch.where(which, as_tensor(last), as_tensor(own))
+
+
+def row_space(space: Any) -> Box:
+    """Return the space of one particle of a world's.
+
+    Args:
+        space: A box of shape [N, ...].
+    """
+    assert isinstance(space, Box), "environments of this package have boxes"
+    return Box(space.low[0], space.high[0], dtype=np.float32)
+
+
+def check_row_actions(actions: Any, *wanted: int) -> None:
+    """Check that there is an action for each row.
+
+    Args:
+        actions: What a library gives.
+        wanted: Rows, then the columns of an action.
+
+    Raises:
+        NPAError: They have another shape, which could be read as that of other rows.
+    """
+    if tuple(np.shape(actions)) != wanted:
+        raise NPAError(
+            f"actions must have shape [rows, A] = {wanted}, got {tuple(np.shape(actions))}: "
+            "one for each row"
+        )
 
 
 class EpisodeClock:
@@ -183,6 +275,43 @@ class EpisodeClock:
         if same_step:
             self.restarted = self.ended
             self.elapsed[self.ended] = 0
+
+
+class Observations(AnyWrapper):
+    """A wrapper of environments of one world that changes observations.
+
+    Args:
+        env: The environment.
+    """
+
+    restarted = False
+    """Whether the last observation is the first of an episode."""
+
+    @abstractmethod
+    def observations(self, observations: Any) -> Any:
+        """Return an observation changed.
+
+        Args:
+            observations: As it is, shape [N, P].
+        """
+
+    def new_ones(self, observations: Any) -> Any:
+        """Return what the world gave; as that of `VectorObservations`."""
+        return observations
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start an episode; as for the environment itself."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        self.restarted = True
+        return self.observations(observation), info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Step; as for the environment itself."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self.restarted = False
+        return self.observations(observation), reward, terminated, truncated, info
 
 
 class VectorObservations(AnyVectorWrapper):

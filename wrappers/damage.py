@@ -79,7 +79,49 @@ class Schedule:
         return np.asarray(due, dtype=bool)
 
 
-class DamageEvents(AnyWrapper, RecordConstructorArgs):
+class _DamagesWorlds(RecordConstructorArgs):
+    """The part of both wrappers that knows the events and draws the damage."""
+
+    schedule: Schedule
+    """When worlds are damaged."""
+
+    def _set_up(self, env: Any, base: NPAEnv | NPAVectorEnv) -> None:
+        check_untouched(env, type(self).__name__)
+        self._base = base
+        # Events of a stack of wrappers are numbered through, so that no two draw the same place.
+        self._first = 0
+        while hasattr(env, "env"):
+            if isinstance(env, _DamagesWorlds):
+                self._first += len(env.schedule.events)
+            env = env.env
+
+    def _read_events(self, events: Event | Sequence[Event], every: int | None) -> None:
+        self.schedule = Schedule(events, every)
+        texts = [str(event) for event in self.schedule.events]
+        RecordConstructorArgs.__init__(self, events=texts, every=every)
+
+    def _particles(self, due: NDArray[np.bool_]) -> tuple[Tensor, Tensor]:
+        """Return the particles of all worlds, damaged where damage is due.
+
+        Args:
+            due: Which events are due in which worlds, shape [E, B].
+
+        Returns:
+            Positions [length units], [B, N, D], and states, [B, N, C].
+        """
+        worlds = self._base.worlds
+        x, s = worlds.x.clone(), worlds.s.clone()
+        for k, (event, mask) in enumerate(zip(self.schedule.events, due, strict=True), self._first):
+            if mask.any():
+                chosen = world_indices(mask, x.device)
+                stream = worlds.random.take(chosen).beside(Purpose.DAMAGE).beside(k)
+                x[chosen], s[chosen] = damage_worlds(
+                    x[chosen], s[chosen], kind=event.kind, size=event.size, generator=stream
+                )
+        return x, s
+
+
+class DamageEvents(_DamagesWorlds, AnyWrapper):
     """Damage the world after certain steps of each episode.
 
     An event comes after the step whose number it has: the observation of that step shows the
@@ -108,14 +150,10 @@ class DamageEvents(AnyWrapper, RecordConstructorArgs):
         *,
         every: int | None = None,
     ) -> None:
-        self.schedule = Schedule(events, every)
-        """When the world is damaged."""
-        texts = [str(event) for event in self.schedule.events]
-        RecordConstructorArgs.__init__(self, events=texts, every=every)
-        self._base = single_env(env, type(self).__name__)
-        super().__init__(env)
-        check_untouched(env, type(self).__name__)
-        self._first = events_beneath(env)
+        self._read_events(events, every)
+        base = single_env(env, type(self).__name__)
+        AnyWrapper.__init__(self, env)
+        self._set_up(env, base)
         self._elapsed = 0
 
     def reset(
@@ -140,7 +178,7 @@ class DamageEvents(AnyWrapper, RecordConstructorArgs):
             return observation, info
         worlds = self._base.worlds
         before = float(worlds.loss[0])
-        x, s = damaged_particles(self._base, self.schedule.events, due, self._first)
+        x, s = self._particles(due)
         observation = self._base.place_particles(x[0], s[0])
         loss, *parts = worlds.report.numbers[1 : 2 + len(worlds.part_names), 0].tolist()
         damage = info.get("loss_damage", 0.0) + loss - before
@@ -149,31 +187,20 @@ class DamageEvents(AnyWrapper, RecordConstructorArgs):
         return observation, info
 
 
-class VectorDamageEvents(AnyVectorWrapper, RecordConstructorArgs):
+class VectorDamageEvents(_DamagesWorlds, AnyVectorWrapper):
     """`DamageEvents` for vector environments: each world by the steps of its own episode.
 
-    World k is damaged as the single environment with the same seed, bit for bit.
-
-    Args:
-        env: A vector environment of this package, under no wrapper that changes observations.
-        events: "STEP:KIND", "STEP:KIND:SIZE" or `DamageEvent`; one or several.
-        every: Each event comes again after so many steps, and again; None: it comes once.
-
-    Raises:
-        NPAError: An event or the environment is wrong.
+    World k is damaged as the single environment with the same seed, bit for bit. Arguments and
+    errors are those of `DamageEvents`, but for `env`, a vector environment of this package.
     """
 
     def __init__(
         self, env: AnyVectorEnv, events: Event | Sequence[Event], *, every: int | None = None
     ) -> None:
-        self.schedule = Schedule(events, every)
-        """When worlds are damaged."""
-        texts = [str(event) for event in self.schedule.events]
-        RecordConstructorArgs.__init__(self, events=texts, every=every)
-        self._base = vector_env(env, type(self).__name__)
-        super().__init__(env)
-        check_untouched(env, type(self).__name__)
-        self._first = events_beneath(env)
+        self._read_events(events, every)
+        base = vector_env(env, type(self).__name__)
+        AnyVectorWrapper.__init__(self, env)
+        self._set_up(env, base)
         self._clock = EpisodeClock(env)
 
     def reset(
@@ -206,7 +233,7 @@ class VectorDamageEvents(AnyVectorWrapper, RecordConstructorArgs):
         before = worlds.loss.clone()
         hurt = np.asarray(due.any(axis=0))
         chosen = world_indices(hurt, base.task.device)
-        x, s = damaged_particles(base, self.schedule.events, due, self._first)
+        x, s = self._particles(due)
         observations = base.place_particles(x[chosen], s[chosen], chosen)
         output = base.config.output
         now = {"loss": worlds.loss.clone(), "loss_damage": worlds.loss - before}
@@ -219,51 +246,6 @@ class VectorDamageEvents(AnyVectorWrapper, RecordConstructorArgs):
             told["loss_damage"] = told["loss_damage"] + infos["loss_damage"]
             told["_loss_damage"] = told["_loss_damage"] | infos["_loss_damage"]
         return observations, infos | told
-
-
-def events_beneath(env: Any) -> int:
-    """Return how many events the wrappers of an environment hold.
-
-    Events of a stack of wrappers are numbered through, so that no two draw the same place.
-
-    Args:
-        env: An environment, wrapped or not.
-    """
-    count = 0
-    while hasattr(env, "env"):
-        if isinstance(env, DamageEvents | VectorDamageEvents):
-            count += len(env.schedule.events)
-        env = env.env
-    return count
-
-
-def damaged_particles(
-    env: NPAEnv | NPAVectorEnv,
-    events: Sequence[DamageEvent],
-    due: NDArray[np.bool_],
-    first: int = 0,
-) -> tuple[Tensor, Tensor]:
-    """Return the particles of all worlds, damaged where damage is due.
-
-    Args:
-        env: The environment.
-        events: The events, shape [E].
-        due: Which are due in which worlds, shape [E, B].
-        first: Number of the first event; events draw apart by their numbers.
-
-    Returns:
-        Positions [length units], [B, N, D], and states, [B, N, C].
-    """
-    worlds = env.worlds
-    x, s = worlds.x.clone(), worlds.s.clone()
-    for k, (event, mask) in enumerate(zip(events, due, strict=True)):
-        if mask.any():
-            chosen = world_indices(mask, x.device)
-            stream = worlds.random.take(chosen).beside(Purpose.DAMAGE).beside(first + k)
-            x[chosen], s[chosen] = damage_worlds(
-                x[chosen], s[chosen], kind=event.kind, size=event.size, generator=stream
-            )
-    return x, s
 
 
 def _copy(value: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Environments in RLlib: their ids, and configurations to begin with."""
+"""Configurations of RLlib for environments by their ids."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from npa_envs.envs import multispecies_v0, particles_v0
 from npa_envs.envs.core.vector import checked_count
 from npa_envs.errors import MissingDependencyError, NPAError, suggest
 from npa_envs.registration import ENVIRONMENTS, register_environments
-from npa_envs.wrappers.row_vector import ParticleRows
+from npa_envs.wrappers.particle_rows import ParticleRows
 
 try:
     from ray.rllib.algorithms.ppo import PPOConfig

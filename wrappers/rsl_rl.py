@@ -1,4 +1,4 @@
-"""Particles as the rows of an environment of RSL-RL's, without copies to the host."""
+"""Adapter to RSL-RL: particles as rows of its `VecEnv`, without copies to the host."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import MissingDependencyError, NPAError
-from npa_envs.wrappers.adapters import (
-    check_copies,
+from npa_envs.wrappers.base import (
+    AnyVectorEnv,
+    autoreset_mode,
+    check_row_actions,
     check_same_step,
-    check_torch_output,
     own_rewards,
+    torch_env,
 )
-from npa_envs.wrappers.base import AnyVectorEnv, autoreset_mode, vector_env
 
 try:
     from rsl_rl.env import VecEnv
@@ -52,9 +53,7 @@ class RslRlParticleEnv(VecEnv):  # type: ignore[misc]
     def __init__(
         self, env: AnyVectorEnv, *, seed: int | None = None, bootstrap: bool = True
     ) -> None:
-        base = vector_env(env, type(self).__name__)
-        check_torch_output(base, type(self).__name__)
-        check_copies(base, type(self).__name__)
+        base = torch_env(env, type(self).__name__)
         check_same_step(autoreset_mode(env))
         self.vector_env = env
         """The environment whose particles these are."""
@@ -103,12 +102,7 @@ class RslRlParticleEnv(VecEnv):  # type: ignore[misc]
             NPAError: The actions have another shape; the worlds are then as they were.
             DivergedError: An action is not finite; the worlds are then as they were.
         """
-        wanted = (self.num_envs, self.num_actions)
-        if tuple(actions.shape) != wanted:
-            raise NPAError(
-                f"actions must have shape [B N, A] = {wanted}, got {tuple(actions.shape)}: "
-                "one for each row"
-            )
+        check_row_actions(actions, self.num_envs, self.num_actions)
         # RSL-RL collects in inference mode, whose tensors nobody else could write to afterwards.
         with torch.inference_mode(False), torch.no_grad():
             by_world = actions.reshape(self.world_count, self.particle_count, -1)

@@ -1,4 +1,4 @@
-"""Particles as rows of a Stable-Baselines3 `VecEnv`: what all such environments share."""
+"""Adapters to Stable-Baselines3: particles, or worlds, as the rows of a `VecEnv`."""
 
 from __future__ import annotations
 
@@ -14,9 +14,16 @@ from torch import Tensor
 
 from npa_envs.envs.multi.vector import MultiSpeciesVectorEnv
 from npa_envs.errors import MissingDependencyError, NPAError, suggest
-from npa_envs.wrappers.adapters import check_same_step, own_rewards, row_space
-from npa_envs.wrappers.base import AnyVectorEnv, autoreset_mode, vector_env
-from npa_envs.wrappers.statistics import as_tensor
+from npa_envs.wrappers.base import (
+    AnyVectorEnv,
+    as_tensor,
+    autoreset_mode,
+    check_row_actions,
+    check_same_step,
+    own_rewards,
+    row_space,
+    vector_env,
+)
 
 try:
     from stable_baselines3.common.vec_env import VecEnv
@@ -24,6 +31,10 @@ except ImportError as error:
     raise MissingDependencyError(
         "particles as rows need Stable-Baselines3: pip install 'npa-envs[sb3]'"
     ) from error
+
+
+RowSteps = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]
+"""Observations, rewards, endings and infos of rows."""
 
 
 class SharedInfo(dict[str, Any]):
@@ -65,7 +76,7 @@ class RowVecEnv(VecEnv):
         """Rows of a world, R."""
         self.spec = getattr(env, "spec", None)
         """What Gymnasium knows of the environment."""
-        self.nothing = SharedInfo()
+        self.nothing: dict[str, Any] = SharedInfo()
         """The info of all rows in the midst of their episodes."""
         self._seed: int | None = None
         self._actions: NDArray[np.float32] | None = None
@@ -90,12 +101,7 @@ class RowVecEnv(VecEnv):
         Raises:
             NPAError: They have another shape, which could be read as that of other rows.
         """
-        wanted = (self.num_envs, *(self.action_space.shape or ()))
-        if np.shape(actions) != wanted:
-            raise NPAError(
-                f"actions must have shape [B R, A] = {wanted}, got {np.shape(actions)}: "
-                "one for each row"
-            )
+        check_row_actions(actions, self.num_envs, *(self.action_space.shape or ()))
         self._actions = actions.reshape(self.world_count, self.row_count, -1)
 
     def taken_actions(self) -> NDArray[np.float32]:
@@ -108,6 +114,34 @@ class RowVecEnv(VecEnv):
             raise NPAError("step_wait needs actions: call step_async, or step")
         actions, self._actions = self._actions, None
         return actions
+
+    def infos(
+        self,
+        rows: NDArray[np.int64],
+        *,
+        truncated: NDArray[np.bool_] | None = None,
+        last: NDArray[np.float32] | None = None,
+        success: NDArray[Any] | None = None,
+    ) -> list[dict[str, Any]]:
+        """Return an info of its own for some rows, and the shared empty one for the others.
+
+        Args:
+            rows: Those whose episodes are over, shape [M].
+            truncated: Whether each was cut off; None: nothing is said of that.
+            last: Their last observations; None: likewise.
+            success: Whether each succeeded; None: likewise.
+        """
+        infos: list[dict[str, Any]] = [self.nothing] * self.num_envs
+        for k, row in enumerate(rows.tolist()):
+            own: dict[str, Any] = {}
+            if success is not None:
+                own["is_success"] = bool(success[k])
+            if truncated is not None:
+                own["TimeLimit.truncated"] = bool(truncated[k])
+            if last is not None:
+                own["terminal_observation"] = last[k]
+            infos[row] = own
+        return infos
 
     def close(self) -> None:
         """Close the environment."""
@@ -225,10 +259,68 @@ def on_host(*given: Any) -> list[NDArray[Any]]:
     return [copy.numpy() for copy in copies]
 
 
-# Each particle as one environment of Stable-Baselines3: many small agents that share a policy.
+class _EpisodeRows(RowVecEnv):
+    """Rows whose episodes are those of their worlds; subclasses say what a row is."""
+
+    bootstrap = True
+    """Whether rows cut off by the step limit say so."""
+
+    pays_particles = True
+    """Whether rows are paid what their particles are, where that is known."""
+
+    def reset(self) -> NDArray[np.float32]:
+        """Start episodes in all worlds and return the rows' observations, shape [B R, ...]."""
+        observations, _ = self.begin()
+        return self._as_rows(on_host(observations)[0])
+
+    def step_wait(self) -> RowSteps:
+        """Step all worlds.
+
+        Returns:
+            Of each row: observation [B R, ...], reward [B R], whether its episode is over [B R],
+            and infos.
+
+        Raises:
+            DivergedError: An action is not finite; the worlds are then as they were.
+        """
+        shape = self.vector_env.single_action_space.shape
+        actions = self.taken_actions().reshape(self.world_count, *shape)
+        observations, rewards, terminations, truncations, infos = self.vector_env.step(actions)
+        own = own_rewards(infos) if self.pays_particles else None
+        shown, paid, ended, cut = on_host(
+            observations, rewards if own is None else own, terminations, truncations
+        )
+        if own is None:
+            paid = np.repeat(paid, self.row_count)
+        done = ended | cut
+        told = self._ends(np.flatnonzero(done), cut & ~ended, infos)
+        paid = paid.reshape(self.num_envs).astype(np.float32, copy=False)
+        return self._as_rows(shown), paid, np.repeat(done, self.row_count), told
+
+    def _as_rows(self, values: NDArray[Any]) -> NDArray[Any]:
+        return values.reshape(-1, *(self.observation_space.shape or ()))
+
+    def _ends(
+        self, worlds: NDArray[np.int64], cut: NDArray[np.bool_], infos: dict[str, Any]
+    ) -> list[dict[str, Any]]:
+        """Return the infos of all rows, after a step in which the episodes of some worlds ended."""
+        if not len(worlds):
+            return [self.nothing] * self.num_envs
+        count = self.row_count
+        success, last = infos["final_info"].get("success"), None
+        if self.bootstrap:
+            # Of the worlds that are over alone, as all are much to copy.
+            final = as_tensor(infos["final_obs"])
+            last = self._as_rows(on_host(final[torch.from_numpy(worlds).to(final.device)])[0])
+        return self.infos(
+            (worlds[:, None] * count + np.arange(count)).reshape(-1),
+            truncated=cut[worlds].repeat(count) if self.bootstrap else None,
+            last=last,
+            success=None if success is None else on_host(success)[0][worlds].repeat(count),
+        )
 
 
-class ParticleVecEnv(RowVecEnv):
+class ParticleVecEnv(_EpisodeRows):
     """The particles of a vector environment as the rows of a Stable-Baselines3 `VecEnv`.
 
     Row w N + i is particle i of world w: it observes that particle's perception, shape [P], gives
@@ -271,72 +363,8 @@ class ParticleVecEnv(RowVecEnv):
             row_space(env.single_action_space),
         )
 
-    def reset(self) -> NDArray[np.float32]:
-        """Start episodes in all worlds and return the rows' observations, shape [B N, P]."""
-        observations, _ = self.begin()
-        return on_host(observations)[0].reshape(self.num_envs, -1)
 
-    def step_wait(
-        self,
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
-        """Step all worlds.
-
-        Returns:
-            Of each row: observation [B N, P], reward [B N], whether its episode is over [B N], and
-            infos.
-
-        Raises:
-            DivergedError: An action is not finite; the worlds are then as they were.
-        """
-        observations, rewards, terminations, truncations, infos = self.vector_env.step(
-            self.taken_actions()
-        )
-        own = own_rewards(infos)
-        shown, paid, ended, cut = on_host(
-            observations, rewards if own is None else own, terminations, truncations
-        )
-        if own is None:
-            paid = np.repeat(paid, self.particle_count)
-        rows: list[dict[str, Any]] = [self.nothing] * self.num_envs
-        done = ended | cut
-        if done.any():
-            self._write_infos(rows, infos, np.flatnonzero(done), cut & ~ended)
-        return (
-            shown.reshape(self.num_envs, -1),
-            paid.reshape(self.num_envs).astype(np.float32, copy=False),
-            np.repeat(done, self.particle_count),
-            rows,
-        )
-
-    def _write_infos(
-        self,
-        rows: list[dict[str, Any]],
-        infos: dict[str, Any],
-        worlds: NDArray[np.int64],
-        cut: NDArray[np.bool_],
-    ) -> None:
-        """Give each row of some worlds an info about its episode's end."""
-        count = self.particle_count
-        success = on_host(infos["final_info"]["success"])[0]
-        final = as_tensor(infos["final_obs"])
-        chosen = torch.from_numpy(worlds).to(final.device)
-        last = on_host(final[chosen])[0] if self.bootstrap else None
-        for k, world in enumerate(worlds.tolist()):
-            common = {"is_success": bool(success[world])}
-            first = world * count
-            if last is None:
-                rows[first : first + count] = [dict(common) for _ in range(count)]
-                continue
-            common["TimeLimit.truncated"] = bool(cut[world])
-            rows[first : first + count] = [
-                {**common, "terminal_observation": observation} for observation in last[k]
-            ]
-
-
-# Each world as one environment of Stable-Baselines3: a policy that acts for all its particles.
-
-
-class WorldVecEnv(RowVecEnv):
+class WorldVecEnv(_EpisodeRows):
     """The worlds of a vector environment as the rows of a Stable-Baselines3 `VecEnv`.
 
     A row observes what all particles of its world perceive, shape [N, P], and gives all their
@@ -357,6 +385,8 @@ class WorldVecEnv(RowVecEnv):
         MissingDependencyError: Stable-Baselines3 is not installed (on import).
     """
 
+    pays_particles = False
+
     def __init__(self, env: Any) -> None:
         spaces = [
             _flat_float(getattr(env, name, None), name)
@@ -364,41 +394,6 @@ class WorldVecEnv(RowVecEnv):
         ]
         check_same_step(autoreset_mode(env))
         super().__init__(env, env.num_envs, 1, *spaces)
-
-    def reset(self) -> NDArray[np.float32]:
-        """Start episodes in all worlds and return their observations, shape [B, N, P]."""
-        observations, _ = self.begin()
-        return on_host(observations)[0]
-
-    def step_wait(
-        self,
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
-        """Step all worlds.
-
-        Returns:
-            Of each world: observation [B, N, P], reward [B], whether its episode is over [B], and
-            infos.
-
-        Raises:
-            DivergedError: An action is not finite; the worlds are then as they were.
-        """
-        actions = self.taken_actions().reshape(self.world_count, *(self.action_space.shape or ()))
-        observations, rewards, terminations, truncations, infos = self.vector_env.step(actions)
-        shown, paid, ended, cut = on_host(observations, rewards, terminations, truncations)
-        done = ended | cut
-        rows: list[dict[str, Any]] = [self.nothing] * self.num_envs
-        if done.any():
-            (last,) = on_host(infos["final_obs"])
-            success = infos["final_info"].get("success")
-            told = None if success is None else on_host(success)[0]
-            for row in np.flatnonzero(done).tolist():
-                rows[row] = {
-                    "TimeLimit.truncated": bool(cut[row] and not ended[row]),
-                    "terminal_observation": last[row],
-                }
-                if told is not None:
-                    rows[row]["is_success"] = bool(told[row])
-        return shown, paid.astype(np.float32, copy=False), done, rows
 
 
 def _flat_float(space: Any, name: str) -> Box:
@@ -409,9 +404,6 @@ def _flat_float(space: Any, name: str) -> Box:
             "environment with gym.make_vec(..., vectorization_mode='vector_entry_point')"
         )
     return Box(space.low, space.high, dtype=np.float32)
-
-
-# Particles of several species as rows of Stable-Baselines3: a policy for all, or for each.
 
 
 SpeciesPolicy = Callable[[Any], Any]
@@ -515,11 +507,9 @@ class SpeciesVecEnv(RowVecEnv):
     def reset(self) -> NDArray[np.float32]:
         """Start episodes in all worlds and return the rows' observations, shape [B R, P]."""
         self._seen, _ = self.begin()
-        return on_host(self._joined(self._seen))[0].reshape(self.num_envs, -1)
+        return on_host(self._rows(self._seen))[0].reshape(self.num_envs, -1)
 
-    def step_wait(
-        self,
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
+    def step_wait(self) -> RowSteps:
         """Step all worlds, the other species by their policies.
 
         Returns:
@@ -539,7 +529,7 @@ class SpeciesVecEnv(RowVecEnv):
         self._seen = seen
         live = {name: as_tensor(infos[name]["live"]) for name in self.rows_of}
         shown, paid, ended, cut = on_host(
-            torch.where(self._repeated(live)[..., None], self._joined(seen), 0.0),
+            torch.where(self._repeated(live)[..., None], self._rows(seen), 0.0),
             self._repeated(rewards),
             self._repeated(terminations),
             self._repeated(truncations),
@@ -549,17 +539,12 @@ class SpeciesVecEnv(RowVecEnv):
         if "final_obs" in first:
             (restarted,) = on_host(first["_final_obs"])
             over |= restarted[:, None]
-        rows: list[dict[str, Any]] = [self.nothing] * self.num_envs
-        if over.any():
+        rows, final = np.flatnonzero(over), None
+        if len(rows):
             last = {name: infos[name].get("final_obs", seen[name]) for name in self.rows_of}
-            final = on_host(self._joined(last))[0].reshape(self.num_envs, -1)
-            late = (cut & ~ended).reshape(-1)
-            for row in np.flatnonzero(over):
-                rows[row] = {
-                    "TimeLimit.truncated": bool(late[row]),
-                    "terminal_observation": final[row],
-                }
-        return shown.reshape(self.num_envs, -1), paid.reshape(-1), over.reshape(-1), rows
+            final = on_host(self._rows(last))[0].reshape(self.num_envs, -1)[rows]
+        told = self.infos(rows, truncated=(cut & ~ended).reshape(-1)[rows], last=final)
+        return shown.reshape(self.num_envs, -1), paid.reshape(-1), over.reshape(-1), told
 
     def policy(self, model: Any, species: str, *, deterministic: bool = False) -> RowPolicy:
         """Return a model that was trained on these rows as the policy of one species.
@@ -582,7 +567,7 @@ class SpeciesVecEnv(RowVecEnv):
             tag = np.eye(len(self.rows_of), dtype=np.float32)[self.rows_of.index(species)]
         return RowPolicy(model, deterministic=deterministic, tag=tag)
 
-    def _joined(self, by_species: Mapping[str, Any]) -> Tensor:
+    def _rows(self, by_species: Mapping[str, Any]) -> Tensor:
         """Return what rows observe, with tags where all species are rows, shape [B, R, P]."""
         rows = torch.cat([as_tensor(by_species[name]) for name in self.rows_of], dim=1)
         if self._tags is None:

@@ -1,4 +1,4 @@
-"""Particles of several species: each is told which one it is."""
+"""Species tags: each particle is told which species it is."""
 
 from __future__ import annotations
 
@@ -12,13 +12,15 @@ from gymnasium.spaces import Box, Space
 from gymnasium.utils import RecordConstructorArgs
 from torch import Tensor
 
+from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.spaces import to_output
+from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.errors import NPAError, suggest
 from npa_envs.tasks.checks import is_real, is_whole
 from npa_envs.world.randomness import Purpose, WorldRandom
 from npa_envs.wrappers.base import (
     AnyVectorEnv,
-    AnyWrapper,
+    Observations,
     VectorObservations,
     single_env,
     vector_env,
@@ -116,19 +118,44 @@ class SpeciesPlan:
         return Box(low, high, dtype=np.float32)
 
 
-def tags(species: Tensor, species_count: int) -> Tensor:
-    """Return species as float32 one-hot vectors, shape [..., K]."""
-    return torch.nn.functional.one_hot(species, species_count).to(torch.float32)
-
-
-def tagged(observation: Any, tag: Any) -> Any:
+def tagged(observation: Any, tags: Any) -> Any:
     """Return observations with tags behind them, arrays or tensors."""
     if isinstance(observation, Tensor):
-        return torch.cat((observation, tag), dim=-1)
-    return np.concatenate((observation, tag), axis=-1)
+        return torch.cat((observation, tags), dim=-1)
+    return np.concatenate((observation, tags), axis=-1)
 
 
-class SpeciesTags(AnyWrapper, RecordConstructorArgs):
+class _TagsSpecies(RecordConstructorArgs):
+    """The part of both wrappers that knows the species of all particles, and their tags."""
+
+    _base: NPAEnv | NPAVectorEnv
+
+    def _plan_species(
+        self,
+        env: NPAEnv | NPAVectorEnv,
+        species_count: int,
+        fractions: Sequence[float] | None,
+        assignment: str,
+    ) -> None:
+        RecordConstructorArgs.__init__(
+            self, species_count=species_count, fractions=fractions, assignment=assignment
+        )
+        self._base = env
+        count = env.config.particle_count
+        self._plan = SpeciesPlan(count, species_count, fractions, assignment)
+
+    @property
+    def species(self) -> Any:
+        """Species of each particle from 0 on, int64, shape [N], or [B, N] of several worlds."""
+        return to_output(self._species, self._base.config.output)
+
+    def _assign(self, species: Tensor) -> None:
+        self._species = species
+        tags = torch.nn.functional.one_hot(species, self._plan.species_count).to(torch.float32)
+        self._tags = to_output(tags, self._base.config.output)
+
+
+class SpeciesTags(_TagsSpecies, Observations):
     """Give each particle a species for the episode, and append it to its observation as one-hot.
 
     Args:
@@ -151,53 +178,28 @@ class SpeciesTags(AnyWrapper, RecordConstructorArgs):
         fractions: Sequence[float] | None = None,
         assignment: str = "blocks",
     ) -> None:
-        RecordConstructorArgs.__init__(
-            self, species_count=species_count, fractions=fractions, assignment=assignment
-        )
-        self._base = base = single_env(env, type(self).__name__)
-        super().__init__(env)
-        self._plan = SpeciesPlan(base.config.particle_count, species_count, fractions, assignment)
-        self.observation_space = self._plan.space(env.observation_space, type(self).__name__)
-        self._world = torch.zeros(1, dtype=torch.int64, device=base.task.device)
-        self._assign()
+        base, name = single_env(env, type(self).__name__), type(self).__name__
+        self._plan_species(base, species_count, fractions, assignment)
+        Observations.__init__(self, env)
+        self.observation_space = self._plan.space(env.observation_space, name)
+        self._draw()
 
-    @property
-    def species(self) -> Any:
-        """Species of each particle from 0 on, int64, shape [N]."""
-        return to_output(self._species, self._base.config.output)
+    def observations(self, observations: Any) -> Any:
+        """Return an observation with tags; a world in a new episode gets new ones."""
+        if self.restarted:
+            self._draw()
+        return tagged(observations, self._tags)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
-        """Start an episode; as for the environment itself."""
-        observation, info = self.env.reset(seed=seed, options=options)
-        self._assign()
-        return tagged(observation, self._tags), info
-
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Step; as for the environment itself."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        return tagged(observation, self._tags), reward, terminated, truncated, info
-
-    def _assign(self) -> None:
-        self._species = self._plan.draw(self._base.worlds.random, self._world)[0].clone()
-        tag = tags(self._species, self._plan.species_count)
-        self._tags = to_output(tag, self._base.config.output)
+    def _draw(self) -> None:
+        world = torch.zeros(1, dtype=torch.int64, device=self._base.task.device)
+        self._assign(self._plan.draw(self._base.worlds.random, world)[0].clone())
 
 
-class VectorSpeciesTags(VectorObservations, RecordConstructorArgs):
+class VectorSpeciesTags(_TagsSpecies, VectorObservations):
     """`SpeciesTags` for vector environments.
 
-    World k has the species of the single environment with the same seed.
-
-    Args:
-        env: A vector environment of this package.
-        species_count: Species K.
-        fractions: Share of each species, of any sum; None: equal shares.
-        assignment: "blocks" or "random", as for `SpeciesTags`.
-
-    Raises:
-        NPAError: An argument is wrong, or a species would have no particle.
+    World k has the species of the single environment with the same seed. Arguments and errors are
+    those of `SpeciesTags`, but for `env`, a vector environment of this package.
     """
 
     def __init__(
@@ -208,22 +210,12 @@ class VectorSpeciesTags(VectorObservations, RecordConstructorArgs):
         fractions: Sequence[float] | None = None,
         assignment: str = "blocks",
     ) -> None:
-        RecordConstructorArgs.__init__(
-            self, species_count=species_count, fractions=fractions, assignment=assignment
-        )
-        self._base = base = vector_env(env, type(self).__name__)
-        super().__init__(env)
-        self._plan = SpeciesPlan(base.config.particle_count, species_count, fractions, assignment)
-        self.single_observation_space = self._plan.space(
-            env.single_observation_space, type(self).__name__
-        )
+        base, name = vector_env(env, type(self).__name__), type(self).__name__
+        self._plan_species(base, species_count, fractions, assignment)
+        VectorObservations.__init__(self, env)
+        self.single_observation_space = self._plan.space(env.single_observation_space, name)
         everyone = torch.arange(env.num_envs, device=base.task.device)
-        self._put(self._plan.draw(base.worlds.random, everyone).clone())
-
-    @property
-    def species(self) -> Any:
-        """Species of each particle from 0 on, int64, shape [B, N]."""
-        return to_output(self._species, self._base.config.output)
+        self._assign(self._plan.draw(base.worlds.random, everyone).clone())
 
     def observations(self, observations: Any) -> Any:
         """Return observations with tags; worlds in a new episode get new ones."""
@@ -232,14 +224,9 @@ class VectorSpeciesTags(VectorObservations, RecordConstructorArgs):
         if self._plan.random and restarted.any():
             chosen = world_indices(restarted, self._base.task.device)
             drawn = self._plan.draw(self._base.worlds.random, chosen)
-            self._put(self._species.index_copy(0, chosen, drawn))
+            self._assign(self._species.index_copy(0, chosen, drawn))
         return tagged(observations, self._tags)
 
     def final_observations(self, observations: Any) -> Any:
         """Return observations with the tags that particles had in the step before."""
         return tagged(observations, self._last_tags)
-
-    def _put(self, species: Tensor) -> None:
-        self._species = species
-        tag = tags(species, self._plan.species_count)
-        self._tags = to_output(tag, self._base.config.output)

@@ -1,27 +1,41 @@
-"""Running means and variances, in float64 and on the device of what they describe."""
+"""Wrappers with running statistics: of perception, of observations, rewards and episodes.
+
+`NormalizePerception` and its vector form have one scale for each group of a perception vector. The
+others are Gymnasium's statistics wrappers for vector environments whose arrays are torch tensors:
+they do what `gymnasium.wrappers.vector` does for NumPy, under the same names behind "Torch", stay
+on the device, and know all three ways in which worlds begin their next episode.
+"""
 
 from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
+import gymnasium
 import numpy as np
 import torch
 from gymnasium.spaces import Box
+from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
 from npa_envs.errors import NPAError, suggest
 from npa_envs.tasks.checks import is_real, is_whole
+from npa_envs.world.actions import Physics
 from npa_envs.wrappers.base import (
     AnyVectorEnv,
     AnyVectorWrapper,
     EpisodeClock,
+    Observations,
     VectorObservations,
+    as_tensor,
     autoreset_mode,
     check_vector_env,
+    like,
+    single_env,
+    vector_env,
     world_indices,
 )
 
@@ -91,20 +105,216 @@ class RunningMoments:
         self.count = float(given["count"])
 
 
-def as_tensor(values: Any) -> Tensor:
-    """Return an array or tensor as a tensor, without a copy."""
-    return values if isinstance(values, Tensor) else torch.from_numpy(np.asarray(values))
+DEFAULT_CLIP, DEFAULT_EPSILON = 10.0, 1e-8
 
 
-def like(result: Tensor, values: Any) -> Any:
-    """Return a tensor as what `values` is: an array or a tensor."""
-    return result if isinstance(values, Tensor) else result.numpy()
+class PerceptionStatistics:
+    """Running statistics of perception vectors z = [s; s̄; L(∇s); L(∇ρ)].
+
+    There is one scale for each channel of the states, the smoothed states and the state gradients,
+    and one for the density gradient, each shared by all particles. States are centred as well.
+    Gradients are not, and the components of one have one scale, so that directions stay what they
+    are.
+
+    Args:
+        physics: The constants of the world that is perceived.
+        clip: What is normalised is clipped to plus and minus this (dimensionless).
+        epsilon: Added to variances (dimensionless).
+
+    Raises:
+        NPAError: `clip` or `epsilon` is not finite or not positive.
+    """
+
+    def __init__(
+        self, physics: Physics, *, clip: float = DEFAULT_CLIP, epsilon: float = DEFAULT_EPSILON
+    ) -> None:
+        self.clip, self.epsilon = above_zero("clip", clip), above_zero("epsilon", epsilon)
+        self.space_dim, self.state_dim = physics.space_dim, physics.state_dim
+        self.perception_dim = physics.perception_dim
+        self.moments = RunningMoments(3 * self.state_dim + 1)
+        """Of the states, smoothed states, state gradients (C each) and the density gradient."""
+
+    def update(self, observation: Any) -> None:
+        """Take in what particles perceive.
+
+        Args:
+            observation: Array or tensor of shape [..., P].
+        """
+        z = as_tensor(observation).flatten(0, -2)
+        var, mean = torch.var_mean(z, dim=0, correction=0)
+        centred = 2 * self.state_dim
+        # About zero, which is the mean of a direction that the world does not prefer.
+        square = (var + mean.square())[centred:]
+        gradients = square[: -self.space_dim].view(self.state_dim, self.space_dim).mean(dim=1)
+        density = square[-self.space_dim :].mean(dim=0, keepdim=True)
+        self.moments.update(
+            torch.cat((mean[:centred], torch.zeros_like(square[: self.state_dim + 1]))),
+            torch.cat((var[:centred], gradients, density)),
+            len(z),
+        )
+
+    def normalize(self, observation: Any) -> Any:
+        """Return perception on one scale, clipped, as new float32 numbers.
+
+        Args:
+            observation: Array or tensor of shape [..., P].
+        """
+        z = as_tensor(observation)
+        mean = self._spread(self.moments.mean).to(z)
+        scale = self._spread((self.moments.var + self.epsilon).rsqrt()).to(z)
+        return like(((z - mean) * scale).clamp_(-self.clip, self.clip), observation)
+
+    def space(self, space: Box) -> Box:
+        """Return the space of normalised observations.
+
+        Args:
+            space: The space of the observations as they are.
+
+        Raises:
+            NPAError: It holds more than perception.
+        """
+        if len(space.shape) != 2 or space.shape[1] != self.perception_dim:
+            raise NPAError(
+                f"observations must be perception vectors, shape [N, {self.perception_dim}], got "
+                f"shape {space.shape}: normalise before other wrappers change them"
+            )
+        return Box(-self.clip, self.clip, space.shape, np.float32)
+
+    def _spread(self, statistics: Tensor) -> Tensor:
+        """Return the number of each entry of a perception vector, shape [P]."""
+        centred = 2 * self.state_dim
+        gradients = statistics[centred:].repeat_interleave(self.space_dim)
+        return torch.cat((statistics[:centred], gradients))
 
 
-# Gymnasium's statistics wrappers for vector environments whose arrays are torch tensors.
-#
-# They do what `gymnasium.wrappers.vector` does for NumPy, under the same names behind "Torch",
-# stay on the device, and know all three ways in which worlds begin their next episode.
+class _NormalizesPerception:
+    """The part of both wrappers that keeps statistics of perception and normalises by them."""
+
+    statistics: PerceptionStatistics
+    training: bool
+    new_ones: Callable[[Any], Any]
+
+    def _choose_statistics(
+        self,
+        physics: Physics,
+        clip: float | None,
+        epsilon: float | None,
+        training: bool,
+        statistics: PerceptionStatistics | None,
+    ) -> dict[str, Any]:
+        """Take the given statistics, or make new ones; return what a spec holds of them.
+
+        Raises:
+            NPAError: There are statistics and other numbers beside them, or one is wrong.
+        """
+        named = (("clip", clip), ("epsilon", epsilon))
+        given = {name: value for name, value in named if value is not None}
+        if statistics is None:
+            statistics = PerceptionStatistics(physics, **given)
+        elif not isinstance(statistics, PerceptionStatistics):
+            raise NPAError(
+                f"statistics must be those of another wrapper, got {type(statistics).__name__}: "
+                "give wrapper.statistics, or load a state with load_state_dict"
+            )
+        elif given:
+            name, value = next(iter(given.items()))
+            raise NPAError(
+                f"{name} belongs to statistics, which has {getattr(statistics, name):g}, got "
+                f"{value!r} as well: leave {name} out"
+            )
+        if not isinstance(training, bool | np.bool_):
+            raise NPAError(f"training must be True or False, got {training!r}")
+        self.statistics, self.training = statistics, bool(training)
+        return {"clip": statistics.clip, "epsilon": statistics.epsilon, "training": training}
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return the statistics, for `torch.save` or safetensors."""
+        return self.statistics.moments.state_dict()
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Take over the statistics of another wrapper.
+
+        Args:
+            state: What its `state_dict` returned.
+
+        Raises:
+            NPAError: It belongs to other observations.
+        """
+        self.statistics.moments.load_state_dict(state)
+
+    def observations(self, observations: Any) -> Any:
+        """Return observations normalised, and count them while training."""
+        if self.training:
+            self.statistics.update(self.new_ones(observations))
+        return self.statistics.normalize(observations)
+
+    def final_observations(self, observations: Any) -> Any:
+        """Return observations normalised."""
+        return self.statistics.normalize(observations)
+
+
+class NormalizePerception(_NormalizesPerception, Observations, RecordConstructorArgs):
+    """Bring perception to one scale, by running statistics.
+
+    The environment's spec holds how, and not the statistics: save those with `state_dict`.
+
+    Args:
+        env: An environment of this package.
+        clip: What is normalised is clipped to plus and minus this (dimensionless); None: to 10, or
+            as `statistics` has it.
+        epsilon: Added to variances (dimensionless); None: 1e-8, or as `statistics` has it.
+        training: Whether the statistics follow what is seen.
+        statistics: Those of another wrapper, to share; None makes new ones.
+
+    Raises:
+        NPAError: The environment or a number is wrong, or `clip` or `epsilon` is given although
+            `statistics` has its own.
+
+    Attributes:
+        training: Whether the statistics follow what is seen; set it to False to freeze them.
+        statistics: The running statistics.
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.Env[Any, Any],
+        *,
+        clip: float | None = None,
+        epsilon: float | None = None,
+        training: bool = True,
+        statistics: PerceptionStatistics | None = None,
+    ) -> None:
+        physics = single_env(env, type(self).__name__).worlds.physics
+        recorded = self._choose_statistics(physics, clip, epsilon, training, statistics)
+        RecordConstructorArgs.__init__(self, **recorded)
+        super().__init__(env)
+        assert isinstance(env.observation_space, Box), "environments of this package have boxes"
+        self.observation_space = self.statistics.space(env.observation_space)
+
+
+class VectorNormalizePerception(_NormalizesPerception, VectorObservations, RecordConstructorArgs):
+    """`NormalizePerception` for vector environments, of NumPy arrays or tensors on a device.
+
+    Final observations are normalised and not counted, nor are those of worlds that a reset leaves
+    alone. Nothing waits for the device. Arguments, errors and attributes are those of
+    `NormalizePerception`, but for `env`, a vector environment of this package.
+    """
+
+    def __init__(
+        self,
+        env: AnyVectorEnv,
+        *,
+        clip: float | None = None,
+        epsilon: float | None = None,
+        training: bool = True,
+        statistics: PerceptionStatistics | None = None,
+    ) -> None:
+        physics = vector_env(env, type(self).__name__).worlds.physics
+        recorded = self._choose_statistics(physics, clip, epsilon, training, statistics)
+        RecordConstructorArgs.__init__(self, **recorded)
+        super().__init__(env)
+        assert isinstance(env.single_observation_space, Box), "ours are boxes"
+        self.single_observation_space = self.statistics.space(env.single_observation_space)
 
 
 class TorchRecordEpisodeStatistics(AnyVectorWrapper):
@@ -222,7 +432,7 @@ class TorchNormalizeObservation(VectorObservations):
     def __init__(self, env: AnyVectorEnv, epsilon: float = 1e-8) -> None:
         check_vector_env(env, type(self).__name__)
         super().__init__(env)
-        self.epsilon = check_above_zero("epsilon", epsilon)
+        self.epsilon = above_zero("epsilon", epsilon)
         shape = env.single_observation_space.shape
         assert shape is not None, "only arrays can be normalised"
         self.single_observation_space = Box(-np.inf, np.inf, shape, np.float32)
@@ -265,7 +475,7 @@ class TorchNormalizeReward(AnyVectorWrapper):
         super().__init__(env)
         if not is_real(gamma) or not 0.0 <= gamma <= 1.0:
             raise NPAError(f"gamma must lie in [0, 1], got {gamma!r}: try 0.99")
-        self.gamma, self.epsilon = gamma, check_above_zero("epsilon", epsilon)
+        self.gamma, self.epsilon = gamma, above_zero("epsilon", epsilon)
         self.return_rms = RunningMoments()
         """Running mean and variance of the discounted return."""
         self.accumulated_reward: Tensor | None = None
@@ -327,7 +537,7 @@ def check_tensor(values: Any, wrapper: str) -> None:
         )
 
 
-def check_above_zero(name: str, value: float) -> float:
+def above_zero(name: str, value: float) -> float:
     """Return a number that must be finite and greater than 0.
 
     Args:

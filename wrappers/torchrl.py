@@ -1,4 +1,4 @@
-"""Batches of worlds as an environment of TorchRL's, without copies to the host."""
+"""Adapter to TorchRL: batches of worlds as one environment, without copies to the host."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
 from npa_envs.errors import MissingDependencyError, NPAError
-from npa_envs.wrappers.adapters import check_copies, check_torch_output
-from npa_envs.wrappers.base import AnyVectorEnv, autoreset_mode, vector_env
+from npa_envs.wrappers.base import AnyVectorEnv, autoreset_mode, torch_env
 
 try:
     from tensordict import TensorDict, TensorDictBase
@@ -50,9 +49,7 @@ class NPATorchRLEnv(EnvBase):  # type: ignore[misc]
     """
 
     def __init__(self, env: AnyVectorEnv, *, rows: bool = False) -> None:
-        base = vector_env(env, type(self).__name__)
-        check_torch_output(base, type(self).__name__)
-        check_copies(base, type(self).__name__)
+        base = torch_env(env, type(self).__name__)
         mode = autoreset_mode(env)
         if mode is not AutoresetMode.DISABLED:
             raise NPAError(

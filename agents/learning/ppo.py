@@ -30,7 +30,7 @@ from npa_envs.envs.core.worlds import free_bytes, needed_bytes
 from npa_envs.errors import NPAError
 from npa_envs.tasks.checks import check_non_negative, check_positive
 from npa_envs.world.cuda_graph import Replayed
-from npa_envs.wrappers.adapters import own_rewards
+from npa_envs.wrappers.base import own_rewards
 
 MANY_PARTICLES = 2**17
 """Particles of all worlds together on a GPU: a round of fewer takes hardly less time."""

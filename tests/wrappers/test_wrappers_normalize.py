@@ -15,7 +15,7 @@ from npa_envs.wrappers import (
     SpeciesTags,
     VectorNormalizePerception,
 )
-from npa_envs.wrappers.normalize import PerceptionStatistics
+from npa_envs.wrappers.statistics import PerceptionStatistics
 
 C, D, P = 16, 2, 66
 

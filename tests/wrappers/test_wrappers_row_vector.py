@@ -62,7 +62,7 @@ def test_what_is_refused():
         ParticleRows(wrapped_envs.single())
     rows = ParticleRows(batched(2))
     rows.reset()
-    with pytest.raises(NPAError, match=r"actions must have shape \[B N, A\] = \(128, 18\), got"):
+    with pytest.raises(NPAError, match=r"actions must have shape \[rows, A\] = \(128, 18\), got"):
         rows.step(np.zeros((2, 64, ACTIONS), np.float32))
 
 

@@ -115,5 +115,5 @@ def test_what_is_refused():
     with pytest.raises(NPAError, match="make it with autoreset_mode='same-step'"):
         RslRlParticleEnv(batched(autoreset_mode="next-step"))
     rows = RslRlParticleEnv(batched(2))
-    with pytest.raises(NPAError, match=r"actions must have shape \[B N, A\] = \(128, 18\), got"):
+    with pytest.raises(NPAError, match=r"actions must have shape \[rows, A\] = \(128, 18\), got"):
         rows.step(torch.zeros(2, 64, ACTIONS))

@@ -148,7 +148,7 @@ def test_rows_need_worlds_and_an_action_each():
         rows.step(np.zeros((6, 18)))
     rows.reset()
     # As many numbers as wanted, but of twelve rows.
-    with pytest.raises(NPAError, match=r"\[B R, A\] = \(6, 18\), got \(12, 9\): one for each row"):
+    with pytest.raises(NPAError, match=r"\[rows, A\] = \(6, 18\), got \(12, 9\): one for each row"):
         rows.step(np.zeros((12, 9)))
     assert rows.step(np.zeros((6, 18)))[1].shape == (6,)
 

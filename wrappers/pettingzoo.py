@@ -1,4 +1,4 @@
-"""Infos of several agents as libraries want them that make a tensor of every entry."""
+"""A wrapper of PettingZoo environments whose infos hold numbers alone."""
 
 from __future__ import annotations
 

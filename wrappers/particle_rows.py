@@ -1,4 +1,4 @@
-"""Particles as the sub-environments of a Gymnasium vector environment, for RLlib and its like."""
+"""Particles as the rows of another vector environment of Gymnasium's, for RLlib and its like."""
 
 from __future__ import annotations
 
@@ -12,8 +12,15 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from npa_envs.errors import NPAError
-from npa_envs.wrappers.adapters import own_rewards, row_space
-from npa_envs.wrappers.base import AnyVectorEnv, autoreset_mode, to_host, vector_env
+from npa_envs.wrappers.base import (
+    AnyVectorEnv,
+    autoreset_mode,
+    check_row_actions,
+    own_rewards,
+    row_space,
+    to_host,
+    vector_env,
+)
 
 
 class ParticleRows(AnyVectorEnv):
@@ -105,12 +112,7 @@ class ParticleRows(AnyVectorEnv):
             NPAError: The actions have another shape; the worlds are then as they were.
             DivergedError: An action is not finite; the worlds are then as they were.
         """
-        wanted = (self.num_envs, *(self.single_action_space.shape or ()))
-        if np.shape(actions) != wanted:
-            raise NPAError(
-                f"actions must have shape [B N, A] = {wanted}, got {np.shape(actions)}: "
-                "one for each row"
-            )
+        check_row_actions(actions, self.num_envs, *(self.single_action_space.shape or ()))
         by_world = actions.reshape(self.world_count, self.particle_count, -1)
         observations, rewards, ended, cut, infos = self.vector_env.step(by_world)
         own = own_rewards(infos)
