@@ -11,11 +11,11 @@ from npa_envs.agents.policies import (
     PaintPolicy,
     Policy,
     RandomPolicy,
+    RulePolicy,
     SpreadPolicy,
     ZeroPolicy,
     interface_of,
 )
-from npa_envs.agents.rule_policy import RulePolicy
 
 __all__ = [
     "Episodes",

@@ -1,4 +1,4 @@
-"""What a policy achieves: whole episodes from given seeds, batched."""
+"""Evaluation of policies: whole episodes from given seeds, batched."""
 
 from __future__ import annotations
 

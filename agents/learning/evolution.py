@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from npa_envs.agents.learning.problem import FIRST_EVALUATION_SEED, Problem
 from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rules import RuleSet, starting_rules
-from npa_envs.agents.rule_policy import bounded, perceived
+from npa_envs.agents.policies import bounded, perceived
 from npa_envs.errors import MissingDependencyError, NPAError
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.checks import check_positive

@@ -1,4 +1,4 @@
-"""The rules of one problem, one for each species: what all learners change."""
+"""Sets of rules, one for each species of a problem: what all learners change."""
 
 from __future__ import annotations
 
@@ -6,20 +6,22 @@ import copy
 from collections.abc import Iterator, Sequence
 from itertools import accumulate
 from pathlib import Path
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 import torch
 from torch import Tensor, nn
 
-from npa_envs.agents.learning.problem import Problem
-from npa_envs.agents.policies import Interface, Policy
-from npa_envs.agents.rule_policy import bounded_update, check_rule_fits
+from npa_envs.agents.policies import Interface, Policy, bounded_update, check_rule_fits
 from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule, save_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.checks import is_whole
 
+if TYPE_CHECKING:
+    from npa_envs.agents.learning.problem import Problem
+
 Source = str | Path | NPARule
+"""A rule, a shipped rule's name, or a rule's file."""
 
 
 class RuleSet(nn.Module):

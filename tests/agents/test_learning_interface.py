@@ -1,4 +1,4 @@
-"""Problems, sets of rules and joined species: what all learners share."""
+"""Problems, sets of rules and species in one array: what all learners share."""
 
 from __future__ import annotations
 
@@ -265,7 +265,7 @@ def test_rules_that_do_not_fit_are_refused(problem, source, message):
         RuleSet.of(problem, source)
 
 
-# Joined species
+# Species in one array
 
 
 def test_a_world_is_paid_the_mean_of_its_species_and_rows_what_their_species_is():
@@ -293,7 +293,7 @@ def test_a_world_is_paid_the_mean_of_its_species_and_rows_what_their_species_is(
     assert infos["acted"].all()
 
 
-def test_joined_episodes_end_with_their_last_observations():
+def test_episodes_of_species_end_with_their_last_observations():
     problem = species(episode_steps=3)
     envs = problem.make_envs(2)
     policy = wild_rules(problem).policy()
@@ -330,7 +330,7 @@ def test_a_world_terminates_where_its_last_species_ends():
     assert (losses[3] > 0.6).all()
 
 
-def test_evaluation_runs_joined_species():
+def test_evaluation_runs_species():
     problem = species(episode_steps=3)
     episodes = evaluate_policy(problem.make_envs(2), wild_rules(problem).policy(), range(5))
     gained = episodes.start_losses - episodes.final_losses
