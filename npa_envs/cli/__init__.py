@@ -74,54 +74,32 @@ def _dispatch(words: list[str]) -> int:
     # Spelled out, so that the import ladder's test and type checkers see every import.
     match name:
         case "demo":
-            from npa_envs.cli import demo
-
-            return demo.main(rest)
+            from npa_envs.cli.demo import main as command
         case "train":
-            from npa_envs.cli import train
-
-            return train.main(rest)
+            from npa_envs.cli.train import main as command
         case "rollout":
-            from npa_envs.cli import rollout
-
-            return rollout.main(rest)
+            from npa_envs.cli.rollout import main as command
         case "evaluate":
-            from npa_envs.cli import evaluate
-
-            return evaluate.main(rest)
+            from npa_envs.cli.evaluate import main as command
         case "interact":
-            from npa_envs.cli import interact
-
-            return interact.main(rest)
+            from npa_envs.cli.interact import main as command
         case "bench":
-            from npa_envs.cli import bench
-
-            return bench.main(rest)
+            from npa_envs.cli.bench import main as command
         case "stress":
-            from npa_envs.cli import stress
-
-            return stress.main(rest)
+            from npa_envs.cli.stress import main as command
         case "robustness":
-            from npa_envs.cli import robustness
-
-            return robustness.main(rest)
+            from npa_envs.cli.robustness import main as command
         case "compare":
-            from npa_envs.cli import compare
-
-            return compare.main(rest)
+            from npa_envs.cli.compare import main as command
         case "list":
-            from npa_envs.cli import listing
-
-            return listing.main(rest)
+            from npa_envs.cli.listing import main as command
         case "warmup":
-            from npa_envs.cli import warmup
-
-            return warmup.main(rest)
+            from npa_envs.cli.warmup import main as command
         case "doctor":
-            from npa_envs.cli import doctor
-
-            return doctor.main(rest)
-    raise NPAError(f"unknown command {name!r}: {suggest(name, COMMANDS)}")
+            from npa_envs.cli.doctor import main as command
+        case _:
+            raise NPAError(f"unknown command {name!r}: {suggest(name, COMMANDS)}")
+    return command(rest)
 
 
 def _help() -> str:

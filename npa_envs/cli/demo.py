@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -66,30 +65,29 @@ class DemoOptions:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the command.
-
-    Args:
-        arguments: The words after `npa-envs demo`.
-
-    Returns:
-        0.
+    """Show what the words after `npa-envs demo` ask for; return 0.
 
     Raises:
         NPAError: A value is wrong, or a file cannot be written.
     """
     options = tyro.cli(DemoOptions, prog="npa-envs demo", args=arguments)
-    from npa_envs.cli.output import make_folder
+    from npa_envs.cli.output import torch_threads, writable_folder
+    from npa_envs.files import write_text
 
     if not 1.0 <= options.train_seconds <= 3600.0:
         raise NPAError(f"train_seconds must lie in [1, 3600], got {options.train_seconds}")
     start = time.perf_counter()
-    make_folder(options.out)
+    writable_folder(options.out)
     report = Report()
-    with one_thread():
+    # On worlds as small as these several threads gain little, and on a busy machine they wait for
+    # each other at every operation: a step then takes several times as long.
+    with torch_threads(1):
         grow_and_heal(options, report)
         train_small(options, report)
     report.line(f"all of it took {time.perf_counter() - start:.0f} s")
-    report.write(options.out / "report.txt")
+    path = options.out / "report.txt"
+    write_text(path, "\n".join(report.lines) + "\n")
+    print(f"  wrote {path}")
     return 0
 
 
@@ -97,87 +95,29 @@ class Report:
     """What the demo says, on the screen and in a file."""
 
     def __init__(self) -> None:
-        self._lines: list[str] = []
+        self.lines: list[str] = []
+        """All that was said."""
 
     def line(self, text: str) -> None:
-        """Print a line and keep it.
-
-        Args:
-            text: The line.
-        """
+        """Print a line and keep it."""
         print(text, flush=True)
-        self._lines.append(text)
+        self.lines.append(text)
 
     def wrote(self, *paths: Path) -> None:
-        """Say which files were written.
-
-        Args:
-            paths: The files.
-        """
+        """Say which files were written."""
         for path in paths:
             self.line(f"  wrote {path}")
-
-    def write(self, path: Path) -> None:
-        """Write everything said so far.
-
-        Args:
-            path: The text file.
-
-        Raises:
-            NPAError: It cannot be written.
-        """
-        from npa_envs.files import write_text
-
-        write_text(path, "\n".join(self._lines) + "\n")
-        print(f"  wrote {path}")
-
-    @contextmanager
-    def timed(self) -> Iterator[Stopwatch]:
-        """Measure the time [s] until the block ends."""
-        watch = Stopwatch()
-        start = time.perf_counter()
-        yield watch
-        watch.seconds = time.perf_counter() - start
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Keep torch to one CPU thread within the block.
-
-    On worlds as small as these several threads gain little, and on a busy machine they wait for
-    each other at every operation: a step then takes several times as long.
-    """
-    import torch
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
-@dataclass
-class Stopwatch:
-    """A time measured by `Report.timed`."""
-
-    seconds: float = 0.0
-    """How long the block took [s]."""
 
 
 def grow_and_heal(options: DemoOptions, report: Report) -> None:
     """Grow the shipped rule, damage it twice, and film how it heals.
-
-    Args:
-        options: What the command line said.
-        report: Where the figures go.
 
     Raises:
         NPAError: The rule cannot be loaded, or a file cannot be written.
     """
     import torch
 
-    from npa_envs.cli.film import film_world, write_film
+    from npa_envs.cli.film import Film, film_world, write_film
     from npa_envs.cli.output import StepBar
     from npa_envs.measure.quality.evaluation import measure
     from npa_envs.rule.files import load_rule
@@ -196,32 +136,24 @@ def grow_and_heal(options: DemoOptions, report: Report) -> None:
     def figures(step: int) -> str:
         if trained.doubt is not None:
             return f"no figures ({trained.doubt})"
-        row = measure(task, x, s, step)
-        return row.figures
+        return measure(task, x, s, step).figures
 
+    lines, film, step = [], Film(), 0
     with StepBar(GROW_STEPS + 2 * HEAL_STEPS, show=options.progress) as bar:
-        common: dict[str, Any] = {
-            "generator": generator,
-            "every": FRAME_STEPS,
-            "progress": bar.advance,
-        }
-        with report.timed() as watch:
-            x, s, film = film_world(rule, task, x, s, GROW_STEPS, **common)
-        lines = [f"  grown for {GROW_STEPS} steps in {watch.seconds:4.1f} s: {figures(GROW_STEPS)}"]
-        step = GROW_STEPS
-        for kind in ("cut", "erase"):
-            damage = DamageEvent(step, kind)
-            x, s = damage_worlds(x, s, kind=kind, generator=generator)
-            film.shoot(task, x, s, f"step {step}: {damage.text}", mark=True)
-            lines.append(f"  {damage.text}: {figures(step)}")
-            with report.timed() as watch:
-                x, s, film = film_world(
-                    rule, task, x, s, HEAL_STEPS, first_step=step, film=film, **common
-                )
-            step += HEAL_STEPS
-            lines.append(
-                f"  healed for {HEAL_STEPS} steps in {watch.seconds:4.1f} s: {figures(step)}"
-            )
+        for kind, steps in ((None, GROW_STEPS), ("cut", HEAL_STEPS), ("erase", HEAL_STEPS)):
+            if kind is not None:
+                damage = DamageEvent(step, kind)
+                x, s = damage_worlds(x, s, kind=kind, generator=generator)
+                film.shoot(task, x, s, f"step {step}: {damage.text}", mark=True)
+                lines.append(f"  {damage.text}: {figures(step)}")
+            start = time.perf_counter()
+            x, s, film = film_world(
+                rule, task, x, s, steps, generator=generator, every=FRAME_STEPS,
+                first_step=step, film=film, progress=bar.advance,
+            )  # fmt: skip
+            seconds, step = time.perf_counter() - start, step + steps
+            done = "grown" if kind is None else "healed"
+            lines.append(f"  {done} for {steps} steps in {seconds:4.1f} s: {figures(step)}")
     for line in lines:
         report.line(line)
     name = Path(options.rule.rpartition("#")[2]).stem
@@ -230,10 +162,6 @@ def grow_and_heal(options: DemoOptions, report: Report) -> None:
 
 def train_small(options: DemoOptions, report: Report) -> None:
     """Train a small rule from a picture, and film what it learned.
-
-    Args:
-        options: What the command line said.
-        report: Where the figures go.
 
     Raises:
         NPAError: The target cannot be loaded, or a file cannot be written.
@@ -264,17 +192,17 @@ def train_small(options: DemoOptions, report: Report) -> None:
         **SMALL_RUN,
     )
     report.line(f"training on {options.target}: {config.task.particle_count} particles")
-    with report.timed() as watch:
-        result = train(
-            config,
-            task_name,
-            overwrite=True,
-            progress=options.progress,
-            max_seconds=options.train_seconds,
-        )
+    start = time.perf_counter()
+    result = train(
+        config,
+        task_name,
+        overwrite=True,
+        progress=options.progress,
+        max_seconds=options.train_seconds,
+    )
     if result.interrupted:
         raise KeyboardInterrupt
-    report.line(f"  {result.iteration} iterations in {watch.seconds:.1f} s")
+    report.line(f"  {result.iteration} iterations in {time.perf_counter() - start:.1f} s")
     device = check_device(options.device)
     task = task_entry(task_name).make(override(config, resolution=SCREEN).task, device)
     generator = torch.Generator(device).manual_seed(options.seed + 1)

@@ -14,25 +14,6 @@ from tqdm import tqdm
 from npa_envs.errors import NPAError, suggest
 
 
-def make_folder(path: Path) -> Path:
-    """Create a folder, and those above it, where missing.
-
-    Args:
-        path: The folder.
-
-    Raises:
-        NPAError: It cannot be created.
-    """
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise NPAError(
-            f"out must be a folder that can be created, got {str(path)!r} "
-            f"({error.strerror or error}): choose another one"
-        ) from error
-    return path
-
-
 def writable_folder(path: Path) -> Path:
     """Create a folder where missing, and check that files can be made in it, before work is done.
 
@@ -42,13 +23,15 @@ def writable_folder(path: Path) -> Path:
     Raises:
         NPAError: It cannot be created, or files in it cannot.
     """
-    make_folder(path)
+    must = "created"
     try:
+        path.mkdir(parents=True, exist_ok=True)
+        must = "written to"
         with tempfile.TemporaryFile(dir=path):
             pass
     except OSError as error:
         raise NPAError(
-            f"out must be a folder that can be written to, got {str(path)!r} "
+            f"out must be a folder that can be {must}, got {str(path)!r} "
             f"({error.strerror or error}): choose another one"
         ) from error
     return path
@@ -84,11 +67,7 @@ def chosen_names(kind: str, names: Sequence[str], known: Iterable[str]) -> list[
 
 @contextlib.contextmanager
 def torch_threads(count: int) -> Iterator[None]:
-    """Let torch use so many CPU threads while a block runs.
-
-    Args:
-        count: Threads, at least 1.
-    """
+    """Let torch use so many CPU threads while a block runs."""
     import torch
 
     before = torch.get_num_threads()

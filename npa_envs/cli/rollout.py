@@ -95,30 +95,12 @@ class RolloutOptions:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the command.
-
-    Args:
-        arguments: The words after `npa-envs rollout`.
-
-    Returns:
-        0.
+    """Grow, film and write what the words after `npa-envs rollout` ask for; return 0.
 
     Raises:
         NPAError: The rule, the damage or another value is wrong, or a file cannot be written.
     """
     options = tyro.cli(RolloutOptions, prog="npa-envs rollout", args=arguments)
-    return run(options)
-
-
-def run(options: RolloutOptions) -> int:
-    """Grow, film, write.
-
-    Args:
-        options: What the command line said.
-
-    Raises:
-        NPAError: As for `main`.
-    """
     import torch
 
     from npa_envs.cli.film import film_world, write_film, write_solid
@@ -158,10 +140,7 @@ def run(options: RolloutOptions) -> int:
     generator = torch.Generator(device).manual_seed(options.seed)
     x, s, goal = seed_worlds(task, 1, generator=generator, device=device)
     task = task_toward(task, goal)
-    with (
-        stop_flag() as flag,
-        StepBar(options.steps, show=options.progress) as bar,
-    ):
+    with stop_flag() as stop, StepBar(options.steps, show=options.progress) as bar:
         x, s, film = film_world(
             rule,
             shown,
@@ -172,7 +151,7 @@ def run(options: RolloutOptions) -> int:
             damages=damages,
             every=options.every or math.ceil(options.steps / FRAME_COUNT),
             progress=bar.advance,
-            stop=lambda: flag.requested,
+            stop=stop.is_set,
         )
     done = bar.done
     if done < options.steps:

@@ -1,4 +1,4 @@
-"""Options of `npa-envs train` for tasks of several species: flat, although configurations nest."""
+"""`npa-envs train TASK`: every field of the configuration is an option."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, make_dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import tyro
 
@@ -17,7 +17,178 @@ from npa_envs.cli import INTERRUPTED
 from npa_envs.errors import NPAError
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
-from npa_envs.training import JointTrainConfig
+from npa_envs.training import (
+    TASKS,
+    JointTrainConfig,
+    RunFolder,
+    TrainConfig,
+    TrainResult,
+    load_config,
+    preset,
+    task_entry,
+    train,
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainOptions:
+    """How to run; what to run are the options of the configuration."""
+
+    preset: str = "fast"
+    """Configuration to start from: `npa-envs list` names them."""
+
+    config: Path | None = None
+    """YAML, TOML or JSON file with field names and values; goes over the preset."""
+
+    resume: bool = False
+    """Go on from the checkpoint in the folder `out`, with the configuration that lies there."""
+
+    overwrite: bool = False
+    """Start anew although the folder `out` holds a run; the run's files are removed."""
+
+    max_seconds: float | None = None
+    """Stop after this time [s]; the run can be resumed."""
+
+    progress: bool = True
+    """Show a progress bar."""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Train what the words after `npa-envs train` ask for.
+
+    Returns:
+        0 when the run is finished or out of time, 130 after Ctrl-C.
+
+    Raises:
+        NPAError: The task or a value is wrong, or as for `npa_envs.training.train`.
+    """
+    if not arguments or arguments[0].startswith("-"):
+        names = "\n".join(f"  {name}  {entry.summary}" for name, entry in TASKS.items())
+        text = f"usage: npa-envs train TASK [options]\n\n{names}\n\n"
+        text += "Options of a task: npa-envs train TASK --help"
+        if arguments and arguments[0] in {"-h", "--help"}:
+            print(text)
+            return 0
+        raise NPAError(f"train needs a task first: {', '.join(TASKS)}")
+    task_name, rest = arguments[0], arguments[1:]
+    task_entry(task_name)
+    options, config = parse(task_name, starting_configuration(task_name, rest), rest)
+    return run(task_name, options, config)
+
+
+def starting_configuration(task_name: str, arguments: Sequence[str]) -> TrainConfig[Any]:
+    """Return the configuration that the options are laid over: preset, file, or the run resumed.
+
+    Args:
+        task_name: The task.
+        arguments: The words after the task.
+
+    Raises:
+        NPAError: No such preset, the file is wrong, or there is nothing to resume.
+    """
+    # These options decide what the others' defaults are, so they are looked at first.
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    parser.add_argument("--preset", default=TrainOptions.preset)
+    parser.add_argument("--config", type=Path)
+    parser.add_argument("--resume", action="store_true")
+    parser.add_argument("--out", type=Path)
+    try:
+        first, _ = parser.parse_known_args(arguments)
+    except argparse.ArgumentError as error:
+        raise NPAError(f"{error.argument_name}: {error.message}") from error
+    base = preset(first.preset, task_name)
+    if first.resume and not {"-h", "--help"} & set(arguments):
+        folder = RunFolder(first.out or base.out)
+        if not folder.checkpoint.is_file():
+            raise NPAError(
+                f"there is no checkpoint to resume from at {str(folder.checkpoint)!r}: give the "
+                "folder of an earlier run with --out, or leave --resume out to start a new run"
+            )
+        base = load_config(folder.config, base)
+    if first.config is not None:
+        base = load_config(first.config, base)
+    return base
+
+
+def parse(
+    task_name: str, base: TrainConfig[Any], arguments: Sequence[str]
+) -> tuple[TrainOptions, TrainConfig[Any]]:
+    """Lay the command line's options over a configuration.
+
+    Args:
+        task_name: The task.
+        base: The defaults.
+        arguments: The words after the task.
+    """
+
+    def read(kind: Any, defaults: Any) -> tuple[TrainOptions, Any]:
+        fields = [("launch", TrainOptions), ("run", kind)]
+        command = make_dataclass("Command", fields, frozen=True)
+        parsed: Any = tyro.cli(
+            command,
+            prog=f"npa-envs train {task_name}",
+            description=f"Train on {task_name}. Defaults shown are those of the preset.",
+            args=arguments,
+            default=command(TrainOptions(), defaults),
+            config=(tyro.conf.OmitArgPrefixes,),
+        )
+        return parsed.launch, parsed.run
+
+    if isinstance(base, JointTrainConfig):
+        return parse_joint(base, partial(read, JointOptions))
+    generic: Any = TrainConfig
+    return read(generic[type(base.task)], base)
+
+
+def run(task_name: str, options: TrainOptions, config: TrainConfig[Any]) -> int:
+    """Train, say where everything lies and how to go on, and return the exit code."""
+    if options.max_seconds is not None and not 0 < options.max_seconds < math.inf:
+        raise NPAError(f"max_seconds must be positive and finite, got {options.max_seconds}")
+    folder = RunFolder(config.out)
+    resume_command = f"npa-envs train {task_name} --out {shlex.quote(str(config.out))} --resume"
+    print(f"{task_name}: {config.total_iterations} iterations on {config.device}")
+    print(f"writing to {config.out}/ (Ctrl-C stops in order; {resume_command} goes on)")
+    try:
+        result = train(
+            config,
+            task_name,
+            resume=options.resume,
+            overwrite=options.overwrite,
+            progress=options.progress,
+            max_seconds=options.max_seconds,
+        )
+    except KeyboardInterrupt:
+        print(f"interrupted; the last checkpoint is {folder.checkpoint}\ngo on: {resume_command}")
+        raise
+    rules = [folder.rule]
+    look = f"npa-envs rollout {shlex.quote(str(folder.rule))}"
+    if isinstance(config, JointTrainConfig):
+        rules = [folder.rule_of(number) for number in range(len(config.task.species))]
+        look = f"npa-envs interact {shlex.join(map(str, rules))}"
+        look += f" --distances {config.task.distance:g}"
+        look += f" --particle-count {sum(config.task.counts[:2])}"
+    _report(result, rules, look, resume_command)
+    return INTERRUPTED if result.interrupted else 0
+
+
+def _report(result: TrainResult, rules: Sequence[Path], look: str, resume_command: str) -> None:
+    folder = RunFolder(result.folder)
+    loss = result.record.get("loss")
+    figures = "" if loss is None else f", loss {loss:.4g}"
+    if result.finished:
+        print(f"finished: {result.iteration} iterations{figures}")
+    else:
+        print(f"stopped at iteration {result.iteration}{figures}")
+        print(f"  checkpoint  {folder.checkpoint}")
+        print(f"  go on       {resume_command}")
+    for rule in rules:
+        print(f"  rule        {rule}")
+    print(f"  log         {folder.log}")
+    print(f"  pictures    {folder.pictures}/")
+    print(f"  look at it  {look}")
+
+
+# Options of tasks of several species: flat, although configurations nest.
 
 LaunchT = TypeVar("LaunchT")
 
@@ -89,190 +260,3 @@ def _of_type(kind: Any, source: Any, **others: Any) -> Any:
     own = {field.name for field in fields(kind)}
     same = {f.name: getattr(source, f.name) for f in fields(source) if f.name in own}
     return kind(**same | others)
-
-
-# `npa-envs train TASK`: every field of the configuration is an option.
-
-
-if TYPE_CHECKING:
-    from npa_envs.training import TrainConfig, TrainResult
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrainOptions:
-    """How to run; what to run are the options of the configuration."""
-
-    preset: str = "fast"
-    """Configuration to start from: `npa-envs list` names them."""
-
-    config: Path | None = None
-    """YAML, TOML or JSON file with field names and values; goes over the preset."""
-
-    resume: bool = False
-    """Go on from the checkpoint in the folder `out`, with the configuration that lies there."""
-
-    overwrite: bool = False
-    """Start anew although the folder `out` holds a run; the run's files are removed."""
-
-    max_seconds: float | None = None
-    """Stop after this time [s]; the run can be resumed."""
-
-    progress: bool = True
-    """Show a progress bar."""
-
-
-def main(arguments: Sequence[str]) -> int:
-    """Run the command.
-
-    Args:
-        arguments: The words after `npa-envs train`.
-
-    Returns:
-        0 when the run is finished or was stopped in order.
-
-    Raises:
-        NPAError: The task or a value is wrong, or as for `npa_envs.training.train`.
-    """
-    from npa_envs.training import TASKS, task_entry
-
-    if not arguments or arguments[0].startswith("-"):
-        names = "\n".join(f"  {name}  {entry.summary}" for name, entry in TASKS.items())
-        text = f"usage: npa-envs train TASK [options]\n\n{names}\n\n"
-        text += "Options of a task: npa-envs train TASK --help"
-        if arguments and arguments[0] in {"-h", "--help"}:
-            print(text)
-            return 0
-        raise NPAError(f"train needs a task first: {', '.join(TASKS)}")
-    task_name, rest = arguments[0], arguments[1:]
-    task_entry(task_name)
-    base = starting_configuration(task_name, rest)
-    options, config = parse(task_name, base, rest)
-    return run(task_name, options, config)
-
-
-def starting_configuration(task_name: str, arguments: Sequence[str]) -> TrainConfig[Any]:
-    """Return the configuration that the options are laid over: preset, file, or the run resumed.
-
-    Args:
-        task_name: The task.
-        arguments: The words after the task.
-
-    Raises:
-        NPAError: No such preset, the file is wrong, or there is nothing to resume.
-    """
-    from npa_envs.training import RunFolder, load_config, preset
-
-    # These options decide what the others' defaults are, so they are looked at first.
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-    parser.add_argument("--preset", default=TrainOptions.preset)
-    parser.add_argument("--config", type=Path)
-    parser.add_argument("--resume", action="store_true")
-    parser.add_argument("--out", type=Path)
-    try:
-        first, _ = parser.parse_known_args(arguments)
-    except argparse.ArgumentError as error:
-        raise NPAError(f"{error.argument_name}: {error.message}") from error
-    base = preset(first.preset, task_name)
-    if first.resume and not {"-h", "--help"} & set(arguments):
-        folder = RunFolder(first.out or base.out)
-        if not folder.checkpoint.is_file():
-            raise NPAError(
-                f"there is no checkpoint to resume from at {str(folder.checkpoint)!r}: give the "
-                "folder of an earlier run with --out, or leave --resume out to start a new run"
-            )
-        base = load_config(folder.config, base)
-    if first.config is not None:
-        base = load_config(first.config, base)
-    return base
-
-
-def parse(
-    task_name: str, base: TrainConfig[Any], arguments: Sequence[str]
-) -> tuple[TrainOptions, TrainConfig[Any]]:
-    """Lay the command line's options over a configuration.
-
-    Args:
-        task_name: The task.
-        base: The defaults.
-        arguments: The words after the task.
-    """
-    from npa_envs.training import JointTrainConfig, TrainConfig
-
-    def read(kind: Any, defaults: Any) -> tuple[TrainOptions, Any]:
-        fields = [("launch", TrainOptions), ("run", kind)]
-        command = make_dataclass("Command", fields, frozen=True)
-        parsed: Any = tyro.cli(
-            command,
-            prog=f"npa-envs train {task_name}",
-            description=f"Train on {task_name}. Defaults shown are those of the preset.",
-            args=arguments,
-            default=command(TrainOptions(), defaults),
-            config=(tyro.conf.OmitArgPrefixes,),
-        )
-        return parsed.launch, parsed.run
-
-    if isinstance(base, JointTrainConfig):
-        return parse_joint(base, partial(read, JointOptions))
-    generic: Any = TrainConfig
-    return read(generic[type(base.task)], base)
-
-
-def run(task_name: str, options: TrainOptions, config: TrainConfig[Any]) -> int:
-    """Train, and say where everything lies and how to go on.
-
-    Args:
-        task_name: The task.
-        options: How to run.
-        config: What to run.
-
-    Raises:
-        NPAError: As for `npa_envs.training.train`.
-    """
-    from npa_envs.training import JointTrainConfig, RunFolder, train
-
-    if options.max_seconds is not None and not 0 < options.max_seconds < math.inf:
-        raise NPAError(f"max_seconds must be positive and finite, got {options.max_seconds}")
-    folder = RunFolder(config.out)
-    resume_command = f"npa-envs train {task_name} --out {shlex.quote(str(config.out))} --resume"
-    print(f"{task_name}: {config.total_iterations} iterations on {config.device}")
-    print(f"writing to {config.out}/ (Ctrl-C stops in order; {resume_command} goes on)")
-    try:
-        result = train(
-            config,
-            task_name,
-            resume=options.resume,
-            overwrite=options.overwrite,
-            progress=options.progress,
-            max_seconds=options.max_seconds,
-        )
-    except KeyboardInterrupt:
-        print(f"interrupted; the last checkpoint is {folder.checkpoint}\ngo on: {resume_command}")
-        raise
-    rules = [folder.rule]
-    look = f"npa-envs rollout {shlex.quote(str(folder.rule))}"
-    if isinstance(config, JointTrainConfig):
-        rules = [folder.rule_of(number) for number in range(len(config.task.species))]
-        look = f"npa-envs interact {shlex.join(map(str, rules))}"
-        look += f" --distances {config.task.distance:g}"
-        look += f" --particle-count {sum(config.task.counts[:2])}"
-    _report(result, rules, look, resume_command)
-    return INTERRUPTED if result.interrupted else 0
-
-
-def _report(result: TrainResult, rules: Sequence[Path], look: str, resume_command: str) -> None:
-    from npa_envs.training import RunFolder
-
-    folder = RunFolder(result.folder)
-    loss = result.record.get("loss")
-    figures = "" if loss is None else f", loss {loss:.4g}"
-    if result.finished:
-        print(f"finished: {result.iteration} iterations{figures}")
-    else:
-        print(f"stopped at iteration {result.iteration}{figures}")
-        print(f"  checkpoint  {folder.checkpoint}")
-        print(f"  go on       {resume_command}")
-    for rule in rules:
-        print(f"  rule        {rule}")
-    print(f"  log         {folder.log}")
-    print(f"  pictures    {folder.pictures}/")
-    print(f"  look at it  {look}")

@@ -27,13 +27,7 @@ class WarmupOptions:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the command.
-
-    Args:
-        arguments: The words after `npa-envs warmup`.
-
-    Returns:
-        0.
+    """Compile what the words after `npa-envs warmup` ask for; return 0.
 
     Raises:
         NPAError: There is no such device, or a dimension is not 2 or 3.
@@ -50,12 +44,11 @@ def main(arguments: Sequence[str]) -> int:
             f"space_dims must be 2, 3 or both and dtypes not empty, got {options.space_dims} and "
             f"{options.dtypes}: for example --space-dims 2 3 --dtypes float32"
         )
-    known = {"float32": torch.float32, "float64": torch.float64}
     start = time.perf_counter()
     warmup(
         check_device(options.device),
         space_dims=options.space_dims,
-        dtypes=[known[name] for name in options.dtypes],
+        dtypes=[getattr(torch, name) for name in options.dtypes],
     )
     seconds = time.perf_counter() - start
     print(f"kernels for {options.device} are ready ({seconds:.1f} s), in {kernel_cache_folder()}")

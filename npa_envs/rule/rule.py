@@ -26,10 +26,8 @@ INIT_GAIN = 0.1
 FOLD = 4
 """Rows of products are padded to a multiple of this many columns: 16 bytes of float32."""
 
-
 LARGEST_DIM = 65536
 """No dimension of a rule is larger."""
-
 
 OUTPUT_BLOCKS = 4
 """The sum over hidden units is taken in this many blocks."""
@@ -56,84 +54,6 @@ class RuleHyperParameters(NamedAlways, total=False):
 
     species_count: int
     moment_inverse: MomentInverse
-
-
-class _BlockedProduct(torch.autograd.Function):
-    """hidden @ weight.T, summed in blocks: less rounding, which rules amplify step by step."""
-
-    @staticmethod
-    def forward(ctx: Any, hidden: Tensor, weight: Tensor) -> Tensor:
-        ctx.save_for_backward(hidden, weight)
-        blocks = OUTPUT_BLOCKS if hidden.shape[1] % OUTPUT_BLOCKS == 0 else 1
-        left = hidden.view(hidden.shape[0], blocks, -1).transpose(0, 1)
-        right = weight.view(weight.shape[0], blocks, -1).permute(1, 2, 0)
-        return torch.bmm(left, right).sum(dim=0)
-
-    @staticmethod
-    def backward(ctx: Any, update_bar: Tensor) -> tuple[Tensor, Tensor]:
-        hidden, weight = ctx.saved_tensors
-        return update_bar @ weight, update_bar.T @ hidden
-
-    @classmethod
-    def product(cls, hidden: Tensor, weight: Tensor) -> Tensor:
-        """Return the product of hidden units, [K, H], and weights, [A, H]: [K, A]."""
-        result: Tensor = cls.apply(hidden, weight)  # type: ignore[no-untyped-call]
-        return result
-
-
-class FoldedRule(NamedTuple):
-    """A rule's weights as two plain products: the bias is one more column of the first.
-
-    A row of perception is followed by a one and by zeros up to a multiple of `FOLD` columns, which
-    saves the passes over all rows that a bias and its gradient cost, and aligns the products.
-    """
-
-    hidden_weight: Tensor
-    """[W1 | b1 | 0], shape [H, row_width]."""
-    output_weight: Tensor
-    """W2 and rows of zeros up to a multiple of `FOLD`, shape [A', H]."""
-    arranged: ArrangedWeights | None = None
-    """Both as the fused kernels read them, where there are such for their device and sizes."""
-    joined: Tensor | None = None
-    """Both one after the other where there are: gradients of many steps are added up at once."""
-
-    @property
-    def row_width(self) -> int:
-        """Columns of a row of perception: P + 1, rounded up to a multiple of `FOLD`."""
-        return self.hidden_weight.shape[1]
-
-    def __call__(self, rows: Tensor) -> Tensor:
-        """Map rows [z | 1 | 0], shape [K, row_width], to raw updates [y | 0], shape [K, A']."""
-        if self.arranged is not None and self.joined is not None:
-            return run_network(rows, self.joined, self.output_weight.shape, self.arranged)
-        hidden = torch.relu(rows @ self.hidden_weight.T)
-        return _BlockedProduct.product(hidden, self.output_weight)
-
-
-def fold_weights(hidden_weight: Tensor, output_weight: Tensor) -> FoldedRule:
-    """Return folded weights as they are run on their device, differentiable in both.
-
-    Args:
-        hidden_weight: [W1 | b1 | 0], shape [H, row_width].
-        output_weight: W2 and rows of zeros up to a multiple of `FOLD`, shape [A', H].
-    """
-    arranged = arrange_weights(hidden_weight, output_weight)
-    if arranged is None:
-        return FoldedRule(hidden_weight, output_weight)
-    joined = torch.cat((hidden_weight.flatten(), output_weight.flatten()))
-    return FoldedRule(hidden_weight, output_weight, arranged, joined)
-
-
-def check_rule(rule: Any) -> None:
-    """Check that something is a rule; one that `torch.compile` has wrapped is one too.
-
-    Raises:
-        NPAError: It is none.
-    """
-    if not isinstance(getattr(rule, "_orig_mod", rule), NPARule):
-        raise NPAError(
-            f"rule must be an NPARule, got {type(rule).__name__}: load it with npa_envs.load_rule"
-        )
 
 
 class NPARule(nn.Module):
@@ -322,3 +242,81 @@ class NPARule(nn.Module):
         if self.moment_inverse != "threshold":
             made["moment_inverse"] = self.moment_inverse
         return made
+
+
+def check_rule(rule: Any) -> None:
+    """Check that something is a rule; one that `torch.compile` has wrapped is one too.
+
+    Raises:
+        NPAError: It is none.
+    """
+    if not isinstance(getattr(rule, "_orig_mod", rule), NPARule):
+        raise NPAError(
+            f"rule must be an NPARule, got {type(rule).__name__}: load it with npa_envs.load_rule"
+        )
+
+
+class _BlockedProduct(torch.autograd.Function):
+    """hidden @ weight.T, summed in blocks: less rounding, which rules amplify step by step."""
+
+    @staticmethod
+    def forward(ctx: Any, hidden: Tensor, weight: Tensor) -> Tensor:
+        ctx.save_for_backward(hidden, weight)
+        blocks = OUTPUT_BLOCKS if hidden.shape[1] % OUTPUT_BLOCKS == 0 else 1
+        left = hidden.view(hidden.shape[0], blocks, -1).transpose(0, 1)
+        right = weight.view(weight.shape[0], blocks, -1).permute(1, 2, 0)
+        return torch.bmm(left, right).sum(dim=0)
+
+    @staticmethod
+    def backward(ctx: Any, update_bar: Tensor) -> tuple[Tensor, Tensor]:
+        hidden, weight = ctx.saved_tensors
+        return update_bar @ weight, update_bar.T @ hidden
+
+    @classmethod
+    def product(cls, hidden: Tensor, weight: Tensor) -> Tensor:
+        """Return the product of hidden units, [K, H], and weights, [A, H]: [K, A]."""
+        result: Tensor = cls.apply(hidden, weight)  # type: ignore[no-untyped-call]
+        return result
+
+
+class FoldedRule(NamedTuple):
+    """A rule's weights as two plain products: the bias is one more column of the first.
+
+    A row of perception is followed by a one and by zeros up to a multiple of `FOLD` columns, which
+    saves the passes over all rows that a bias and its gradient cost, and aligns the products.
+    """
+
+    hidden_weight: Tensor
+    """[W1 | b1 | 0], shape [H, row_width]."""
+    output_weight: Tensor
+    """W2 and rows of zeros up to a multiple of `FOLD`, shape [A', H]."""
+    arranged: ArrangedWeights | None = None
+    """Both as the fused kernels read them, where there are such for their device and sizes."""
+    joined: Tensor | None = None
+    """Both one after the other where there are: gradients of many steps are added up at once."""
+
+    @property
+    def row_width(self) -> int:
+        """Columns of a row of perception: P + 1, rounded up to a multiple of `FOLD`."""
+        return self.hidden_weight.shape[1]
+
+    def __call__(self, rows: Tensor) -> Tensor:
+        """Map rows [z | 1 | 0], shape [K, row_width], to raw updates [y | 0], shape [K, A']."""
+        if self.arranged is not None and self.joined is not None:
+            return run_network(rows, self.joined, self.output_weight.shape, self.arranged)
+        hidden = torch.relu(rows @ self.hidden_weight.T)
+        return _BlockedProduct.product(hidden, self.output_weight)
+
+
+def fold_weights(hidden_weight: Tensor, output_weight: Tensor) -> FoldedRule:
+    """Return folded weights as they are run on their device, differentiable in both.
+
+    Args:
+        hidden_weight: [W1 | b1 | 0], shape [H, row_width].
+        output_weight: W2 and rows of zeros up to a multiple of `FOLD`, shape [A', H].
+    """
+    arranged = arrange_weights(hidden_weight, output_weight)
+    if arranged is None:
+        return FoldedRule(hidden_weight, output_weight)
+    joined = torch.cat((hidden_weight.flatten(), output_weight.flatten()))
+    return FoldedRule(hidden_weight, output_weight, arranged, joined)

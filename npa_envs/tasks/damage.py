@@ -1,4 +1,4 @@
-"""Damage that a rule should heal: erased states, cuts and clumps; batched, on the world's device.
+"""Damage that a rule should heal: to worlds of a rollout, and to those of the training pool.
 
 Nothing here reads a value back from the device, so all of it may be captured in a CUDA graph.
 """
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from npa_envs.errors import NPAError, suggest
 from npa_envs.ops import world_mean
-from npa_envs.ops.checks import DTYPES, check_dense, checked_number
+from npa_envs.ops.checks import check_world, checked_number
 from npa_envs.tasks.checks import check_non_negative, is_real, is_whole
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.world.randomness import (
@@ -123,7 +123,7 @@ def damage_worlds(
     """
     if not isinstance(kind, str) or kind not in DAMAGE_SIZES:
         raise NPAError(f"unknown damage {kind!r}: {suggest(str(kind), DAMAGE_SIZES)}")
-    _check_world(x, s)
+    check_world(x, s)
     check_generator(generator, x.device, x.shape[0])
     extent = DAMAGE_SIZES[kind] if size is None else checked_number("size", size)
     if not 0 <= extent <= torch.finfo(x.dtype).max:
@@ -154,11 +154,9 @@ def random_particle(x: Tensor, generator: Randomness | None = None) -> Tensor:
         NPAError: A wrong shape or dtype, no particles, or a generator on another device or for
             another number of worlds.
     """
-    _check_positions(x)
+    check_world(x, x)
     check_generator(generator, x.device, x.shape[0])
     world_count, particle_count, _ = x.shape
-    if particle_count == 0:
-        raise NPAError("x must hold at least one particle, got N = 0: give a world with particles")
     if isinstance(generator, WorldRandom):
         chosen = generator.integers(particle_count, 1, 1)
     else:
@@ -183,7 +181,7 @@ def erase_state(x: Tensor, s: Tensor, *, centre: Tensor, radius: float | Tensor)
     Raises:
         NPAError: A wrong shape or dtype, or a radius that is negative or not finite.
     """
-    _check_world(x, s)
+    check_world(x, s)
     inside = _inside_ball(x, centre, radius)
     return s.masked_fill(inside[..., None], 0.0)
 
@@ -210,7 +208,7 @@ def cut(
     Raises:
         NPAError: A wrong shape or dtype, or a gap that is negative or not finite.
     """
-    _check_world(x, s)
+    check_world(x, s)
     _check_vector("centre", centre, x)
     _check_vector("normal", normal, x)
     width = _per_world("gap", gap, x)
@@ -243,7 +241,7 @@ def clump(
         NPAError: A wrong shape or dtype, a radius that is negative or not finite, or a factor
             outside [0, 1].
     """
-    _check_world(x, s)
+    check_world(x, s)
     inside = _inside_ball(x, centre, radius)
     share = _per_world("factor", factor, x, highest=1.0)
     pulled = x + share * (centre[:, None] - x)
@@ -273,34 +271,6 @@ def _per_world(name: str, value: float | Tensor, x: Tensor, *, highest: float = 
     return x.new_full((1, 1, 1), value)
 
 
-def _check_positions(x: Tensor) -> None:
-    if not isinstance(x, Tensor):
-        raise NPAError(f"x must be a torch tensor, got {type(x).__name__}: use torch.as_tensor")
-    if x.ndim != 3:
-        cure = ": add a world dimension with x[None]" if x.ndim == 2 else ""
-        raise NPAError(f"x must have shape [B, N, D], got {tuple(x.shape)}{cure}")
-    if x.dtype not in DTYPES:
-        raise NPAError(f"x must be float32 or float64, got {x.dtype}: convert it with x.float()")
-    check_dense("x", x)
-
-
-def _check_world(x: Tensor, s: Tensor) -> None:
-    _check_positions(x)
-    if not isinstance(s, Tensor):
-        raise NPAError(f"s must be a torch tensor, got {type(s).__name__}: use torch.as_tensor")
-    if s.ndim != 3 or s.shape[:2] != x.shape[:2]:
-        raise NPAError(
-            f"s must have shape [B, N, C] with the B and N of x, {tuple(x.shape[:2])}, "
-            f"got {tuple(s.shape)}: give one state for each particle"
-        )
-    check_dense("s", s)
-    if s.device != x.device:
-        raise NPAError(
-            f"x and s must share a device, got {x.device} and {s.device}: "
-            f"convert one with .to(other)"
-        )
-
-
 def _check_vector(name: str, vector: Tensor, x: Tensor) -> None:
     wanted = (x.shape[0], x.shape[2])
     if vector.shape != wanted:
@@ -315,12 +285,9 @@ def _check_vector(name: str, vector: Tensor, x: Tensor) -> None:
         )
 
 
-# Particles that have lost the others: they see nobody, so nothing says where to stay.
-#
-# A rule that was trained in whole worlds alone may let a lone particle walk on for ever, too
-# slowly to be seen in a picture. Throwing some out, and counting how far they walk, teaches it to
-# rest.
-
+# Strays see nobody, so nothing says where to stay: a rule that was trained in whole worlds alone
+# may let a lone particle walk on for ever, too slowly to be seen in a picture. Throwing some out,
+# and counting how far they walk, teaches it to rest.
 
 NEAREST, FARTHEST = 2.0, 4.0
 """Distances from the origin between which particles are thrown [length units]."""
@@ -394,9 +361,6 @@ def stray_motion(x: Tensor, path_length: Tensor) -> Tensor:
     """
     outside = (x.detach().abs().amax(dim=-1) > 1.0).to(x.dtype)
     return (outside * path_length).sum() / outside.sum().clamp_min(1.0)
-
-
-# What is done to worlds of the pool before a rollout, so that a rule learns to heal it.
 
 
 SHARE = 0.25

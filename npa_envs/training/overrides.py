@@ -31,35 +31,27 @@ def override(config: TrainConfig[TaskConfigT], /, **fields: Any) -> TrainConfig[
     Raises:
         NPAError: A name is unknown, or a value has the wrong type or lies outside its range.
     """
-    own = _field_types(config)
-    task = config.task
-    task_types = _field_types(task)
-    own_changes: dict[str, Any] = {}
+    own, task_types = _field_types(config), _field_types(config.task)
+    task: Any = config.task
+    changes: dict[str, Any] = {}
     task_changes: dict[str, Any] = {}
     for name, value in fields.items():
         if name == "task" and isinstance(value, Mapping):
-            for inner, inner_value in value.items():
-                if inner not in task_types:
-                    raise NPAError(
-                        f"unknown field 'task.{inner}': {suggest(str(inner), task_types)}"
-                    )
-                task_changes[inner] = _converted(task, inner, inner_value)
+            task_changes |= value
         elif name == "task":
-            if type(value) is not type(config.task):
+            if type(value) is not type(task):
                 raise NPAError(
-                    f"task must be a {type(config.task).__name__} or a mapping of its fields, "
+                    f"task must be a {type(task).__name__} or a mapping of its fields, "
                     f"got {value!r}"
                 )
             task = value
         elif name in own:
-            own_changes[name] = _converted(config, name, value)
+            changes[name] = _convert(name, value, own[name], getattr(config, name))
         elif name in task_types:
-            task_changes[name] = _converted(task, name, value)
+            task_changes[name] = value
         else:
-            known = [*own, *task_types]
-            raise NPAError(f"unknown field {name!r}: {suggest(name, known)}")
-    changed = dataclasses.replace(typing.cast(Any, task), **task_changes)
-    return dataclasses.replace(config, task=changed, **own_changes)
+            raise NPAError(f"unknown field {name!r}: {suggest(name, [*own, *task_types])}")
+    return dataclasses.replace(config, task=_laid_over("task", task, task_changes), **changes)
 
 
 def load_config(path: str | Path, base: TrainConfig[TaskConfigT]) -> TrainConfig[TaskConfigT]:
@@ -144,9 +136,14 @@ def _field_types(config: Any) -> dict[str, Any]:
     return {field.name: hints[field.name] for field in dataclasses.fields(config)}
 
 
-def _converted(config: Any, name: str, value: Any) -> Any:
-    """Return a plain value as the type of a configuration's field, which exists."""
-    return _convert(name, value, _field_types(config)[name], getattr(config, name))
+def _laid_over(name: str, present: Any, fields: Mapping[str, Any]) -> Any:
+    """Return a dataclass, which errors call `name`, with fields changed to plain values."""
+    kinds = _field_types(present)
+    for field in fields:
+        if field not in kinds:
+            raise NPAError(f"unknown field '{name}.{field}': {suggest(str(field), kinds)}")
+    changes = {k: _convert(k, v, kinds[k], getattr(present, k)) for k, v in fields.items()}
+    return dataclasses.replace(present, **changes)
 
 
 def _convert(name: str, value: Any, kind: Any, present: Any) -> Any:
@@ -174,12 +171,7 @@ def _convert(name: str, value: Any, kind: Any, present: Any) -> Any:
             for k, entry in enumerate(value)
         )
     if dataclasses.is_dataclass(kind) and isinstance(value, Mapping):
-        known = _field_types(present)
-        for inner in value:
-            if inner not in known:
-                raise NPAError(f"unknown field '{name}.{inner}': {suggest(str(inner), known)}")
-        changes = {k: _converted(present, k, v) for k, v in value.items()}
-        return dataclasses.replace(present, **changes)
+        return _laid_over(name, present, value)
     if kind is Path and isinstance(value, str | Path):
         return Path(value)
     if kind is float and not isinstance(value, bool):

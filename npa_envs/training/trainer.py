@@ -1,4 +1,4 @@
-"""What the rule of a run is before its first iteration."""
+"""The trainer: one iteration after another, and everything that a run leaves behind."""
 
 from __future__ import annotations
 
@@ -35,165 +35,6 @@ from npa_envs.training.checkpoint import check_same_run, load_checkpoint, save_c
 from npa_envs.training.iteration import Rollout, TrainingCycle
 from npa_envs.training.overrides import config_to_dict
 from npa_envs.training.run_folder import JsonlLog, RunFolder, open_tensorboard
-
-
-def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
-    """Return the rule that a run starts from, with the configuration's `moment_inverse`.
-
-    Args:
-        config: The run's configuration.
-        untrained: The task's own rule, whose shape the rule must have.
-
-    Raises:
-        NPAError: The configuration's rule cannot be loaded, has another shape, or was trained with
-            another `moment_inverse` than the paper's and the configuration's.
-    """
-    untrained.moment_inverse = config.moment_inverse
-    if not config.initial_rule:
-        return untrained
-    source = config.initial_rule
-    rule = load_rule(source)
-    wrong = differing_fields(rule, untrained)
-    if wrong:
-        raise NPAError(
-            f"initial_rule must be a rule of the task's shape, but {source!r} differs in "
-            f"{', '.join(wrong)}: change those fields, or start from another rule"
-        )
-    rule.moment_inverse = config.moment_inverse
-    return rule
-
-
-# Stop between two iterations, not in the middle of one.
-
-
-class StopFlag:
-    """Set once the user (Ctrl-C) or the system (SIGTERM) asks for the end."""
-
-    def __init__(self) -> None:
-        self.requested = False
-        """Whether to stop after the iteration at hand."""
-
-
-@contextmanager
-def stop_flag() -> Iterator[StopFlag]:
-    """Within the block, the first SIGINT or SIGTERM sets the flag; the next one acts as usual.
-
-    In a thread other than the main one, where signals cannot be caught, the flag stays unset.
-    """
-    flag = StopFlag()
-    if threading.current_thread() is not threading.main_thread():
-        yield flag
-        return
-    previous: dict[signal.Signals, Any] = {}
-
-    def stop(number: int, frame: FrameType | None) -> None:
-        flag.requested = True
-        print("\nstopping after this iteration; once more to stop at once", file=sys.stderr)
-        for signal_number, handler in previous.items():
-            signal.signal(signal_number, handler)
-
-    for signal_number in (signal.SIGINT, signal.SIGTERM):
-        previous[signal_number] = signal.signal(signal_number, stop)
-    try:
-        yield flag
-    finally:
-        for signal_number, handler in previous.items():
-            signal.signal(signal_number, handler)
-
-
-# Pictures of a batch.
-
-
-def write_batch_picture(path: Path, picture: Tensor, board: Any, iteration: int) -> None:
-    """Write the worlds of a batch side by side as a PNG, and as a JPEG to TensorBoard.
-
-    Args:
-        path: The file to write.
-        picture: rgb sums and density of each world, shape [B, R, R, 4].
-        board: TensorBoard's writer (`open_tensorboard`), or None.
-        iteration: Iterations done so far.
-
-    Raises:
-        NPAError: The file cannot be written.
-    """
-    frame = np.concatenate(list(to_uint8(picture)), axis=1)
-    write_bytes(path, encode_frame(frame, "PNG"))
-    if board is not None:
-        _add_picture(board, frame, iteration)
-
-
-def _add_picture(board: Any, frame: NDArray[np.uint8], iteration: int) -> None:
-    # Imported late: only runs with TensorBoard need it.
-    from tensorboard.compat.proto.summary_pb2 import Summary
-
-    # The writer's own add_image makes a PNG, and TensorBoard takes a checksum of it in Python, byte
-    # by byte, which holds up the interpreter for longer than all the rest takes.
-    height, width, channels = frame.shape
-    image = Summary.Image(
-        height=height,
-        width=width,
-        colorspace=channels,
-        encoded_image_string=encode_frame(frame, "JPEG"),
-    )
-    summary = Summary(value=[Summary.Value(tag="batch", image=image)])
-    board.file_writer.add_summary(summary, iteration)
-
-
-# The report of a loss that is not finite.
-
-
-def divergence_error(
-    task: Task, rule: NPARule, snapshot: dict[str, Any], diagnosis: Path
-) -> DivergedError:
-    """Return the error that ends a run whose loss is not finite.
-
-    Args:
-        task: The run's task, to find the worlds at fault.
-        rule: The run's rule; its parameters may have changed since.
-        snapshot: `LossMeter.snapshot()`.
-        diagnosis: Where the snapshot was written.
-    """
-    terms = [name for name, value in snapshot["terms"].items() if not math.isfinite(value)]
-    shown = [name for name in terms if name != "loss"] or terms
-    worlds = bad_worlds(task, rule, snapshot)
-    where = f"world{'s' * (len(worlds) > 1)} {', '.join(map(str, worlds))}" if worlds else "no one"
-    return DivergedError(
-        f"the loss must stay finite, but {' and '.join(shown)} was not in iteration "
-        f"{snapshot['iteration']} ({snapshot['steps']} steps, {where} of the batch): lower "
-        f"learning_rate, or use fewer steps; the worlds and the rule are in {str(diagnosis)!r}, "
-        "the last good checkpoint is untouched"
-    )
-
-
-def bad_worlds(task: Task, rule: NPARule, snapshot: dict[str, Any]) -> list[int]:
-    """Return which worlds of the batch alone give a loss that is not finite.
-
-    Args:
-        task: The run's task.
-        rule: The run's rule.
-        snapshot: `LossMeter.snapshot()`, with `x` [B, N, D] and `s` [B, N, C] after the rollout,
-            the `parameters` at that time, and `goal` [B] where the task has goals.
-    """
-    rule = copy.deepcopy(rule).cpu()
-    trained = [parameter for parameter in rule.parameters() if parameter.requires_grad]
-    nn.utils.vector_to_parameters(snapshot["parameters"], trained)
-    task = task_for_rule(task, rule)
-    x, s, goal = snapshot["x"], snapshot["s"], snapshot.get("goal")
-    found = []
-    for world in range(len(x)):
-        one = slice(world, world + 1)
-        finite = bool(torch.isfinite(x[one]).all() and torch.isfinite(s[one]).all())
-        if finite:
-            with torch.no_grad():
-                aimed = task_toward(task, None if goal is None else goal[one])
-                total, parts = aimed.loss(x[one], s[one], torch.zeros_like(x[one][..., 0]))
-            finite = all(bool(torch.isfinite(v).all()) for v in (total, *parts.values()))
-        if not finite:
-            found.append(world)
-    return found
-
-
-# The trainer: one iteration after another, and everything that a run leaves behind.
 
 
 @dataclass(frozen=True)
@@ -289,21 +130,18 @@ class Trainer:
             DivergedError: The loss is not finite.
             NPAError: A file cannot be written; the last checkpoint is intact.
         """
-        config = self.config
+        config, total = self.config, self.config.total_iterations
         start = self._started = time.perf_counter()
         self._record = next(iter(self._log.records()[-1:]), {})
         if config.tensorboard:
             self._board = open_tensorboard(self.folder, self.iteration)
-        total = config.total_iterations
         bar = tqdm(total=total, initial=self.iteration, disable=not progress, unit="it")
         try:
-            with stop_flag() as flag:
-                while self.iteration < total:
-                    if flag.requested:
-                        break
+            with stop_flag() as stop:
+                while self.iteration < total and not stop.is_set():
                     if max_seconds is not None and time.perf_counter() - start >= max_seconds:
                         break
-                    self._iterate()
+                    self.iterate()
                     # Of the iteration before: meanwhile the device has this one to do.
                     self._finish_record()
                     if self._due(config.log_interval) or self.iteration == total:
@@ -322,13 +160,18 @@ class Trainer:
                 self._board.close()
                 self._board = None
         return TrainResult(
-            self.rule,
-            self.iteration,
-            self.iteration >= total,
-            flag.requested,
-            self._record,
-            self.folder.path,
+            rule=self.rule,
+            iteration=self.iteration,
+            finished=self.iteration >= total,
+            interrupted=stop.is_set(),
+            record=self._record,
+            folder=self.folder.path,
         )
+
+    def iterate(self) -> None:
+        """Train for one iteration, and neither wait for the device nor write anything."""
+        self._cycle.run(self.iteration)
+        self.iteration += 1
 
     def save(self) -> None:
         """Write the checkpoint and the rule.
@@ -339,18 +182,9 @@ class Trainer:
         """
         self._finish_record()
         self._stop_if_diverged()
-        save_checkpoint(
-            self.folder.checkpoint,
-            {
-                "task_name": self.task_name,
-                "config": config_to_dict(self.config),
-                "iteration": self.iteration,
-                "seconds": self._seconds(),
-                "rule": self.rule.state_dict(),
-                "rule_hyper_parameters": dict(self.rule.hyper_parameters()),
-                **self._cycle.state_dict(),
-            },
-        )
+        content = {"iteration": self.iteration, "seconds": self._seconds()}
+        content |= {"rule": self.rule.state_dict(), **self._cycle.state_dict()}
+        save_checkpoint(self.folder.checkpoint, self._origin() | content)
         # A rule is passed on: where and on what it was trained is nobody's business.
         told = config_to_dict(self.config)
         told = {name: told[name] for name in told if name not in ("out", "device", "initial_rule")}
@@ -361,9 +195,13 @@ class Trainer:
         metadata["iteration"] = str(self.iteration)
         save_rule(self.rule, self.folder.rule, metadata=metadata)
 
-    def _iterate(self) -> None:
-        self._cycle.run(self.iteration)
-        self.iteration += 1
+    def _origin(self) -> dict[str, Any]:
+        """Return what checkpoint and diagnosis say of where they come from."""
+        return {
+            "task_name": self.task_name,
+            "config": config_to_dict(self.config),
+            "rule_hyper_parameters": dict(self.rule.hyper_parameters()),
+        }
 
     def _make_rule(self, generator: torch.Generator) -> NPARule:
         return initial_rule(self.config, self.task.make_rule(generator))
@@ -422,18 +260,8 @@ class Trainer:
         if meter.bad_iteration() is None:
             return
         snapshot = meter.snapshot()
-        diagnosis = self.folder.diagnosis
-        hyper_parameters = dict(self.rule.hyper_parameters())
-        save_checkpoint(
-            diagnosis,
-            {
-                "task_name": self.task_name,
-                "config": config_to_dict(self.config),
-                "rule_hyper_parameters": hyper_parameters,
-                **snapshot,
-            },
-        )
-        raise divergence_error(self.task, self.rule, snapshot, diagnosis)
+        save_checkpoint(self.folder.diagnosis, self._origin() | snapshot)
+        raise divergence_error(self.task, self.rule, snapshot, self.folder.diagnosis)
 
     def _open_folder(self, *, resume: bool, overwrite: bool) -> dict[str, Any] | None:
         path = self.folder.checkpoint
@@ -454,3 +282,144 @@ class Trainer:
         self.rule.load_state_dict(content["rule"])
         self._cycle.load_state_dict(content)
         self._log.truncate(self.iteration)
+
+
+def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
+    """Return the rule that a run starts from, with the configuration's `moment_inverse`.
+
+    Args:
+        config: The run's configuration.
+        untrained: The task's own rule, whose shape the rule must have.
+
+    Raises:
+        NPAError: The configuration's rule cannot be loaded, has another shape, or was trained with
+            another `moment_inverse` than the paper's and the configuration's.
+    """
+    untrained.moment_inverse = config.moment_inverse
+    if not config.initial_rule:
+        return untrained
+    source = config.initial_rule
+    rule = load_rule(source)
+    wrong = differing_fields(rule, untrained)
+    if wrong:
+        raise NPAError(
+            f"initial_rule must be a rule of the task's shape, but {source!r} differs in "
+            f"{', '.join(wrong)}: change those fields, or start from another rule"
+        )
+    rule.moment_inverse = config.moment_inverse
+    return rule
+
+
+@contextmanager
+def stop_flag() -> Iterator[threading.Event]:
+    """Within the block, the first SIGINT or SIGTERM sets the event; the next one acts as usual.
+
+    In a thread other than the main one, where signals cannot be caught, it stays unset.
+    """
+    asked = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield asked
+        return
+    previous: dict[signal.Signals, Any] = {}
+
+    def give_back() -> None:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        asked.set()
+        print("\nstopping after this iteration; once more to stop at once", file=sys.stderr)
+        give_back()
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        previous[number] = signal.signal(number, stop)
+    try:
+        yield asked
+    finally:
+        give_back()
+
+
+def write_batch_picture(path: Path, picture: Tensor, board: Any, iteration: int) -> None:
+    """Write the worlds of a batch side by side as a PNG, and as a JPEG to TensorBoard.
+
+    Args:
+        path: The file to write.
+        picture: rgb sums and density of each world, shape [B, R, R, 4].
+        board: TensorBoard's writer (`open_tensorboard`), or None.
+        iteration: Iterations done so far.
+
+    Raises:
+        NPAError: The file cannot be written.
+    """
+    frame = np.concatenate(list(to_uint8(picture)), axis=1)
+    write_bytes(path, encode_frame(frame, "PNG"))
+    if board is not None:
+        _add_picture(board, frame, iteration)
+
+
+def _add_picture(board: Any, frame: NDArray[np.uint8], iteration: int) -> None:
+    # Imported late: only runs with TensorBoard need it.
+    from tensorboard.compat.proto.summary_pb2 import Summary
+
+    # The writer's own add_image makes a PNG, and TensorBoard takes a checksum of it in Python, byte
+    # by byte, which holds up the interpreter for longer than all the rest takes.
+    height, width, channels = frame.shape
+    image = Summary.Image(
+        height=height,
+        width=width,
+        colorspace=channels,
+        encoded_image_string=encode_frame(frame, "JPEG"),
+    )
+    summary = Summary(value=[Summary.Value(tag="batch", image=image)])
+    board.file_writer.add_summary(summary, iteration)
+
+
+def divergence_error(
+    task: Task, rule: NPARule, snapshot: dict[str, Any], diagnosis: Path
+) -> DivergedError:
+    """Return the error that ends a run whose loss is not finite.
+
+    Args:
+        task: The run's task, to find the worlds at fault.
+        rule: The run's rule; its parameters may have changed since.
+        snapshot: `LossMeter.snapshot()`.
+        diagnosis: Where the snapshot was written.
+    """
+    terms = [name for name, value in snapshot["terms"].items() if not math.isfinite(value)]
+    shown = [name for name in terms if name != "loss"] or terms
+    worlds = bad_worlds(task, rule, snapshot)
+    where = f"world{'s' * (len(worlds) > 1)} {', '.join(map(str, worlds))}" if worlds else "no one"
+    return DivergedError(
+        f"the loss must stay finite, but {' and '.join(shown)} was not in iteration "
+        f"{snapshot['iteration']} ({snapshot['steps']} steps, {where} of the batch): lower "
+        f"learning_rate, or use fewer steps; the worlds and the rule are in {str(diagnosis)!r}, "
+        "the last good checkpoint is untouched"
+    )
+
+
+def bad_worlds(task: Task, rule: NPARule, snapshot: dict[str, Any]) -> list[int]:
+    """Return which worlds of the batch alone give a loss that is not finite.
+
+    Args:
+        task: The run's task.
+        rule: The run's rule.
+        snapshot: `LossMeter.snapshot()`, with `x` [B, N, D] and `s` [B, N, C] after the rollout,
+            the `parameters` at that time, and `goal` [B] where the task has goals.
+    """
+    rule = copy.deepcopy(rule).cpu()
+    trained = [parameter for parameter in rule.parameters() if parameter.requires_grad]
+    nn.utils.vector_to_parameters(snapshot["parameters"], trained)
+    task = task_for_rule(task, rule)
+    x, s, goal = snapshot["x"], snapshot["s"], snapshot.get("goal")
+    found = []
+    for world in range(len(x)):
+        one = slice(world, world + 1)
+        finite = bool(torch.isfinite(x[one]).all() and torch.isfinite(s[one]).all())
+        if finite:
+            with torch.no_grad():
+                aimed = task_toward(task, None if goal is None else goal[one])
+                total, parts = aimed.loss(x[one], s[one], torch.zeros_like(x[one][..., 0]))
+            finite = all(bool(torch.isfinite(v).all()) for v in (total, *parts.values()))
+        if not finite:
+            found.append(world)
+    return found

@@ -164,7 +164,7 @@ def test_wrong_arguments_are_clear_errors():
         random_particle(x[:, :0])
     with pytest.raises(NPAError, match=r"x must be float32 or float64, got torch\.int64"):
         random_particle(x.long())
-    with pytest.raises(NPAError, match=r"s must have shape \[B, N, C\]"):
+    with pytest.raises(NPAError, match="x and s must agree in worlds and particles"):
         erase_state(x, s[:, :3], centre=centre, radius=0.1)
     with pytest.raises(NPAError, match=r"centre must have shape \[B, D\] = \(2, 2\), got \(2,\)"):
         erase_state(x, s, centre=centre[0], radius=0.1)

@@ -1,23 +1,12 @@
 """What is done to worlds of the pool before a rollout: to some of them, to each its own."""
 
-from dataclasses import dataclass
-
 import pytest
 import torch
 
-from npa_envs.tasks.damage import FARTHEST, NEAREST, SHARE, hurt, tear
+from npa_envs.tasks.damage import FARTHEST, NEAREST, SHARE, PoolDamage, hurt, tear
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.world.randomness import WorldRandom
-
-
-@dataclass(frozen=True)
-class Damage:
-    damage_radius: float = 0.0
-    clump_radius: float = 0.0
-    cut_gap: float = 0.0
-    flake_radius: float = 0.0
-    stray_share: float = 0.0
 
 
 def worlds(count, space_dim=2, particles=200):
@@ -35,7 +24,7 @@ def changed(before, after):
 def test_a_quarter_of_the_worlds_is_hit(what, space_dim):
     x, s = worlds(400, space_dim, 60)
     generator = torch.Generator().manual_seed(2)
-    found, states = hurt(x, s, Damage(**{what: 0.5}), generator=generator)
+    found, states = hurt(x, s, PoolDamage(**{what: 0.5}), generator=generator)
     # Five standard deviations of a share of 400 worlds; some are hit where nobody is.
     share = float(changed(x, found).float().mean())
     assert SHARE - 0.13 < share < SHARE + 0.11
@@ -45,7 +34,7 @@ def test_a_quarter_of_the_worlds_is_hit(what, space_dim):
 def test_a_clump_is_one_point():
     x, s = worlds(40)
     generator = torch.Generator().manual_seed(2)
-    found, _ = hurt(x, s, Damage(clump_radius=0.3), generator=generator)
+    found, _ = hurt(x, s, PoolDamage(clump_radius=0.3), generator=generator)
     hit = changed(x, found)
     assert hit.any()
     for before, after in zip(x[hit], found[hit], strict=True):
@@ -76,7 +65,9 @@ def test_a_flake_leaves_as_it_is(space_dim):
 
 
 def test_each_world_suffers_what_it_would_suffer_alone(device):
-    every = Damage(0.1, 0.3, 0.2, 0.3, 0.05)
+    every = PoolDamage(
+        damage_radius=0.1, clump_radius=0.3, cut_gap=0.2, flake_radius=0.3, stray_share=0.05
+    )
     x, s = (tensor.to(device) for tensor in worlds(6))
     together = hurt(x, s, every, generator=WorldRandom(range(6), device=device))
     for k in range(6):
@@ -87,7 +78,7 @@ def test_each_world_suffers_what_it_would_suffer_alone(device):
 
 def test_nothing_is_done_unless_asked_for():
     x, s = worlds(3)
-    found = hurt(x, s, Damage(), generator=torch.Generator())
+    found = hurt(x, s, PoolDamage(), generator=torch.Generator())
     assert found[0] is x
     assert found[1] is s
     assert Morphogenesis2DConfig().clump_radius == Morphogenesis2DConfig().flake_radius == 0.0

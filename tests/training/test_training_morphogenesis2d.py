@@ -127,11 +127,11 @@ def test_iterations_never_wait_for_the_device(tmp_path):
     task = Morphogenesis2D(config.task, device="cuda")
     trainer = Trainer(task, config, task_name="morphogenesis2d")
     for _ in range(2):
-        trainer._iterate()  # Warms up and captures all graphs, which does wait.
+        trainer.iterate()  # Warms up and captures all graphs, which does wait.
     torch.cuda.set_sync_debug_mode("error")
     try:
         for _ in range(5):
-            trainer._iterate()
+            trainer.iterate()
     finally:
         torch.cuda.set_sync_debug_mode("default")
     trainer.save()

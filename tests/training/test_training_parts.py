@@ -13,8 +13,15 @@ from torch import nn
 from npa_envs.devices import check_device, parse_device
 from npa_envs.errors import NPAError
 from npa_envs.training.checkpoint import check_same_run, load_checkpoint, save_checkpoint
-from npa_envs.training.iteration import EagerIteration, GraphedIteration, Interval, LossMeter
-from npa_envs.training.optimiser import RuleOptimiser, clear_non_finite, normalise_gradients
+from npa_envs.training.iteration import (
+    EagerIteration,
+    GraphedIteration,
+    Interval,
+    LossMeter,
+    RuleOptimiser,
+    clear_non_finite,
+    normalise_gradients,
+)
 from npa_envs.training.overrides import config_to_dict
 from npa_envs.training.pool import WorldPool
 from npa_envs.training.run_folder import JsonlLog

@@ -89,6 +89,32 @@ def open_image(path: Path) -> Image.Image:
         ) from error
 
 
+def looks_like_path(source: str) -> bool:
+    """Return whether text is the path of a file: by a folder or suffix in it, or that it exists."""
+    if "/" in source or "\\" in source or Path(source).suffix:
+        return True
+    try:
+        return source != "" and Path(source).exists()
+    except (OSError, ValueError):
+        return False
+
+
+def scaled_square(image: Image.Image, side: int) -> FloatImage:
+    """Return a square RGBA picture scaled to `side` pixels: colours times alpha, and alpha.
+
+    Args:
+        image: The picture.
+        side: Pixels along each side.
+
+    Returns:
+        In [0, 1], shape [side, side, 4]; the first row is the upper one.
+    """
+    kind = Image.Resampling.BOX if image.width >= side else Image.Resampling.BICUBIC
+    # Pillow's premultiplied mode: colours of transparent pixels do not leak.
+    scaled = image.convert("RGBa").resize((side, side), kind)
+    return np.asarray(scaled).astype(np.float32) / np.float32(255.0)
+
+
 def require_opaque_pixels(image: Image.Image, *, label: str) -> None:
     """Raise NPAError where no pixel of the RGBA picture has an alpha above one half."""
     alpha = np.asarray(image.getchannel("A"))
@@ -210,13 +236,9 @@ def _to_rgba(image: Image.Image) -> Image.Image:
     if image.mode.startswith("I") or image.mode == "F":
         # Pillow would clip sixteen bits at 255 instead of scaling them.
         levels = np.asarray(image).astype(np.float64)
-        top = (
-            1.0
-            if image.mode == "F" and levels.max() <= 1
-            else 255.0
-            if levels.max() < 256
-            else 65535.0
-        )
+        top = 255.0 if levels.max() < 256 else 65535.0
+        if image.mode == "F" and levels.max() <= 1:
+            top = 1.0
         image = Image.fromarray((levels / top * 255).clip(0, 255).astype(np.uint8))
     return image.convert("RGBA")
 

@@ -1,4 +1,4 @@
-"""What a rule is to grow: coloured points taken from a picture, an emoji or a built-in drawing."""
+"""Targets to grow in 2D: coloured points of a picture, an emoji or a built-in drawing."""
 
 from __future__ import annotations
 
@@ -15,7 +15,13 @@ from torch import Tensor
 from npa_envs.errors import NPAError, suggest
 from npa_envs.tasks.targets.drawings import DRAWINGS
 from npa_envs.tasks.targets.emoji import is_emoji, render_emoji
-from npa_envs.tasks.targets.images import OPAQUE, read_image, require_opaque_pixels, resample
+from npa_envs.tasks.targets.images import (
+    OPAQUE,
+    looks_like_path,
+    read_image,
+    require_opaque_pixels,
+    resample,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +118,7 @@ def load_target_image(source: str | Path) -> tuple[str, Image.Image]:
         )
     if isinstance(source, str) and source in DRAWINGS:
         return source, DRAWINGS[source]()
-    if isinstance(source, Path) or _looks_like_path(source):
+    if isinstance(source, Path) or looks_like_path(source):
         path = Path(os.path.expanduser(source))
         return path.stem, read_image(path)
     if is_emoji(source):
@@ -158,14 +164,3 @@ def target_from_image(
         colours=torch.tensor(colours, dtype=torch.float32, device=device),
         pixel_size=pixel_size,
     )
-
-
-def _looks_like_path(source: str) -> bool:
-    if not source:
-        return False
-    if "/" in source or "\\" in source or Path(source).suffix:
-        return True
-    try:
-        return Path(source).exists()
-    except (OSError, ValueError):
-        return False

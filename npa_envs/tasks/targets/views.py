@@ -1,4 +1,4 @@
-"""What a 3D world is learned from: pictures with alpha from known cameras, some held out."""
+"""Views of a thing to grow in 3D: pictures with alpha from known cameras, some held out."""
 
 from __future__ import annotations
 
@@ -9,15 +9,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from PIL import Image
 from torch import Tensor
 
 from npa_envs.errors import NPAError
 from npa_envs.ops import Cameras, cameras_of_poses, look_at, orbit
 from npa_envs.tasks.checks import is_real
-from npa_envs.tasks.targets.images import open_image
+from npa_envs.tasks.targets.images import open_image, scaled_square
 from npa_envs.tasks.targets.meshes import RADIUS, draw_mesh, load_mesh
 
 DISTANCE = 3.2
@@ -39,11 +37,7 @@ class Views:
     first row is the upper one."""
 
     def to(self, device: str | torch.device) -> Views:
-        """Return the views on another device.
-
-        Args:
-            device: The device.
-        """
+        """Return the views on another device."""
         return Views(self.cameras.to(torch.device(device)), self.pictures.to(device))
 
 
@@ -61,11 +55,7 @@ class ViewTarget:
     """What rules are measured by."""
 
     def to(self, device: str | torch.device) -> ViewTarget:
-        """Return the target on another device.
-
-        Args:
-            device: The device.
-        """
+        """Return the target on another device."""
         return ViewTarget(self.name, self.training.to(device), self.held_out.to(device))
 
 
@@ -106,8 +96,6 @@ def load_views(
             raise NPAError(f"{name} must be an integer of at least 1, got {value!r}")
     folder = Path(os.path.expanduser(source))
     if folder.is_dir():
-        # Imported here: folders are read by a module that makes views.
-
         return read_nerf(folder, resolution, training_count, held_out_count).to(device)
     mesh = load_mesh(source)
     views = []
@@ -183,7 +171,6 @@ def nearest_elevation(cameras: Cameras, elevation: float) -> int:
 
 
 # Folders of pictures and cameras as the NeRF-synthetic scenes are (Mildenhall et al. 2020).
-
 
 TRAINING = "transforms_train.json"
 HELD_OUT = ("transforms_test.json", "transforms_val.json")
@@ -296,10 +283,7 @@ def _read_picture(path: Path, resolution: int) -> Tensor:
             f"views must be square, {str(path)!r} has {image.width} x {image.height} pixels: "
             "cut them to squares around the middle, and mend camera_angle_x"
         )
-    # Pillow's premultiplied mode: colours of transparent pixels do not leak.
-    kind = Image.Resampling.BOX if image.width >= resolution else Image.Resampling.BICUBIC
-    scaled = image.convert("RGBa").resize((resolution, resolution), kind)
-    return torch.from_numpy(np.asarray(scaled).astype(np.float32) / 255.0)
+    return torch.from_numpy(scaled_square(image, resolution))
 
 
 def _read_split(path: Path) -> _Split:
@@ -331,13 +315,11 @@ def _read_frame(path: Path, number: int, frame: Any) -> tuple[Path, Tensor]:
     name = frame.get("file_path") if isinstance(frame, dict) else None
     if not isinstance(name, str) or not name:
         raise NPAError(f"frame {number} in {str(path)!r} must have a file_path, got {name!r}")
+    fault = ""
     try:
         pose = torch.tensor(frame.get("transform_matrix"), dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError) as error:
-        pose, cause = torch.empty(0), error
-        fault = f" ({cause})"
-    else:
-        fault = ""
+        pose, fault = torch.empty(0), f" ({error})"
     if pose.shape != (4, 4):
         raise NPAError(
             f"transform_matrix of frame {number} in {str(path)!r} must be 4 x 4 numbers, "
