@@ -8,7 +8,7 @@ import gymnasium
 import pytest
 import torch
 from small_digits import write_idx
-from test_training_cycle import Recording, assert_same, make_cycle
+from training_runs import Recording, assert_same, make_cycle
 
 from npa_envs.agents import RulePolicy
 from npa_envs.cli import main
@@ -30,7 +30,7 @@ from npa_envs.tasks.point_classification import (
     class_colours,
     majority,
 )
-from npa_envs.training import Trainer, preset, train
+from npa_envs.training import preset, train
 from npa_envs.world.rollout import rollout
 
 SMALL = {"class_count": 3, "particle_count": 24, "state_dim": 6, "hidden_dim": 8, "eps": 0.3}
@@ -117,21 +117,6 @@ def test_without_read_out_the_last_channels_are_the_classes(task, device):
         task.outputs(s[..., :2])
 
 
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"data": ""}, "data must be a name or a path"),
-        ({"stretch": 1.5}, "stretch must be at most 1"),
-        ({"rotation": -1.0}, "rotation must be a finite number of at least 0"),
-        ({"class_count": 1}, "class_count must be a whole number of at least 2"),
-        ({"sample_seed": -1}, "sample_seed must be a whole number"),
-    ],
-)
-def test_a_wrong_field_is_a_clear_error(fields, message):
-    with pytest.raises(NPAError, match=message):
-        PointClassificationConfig(**fields)
-
-
 def test_data_of_more_classes_than_told_are_refused(folder):
     task = PointClassification(PointClassificationConfig(data=folder, **SMALL | {"class_count": 2}))
     with pytest.raises(NPAError, match="more than the highest class of the data, 2, got 2"):
@@ -210,23 +195,6 @@ def test_replayed_operations_train_the_same_rule_as_called_ones(folder, tmp_path
         assert_same(replayed_rule.state_dict(), called_rule.state_dict())
     assert_same(replayed.state_dict(), called.state_dict())
     assert "goal" in called.state_dict()["pool"]
-
-
-def test_a_resumed_run_equals_one_that_was_never_stopped(folder, tmp_path):
-    runs = {}
-    for name in ("whole", "resumed"):
-        config = small_config(
-            folder, tmp_path / name, iterations=6, checkpoint_interval=3, picture_interval=6
-        )
-        task = PointClassification(config.task)
-        trainer = Trainer(task, config, task_name="point_classification")
-        if name == "resumed":
-            for _ in range(3):
-                trainer._iterate()
-            trainer.save()
-            trainer = Trainer(task, config, task_name="point_classification", resume=True)
-        runs[name] = trainer.run(progress=False).rule.state_dict()
-    assert_same(runs["whole"], runs["resumed"])
 
 
 def test_accuracies_are_those_of_a_rollout(task):

@@ -5,60 +5,12 @@ from __future__ import annotations
 import pytest
 import torch
 from circle_task import CircleTask, circle_config, plain_rollout
-from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
+from training_runs import Recording, assert_same, make_cycle
 
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
 from npa_envs.training import preset
-from npa_envs.training.iteration import TrainingCycle
 
 needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-
-
-class Recording(TorchDispatchMode):
-    """A CUDA graph for the CPU: the same operations on the same memory, with numbers as they were.
-
-    The second call of the function is recorded, as by `npa_envs.world.cuda_graph.Replayed`.
-    """
-
-    def __init__(self, function):
-        super().__init__()
-        self.function = function
-        self.calls = 0
-        self.recorded = []
-
-    @torch.no_grad()
-    def __call__(self):
-        self.calls += 1
-        if self.calls == 2:
-            with self:
-                self.function()
-        elif self.calls == 1:
-            self.function()
-        else:
-            for operation, args, kwargs, out in self.recorded:
-                again = operation(*args, **kwargs)
-                memory = {t.untyped_storage().data_ptr() for t in tensors(args, kwargs)}
-                for old, new in zip(tensors(out), tensors(again), strict=True):
-                    if old.untyped_storage().data_ptr() not in memory:
-                        old.copy_(new)
-
-    def __torch_dispatch__(self, operation, types, args=(), kwargs=None):
-        assert "_local_scalar_dense" not in operation.name(), "this would wait for the device"
-        out = operation(*args, **(kwargs or {}))
-        self.recorded.append((operation, args, kwargs or {}, out))
-        return out
-
-
-def tensors(*values):
-    return [leaf for leaf in tree_leaves(values) if isinstance(leaf, torch.Tensor)]
-
-
-def make_cycle(config, task, device="cpu", rollout=None):
-    device = torch.device(device)
-    schedule = torch.Generator().manual_seed(config.seed)
-    rule = task.make_rule(schedule).to(device, config.torch_dtype)
-    return TrainingCycle(task, rule, config, device, schedule, rollout), rule
 
 
 def circle_cycle(tmp_path, **fields):
@@ -79,13 +31,6 @@ def runaway():
         return x + torch.tensor([0.0, 100.0, 0.0])[:, None, None], s, path_length
 
     return rollout
-
-
-def assert_same(ours, theirs):
-    ours, theirs = tensors(ours), tensors(theirs)
-    assert len(ours) == len(theirs) > 0
-    for one, other in zip(ours, theirs, strict=True):
-        assert torch.equal(one, other)
 
 
 @pytest.mark.parametrize(

@@ -16,59 +16,16 @@ import pytest
 import torch
 from circle_task import CircleTask, circle_config, plain_rollout
 from PIL import Image
+from training_runs import Killed, KilledTask, kill, log_of, train, trainer_of
 
 import npa_envs
 from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule, rule_metadata, save_rule
 from npa_envs.rule.rule import NPARule
-from npa_envs.training import (
-    DivergedError,
-    JsonlLog,
-    Trainer,
-    check_device,
-    load_config,
-    override,
-)
+from npa_envs.training import DivergedError, JsonlLog, check_device, load_config, override
 from npa_envs.training.checkpoint import load_checkpoint, save_checkpoint
 
 TESTS = Path(__file__).resolve().parents[1]
-
-
-def trainer_of(config, task=None, **options):
-    options = {"task_name": "circle", "rollout": plain_rollout} | options
-    return Trainer(task or CircleTask(), config, **options)
-
-
-def train(config, task=None, **options):
-    return trainer_of(config, task, **options).run(progress=False)
-
-
-def log_of(folder):
-    """The log without its times, which differ from run to run."""
-    records = JsonlLog(folder / "log.jsonl").records()
-    return [{k: v for k, v in record.items() if k != "seconds"} for record in records]
-
-
-class Killed(BaseException):
-    pass
-
-
-class KilledTask(CircleTask):
-    """Ends the program, as a kill would, in the loss of an iteration."""
-
-    def __init__(self, iteration, end):
-        super().__init__()
-        self.calls_before = iteration  # One of them is the trainer's look at the terms.
-        self.end = end
-
-    def loss(self, x, s, path_length):
-        if self.loss_calls == self.calls_before:
-            self.end()
-        return super().loss(x, s, path_length)
-
-
-def kill():
-    raise Killed
 
 
 def test_training_learns_the_circle(tmp_path):
@@ -135,7 +92,7 @@ def test_run_killed_before_its_first_checkpoint_can_be_resumed(tmp_path):
 SCRIPT = """
 import os, signal, sys
 from circle_task import circle_config
-from test_training_trainer import KilledTask, train
+from training_runs import KilledTask, train
 out, iteration, resume = sys.argv[1], int(sys.argv[2]), sys.argv[3] == "resume"
 end = lambda: os.kill(os.getpid(), signal.SIGKILL)
 train(circle_config(out), KilledTask(iteration, end), resume=resume)
@@ -144,8 +101,7 @@ train(circle_config(out), KilledTask(iteration, end), resume=resume)
 
 def run_script(*arguments):
     # The package first: its root may hold only a part of it, where it was copied from a checkout.
-    folders = (TESTS, Path(__file__).parent)
-    paths = [Path(npa_envs.__file__).parent.parent, *folders, os.environ.get("PYTHONPATH", "")]
+    paths = [Path(npa_envs.__file__).parent.parent, TESTS, os.environ.get("PYTHONPATH", "")]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, paths))}
     command = [sys.executable, "-c", SCRIPT, *map(str, arguments)]
     return subprocess.run(command, env=environment, capture_output=True, timeout=120, check=False)

@@ -1,0 +1,101 @@
+"""Small runs of training for tests: their logs, their ends, their operations recorded."""
+
+from __future__ import annotations
+
+import torch
+from circle_task import CircleTask, plain_rollout
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+
+from npa_envs.training import JsonlLog, Trainer
+from npa_envs.training.iteration import TrainingCycle
+
+
+def trainer_of(config, task=None, **options):
+    options = {"task_name": "circle", "rollout": plain_rollout} | options
+    return Trainer(task or CircleTask(), config, **options)
+
+
+def train(config, task=None, **options):
+    return trainer_of(config, task, **options).run(progress=False)
+
+
+def log_of(folder):
+    """The log without its times, which differ from run to run."""
+    records = JsonlLog(folder / "log.jsonl").records()
+    return [{k: v for k, v in record.items() if k != "seconds"} for record in records]
+
+
+class Killed(BaseException):
+    pass
+
+
+class KilledTask(CircleTask):
+    """Ends the program, as a kill would, in the loss of an iteration."""
+
+    def __init__(self, iteration, end):
+        super().__init__()
+        self.calls_before = iteration  # One of them is the trainer's look at the terms.
+        self.end = end
+
+    def loss(self, x, s, path_length):
+        if self.loss_calls == self.calls_before:
+            self.end()
+        return super().loss(x, s, path_length)
+
+
+def kill():
+    raise Killed
+
+
+class Recording(TorchDispatchMode):
+    """A CUDA graph for the CPU: the same operations on the same memory, with numbers as they were.
+
+    The second call of the function is recorded, as by `npa_envs.world.cuda_graph.Replayed`.
+    """
+
+    def __init__(self, function):
+        super().__init__()
+        self.function = function
+        self.calls = 0
+        self.recorded = []
+
+    @torch.no_grad()
+    def __call__(self):
+        self.calls += 1
+        if self.calls == 2:
+            with self:
+                self.function()
+        elif self.calls == 1:
+            self.function()
+        else:
+            for operation, args, kwargs, out in self.recorded:
+                again = operation(*args, **kwargs)
+                memory = {t.untyped_storage().data_ptr() for t in tensors(args, kwargs)}
+                for old, new in zip(tensors(out), tensors(again), strict=True):
+                    if old.untyped_storage().data_ptr() not in memory:
+                        old.copy_(new)
+
+    def __torch_dispatch__(self, operation, types, args=(), kwargs=None):
+        assert "_local_scalar_dense" not in operation.name(), "this would wait for the device"
+        out = operation(*args, **(kwargs or {}))
+        self.recorded.append((operation, args, kwargs or {}, out))
+        return out
+
+
+def tensors(*values):
+    return [leaf for leaf in tree_leaves(values) if isinstance(leaf, torch.Tensor)]
+
+
+def make_cycle(config, task, device="cpu", rollout=None):
+    device = torch.device(device)
+    schedule = torch.Generator().manual_seed(config.seed)
+    rule = task.make_rule(schedule).to(device, config.torch_dtype)
+    return TrainingCycle(task, rule, config, device, schedule, rollout), rule
+
+
+def assert_same(ours, theirs):
+    ours, theirs = tensors(ours), tensors(theirs)
+    assert len(ours) == len(theirs) > 0
+    for one, other in zip(ours, theirs, strict=True):
+        assert torch.equal(one, other)
