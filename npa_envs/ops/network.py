@@ -179,7 +179,7 @@ def _map_rows(
     signs: Tensor | None,
     mode: str,
 ) -> Tensor:
-    """Run two layers on rows [K, width], as `make_two_layers` says; returns [K, out_width]."""
+    """Run two layers on rows [K, width], as `two_layer_kernel` says; returns [K, out_width]."""
     steps, tiles = -(-rows.shape[1] // 16), -(-out_width // 8)
     output = rows.new_empty(rows.shape[0], out_width)
     warps = -(-rows.shape[0] // ROW_GROUP)

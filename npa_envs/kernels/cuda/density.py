@@ -1,12 +1,12 @@
 """Density on CUDA in float32, and on the way to it lists of neighbours, for perception.
 
 One thread of a particle finds its neighbours with far fewer instructions than several that must
-agree on where they are in a list. Lists have room for so many; of a longer one, only the length
-is known.
+agree on where they are in a list. A list holds the steps to neighbours in the sorted order, in 16
+bits. It is gathered in fast memory and left in an array: 32 particles together, first entries
+first. It has room for so many; of a longer one, only the length is known.
 """
 
 import functools
-from types import SimpleNamespace
 
 import warp as wp
 
@@ -45,47 +45,6 @@ store_record = make_wide_store(RECORD, wp.float32)
 
 
 @functools.cache
-def make_lists(capacity: int, lanes: int) -> SimpleNamespace:
-    """Return the Warp functions by which the lanes of a particle list its neighbours.
-
-    A list holds the steps to neighbours in the sorted order, in 16 bits. It is gathered in fast
-    memory and left in an array: 32 particles together, first entries first.
-
-    Args:
-        capacity: Neighbours that a list has room for; more are counted, but not all are kept.
-        lanes: Lanes of a particle; whole warps must leave their lists together.
-    """
-    room = min(capacity, SHARE_OF_LIST * capacity // lanes)
-
-    @native.func_native(room, CUDA_BLOCK)
-    def list_address() -> wp.uint32: ...
-
-    @native.func_native(room, CUDA_BLOCK)
-    def append_step(
-        first: wp.uint32, place: wp.uint32, weight: wp.float32, step: wp.int32
-    ) -> wp.uint32: ...
-
-    @native.func_native(room, CUDA_BLOCK, capacity, lanes)
-    def leave_list(
-        first: wp.uint32, place: wp.uint32, row: wp.int32, lists: wp.array(dtype=wp.int16)
-    ) -> wp.int32: ...
-
-    return SimpleNamespace(
-        list_address=list_address, append_step=append_step, leave_list=leave_list
-    )
-
-
-@functools.cache
-def make_step_at(capacity: int) -> wp.Function:
-    """Return a Warp function that reads an entry of a row's list, as `make_lists` leaves it."""
-
-    @native.func_native(capacity)
-    def step_at(lists: wp.array(dtype=wp.int16), row: wp.int32, entry: wp.int32) -> wp.int32: ...
-
-    return step_at
-
-
-@functools.cache
 def listed_density(
     space_dim: int, lanes: int, periodic: bool, capacity: int, masked: bool
 ) -> wp.Kernel:
@@ -93,7 +52,8 @@ def listed_density(
 
     Args:
         space_dim: Space dimension D.
-        lanes: Threads of a particle; launches of several come in whole warps.
+        lanes: Threads of a particle; launches of several come in whole warps, which leave their
+            lists together.
         periodic: Whether space is a periodic box.
         capacity: Neighbours that a list has room for.
         masked: Whether only some particles have rows, and lists.
@@ -112,8 +72,20 @@ def listed_density(
     add_scalar = make_lane_sum(scalar, scalar, lanes)
     many = AHEAD if lanes == 1 else SHARED_AHEAD
     positions_ahead = wp.types.matrix((many, space_dim), scalar)
-    keep = make_lists(capacity, lanes)
-    list_address, append_step, leave_list = keep.list_address, keep.append_step, keep.leave_list
+    room = min(capacity, SHARE_OF_LIST * capacity // lanes)
+
+    @native.func_native(room, CUDA_BLOCK)
+    def list_address() -> wp.uint32: ...
+
+    @native.func_native(room, CUDA_BLOCK)
+    def append_step(
+        first: wp.uint32, place: wp.uint32, weight: wp.float32, step: wp.int32
+    ) -> wp.uint32: ...
+
+    @native.func_native(room, CUDA_BLOCK, capacity, lanes)
+    def leave_list(
+        first: wp.uint32, place: wp.uint32, row: wp.int32, lists: wp.array(dtype=wp.int16)
+    ) -> wp.int32: ...
 
     @wp.func
     def falloff_at(domain: Domain, offset: vector):
@@ -230,3 +202,13 @@ def listed_density(
             store_record(records, k, record)
 
     return compute_density
+
+
+@functools.cache
+def make_step_at(capacity: int) -> wp.Function:
+    """Return a Warp function that reads a step of a row's list, as the density pass leaves it."""
+
+    @native.func_native(capacity)
+    def step_at(lists: wp.array(dtype=wp.int16), row: wp.int32, entry: wp.int32) -> wp.int32: ...
+
+    return step_at

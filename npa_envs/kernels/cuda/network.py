@@ -1,13 +1,7 @@
-"""Products on CUDA's tensor cores, of float32 numbers that are each split into two halves.
+"""The rule's network on CUDA's tensor cores, in float32: fused kernels, and the weights for them.
 
-A number is the sum of a 16-bit number and of what that leaves, again in 16 bits; of the four
-products of two such pairs the three larger ones are summed: 22 bits of float16, 16 of bfloat16.
-float16 has little range, so a row is first scaled by a power of two, which is exact. Tensor cores
-cut off what does not fit when they add, so long sums are added outside of them.
-
-A group of units or of rows is a fragment of PTX's `mma.m16n8k16`: lane 4 g + t of a warp holds row
-g (and g + 8) and columns 2 t, 2 t + 1 (and 8 further). Two results side by side are laid out
-like the left operand of a next product, so the hidden units between two products stay in registers.
+Products are of numbers that are each split into two halves of 16 bits: `network.cuh` says how they
+lie in a warp. float16 has little range, so a row is first scaled by a power of two, which is exact.
 """
 
 import functools
@@ -36,14 +30,9 @@ LAYER_REGISTERS, GRADIENT_REGISTERS = 168, 255
 """Registers of a thread of the two kinds of kernels."""
 
 
-@native.func_native()
-def scale_to(size: wp.float32, target: wp.uint32) -> wp.float32:
-    """The power of two by which a positive size comes to lie in [2^target, 2^(target + 1))."""
-
-
 @functools.cache
-def make_two_layers(steps: int, tiles: int, mode: str) -> wp.Function:
-    """Return the Warp function of two products, row by row, for 16 rows a warp.
+def two_layer_kernel(steps: int, tiles: int, mode: str) -> wp.Kernel:
+    """Return the kernel of two products, row by row, for 16 rows a warp.
 
     Args:
         steps: Groups of 16 input columns.
@@ -51,7 +40,7 @@ def make_two_layers(steps: int, tiles: int, mode: str) -> wp.Function:
         mode: Between the products, "rectify" hidden units, "note" which are positive too, or
             "mask" by what was noted.
 
-    The function takes a number of hidden units H, a multiple of 16; rows [K, width] of at most 16
+    The kernel takes a number of hidden units H, a multiple of 16; rows [K, width] of at most 16
     `steps` columns; both layers' fragments, as `arrange_hidden` and `arrange_output` leave them;
     the outputs' scales [8 `tiles`]; for each row, 4 words of the signs of every 128 hidden units,
     [K, 4 ceil(H / 128)], which "note" writes and "mask" reads; and writes outputs [K, out_width]
@@ -59,6 +48,7 @@ def make_two_layers(steps: int, tiles: int, mode: str) -> wp.Function:
     outputs written 8 at a time: rows must be dense, begin at a multiple of 16 bytes and have a
     multiple of 4 columns, outputs of 8 bytes and 2 columns; fragments begin at 16 bytes, too.
     """
+    name = f"npa_envs.kernels.network_{mode}_{steps}_{tiles}"
 
     @native.func_native(steps, tiles, mode.upper(), ROW_TARGET)
     def two_layers(
@@ -71,14 +61,35 @@ def make_two_layers(steps: int, tiles: int, mode: str) -> wp.Function:
         output: wp.array(dtype=wp.float32, ndim=2),
     ): ...
 
-    return two_layers
+    @wp.kernel(
+        enable_backward=False, module=native.module(name), cuda_max_registers=LAYER_REGISTERS
+    )
+    def network_layers(
+        unit_count: wp.int32,
+        rows: wp.array(dtype=wp.float32, ndim=2),
+        hidden_weights: wp.array(dtype=wp.float16),
+        output_weights: wp.array(dtype=wp.float16),
+        output_unscale: wp.array(dtype=wp.float32),
+        signs: wp.array(dtype=wp.int32, ndim=2),
+        # outputs
+        output: wp.array(dtype=wp.float32, ndim=2),
+    ):
+        """Map rows through both layers; the hidden units between stay in registers."""
+        two_layers(unit_count, rows, hidden_weights, output_weights, output_unscale, signs, output)
+
+    return network_layers
 
 
 @functools.cache
-def make_weight_sums(
+def weight_gradient_kernels(
     steps: int, tiles: int, out_tiles: int, warps: int, unit_blocks: int, words: int
-) -> wp.Function:
-    """Return the Warp function that sums the weights' gradients over a share of the rows.
+) -> SimpleNamespace:
+    """Return the kernels of the weights' gradients: sums over shares of the rows, and their sum.
+
+    A block sums a share of the rows, each warp of it for some hidden units: it computes their
+    values and cotangents again, transposed, so that they are the left operands of the gradients'
+    products. Numbers are pairs of bfloat16, which need no scaling: the rows' scales differ, and
+    sums run over rows.
 
     Args:
         steps: Groups of 16 columns of a row.
@@ -88,6 +99,8 @@ def make_weight_sums(
         unit_blocks: Blocks that serve the hidden units of one share of rows.
         words: Words of a row's signs.
     """
+    variant = f"{steps}_{tiles}_{out_tiles}_{warps}_{unit_blocks}_{words}"
+    module = native.module(f"npa_envs.kernels.network_gradients_{variant}")
 
     @native.func_native(steps, tiles, out_tiles, warps, unit_blocks, words, ROW_TILE)
     def weight_sums(
@@ -101,7 +114,40 @@ def make_weight_sums(
         partial_sums: wp.array(dtype=wp.float32, ndim=2),
     ): ...
 
-    return weight_sums
+    @wp.kernel(enable_backward=False, module=module, cuda_max_registers=GRADIENT_REGISTERS)
+    def sum_weight_gradients(
+        unit_count: wp.int32,
+        share_rows: wp.int32,
+        rows: wp.array(dtype=wp.float32, ndim=2),
+        output_bar: wp.array(dtype=wp.float32, ndim=2),
+        signs: wp.array(dtype=wp.int32, ndim=2),
+        hidden_weights: wp.array(dtype=wp.bfloat16),
+        output_weights: wp.array(dtype=wp.bfloat16),
+        # outputs
+        partial_sums: wp.array(dtype=wp.float32, ndim=2),
+    ):
+        """Sum both weights' gradients over each share of the rows."""
+        weight_sums(
+            unit_count,
+            share_rows,
+            rows,
+            output_bar,
+            signs,
+            hidden_weights,
+            output_weights,
+            partial_sums,
+        )
+
+    @wp.kernel(enable_backward=False, module=module)
+    def add_shares(
+        partial_sums: wp.array(dtype=wp.float32, ndim=2),
+        # outputs
+        total: wp.array(dtype=wp.float32),
+    ):
+        """Add the shares' sums."""
+        add_partial_sums(partial_sums, total)
+
+    return SimpleNamespace(sum_weight_gradients=sum_weight_gradients, add_shares=add_shares)
 
 
 @native.func_native()
@@ -111,11 +157,16 @@ def add_partial_sums(
     """Add what the shares of rows summed, in a fixed order; blocks of 128 threads, 32 columns."""
 
 
+@native.func_native()
+def scale_to(size: wp.float32, target: wp.uint32) -> wp.float32:
+    """The power of two by which a positive size comes to lie in [2^target, 2^(target + 1))."""
+
+
 @functools.cache
 def arrangement_kernels() -> SimpleNamespace:
     """Return the kernels that lay out weights in the order in which the lanes of a warp read them.
 
-    Each number is split in two halves; `products` says how fragments lie in a warp.
+    Each number is split in two halves.
     """
     module = native.module("npa_envs.kernels.network_arrangement")
 
@@ -196,73 +247,3 @@ def arrangement_kernels() -> SimpleNamespace:
     return SimpleNamespace(
         arrange_hidden=arrange_hidden, arrange_output=arrange_output, arrange_left=arrange_left
     )
-
-
-@functools.cache
-def two_layer_kernel(steps: int, tiles: int, mode: str) -> wp.Kernel:
-    """Return the kernel of two products, row by row: `make_two_layers` names the variants."""
-    name = f"npa_envs.kernels.network_{mode}_{steps}_{tiles}"
-    two_layers = make_two_layers(steps, tiles, mode)
-
-    @wp.kernel(
-        enable_backward=False, module=native.module(name), cuda_max_registers=LAYER_REGISTERS
-    )
-    def network_layers(
-        unit_count: wp.int32,
-        rows: wp.array(dtype=wp.float32, ndim=2),
-        hidden_weights: wp.array(dtype=wp.float16),
-        output_weights: wp.array(dtype=wp.float16),
-        output_unscale: wp.array(dtype=wp.float32),
-        signs: wp.array(dtype=wp.int32, ndim=2),
-        # outputs
-        output: wp.array(dtype=wp.float32, ndim=2),
-    ):
-        """Map rows through both layers; the hidden units between stay in registers."""
-        two_layers(unit_count, rows, hidden_weights, output_weights, output_unscale, signs, output)
-
-    return network_layers
-
-
-@functools.cache
-def weight_gradient_kernels(
-    steps: int, tiles: int, out_tiles: int, warps: int, unit_blocks: int, words: int
-) -> SimpleNamespace:
-    """Return the kernels of the weights' gradients: `make_weight_sums` names the variants."""
-    variant = f"{steps}_{tiles}_{out_tiles}_{warps}_{unit_blocks}_{words}"
-    module = native.module(f"npa_envs.kernels.network_gradients_{variant}")
-    weight_sums = make_weight_sums(steps, tiles, out_tiles, warps, unit_blocks, words)
-
-    @wp.kernel(enable_backward=False, module=module, cuda_max_registers=GRADIENT_REGISTERS)
-    def sum_weight_gradients(
-        unit_count: wp.int32,
-        share_rows: wp.int32,
-        rows: wp.array(dtype=wp.float32, ndim=2),
-        output_bar: wp.array(dtype=wp.float32, ndim=2),
-        signs: wp.array(dtype=wp.int32, ndim=2),
-        hidden_weights: wp.array(dtype=wp.bfloat16),
-        output_weights: wp.array(dtype=wp.bfloat16),
-        # outputs
-        partial_sums: wp.array(dtype=wp.float32, ndim=2),
-    ):
-        """Sum both weights' gradients over each share of the rows."""
-        weight_sums(
-            unit_count,
-            share_rows,
-            rows,
-            output_bar,
-            signs,
-            hidden_weights,
-            output_weights,
-            partial_sums,
-        )
-
-    @wp.kernel(enable_backward=False, module=module)
-    def add_shares(
-        partial_sums: wp.array(dtype=wp.float32, ndim=2),
-        # outputs
-        total: wp.array(dtype=wp.float32),
-    ):
-        """Add the shares' sums."""
-        add_partial_sums(partial_sums, total)
-
-    return SimpleNamespace(sum_weight_gradients=sum_weight_gradients, add_shares=add_shares)

@@ -9,7 +9,6 @@ transactions. A list that is too long was not kept: its neighbours are searched 
 
 import functools
 import math
-from types import SimpleNamespace
 
 import warp as wp
 
@@ -49,78 +48,6 @@ SLOT_ENTRIES = 32
 """Neighbours that a slot has room for; longer neighbourhoods are summed in several rounds."""
 
 load_record = make_wide_load(RECORD, wp.float32)
-
-
-@functools.cache
-def make_slots(
-    space_dim: int, width: int, lanes: int, state_gradient: bool, grouped: bool
-) -> SimpleNamespace:
-    """Return the Warp functions on slots of one variant.
-
-    Args:
-        space_dim: Space dimension D.
-        width: Channels of a group.
-        lanes: Lanes of a particle.
-        state_gradient: Whether a row holds the state gradient.
-        grouped: Whether channels come in several groups.
-    """
-    vector = wp.types.vector(space_dim, wp.float32)
-    entry_type = wp.types.vector(space_dim + 2, wp.float32)
-    row_words = width * (2 + space_dim * state_gradient)
-    # The odd 16 bytes spread the slots of a warp over the memory's banks.
-    slot_bytes = max(SLOT_ENTRIES * (16 if space_dim == 2 else 20), 4 * row_words) + 16
-
-    @native.func_native(slot_bytes, lanes, CUDA_BLOCK)
-    def slot_address() -> wp.uint32: ...
-
-    @native.func_native(space_dim, SLOT_ENTRIES, lanes)
-    def append_number(
-        slot: wp.uint32, count: wp.int32, accepted: wp.bool, number: wp.int32
-    ) -> wp.int32: ...
-
-    @native.func_native(space_dim, SLOT_ENTRIES)
-    def number_at(slot: wp.uint32, entry: wp.int32) -> wp.int32: ...
-
-    @native.func_native(space_dim, SLOT_ENTRIES)
-    def put_entry(
-        slot: wp.uint32, entry: wp.int32, smooth: wp.float32, kernel: vector, number: wp.int32
-    ): ...
-
-    @native.func_native(space_dim, SLOT_ENTRIES)
-    def entry_at(slot: wp.uint32, entry: wp.int32) -> entry_type: ...
-
-    @native.func_native(space_dim, width, lanes, row_words, slot_bytes, grouped)
-    def write_rows(
-        slot: wp.uint32,
-        destination: wp.int32,
-        group: wp.int32,
-        state_dim: wp.int32,
-        limit: wp.float32,
-        rows: wp.array(dtype=wp.float32, ndim=2),
-    ): ...
-
-    return SimpleNamespace(
-        slot_address=slot_address,
-        append_number=append_number,
-        number_at=number_at,
-        put_entry=put_entry,
-        entry_at=entry_at,
-        write_rows=write_rows,
-    )
-
-
-@functools.cache
-def make_stage(value_type: type) -> wp.Function:
-    """Return a Warp function that puts a value into a slot, a number of words from its beginning.
-
-    Args:
-        value_type: A vector or matrix type of float32.
-    """
-
-    @native.func_native()
-    def stage(slot: wp.uint32, word: wp.int32, value: value_type): ...
-
-    return stage
 
 
 @functools.cache
@@ -188,19 +115,44 @@ def listed_perception(
     add_wide = make_lane_sum(wide, wp.float64, lanes, whole_warps=True)
     add_share = make_lane_sum(share, scalar, lanes, whole_warps=True, stride=team)
     add_gradient = make_lane_sum(share_gradient, scalar, lanes, whole_warps=True, stride=team)
-    slots = make_slots(space_dim, width, lanes, state_gradient, grouped)
-    slot_address, append_number, number_at = (
-        slots.slot_address,
-        slots.append_number,
-        slots.number_at,
-    )
-    put_entry, entry_at = slots.put_entry, slots.entry_at
     step_at = make_step_at(capacity)
     places_ahead = wp.types.vector(AHEAD, wp.int32)
     records_ahead = wp.types.matrix((AHEAD, 4), scalar)
-    write_rows = slots.write_rows
     corrected = make_corrected(space_dim, scalar, share_width, moment_inverse)
     stage_share, stage_rows = make_stage(share), make_stage(share_rows)
+    entry_type = wp.types.vector(space_dim + 2, wp.float32)
+    row_words = width * (2 + space_dim * state_gradient)
+    # The odd 16 bytes spread the slots of a warp over the memory's banks.
+    slot_bytes = max(SLOT_ENTRIES * (16 if space_dim == 2 else 20), 4 * row_words) + 16
+
+    @native.func_native(slot_bytes, lanes, CUDA_BLOCK)
+    def slot_address() -> wp.uint32: ...
+
+    @native.func_native(space_dim, SLOT_ENTRIES, lanes)
+    def append_number(
+        slot: wp.uint32, count: wp.int32, accepted: wp.bool, number: wp.int32
+    ) -> wp.int32: ...
+
+    @native.func_native(space_dim, SLOT_ENTRIES)
+    def number_at(slot: wp.uint32, entry: wp.int32) -> wp.int32: ...
+
+    @native.func_native(space_dim, SLOT_ENTRIES)
+    def put_entry(
+        slot: wp.uint32, entry: wp.int32, smooth: wp.float32, kernel: vector, number: wp.int32
+    ): ...
+
+    @native.func_native(space_dim, SLOT_ENTRIES)
+    def entry_at(slot: wp.uint32, entry: wp.int32) -> entry_type: ...
+
+    @native.func_native(space_dim, width, lanes, row_words, slot_bytes, grouped)
+    def write_rows(
+        slot: wp.uint32,
+        destination: wp.int32,
+        group: wp.int32,
+        state_dim: wp.int32,
+        limit: wp.float32,
+        rows: wp.array(dtype=wp.float32, ndim=2),
+    ): ...
 
     @wp.func
     def padded(count: wp.int32):
@@ -609,3 +561,17 @@ def listed_perception(
                 )
 
     return perceive
+
+
+@functools.cache
+def make_stage(value_type: type) -> wp.Function:
+    """Return a Warp function that puts a value into a slot, a number of words from its beginning.
+
+    Args:
+        value_type: A vector or matrix type of float32.
+    """
+
+    @native.func_native()
+    def stage(slot: wp.uint32, word: wp.int32, value: value_type): ...
+
+    return stage

@@ -1,12 +1,12 @@
 """Cell lists of small worlds on CUDA: a block sorts a world, all of it in fast memory.
 
-The same order as that of `cells`, in one launch in place of six: particles are counted by cell,
-the counts are added up, particles take provisional places by arrival, and ranks among indices
-replace those. Where worlds are few, several blocks sort the same world, and each writes a slice.
+The same order as that of the portable kernels, in one launch in place of six: particles are counted
+by cell, the counts are added up, particles take provisional places by arrival, and ranks among
+indices replace those. Where worlds are few, several blocks sort the same world, and each writes a
+slice.
 """
 
 import functools
-from types import SimpleNamespace
 
 import warp as wp
 
@@ -42,9 +42,22 @@ def count_active(mask: wp.array(dtype=wp.uint8), count: wp.int32) -> wp.int32:
 
 
 @functools.cache
-def make_block_sort(capacity: int) -> SimpleNamespace:
-    """Return the Warp functions by which a block sorts a world of up to `capacity` particles."""
-    sizes = capacity, BLOCKS[capacity], LARGEST_GRID
+def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
+    """Return the kernel that sorts worlds of float32 and of up to `capacity` particles."""
+    scalar = wp.float32
+    block = BLOCKS[capacity]
+    turns = capacity // block
+    types = domain_types(space_dim, scalar)
+    vector, Domain = types.vector, types.Domain
+    cell_of, cell_index = types.cell_of, types.cell_index
+    share = wp.types.vector(STATE_SHARE, scalar)
+    positions_ahead = wp.types.matrix((turns, space_dim), scalar)
+    flags_ahead = wp.types.vector(turns, wp.int32)
+    load_vector = make_wide_load(vector, scalar)
+    read_channels = make_read_channels(share, scalar)
+    store_vector = make_wide_store(vector, scalar)
+    store_share = make_wide_store(share, scalar)
+    sizes = capacity, block, LARGEST_GRID
 
     @native.func_native(*sizes)
     def block_memory() -> wp.uint64:
@@ -81,45 +94,6 @@ def make_block_sort(capacity: int) -> SimpleNamespace:
     @native.func_native(*sizes)
     def member_at(address: wp.uint64, place: wp.int32) -> wp.int32:
         """Number of the particle at a provisional place."""
-
-    return SimpleNamespace(
-        block_memory=block_memory,
-        clear_counts=clear_counts,
-        arrive=arrive,
-        add_up_counts=add_up_counts,
-        start_of=start_of,
-        place_arrived=place_arrived,
-        span_of_slice=span_of_slice,
-        ranked_at=ranked_at,
-        member_at=member_at,
-    )
-
-
-@functools.cache
-def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
-    """Return the kernel that sorts worlds of float32 and of up to `capacity` particles."""
-    scalar = wp.float32
-    block = BLOCKS[capacity]
-    turns = capacity // block
-    types = domain_types(space_dim, scalar)
-    vector, Domain = types.vector, types.Domain
-    cell_of, cell_index = types.cell_of, types.cell_index
-    share = wp.types.vector(STATE_SHARE, scalar)
-    positions_ahead = wp.types.matrix((turns, space_dim), scalar)
-    flags_ahead = wp.types.vector(turns, wp.int32)
-    load_vector = make_wide_load(vector, scalar)
-    read_channels = make_read_channels(share, scalar)
-    store_vector = make_wide_store(vector, scalar)
-    store_share = make_wide_store(share, scalar)
-    sort = make_block_sort(capacity)
-    block_memory, clear_counts = sort.block_memory, sort.clear_counts
-    arrive, add_up_counts, start_of = sort.arrive, sort.add_up_counts, sort.start_of
-    place_arrived, span_of_slice, ranked_at = (
-        sort.place_arrived,
-        sort.span_of_slice,
-        sort.ranked_at,
-    )
-    member_at = sort.member_at
 
     @wp.func
     def write_starts(
