@@ -48,12 +48,11 @@ def in_ranges(smallest: int) -> Callable[[Any], Any]:
     return mark
 
 
-# Sums over groups of channels, in vector registers of the CPU where its compiler finds none.
-
-
 @functools.cache
 def make_add_scaled(group: type, scalar: type) -> Any:
     """Return a Warp function for total + factor * value, rounded after each operation on the CPU.
+
+    It uses vector registers of the CPU, where its compiler finds none by itself.
 
     Args:
         group: A vector type, of 4, 8 or 16 channels.

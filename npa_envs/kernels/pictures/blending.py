@@ -16,7 +16,6 @@ Gaussian has a slot of its own for what the tile pulls: no sum depends on which 
 
 import functools
 from types import SimpleNamespace
-from typing import Any
 
 import warp as wp
 
@@ -38,7 +37,7 @@ from npa_envs.kernels.pictures.gaussians import (
     SMALLEST_ALPHA,
     TILE,
     gaussian_types,
-    projection_functions,
+    make_covered,
 )
 
 LARGEST_ALPHA = 0.99
@@ -58,24 +57,6 @@ BATCH = 32
 
 TO_POWER_OF_TWO = -0.7213475204444817
 """-1/2 log2(e): of exp(-1/2 p) as a power of two."""
-
-
-@functools.cache
-def make_keep(value_type: type, scalar: type) -> Any:
-    """Return a Warp function, of CUDA alone, for what the warps of a block have for some pairs.
-
-    It writes the value that a warp's first thread has for pair i, or returns an entry of the sum
-    over the warps; both in one function, as they share its memory.
-
-    Args:
-        value_type: A vector type.
-        scalar: The scalar type that it is made of.
-    """
-
-    @native.func_native(BATCH, TILE_PIXELS // WARP)
-    def keep(write: wp.bool, i: wp.int32, entry: wp.int32, value: value_type) -> scalar: ...
-
-    return keep
 
 
 @functools.cache
@@ -172,7 +153,7 @@ def tile_kernels(scalar: type) -> SimpleNamespace:
         functions.pixel_of,
         functions.middle_of,
     )
-    covered = projection_functions(scalar).covered
+    covered = make_covered(scalar)
     module = native.module(f"npa_envs.kernels.blending_tiles_{scalar_name(scalar)}")
 
     @wp.func
@@ -296,7 +277,10 @@ def block_kernels(scalar: type) -> SimpleNamespace:
     pulling = native.module(f"npa_envs.kernels.blending_blocks_adjoint_{name}")
     load_footprint = make_wide_load(footprint_type, scalar)
     add_warp = make_lane_sum(pulls_type, scalar, WARP, whole_warps=True)
-    keep = make_keep(pulls_type, scalar)
+
+    @native.func_native(BATCH, TILE_PIXELS // WARP)
+    def keep(write: wp.bool, i: wp.int32, entry: wp.int32, value: pulls_type) -> scalar:
+        """Keep what a warp has for pair i, or return an entry of the sum over the warps."""
 
     @wp.func
     def own_pixel(frame: Frame, tile: wp.int32, k: wp.int32):

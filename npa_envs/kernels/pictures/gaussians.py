@@ -1,4 +1,7 @@
-"""How 3D Gaussians lie on a picture: types, sizes, and the functions that projection is made of.
+"""3D Gaussians on pictures: their footprints, the tiles that these cover, and the adjoint of both.
+
+A footprint is all that `blending` needs of a Gaussian. It reaches to where the Gaussian falls below
+the smallest alpha, so that tiles leave out nothing.
 
 Sources: Kerbl et al. 2023, "3D Gaussian Splatting for Real-Time Radiance Field Rendering", and
 Zwicker et al. 2002, "EWA Splatting". A Gaussian of mean p and covariance P = (R S)(R S)ᵀ (Kerbl,
@@ -109,12 +112,32 @@ def tile_total(width: int, height: int) -> int:
 
 
 @functools.cache
-def projection_functions(scalar: type) -> SimpleNamespace:
-    """Return Warp functions of one scalar type."""
+def make_covered(scalar: type) -> wp.Function:
+    """Return a Warp function for the pixels along one direction that a footprint covers."""
+
+    @wp.func
+    def covered(middle: scalar, reach: scalar, size: wp.int32):
+        """First pixel along one direction whose middle is within reach, and one past the last."""
+        end = scalar(size)
+        first = wp.ceil(wp.clamp(middle - reach - scalar(0.5), scalar(0.0), end))
+        last = wp.floor(wp.clamp(middle + reach + scalar(0.5), scalar(0.0), end))
+        return wp.int32(first), wp.int32(last)
+
+    return covered
+
+
+@functools.cache
+def gaussian_kernels(scalar: type) -> SimpleNamespace:
+    """Return the kernels of one scalar type."""
     types = gaussian_types(scalar)
     Frame, pair, triple, quad = types.Frame, types.pair, types.triple, types.quad
-    flat, cube, motion_type = types.flat, types.cube, types.motion
-    footprint_type, harmonics_type = types.footprint, types.harmonics
+    footprint_type, pulls_type, harmonics_type = types.footprint, types.pulls, types.harmonics
+    square, flat, cube, motion_type = types.square, types.flat, types.cube, types.motion
+    covered = make_covered(scalar)
+    module = native.module(f"npa_envs.kernels.gaussians_{scalar_name(scalar)}")
+    load_footprint = make_wide_load(footprint_type, scalar)
+    store_footprint = make_wide_store(footprint_type, scalar)
+    load_pulls = make_wide_load(pulls_type, scalar)
 
     @wp.func
     def unit_quaternion(quaternion: quad):
@@ -256,14 +279,6 @@ def projection_functions(scalar: type) -> SimpleNamespace:
         return result
 
     @wp.func
-    def covered(middle: scalar, reach: scalar, size: wp.int32):
-        """First pixel along one direction whose middle is within reach, and one past the last."""
-        end = scalar(size)
-        first = wp.ceil(wp.clamp(middle - reach - scalar(0.5), scalar(0.0), end))
-        last = wp.floor(wp.clamp(middle + reach + scalar(0.5), scalar(0.0), end))
-        return wp.int32(first), wp.int32(last)
-
-    @wp.func
     def covered_tiles(frame: Frame, footprint: footprint_type):
         """First column and row of the tiles that a footprint covers, and one past the last."""
         left, right = covered(footprint[0], footprint[10], frame.width)
@@ -275,50 +290,6 @@ def projection_functions(scalar: type) -> SimpleNamespace:
                 left / size, top / size, (right - 1) / size + 1, (bottom - 1) / size + 1
             )
         return result
-
-    return SimpleNamespace(
-        unit_quaternion=unit_quaternion,
-        rotation_of=rotation_of,
-        pull_back_rotation=pull_back_rotation,
-        rotation_part=rotation_part,
-        shift_part=shift_part,
-        limited_ratios=limited_ratios,
-        jacobian_of=jacobian_of,
-        scaled_columns=scaled_columns,
-        outlook=outlook,
-        harmonics_at=harmonics_at,
-        harmonic_basis=harmonic_basis,
-        colours_of=colours_of,
-        covered=covered,
-        covered_tiles=covered_tiles,
-    )
-
-
-# 3D Gaussians on pictures: their footprints, the tiles that these cover, and the adjoint of both.
-#
-# A footprint is all that `blending` needs of a Gaussian. It reaches to where the Gaussian falls
-# below the smallest alpha, so that tiles leave out nothing.
-
-
-@functools.cache
-def gaussian_kernels(scalar: type) -> SimpleNamespace:
-    """Return the kernels of one scalar type."""
-    types = gaussian_types(scalar)
-    Frame, pair, triple, quad = types.Frame, types.pair, types.triple, types.quad
-    footprint_type, pulls_type, harmonics_type = types.footprint, types.pulls, types.harmonics
-    square, cube, motion_type = types.square, types.cube, types.motion
-    functions = projection_functions(scalar)
-    unit_quaternion, rotation_of = functions.unit_quaternion, functions.rotation_of
-    pull_back_rotation, scaled_columns = functions.pull_back_rotation, functions.scaled_columns
-    rotation_part, shift_part = functions.rotation_part, functions.shift_part
-    outlook = functions.outlook
-    limited_ratios, jacobian_of = functions.limited_ratios, functions.jacobian_of
-    harmonics_at, harmonic_basis = functions.harmonics_at, functions.harmonic_basis
-    colours_of, covered_tiles = functions.colours_of, functions.covered_tiles
-    module = native.module(f"npa_envs.kernels.gaussians_{scalar_name(scalar)}")
-    load_footprint = make_wide_load(footprint_type, scalar)
-    store_footprint = make_wide_store(footprint_type, scalar)
-    load_pulls = make_wide_load(pulls_type, scalar)
 
     @in_ranges(PAIRS)
     @wp.kernel(enable_backward=False, module=module)

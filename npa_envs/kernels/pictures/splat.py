@@ -1,4 +1,14 @@
-"""How pictures of 2D worlds are divided: the `Lens` struct, its sizes and the types of splats."""
+"""Pictures of 2D worlds, every particle a small Gaussian, and their errors against a target.
+
+A particle at pixel p covers the patch of pixels q with |q - round(p)| <= r in both directions; its
+weights exp(-|q - p|^2 / 2 sigma^2) are normalised to sum 1 over the patch, be it inside the picture
+or not. They are products of a row's weight and a column's.
+
+On CUDA a few threads gather a tile of pixels. Particles are sorted by the tile that their patch's
+centre lies in, counted from r pixels before the picture: all that cover the tiles of a row of cells
+are then one contiguous run. On the CPU a thread draws a whole world, particle by particle. Either
+way a pixel's sum has an order that depends on its own world alone.
+"""
 
 import functools
 import math
@@ -110,18 +120,6 @@ def group_count(resolution: int) -> int:
     """Return how many groups of tiles cover a picture."""
     across = -(-resolution // (TILE_WIDTH * GROUP_WIDTH))
     return across * -(-resolution // (TILE_HEIGHT * GROUP_HEIGHT))
-
-
-# Pictures of 2D worlds: every particle is a small Gaussian. Their errors against a target.
-#
-# A particle at pixel p covers the patch of pixels q with |q - round(p)| <= r in both directions;
-# its weights exp(-|q - p|^2 / 2 sigma^2) are normalised to sum 1 over the patch, be it inside the
-# picture or not. They are products of a row's weight and a column's.
-#
-# On CUDA a few threads gather a tile of pixels. Particles are sorted by the tile that their
-# patch's centre lies in, counted from r pixels before the picture: all that cover the tiles of a
-# row of cells are then one contiguous run. On the CPU a thread draws a whole world, particle by
-# particle. Either way a pixel's sum has an order that depends on its own world alone.
 
 
 @functools.cache
