@@ -38,12 +38,6 @@ TABLE, FIGURES, CURVES = "comparison.md", "comparison.json", "comparison.csv"
 def write_table(plan: Plan, records: Sequence[RunRecord], folder: Path, command: str) -> str:
     """Write the table, in Markdown and as JSON, and all curves; return the table in Markdown.
 
-    Args:
-        plan: What was compared.
-        records: Those of the runs that are over.
-        folder: The comparison's folder.
-        command: The command line.
-
     Raises:
         NPAError: A file cannot be written.
     """
@@ -114,9 +108,7 @@ class Row:
     axis: Axis
     """What was equal for all methods."""
     task: str
-    """The task."""
     method: str
-    """The method."""
     done: int
     """Runs that came to their end."""
     diverged: int
@@ -173,15 +165,10 @@ def rows(records: Iterable[RunRecord]) -> list[Row]:
 
 
 def fraction(reached: Estimate, nothing: Estimate, yardstick: Estimate) -> Estimate:
-    """Return (R - R_nothing) / (R_yardstick - R_nothing), with the error that both R have.
+    """Return (R - R_nothing) / (R_yardstick - R_nothing) of mean returns R, with both R's error.
 
     It is not defined where the yardstick is no better than nothing. Errors are propagated to first
     order; that of R_nothing, which is the same in both differences, is left out.
-
-    Args:
-        reached: The method's mean return R.
-        nothing: That of zero actions.
-        yardstick: That of the gradient.
     """
     gain = yardstick.mean - nothing.mean
     if not gain > 0.0 or math.isnan(reached.mean):
@@ -319,10 +306,6 @@ def curve(records: Sequence[RunRecord], across: Callable[[Point], float]) -> Cur
 
     Between its points a curve is straight. What does not learn has a single point: its curve is
     that. Runs that broke off are left out, so that they do not cut off the others, unless all did.
-
-    Args:
-        records: Of one method on one task from several seeds; those without a curve are left out.
-        across: What curves are drawn against.
     """
     lines = []
     for record in [record for record in records if record.status == "done"] or records:

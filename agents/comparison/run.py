@@ -50,18 +50,15 @@ FIRST_TEST_SEED = 2_000_000
 
 @dataclass(frozen=True)
 class Point:
-    """A place on a learning curve."""
+    """A place on a learning curve: training's wall time [s] and particles times steps so far, and
+    the mean return of held-out episodes, its standard error, and their mean loss at the end.
+    """
 
     seconds: float
-    """Wall time of training so far [s]."""
     particle_steps: float
-    """Particles times steps so far."""
     mean_return: float
-    """Mean return of held-out episodes."""
     standard_error: float
-    """Its standard error."""
     final_loss: float
-    """Mean loss at the episodes' ends."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,7 +66,6 @@ class RunRecord:
     """What came of one run."""
 
     job: Job
-    """Which run."""
     facts: Mapping[str, Any]
     """What its figures follow from."""
     status: Status
@@ -87,7 +83,6 @@ class RunRecord:
     seconds: float = 0.0
     """How long it took with set-up and evaluation [s]."""
     command: str = ""
-    """The command line."""
     date: str = ""
     """The day, as YYYY-MM-DD."""
 
@@ -139,13 +134,10 @@ class Request:
     """What a process is asked for."""
 
     job: Job
-    """Which run."""
     facts: dict[str, Any]
     """What its figures follow from: problem, budget, options, episodes, and more."""
     threads: int = 1
-    """CPU threads."""
     command: str = ""
-    """The command line of the comparison."""
 
     @classmethod
     def read(cls, folder: Path) -> Request:

@@ -92,13 +92,7 @@ class BenchOptions:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Measure, print, write and check.
-
-    Args:
-        arguments: The words after `npa-envs bench`.
-
-    Returns:
-        0, or 1 where `--check` found a ratio that was missed.
+    """Measure, print, write and check; return 1 where `--check` found a ratio that was missed.
 
     Raises:
         NPAError: There is no such suite, device, strategy or precision, or a file is wrong.

@@ -89,13 +89,7 @@ class CompareOptions:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run what is missing, print and write.
-
-    Args:
-        arguments: The words after `npa-envs compare`.
-
-    Returns:
-        0, or 1 where a run failed.
+    """Run what is missing, print and write; return 1 where a run failed.
 
     Raises:
         NPAError: There is no such task, method, option or device, a number is out of range, or the

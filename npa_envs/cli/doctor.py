@@ -35,14 +35,7 @@ class DoctorOptions:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the command.
-
-    Args:
-        arguments: The words after `npa-envs doctor`.
-
-    Returns:
-        0 where all is well, 1 where something has to be mended.
-    """
+    """Print the report; return 1 where something has to be mended."""
     tyro.cli(DoctorOptions, prog="npa-envs doctor", args=arguments)
     findings = examine()
     width = max(len(finding.subject) for finding in findings)
@@ -62,10 +55,8 @@ class Finding:
 
     subject: str
     """What was looked at."""
-
     text: str
     """What was found."""
-
     cure: str | None = None
     """What to do about it; None where all is well."""
 

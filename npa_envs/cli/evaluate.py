@@ -76,12 +76,6 @@ class EvaluateOptions:
 def main(arguments: Sequence[str]) -> int:
     """Measure and print.
 
-    Args:
-        arguments: The words after `npa-envs evaluate`.
-
-    Returns:
-        0.
-
     Raises:
         NPAError: The rule or a value is wrong, its target is not known, or the JSON file cannot
             be written.

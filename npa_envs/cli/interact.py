@@ -78,12 +78,6 @@ class InteractOptions:
 def main(arguments: Sequence[str]) -> int:
     """Bring together, measure, write.
 
-    Args:
-        arguments: The words after `npa-envs interact`.
-
-    Returns:
-        0.
-
     Raises:
         NPAError: A rule or a value is wrong, rules cannot share a world, or the folder cannot be
             written to or holds results of other settings.

@@ -14,14 +14,7 @@ class ListOptions:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the command.
-
-    Args:
-        arguments: The words after `npa-envs list`.
-
-    Returns:
-        0.
-    """
+    """Print everything that has a name."""
     tyro.cli(ListOptions, prog="npa-envs list", args=arguments)
     from npa_envs.measure.quality.scores import score_line, scores
     from npa_envs.registration import ENVIRONMENTS

@@ -17,9 +17,6 @@ from npa_envs.errors import NPAError, suggest
 def writable_folder(path: Path) -> Path:
     """Create a folder where missing, and check that files can be made in it, before work is done.
 
-    Args:
-        path: The folder.
-
     Raises:
         NPAError: It cannot be created, or files in it cannot.
     """
@@ -93,11 +90,7 @@ class StepBar:
         self._bar = tqdm(total=total, disable=not show, unit=unit)
 
     def advance(self, steps: int) -> None:
-        """Count steps that are done.
-
-        Args:
-            steps: How many since the last call.
-        """
+        """Count steps that are done since the last call."""
         self.done += steps
         self._bar.update(steps)
 

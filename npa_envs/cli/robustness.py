@@ -68,12 +68,6 @@ class RobustnessOptions:
 def main(arguments: Sequence[str]) -> int:
     """Measure, print and write.
 
-    Args:
-        arguments: The words after `npa-envs robustness`.
-
-    Returns:
-        0.
-
     Raises:
         NPAError: There is no such rule or device, a number is out of range, or the folder cannot be
             written to or holds figures of other settings.

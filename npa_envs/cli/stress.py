@@ -57,13 +57,7 @@ class StressOptions:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Check, print and write.
-
-    Args:
-        arguments: The words after `npa-envs stress`.
-
-    Returns:
-        0, or 1 where a check failed.
+    """Check, print and write; return 1 where a check failed.
 
     Raises:
         NPAError: There is no such check or device, or the folder cannot be written to or holds

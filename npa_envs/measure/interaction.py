@@ -41,22 +41,16 @@ class InteractionSettings:
 
     particle_count: int
     """Particles of a world with two species, N."""
-
     distances: tuple[float, ...] = (0.0, 0.5, 1.0)
     """Distances between the centres of the two seeds [length units]."""
-
     ratios: tuple[float, ...] = (0.5,)
     """Shares of the particles that are of the measured species, in (0, 1)."""
-
     steps: int = 512
     """Steps from the seeds."""
-
     seeds: tuple[int, ...] = tuple(range(8))
     """One number for each world; the same numbers give the same table."""
-
     update_prob: float | None = None
     """Probability of each particle's update in a step; None: of each species as trained."""
-
     margin: float = MARGIN
     """Share by which a loss must change to count as changed, in (0, 1)."""
 
@@ -95,31 +89,22 @@ class InteractionRow:
 
     rule: str
     """The rule that is measured, A."""
-
     beside: str
     """The rule beside it, B."""
-
     distance: float
     """Distance between the centres of their seeds [length units]."""
-
     ratio: float
     """A's share of the particles (dimensionless)."""
-
     alone: float
     """A's task metric where it grows alone, mean of the worlds."""
-
     together: float
     """A's task metric of its own particles where it grows beside B, mean of the worlds."""
-
     change: float
     """together / alone (dimensionless)."""
-
     mixing: float
     """`mixing_index` at the end, mean of the worlds (dimensionless)."""
-
     displacement: float
     """How far A's centroid ends from where it ends alone, mean of the worlds [length units]."""
-
     verdict: str
     """`verdict` of `change` and `mixing`."""
 
@@ -130,11 +115,6 @@ def verdict(change: float, mixing: float, margin: float = MARGIN) -> str:
     "cooperates" where the loss falls below 1 - margin of what it is alone, "disrupted" where it
     rises above 1 + margin or is no number, else "undisturbed"; and ", mixes" where the mixing index
     is at least `MIXED`.
-
-    Args:
-        change: Loss together over loss alone (dimensionless).
-        mixing: The mixing index (dimensionless).
-        margin: Share by which the loss must change.
     """
     word = "disrupted"
     if change < 1.0 - margin:
@@ -186,13 +166,10 @@ class Organism:
 
     name: str
     """What tables call it."""
-
     rule: NPARule
     """The rule, on the device to run on."""
-
     task_of: Callable[[int], PictureTask]
     """Returns its task with a number of particles, of which seeds are made and losses taken."""
-
     update_prob: float
     """Probability of a particle's update in a step, as trained (dimensionless)."""
 
@@ -203,7 +180,6 @@ class Scenes:
 
     frames: list[NDArray[np.uint8]] = field(default_factory=list)
     """Pictures, uint8, shape [R, R, 3] each; `len(FRAME_SHARES)` of each encounter."""
-
     captions: list[str] = field(default_factory=list)
     """One for each frame."""
 
@@ -220,10 +196,7 @@ class _Solo(NamedTuple):
 class Encounters:
     """Grows rules alone and beside each other; what was grown alone is kept.
 
-    Args:
-        settings: How rules are brought together.
-        device: Where to run.
-        progress: Called with the number of steps done since its last call.
+    `progress` is called with the number of steps done since its last call.
     """
 
     def __init__(
@@ -256,11 +229,7 @@ class Encounters:
 
     @torch.no_grad()
     def meet(self, first: Organism, second: Organism) -> tuple[list[InteractionRow], Scenes]:
-        """Grow one rule beside another, at every distance and ratio.
-
-        Args:
-            first: The rule that is measured.
-            second: The rule beside it; it may be the same.
+        """Grow one rule, which is measured, beside another or itself, at every distance and ratio.
 
         Returns:
             One row for each ratio and distance, and pictures.

@@ -24,7 +24,6 @@ from npa_envs.agents.comparison.report import (
     curves,
     estimate,
     fraction,
-    pictures,
     rows,
     text,
     write_strips,
@@ -188,19 +187,11 @@ def test_a_record_comes_back_as_it_was_written(tmp_path):
 
 def test_what_is_not_finite_comes_back_as_not_a_number(tmp_path):
     record("one", 0, (0.25, math.inf), status="diverged").write(tmp_path)
-    assert json.loads((tmp_path / "run.json").read_text())["returns"] == [0.25, None]
     again = RunRecord.read(tmp_path, FACTS)
     assert again.returns[0] == 0.25
     assert math.isnan(again.mean_return)
-
-
-def test_records_of_other_settings_and_other_files_are_refused(tmp_path):
-    record("one", 0, (0.25,)).write(tmp_path)
     with pytest.raises(NPAError, match=r"other settings: budget was 1\.0, now 2\.0"):
         RunRecord.read(tmp_path, FACTS | {"budget": 2.0})
-    (tmp_path / "run.json").write_text('{"job": 3}')
-    with pytest.raises(NPAError, match="must hold a record of npa-envs compare"):
-        RunRecord.read(tmp_path, FACTS)
 
 
 # Processes
@@ -248,35 +239,23 @@ def test_no_place_stays_free_while_a_process_waits(tmp_path, child):
     assert [one.job.seed for one in seen] == [1, 2, 3, 0]
 
 
-def test_processes_that_wait_leave_nothing_when_the_time_is_over(tmp_path, child):
-    child("time.sleep(0.3)", before=WRITE_PID.format(tmp_path))
-    made, seen = plan(), []
-    run_jobs(made, made.jobs(), tmp_path, Places(("cuda",)), max_seconds=0.2, written=seen.append)
-    assert [one.job for one in seen] == made.jobs()[:1]
-    assert not list(tmp_path.rglob(".seed*"))
-    assert not any(map(is_alive, pids(tmp_path)))
-
-
-def test_a_process_that_dies_while_it_waits_is_recorded_and_the_others_go_on(tmp_path, child):
-    child("time.sleep(0 if seed else 1)", before="if seed == 1: import os; os._exit(3)")
+@pytest.mark.parametrize("waiting", [False, True])
+def test_a_process_that_dies_is_recorded_the_others_go_on_and_it_is_run_again(
+    tmp_path, child, waiting
+):
+    death = "if seed == 1: print('out of luck', flush=True); import os; os._exit(3)"
+    child("time.sleep(0 if seed else 1)" if waiting else death, before=death if waiting else "")
     made, seen = plan(methods=["one"], seeds=(0, 1, 2)), []
-    run_jobs(made, made.jobs(), tmp_path, Places(("cuda",)), written=seen.append)
+    places = Places(("cuda" if waiting else "cpu",))
+    run_jobs(made, made.jobs(), tmp_path, places, written=seen.append)
     assert [one.status for one in seen] == ["done", "failed", "done"]
-    assert "ended with code 3" in seen[1].error
-    assert seen[1].seconds < 1.0
-
-
-def test_a_process_that_dies_is_recorded_the_others_go_on_and_it_is_run_again(tmp_path, child):
-    child("if seed == 0: print('out of luck', flush=True); import os; os._exit(3)")
-    made, seen = plan(methods=["one"]), []
-    run_jobs(made, made.jobs(), tmp_path, Places(("cpu",)), written=seen.append)
-    first, second = seen
-    assert (first.status, second.status) == ("failed", "done")
-    assert first.error == "its process ended with code 3: out of luck"
-    assert list(held_records(made, tmp_path)) == [second.job]
-    assert RunRecord.read(tmp_path / first.job.folder, made.facts(first.job)) == first
+    lost = seen[1]
+    assert lost.error == "its process ended with code 3: out of luck"
+    assert lost.seconds < 1.0 or not waiting
+    assert list(held_records(made, tmp_path)) == [seen[0].job, seen[2].job]
+    assert RunRecord.read(tmp_path / lost.job.folder, made.facts(lost.job)) == lost
     child("")
-    run_jobs(made, [first.job], tmp_path, Places(("cpu",)))
+    run_jobs(made, [lost.job], tmp_path, Places(("cpu",)))
     assert list(held_records(made, tmp_path)) == made.jobs()
 
 
@@ -314,11 +293,14 @@ def test_what_a_killed_comparison_left_half_way_is_swept_away(tmp_path, child):
     assert list(held_records(made, tmp_path)) == [job]
 
 
-def test_no_run_begins_once_the_time_is_over(tmp_path, child):
-    child("time.sleep(0.3)")
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
+def test_no_run_begins_once_the_time_is_over_and_who_waits_leaves_nothing(tmp_path, child, device):
+    child("time.sleep(0.3)", before=WRITE_PID.format(tmp_path))
     made, seen = plan(), []
-    run_jobs(made, made.jobs(), tmp_path, Places(("cpu",)), max_seconds=0.2, written=seen.append)
+    run_jobs(made, made.jobs(), tmp_path, Places((device,)), max_seconds=0.2, written=seen.append)
     assert [one.job for one in seen] == made.jobs()[:1]
+    assert not list(tmp_path.rglob(".seed*"))
+    assert not any(map(is_alive, pids(tmp_path)))
 
 
 @pytest.mark.parametrize("told", [b"", b"cpu\n"], ids=["that waits", "that learns"])
@@ -349,11 +331,7 @@ def test_the_process_of_a_run_ends_with_the_comparison(tmp_path, told):
 
 def test_an_estimate_is_the_mean_with_its_standard_error():
     assert estimate([1.0, 2.0, 6.0, math.nan]) == Estimate(3.0, pytest.approx(math.sqrt(7 / 3)))
-    single, nothing = estimate([2.0]), estimate([])
-    assert single.mean == 2.0
-    assert math.isnan(single.error)
-    assert str(nothing) == "–"
-    assert str(Estimate(1.0, 0.25)) == "1.000 ± 0.250"
+    assert [str(estimate(values)) for values in ([2.0], [])] == ["2.000", "–"]
 
 
 def test_a_fraction_counts_from_nothing_to_the_gradient():
@@ -476,13 +454,6 @@ def test_a_curve_is_the_mean_of_seeds_where_all_of_them_are():
     assert (alone.across.tolist(), alone.mean.tolist()) == ([0.0], [0.5])
 
 
-def test_curves_are_drawn_for_each_task():
-    pytest.importorskip("matplotlib")
-    drawn = pictures([*synthetic(), record("zero", 2, (0.5,), curve=points((0.0, 0.5)))])
-    assert list(drawn) == ["growth"]
-    assert drawn["growth"].startswith(b"\x89PNG")
-
-
 @pytest.mark.parametrize("name", ["morphogenesis2d", "mixing"])
 def test_a_picture_shows_the_end_of_the_episode_and_not_the_next_start(name, device):
     problem, place = make_problem(name, quick=True), str(device)
@@ -544,23 +515,18 @@ def test_a_quick_comparison_stops_goes_on_and_refuses_other_settings(tmp_path, c
     assert len(list(folder.rglob("run.json"))) == 2
 
     held = json.loads((folder / "evolution" / "seed-0" / "run.json").read_text())
-    assert held["status"] == "done"
-    assert len(held["returns"]) == 4
+    assert (held["status"], len(held["returns"])) == ("done", 4)
     assert held["curve"][-1]["particle_steps"] >= 20000
     assert str(tmp_path) not in json.dumps(held)
     assert "--output OUT" in held["command"]
     problem = make_problem("morphogenesis2d", quick=True)
     assert len(list(RuleSet.load(folder / "evolution" / "seed-0", problem))) == 1
     assert f"| evolution | 1 | {np.mean(held['returns']):.3f}" in told
-    assert "| zero | 1 | 0.000 |" in told
     table = json.loads((tmp_path / "comparison.json").read_text())
     assert [row["method"] for row in table["rows"]] == ["evolution", "zero"]
     lines = (tmp_path / "comparison.csv").read_text().splitlines()
-    ends = [
-        line for line in lines if line.startswith("particle-steps,morphogenesis2d,evolution,0,")
-    ]
+    ends = [line for line in lines if ",morphogenesis2d,evolution,0," in line]
     assert len(ends) == len(held["curve"])
-    assert float(ends[-1].split(",")[7]) == pytest.approx(held["curve"][-1]["mean_return"])
     assert (tmp_path / "comparison.md").read_text().endswith(told.split("wrote")[0].rstrip() + "\n")
     for name in ("grown_morphogenesis2d_particle-steps.png", "curves_morphogenesis2d.png"):
         assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")

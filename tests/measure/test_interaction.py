@@ -68,24 +68,21 @@ def row(rule="a", beside="b", **fields):
 
 
 @pytest.mark.parametrize(
-    ("change", "mixing", "expected"),
+    ("change", "mixing", "margin", "expected"),
     [
-        (0.79, 0.0, "cooperates"),
-        (0.81, 0.0, "undisturbed"),
-        (1.19, MIXED - 1e-9, "undisturbed"),
-        (1.21, MIXED, "disrupted, mixes"),
-        (0.5, 1.0, "cooperates, mixes"),
-        (math.inf, 0.0, "disrupted"),
-        (math.nan, 0.0, "disrupted"),
+        (0.79, 0.0, 0.2, "cooperates"),
+        (0.81, 0.0, 0.2, "undisturbed"),
+        (0.81, 0.0, 0.1, "cooperates"),
+        (1.19, MIXED - 1e-9, 0.2, "undisturbed"),
+        (1.19, 0.0, 0.1, "disrupted"),
+        (1.21, MIXED, 0.2, "disrupted, mixes"),
+        (0.5, 1.0, 0.2, "cooperates, mixes"),
+        (math.inf, 0.0, 0.2, "disrupted"),
+        (math.nan, 0.0, 0.2, "disrupted"),
     ],
 )
-def test_a_verdict_follows_from_the_change_and_the_mixing(change, mixing, expected):
-    assert verdict(change, mixing) == expected
-
-
-def test_a_verdict_takes_its_margin():
-    assert verdict(1.19, 0.0, margin=0.1) == "disrupted"
-    assert verdict(0.81, 0.0, margin=0.1) == "cooperates"
+def test_a_verdict_follows_from_the_change_and_the_mixing(change, mixing, margin, expected):
+    assert verdict(change, mixing, margin) == expected
 
 
 def test_the_mixing_index_of_known_worlds():
@@ -140,12 +137,8 @@ def test_still_rules_leave_their_seeds_and_the_metric_is_the_tasks():
     task = task_of(COUNT // 2)
     x, s = task.seed(3, generator=WorldRandom([1, 2, 3]))
     assert found.alone == pytest.approx(task.metric(x, s).mean().item(), rel=1e-6)
-
-
-def test_a_rule_beside_itself_has_seeds_of_its_own():
-    still = organism(scale=0.0)
-    rows, _ = Encounters(settings(), device=CPU).meet(still, still)
-    # Were both seeds one, every particle would see both species alike.
+    # A rule beside itself has seeds of its own: else every particle would see both alike.
+    rows, _ = Encounters(settings(), device=CPU).meet(still[0], still[0])
     assert 0.5 < rows[0].mixing < 0.99
 
 
@@ -204,9 +197,8 @@ def test_wrong_settings_are_clear_errors(options, message):
 
 
 def test_a_share_leaves_a_particle_for_either_species():
-    assert settings().counts(0.5) == (20, 20)
-    assert settings().counts(0.001) == (1, 39)
-    assert settings().counts(0.999) == (39, 1)
+    shares = (0.5, 0.001, 0.999)
+    assert [settings().counts(share) for share in shares] == [(20, 20), (1, 39), (39, 1)]
 
 
 def test_a_heat_map_is_drawn_of_rows_with_gaps_and_infinities():
@@ -295,9 +287,6 @@ class TestCommand:
         save_rule(make_rule(5), rules / "two.safetensors", metadata=rules_metadata(rules))
         assert main(self.words(rules, tmp_path)) == 2
         assert "holds figures of other settings: rules was" in capsys.readouterr().err
-        (tmp_path / "interactions.json").write_text("{}")
-        assert main(self.words(rules, tmp_path)) == 2
-        assert "must hold a record of npa-envs interact" in capsys.readouterr().err
 
     def test_without_matplotlib_only_the_heat_map_is_missing(
         self, rules, tmp_path, capsys, monkeypatch

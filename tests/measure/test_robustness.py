@@ -11,9 +11,7 @@ import pytest
 import torch
 
 from npa_envs.cli import main
-from npa_envs.errors import NPAError
 from npa_envs.measure.accuracy.habitats import rule_names, task_name
-from npa_envs.measure.plots import mark_decades
 from npa_envs.measure.robustness import study
 from npa_envs.measure.robustness.grounds import Ground, courses
 from npa_envs.measure.robustness.plans import (
@@ -140,8 +138,8 @@ def test_noise_changes_all_states_by_as_much_as_it_says_and_no_position(worlds):
     assert float((new_s - s).std()) == pytest.approx(STATE_NOISE, rel=0.05)
 
 
-@pytest.mark.parametrize("name", ["half", "side"])
-def test_removals_leave_half_of_the_particles_as_they_were(worlds, name):
+@pytest.mark.parametrize(("name", "least", "most"), [("half", 0.0, 0.12), ("side", 0.35, 1.0)])
+def test_removals_leave_half_of_the_particles_as_they_were(worlds, name, least, most):
     x, s, box = worlds
     new_x, new_s = damaged(name, x, s, box)
     assert new_x.shape[1] == new_s.shape[1] == COUNT // 2
@@ -150,13 +148,9 @@ def test_removals_leave_half_of_the_particles_as_they_were(worlds, name):
         kept = {tuple(row) for row in torch.cat((new_x[world], new_s[world]), 1).tolist()}
         assert kept <= rows
         assert len(kept) == COUNT // 2
-
-
-def test_a_removed_side_is_a_side_and_a_removed_half_is_none(worlds):
-    x, s, box = worlds
-    shift = {n: (damaged(n, x, s, box)[0].mean(1) - x.mean(1)).norm(dim=-1) for n in DAMAGES}
-    assert float(shift["side"].min()) > 0.35
-    assert float(shift["half"].max()) < 0.12
+    # A removed side is a side, and a removed half is none.
+    shift = (new_x.mean(1) - x.mean(1)).norm(dim=-1)
+    assert least < float(shift.min()) <= float(shift.max()) < most
 
 
 @pytest.mark.parametrize("name", DAMAGES)
@@ -257,9 +251,10 @@ def test_a_rule_works_where_its_loss_at_most_doubles(ratios, text):
 
 
 def responding(condition: str, *losses_by_value) -> RuleRecord:
-    """A record of one condition beside the loss as trained, which is 1."""
+    """A record of one condition beside the loss as trained, which is 1 unless it says so."""
     told = [Response(condition, value, 8, losses) for value, losses in losses_by_value]
-    return record(responses=(Response("eps", 1.0, 8, (0.5, 1.5)), *told))
+    trained = () if condition == "eps" else (Response("eps", 1.0, 8, (0.5, 1.5)),)
+    return record(responses=(*trained, *told))
 
 
 @pytest.mark.parametrize(
@@ -281,18 +276,14 @@ def responding(condition: str, *losses_by_value) -> RuleRecord:
             "trained, square",
         ),
         ("shape", [], ""),
+        # Of losses of zero at most zero is twice as much.
+        ("eps", [(1.0, (0.0, 0.0)), (2.0, (0.0, 0.1))], "1 alone"),
     ],
 )
 def test_where_a_rule_works_follows_from_the_mean_loss_of_its_seeds(
     condition, losses_by_value, text
 ):
     assert where_it_works(responding(condition, *losses_by_value), condition) == text
-
-
-def test_a_rule_that_is_never_wrong_works_where_it_still_is_not():
-    told = [("eps", 1.0, (0.0, 0.0)), ("dt", 1.0, (0.0, 0.0)), ("dt", 2.0, (0.0, 0.1))]
-    found = record(responses=tuple(Response(name, v, 8, losses) for name, v, losses in told))
-    assert where_it_works(found, "dt") == "1 alone"
 
 
 # Measuring
@@ -320,15 +311,6 @@ def test_damaged_worlds_go_beside_twins_with_the_same_masks(name, device):
     assert torch.allclose(alone, torch.tensor(twins, dtype=torch.float64).to(alone), rtol=1e-5)
 
 
-def test_worlds_that_nothing_is_done_to_stay_with_their_twins(device, monkeypatch):
-    nothing = dataclasses.replace(DAMAGES["noise"], apply=lambda x, s, random, box: (x, s))
-    monkeypatch.setitem(DAMAGES, "noise", nothing)
-    place = ground("heart", device)
-    found = {course.damage: course for course in healing(place, grow(place)[0])}
-    assert found["noise"].losses == found["noise"].twins
-    assert found["noise"].recovery_steps() == [0, 0]
-
-
 def test_conditions_are_grown_for_as_many_updates_and_left_out_where_too_large(device):
     place = ground("heart", device)
     _, trained = grow(place)
@@ -347,19 +329,15 @@ def test_conditions_are_grown_for_as_many_updates_and_left_out_where_too_large(d
     assert found[1].losses != trained.losses
 
 
-def test_other_numbers_of_particles_have_the_task_of_that_number(device):
-    place = ground("heart", device)
-    x = place.home(share=0.5).x
-    assert x.shape == (2, 64, 2)
-    assert place.home(share=0.5).task.config.target_point_count == 64
-    assert place.home().task.config.target_point_count == 128
-
-
 def test_seeds_are_worlds_of_their_own_whatever_their_number(device):
-    two = ground("heart", device).home(shape="ring")
+    place = ground("heart", device)
+    two = place.home(shape="ring")
     one = Ground("heart", device, TINY, range(6, 7), 128).home(shape="ring")
     assert torch.equal(two.x[1:], one.x)
     assert not torch.equal(two.x[0], two.x[1])
+    half = place.home(share=0.5)
+    assert half.x.shape == (2, 64, 2)
+    assert (half.task.config.target_point_count, two.task.config.target_point_count) == (64, 128)
 
 
 def test_a_world_that_is_lost_stays_lost_and_leaves_the_others_as_they_are(device):
@@ -392,20 +370,13 @@ def test_plans_are_whole_chunks_and_hold_what_was_trained():
 # Records and the command
 
 
-def test_a_record_comes_back_and_one_of_other_settings_is_refused(tmp_path: Path):
+def test_a_record_comes_back_as_it_was_written(tmp_path: Path):
     path = tmp_path / "robustness_heart.json"
-    assert RuleRecord.read(path, {"a": 1}) is None
     course = Course("erase", (0, 16), ((2.0, 1.0), (math.nan, 3.0)), ((1.0, 1.0), (1.0, 1.0)))
     written = record(course)
     written.write(path)
     assert json.loads(path.read_text())["courses"][0]["recovery_steps"] == [16, None]
-    back = RuleRecord.read(path, {"a": 1})
-    assert repr(back) == repr(written)
-    with pytest.raises(NPAError, match="other settings: a was 1, now 2"):
-        RuleRecord.read(path, {"a": 2})
-    path.write_text("{}")
-    with pytest.raises(NPAError, match="must hold a record of npa-envs robustness"):
-        RuleRecord.read(path, {"a": 1})
+    assert repr(RuleRecord.read(path, {"a": 1})) == repr(written)
 
 
 def test_tables_say_who_recovered_when_and_what_was_not_measured():
@@ -434,22 +405,6 @@ def test_curves_are_drawn_by_task():
     drawn = pictures([record(course), record(course, task="texture", rule="dots")])
     assert set(drawn) == {"morphogenesis2d", "texture"}
     assert all(picture.startswith(b"\x89PNG") for picture in drawn.values())
-
-
-@pytest.mark.parametrize(
-    ("low", "high", "marks"),
-    [(0.1, 1.0, ["0.1", "0.2", "0.5", "1"]), (1.0, 1000.0, ["1", "10", "100", "1000"])],
-)
-def test_axes_of_few_decades_are_marked_within_them(low, high, marks):
-    pytest.importorskip("matplotlib")
-    from matplotlib.figure import Figure
-
-    panel = Figure().subplots()
-    panel.set(yscale="log", ylim=(0.99 * low, 1.01 * high))
-    mark_decades(panel)
-    places, labels = panel.get_yticks(), panel.yaxis.get_major_formatter().format_ticks
-    assert labels([place for place in places if low <= place <= high]) == marks
-    assert not panel.get_yticks(minor=True).size
 
 
 def test_the_command_measures_writes_and_goes_on(tmp_path, capsys, monkeypatch):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import time
+from dataclasses import replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -43,7 +44,7 @@ from npa_envs.measure.speed.throughput import (
 from npa_envs.measure.speed.timing import LeftOut, Session, Timing, compare, measure
 from npa_envs.measure.speed.workloads import Workload, gecko
 from npa_envs.ops import perceive
-from npa_envs.world.rollout import rollout, step
+from npa_envs.world.rollout import rollout
 
 TINY = Workload(2, 2, 150, 2, hidden_dim=16, eps=0.2)
 FORWARD = 1e-5
@@ -62,9 +63,7 @@ def timing(median: float) -> Timing:
 
 def tiny_suite(monkeypatch: pytest.MonkeyPatch) -> None:
     """Make the suite `quick` a tiny one of the same kind."""
-    suite = suites.Suite(
-        "tiny", lambda here: {"perception": perception_rows(here, TINY)}, guarded=True
-    )
+    suite = suites.Suite(lambda here: {"perception": perception_rows(here, TINY)}, guarded=True)
     monkeypatch.setitem(suites.SUITES, "quick", suite)
     monkeypatch.setattr(suites, "WORKLOAD", Workload(2, 1, 100, 1, hidden_dim=16))
 
@@ -109,45 +108,37 @@ def test_the_hash_grid_keeps_worlds_apart():
         torch.testing.assert_close(together[1:], single)
 
 
-def test_a_step_composed_in_torch_is_that_of_the_library():
+def test_steps_composed_in_torch_are_those_of_the_library_with_the_same_masks():
     start = gecko(1, 300, torch.device("cpu")).grown(3)
     rule, x, s = start.rule.double(), start.x.double(), start.s.double()
-    mask = drawn_mask(x, 0.5, mask_source(x))
-    composed = composed_step(STRATEGIES["dense"], rule, x, s, mask)
-    own = step(rule, x, s, update_prob=0.5, generator=mask_source(x))
-    for value, expected in zip(composed, own, strict=True):
-        torch.testing.assert_close(value, expected, rtol=1e-12, atol=1e-12)
+    own = rollout(rule, x, s, 3, update_prob=0.5, generator=mask_source(x))
+    generator = mask_source(x)
     assert not torch.equal(own[0], x)
+    for _ in range(3):
+        mask = drawn_mask(x, 0.5, generator)
+        x, s = composed_step(STRATEGIES["dense"], rule, x, s, mask)
+    for value, expected in zip((x, s), own, strict=True):
+        torch.testing.assert_close(value, expected, rtol=1e-10, atol=1e-10)
 
 
-def test_the_mixed_rule_is_the_rule_in_bfloat16():
+def test_a_precision_keeps_weights_and_rounds_what_it_says():
     rule = gecko(1, 64, torch.device("cpu")).rule
-    mixed = PRECISIONS["mixed"].rule(rule)
-    z = torch.randn(40, rule.perception_dim, generator=torch.Generator().manual_seed(0))
-    expected, value = rule(z).detach(), mixed(z).detach()
-    error = float((value - expected).norm() / expected.norm())
-    assert 1e-4 < error < 2e-2
-    assert value.dtype == torch.float32
-
-
-def test_bfloat16_storage_rounds_states_and_nothing_else():
-    s = torch.randn(2, 3, 4, generator=torch.Generator().manual_seed(0))
-    kept = PRECISIONS["bf16_storage"].kept(s)
-    assert torch.equal(kept, s.bfloat16().float())
-    assert torch.equal(PRECISIONS["float32"].kept(s), s)
-
-
-def test_a_rule_in_another_precision_has_the_same_weights():
-    rule = gecko(1, 64, torch.device("cpu")).rule
-    for precision in PRECISIONS.values():
+    generator = torch.Generator().manual_seed(0)
+    z = torch.randn(40, rule.perception_dim, generator=generator)
+    s = torch.randn(2, 3, 4, generator=generator)
+    expected = rule(z).detach()
+    for name, precision in PRECISIONS.items():
         own = precision.rule(rule)
         assert own.hidden.weight.dtype == precision.dtype
         assert torch.equal(own.output.weight.float(), rule.output.weight)
+        value = own(z.to(precision.dtype)).detach()
+        assert value.dtype == precision.dtype
+        error = float((value - expected).norm() / expected.norm())
+        assert (1e-4 < error < 2e-2) if name == "mixed" else (error < 1e-6)
+        rounded = s.bfloat16().float() if name == "bf16_storage" else s
+        assert torch.equal(precision.kept(s), rounded)
     # The fused path does not see torch's switch.
     assert not PRECISIONS["tf32"].rule(rule).is_plain()
-
-
-def test_the_switch_for_tf32_is_put_back():
     before = torch.backends.cuda.matmul.allow_tf32
     with PRECISIONS["tf32"].active():
         assert torch.backends.cuda.matmul.allow_tf32
@@ -173,15 +164,8 @@ def test_workloads_have_the_neighbours_they_claim():
         inner = (x.abs() < workload.half_width - workload.eps).all(1)
         counted = (torch.cdist(x[inner], x) < workload.eps).sum(1).double().mean()
         assert float(counted) == pytest.approx(workload.neighbour_count, rel=0.1)
-
-
-def test_the_papers_workloads_are_as_dense_as_each_other():
     flat = [workload for workload in PAPER if workload.space_dim == 2]
     assert {round(workload.neighbour_count, 6) for workload in flat} == {66.652875}
-    assert max(workload.particle_count for workload in PAPER) == 16_777_216
-
-
-def test_fresh_rules_of_a_workload_are_equal_and_leave_the_generator_alone():
     state = torch.get_rng_state()
     one, other = (TINY.rule(torch.device("cpu")) for _ in range(2))
     assert torch.equal(one.hidden.weight, other.hidden.weight)
@@ -239,7 +223,7 @@ def test_rollouts_err_more_in_shorter_precisions():
     assert {entry.what for entry in here.left_out} == {"rollouts of dense"}
 
 
-def test_throughput_stores_and_recomputes_and_compares_with_the_aims():
+def test_throughput_stores_and_recomputes_and_an_aim_takes_the_better_of_both():
     store, recompute = throughput_rows(session(), [TINY])
     assert (store.memory, recompute.memory) == ("store", "recompute")
     assert store.workload == "2D (2, 150, 2)"
@@ -247,30 +231,29 @@ def test_throughput_stores_and_recomputes_and_compares_with_the_aims():
     for row in (store, recompute):
         assert min(row.infer_us.low, row.train_us.low) > 0.0
     assert aim_rows([store, recompute]) == []
-
-
-def test_an_aim_takes_the_faster_training_and_the_smaller_memory():
-    here = session()
-    store, recompute = throughput_rows(here, [TINY])
-    name = PAPER[0].name
-    changes = {"workload": name, "infer_us": timing(80.0)}
-    store = type(store)(**vars(store) | changes | {"train_us": timing(150.0), "train_mib": 900.0})
-    recompute = type(store)(
-        **vars(recompute) | changes | {"train_us": timing(210.0), "train_mib": 300.0}
-    )
+    known = {"workload": PAPER[0].name, "infer_us": timing(80.0)}
+    store = replace(store, **known, train_us=timing(150.0), train_mib=900.0)
+    recompute = replace(recompute, **known, train_us=timing(210.0), train_mib=300.0)
     (row,) = aim_rows([store, recompute])
     assert (row.train_us, row.recompute_mib, row.recompute_slower) == (150.0, 300.0, 1.4)
     assert (row.infer_aim, row.train_aim, row.mib_aim) == (72, 163, 395)
 
 
-def test_scaling_varies_one_number_at_a_time(monkeypatch):
+def test_scaling_varies_one_number_at_a_time_and_slopes_are_those_of_logarithms(monkeypatch):
     monkeypatch.setattr(throughput, "_values", lambda _: ((100, 200), (8, 16), (1, 2), (4, 20)))
-    here = session()
-    rows = scaling_rows(here)
+    rows = scaling_rows(session())
     assert [row.value for row in rows] == [100, 200, 8, 16, 1, 2, 4, 20]
     assert [round(row.neighbours) for row in rows] == [67, 67, 8, 16, 67, 67, 67, 67]
     assert [row.channels for row in rows] == [16] * 6 + [4, 20]
-    assert {slope.axis for slope in slope_rows(rows)} == set(throughput.AXES)
+    grown = [
+        replace(row, value=n, infer_us=timing(3 * n), train_us=timing(n**2))
+        for row in rows[::2]
+        for n in (16, 64, 256, 1024)
+    ]
+    slopes = slope_rows(grown)
+    assert [slope.axis for slope in slopes] == list(throughput.AXES)
+    for slope in slopes:
+        assert (slope.infer_slope, slope.train_slope) == pytest.approx((1.0, 2.0))
 
 
 def test_what_does_not_fit_into_memory_is_left_out():
@@ -283,16 +266,6 @@ def test_what_does_not_fit_into_memory_is_left_out():
     assert here.attempt("small", lambda: 3) == [3]
     assert here.left_out == [LeftOut("large", "not enough memory")]
     assert done == [1, 1]
-
-
-def test_a_slope_is_that_of_the_logarithms():
-    row = throughput._scaling_row(session(), "particles", 64)
-    rows = [
-        type(row)(**vars(row) | {"value": n, "infer_us": timing(3 * n), "train_us": timing(n**2)})
-        for n in (16, 64, 256, 1024)
-    ]
-    slope = throughput._slope_row("particles", rows)
-    assert (slope.infer_slope, slope.train_slope) == pytest.approx((1.0, 2.0))
 
 
 def test_peers_that_are_there_are_right_and_others_are_left_out_with_a_reason(monkeypatch):
@@ -311,7 +284,6 @@ def test_peers_that_are_there_are_right_and_others_are_left_out_with_a_reason(mo
 
 def test_each_skip_is_measured_with_and_without():
     here = session()
-    here.small = True
     rows = skip_rows(here)
     assert here.left_out == []
     assert len({row.condition for row in rows}) == len(rows) == 10
@@ -438,16 +410,12 @@ def question(**options) -> Question:
     return Question(**usual | {"periodic": False, "gradients": "weights"} | options)
 
 
-def test_an_explanation_names_the_kernels_of_both_passes():
-    text = explain(question())
-    forward, backward = text.split("backward:")
+def test_an_explanation_names_the_kernels_and_follows_what_is_asked_for():
+    forward, backward = explain(question()).split("backward:")
     for kernel in ("count_cells", "compute_density", "perceive", "apply_update"):
         assert f"  {kernel} " in forward
     assert "  gather_state_cotangents " in backward
     assert "Count the particles" in forward
-
-
-def test_an_explanation_follows_what_is_asked_for():
     wide = Workload(2, 1, 900, 1)
     plain = explain(question(workload=wide, gradients="none", periodic=True))
     assert "backward:" not in plain
@@ -484,27 +452,25 @@ def test_a_ratio_is_held_down_to_a_third_and_missed_below(tmp_path):
     assert len(suites.missed_ratios({"dense": math.nan}, wanted)) == 2
 
 
-def test_the_library_is_faster_than_dense_torch():
+def test_the_library_is_faster_than_dense_torch_and_stored_ratios_are_those_measured():
+    path = Path(__file__).resolve().parents[2] / "benchmarks" / "results" / "ratios.json"
     measured = suites.ratios(session())
     assert measured["perceive: dense torch over library"] > 3.0
     assert all(value > 0.0 for value in measured.values())
-
-
-def test_the_stored_ratios_are_those_that_are_measured():
-    path = Path(__file__).resolve().parents[2] / "benchmarks" / "results" / "ratios.json"
-    kept = json.loads(path.read_text())
-    measured = suites.ratios(session())
-    assert sorted(kept["cpu"]) == sorted(measured)
+    assert sorted(json.loads(path.read_text())["cpu"]) == sorted(measured)
 
 
 def test_check_decides_the_exit_code(tmp_path, monkeypatch, capsys):
     tiny_suite(monkeypatch)
+    monkeypatch.chdir(tmp_path)
     name = "perceive: dense torch over library"
     words = [*FAST, "--strategies", "library", "--check"]
     assert main([*words, str(stored(tmp_path, **{name: 1e-3}))]) == 0
     assert "ratios are held" in capsys.readouterr().out
     assert main([*words, str(stored(tmp_path, **{name: 1e9}))]) == 1
     assert f"missed: {name}" in capsys.readouterr().out
+    # Nothing is written unless asked for.
+    assert [path.name for path in tmp_path.iterdir()] == ["ratios.json"]
 
 
 # The command
@@ -524,13 +490,6 @@ def test_the_command_prints_tables_and_writes_what_it_says(tmp_path, monkeypatch
     assert loaded["command"].startswith("npa-envs bench --no-progress")
     strategies = {row["strategy"] for row in loaded["tables"]["perception"]}
     assert strategies == set(STRATEGIES) - {"plain"}
-
-
-def test_the_command_writes_nothing_unless_asked(tmp_path, monkeypatch):
-    tiny_suite(monkeypatch)
-    monkeypatch.chdir(tmp_path)
-    assert main([*FAST, "--strategies", "library"]) == 0
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(
@@ -568,13 +527,3 @@ def test_a_file_without_ratios_is_refused_before_anything_is_measured(
 def test_explain_prints_and_measures_nothing(capsys):
     assert main(["bench", "--explain", "--particle-count", "64", "--gradients", "none"]) == 0
     assert "One step of 1 x 64 particles in 2D" in capsys.readouterr().out
-
-
-def test_the_masks_of_a_composed_rollout_are_those_of_the_library():
-    start = gecko(1, 100, torch.device("cpu"))
-    own = rollout(start.rule, start.x, start.s, 3, update_prob=0.5, generator=mask_source(start.x))
-    x, s, generator = start.x, start.s, mask_source(start.x)
-    for _ in range(3):
-        mask = drawn_mask(x, 0.5, generator)
-        x, s = composed_step(STRATEGIES["dense"], start.rule, x, s, mask)
-    torch.testing.assert_close(x, own[0], rtol=1e-4, atol=1e-5)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Literal
 
 import torch
@@ -102,3 +103,14 @@ class Check:
 def group_of(name: str) -> str:
     """Return the group of a check's name."""
     return name.partition("/")[0]
+
+
+def in_2d_and_3d(
+    group: str, cases: Mapping[str, tuple[str, Callable[[int, Session], Finding]]]
+) -> list[Check]:
+    """Return checks GROUP/CASE/2d and /3d of cases: what is expected, and what measures it."""
+    return [
+        Check(f"{group}/{name}/{space_dim}d", expected, partial(run, space_dim))
+        for space_dim in (2, 3)
+        for name, (expected, run) in cases.items()
+    ]

@@ -49,13 +49,9 @@ def endurance_checks() -> list[Check]:
 
 
 def measured(home: Habitat, x: Tensor, s: Tensor, generator: torch.Generator) -> dict[str, float]:
-    """Return the figures of worlds as they are, none of them compared with others.
+    """Return the figures of worlds x [B, N, D], s [B, N, C], none of them compared with others.
 
-    Args:
-        home: Their rule and task.
-        x: Positions [length units], shape [B, N, D].
-        s: States, shape [B, N, C].
-        generator: Source of the masks of the step that tells the energy.
+    One more step, with masks from the generator, tells the energy.
     """
     with torch.no_grad():
         not_finite = (~x.isfinite()).sum() + (~s.isfinite()).sum()

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from npa_envs import reference
-from npa_envs.measure.accuracy.checks import Check, Finding, Session
+from npa_envs.measure.accuracy.checks import Check, Finding, Session, in_2d_and_3d
 from npa_envs.measure.accuracy.scenes import (
     EPS,
     LIMITS,
@@ -33,56 +33,45 @@ NEAR_THRESHOLD = 1e-3
 
 
 def geometry_checks(seed: int = 0) -> list[Check]:
-    """Return the checks of the group `geometry`.
-
-    Args:
-        seed: What random places are drawn from.
-    """
-    checks = []
-    for space_dim in (2, 3):
-        for periodic in (False, True):
-            where = f"{space_dim}d/{'periodic' if periodic else 'open'}"
-            checks += [
-                Check(
-                    f"geometry/{scene.name}/{where}",
-                    f"{scene.summary}: all is finite, as the float64 reference has it",
-                    partial(_run_scene, scene),
-                )
-                for scene in scenes(space_dim, periodic=periodic, seed=seed)
-            ]
-        checks += [
-            Check(
-                f"geometry/threshold/{space_dim}d",
-                "a moment matrix at the threshold of its inverse is inverted or is not, and "
-                "nothing between",
-                partial(_run_threshold, space_dim),
-            ),
-            Check(
-                f"geometry/smooth_inverse/{space_dim}d",
-                "perception with moment_inverse='smooth' is as the float64 reference has it, and "
-                "does not jump where that by the threshold does",
-                partial(_run_smooth_inverse, space_dim),
-            ),
-            Check(
-                f"geometry/crowd/{space_dim}d",
-                "very many particles in one cell: densities as float64 has them, all is finite, "
-                "and the smoothing's adjoint conserves what it spreads",
-                partial(_run_crowd, space_dim),
-            ),
-            Check(
-                f"geometry/nearest/{space_dim}d",
-                "a pair is perceived as such from 1e-19 length units on (float32), below it counts "
-                "as coincident; all is finite down to denormal distances",
-                partial(_run_nearest, space_dim),
-            ),
-            Check(
-                f"geometry/outside/{space_dim}d",
-                "particles outside of a periodic box are perceived as their images: in float32 "
-                "with the rounding of their coordinates; all is finite",
-                partial(_run_outside, space_dim),
-            ),
-        ]
-    return checks
+    """Return the checks of the group `geometry`; random places are drawn from the seed."""
+    hard = [
+        Check(
+            f"geometry/{scene.name}/{space_dim}d/{'periodic' if periodic else 'open'}",
+            f"{scene.summary}: all is finite, as the float64 reference has it",
+            partial(_run_scene, scene),
+        )
+        for space_dim in (2, 3)
+        for periodic in (False, True)
+        for scene in scenes(space_dim, periodic=periodic, seed=seed)
+    ]
+    others = {
+        "threshold": (
+            "a moment matrix at the threshold of its inverse is inverted or is not, and nothing "
+            "between",
+            _run_threshold,
+        ),
+        "smooth_inverse": (
+            "perception with moment_inverse='smooth' is as the float64 reference has it, and does "
+            "not jump where that by the threshold does",
+            _run_smooth_inverse,
+        ),
+        "crowd": (
+            "very many particles in one cell: densities as float64 has them, all is finite, and "
+            "the smoothing's adjoint conserves what it spreads",
+            _run_crowd,
+        ),
+        "nearest": (
+            "a pair is perceived as such from 1e-19 length units on (float32), below it counts as "
+            "coincident; all is finite down to denormal distances",
+            _run_nearest,
+        ),
+        "outside": (
+            "particles outside of a periodic box are perceived as their images: in float32 with "
+            "the rounding of their coordinates; all is finite",
+            _run_outside,
+        ),
+    }
+    return [*hard, *in_2d_and_3d("geometry", others)]
 
 
 def _run_scene(scene: Scene, session: Session) -> Finding:
@@ -143,11 +132,7 @@ def _run_smooth_inverse(space_dim: int, session: Session) -> Finding:
 
 
 def _largest_jump(z: Tensor) -> float:
-    """Return how far the first particle's perception changes from one world to the next at most.
-
-    Args:
-        z: Perception vectors, shape [B, N, P].
-    """
+    """Return how far the first particle's z [B, N, P] changes at most from world to world."""
     corner = z[:, 0].cpu().double()
     return float(corner.diff(dim=0).norm(dim=-1).max() / corner.norm(dim=-1).max())
 

@@ -55,11 +55,7 @@ class Outcome(NamedTuple):
 
 
 def gradients_checks(*, quick: bool) -> list[Check]:
-    """Return the checks of the group `gradients`.
-
-    Args:
-        quick: Only of some rules.
-    """
+    """Return the checks of the group `gradients`; when quick only of some rules."""
     checks = []
     for name in QUICK_RULES if quick else RULES:
         checks += [
@@ -96,14 +92,7 @@ def powers_of_two(most: int) -> list[int]:
 
 
 def outcome(home: Habitat, session: Session, steps: int, dtype: torch.dtype) -> Outcome:
-    """Return a rollout from the seed and its gradients; the same masks in every dtype.
-
-    Args:
-        home: The rule, its task and its seeds.
-        session: What masks are drawn from.
-        steps: Number of steps T.
-        dtype: What everything is computed in.
-    """
+    """Return a rollout from the seed and its gradients; the same masks in every dtype."""
     rule = NPARule(**home.rule.hyper_parameters()).to(home.x.device)
     rule.load_state_dict(home.rule.state_dict())
     rule.to(dtype)

@@ -66,14 +66,10 @@ class Habitat:
         return {"eps": task.eps, "box": task.box, "update_prob": task.update_prob} | changed
 
     def at_trained_size(self, x: Tensor, eps: float) -> Tensor:
-        """Return positions as large as they would be at the radius that the rule was trained at.
+        """Return positions [B, N, D] as large as they would be at the radius of training.
 
         Scaling positions and ε alike is a symmetry of the dynamics, so what grows in open space at
         another ε is as much larger. Boxes and particles that do not move keep their size.
-
-        Args:
-            x: Positions [length units], shape [B, N, D].
-            eps: Perception radius that they grew at [length units].
         """
         free = self.task.box is None and not self.rule.static
         return x * (self.task.eps / eps) if free and eps != self.task.eps else x
@@ -108,8 +104,7 @@ def habitat(
         session: Where, and whether worlds are to be small.
         name: The rule's name.
         world_count: Worlds B.
-        particles: Particles, as a multiple of those it was trained with or, in a quick run, of
-            the most that are allowed there.
+        particles: Particles over those it was trained with or, in a quick run, over the most there.
         looks: Whether loss or metric will be asked for; a 3D target takes long to make.
     """
     key = ("task", name, particles, looks)
@@ -148,16 +143,10 @@ def trained_particles(session: Session, name: str) -> int:
 
 
 class LongRun:
-    """Worlds that are run for very long, without gradients.
+    """Worlds that are run for very long, without gradients; `options` are those of `rollout`.
 
     On CUDA, a chunk of steps is recorded as a graph, which is replayed: their launches would take
     most of the time.
-
-    Args:
-        home: The rule, and worlds to start from.
-        generator: Source of masks and noise, on their device.
-        options: Of `rollout`.
-        chunk: Steps that are recorded as a graph.
     """
 
     def __init__(

@@ -8,7 +8,13 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from npa_envs.measure.accuracy.checks import Check, Finding, Session, Skipped
+from npa_envs.measure.accuracy.checks import (
+    Check,
+    Finding,
+    Session,
+    Skipped,
+    in_2d_and_3d,
+)
 from npa_envs.measure.accuracy.habitats import WORKS, Habitat, habitat
 from npa_envs.measure.accuracy.scenes import (
     EPS,
@@ -46,11 +52,7 @@ STEPS = 16
 
 
 def precision_checks(*, quick: bool) -> list[Check]:
-    """Return the checks of the group `precision`.
-
-    Args:
-        quick: Only of some rules.
-    """
+    """Return the checks of the group `precision`; when quick only of some rules."""
     checks = [
         Check(
             f"precision/{name}/{rule}",
@@ -61,31 +63,23 @@ def precision_checks(*, quick: bool) -> list[Check]:
         for name in SHORT
         for rule in (QUICK_RULES if quick else RULES)
     ]
-    for space_dim in (2, 3):
-        checks.append(
-            Check(
-                f"precision/order/{space_dim}d",
-                "particles in another order perceive the same but for rounding, in every hard "
-                "scene",
-                partial(_run_order, space_dim),
-            )
-        )
-        checks.append(
-            Check(
-                f"precision/repeated/{space_dim}d",
-                "perception and gradients of every hard scene are the same bits when repeated",
-                partial(_run_repeated, space_dim),
-            )
-        )
-        checks.append(
-            Check(
-                f"precision/batch/{space_dim}d",
-                "every world of a batch perceives the bits that it perceives alone",
-                partial(_run_batch, space_dim),
-            )
-        )
+    by_dimension = {
+        "order": (
+            "particles in another order perceive the same but for rounding, in every hard scene",
+            _run_order,
+        ),
+        "repeated": (
+            "perception and gradients of every hard scene are the same bits when repeated",
+            _run_repeated,
+        ),
+        "batch": (
+            "every world of a batch perceives the bits that it perceives alone",
+            _run_batch,
+        ),
+    }
     return [
         *checks,
+        *in_2d_and_3d("precision", by_dimension),
         Check(
             "precision/devices",
             "a CUDA device perceives what the CPU does but for rounding, in every hard scene",

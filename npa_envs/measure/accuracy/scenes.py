@@ -45,13 +45,7 @@ class Scene:
 
 
 def scenes(space_dim: int, *, periodic: bool, seed: int = 0) -> list[Scene]:
-    """Return every scene of open space or of a periodic box.
-
-    Args:
-        space_dim: Space dimension D.
-        periodic: Whether space is a box of side `SIDE`.
-        seed: What random places are drawn from.
-    """
+    """Return every scene of open space or of a periodic box of side `SIDE`."""
     made: list[Scene] = []
     for name, (summary, place) in PLACES.items():
         generator = torch.Generator().manual_seed(1000 * seed + len(made))
@@ -180,10 +174,6 @@ def threshold_scenes(space_dim: int, threshold: float) -> tuple[Tensor, Tensor]:
     The particles are a corner, one on each other axis, and one whose height over those says how
     flat the corner is.
 
-    Args:
-        space_dim: Space dimension D.
-        threshold: Smallest determinant that is inverted (dimensionless).
-
     Returns:
         Positions [length units], shape [B, 1 + D, D], and how far each determinant was to lie from
         the threshold, relatively, shape [B].
@@ -240,11 +230,9 @@ class Perceived(NamedTuple):
 
 
 def relative_error(value: Tensor, expected: Tensor) -> float:
-    """Return the largest relative error of a world, in the Euclidean norm, taken in float64.
+    """Return the largest relative error of a world [B, ...] in the Euclidean norm, in float64.
 
-    Args:
-        value: Shape [B, ...].
-        expected: Shape [B, ...]; where a world's is 0 its error is taken as it is.
+    Where a world's expected norm is 0 its error is taken as it is.
     """
     exact = expected.detach().cpu().double().flatten(1)
     away = (value.detach().cpu().double().flatten(1) - exact).norm(dim=1)
@@ -270,15 +258,10 @@ def perceived(
     weights: Tensor | None = None,
     given: Callable[[Tensor], Tensor] = torch.clone,
 ) -> Perceived:
-    """Return z and the gradients of a random functional of it.
+    """Return z and the gradients of a random functional of it, by the library or the reference.
 
-    Args:
-        x: Positions [length units], shape [B, N, D].
-        s: States, shape [B, N, C].
-        box: Sides of the periodic box [length units], or None.
-        by_reference: Ask the reference instead of the library.
-        weights: Those of the functional, shape [B, N, P]; default: `functional_weights`.
-        given: What to make of positions, states and the functional's weights first.
+    `weights` [B, N, P] are by default `functional_weights`; `given` is what to make of positions,
+    states and weights first.
     """
     x, s = given(x.detach()).requires_grad_(), given(s.detach()).requires_grad_()
     if by_reference:
@@ -293,18 +276,12 @@ def perceived(
 def error_limits(
     x: Tensor, s: Tensor, box: tuple[float, ...] | None, expected: Perceived
 ) -> dict[str, float]:
-    """Return the relative errors that worlds allow, by the names of `LIMITS`.
+    """Return the relative errors that float64 worlds allow, by the names of `LIMITS`.
 
     Where sums cancel, or answers grow with 1 / distance, the last bit of what is given shows in
     many digits of the answer. So an error may be what some roundings of every number given change.
     Particles in one place stay together, and far away in open space the differences of coordinates
     are rounded, not they themselves.
-
-    Args:
-        x: Positions [length units], float64, shape [B, N, D].
-        s: States, float64, shape [B, N, C].
-        box: Sides of the periodic box [length units], or None.
-        expected: What the reference perceives there.
     """
     generator = torch.Generator().manual_seed(4)
     change = 1e-11

@@ -52,11 +52,7 @@ def all_checks(*, quick: bool = False, seed: int = 0) -> list[Check]:
 
 
 def chosen_checks(checks: Sequence[Check], names: Sequence[str]) -> list[Check]:
-    """Return the checks that names stand for, all where there are none.
-
-    Args:
-        checks: Every check.
-        names: Groups, checks, or what checks' names begin with, up to a slash.
+    """Return the checks that names stand for: groups, checks, beginnings of names up to a slash.
 
     Raises:
         NPAError: A name stands for none.
@@ -79,11 +75,8 @@ class Entry:
     """A check and what came of it."""
 
     name: str
-    """Its name."""
     expected: str
-    """What was expected."""
     verdict: Verdict
-    """What came of it."""
     figures: Mapping[str, float] = field(default_factory=dict)
     """What was measured, by name."""
     limits: Mapping[str, float] = field(default_factory=dict)

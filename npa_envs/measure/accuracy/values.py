@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.measure.accuracy.checks import Check, Finding, Session
+from npa_envs.measure.accuracy.checks import Check, Finding, Session, in_2d_and_3d
 from npa_envs.measure.accuracy.scenes import EPS, LIMITS, STATE_DIM, perceived, relative_error
 from npa_envs.ops import perceive
 from npa_envs.rule.files import load_rule
@@ -31,24 +31,20 @@ WORLD_COUNT, PARTICLE_COUNT, STEPS = 3, 150, 8
 
 def values_checks() -> list[Check]:
     """Return the checks of the group `values`."""
-    checks = []
-    for space_dim in (2, 3):
-        checks += [
-            Check(
-                f"values/scale/{space_dim}d",
-                "states of 1e-30 to 1e30 are perceived as the float64 reference has them, forwards "
-                "and backwards; beyond, the largest scale is told",
-                partial(_run_scale, space_dim),
-            ),
-            Check(
-                f"values/infinite_channel/{space_dim}d",
-                "a channel that is infinite at one particle changes no bit of other channels, of "
-                "particles that do not see it, and of other worlds",
-                partial(_run_infinite_channel, space_dim),
-            ),
-        ]
+    by_dimension = {
+        "scale": (
+            "states of 1e-30 to 1e30 are perceived as the float64 reference has them, forwards and "
+            "backwards; beyond, the largest scale is told",
+            _run_scale,
+        ),
+        "infinite_channel": (
+            "a channel that is infinite at one particle changes no bit of other channels, of "
+            "particles that do not see it, and of other worlds",
+            _run_infinite_channel,
+        ),
+    }
     return [
-        *checks,
+        *in_2d_and_3d("values", by_dimension),
         Check(
             "values/gradient_of_nan",
             "cotangents and states that are NaN in one world change no bit of other worlds' "

@@ -1,8 +1,7 @@
-"""How well a rule classifies clouds, and whether it changes its mind when they change."""
+"""Accuracy of a rule that classifies clouds, and whether it changes its mind when they change."""
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -10,10 +9,9 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.measure.quality.evaluation import check_steps
+from npa_envs.measure.quality.evaluation import Runner, check_steps
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.point_classification import PointClassification, majority, particle_classes
-from npa_envs.world.rollout import rollout
 
 CLOUD_CHECKPOINTS = (8, 16, 24, 32, 64, 128)
 """Steps after which clouds are asked for their class, unless others are given."""
@@ -31,19 +29,14 @@ class AccuracyRow:
 
     step: int
     """Steps from blank states."""
-
     majority: float
     """Share of the clouds whose majority says the right class."""
-
     particle: float
     """Share of all particles that say the right class."""
-
     agreement: float
     """Share of all particles that say what their cloud's majority says."""
-
     loss: float
     """Mean squared error to the class (dimensionless)."""
-
     overflow: float
     """mean |s − clip(s, −1, 1)| (dimensionless)."""
 
@@ -54,16 +47,12 @@ class ChangeRow:
 
     change: str
     """What was done; the states of the particles were left as they were."""
-
     steps: int
     """Steps since."""
-
     majority: float
     """Share of the clouds whose majority says the class that they now show."""
-
     particle: float
     """Share of all particles that say so."""
-
     majority_before: float
     """Share of the clouds whose majority says the class that they showed before."""
 
@@ -93,16 +82,16 @@ def accuracies(
         NPAError: `checkpoints` are empty or out of order.
     """
     check_steps("checkpoints", checkpoints)
-    runner = _Runner(rule, task, seed, progress)
+    clouds = _Clouds(rule, task, seed, progress)
     sums = torch.zeros(len(checkpoints), 5, dtype=torch.float64)
-    for index in runner.batches():
-        x, label, s = runner.blank(index)
-        aimed = runner.task.toward(label)
+    for index in clouds.batches():
+        x, label, s = clouds.blank(index)
+        aimed = clouds.task.toward(label)
         before = 0
         for row, step in enumerate(checkpoints):
-            s = runner.run(x, s, step - before)
+            s = clouds.states(x, s, step - before)
             before = step
-            outputs = runner.task.outputs(s)
+            outputs = clouds.task.outputs(s)
             says, most = particle_classes(outputs), majority(outputs)
             overflow = (s - s.clamp(-1.0, 1.0)).abs().mean((1, 2))
             figures = (
@@ -113,7 +102,7 @@ def accuracies(
                 overflow.double(),
             )
             sums[row] += torch.stack([figure.sum() for figure in figures]).cpu()
-    means = (sums / runner.cloud_count).tolist()
+    means = (sums / clouds.cloud_count).tolist()
     return [AccuracyRow(step, *row) for step, row in zip(checkpoints, means, strict=True)]
 
 
@@ -148,30 +137,30 @@ def changes_of_mind(
     """
     check_steps("settle_steps", [settle_steps])
     check_steps("steps", [1 + step for step in steps])
-    runner = _Runner(rule, task, seed, progress)
-    partner = _partners(runner.label)
+    clouds = _Clouds(rule, task, seed, progress)
+    partner = _partners(clouds.label)
     names = (f"{CUT_SHARE:.0%} cut off", "upper half mutated", "all mutated")
     sums = torch.zeros(len(names), len(steps), 3, dtype=torch.float64)
-    for index in runner.batches():
-        x, label, s = runner.blank(index)
-        other_x, other = runner.x[partner[index]], runner.label[partner[index]]
-        s = runner.run(x, s, settle_steps)
+    for index in clouds.batches():
+        x, label, s = clouds.blank(index)
+        other_x, other = clouds.x[partner[index]], clouds.label[partner[index]]
+        s = clouds.states(x, s, settle_steps)
         changed = (
-            (*_cut(x, s, runner.generator), label),
+            (*_cut(x, s, clouds.generator), label),
             (*_chimera(x, s, other_x), other),
             (other_x, s, other),
         )
         for number, (new_x, new_s, goal) in enumerate(changed):
             before = 0
             for row, step in enumerate(steps):
-                new_s = runner.run(new_x, new_s, step - before)
+                new_s = clouds.states(new_x, new_s, step - before)
                 before = step
-                outputs = runner.task.outputs(new_s)
+                outputs = clouds.task.outputs(new_s)
                 most = majority(outputs)
                 right = (particle_classes(outputs) == goal[:, None]).double().mean(1)
                 figures = ((most == goal).double(), right, (most == label).double())
                 sums[number, row] += torch.stack([figure.sum() for figure in figures]).cpu()
-    means = (sums / runner.cloud_count).tolist()
+    means = (sums / clouds.cloud_count).tolist()
     return [
         ChangeRow(name, step, *row)
         for name, rows in zip(names, means, strict=True)
@@ -212,8 +201,8 @@ def _partners(label: Tensor) -> Tensor:
     return partner
 
 
-class _Runner:
-    """Runs a rule on the clouds of a task, some at a time."""
+class _Clouds(Runner):
+    """A rule on the clouds of a task, some at a time."""
 
     def __init__(
         self,
@@ -222,16 +211,9 @@ class _Runner:
         seed: int,
         progress: Callable[[int], None] | None,
     ) -> None:
-        clouds = task.clouds
-        self.x, self.label = clouds.x, clouds.label
-        self.cloud_count = len(clouds.label)
-        # The caller's own rule stays where it is.
-        self._rule = copy.deepcopy(rule).to(clouds.x.device)
-        self._dtype = next(rule.parameters()).dtype
-        self.x = self.x.to(self._dtype)
-        self.task = task.for_rule(self._rule)
-        self.generator = torch.Generator(clouds.x.device).manual_seed(seed)
-        self._progress = progress
+        super().__init__(rule, task, task.clouds.x.device, seed, progress)
+        self.x, self.label = task.clouds.x.to(self.dtype), task.clouds.label
+        self.cloud_count = len(self.label)
 
     def batches(self) -> Iterator[Tensor]:
         """Yield the indices of some clouds after the other."""
@@ -243,17 +225,6 @@ class _Runner:
         x = self.x[index]
         return x, self.label[index], x.new_zeros(*x.shape[:2], self.task.config.state_dim)
 
-    def run(self, x: Tensor, s: Tensor, steps: int) -> Tensor:
+    def states(self, x: Tensor, s: Tensor, steps: int) -> Tensor:
         """Return the states after some steps; positions stay as they are."""
-        _, s = rollout(
-            self._rule,
-            x,
-            s,
-            steps,
-            eps=self.task.eps,
-            update_prob=self.task.update_prob,
-            generator=self.generator,
-        )
-        if self._progress is not None:
-            self._progress(steps)
-        return s
+        return self.run(x, s, steps)[1]

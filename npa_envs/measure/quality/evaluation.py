@@ -1,4 +1,4 @@
-"""How good a rule is, in numbers: stable over thousands of steps, healing what is done to it."""
+"""Quality of a rule: loss and PSNR over thousands of steps, healing what is done to it."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import copy
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -47,23 +48,17 @@ class EvaluationRow:
 
     step: int
     """Steps from the seed."""
-
     loss: float
     """The task's metric, mean of the worlds."""
-
     loss_worst: float
     """The task's metric in the worst world."""
-
     psnr: float | None
     """PSNR of the picture against the target's, four channels in [0, 1], mean [dB]; in 3D that of
     held-out views; None where a world is not to match the target pixel by pixel."""
-
     psnr_worst: float | None
     """PSNR in the worst world [dB], likewise."""
-
     overflow: float
     """mean |s − clip(s, −1, 1)|, mean of the worlds (dimensionless)."""
-
     extent: float
     """Longest side of a world's bounding box, mean of the worlds [length units]."""
 
@@ -80,22 +75,16 @@ class HealingRow:
 
     damage: str
     """What was done to them."""
-
     before: float
     """The task's metric before the damage, mean of the worlds."""
-
     after: float
     """Right after it."""
-
     steps_to_heal: int | None
     """Steps until the mean is within 20 % of `before`; None: not within the steps allowed."""
-
     worlds_healed: int
     """Worlds whose own loss came within 20 % of their own undamaged one."""
-
     world_count: int
     """Worlds damaged."""
-
     end: float
     """The metric at the end, mean of the worlds."""
 
@@ -131,7 +120,7 @@ def evaluate(
     x, s, task = worlds.x, worlds.s, worlds.task
     rows = []
     for step, before in zip(checkpoints, (0, *checkpoints), strict=False):
-        x, s = worlds.grow(x, s, step - before)
+        x, s = worlds.run(x, s, step - before)
         rows.append(measure(task, x, s, step))
     return rows
 
@@ -214,7 +203,7 @@ def healing(
     check_steps("heal_steps", [heal_steps])
     check_steps("every", [every])
     worlds = _Worlds(rule, task, seeds, check_device(device), progress)
-    x, s = worlds.grow(worlds.x, worlds.s, grow_steps)
+    x, s = worlds.run(worlds.x, worlds.s, grow_steps)
     task = worlds.task
     before = task.metric(x, s)
     normal = torch.randn(
@@ -234,7 +223,7 @@ def healing(
         steps = [0]
         while steps[-1] < heal_steps:
             more = min(every, heal_steps - steps[-1])
-            hurt_x, hurt_s = worlds.grow(hurt_x, hurt_s, more)
+            hurt_x, hurt_s = worlds.run(hurt_x, hurt_s, more)
             losses.append(task.metric(hurt_x, hurt_s))
             steps.append(steps[-1] + more)
         rows.append(_healing_row(name, before, torch.stack(losses), steps))
@@ -273,35 +262,29 @@ def check_steps(name: str, steps: Sequence[int]) -> None:
         )
 
 
-class _Worlds:
-    """One seed world for each of `seeds` (x [B, N, D], s [B, N, C]), and what lets them grow."""
+class Runner:
+    """A rule on the worlds of a task, on the device and in the precision of the rule's copy.
+
+    `progress` is called with the number of steps done since its last call.
+    """
 
     def __init__(
         self,
         rule: NPARule,
-        task: PictureTask,
-        seeds: Sequence[int],
+        task: Any,
         device: torch.device,
+        seed: int,
         progress: Callable[[int], None] | None,
     ) -> None:
-        if not seeds:
-            raise NPAError(
-                "seeds must hold at least one number, got none: for example seeds=(0, 1)"
-            )
-        worlds = [
-            task.seed(1, generator=torch.Generator(device).manual_seed(seed), device=device)
-            for seed in seeds
-        ]
         # The caller's own rule stays on its device.
         self._rule = copy.deepcopy(rule).to(device)
-        dtype = next(rule.parameters()).dtype
-        self.x = torch.cat([x for x, _ in worlds]).to(dtype)
-        self.s = torch.cat([s for _, s in worlds]).to(dtype)
-        self.generator = torch.Generator(device).manual_seed(seeds[0] + len(seeds))
+        self.dtype = next(rule.parameters()).dtype
         self.task = task_for_rule(task, self._rule)
+        self.generator = torch.Generator(device).manual_seed(seed)
         self._progress = progress
 
-    def grow(self, x: Tensor, s: Tensor, steps: int) -> tuple[Tensor, Tensor]:
+    def run(self, x: Tensor, s: Tensor, steps: int) -> tuple[Tensor, Tensor]:
+        """Return worlds x [B, N, D], s [B, N, C] some steps later."""
         while steps > 0:
             some = min(steps, PROGRESS_STEPS)
             x, s = rollout(
@@ -318,3 +301,26 @@ class _Worlds:
                 self._progress(some)
             steps -= some
         return x, s
+
+
+class _Worlds(Runner):
+    """One seed world for each of `seeds` (x [B, N, D], s [B, N, C]), and what lets them grow."""
+
+    def __init__(
+        self,
+        rule: NPARule,
+        task: PictureTask,
+        seeds: Sequence[int],
+        device: torch.device,
+        progress: Callable[[int], None] | None,
+    ) -> None:
+        if not seeds:
+            raise NPAError(
+                "seeds must hold at least one number, got none: for example seeds=(0, 1)"
+            )
+        super().__init__(rule, task, device, seeds[0] + len(seeds), progress)
+        worlds = [
+            task.seed(1, generator=torch.Generator(device).manual_seed(seed), device=device)
+            for seed in seeds
+        ]
+        self.x, self.s = (torch.cat(parts).to(self.dtype) for parts in zip(*worlds, strict=True))

@@ -62,14 +62,9 @@ class Home(Habitat):
 
 
 class Ground:
-    """A rule and the tasks that it is tried in, one for each number of particles.
+    """A shipped rule and the tasks that it is tried in, one for each number of particles.
 
-    Args:
-        name: A shipped rule.
-        device: Where to run.
-        plan: What is measured.
-        seeds: Numbers of the seeds; none that a rule was trained with.
-        particle_count: Particles N that count as trained; default: as trained.
+    The seeds are none that a rule was trained with.
     """
 
     def __init__(

@@ -32,8 +32,6 @@ class Damage:
 
     name: str
     """What it is called."""
-    summary: str
-    """What it is, in a few words."""
     apply: Change
     """Does it, to copies."""
     static: bool
@@ -109,14 +107,12 @@ def _lowest_half(x: Tensor, s: Tensor, key: Tensor) -> tuple[Tensor, Tensor]:
 DAMAGES = {
     damage.name: damage
     for damage in (
-        Damage("erase", "states in a disk of radius 0.2 set to 0", erase, static=True),
-        Damage("cut", "a slit of width 0.1", slit, static=False),
-        Damage("clump", "a disk of radius 0.2 pulled to a point", pull_together, static=False),
-        Damage("noise", "noise of 0.3 on every state", add_state_noise, static=True, beyond=True),
-        Damage("half", "half of the particles removed", remove_half, static=True, halves=True),
-        Damage(
-            "side", "all on one side removed", remove_side, static=True, halves=True, beyond=True
-        ),
+        Damage("erase", erase, static=True),
+        Damage("cut", slit, static=False),
+        Damage("clump", pull_together, static=False),
+        Damage("noise", add_state_noise, static=True, beyond=True),
+        Damage("half", remove_half, static=True, halves=True),
+        Damage("side", remove_side, static=True, halves=True, beyond=True),
     )
 }
 """Every damage by its name."""

@@ -27,9 +27,7 @@ class Response:
     """The losses of all seeds under one condition."""
 
     condition: str
-    """What was varied."""
     value: float | str
-    """Its value."""
     steps: int
     """Steps from the seed."""
     losses: tuple[float, ...]
@@ -47,9 +45,7 @@ class RuleRecord:
     """What was measured of one rule."""
 
     rule: str
-    """Its name."""
     task: str
-    """Its task."""
     metric: str
     """What losses are."""
     update_prob: float
@@ -65,9 +61,7 @@ class RuleRecord:
     seconds: float = 0.0
     """How long it took [s]."""
     command: str = ""
-    """The command line."""
     date: str = ""
-    """The day, as YYYY-MM-DD."""
 
     @classmethod
     def read(cls, path: Path, facts: Mapping[str, Any]) -> RuleRecord | None:
@@ -196,13 +190,9 @@ def grow(ground: Ground, condition: str = "", value: float | str = 1.0) -> tuple
 def responses(
     ground: Ground, trained: Response, most_particles: int, *, done: int = 0
 ) -> Iterator[Response]:
-    """Yield what comes of each value of each condition.
+    """Yield what comes of each value of each condition but for the first `done`.
 
-    Args:
-        ground: The rule, and what is measured.
-        trained: What comes of worlds as trained; it is not measured again.
-        most_particles: Particles of all worlds; where there would be more, a value is left out.
-        done: Values that are measured already, the first in order.
+    Worlds as trained are not measured again; a value of more than `most_particles` is left out.
     """
     every = [(name, value) for name, values in ground.plan.values.items() for value in values]
     for condition, value in every[done:]:

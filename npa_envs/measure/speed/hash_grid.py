@@ -35,13 +35,7 @@ class GridFields(NamedTuple):
 
 
 def grid_fields(x: Tensor, s: Tensor, eps: float) -> GridFields:
-    """Return the fields of worlds in open space; not differentiable.
-
-    Args:
-        x: Positions [length units], shape [B, N, D].
-        s: States, dimensionless, shape [B, N, C].
-        eps: Perception radius [length units].
-    """
+    """Return the fields of worlds x [B, N, D], s [B, N, C] in open space; not differentiable."""
     world_count, particle_count, space_dim = x.shape
     total, state_dim = world_count * particle_count, s.shape[2]
     scalar = scalar_type(x.dtype)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -34,8 +35,6 @@ class Strategy:
 
     name: str
     """What the command line calls it."""
-    summary: str
-    """What it does, in a few words."""
     perceive: Callable[[Tensor, Tensor, float], Tensor]
     """Takes x [B, N, D], s [B, N, C] and eps; returns z, shape [B, N, P]."""
     density: Callable[[Tensor, Tensor, float], Tensor]
@@ -78,10 +77,9 @@ def _taken(values: Tensor, index: Tensor) -> Tensor:
     return values[world, index]
 
 
-def capped_density(x: Tensor, s: Tensor, eps: float, index: Tensor | None = None) -> Tensor:
+def capped_density(x: Tensor, s: Tensor, eps: float) -> Tensor:
     """Return the density that the nearest neighbours alone give, shape [B, N]."""
-    index = nearest(x, NEIGHBOUR_CAP) if index is None else index
-    r = _taken(x, index) - x[:, :, None]
+    r = _taken(x, nearest(x, NEIGHBOUR_CAP)) - x[:, :, None]
     return reference.smoothing_kernel((r * r).sum(dim=-1), eps, x.shape[2]).sum(dim=2)
 
 
@@ -103,62 +101,52 @@ def capped_perceive(x: Tensor, s: Tensor, eps: float) -> Tensor:
     return assemble(s, blur, gradient, kernel.sum(dim=2))
 
 
-def plain_perceive(x: Tensor, s: Tensor, eps: float) -> Tensor:
-    """Return perception vectors by way of the plain kernels' fields, shape [B, N, P]."""
-    fields = perception_fields(x, s, eps)
+def from_fields(
+    fields_of: Callable[[Tensor, Tensor, float], Any], x: Tensor, s: Tensor, eps: float
+) -> Tensor:
+    """Return perception vectors by way of a function's fields, shape [B, N, P]."""
+    fields = fields_of(x, s, eps)
     return assemble(s, fields.blur, fields.grad1, fields.drho)
-
-
-def grid_perceive(x: Tensor, s: Tensor, eps: float) -> Tensor:
-    """Return perception vectors summed over a hash grid's neighbours, shape [B, N, P]."""
-    fields = grid_fields(x, s, eps)
-    return assemble(s, fields.blur, fields.grad1, fields.drho)
-
-
-def dense_density(x: Tensor, s: Tensor, eps: float) -> Tensor:
-    """Return densities from all pairs, shape [B, N]."""
-    r = reference.differences(x)
-    return reference.smoothing_kernel((r * r).sum(dim=-1), eps, x.shape[2]).sum(dim=2)
 
 
 STRATEGIES = {
     strategy.name: strategy
     for strategy in (
+        # Sorted cells, one fused pass; neighbours listed on CUDA.
         Strategy(
             "library",
-            "npa_envs.perceive: sorted cells, one fused pass; neighbours listed on CUDA",
             lambda x, s, eps: perceive(x, s, eps),
             lambda x, s, eps: perception_fields(x, s, eps).rho,
             differentiable=True,
             capturable=True,
         ),
+        # The library's plain kernels: no neighbour lists, the scaling in torch.
         Strategy(
             "plain",
-            "the library's plain kernels: no neighbour lists, the scaling in torch",
-            plain_perceive,
+            lambda x, s, eps: from_fields(perception_fields, x, s, eps),
             lambda x, s, eps: perception_fields(x, s, eps).rho,
             differentiable=False,
             capturable=True,
         ),
+        # Two plain Warp kernels over the neighbours of wp.HashGrid.
         Strategy(
             "hash_grid",
-            "two plain Warp kernels over the neighbours of wp.HashGrid",
-            grid_perceive,
+            lambda x, s, eps: from_fields(grid_fields, x, s, eps),
             lambda x, s, eps: grid_fields(x, s, eps).rho,
             differentiable=False,
             capturable=False,
         ),
+        # Torch over all pairs of particles.
         Strategy(
             "dense",
-            "torch over all pairs of particles (npa_envs.reference)",
             lambda x, s, eps: reference.perceive(x, s, eps, eps),
-            dense_density,
+            lambda x, s, eps: reference.fields(x, s, eps).rho,
             differentiable=True,
             capturable=False,
         ),
+        # Torch over the nearest particles only.
         Strategy(
             "neighbour_cap",
-            f"torch over the {NEIGHBOUR_CAP} nearest particles only",
             capped_perceive,
             capped_density,
             differentiable=True,

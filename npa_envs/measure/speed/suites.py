@@ -48,8 +48,6 @@ from npa_envs.world.rollout import step
 class Suite:
     """Some measurements that belong together."""
 
-    summary: str
-    """What it measures, in a few words."""
     run: Callable[[Session], Tables]
     """Makes its tables."""
     guarded: bool = False
@@ -101,21 +99,14 @@ def quick(session: Session) -> Tables:
 
 
 SUITES = {
-    "quick": Suite("small worlds; about a minute on a CPU", quick, guarded=True),
-    "paper": Suite("the paper's workloads: inference, training, memory, errors", paper),
-    "accuracy": Suite("run time against error, by strategy and precision; peers", accuracy),
-    "scaling": Suite("time and memory against N, neighbours, B and C", scaling),
-    "skips": Suite(
-        "what it saves to leave out what a scene does not need",
-        lambda session: {"skips": skip_rows(session)},
-    ),
-    "species": Suite(
-        "what a world of one species pays for others: rollouts in turn",
-        lambda session: {"one_species": one_species_rows(session)},
-    ),
+    "quick": Suite(quick, guarded=True),
+    "paper": Suite(paper),
+    "accuracy": Suite(accuracy),
+    "scaling": Suite(scaling),
+    "skips": Suite(lambda session: {"skips": skip_rows(session)}),
+    "species": Suite(lambda session: {"one_species": one_species_rows(session)}),
     "kernels": Suite(
-        "which CUDA kernels a step takes, and how long each",
-        lambda here: {"kernels": kernel_rows(here, SMALL if here.small else PROFILED)},
+        lambda here: {"kernels": kernel_rows(here, SMALL if here.small else PROFILED)}
     ),
 }
 """Every suite by its name."""
@@ -129,15 +120,11 @@ class Report:
     """One run of one suite."""
 
     suite: str
-    """Its name."""
     command: str
-    """The command line."""
     commit: str
     """Commit that was measured."""
     device: torch.device
-    """Where."""
     threads: int
-    """CPU threads of torch."""
     tables: Tables
     """Rows by the table's name."""
     left_out: Sequence[LeftOut]

@@ -86,12 +86,8 @@ def measure(
 ) -> Cost:
     """Return what a call costs once its kernels are compiled.
 
-    Args:
-        run: The call.
-        device: Where it works.
-        repeats: Readings to take, at least 1; fewer of slow calls.
-        graph: On CUDA, capture the call in a graph and time its replay.
-        generator: A CUDA generator that the call draws from.
+    Slow calls get fewer readings than `repeats`. On CUDA, `graph` captures the call, which may draw
+    from the generator, and times its replay.
     """
     run()
     synchronize(device)
@@ -111,12 +107,8 @@ def compare(
 ) -> Comparison:
     """Return what two calls cost, timed in turn, so that both see the same machine.
 
-    Args:
-        first: A call, and the generator that it draws from.
-        second: Another one.
-        device: Where they work.
-        repeats: Pairs of readings, at least 1; whoever is second is first in the next pair.
-        graph: On CUDA, capture the calls in graphs and time their replays.
+    Each comes with the generator that it draws from. Whoever is second is first in the next of the
+    `repeats` pairs of readings. On CUDA, `graph` times replays of captured graphs.
     """
     runs: list[Callable[[], object]] = []
     for run, generator in (first, second):
@@ -211,12 +203,7 @@ class Session:
         return measure(run, self.device, repeats=self.repeats, graph=graph, generator=generator)
 
     def attempt(self, what: str, make: Callable[[], Row]) -> list[Row]:
-        """Return the row that a call makes, none where the device's memory does not suffice.
-
-        Args:
-            what: What is measured, for the note on what was left out.
-            make: Measures it.
-        """
+        """Return the row that a call makes, none where the device's memory does not suffice."""
         try:
             return [make()]
         except torch.OutOfMemoryError:

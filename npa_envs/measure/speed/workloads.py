@@ -71,12 +71,7 @@ class Workload:
         return x.mul_(2.0).sub_(1.0).mul_(self.half_width), s.mul_(0.1)
 
     def rule(self, device: torch.device, **options: Any) -> NPARule:
-        """Return a rule with the same fresh weights at every call.
-
-        Args:
-            device: Where it lives.
-            options: What `NPARule` takes besides its dimensions.
-        """
+        """Return a rule with the same fresh weights at every call, and options of `NPARule`."""
         # Weights are drawn from torch's global generators, which must be left as they were.
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)
@@ -96,12 +91,10 @@ def rollout_call(
     roll: Callable[..., Any] = rollout,
     **options: Any,
 ) -> tuple[Callable[[], None], torch.Generator]:
-    """Return a call that rolls worlds out, and the source of its update masks.
+    """Return a call that rolls worlds x [B, N, D], s [B, N, C] out, and the source of its masks.
 
     Args:
         workload: Rule, radius, probability of updates and steps.
-        x: Positions [length units], shape [B, N, D].
-        s: States, dimensionless, shape [B, N, C].
         train: Also take the gradient of a random linear functional by the rule's weights.
         gradients: Without that, let autograd store what it would read.
         rule: Options of the rule.
@@ -156,13 +149,7 @@ class Gecko(NamedTuple):
 
 
 def gecko(world_count: int, particle_count: int, device: torch.device) -> Gecko:
-    """Return the shipped rule with seeds of its task.
-
-    Args:
-        world_count: Worlds B.
-        particle_count: Particles in each world N.
-        device: Where to put all of it.
-    """
+    """Return the shipped rule with seeds of its task."""
     config = Morphogenesis2DConfig(particle_count=particle_count, target_point_count=particle_count)
     task = Morphogenesis2D(config, device=device)
     generator = torch.Generator(device).manual_seed(0)

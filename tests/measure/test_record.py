@@ -1,0 +1,134 @@
+"""Records, tables and plots: what every measuring command shares."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import torch
+
+from npa_envs.errors import NPAError
+from npa_envs.measure.plots import mark_decades, write_plots
+from npa_envs.measure.record import (
+    current_commit,
+    measured_facts,
+    number,
+    read_record,
+    time_limit,
+    write_record,
+)
+from npa_envs.measure.tables import csv_text, markdown_table, mean_with_error, table_text
+
+RESULTS = Path(__file__).resolve().parents[2] / "benchmarks" / "results"
+FACTS = {"commit": "0", "seeds": (1, 2)}
+
+
+def read(path: Path, facts=FACTS, **options):
+    return read_record(path, facts, lambda held: held["rows"], command="x", **options)
+
+
+def test_a_record_comes_back_with_null_for_what_is_not_finite(tmp_path):
+    path = tmp_path / "record.json"
+    assert read(path) is None
+    write_record(path, {"facts": FACTS, "rows": [1.5, math.inf, math.nan]})
+    assert read(path) == [1.5, None, None]
+    assert math.isnan(number(None))
+    assert number(3) == 3.0
+
+
+@pytest.mark.parametrize(
+    ("content", "facts", "message"),
+    [
+        ('{"facts": {"commit": "0"}, "rows": []}', {"commit": "1"}, "commit was '0', now '1'"),
+        ('{"facts": {}, "rows": []}', {"commit": "1"}, "commit was None, now '1'"),
+        ('{"facts": {}}', {}, "must hold a record of npa-envs x, but cannot be read"),
+        ('{"facts": 3, "rows": []}', {}, "must hold a record"),
+        ("[]", {}, "must hold a record"),
+        ("{", {}, "must hold a record"),
+    ],
+)
+def test_other_settings_and_other_files_are_refused(content, facts, message, tmp_path):
+    path = tmp_path / "record.json"
+    path.write_text(content)
+    with pytest.raises(NPAError, match=message) as error:
+        read(path, facts, option="--out")
+    assert str(error.value).endswith("remove it, or choose another folder with --out")
+
+
+def test_facts_name_the_machine_the_commit_and_the_versions():
+    facts = measured_facts(torch.device("cpu"), None, seed=3)
+    assert list(facts) == ["device", "machine", "seed", "commit", "versions"]
+    assert facts["machine"].startswith("CPU (")
+    assert facts["commit"] == current_commit()
+    assert torch.__version__.startswith(facts["versions"]["torch"])
+    assert measured_facts(torch.device("cpu"), "abc")["commit"] == "abc"
+
+
+def test_a_time_limit_passes_once_and_never_without_one():
+    assert not time_limit(None)()
+    assert not time_limit(60.0)()
+    assert time_limit(0.0)()
+
+
+def test_stored_records_can_be_read():
+    from npa_envs.measure.accuracy.suite import Record
+    from npa_envs.measure.interaction import read_rows
+    from npa_envs.measure.robustness.study import RuleRecord
+
+    def held(path: Path) -> dict:
+        return json.loads(path.read_text("utf-8"))
+
+    path = RESULTS / "stress_h200.json"
+    assert Record.read(path, held(path)["facts"]).counts()["fail"] == 0
+    path = RESULTS / "interactions_cpu.json"
+    assert len(read_rows(path, held(path)["settings"])) == 16
+    rules = list((RESULTS / "robustness_h200").glob("*.json"))
+    assert len(rules) == 15
+    for path in rules:
+        assert RuleRecord.read(path, held(path)["facts"]).done
+
+
+@dataclass(frozen=True)
+class Row:
+    step: int
+    mean_loss: float | None
+
+
+def test_tables_as_text_markdown_and_comma_separated_values():
+    rows = [Row(64, 31.41592), Row(128, None)]
+    assert table_text(rows, missing="-").splitlines() == [
+        "step  mean loss",
+        "  64      31.42",
+        " 128          -",
+    ]
+    assert table_text([]) == ""
+    assert markdown_table(["a", "b"], [["1", "2"]]) == "| a | b |\n| --- | --- |\n| 1 | 2 |"
+    assert csv_text(["a", "b"], [["x", 125.0], [1, math.nan]]) == "a,b\nx,125\n1,nan\n"
+    estimates = [(1.0, 0.25), (2.0, math.nan), (math.nan, math.nan)]
+    assert [mean_with_error(*one) for one in estimates] == ["1.000 ± 0.250", "2.000", "–"]
+
+
+def test_plots_without_matplotlib_name_the_extra(tmp_path, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "matplotlib", None)
+    (told,) = write_plots(lambda: pytest.fail("drawn"), tmp_path / "*.png", "curves")
+    assert told.startswith("no curves: ")
+    assert "pip install 'npa-envs[bench]'" in told
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "marks"),
+    [(0.1, 1.0, ["0.1", "0.2", "0.5", "1"]), (1.0, 1000.0, ["1", "10", "100", "1000"])],
+)
+def test_axes_of_few_decades_are_marked_within_them(low, high, marks):
+    pytest.importorskip("matplotlib")
+    from matplotlib.figure import Figure
+
+    panel = Figure().subplots()
+    panel.set(yscale="log", ylim=(0.99 * low, 1.01 * high))
+    mark_decades(panel)
+    places, labels = panel.get_yticks(), panel.yaxis.get_major_formatter().format_ticks
+    assert labels([place for place in places if low <= place <= high]) == marks
+    assert not panel.get_yticks(minor=True).size
