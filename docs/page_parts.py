@@ -27,10 +27,13 @@ def field_meanings(config_type: type) -> dict[str, str]:
     """Return the docstring of each field of a configuration, as its source has it.
 
     Args:
-        config_type: A dataclass; what a subclass says goes before what its bases say.
+        config_type: A dataclass; what a subclass says goes before what its bases say, and what they
+            say before what the configuration of the task says that is shared with training.
     """
     meanings: dict[str, str] = {}
-    for cls in reversed(config_type.__mro__[:-1]):
+    task_config_type = getattr(config_type, "task_config_type", None)
+    bases = [] if task_config_type is None else [task_config_type]
+    for cls in [*bases, *reversed(config_type.__mro__[:-1])]:
         body = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0].body
         for field, text in pairwise(body):
             if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):

@@ -13,30 +13,21 @@ from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import EnvTask
 from npa_envs.envs.core.vector import NPAVectorEnv
-from npa_envs.errors import NPAError
-from npa_envs.tasks.checks import check_non_negative, check_positive
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.world.randomness import WorldRandom
 
 
 @dataclass(frozen=True, kw_only=True)
 class Morphogenesis2DEnvConfig(EnvConfig):
-    """What 2D morphogenesis can be told besides."""
+    """Adds the target, the seed and the loss of `Morphogenesis2DConfig`, which explains them."""
 
-    target: str = "gecko"
-    """What to grow: a built-in name (`npa-envs list`), an emoji, or the path of a picture."""
+    task_config_type = Morphogenesis2DConfig
 
+    target: str = Morphogenesis2DConfig.target
     resolution: int = 64
-    """Pixels on each side of the picture that the loss compares."""
-
-    sigma: float = 1.0
-    """Standard deviation of a particle's splat, in pixels of the target (dimensionless)."""
-
-    colour_weight: float = 5.0
-    """Weight of the colour error against the density error (dimensionless)."""
-
-    seed_radius: float = 0.2
-    """Radius of the disk that the particles start in [length units]."""
+    sigma: float = Morphogenesis2DConfig.sigma
+    colour_weight: float = Morphogenesis2DConfig.colour_weight
+    seed_radius: float = Morphogenesis2DConfig.seed_radius
 
     def __post_init__(self) -> None:
         """Check every field.
@@ -45,20 +36,13 @@ class Morphogenesis2DEnvConfig(EnvConfig):
             NPAError: A field has the wrong type or lies outside its range.
         """
         super().__post_init__()
-        if not isinstance(self.target, str) or not self.target:
-            raise NPAError(
-                f"target must be a built-in name, an emoji or a path, got {self.target!r}: "
-                "for example target='gecko'"
-            )
-        check_positive(self, int, "state_dim", at_least=3)
-        check_positive(self, int, "resolution", at_least=8)
-        check_positive(self, float, "sigma", "seed_radius")
-        check_non_negative(self, "colour_weight")
-        if self.seed_radius >= self.position_limit:
-            raise NPAError(
-                f"seed_radius must be below position_limit = {self.position_limit:g}, got "
-                f"{self.seed_radius}: worlds would begin out of bounds"
-            )
+        _ = self.goal
+        self.check_start_radius(self.seed_radius)
+
+    @property
+    def goal(self) -> Morphogenesis2DConfig:
+        """What the task itself is told."""
+        return self.task_config(Morphogenesis2DConfig, target_point_count=self.particle_count)
 
 
 Config = TypeVar("Config", bound=Morphogenesis2DEnvConfig)
@@ -79,21 +63,7 @@ class PictureTask(EnvTask[Config]):
 
     def __init__(self, config: Config, device: torch.device) -> None:
         super().__init__(config, device)
-        self.goal = Morphogenesis2D(
-            Morphogenesis2DConfig(
-                target=config.target,
-                target_point_count=config.particle_count,
-                particle_count=config.particle_count,
-                state_dim=config.state_dim,
-                eps=config.eps,
-                alpha=config.alpha,
-                seed_radius=config.seed_radius,
-                resolution=config.resolution,
-                sigma=config.sigma,
-                colour_weight=config.colour_weight,
-            ),
-            device=device,
-        )
+        self.goal = Morphogenesis2D(config.goal, device=device)
         """The task with its target and its loss."""
 
     @classmethod

@@ -19,7 +19,7 @@ from npa_envs.errors import NPAError
 from npa_envs.render import turntable_frames
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.checks import check_fraction, check_positive
+from npa_envs.tasks.checks import check_positive
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D, Morphogenesis3DConfig
 from npa_envs.world.randomness import WorldRandom
 
@@ -32,19 +32,17 @@ SEEN_BYTES = 700
 
 @dataclass(frozen=True, kw_only=True)
 class Morphogenesis3DEnvConfig(EnvConfig):
-    """What 3D morphogenesis can be told besides."""
+    """Adds the target, the seed and the views of `Morphogenesis3DConfig`, which explains most."""
+
+    task_config_type = Morphogenesis3DConfig
 
     eps: float = 0.3
-    """Perception radius ε [length units]."""
-
     eps0: float = 0.3
-    """Radius ε0 that perception is scaled to: that of the rules run here [length units]."""
-
     alpha: float = 0.3
-    """Largest displacement in one step, as a fraction of ε (dimensionless)."""
-
-    target: str = "mushroom"
-    """What to grow: a built-in mesh (`npa-envs list`), a mesh file, or a folder of views."""
+    target: str = Morphogenesis3DConfig.target
+    resolution: int = 48
+    sigma: float = 0.06
+    seed_radius: float = 0.6
 
     readout: str = ""
     """Rule whose read-out says how particles look: a shipped one's name or a file; empty: the last
@@ -53,17 +51,8 @@ class Morphogenesis3DEnvConfig(EnvConfig):
     view_count: int = 6
     """Views from all sides that the loss compares, at most."""
 
-    resolution: int = 48
-    """Pixels on each side of a view."""
-
-    sigma: float = 0.06
-    """Standard deviation of a round particle [length units]."""
-
     opacity: float = 0.5
     """Opacity of a particle, in (0, 1); with a read-out, where that is 0."""
-
-    seed_radius: float = 0.6
-    """Radius of the ball that the particles start in [length units]."""
 
     def __post_init__(self) -> None:
         """Check every field.
@@ -72,22 +61,24 @@ class Morphogenesis3DEnvConfig(EnvConfig):
             NPAError: A field has the wrong type or lies outside its range.
         """
         super().__post_init__()
-        for name in ("target", "readout"):
-            value = getattr(self, name)
-            if not isinstance(value, str) or (name == "target" and not value):
-                raise NPAError(
-                    f"{name} must be a name or a path, got {value!r}: for example {name}='mushroom'"
-                )
-        check_positive(self, int, "state_dim", at_least=3)
-        check_positive(self, int, "resolution", at_least=8)
-        check_positive(self, int, "view_count")
-        check_positive(self, float, "sigma", "seed_radius")
-        check_fraction(self, "opacity")
-        if self.seed_radius >= self.position_limit:
+        if not isinstance(self.readout, str):
             raise NPAError(
-                f"seed_radius must be below position_limit = {self.position_limit:g}, got "
-                f"{self.seed_radius}: worlds would begin out of bounds"
+                f"readout must be a name or a path, got {self.readout!r}: "
+                "for example readout='mushroom'"
             )
+        check_positive(self, int, "view_count")
+        _ = self.goal
+        self.check_start_radius(self.seed_radius)
+
+    @property
+    def goal(self) -> Morphogenesis3DConfig:
+        """What the task itself is told; the views compared are held out, none is trained with."""
+        return self.task_config(
+            Morphogenesis3DConfig,
+            training_views=1,
+            held_out_views=self.view_count,
+            ssim_weight=0.0,
+        )
 
 
 class SolidTask(EnvTask[Morphogenesis3DEnvConfig]):
@@ -106,23 +97,7 @@ class SolidTask(EnvTask[Morphogenesis3DEnvConfig]):
 
     def __init__(self, config: Morphogenesis3DEnvConfig, device: torch.device) -> None:
         super().__init__(config, device)
-        goal = Morphogenesis3D(
-            Morphogenesis3DConfig(
-                target=config.target,
-                particle_count=config.particle_count,
-                state_dim=config.state_dim,
-                eps=config.eps,
-                alpha=config.alpha,
-                seed_radius=config.seed_radius,
-                resolution=config.resolution,
-                training_views=1,
-                held_out_views=config.view_count,
-                sigma=config.sigma,
-                opacity=config.opacity,
-                ssim_weight=0.0,
-            ),
-            device=device,
-        )
+        goal = Morphogenesis3D(config.goal, device=device)
         self._rule = _read_out(config, device) if config.readout else None
         self.goal = goal if self._rule is None else goal.for_rule(self._rule)
         """The task with its target and its loss."""

@@ -7,10 +7,161 @@ from __future__ import annotations
 
 from typing import Any
 
-from npa_envs.envs.multi.parallel import MultiSpeciesEnv
-from npa_envs.envs.multi.pettingzoo import aec_env, clipped, register
-from npa_envs.envs.multi.tasks.table import ENVIRONMENTS
+from npa_envs.envs.multi.parallel import CrowdEnv, aec_env, clipped, register
+from npa_envs.envs.multi.tasks import ENVIRONMENTS
 from npa_envs.envs.multi.vector import MultiSpeciesVectorEnv
+
+
+class MultiSpeciesEnv(CrowdEnv):
+    """Species that share one world, each an agent that controls all of its particles.
+
+    ## Description
+
+    A world holds particles of K species in the plane, those of each one after the other. Each
+    particle has a position and a state of C numbers, of which the last three, plus 0.5, are its
+    colour. In every step each agent tells all of its particles where to move and how to change
+    their states.
+
+    Particles perceive each other whatever their species, as in the paper: states and densities
+    around a particle are those of all. So species influence each other only by what they let others
+    perceive, and a species that wants to be told apart has to mark its particles by their states.
+    All of them perceive in one pass over the world.
+
+    | `task` | Id | What it is about |
+    |---|---|---|
+    | `"mixing"` | `npa/Mixing-v0` | species that start side by side are to mix |
+    | `"segregation"` | `npa/Segregation-v0` | species that start all mixed are to part |
+    | `"co_morphogenesis"` | `npa/CoMorphogenesis-v0` | each grows a picture of its own |
+    | `"invasion"` | `npa/Invasion-v0` | species 0 grows a picture, the others keep it from it |
+    | `"symbiosis"` | `npa/Symbiosis-v0` | all grow one picture that takes all particles |
+
+    `parallel_env` has all agents act at once. `env` and `raw_env` have them act in turn, by
+    PettingZoo's own conversion: the world moves on after the last one; `env` also clips actions
+    into their space. The ids are for `pettingzoo.make`, of PettingZoo 1.27 or newer, once
+    `npa_envs.envs.multispecies_v0` is imported: both `"parallel"` and `"aec"` are there. `batched`
+    steps [many worlds at once](../species.md#many-worlds-at-once), to train on.
+
+    A trained rule is a policy for one species:
+    `npa_envs.agents.RulePolicy(npa_envs.load_rule("gecko"))`. Where all species follow the same
+    rule, the episode is its rollout. That species disturb each other can be seen in an invasion by
+    the defaults: after 150 steps of this rule the loss of species 0 was 0.66 beside invaders that
+    did nothing, 0.85 beside some that followed the same rule, and 0.94 beside some that acted at
+    random (means of three seeds).
+
+    ## Observation space
+
+    `Box(-64, 64, (N_k, P), float32)` with P = 4C + 2, for species k: a row for each of its
+    particles, always in the same order. The columns are those of
+    [`npa/Morphogenesis2D-v0`](Morphogenesis2D.md#observation-space). Nothing tells a particle's
+    species.
+
+    With `perception="per_species"` K (1 + D) columns follow: what particles perceive of each
+    species, its density c² ρ_k / N for k = 0, 1, ..., and then, species after species, its density
+    gradient, scaled as that of all is. A species that is gone has zeros there. It takes a second
+    pass over the world. See [several rules in one world](../species.md#telling-species-apart).
+
+    ## Action space
+
+    `Box(-1, 1, (N_k, A), float32)` with A = 2 + C, for species k. The columns, and what they do,
+    are those of [`npa/Morphogenesis2D-v0`](Morphogenesis2D.md#action-space). Every live agent has
+    to give an action, and no other may: see `agents`. What is missing, unwanted, of another shape
+    or not finite raises `NPAError` and leaves the world as it was.
+
+    ## Reward
+
+    Each species k has a loss L_k, and its reward is L_k before the step minus L_k after it.
+
+    | Task | L_k | Parts |
+    |---|---|---|
+    | mixing | 1 less the mean entropy around its particles | `separation` |
+    | segregation | the mean entropy around its particles | `mixture` |
+    | co_morphogenesis | its particles' splat loss against `targets[k]` | `density`, `colour` |
+    | invasion | L_0: the splat loss of species 0; L_k: -L_0 / (K - 1) | `density`, `colour` |
+    | symbiosis | for all: the splat loss of all particles | `density`, `colour` |
+
+    The entropy around a particle is -Σ f_k ln f_k / ln K, where f_k is the share of species k among
+    the SPH-weighted neighbours within ε, itself included: 0 where it sees its own species alone, 1
+    where it sees all in equal parts. K counts the species that there were at the start. The splat
+    loss is that of [`npa/Morphogenesis2D-v0`](Morphogenesis2D.md#reward); it moves a picture's
+    middle onto the target's, so where the whole thing lies does not count.
+
+    With `reward="team"` every live agent is paid the mean of all; the parts in `info` stay its own.
+    In an invasion rewards sum to zero: what species 0 gains, the live invaders lose in equal parts,
+    and "team" is refused.
+
+    Rewards telescope but for deaths: particles that are taken out change the others' losses, which
+    is nobody's merit and not paid. In the step in which a species leaves the world L_k counts as at
+    least its value at the start and what deaths added to it, so that leaving never pays; the parts
+    in `info` are as they are.
+
+    ## Starting state
+
+    Each species is uniform in a disk of radius `seed_radius`, all states are zero. The disks'
+    centres lie in a row along x, `seed_distance` apart, their middle at the origin.
+    `reset(seed=k)` begins the sequence of episodes that belongs to k, and `reset()` goes on with
+    the next one.
+
+    ## Episode end
+
+    | Cause | Ends | Returned as | `info["reason"]` |
+    |---|---|---|---|
+    | a pair of `deaths` names the species and this step | the species | terminated | `"removed"` |
+    | all its particles are out of bounds | the species | terminated | `"left the world"` |
+    | one side of an invasion is gone | all | terminated | `"no opponent"` |
+    | `max_cycles` steps are done | all | truncated | `"time limit"` |
+
+    A particle is out of bounds where a coordinate is held at ±`position_limit` or a state at
+    ±`observation_limit`; while others of its species are not, it stays and may come back. A species
+    that ends is taken out of `agents` and, but for the survivors of an invasion, out of the world:
+    the observations that the others get in that step are already without it, its own last one is
+    with it. No species comes back before `reset`.
+
+    ## Info
+
+    One dict for each agent that acted.
+
+    | Key | In | Value |
+    |---|---|---|
+    | `species` | reset, step | the agent's species, from 0 on |
+    | `loss` | reset, step | L_k as it is now |
+    | `loss_separation`, ... | reset, step | its parts, by their names above |
+    | `reward_separation`, ... | step | how much each part fell in this step |
+    | `reason` | last step | why the agent's episode ended, see above |
+
+    ## State
+
+    `state()` is for central critics: float32, shape [N, 2 + C + 1], a row [position; state; 1] for
+    each particle that the episode began with, zeros for those that are gone. `state_space` is its
+    space. `particles()` returns positions and states of those that are there, and
+    `place_particles(x, s)` replaces them, at no reward.
+
+    ## Rendering
+
+    `render_mode="rgb_array"` makes uint8 pictures of shape [R, R, 3], R = `render_size`, with y up.
+    `render_mode="human"` shows them in a window; it needs `pip install 'npa-envs[human]'` and a
+    screen: without one, it warns once and goes on. With `render_style="species"` each species has a
+    colour of its own; the other styles are those of the single environments.
+
+    ## Arguments
+
+    `task` and `species_count` come first, all else is by keyword, in `parallel_env`, `env`,
+    `raw_env` and `pettingzoo.make` alike. An unknown name, or a value out of range, raises an
+    `NPAError` that says what would be right.
+
+    ## Version history
+
+    - v0: first version.
+
+    Args:
+        task: A name from `npa_envs.envs.multi.TASKS`.
+        config: Fields of the task's configuration.
+
+    Raises:
+        NPAError: A name is unknown, or a value wrong.
+    """
+
+    def __init__(self, task: str = "mixing", **config: Any) -> None:
+        super().__init__(task, config, by_particle=False)
 
 
 def parallel_env(task: str = "mixing", species_count: int = 2, **config: Any) -> MultiSpeciesEnv:
@@ -57,30 +208,12 @@ def batched(
 
 
 def raw_env(task: str = "mixing", species_count: int = 2, **config: Any) -> Any:
-    """Return an environment in which species act in turn, and the world after the last of them.
-
-    Args:
-        task: As for `parallel_env`.
-        species_count: As for `parallel_env`.
-        config: As for `parallel_env`.
-
-    Raises:
-        NPAError: As `parallel_env`.
-    """
+    """Return `parallel_env` with species that act in turn, and the world after the last of them."""
     return aec_env(parallel_env(task, species_count, **config))
 
 
 def env(task: str = "mixing", species_count: int = 2, **config: Any) -> Any:
-    """Return `raw_env` with actions clipped into their spaces.
-
-    Args:
-        task: As for `parallel_env`.
-        species_count: As for `parallel_env`.
-        config: As for `parallel_env`.
-
-    Raises:
-        NPAError: As `parallel_env`.
-    """
+    """Return `raw_env` with actions clipped into their spaces."""
     return clipped(raw_env(task, species_count, **config))
 
 

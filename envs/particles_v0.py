@@ -6,23 +6,123 @@ newer).
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
-from npa_envs.envs.multi.config import plain
-from npa_envs.envs.multi.parallel import ParticlesEnv
-from npa_envs.envs.multi.pettingzoo import aec_env, clipped, register
+from npa_envs.envs.core.config import plain
+from npa_envs.envs.multi.parallel import CrowdEnv, aec_env, clipped, register
+from npa_envs.envs.multi.tasks import ENVIRONMENTS as OF_SPECIES
+from npa_envs.envs.multi.tasks import task_type
+from npa_envs.errors import NPAError
 
-ENVIRONMENTS = {
-    "npa/MixingParticles-v0": "mixing",
-    "npa/SegregationParticles-v0": "segregation",
-    "npa/CoMorphogenesisParticles-v0": "co_morphogenesis",
-    "npa/InvasionParticles-v0": "invasion",
-    "npa/SymbiosisParticles-v0": "symbiosis",
-}
+ENVIRONMENTS = {name.replace("-v0", "Particles-v0"): task for name, task in OF_SPECIES.items()}
 """Tasks by the ids that `pettingzoo.make` takes."""
 
 PARTICLE_COUNT = 64
 """Particles by default."""
+
+LARGEST_CROWD = 512
+"""No more agents than this: each costs a place in five dicts a step."""
+
+
+class ParticlesEnv(CrowdEnv):
+    """Few particles that share one world, each an agent.
+
+    ## Description
+
+    The worlds and tasks of [several species](MultiSpecies.md), with the same seeds and the same
+    physics, but every particle is an agent: `particle_0`, `particle_1`, ... in the order of their
+    species. `info["species"]` tells which one it is of. Each agent costs places in five dicts a
+    step, so there are at most 512; beyond, let species be the agents.
+
+    | `task` | Id |
+    |---|---|
+    | `"mixing"` | `npa/MixingParticles-v0` |
+    | `"segregation"` | `npa/SegregationParticles-v0` |
+    | `"co_morphogenesis"` | `npa/CoMorphogenesisParticles-v0` |
+    | `"invasion"` | `npa/InvasionParticles-v0` |
+    | `"symbiosis"` | `npa/SymbiosisParticles-v0` |
+
+    The ids are for `pettingzoo.make`, of PettingZoo 1.27 or newer, once
+    `npa_envs.envs.particles_v0` is imported.
+
+    ## Observation space
+
+    `Box(-64, 64, (P,), float32)` with P = 4C + 2: one row of what a species would observe.
+
+    ## Action space
+
+    `Box(-1, 1, (A,), float32)` with A = 2 + C: one row of what a species would do.
+
+    ## Reward
+
+    Each particle has a loss of its own, and its reward is how much it fell in the step.
+
+    | Task | Loss of a particle | Part |
+    |---|---|---|
+    | mixing | 1 less the entropy around it | `separation` |
+    | segregation | the entropy around it | `mixture` |
+    | co_morphogenesis | its share of its species' splat loss | `picture` |
+    | invasion | species 0: its share of the splat loss; others: -Σ / their number | `picture` |
+    | symbiosis | its share of the splat loss of all particles | `picture` |
+
+    A share comes from the errors of the pixels that a particle covers; what nobody covers is shared
+    by all alike. The mean of all shares is the splat loss, up to rounding, and Σ is their sum. With
+    `reward="team"` every particle is paid the mean of all. In an invasion rewards sum to zero.
+
+    ## Starting state
+
+    As for [several species](MultiSpecies.md#starting-state).
+
+    ## Episode end
+
+    As for [several species](MultiSpecies.md#episode-end), particle by particle: one that is out of
+    bounds leaves the world alone, and all those of a species that `deaths` names end together.
+
+    ## Info
+
+    | Key | In | Value |
+    |---|---|---|
+    | `species` | reset, step | the particle's species, from 0 on |
+    | `loss` | reset, step | its loss as it is now |
+    | `loss_separation`, ... | reset, step | the same by the name of its part, see above |
+    | `reward_separation`, ... | step | how much that fell in this step |
+    | `reason` | last step | why the particle's episode ended |
+
+    ## State
+
+    As for [several species](MultiSpecies.md#state).
+
+    ## Rendering
+
+    As for [several species](MultiSpecies.md#rendering).
+
+    ## Arguments
+
+    Those of [several species](MultiSpecies.md#arguments), of `npa_envs.envs.particles_v0` instead;
+    `particle_count` is 64 by default and 512 at most.
+
+    ## Version history
+
+    - v0: first version.
+
+    Args:
+        task: A name from `npa_envs.envs.multi.TASKS`.
+        config: Fields of the task's configuration.
+
+    Raises:
+        NPAError: A name is unknown, a value wrong, or there are more than 512 particles.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = CrowdEnv.metadata | {"name": "npa_particles_v0"}
+
+    def __init__(self, task: str = "mixing", **config: Any) -> None:
+        count = sum(task_type(task).config_type.from_keywords(config).counts)
+        if count > LARGEST_CROWD:
+            raise NPAError(
+                f"particle_count must be at most {LARGEST_CROWD} where every particle is an agent, "
+                f"got {count}: make species the agents with npa_envs.envs.multispecies_v0"
+            )
+        super().__init__(task, config, by_particle=True)
 
 
 def parallel_env(task: str = "mixing", species_count: int = 2, **config: Any) -> ParticlesEnv:
@@ -43,30 +143,12 @@ def parallel_env(task: str = "mixing", species_count: int = 2, **config: Any) ->
 
 
 def raw_env(task: str = "mixing", species_count: int = 2, **config: Any) -> Any:
-    """Return an environment in which particles act in turn, and the world after the last of them.
-
-    Args:
-        task: As for `parallel_env`.
-        species_count: As for `parallel_env`.
-        config: As for `parallel_env`.
-
-    Raises:
-        NPAError: As `parallel_env`.
-    """
+    """Return `parallel_env` with particles that act in turn, and the world after the last one."""
     return aec_env(parallel_env(task, species_count, **config))
 
 
 def env(task: str = "mixing", species_count: int = 2, **config: Any) -> Any:
-    """Return `raw_env` with actions clipped into their spaces.
-
-    Args:
-        task: As for `parallel_env`.
-        species_count: As for `parallel_env`.
-        config: As for `parallel_env`.
-
-    Raises:
-        NPAError: As `parallel_env`.
-    """
+    """Return `raw_env` with actions clipped into their spaces."""
     return clipped(raw_env(task, species_count, **config))
 
 

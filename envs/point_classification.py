@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Self
+from typing import Self, get_args
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
-from npa_envs.tasks.checks import check_non_negative, check_positive
+from npa_envs.tasks.checks import check_positive
 from npa_envs.tasks.point_classification import (
     PointClassification,
     PointClassificationConfig,
@@ -30,37 +30,24 @@ from npa_envs.world.randomness import WorldRandom
 
 @dataclass(frozen=True, kw_only=True)
 class PointClassificationEnvConfig(EnvConfig):
-    """What the classification environment can be told besides."""
+    """Adds the clouds and the loss of `PointClassificationConfig`, which explains them."""
 
-    particle_count: int = 512
-    """Particles in a world, N: points of a cloud."""
+    task_config_type = PointClassificationConfig
 
-    data: str = "digits"
-    """The pictures: "digits" (scikit-learn), "mnist" (torchvision), or a folder of IDX files."""
-
-    data_folder: str = "data"
-    """Where torchvision keeps "mnist"."""
+    particle_count: int = PointClassificationConfig.particle_count
+    data: str = PointClassificationConfig.data
+    data_folder: str = PointClassificationConfig.data_folder
+    class_count: int = PointClassificationConfig.class_count
+    rotation: float = PointClassificationConfig.rotation
+    stretch: float = PointClassificationConfig.stretch
+    jitter: float = PointClassificationConfig.jitter
+    overflow_weight: float = PointClassificationConfig.overflow_weight
 
     split: Split = "train"
     """Which pictures: "train" or "test", which are never varied."""
 
-    class_count: int = 10
-    """Classes that there are."""
-
-    rotation: float = 0.0
-    """Clouds are turned by up to this, either way [degrees]."""
-
-    stretch: float = 0.0
-    """Clouds are stretched and sheared by up to this share (dimensionless)."""
-
-    jitter: float = 0.0
-    """Standard deviation of what is added to clouds' coordinates [length units]."""
-
     rule: str = ""
     """Rule whose read-out tells classes from states, a file; empty: the last channels are them."""
-
-    overflow_weight: float = 1.0
-    """Weight of mean |s − clip(s, −1, 1)| in the loss (dimensionless)."""
 
     def __post_init__(self) -> None:
         """Check every field.
@@ -73,13 +60,17 @@ class PointClassificationEnvConfig(EnvConfig):
             raise NPAError(
                 f"boundary must be 'open' for point clouds, got {self.boundary!r}: leave it out"
             )
-        if self.split not in ("train", "test"):
+        if self.split not in get_args(Split):
             raise NPAError(f"split must be 'train' or 'test', got {self.split!r}")
         if not isinstance(self.rule, str):
             raise NPAError(f"rule must be the path of a rule as a string, got {self.rule!r}")
-        check_positive(self, int, "class_count", at_least=2)
+        _ = self.goal
         check_positive(self, int, "state_dim", at_least=3 if self.rule else self.class_count)
-        check_non_negative(self, "overflow_weight")
+
+    @property
+    def goal(self) -> PointClassificationConfig:
+        """What the task itself is told."""
+        return self.task_config(PointClassificationConfig)
 
 
 class _WorldByWorld(NPARule):
@@ -105,22 +96,7 @@ class PointClassificationTask(EnvTask[PointClassificationEnvConfig]):
 
     def __init__(self, config: PointClassificationEnvConfig, device: torch.device) -> None:
         super().__init__(config, device)
-        self.goal = PointClassification(
-            PointClassificationConfig(
-                data=config.data,
-                data_folder=config.data_folder,
-                class_count=config.class_count,
-                rotation=config.rotation,
-                stretch=config.stretch,
-                jitter=config.jitter,
-                particle_count=config.particle_count,
-                state_dim=config.state_dim,
-                eps=config.eps,
-                overflow_weight=config.overflow_weight,
-            ),
-            device=device,
-            split=config.split,
-        )
+        self.goal = PointClassification(config.goal, device=device, split=config.split)
         """The task with its clouds and its loss."""
         if config.rule:
             self.goal = self.goal.for_rule(_read_out_rule(config, device))

@@ -13,8 +13,6 @@ from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import EnvTask
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.errors import NPAError
-from npa_envs.tasks.checks import check_non_negative, check_positive
-from npa_envs.tasks.losses.texture import DEFAULT_LOSS, check_loss_name
 from npa_envs.tasks.texture import Texture, TextureConfig
 from npa_envs.world.randomness import WorldRandom
 
@@ -24,40 +22,23 @@ LOSS_BYTES = 4000
 
 @dataclass(frozen=True, kw_only=True)
 class TextureEnvConfig(EnvConfig):
-    """What the texture environment can be told besides."""
+    """Adds the target and the loss of `TextureConfig`, which explains them."""
 
-    eps: float = 0.2
-    """Perception radius ε [length units]."""
-
-    eps0: float = 0.2
-    """Radius ε0 that perception is scaled to: that of the rules run here [length units]."""
+    task_config_type = TextureConfig
 
     boundary: Boundary = "periodic"
     """A texture has no edge: only "periodic", a box into which positions are wrapped."""
 
+    eps: float = TextureConfig.eps
+    eps0: float = TextureConfig.eps
     target: str = "dots"
-    """The texture: a built-in name (`npa-envs list`), or the path of a picture."""
-
-    target_tiles: bool = False
-    """Whether the opposite edges of a picture file fit together; built-in textures tile."""
-
-    loss: str = DEFAULT_LOSS
-    """How textures are compared: "patch_swd", "filter_swd", or "vgg_ot", which needs weights."""
-
-    vgg_weights: str = ""
-    """File of VGG16's weights for "vgg_ot"; empty: torch's usual folder of downloads."""
-
+    target_tiles: bool = TextureConfig.target_tiles
+    loss: str = TextureConfig.loss
+    vgg_weights: str = TextureConfig.vgg_weights
     resolution: int = 64
-    """Pixels on each side of the picture that the loss compares."""
-
-    sigma: float = 0.7
-    """Standard deviation of a particle's splat, in distances between particles (dimensionless)."""
-
-    colour_weight: float = 1.0
-    """Weight of the loss of the colour image (dimensionless)."""
-
-    density_weight: float = 1.0
-    """Weight of the loss of the density image (dimensionless)."""
+    sigma: float = TextureConfig.sigma
+    colour_weight: float = TextureConfig.colour_weight
+    density_weight: float = TextureConfig.density_weight
 
     def __post_init__(self) -> None:
         """Check every field.
@@ -70,16 +51,12 @@ class TextureEnvConfig(EnvConfig):
             raise NPAError(
                 f"boundary must be 'periodic' for textures, got {self.boundary!r}: leave it out"
             )
-        if not isinstance(self.target, str) or not self.target:
-            raise NPAError(
-                f"target must be a built-in texture or a path, got {self.target!r}: "
-                "for example target='dots'"
-            )
-        check_loss_name(self.loss)
-        check_positive(self, int, "state_dim", at_least=3)
-        check_positive(self, int, "resolution", at_least=12)
-        check_positive(self, float, "sigma")
-        check_non_negative(self, "colour_weight", "density_weight")
+        _ = self.goal
+
+    @property
+    def goal(self) -> TextureConfig:
+        """What the task itself is told."""
+        return self.task_config(TextureConfig)
 
 
 class TextureTask(EnvTask[TextureEnvConfig]):
@@ -97,24 +74,7 @@ class TextureTask(EnvTask[TextureEnvConfig]):
 
     def __init__(self, config: TextureEnvConfig, device: torch.device) -> None:
         super().__init__(config, device)
-        self.goal = Texture(
-            TextureConfig(
-                target=config.target,
-                target_tiles=config.target_tiles,
-                loss=config.loss,
-                vgg_weights=config.vgg_weights,
-                particle_count=config.particle_count,
-                state_dim=config.state_dim,
-                eps=config.eps,
-                alpha=config.alpha,
-                box_size=config.box_size,
-                resolution=config.resolution,
-                sigma=config.sigma,
-                colour_weight=config.colour_weight,
-                density_weight=config.density_weight,
-            ),
-            device=device,
-        )
+        self.goal = Texture(config.goal, device=device)
         """The task with its target and its loss."""
 
     @classmethod

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from npa_envs.envs import multispecies_v0
-from npa_envs.envs.multi.parallel import MultiSpeciesEnv
+from npa_envs.envs.multispecies_v0 import MultiSpeciesEnv
 from npa_envs.tasks import morphogenesis2d
 
 TASKS = ("mixing", "segregation", "co_morphogenesis", "invasion", "symbiosis")

@@ -15,8 +15,7 @@ from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Progress, annealed
 from npa_envs.agents.learning.rules import RuleSet, starting_rules
 from npa_envs.envs.core.task import EnvTask
-from npa_envs.envs.multi.config import SpeciesConfig
-from npa_envs.envs.multi.task import Population, SpeciesTask
+from npa_envs.envs.multi.task import Population, SpeciesConfig, SpeciesTask
 from npa_envs.errors import NPAError
 from npa_envs.rule.rule import FoldedRule, NPARule
 from npa_envs.tasks.base import Task

@@ -26,7 +26,7 @@ from npa_envs.agents.learning.ppo_common import (
 from npa_envs.agents.learning.problem import WORLDS_PER_SEED, Problem, world_seeds
 from npa_envs.agents.learning.progress import Budget, Progress
 from npa_envs.agents.learning.rules import RuleSet
-from npa_envs.envs.core.worlds import free_bytes, needed_bytes
+from npa_envs.envs.core.memory import free_bytes, needed_bytes
 from npa_envs.errors import NPAError
 from npa_envs.tasks.checks import check_non_negative, check_positive
 from npa_envs.world.cuda_graph import Replayed

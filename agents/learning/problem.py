@@ -26,10 +26,9 @@ from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.task import EnvTask
 from npa_envs.envs.core.vector import NPAVectorEnv, worlds_to_reset
 from npa_envs.envs.core.worlds import make_physics
-from npa_envs.envs.multi.config import SpeciesConfig
-from npa_envs.envs.multi.task import SpeciesTask
-from npa_envs.envs.multi.tasks.table import ENVIRONMENTS as SPECIES
-from npa_envs.envs.multi.tasks.table import task_type as species_task_type
+from npa_envs.envs.multi.task import SpeciesConfig, SpeciesTask
+from npa_envs.envs.multi.tasks import ENVIRONMENTS as SPECIES
+from npa_envs.envs.multi.tasks import task_type as species_task_type
 from npa_envs.envs.multi.vector import MultiSpeciesVectorEnv
 from npa_envs.errors import NPAError, suggest
 from npa_envs.registration import ENVIRONMENTS
@@ -162,11 +161,7 @@ class Problem:
     @property
     def physics(self) -> Physics:
         """The worlds' constants."""
-        config = self.config
-        if isinstance(config, SpeciesConfig):
-            return make_physics(config.world, EnvTask)
-        task_type: Any = self.task_type
-        return make_physics(config, task_type)
+        return make_physics(self.config, self.task_type)
 
     @property
     def interface(self) -> Interface:

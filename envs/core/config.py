@@ -1,12 +1,14 @@
-"""What every environment can be told: flat keywords of `gym.make`, checked before all else."""
+"""Configurations of environments: flat keywords of `gym.make`, checked before all else."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
-from typing import Any, Literal, Self
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar, Literal, Self, TypeVar, get_args
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from npa_envs.devices import check_device
 from npa_envs.errors import NPAError, suggest
@@ -25,39 +27,38 @@ Reward = Literal["dense", "sparse", "particle"]
 Output = Literal["numpy", "torch"]
 OnDivergence = Literal["terminate", "reset", "raise", "ignore"]
 
-CHOICES = {
-    "moment_inverse": ("threshold", "smooth"),
-    "boundary": ("open", "periodic"),
-    "reward": ("dense", "sparse", "particle"),
-    "output": ("numpy", "torch"),
-    "on_divergence": ("terminate", "reset", "raise", "ignore"),
-    "render_mode": (None, "rgb_array", "human"),
-    "render_style": STYLES,
-}
-"""Fields that take one of a few words."""
-
-ELSEWHERE = {
-    "seed": "give it to reset(seed=...)",
-    "num_envs": "many worlds at once are made by gymnasium.make_vec",
-    "autoreset_mode": "it is for make_vec(..., vectorization_mode='vector_entry_point'); "
-    "Gymnasium's own vector environments take it in vector_kwargs",
-}
-"""Names that belong to something else, and where they are said."""
-
 LARGEST = 1e9
 """No number of a configuration is larger: products of them stay finite in float32."""
-
 
 LARGEST_RATIO = 1e7
 """Perception is not scaled by more: its fourth power is a number of float32."""
 
+TaskConfig = TypeVar("TaskConfig")
+
 
 @dataclass(frozen=True, kw_only=True)
-class EnvConfig:
-    """The fields that all environments share; a task adds its own.
+class WorldConfig:
+    """The fields that all environments have, whether one species lives in a world or several.
 
     Lengths are in length units: pictures show [-1, 1] x [-1, 1].
     """
+
+    words: ClassVar[Mapping[str, tuple[str | None, ...]]] = {
+        "moment_inverse": get_args(MomentInverse),
+        "boundary": get_args(Boundary),
+        "output": get_args(Output),
+        "render_mode": (None, "rgb_array", "human"),
+    }
+    """Fields that take one of a few words."""
+
+    elsewhere: ClassVar[Mapping[str, str]] = {"seed": "give it to reset(seed=...)"}
+    """Names that belong to something else, and where they are said."""
+
+    taken_by_make: ClassVar[tuple[str, ...]] = ()
+    """Keywords that are no fields, as Gymnasium itself takes them."""
+
+    task_config_type: ClassVar[type | None] = None
+    """Configuration of a task in `npa_envs.tasks` that explains the fields without a docstring."""
 
     particle_count: int = 1024
     """Particles in a world, N."""
@@ -97,29 +98,11 @@ class EnvConfig:
     """Side of the periodic box around the origin [length units]."""
 
     observation_limit: float = 64.0
-    """Observations are clipped to ± this; a state beyond it has diverged (dimensionless)."""
+    """Observations and states are clipped to ± this; a particle held there has diverged
+    (dimensionless)."""
 
     position_limit: float = 4.0
-    """A particle with a coordinate beyond ± this has diverged [length units]."""
-
-    on_divergence: OnDivergence = "terminate"
-    """What becomes of a world that diverges, besides `info["diverged"]`: "terminate" ends its
-    episode; "reset" starts it anew within the episode; "raise" is an error that names the particle;
-    "ignore" goes on with its numbers held at the limits."""
-
-    reward: Reward = "dense"
-    """"dense": each step's improvement of the loss; "sparse": minus the loss at the episode's end;
-    "particle": as dense, with each particle's own share in `info["particle_reward"]`."""
-
-    episode_steps: int = 256
-    """Length of an episode where reward is "sparse", which a single environment cannot know from
-    `max_episode_steps`: change both together. Vector environments know it."""
-
-    success_loss: float | None = None
-    """The episode ends in success once the loss is at most this; None: the task's own choice."""
-
-    seed_pool: int = 0
-    """Episodes start from one of so many worlds, made once; 0: from a fresh one each time."""
+    """Coordinates are clipped to ± this; a particle held there has diverged [length units]."""
 
     device: str = "cpu"
     """Where the worlds live: "cpu", "cuda" or "cuda:1"."""
@@ -143,30 +126,13 @@ class EnvConfig:
             NPAError: A field has the wrong type or lies outside its range, or this machine does not
                 have the device.
         """
-        check_positive(self, int, "particle_count", "state_dim", "episode_steps")
+        check_positive(self, int, "particle_count", "state_dim")
         check_positive(self, int, "render_size", at_least=8)
-        check_positive(
-            self,
-            float,
-            "eps",
-            "eps0",
-            "alpha",
-            "state_scale",
-            "dt",
-            "box_size",
-            "observation_limit",
-            "position_limit",
-        )
+        check_positive(self, float, "eps", "eps0", "alpha", "state_scale", "dt", "box_size")
+        check_positive(self, float, "observation_limit", "position_limit")
         check_fraction(self, "update_prob")
         check_non_negative(self, "position_noise")
-        if self.success_loss is not None:
-            check_non_negative(self, "success_loss")
-        if not is_whole(self.seed_pool) or self.seed_pool < 0:
-            raise NPAError(
-                f"seed_pool must be a whole number of at least 0, got {self.seed_pool!r}: "
-                "0 makes a fresh start for each episode"
-            )
-        for name, words in CHOICES.items():
+        for name, words in self.words.items():
             value = getattr(self, name)
             if value not in words:
                 known = [word for word in words if word is not None]
@@ -215,23 +181,117 @@ class EnvConfig:
         """Return the configuration with some fields changed.
 
         Args:
-            keywords: Fields by name.
+            keywords: Fields by name; numbers of NumPy are taken for Python's, lists for tuples.
 
         Raises:
             NPAError: There is no field of that name, or a field is wrong.
         """
         known = [field.name for field in fields(cls)]
         for name in keywords:
-            if name in ELSEWHERE:
-                raise NPAError(f"unknown keyword {name!r}: {ELSEWHERE[name]}")
             if name not in known:
-                near = suggest(name, [*known, "max_episode_steps"])
-                raise NPAError(f"unknown keyword {name!r}: {near}")
-        if "episode_steps" in keywords and keywords.get("reward") != "sparse":
+                hint = cls.elsewhere.get(name) or suggest(name, [*known, *cls.taken_by_make])
+                raise NPAError(f"unknown keyword {name!r}: {hint}")
+        return cls(**{name: plain(value) for name, value in keywords.items()})
+
+    def task_config(self, config_type: type[TaskConfig], **changes: Any) -> TaskConfig:
+        """Return a task's own configuration, with all fields that the environment has as well.
+
+        It checks them: so each field is explained, and checked, once.
+
+        Args:
+            config_type: A dataclass of `npa_envs.tasks`.
+            changes: Fields that are called, or valued, otherwise.
+
+        Raises:
+            NPAError: A field is wrong.
+        """
+        names = [field.name for field in fields(config_type)]  # type: ignore[arg-type]
+        shared = {name: getattr(self, name) for name in names if hasattr(self, name)}
+        return config_type(**(shared | changes))
+
+    def check_start_radius(self, radius: float) -> None:
+        """Check that particles that start within a radius are not out of bounds at once."""
+        if radius >= self.position_limit:
+            raise NPAError(
+                f"seed_radius must be below position_limit = {self.position_limit:g}, got "
+                f"{radius}: worlds would begin out of bounds"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class EnvConfig(WorldConfig):
+    """The fields that all environments of one species have; a task adds its own."""
+
+    words = WorldConfig.words | {
+        "reward": get_args(Reward),
+        "on_divergence": get_args(OnDivergence),
+        "render_style": STYLES,
+    }
+
+    elsewhere = WorldConfig.elsewhere | {
+        "num_envs": "many worlds at once are made by gymnasium.make_vec",
+        "autoreset_mode": "it is for make_vec(..., vectorization_mode='vector_entry_point'); "
+        "Gymnasium's own vector environments take it in vector_kwargs",
+    }
+
+    taken_by_make = ("max_episode_steps",)
+
+    on_divergence: OnDivergence = "terminate"
+    """What becomes of a world that diverges, besides `info["diverged"]`: "terminate" ends its
+    episode; "reset" starts it anew within the episode; "raise" is an error that names the particle;
+    "ignore" goes on with its numbers held at the limits."""
+
+    reward: Reward = "dense"
+    """"dense": each step's improvement of the loss; "sparse": minus the loss at the episode's end;
+    "particle": as dense, with each particle's own share in `info["particle_reward"]`."""
+
+    episode_steps: int = 256
+    """Length of an episode where reward is "sparse", which a single environment cannot know from
+    `max_episode_steps`: change both together. Vector environments know it."""
+
+    success_loss: float | None = None
+    """The episode ends in success once the loss is at most this; None: the task's own choice."""
+
+    seed_pool: int = 0
+    """Episodes start from one of so many worlds, made once; 0: from a fresh one each time."""
+
+    def __post_init__(self) -> None:
+        """Check every field.
+
+        Raises:
+            NPAError: A field has the wrong type or lies outside its range, or this machine does not
+                have the device.
+        """
+        super().__post_init__()
+        check_positive(self, int, "episode_steps")
+        if self.success_loss is not None:
+            check_non_negative(self, "success_loss")
+        if not is_whole(self.seed_pool) or self.seed_pool < 0:
+            raise NPAError(
+                f"seed_pool must be a whole number of at least 0, got {self.seed_pool!r}: "
+                "0 makes a fresh start for each episode"
+            )
+
+    @classmethod
+    def from_keywords(cls, keywords: dict[str, Any]) -> Self:
+        """As `WorldConfig.from_keywords`; refuses `episode_steps` where it would do nothing."""
+        made = super().from_keywords(keywords)
+        if "episode_steps" in keywords and made.reward != "sparse":
             raise NPAError(
                 "episode_steps serves reward='sparse' alone: for longer or shorter episodes give "
                 "max_episode_steps"
             )
-        # Sweeps give NumPy's numbers.
-        plain = {k: v.item() if isinstance(v, np.generic) else v for k, v in keywords.items()}
-        return replace(cls(), **plain)
+        return made
+
+
+def plain(value: Any) -> Any:
+    """Return a value as fields have it: NumPy's numbers as Python's, lists and arrays as tuples.
+
+    Args:
+        value: Of any type; others are left as they are.
+    """
+    if isinstance(value, np.generic | np.ndarray | Tensor):
+        value = value.tolist()
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return tuple(plain(entry) for entry in value)
+    return value

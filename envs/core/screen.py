@@ -1,73 +1,43 @@
-"""Pictures of an environment's worlds, and the window that shows them side by side."""
+"""The window that shows worlds side by side, and what `render` returns."""
 
 from __future__ import annotations
 
 import math
-from typing import Any, Protocol
+from typing import Protocol
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from npa_envs.envs.core.worlds import Worlds
+from npa_envs.envs.core.config import WorldConfig
 from npa_envs.render import Window
 
 SHOWN_ACROSS = 4
 """A window shows at most so many worlds side by side."""
 
 
-class View(Protocol):
+class Drawn(Protocol):
     """Worlds that can be drawn."""
-
-    config: Any
-    """The environment's configuration."""
 
     world_count: int
     """Worlds B."""
 
     def pictures(self, count: int) -> NDArray[np.uint8]:
-        """Return pictures of the first worlds, uint8, shape [count, R, R, 3].
-
-        Args:
-            count: How many.
-        """
-
-
-class WorldsView:
-    """Worlds of one task as they are drawn.
-
-    Args:
-        worlds: The worlds.
-    """
-
-    def __init__(self, worlds: Worlds) -> None:
-        self._worlds = worlds
-        self.config = worlds.task.config
-        self.world_count = worlds.world_count
-
-    def pictures(self, count: int) -> NDArray[np.uint8]:
-        """Return pictures of the first worlds, uint8, shape [count, R, R, 3].
-
-        Args:
-            count: How many.
-        """
-        worlds = self._worlds
-        steps = worlds.elapsed[:count].cpu().numpy()
-        pictures: NDArray[np.uint8] = worlds.task.draw(worlds.x[:count], worlds.s[:count], steps)
-        return pictures
+        """Return pictures of the first worlds, uint8, shape [count, R, R, 3]."""
 
 
 class Screen:
     """What `render` of an environment returns or shows.
 
     Args:
-        view: The environment's worlds.
+        worlds: The environment's worlds.
+        config: The environment's configuration.
         fps: Most frames a second that the window shows.
     """
 
-    def __init__(self, view: View, fps: float) -> None:
-        self._view = view
-        self._config = view.config
+    def __init__(self, worlds: Drawn, config: WorldConfig, fps: float) -> None:
+        self._worlds = worlds
+        self._config = config
         self._fps = fps
         self._window: Window | None = None
 
@@ -81,7 +51,7 @@ class Screen:
         # A window already shows the worlds as they are.
         if self._config.render_mode != "rgb_array":
             return None
-        return self._view.pictures(self._view.world_count)
+        return self._worlds.pictures(self._worlds.world_count)
 
     def show(self, title: str) -> None:
         """Show the worlds as they are, the first ones where they are many; only if "human".
@@ -91,11 +61,11 @@ class Screen:
         """
         if self._config.render_mode != "human":
             return
-        count, size = self._view.world_count, self._config.render_size
+        count, size = self._worlds.world_count, self._config.render_size
         across = min(math.ceil(math.sqrt(count)), SHOWN_ACROSS)
         shown = min(count, across * across)
         frame = np.full((across * across, size, size, 3), 255, np.uint8)
-        frame[:shown] = self._view.pictures(shown)
+        frame[:shown] = self._worlds.pictures(shown)
         frame = frame.reshape(across, across, size, size, 3).swapaxes(1, 2)
         if self._window is None:
             self._window = Window(title, across * size, fps=self._fps)

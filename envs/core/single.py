@@ -11,12 +11,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.envs.core.divergence import guarded
-from npa_envs.envs.core.report import DIVERGED, SUCCESS, reason
-from npa_envs.envs.core.screen import Screen, WorldsView
+from npa_envs.envs.core.screen import Screen
 from npa_envs.envs.core.spaces import (
     action_space,
-    checked_action,
+    action_tensor,
     checked_particles,
     number_tensor,
     observation_space,
@@ -24,7 +22,7 @@ from npa_envs.envs.core.spaces import (
 )
 from npa_envs.envs.core.task import EnvTask
 from npa_envs.envs.core.vector import world_keys
-from npa_envs.envs.core.worlds import Worlds
+from npa_envs.envs.core.worlds import DIVERGED, SUCCESS, Worlds, reason
 from npa_envs.errors import NPAError
 
 
@@ -58,7 +56,7 @@ class NPAEnv(gymnasium.Env[Any, Any]):
         self._started = False
         self._unpaid_steps = 0
         self._warned = False
-        self._screen = Screen(WorldsView(self.worlds), self.metadata["render_fps"])
+        self._screen = Screen(self.worlds, self.config, self.metadata["render_fps"])
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -109,13 +107,12 @@ class NPAEnv(gymnasium.Env[Any, Any]):
         if not self._started:
             raise NPAError("step needs a world: call reset first")
         worlds, config = self.worlds, self.config
-        checked = checked_action(
-            action, (1, config.particle_count, worlds.physics.action_dim), False
-        )
+        shape = (config.particle_count, worlds.physics.action_dim)
+        checked = action_tensor("action", action, shape, "env.action_space", "[N, A] = ")
         with worlds.here():
-            endings, observation = worlds.step(checked)
+            endings, observation = worlds.step(checked[None])
             diverged = bool(endings[0] & DIVERGED)
-            ending = int(guarded(worlds, endings, observation)[0])
+            ending = int(worlds.guarded(endings, observation)[0])
         ended = ending & (SUCCESS | DIVERGED) != 0
         names, numbers = worlds.part_names, worlds.report.numbers[:, 0].tolist()
         info = self._losses(numbers)

@@ -1,4 +1,4 @@
-"""Observation and action spaces, by the numbers of a world."""
+"""Spaces of environments, and arrays in and out: NumPy or torch outside, float32 tensors inside."""
 
 from __future__ import annotations
 
@@ -35,9 +35,6 @@ def action_space(physics: Physics, particle_count: int) -> Box:
     return Box(-1.0, 1.0, (particle_count, physics.action_dim), np.float32)
 
 
-# Arrays in and out: NumPy or torch on the outside, float32 tensors on the device inside.
-
-
 def to_output(tensor: Tensor, output: str) -> Any:
     """Return a tensor as it is handed out.
 
@@ -48,43 +45,39 @@ def to_output(tensor: Tensor, output: str) -> Any:
     return tensor if output == "torch" else tensor.cpu().numpy()
 
 
-def checked_action(action: Any, shape: tuple[int, ...], batched: bool) -> Tensor:
-    """Return an action as a float32 tensor of shape [B, N, A], on the device where it came from.
+def action_tensor(
+    name: str, action: Any, wanted: tuple[int, ...], space: str, letters: str = ""
+) -> Tensor:
+    """Return an action as a float32 tensor, on the device where it came from.
 
     Args:
+        name: What the caller calls it.
         action: An array or tensor.
-        shape: B, N and A.
-        batched: Whether the caller gives the first dimension.
+        wanted: Its shape.
+        space: Where the caller can look up what it has to be.
+        letters: The shape in letters, and " = ".
 
     Raises:
         NPAError: It is no array of numbers, or has another shape.
     """
-    wanted = shape if batched else shape[1:]
-    letters = "[B, N, A]" if batched else "[N, A]"
+    came = ""
     if not isinstance(action, Tensor):
         try:
             if np.iscomplexobj(action):
                 raise TypeError("complex numbers")
             # Torch cannot read what may not be written.
             action = torch.from_numpy(np.require(action, np.float32, ("C", "W")))
-        except (TypeError, ValueError) as error:
-            raise NPAError(
-                f"action must be an array of numbers of shape {letters} = {wanted}, "
-                f"got {type(action).__name__}: see env.action_space"
-            ) from error
-    if tuple(action.shape) != wanted:
+        except (TypeError, ValueError):
+            came = type(action).__name__
+    if not came and (tuple(action.shape) != wanted or action.dtype.is_complex):
+        came = f"{tuple(action.shape)} of {action.dtype}"
+    elif not came and (action.layout != torch.strided or action.is_meta):
+        came = f"a tensor that is {action.layout} on {action.device}"
+    if came:
         raise NPAError(
-            f"action must have shape {letters} = {wanted}, got {tuple(action.shape)}: "
-            "see env.action_space"
+            f"{name} must be real numbers of shape {letters}{wanted}, got {came}: see {space}"
         )
-    if action.dtype.is_complex:
-        raise NPAError(f"action must be an array of numbers that are real, got {action.dtype}")
-    if action.layout != torch.strided or action.device.type == "meta":
-        raise NPAError(
-            f"action must be a dense array of numbers, got {action.layout} on {action.device}: "
-            "convert it with action.to_dense()"
-        )
-    checked: Tensor = action.detach().to(torch.float32).view(shape)
+    checked: Tensor = action.detach().to(torch.float32)
     return checked
 
 

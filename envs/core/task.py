@@ -1,4 +1,4 @@
-"""What an environment asks of its task: where worlds start, and how far they are from the goal."""
+"""Tasks as environments see them: where worlds start, and how far they are from the goal."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.envs.core.config import EnvConfig
+from npa_envs.envs.core.config import EnvConfig, WorldConfig
 from npa_envs.errors import NPAError
 from npa_envs.render import draw_worlds
 from npa_envs.world.randomness import Purpose, WorldRandom
 
+AnyConfig = TypeVar("AnyConfig", bound=WorldConfig)
 Config = TypeVar("Config", bound=EnvConfig)
 
 SHARPNESS = 0.7
@@ -40,7 +41,68 @@ class Start(NamedTuple):
     """What each world is to come to, int64, shape [B], where worlds differ in that."""
 
 
-class EnvTask(Generic[Config]):
+class WorldTask(Generic[AnyConfig]):
+    """What tasks of one species and of several have in common: constants and pictures.
+
+    Args:
+        config: The environment's configuration.
+        device: Where the worlds live.
+    """
+
+    config_type: ClassVar[type[WorldConfig]] = WorldConfig
+    """The configuration's class: its fields are the environment's keywords."""
+
+    space_dim: ClassVar[int] = 2
+    """Space dimension D."""
+
+    static: ClassVar[bool] = False
+    """Whether particles stay where they are; actions are then state steps alone."""
+
+    def __init__(self, config: AnyConfig, device: torch.device) -> None:
+        self.config = config
+        self.device = device
+
+    @property
+    def pixel_size(self) -> float:
+        """Size of a particle in pictures [length units]."""
+        raise NotImplementedError
+
+    @property
+    def open_half_width(self) -> float:
+        """From the middle of a picture to its edge in open space; 1 at least [length units]."""
+        return 1.0
+
+    @property
+    def half_width(self) -> float:
+        """From the middle of a picture to its edge [length units]."""
+        box = self.config.box
+        return max(1.0, self.open_half_width if box is None else 0.5 * box)
+
+    def draw_particles(
+        self, x: Tensor, s: Tensor, style: str, azimuth: float = 0.0
+    ) -> NDArray[np.uint8]:
+        """Return a picture of each world, shape [B, R, R, 3].
+
+        Args:
+            x: Positions [length units], shape [B, N, D].
+            s: States, dimensionless, shape [B, N, C].
+            style: "particles", "density" or "states".
+            azimuth: Where the camera of 3D worlds stands [degrees].
+        """
+        return draw_worlds(
+            x,
+            s,
+            style=style,
+            resolution=self.config.render_size,
+            pixel_size=self.pixel_size,
+            sigma=SHARPNESS,
+            half_width=self.half_width,
+            periodic=self.space_dim == 2 and (self.config.box or 0.0) >= 2.0,
+            azimuth=azimuth,
+        )
+
+
+class EnvTask(WorldTask[Config]):
     """One task as environments see it; subclass it, and name the subclass in an `NPAEnv`.
 
     `seed` and `losses` are all that a task must have. None of the methods may wait for the device
@@ -53,17 +115,9 @@ class EnvTask(Generic[Config]):
     """
 
     config_type: ClassVar[type[EnvConfig]] = EnvConfig
-    """The configuration's class: its fields are the keywords of `gym.make`."""
-
-    space_dim: ClassVar[int] = 2
-    """Space dimension D."""
-
-    static: ClassVar[bool] = False
-    """Whether particles stay where they are; actions are then state steps alone."""
 
     def __init__(self, config: Config, device: torch.device) -> None:
-        self.config = config
-        self.device = device
+        super().__init__(config, device)
         self._pool: Start | None = None
 
     @classmethod
@@ -142,7 +196,10 @@ class EnvTask(Generic[Config]):
             chosen = random.integers(self.config.seed_pool, 1)[:, 0]
             goal = None if pool.goal is None else pool.goal[chosen]
             start = Start(pool.x[chosen], pool.s[chosen], goal=goal)
-        return start._replace(success_loss=self._constant_success(len(start.x)))
+        threshold, success = self.config.success_loss, None
+        if threshold is not None:
+            success = torch.full((len(start.x),), threshold, device=self.device)
+        return start._replace(success_loss=success)
 
     def pool(self) -> Start:
         """Return the worlds that episodes start from, made when first asked for."""
@@ -160,32 +217,18 @@ class EnvTask(Generic[Config]):
             s: States, dimensionless, shape [B, N, C].
             steps: Steps since each episode's start, shape [B].
         """
-        # All 2D worlds at once; in 3D each is seen from an angle of its own.
-        batches = [slice(None)] if self.space_dim == 2 else [slice(k, k + 1) for k in range(len(x))]
-        pictures = [
-            draw_worlds(
-                x[batch],
-                s[batch],
-                style=self.config.render_style,
-                resolution=self.config.render_size,
-                pixel_size=self.pixel_size,
-                sigma=SHARPNESS,
-                half_width=max(1.0, 0.5 * (self.config.box or 0.0)),
-                periodic=self.space_dim == 2 and (self.config.box or 0.0) >= 2.0,
-                azimuth=TURN * float(steps[batch][0]),
-            )
-            for batch in batches
+        style = self.config.render_style
+        if self.space_dim == 2:
+            return self.draw_particles(x, s, style)
+        # Each is seen from an angle of its own.
+        angles = TURN * steps.astype(float)
+        seen = [
+            self.draw_particles(x[k : k + 1], s[k : k + 1], style, a) for k, a in enumerate(angles)
         ]
-        return np.concatenate(pictures)
+        return np.concatenate(seen)
 
     @property
     def pixel_size(self) -> float:
         """Size of a particle in pictures: their distance where N fill the unit disk or ball."""
         volume = np.pi if self.space_dim == 2 else 4.0 * np.pi / 3.0
         return float((volume / self.config.particle_count) ** (1.0 / self.space_dim))
-
-    def _constant_success(self, world_count: int) -> Tensor | None:
-        threshold = self.config.success_loss
-        if threshold is None:
-            return None
-        return torch.full((world_count,), threshold, device=self.device)

@@ -15,18 +15,16 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.envs.core.divergence import guarded
-from npa_envs.envs.core.report import FLAGS, TIME_LIMIT, reason
-from npa_envs.envs.core.screen import Screen, WorldsView
+from npa_envs.envs.core.screen import Screen
 from npa_envs.envs.core.spaces import (
     action_space,
-    checked_action,
+    action_tensor,
     checked_particles,
     observation_space,
     to_output,
 )
 from npa_envs.envs.core.task import EnvTask
-from npa_envs.envs.core.worlds import Worlds
+from npa_envs.envs.core.worlds import FLAGS, TIME_LIMIT, Worlds, reason
 from npa_envs.errors import NPAError, suggest
 from npa_envs.tasks.checks import is_whole
 from npa_envs.world.cuda_graph import sent
@@ -205,7 +203,7 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
         self._started = False
         self._buffer: Tensor | None = None
         self._ended = np.zeros(num_envs, dtype=bool)
-        self._screen = Screen(WorldsView(self.worlds), self.metadata["render_fps"])
+        self._screen = Screen(self.worlds, self.config, self.metadata["render_fps"])
 
     @cached_property
     def observation_space(self) -> Space[Any]:  # type: ignore[override]
@@ -278,7 +276,7 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
         if not self._started:
             raise NPAError("step needs worlds: call reset first")
         shape = (self.num_envs, self.config.particle_count, self.worlds.physics.action_dim)
-        action = checked_action(actions, shape, batched=True)
+        action = action_tensor("action", actions, shape, "env.action_space", "[B, N, A] = ")
         with self.worlds.here():
             return self._step(action)
 
@@ -297,7 +295,7 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
         stepped = None
         if restarting:
             stepped, endings = ~over, np.where(over, 0, endings)
-        endings = guarded(self.worlds, endings, observation)
+        endings = self.worlds.guarded(endings, observation)
         if restarting:
             self.worlds.restart(np.flatnonzero(over), observation)
         ended = endings != 0

@@ -1,184 +1,35 @@
-"""Whether worlds fit into memory, asked before anything is allocated."""
+"""The batch of worlds behind every environment: steps, losses, endings, restarts.
+
+Gymnasium is not known here. A single environment is a batch of one; world k of a batch is, bit for
+bit, that world alone.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import os
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.envs.core.config import EnvConfig
-from npa_envs.envs.core.report import DIVERGED, SUCCESS, TIME_LIMIT, Report
-from npa_envs.envs.core.task import EnvTask, Start
-from npa_envs.errors import DivergedError, NPAError
+from npa_envs.envs.core.config import EnvConfig, WorldConfig
+from npa_envs.envs.core.memory import check_memory
+from npa_envs.envs.core.task import EnvTask, Start, WorldTask
+from npa_envs.errors import DivergedError
 from npa_envs.world.actions import Actions, Physics, SurveyedWorlds, survey_worlds
 from npa_envs.world.cuda_graph import Beside, Replayed, WeakFunction, sent
+from npa_envs.world.divergence import LARGEST_REPORT, term_name
 from npa_envs.world.randomness import WorldRandom
 
-OBSERVATION_COPIES = 4
-"""Observations alive at once: the rows, the arrays handed out, the last ones, one to spare."""
+SUCCESS, DIVERGED, TIME_LIMIT = 1, 2, 4
+"""Bits of an ending: why an episode is over; none is set while it runs."""
 
-LARGEST_INDEX = 2**31 - 1
-"""Kernels index the particles' states with 32 bits."""
-
-
-LISTED_BYTES = 320
-"""What CUDA keeps of a particle's neighbours, at most: a list of 128, and what is sorted."""
-
-RECORDED_STARTS = 4 / 3
-"""Particles of all recorded restarts together, which have lists of their own, to those of a batch:
-1 + 1/4 + 1/16 + ..."""
-
-
-def needed_bytes(
-    world_count: int, particle_count: int, physics: Physics, device: torch.device
-) -> int:
-    """Return about how much memory worlds take while they are stepped [bytes]."""
-    particles = world_count * particle_count
-    worlds = 6 * (physics.space_dim + physics.state_dim)
-    numbers = OBSERVATION_COPIES * physics.perception_dim + 2 * physics.action_dim + worlds + 16
-    listed = LISTED_BYTES * (1.0 + RECORDED_STARTS) if device.type == "cuda" else 0.0
-    return int(particles * (4 * numbers + listed))
-
-
-def free_bytes(device: torch.device) -> int | None:
-    """Return the memory that is free on a device [bytes], or None where nobody says."""
-    if device.type == "cuda":
-        free, _ = torch.cuda.mem_get_info(device)
-        cached = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
-        return int(free) + cached
-    try:
-        for line in Path("/proc/meminfo").read_text().splitlines():
-            if line.startswith("MemAvailable:"):
-                return int(line.split()[1]) * 1024
-    except (OSError, ValueError, IndexError):
-        pass
-    try:
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, ValueError, OSError):
-        return None
-
-
-def check_memory(
-    world_count: int,
-    particle_count: int,
-    physics: Physics,
-    device: torch.device,
-    extra_bytes: int = 0,
-) -> None:
-    """Check that worlds fit into a device's memory and into the kernels' indices.
-
-    Args:
-        world_count: Worlds B.
-        particle_count: Particles in each, N.
-        physics: The worlds' constants.
-        device: Where they shall live.
-        extra_bytes: What the task needs besides.
-
-    Raises:
-        NPAError: They do not.
-    """
-    what = f"{world_count} world(s) of {particle_count} particles"
-    cure = "choose a smaller particle_count or fewer worlds"
-    if world_count * particle_count * (1 + physics.state_dim) > LARGEST_INDEX:
-        raise NPAError(f"particle_count is too large: {what} exceed 32-bit indices: {cure}")
-    needed = needed_bytes(world_count, particle_count, physics, device) + extra_bytes
-    free = free_bytes(device)
-    if free is not None and needed > free:
-        raise NPAError(
-            f"particle_count must fit into memory: {what} need about {needed / 2**30:.1f} GiB "
-            f"with pictures and pool, and {device} has {free / 2**30:.1f} GiB free: {cure}"
-        )
-
-
-# Next episodes for some worlds of a batch.
-
-
-GROWTH = 4
-"""Each recorded size is so many times the one before it."""
-
-
-class Restarts:
-    """Starts of next episodes, on CUDA as one graph and one launch instead of some hundred.
-
-    A recorded start serves a fixed number of worlds. Fewer are filled up by repeating the last one:
-    it is then started twice in the same way, which is the same as once.
-
-    Args:
-        start: Starts the next episodes of worlds (indices, int64, shape [M]) and returns them made
-            ready for perception in the rows of the whole batch. A method's object has to be kept
-            by others.
-        world_count: Worlds B.
-        device: Where they live.
-        recorded: Whether `start` may be recorded: it never waits for the device.
-    """
-
-    def __init__(
-        self,
-        start: Callable[[Tensor], SurveyedWorlds],
-        world_count: int,
-        device: torch.device,
-        *,
-        recorded: bool,
-    ) -> None:
-        self._start = WeakFunction(start)
-        self._world_count = world_count
-        self._device = device
-        self._recorded = recorded and device.type == "cuda"
-        self._chunks: dict[int, _Chunk] = {}
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Leave out recorded starts, which cannot be pickled."""
-        return self.__dict__ | {"_chunks": {}}
-
-    def __call__(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
-        """Start the next episodes of some worlds.
-
-        Args:
-            worlds: Which, shape [M].
-            observation: Where to write what is perceived in them, shape [B, N, P].
-        """
-        if not self._recorded:
-            self._start()(sent(worlds, self._device)).perceive(observation)
-            return
-        size = 1
-        while size < len(worlds):
-            size = min(size * GROWTH, self._world_count)
-        if size not in self._chunks:
-            self._chunks[size] = _Chunk(self._start, size, self._device)
-        filled = np.full(size, worlds[-1])
-        filled[: len(worlds)] = worlds
-        self._chunks[size].restart(sent(filled, self._device), observation)
-
-
-class _Chunk:
-    """The recorded start of a fixed number of worlds."""
-
-    def __init__(self, start: WeakFunction, size: int, device: torch.device) -> None:
-        self._start = start
-        self._index = torch.zeros(size, dtype=torch.int64, device=device)
-        self._replayed = Replayed(self._run, device)
-
-    def restart(self, worlds: Tensor, observation: Tensor) -> None:
-        """Start the next episodes of as many worlds as the chunk is for."""
-        self._index.copy_(worlds)
-        self._replayed()
-        self._surveyed.perceive(observation)
-
-    def _run(self) -> None:
-        self._surveyed: SurveyedWorlds = self._start()(self._index)
-
-
-# The batch of worlds behind every environment: steps, losses, endings, restarts.
-#
-# Gymnasium is not known here. A single environment is a batch of one; world k of a batch is, bit
-# for bit, that world alone.
+FLAGS = ("success", "diverged")
+"""Names of the first two endings in `info`."""
 
 
 # Torch's pool of threads does not survive a fork: a forked worker, as Gymnasium's AsyncVectorEnv
@@ -187,7 +38,7 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
 
 
-def make_physics(config: EnvConfig, task_type: type[EnvTask[Any]]) -> Physics:
+def make_physics(config: WorldConfig, task_type: type[WorldTask[Any]]) -> Physics:
     """Return the constants of the worlds that a configuration describes."""
     return Physics(
         space_dim=task_type.space_dim,
@@ -216,7 +67,62 @@ def total(parts: Tensor) -> Tensor:
     return first
 
 
-class Worlds:
+class Batch:
+    """Particles of B worlds on a device, a stream of randomness for each world.
+
+    Args:
+        config: The environment's configuration.
+        task_type: Says how many dimensions there are, and whether particles move.
+        world_count: Worlds B.
+        particle_count: Particles of each, N.
+        extra_bytes: Memory that the task needs besides.
+
+    Raises:
+        NPAError: The worlds do not fit into memory.
+    """
+
+    def __init__(
+        self,
+        config: WorldConfig,
+        task_type: type[WorldTask[Any]],
+        world_count: int,
+        particle_count: int,
+        extra_bytes: int,
+    ) -> None:
+        self.device = device = config.torch_device
+        self.world_count = world_count
+        self.particle_count = particle_count
+        self.physics = physics = make_physics(config, task_type)
+        """The worlds' constants."""
+        check_memory(world_count, particle_count, physics, device, extra_bytes)
+        self.x = torch.zeros(world_count, particle_count, physics.space_dim, device=device)
+        """Positions [length units], shape [B, N, D]."""
+        self.s = torch.zeros(world_count, particle_count, physics.state_dim, device=device)
+        """States, dimensionless, shape [B, N, C]."""
+        keys = torch.zeros(world_count, dtype=torch.int64, device=device)
+        self.random = WorldRandom.from_keys(keys)
+        """One stream of randomness for each world."""
+
+    def next_streams(self, worlds: Tensor, keys: Tensor | None) -> WorldRandom:
+        """Return the streams of randomness that some worlds' next episodes begin with.
+
+        Args:
+            worlds: Which, int64, shape [M].
+            keys: Keys of new streams, int64, shape [M], which begin with their first episode; None:
+                each world goes on to its next one.
+        """
+        if keys is not None:
+            return WorldRandom.from_keys(keys.to(self.device))
+        random = self.random.take(worlds)
+        random.restart()
+        return random
+
+    def here(self) -> contextlib.AbstractContextManager[Any]:
+        """Return a context in which the worlds' device is the current one."""
+        return torch.cuda.device(self.device) if self.x.is_cuda else contextlib.nullcontext()
+
+
+class Worlds(Batch):
     """B worlds of one task, stepped together. All tensors stay where they are between steps.
 
     Args:
@@ -236,25 +142,16 @@ class Worlds:
         world_count: int,
         episode_steps: int | None = None,
     ) -> None:
-        device = config.torch_device
-        self.physics = physics = make_physics(config, task_type)
-        # Before the task, which may make a target of as many points.
-        extra = task_type.extra_bytes(config, world_count)
-        check_memory(world_count, config.particle_count, physics, device, extra)
+        # Memory is asked for before the task, which may make a target of as many points.
+        extra, count = task_type.extra_bytes(config, world_count), config.particle_count
+        super().__init__(config, task_type, world_count, count, extra)
+        device = self.device
         self.task = task_type(config, device)
-        self.world_count = world_count
         self.episode_steps = episode_steps
 
         def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
             return torch.zeros(world_count, *shape, dtype=dtype, device=device)
 
-        count = config.particle_count
-        self.x = zeros(count, physics.space_dim)
-        """Positions [length units], shape [B, N, D]."""
-        self.s = zeros(count, physics.state_dim)
-        """States, dimensionless, shape [B, N, C]."""
-        self.random = WorldRandom.from_keys(zeros(dtype=torch.int64))
-        """One stream of randomness for each world."""
         self.elapsed = zeros(dtype=torch.int32)
         """Steps since the start of each episode, shape [B]."""
         self.particle_loss = zeros(count) if config.reward == "particle" else None
@@ -278,7 +175,7 @@ class Worlds:
         self._actions = Actions(
             self.x,
             self.s,
-            physics,
+            self.physics,
             self.random,
             enabled=self._enabled,
             diverged=self._diverged,
@@ -318,14 +215,9 @@ class Worlds:
 
         Args:
             worlds: Which, int64, shape [M].
-            keys: Keys of new streams of randomness, int64, shape [M], which begin with their first
-                episode; None: each world goes on to its next one.
+            keys: As for `next_streams`.
         """
-        if keys is not None:
-            random = WorldRandom.from_keys(keys.to(self.task.device))
-        else:
-            random = self.random.take(worlds)
-            random.restart()
+        random = self.next_streams(worlds, keys)
         start = self.task.start(random)
         self.random.put(worlds, random)
         self.elapsed.index_fill_(0, worlds, 0)
@@ -399,12 +291,6 @@ class Worlds:
         self.report.endings.copy_(paid.endings)
         if own is not None and self.particle_reward is not None:
             self.particle_reward.copy_(own)
-
-    def here(self) -> contextlib.AbstractContextManager[Any]:
-        """Return a context in which the worlds' device is the current one."""
-        return (
-            contextlib.nullcontext() if self._beside is None else torch.cuda.device(self.x.device)
-        )
 
     @torch.no_grad()
     def step(self, action: Tensor, out: Tensor | None = None) -> tuple[NDArray[np.uint8], Tensor]:
@@ -488,6 +374,45 @@ class Worlds:
         self._host_endings.copy_(torch.cat((ending, self._enabled)), non_blocking=True)
         self._enabled.fill_(1)
 
+    @torch.no_grad()
+    def guarded(self, endings: NDArray[np.uint8], observation: Tensor) -> NDArray[np.uint8]:
+        """Do what `on_divergence` says about worlds that diverged; return what ends episodes.
+
+        Nothing is read from the device, and nothing run, where none did.
+
+        Args:
+            endings: What `step` returned, of the worlds that were to act, shape [B].
+            observation: What is perceived, shape [B, N, P]; changed where worlds are reset.
+
+        Returns:
+            Endings, shape [B], without divergence where that ends no episode.
+
+        Raises:
+            DivergedError: A world diverged, and `on_divergence` is "raise".
+        """
+        way = self.task.config.on_divergence
+        diverged = endings & DIVERGED != 0
+        if way == "terminate" or not diverged.any():
+            return endings
+        if way == "raise":
+            raise DivergedError(self._told(np.flatnonzero(diverged)))
+        if way == "reset":
+            # Where the time is up, the next episode comes anyway.
+            going_on = np.flatnonzero(endings == DIVERGED)
+            if len(going_on):
+                self.reseed(going_on, observation)
+        return endings & ~np.uint8(DIVERGED)
+
+    def pictures(self, count: int) -> NDArray[np.uint8]:
+        """Return pictures of the first worlds, uint8, shape [count, R, R, 3].
+
+        Args:
+            count: How many.
+        """
+        steps = self.elapsed[:count].cpu().numpy()
+        pictures: NDArray[np.uint8] = self.task.draw(self.x[:count], self.s[:count], steps)
+        return pictures
+
     def _not_finite(self, action: Tensor) -> DivergedError:
         bad = ~torch.isfinite(action)
         world, particle, entry = (int(k) for k in bad.nonzero()[0])
@@ -495,3 +420,147 @@ class Worlds:
             f"action must be finite, got {action[world, particle, entry].item()} at world {world}, "
             f"particle {particle}, entry {entry} ({int(bad.sum())} such numbers): check the policy"
         )
+
+    def _told(self, diverged: NDArray[np.int64]) -> str:
+        """Return an error's message about worlds that diverged."""
+        physics, told = self.physics, []
+        for world in diverged[:LARGEST_REPORT].tolist():
+            numbers = torch.cat((self.x[world], self.s[world]), dim=1)
+            outside = self.x[world].abs() >= physics.position_limit
+            held = torch.cat((outside, self.s[world].abs() >= physics.state_limit), dim=1)
+            line = f"world {world} in step {int(self.elapsed[world])}"
+            if bool(held.any()):
+                particle, entry = held.nonzero()[0].tolist()
+                line += (
+                    f": {term_name(entry, physics.space_dim)} of particle {particle} got to "
+                    f"{numbers[particle, entry].item():g} "
+                    f"({int(held.any(dim=1).sum())} such particles)"
+                )
+            told.append(line)
+        if len(diverged) > LARGEST_REPORT:
+            told.append(f"and {len(diverged) - LARGEST_REPORT} more worlds")
+        return (
+            f"numbers must stay within position_limit = {physics.position_limit:g} and "
+            f"observation_limit = {physics.state_limit:g}, but left them in {'; '.join(told)}: "
+            "take smaller actions, raise the limits, or choose on_divergence='terminate' or 'reset'"
+        )
+
+
+class Report(NamedTuple):
+    """What a step says of each world, in one buffer: it is handed out by one copy, not twenty."""
+
+    buffer: Tensor
+    """All that follows, uint8."""
+    numbers: Tensor
+    """Reward; loss; its parts; their improvements in the last step; shape [2 + 2 K, B]."""
+    endings: Tensor
+    """Terminated; truncated; success; diverged; bool, shape [4, B]."""
+    everyone: Tensor
+    """True for every world, bool, shape [B]."""
+
+    @classmethod
+    def empty(cls, world_count: int, part_count: int, device: torch.device) -> Report:
+        """Return the report of B worlds whose loss has K parts: zeros."""
+        rows = 4 * (2 + 2 * part_count) + 3 + len(FLAGS)
+        buffer = torch.zeros(rows * world_count, dtype=torch.uint8, device=device)
+        report = cls.over(buffer, world_count)
+        report.everyone.fill_(True)
+        return report
+
+    @classmethod
+    def over(cls, buffer: Tensor, world_count: int) -> Report:
+        """Return the report that a buffer holds."""
+        flag_rows = 3 + len(FLAGS)
+        rows = buffer.view(-1, world_count)
+        numbers = buffer[: -flag_rows * world_count].view(torch.float32).view(-1, world_count)
+        flags = rows[-flag_rows:].view(torch.bool)
+        return cls(buffer, numbers, flags[:-1], flags[-1])
+
+    def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+        """Pickle the buffer alone: views that are pickled apart no longer share its memory."""
+        return Report.over, (self.buffer, len(self.everyone))
+
+    def copy(self) -> Report:
+        """Return a copy that later steps leave alone."""
+        return self.over(self.buffer.clone(), len(self.everyone))
+
+
+def reason(ending: int) -> str | None:
+    """Return why an episode ended, in words, or None where it has not."""
+    words = {DIVERGED: "diverged", SUCCESS: "success", TIME_LIMIT: "time limit"}
+    return next((word for bit, word in words.items() if ending & bit), None)
+
+
+GROWTH = 4
+"""Each recorded size is so many times the one before it."""
+
+
+class Restarts:
+    """Starts of next episodes, on CUDA as one graph and one launch instead of some hundred.
+
+    A recorded start serves a fixed number of worlds. Fewer are filled up by repeating the last one:
+    it is then started twice in the same way, which is the same as once.
+
+    Args:
+        start: Starts the next episodes of worlds (indices, int64, shape [M]) and returns them made
+            ready for perception in the rows of the whole batch. A method's object has to be kept
+            by others.
+        world_count: Worlds B.
+        device: Where they live.
+        recorded: Whether `start` may be recorded: it never waits for the device.
+    """
+
+    def __init__(
+        self,
+        start: Callable[[Tensor], SurveyedWorlds],
+        world_count: int,
+        device: torch.device,
+        *,
+        recorded: bool,
+    ) -> None:
+        self._start = WeakFunction(start)
+        self._world_count = world_count
+        self._device = device
+        self._recorded = recorded and device.type == "cuda"
+        self._chunks: dict[int, _Chunk] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out recorded starts, which cannot be pickled."""
+        return self.__dict__ | {"_chunks": {}}
+
+    def __call__(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
+        """Start the next episodes of some worlds.
+
+        Args:
+            worlds: Which, shape [M].
+            observation: Where to write what is perceived in them, shape [B, N, P].
+        """
+        if not self._recorded:
+            self._start()(sent(worlds, self._device)).perceive(observation)
+            return
+        size = 1
+        while size < len(worlds):
+            size = min(size * GROWTH, self._world_count)
+        if size not in self._chunks:
+            self._chunks[size] = _Chunk(self._start, size, self._device)
+        filled = np.full(size, worlds[-1])
+        filled[: len(worlds)] = worlds
+        self._chunks[size].restart(sent(filled, self._device), observation)
+
+
+class _Chunk:
+    """The recorded start of a fixed number of worlds."""
+
+    def __init__(self, start: WeakFunction, size: int, device: torch.device) -> None:
+        self._start = start
+        self._index = torch.zeros(size, dtype=torch.int64, device=device)
+        self._replayed = Replayed(self._run, device)
+
+    def restart(self, worlds: Tensor, observation: Tensor) -> None:
+        """Start the next episodes of as many worlds as the chunk is for."""
+        self._index.copy_(worlds)
+        self._replayed()
+        self._surveyed.perceive(observation)
+
+    def _run(self) -> None:
+        self._surveyed: SurveyedWorlds = self._start()(self._index)

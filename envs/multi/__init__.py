@@ -5,8 +5,7 @@ species begin and how far each of them is from its goal; `npa_envs.world.actions
 particles. Nothing but `crowd` needs PettingZoo.
 """
 
-from npa_envs.envs.multi.config import SpeciesConfig
-from npa_envs.envs.multi.task import Population, SpeciesTask
-from npa_envs.envs.multi.tasks.table import TASKS, task_type
+from npa_envs.envs.multi.task import Population, SpeciesConfig, SpeciesTask
+from npa_envs.envs.multi.tasks import TASKS, task_type
 
 __all__ = ["TASKS", "Population", "SpeciesConfig", "SpeciesTask", "task_type"]

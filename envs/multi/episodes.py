@@ -12,7 +12,7 @@ from torch import Tensor
 from npa_envs import world_mean
 from npa_envs.envs.core.worlds import total
 from npa_envs.envs.multi.task import SpeciesTask
-from npa_envs.envs.multi.tasks.table import task_type
+from npa_envs.envs.multi.tasks import task_type
 from npa_envs.envs.multi.worlds import SpeciesWorlds
 from npa_envs.errors import DivergedError
 from npa_envs.world.cuda_graph import Beside, sent

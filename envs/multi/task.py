@@ -1,19 +1,162 @@
-"""What an environment of several species asks of its task."""
+"""Tasks of several species: configuration, population, losses, pictures."""
 
 from __future__ import annotations
 
+import colorsys
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from itertools import accumulate
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple, Self, get_args
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.envs.multi.config import SpeciesConfig
+from npa_envs.envs.core.config import WorldConfig, plain
+from npa_envs.envs.core.task import WorldTask
 from npa_envs.errors import NPAError
+from npa_envs.render import STYLES
+from npa_envs.rule.rule import COLOUR_OFFSET
+from npa_envs.tasks.checks import check_non_negative, check_positive, is_whole
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.world.randomness import WorldRandom
+
+Reward = Literal["individual", "team"]
+Perception = Literal["shared", "per_species"]
+OnDivergence = Literal["terminate", "raise", "ignore"]
+
+SPECIES_STYLE = "species"
+"""Style of pictures in which each species has one colour."""
+
+LARGEST_COUNT = 64
+"""No more species than this: their tags are smoothed as states."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpeciesConfig(WorldConfig):
+    """The fields that all tasks of several species have; a task adds its own."""
+
+    words = WorldConfig.words | {
+        "perception": get_args(Perception),
+        "reward": get_args(Reward),
+        "on_divergence": get_args(OnDivergence),
+        "render_style": (SPECIES_STYLE, *STYLES),
+    }
+
+    species_count: int = 2
+    """Species K."""
+
+    particle_count: int = 1024
+    """Particles of all species together, N; they are shared out evenly."""
+
+    particle_counts: tuple[int, ...] = ()
+    """Particles of each species, where these differ; empty: equal shares of `particle_count`."""
+
+    perception: Perception = "shared"
+    """"shared": particles perceive each other whatever their species; "per_species": they also
+    perceive the density and the density gradient of each species."""
+
+    on_divergence: OnDivergence = "terminate"
+    """What becomes of an agent all of whose particles have diverged: "terminate" takes it out of
+    the world; "raise" is an error that names it; "ignore" lets it go on, held at the limits."""
+
+    seed_radius: float = 0.2
+    """Radius of the disk that each species starts in [length units]."""
+
+    seed_distance: float = 0.4
+    """Distance between the centres of neighbouring disks, which lie in a row [length units]."""
+
+    deaths: tuple[tuple[int, int], ...] = ()
+    """Pairs (species, step): the species is removed at the end of that step."""
+
+    reward: Reward = "individual"
+    """"individual": each agent is paid for its own improvement; "team": for the mean of all."""
+
+    max_cycles: int = 256
+    """Steps after which the episode is cut off for all."""
+
+    render_style: str = SPECIES_STYLE
+    """What pictures show: "species" (a colour each), "particles" (their own colours), "density" or
+    "states" (hidden channels)."""
+
+    def __post_init__(self) -> None:
+        """Check every field.
+
+        Raises:
+            NPAError: A field has the wrong type or lies outside its range, or this machine does not
+                have the device.
+        """
+        super().__post_init__()
+        check_positive(self, int, "species_count", "max_cycles")
+        if self.species_count > LARGEST_COUNT:
+            raise NPAError(
+                f"species_count must be at most {LARGEST_COUNT}, got {self.species_count}: "
+                "give each of fewer species more particles"
+            )
+        self._check_counts()
+        check_positive(self, float, "seed_radius")
+        check_non_negative(self, "seed_distance")
+        self._check_deaths()
+        half = self.position_limit if self.box is None else 0.5 * self.box
+        if self.seed_span >= half:
+            raise NPAError(
+                f"seed_radius and seed_distance must keep all disks within {half:g}, got disks up "
+                f"to {self.seed_span:g}: worlds would begin out of bounds"
+            )
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """Particles of each species at the start of an episode."""
+        if self.particle_counts:
+            return self.particle_counts
+        share, rest = divmod(self.particle_count, self.species_count)
+        return tuple(share + int(k < rest) for k in range(self.species_count))
+
+    @property
+    def seed_span(self) -> float:
+        """How far from the origin particles start at most [length units]."""
+        return self.seed_radius + 0.5 * (self.species_count - 1) * self.seed_distance
+
+    @classmethod
+    def from_keywords(cls, keywords: dict[str, Any]) -> Self:
+        """As `WorldConfig.from_keywords`; particles are counted in one way."""
+        if "particle_count" in keywords and plain(keywords.get("particle_counts")):
+            raise NPAError(
+                "particle_count and particle_counts exclude each other: "
+                "particle_counts gives the number of each species"
+            )
+        return super().from_keywords(keywords)
+
+    def _check_counts(self) -> None:
+        given = self.particle_counts
+        whole = isinstance(given, tuple) and all(is_whole(count) for count in given)
+        if given and (not whole or len(given) != self.species_count or min(given) < 1):
+            raise NPAError(
+                f"particle_counts must be {self.species_count} whole numbers of at least 1, one "
+                f"for each of species_count = {self.species_count}, got {given!r}: for example "
+                f"particle_counts={(64,) * self.species_count}"
+            )
+        if not given and self.particle_count < self.species_count:
+            raise NPAError(
+                f"particle_count must be at least species_count = {self.species_count}, got "
+                f"{self.particle_count}: each species needs a particle"
+            )
+
+    def _check_deaths(self) -> None:
+        rule = (
+            "deaths must be pairs (species, step), each species from 0 to "
+            f"{self.species_count - 1} at most once, each step at least 1"
+        )
+        given = self.deaths
+        pairs = isinstance(given, tuple) and all(
+            isinstance(pair, tuple) and len(pair) == 2 and all(is_whole(k) for k in pair)
+            for pair in given
+        )
+        fits = pairs and all(0 <= k < self.species_count and step > 0 for k, step in given)
+        if not fits or len({k for k, _ in given}) < len(given):
+            raise NPAError(f"{rule}, got {given!r}: for example deaths=((1, 50),)")
 
 
 class Population(NamedTuple):
@@ -46,7 +189,7 @@ class Population(NamedTuple):
         return self.x[:, span].contiguous(), self.s[:, span].contiguous()
 
 
-class SpeciesTask:
+class SpeciesTask(WorldTask[Any]):
     """One task of several species; a loss for each, and one for each particle.
 
     An agent's reward is how much its loss falls in a step, so losses go down where it does well.
@@ -60,7 +203,6 @@ class SpeciesTask:
     """
 
     config_type: ClassVar[type[SpeciesConfig]] = SpeciesConfig
-    """The configuration's class: its fields are the environment's keywords."""
 
     least_species: ClassVar[int] = 2
     """The task makes no sense with fewer."""
@@ -71,8 +213,7 @@ class SpeciesTask:
                 f"species_count must be at least {self.least_species} in this task, got "
                 f"{config.species_count}: with one species there is nobody to meet"
             )
-        self.config = config
-        self.device = device
+        super().__init__(config, device)
         middle = 0.5 * (config.species_count - 1)
         places = [config.seed_distance * (k - middle) for k in range(config.species_count)]
         # Sent once: worlds that restart would wait for it.
@@ -136,16 +277,22 @@ class SpeciesTask:
         return math.sqrt(math.pi / sum(self.config.counts))
 
     @property
-    def half_width(self) -> float:
-        """From the middle of a picture to its edge [length units]."""
-        if self.config.boundary == "periodic":
-            return max(1.0, 0.5 * float(self.config.box_size))
-        return max(1.0, self.open_half_width)
-
-    @property
     def open_half_width(self) -> float:
-        """The same in open space, where it is 1 at least [length units]."""
+        """From the middle of a picture to its edge in open space; 1 at least [length units]."""
         return 1.25 * float(self.config.seed_span)
+
+    def draw(self, population: Population) -> NDArray[np.uint8]:
+        """Return a picture of each world, shape [B, R, R, 3]; white where nobody is left."""
+        config, x, s = self.config, population.x, population.s
+        if x.shape[1] == 0:
+            return np.full((len(x), config.render_size, config.render_size, 3), 255, np.uint8)
+        if config.render_style != SPECIES_STYLE:
+            return self.draw_particles(x, s, config.render_style)
+        # A colour for each species, evenly around the wheel.
+        hues = [k / config.species_count for k in range(config.species_count)]
+        colours = torch.tensor([colorsys.hsv_to_rgb(hue, 0.85, 0.8) for hue in hues]).to(s)
+        own = (colours[population.species] - COLOUR_OFFSET).expand(len(x), -1, -1)
+        return self.draw_particles(x, own, "particles")
 
 
 def by_species(losses: list[Tensor], population: Population) -> Tensor:

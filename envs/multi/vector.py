@@ -9,18 +9,14 @@ from typing import Any
 import numpy as np
 import torch
 from gymnasium import Space
-from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.envs.core.screen import Screen
-from npa_envs.envs.core.spaces import to_output
-from npa_envs.envs.core.vector import checked_count, checked_mode, world_keys, worlds_to_reset
-from npa_envs.envs.multi.episodes import Episodes, Outcome
-from npa_envs.envs.multi.pictures import SpeciesView
-from npa_envs.envs.multi.spaces import agent_spaces, joined_actions, state_space
+from npa_envs.envs.core.vector import checked_count, checked_mode, worlds_to_reset
+from npa_envs.envs.multi.agents import AgentsEnv, joined_actions
+from npa_envs.envs.multi.episodes import Outcome
 from npa_envs.errors import NPAError
 from npa_envs.world.cuda_graph import sent
 
@@ -31,7 +27,7 @@ BatchOutcome = tuple[ByAgent, ByAgent, ByAgent, ByAgent, Infos]
 """What a step returns: observations, rewards, terminations, truncations, infos."""
 
 
-class MultiSpeciesVectorEnv:
+class MultiSpeciesVectorEnv(AgentsEnv):
     """B worlds of several species, stepped together: `MultiSpeciesEnv`, batched on the device.
 
     World k, reset with `seed`, is the single environment reset with `seed + k`, bit for bit,
@@ -82,27 +78,12 @@ class MultiSpeciesVectorEnv:
                 "autoreset_mode must be 'same-step' or 'disabled' where several species share a "
                 "world, got 'next-step': one of these"
             )
-        self._episodes = episodes = Episodes(task, config, self.world_count, by_particle=False)
-        self.config = episodes.config
-        self.render_mode = self.config.render_mode
-        self.max_cycles = self.config.max_cycles
-        """Steps after which an episode is cut off for all."""
-        self.worlds = worlds = episodes.worlds
-        """The particles."""
-        self.possible_agents = [f"species_{k}" for k in range(worlds.agent_count)]
-        """Names of the species."""
+        super().__init__(task, config, self.world_count, by_particle=False)
         self.agents = self.possible_agents
         """The same: every species gets and gives arrays at all times."""
-        rows = [(count,) for count in self.config.counts]
-        self.single_observation_spaces, self.single_action_spaces = agent_spaces(
-            worlds.physics, worlds.perception_dim, self.possible_agents, rows
-        )
-        self.single_state_space = state_space(worlds.physics, worlds.particle_count)
+        self.single_observation_spaces, self.single_action_spaces = self._spaces
+        self.single_state_space = self._state_space
         """Space of one world's `state`: float32, shape [N, 2 + C + 1]."""
-        self.np_random: np.random.Generator | None = None
-        self._task_name = task
-        self._started = False
-        self._screen = Screen(SpeciesView(worlds), 25)
 
     @cached_property
     def observation_spaces(self) -> dict[str, Space[Any]]:
@@ -136,11 +117,8 @@ class MultiSpeciesVectorEnv:
         chosen = worlds_to_reset(options, self.world_count)
         if not self._started and len(chosen) < self.world_count:
             raise NPAError("reset_mask needs worlds to leave alone: reset all of them first")
-        keys = None
-        if seed is not None or self.np_random is None:
-            first = int(seed) if isinstance(seed, int | np.integer) else None
-            self.np_random, _ = seeding.np_random(first)
-            keys = world_keys(seed, self.world_count, self.np_random)[chosen]
+        keys = self._next_keys(seed, int(seed) if isinstance(seed, int | np.integer) else None)
+        keys = None if keys is None else keys[chosen]
         with self.worlds.here():
             observation = self._episodes.start(chosen, keys)
             if len(chosen) < self.world_count:
@@ -203,26 +181,18 @@ class MultiSpeciesVectorEnv:
         Raises:
             NPAError: There are no worlds yet.
         """
-        if not self._started:
-            raise NPAError("state needs worlds: call reset first")
-        return to_output(self.worlds.state(), self.config.output)
+        return self._out(self._state())
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return a picture of each world, shape [R, R, 3], in the mode "rgb_array"."""
-        if not self._started:
-            raise NPAError("render needs worlds: call reset first")
-        pictures = self._screen.render()
+        pictures = self._pictures()
         return None if pictures is None else tuple(pictures)
-
-    def close(self) -> None:
-        """Close the window, if there is one."""
-        self._screen.close()
 
     def _infos(self, numbers: dict[str, Tensor], acted: NDArray[np.bool_]) -> Infos:
         """Return numbers of species that acted, 0 of the others, and who is live now."""
         own = sent(acted, self.worlds.device)
         everyone = torch.stack(list(numbers.values())).float()
-        rows = to_output(torch.where(own, everyone, 0.0).movedim(2, 0).contiguous(), self._output)
+        rows = self._out(torch.where(own, everyone, 0.0).movedim(2, 0).contiguous())
         live = self._columns(self._sent(self._episodes.live.copy()))
         return {
             agent: {"species": k, "live": live[agent]} | dict(zip(numbers, rows[k], strict=True))
@@ -242,18 +212,14 @@ class MultiSpeciesVectorEnv:
         if final is not None:
             which = np.zeros(self.world_count, dtype=bool)
             which[final[1]] = True
-            restarted = to_output(self._sent(which), self._output)
+            restarted = self._out(self._sent(which))
             for agent, rows in final[0].items():
                 infos[agent] |= {"final_obs": rows, "_final_obs": restarted}
         return infos
 
-    @property
-    def _output(self) -> str:
-        return str(self.config.output)
-
     def _rows(self, observation: Tensor) -> ByAgent:
         """Return what particles perceive, [B, N, P], species by species."""
-        rows = to_output(observation, self._output)
+        rows = self._out(observation)
         spans = self._episodes.spans
         return {
             agent: rows[:, span] for agent, span in zip(self.possible_agents, spans, strict=True)
@@ -261,16 +227,13 @@ class MultiSpeciesVectorEnv:
 
     def _columns(self, values: Tensor) -> ByAgent:
         """Return values of shape [B, K] species by species, shape [B] each."""
-        columns = to_output(values.T.contiguous(), self._output)
+        columns = self._out(values.T.contiguous())
         return dict(zip(self.possible_agents, columns, strict=True))
 
     def _sent(self, values: NDArray[Any]) -> Tensor:
         """Return an array where results are wanted: on the device, or not."""
         return (
             sent(values, self.worlds.device)
-            if self._output == "torch"
+            if self.config.output == "torch"
             else torch.from_numpy(values)
         )
-
-    def _show(self) -> None:
-        self._screen.show(f"npa_multispecies_v0: {self._task_name}")

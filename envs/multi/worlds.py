@@ -1,8 +1,11 @@
-"""Worlds of a batch in which the same particles are there, packed without the others."""
+"""Worlds that several species share: how they start, act, perceive, and lose particles.
+
+Neither Gymnasium nor PettingZoo is known here. A single environment is a batch of one; world k of a
+batch is, bit for bit, that world alone.
+"""
 
 from __future__ import annotations
 
-import contextlib
 from typing import Any
 
 import numpy as np
@@ -10,9 +13,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from npa_envs.envs.core.memory import OBSERVATION_COPIES
 from npa_envs.envs.core.spaces import checked_particles
-from npa_envs.envs.core.task import EnvTask
-from npa_envs.envs.core.worlds import OBSERVATION_COPIES, check_memory, make_physics
+from npa_envs.envs.core.worlds import Batch
 from npa_envs.envs.multi.task import Population, SpeciesTask
 from npa_envs.world.actions import (
     Actions,
@@ -174,13 +177,7 @@ class Cohort:
         self._surveyed = survey_worlds(population.x, population.s, self._judge.physics)
 
 
-# The worlds that several species share: how they start, act, perceive, and lose particles.
-#
-# Neither Gymnasium nor PettingZoo is known here. A single environment is a batch of one; world k
-# of a batch is, bit for bit, that world alone.
-
-
-class SpeciesWorlds:
+class SpeciesWorlds(Batch):
     """B worlds; particles of each species lie one after the other, and those removed are gone.
 
     A world that lost particles is computed without them. Worlds that have the same ones are
@@ -200,14 +197,13 @@ class SpeciesWorlds:
         self, task_type: type[SpeciesTask], config: Any, world_count: int, *, by_particle: bool
     ) -> None:
         self.config = config
-        self.device = config.world.torch_device
-        self.world_count = world_count
-        self.particle_count = count = sum(config.counts)
-        """Particles of all species at the start of an episode, N."""
-        self.physics = make_physics(config.world, EnvTask)
-        """The worlds' constants."""
+        count = sum(config.counts)
+        self._appended = 0
+        if config.perception == "per_species":
+            # Numbers that a particle perceives of species one by one.
+            self._appended = config.species_count * (1 + task_type.space_dim)
         told_apart = 4 * OBSERVATION_COPIES * world_count * count * self._appended
-        check_memory(world_count, count, self.physics, self.device, told_apart)
+        super().__init__(config, task_type, world_count, count, told_apart)
         self.task = task_type(config, self.device)
         self.species = np.repeat(np.arange(config.species_count), config.counts)
         """Species of each particle that an episode starts with, int64, shape [N]."""
@@ -220,26 +216,15 @@ class SpeciesWorlds:
         """Whether each world goes on; the others stay as they are, shape [B]."""
         self.elapsed = np.zeros(world_count, dtype=np.int64)
         """Steps since the start of each episode, shape [B]."""
-        self._x = torch.zeros(world_count, count, 2, device=self.device)
-        self._s = torch.zeros(world_count, count, config.state_dim, device=self.device)
-        keys = torch.zeros(world_count, dtype=torch.int64, device=self.device)
-        self._random = WorldRandom.from_keys(keys)
         everyone, all_worlds = np.arange(count), np.arange(world_count)
         # Its work is recorded on CUDA, and worlds come back to it when their next episodes start.
-        self._whole = Cohort(self._judge, all_worlds, everyone, self._x, self._s, self._random)
+        self._whole = Cohort(self._judge, all_worlds, everyone, self.x, self.s, self.random)
         self._cohorts: list[Cohort] | None = None
 
     @property
     def perception_dim(self) -> int:
         """Numbers that a particle perceives: P, and K (1 + D) more where species are told apart."""
         return self.physics.perception_dim + self._appended
-
-    @property
-    def _appended(self) -> int:
-        """Numbers that a particle perceives of species one by one."""
-        if self.config.perception == "shared":
-            return 0
-        return int(self.config.species_count * (1 + self.physics.space_dim))
 
     @property
     def agent_count(self) -> int:
@@ -252,20 +237,15 @@ class SpeciesWorlds:
 
         Args:
             worlds: Which, shape [M].
-            keys: Keys of new streams of randomness, int64, shape [M], which begin with their first
-                episode; None: each world goes on to its next one.
+            keys: As for `next_streams`.
         """
         self._disband()
         index = sent(worlds, self.device)
-        if keys is not None:
-            random = WorldRandom.from_keys(keys.to(self.device))
-        else:
-            random = self._random.take(index)
-            random.restart()
+        random = self.next_streams(index, keys)
         x, s = self.task.start(random)
-        self._random.put(index, random)
-        self._x.index_copy_(0, index, x)
-        self._s.index_copy_(0, index, s)
+        self.random.put(index, random)
+        self.x.index_copy_(0, index, x)
+        self.s.index_copy_(0, index, s)
         self.there[worlds] = self.open[worlds] = True
         self.elapsed[worlds] = 0
         return self._whole.population._replace(x=x.contiguous(), s=s)
@@ -292,7 +272,7 @@ class SpeciesWorlds:
         if self.cohorts == [self._whole]:
             return self._whole.perceived(stepped=stepped)
         shape = self.world_count, self.particle_count, self.perception_dim
-        seen = self._x.new_zeros(shape)
+        seen = self.x.new_zeros(shape)
         for cohort in self.cohorts:
             seen[_places(cohort)] = cohort.perceived(stepped=stepped)
         return seen
@@ -376,7 +356,7 @@ class SpeciesWorlds:
         kind = self.species[columns]
         counts = np.bincount(kind, minlength=self.config.species_count)
         index = sent(columns, self.device)
-        x, s = self._x[world : world + 1, index], self._s[world : world + 1, index]
+        x, s = self.x[world : world + 1, index], self.s[world : world + 1, index]
         return Population(x, s, tuple(counts.tolist()), sent(kind, self.device))
 
     @torch.no_grad()
@@ -384,13 +364,16 @@ class SpeciesWorlds:
         """Return position, state and 1 of each particle, 0s of those gone, [B, N, 2 + C + 1]."""
         self._collect()
         there = sent(self.there[:, self.owner], self.device)[..., None]
-        rows = torch.cat((self._x, self._s, there.float()), dim=-1)
+        rows = torch.cat((self.x, self.s, there.float()), dim=-1)
         return torch.where(there, rows, 0.0)
 
-    def here(self) -> contextlib.AbstractContextManager[Any]:
-        """Return a context in which the worlds' device is the current one."""
-        device = self.device
-        return contextlib.nullcontext() if device.type != "cuda" else torch.cuda.device(device)
+    def pictures(self, count: int) -> NDArray[np.uint8]:
+        """Return pictures of the first worlds, uint8, shape [count, R, R, 3].
+
+        Args:
+            count: How many.
+        """
+        return np.concatenate([self.task.draw(self.population(k)) for k in range(count)])
 
     @property
     def cohorts(self) -> list[Cohort]:
@@ -413,7 +396,7 @@ class SpeciesWorlds:
             columns = np.flatnonzero(kind[self.owner])
             index = sent(worlds, self.device)
             places = index[:, None], sent(columns, self.device)
-            x, s, random = self._x[places], self._s[places], self._random.take(index)
+            x, s, random = self.x[places], self.s[places], self.random.take(index)
             cohorts.append(Cohort(self._judge, worlds, columns, x, s, random))
         return cohorts
 
@@ -426,9 +409,9 @@ class SpeciesWorlds:
         """Copy the cohorts' particles to their places in the batch."""
         for cohort in self._cohorts or ():
             if cohort is not self._whole:
-                self._x[_places(cohort)] = cohort.population.x
-                self._s[_places(cohort)] = cohort.population.s
-                self._random.put(cohort.worlds, cohort.random)
+                self.x[_places(cohort)] = cohort.population.x
+                self.s[_places(cohort)] = cohort.population.s
+                self.random.put(cohort.worlds, cohort.random)
 
 
 def _places(cohort: Cohort) -> tuple[Tensor, Tensor]:

@@ -448,10 +448,12 @@ def test_action_of_another_shape_is_an_error(name, shape):
     env.reset(seed=0)
     right = env.action_space.shape
     shape = shape if len(shape) == 1 else (*shape[:-1], right[1] + shape[-1])
-    with pytest.raises(NPAError, match=rf"action must have shape \[N, A\] = \(61, {right[1]}\)"):
+    with pytest.raises(
+        NPAError, match=rf"action must be real numbers of shape \[N, A\] = \(61, {right[1]}\)"
+    ):
         env.step(np.zeros(shape, np.float32))
     for wrong in ("left", np.zeros(right, complex), torch.zeros(right, dtype=torch.complex64)):
-        with pytest.raises(NPAError, match="action must be an array of numbers"):
+        with pytest.raises(NPAError, match="action must be real numbers"):
             env.step(wrong)
     fixed = np.zeros(right, np.float32)
     fixed.flags.writeable = False
@@ -537,14 +539,14 @@ def test_bad_keyword_of_one_environment_is_a_clear_error(name, keywords, message
     "keywords", [{"particle_count": 10**5}, {"resolution": 4096}, {"seed_pool": 10**6}]
 )
 def test_worlds_beyond_memory_are_refused_before_they_are_made(keywords, monkeypatch):
-    monkeypatch.setattr("npa_envs.envs.core.worlds.free_bytes", lambda device: 10**8)
+    monkeypatch.setattr("npa_envs.envs.core.memory.free_bytes", lambda device: 10**8)
     make(IDS[0])
     with pytest.raises(NPAError, match="particle_count must fit into memory: 1 world"):
         make(IDS[0], **keywords)
 
 
 def test_memory_that_is_counted_is_what_worlds_take():
-    from npa_envs.envs.core.worlds import free_bytes
+    from npa_envs.envs.core.memory import free_bytes
 
     assert 2**26 < free_bytes(torch.device("cpu")) < 2**44
 

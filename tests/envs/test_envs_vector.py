@@ -327,7 +327,7 @@ def test_wrong_use_is_a_clear_error(name):
     with pytest.raises(NPAError, match="reset all of them first"):
         envs.reset(options={"reset_mask": np.array([True, False, False])})
     envs.reset(seed=0)
-    with pytest.raises(NPAError, match=r"action must have shape \[B, N, A\]"):
+    with pytest.raises(NPAError, match=r"action must be real numbers of shape \[B, N, A\]"):
         envs.step(zeros[:2])
     with pytest.raises(NPAError, match="reset_mask must be bool"):
         envs.reset(options={"reset_mask": np.array([1, 0, 0])})

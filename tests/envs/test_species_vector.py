@@ -10,7 +10,7 @@ import torch
 from crowds import TASKS, make, small, targets_made_once
 
 from npa_envs.envs import multispecies_v0
-from npa_envs.envs.core import worlds as memory
+from npa_envs.envs.core import memory
 from npa_envs.envs.multi import worlds as cohort_module
 from npa_envs.errors import DivergedError, NPAError
 

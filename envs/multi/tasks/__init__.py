@@ -1,1 +1,43 @@
-"""The tasks of several species, one file each."""
+"""The table of tasks of several species, and of their ids."""
+
+from __future__ import annotations
+
+from npa_envs.envs.multi.task import SpeciesTask
+from npa_envs.envs.multi.tasks.co_morphogenesis import CoMorphogenesisTask
+from npa_envs.envs.multi.tasks.invasion import InvasionTask
+from npa_envs.envs.multi.tasks.mixing import MixingTask, SegregationTask
+from npa_envs.envs.multi.tasks.symbiosis import SymbiosisTask
+from npa_envs.errors import NPAError, suggest
+
+TASKS: dict[str, type[SpeciesTask]] = {
+    "mixing": MixingTask,
+    "segregation": SegregationTask,
+    "co_morphogenesis": CoMorphogenesisTask,
+    "invasion": InvasionTask,
+    "symbiosis": SymbiosisTask,
+}
+"""Tasks by the names that environments take."""
+
+
+ENVIRONMENTS = {
+    "npa/Mixing-v0": "mixing",
+    "npa/Segregation-v0": "segregation",
+    "npa/CoMorphogenesis-v0": "co_morphogenesis",
+    "npa/Invasion-v0": "invasion",
+    "npa/Symbiosis-v0": "symbiosis",
+}
+"""Tasks by the ids that `pettingzoo.make` takes."""
+
+
+def task_type(name: str) -> type[SpeciesTask]:
+    """Return a task's class.
+
+    Args:
+        name: One of `TASKS`.
+
+    Raises:
+        NPAError: There is no such task.
+    """
+    if not isinstance(name, str) or name not in TASKS:
+        raise NPAError(f"task must be a known word, got {name!r}: {suggest(str(name), TASKS)}")
+    return TASKS[name]

@@ -1,4 +1,4 @@
-"""What the tasks share in which species grow pictures."""
+"""Configuration and loss of the tasks in which species grow pictures."""
 
 from __future__ import annotations
 
@@ -7,27 +7,20 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from npa_envs.envs.multi.config import SpeciesConfig
-from npa_envs.tasks.checks import check_non_negative, check_positive
+from npa_envs.envs.multi.task import SpeciesConfig
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 
 
 @dataclass(frozen=True, kw_only=True)
 class GrowthConfig(SpeciesConfig):
-    """What tasks with pictures can be told besides."""
+    """Adds the loss of `Morphogenesis2DConfig`, which explains it."""
+
+    task_config_type = Morphogenesis2DConfig
 
     resolution: int = 64
-    """Pixels on each side of the picture that the loss compares."""
-
-    sigma: float = 1.0
-    """Standard deviation of a particle's splat, in pixels of the target (dimensionless)."""
-
-    colour_weight: float = 5.0
-    """Weight of the colour error against the density error (dimensionless)."""
-
+    sigma: float = Morphogenesis2DConfig.sigma
+    colour_weight: float = Morphogenesis2DConfig.colour_weight
     render_style: str = "particles"
-    """What pictures show: "species" (a colour each), "particles" (their own colours), "density" or
-    "states" (hidden channels)."""
 
     def __post_init__(self) -> None:
         """Check every field.
@@ -36,10 +29,39 @@ class GrowthConfig(SpeciesConfig):
             NPAError: A field has the wrong type or lies outside its range.
         """
         super().__post_init__()
-        check_positive(self, int, "state_dim", at_least=3)
-        check_positive(self, int, "resolution", at_least=8)
-        check_positive(self, float, "sigma")
-        check_non_negative(self, "colour_weight")
+        _ = self.goal_config()
+
+    def goal_config(
+        self, target: str = Morphogenesis2DConfig.target, particle_count: int = 1
+    ) -> Morphogenesis2DConfig:
+        """Return what the task of growing a target with so many particles is told.
+
+        Args:
+            target: A built-in name, an emoji, or the path of a picture.
+            particle_count: Particles that the target is made for; as many points are in it.
+        """
+        return self.task_config(
+            Morphogenesis2DConfig,
+            target=target,
+            target_point_count=particle_count,
+            particle_count=particle_count,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class OneTargetConfig(GrowthConfig):
+    """Adds the one picture of tasks that have no other."""
+
+    target: str = Morphogenesis2DConfig.target
+
+    def __post_init__(self) -> None:
+        """Check every field.
+
+        Raises:
+            NPAError: A field has the wrong type or lies outside its range.
+        """
+        super().__post_init__()
+        _ = self.goal_config(self.target)
 
 
 def make_goal(
@@ -50,27 +72,13 @@ def make_goal(
     Args:
         config: The environment's configuration.
         target: A built-in name, an emoji, or the path of a picture.
-        particle_count: Particles that the target is made for; as many points are in it.
+        particle_count: Particles that the target is made for.
         device: Where worlds are compared with it.
 
     Raises:
         NPAError: The target cannot be loaded.
     """
-    return Morphogenesis2D(
-        Morphogenesis2DConfig(
-            target=target,
-            target_point_count=particle_count,
-            particle_count=particle_count,
-            state_dim=config.state_dim,
-            eps=config.eps,
-            alpha=config.alpha,
-            seed_radius=config.seed_radius,
-            resolution=config.resolution,
-            sigma=config.sigma,
-            colour_weight=config.colour_weight,
-        ),
-        device=device,
-    )
+    return Morphogenesis2D(config.goal_config(target, particle_count), device=device)
 
 
 def row_half_width(config: GrowthConfig) -> float:

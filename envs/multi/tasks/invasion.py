@@ -10,8 +10,12 @@ from torch import Tensor
 
 from npa_envs import world_mean
 from npa_envs.envs.multi.task import Population, SpeciesTask
-from npa_envs.envs.multi.tasks.growth import make_goal, picture_parts, row_half_width
-from npa_envs.envs.multi.tasks.symbiosis import OneTargetConfig
+from npa_envs.envs.multi.tasks.growth import (
+    OneTargetConfig,
+    make_goal,
+    picture_parts,
+    row_half_width,
+)
 from npa_envs.errors import NPAError
 
 

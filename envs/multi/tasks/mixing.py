@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from npa_envs import perceive, world_mean
-from npa_envs.envs.multi.config import SpeciesConfig
-from npa_envs.envs.multi.task import Population, SpeciesTask, by_species
+from npa_envs.envs.multi.task import Population, SpeciesConfig, SpeciesTask, by_species
 
 
 def local_entropy(population: Population, *, eps: float, box: float | None) -> Tensor:
@@ -73,8 +72,7 @@ class MixingTask(SpeciesTask):
         return {"separation": 1.0 - self._entropy(population)}
 
     def _entropy(self, population: Population) -> Tensor:
-        box = self.config.box_size if self.config.boundary == "periodic" else None
-        return local_entropy(population, eps=self.config.eps, box=box)
+        return local_entropy(population, eps=self.config.eps, box=self.config.box)
 
 
 # `npa/Segregation-v0`: species that start all mixed are to part.

@@ -9,29 +9,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.envs.multi.task import Population, SpeciesTask
-from npa_envs.envs.multi.tasks.growth import GrowthConfig, make_goal, picture_parts
-from npa_envs.errors import NPAError
-
-
-@dataclass(frozen=True, kw_only=True)
-class OneTargetConfig(GrowthConfig):
-    """What tasks with one picture can be told besides."""
-
-    target: str = "gecko"
-    """What to grow: a built-in name (`npa-envs list`), an emoji, or the path of a picture."""
-
-    def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            NPAError: A field has the wrong type or lies outside its range.
-        """
-        super().__post_init__()
-        if not isinstance(self.target, str) or not self.target:
-            raise NPAError(
-                f"target must be a built-in name, an emoji or a path, got {self.target!r}: "
-                "for example target='gecko'"
-            )
+from npa_envs.envs.multi.tasks.growth import OneTargetConfig, make_goal, picture_parts
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,17 +1,103 @@
-"""Spaces of agents that own particles, and of the world as a whole."""
+"""Agents that own particles of shared worlds: names, spaces, actions laid one after the other."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from gymnasium.spaces import Box
+from gymnasium.utils import seeding
+from numpy.typing import NDArray
 from torch import Tensor
 
+from npa_envs.envs.core.screen import Screen
+from npa_envs.envs.core.spaces import action_tensor, to_output
+from npa_envs.envs.core.vector import world_keys
+from npa_envs.envs.multi.episodes import Episodes
 from npa_envs.errors import DivergedError, NPAError
 from npa_envs.world.actions import Physics
+
+
+class AgentsEnv:
+    """What environments of agents are made of, be it one world or many.
+
+    Args:
+        task: A name from `npa_envs.envs.multi.TASKS`.
+        keywords: Fields of the task's configuration.
+        world_count: Worlds B.
+        by_particle: Whether every particle is an agent, and not every species.
+
+    Raises:
+        NPAError: There is no such task, a keyword is unknown or wrong, or the worlds do not fit
+            into memory.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {
+        "name": "npa_multispecies_v0",
+        "render_modes": ["rgb_array", "human"],
+        "render_fps": 25,
+        "is_parallelizable": True,
+    }
+
+    def __init__(
+        self, task: str, keywords: dict[str, Any], world_count: int, *, by_particle: bool
+    ) -> None:
+        self._episodes = episodes = Episodes(task, keywords, world_count, by_particle=by_particle)
+        self._by_particle = by_particle
+        self._task_name = task
+        self.config = episodes.config
+        self.render_mode = self.config.render_mode
+        self.max_cycles = self.config.max_cycles
+        """Steps after which an episode is cut off for all."""
+        self.worlds = worlds = episodes.worlds
+        """The particles."""
+        word = "particle" if by_particle else "species"
+        self.possible_agents = [f"{word}_{k}" for k in range(worlds.agent_count)]
+        """Names of the agents."""
+        counts = [span.stop - span.start for span in episodes.spans]
+        rows = [() if by_particle else (count,) for count in counts]
+        # Of observations and of actions, by agents.
+        self._spaces = agent_spaces(
+            worlds.physics, worlds.perception_dim, self.possible_agents, rows
+        )
+        self._state_space = state_space(worlds.physics, worlds.particle_count)
+        self.np_random: np.random.Generator | None = None
+        self._started = False
+        self._screen = Screen(worlds, self.config, self.metadata["render_fps"])
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        self._screen.close()
+
+    def _next_keys(self, seed: int | Sequence[int] | None, first: int | None) -> Tensor | None:
+        """Return keys of all worlds' randomness where it begins anew, [B], or None to go on.
+
+        Args:
+            seed: What `reset` was given.
+            first: What the generator of later keys begins with.
+        """
+        if seed is None and self.np_random is not None:
+            return None
+        self.np_random, _ = seeding.np_random(first)
+        return world_keys(seed, self.worlds.world_count, self.np_random)
+
+    def _state(self) -> Tensor:
+        if not self._started:
+            raise NPAError("state needs a world: call reset first")
+        return self.worlds.state()
+
+    def _pictures(self) -> NDArray[np.uint8] | None:
+        if not self._started:
+            raise NPAError("render needs a world: call reset first")
+        return self._screen.render()
+
+    def _out(self, tensor: Tensor) -> Any:
+        return to_output(tensor, self.config.output)
+
+    def _show(self) -> None:
+        self._screen.show(f"{self.metadata['name']}: {self._task_name}")
 
 
 def agent_spaces(
@@ -49,9 +135,6 @@ def state_space(physics: Physics, particle_count: int) -> Box:
     return Box(np.tile(low, shape), np.tile(high, shape), dtype=np.float32)
 
 
-# Actions of several agents, checked and laid one after the other.
-
-
 def joined_actions(
     actions: Any, agents: Sequence[str], shapes: Sequence[tuple[int, ...]], device: torch.device
 ) -> Tensor:
@@ -87,7 +170,8 @@ def joined_actions(
             "get no more actions until reset; see env.agents"
         )
     rows = [
-        _checked(agent, actions[agent], shape) for agent, shape in zip(agents, shapes, strict=True)
+        action_tensor(f"actions[{agent!r}]", actions[agent], shape, f"env.action_space({agent!r})")
+        for agent, shape in zip(agents, shapes, strict=True)
     ]
     # What has one row only has no dimension for it.
     blocks = [row if row.ndim > 1 else row[None] for row in rows]
@@ -100,30 +184,6 @@ def joined_actions(
             "numbers): check the policy; the world is as it was"
         )
     return joined
-
-
-def _checked(agent: str, action: Any, wanted: tuple[int, ...]) -> Tensor:
-    try:
-        if not isinstance(action, Tensor):
-            if np.iscomplexobj(action):
-                raise TypeError("complex numbers")
-            # Torch cannot read what may not be written.
-            action = torch.from_numpy(np.require(action, np.float32, ("C", "W")))
-    except (TypeError, ValueError) as error:
-        raise NPAError(_rule(agent, wanted, type(action).__name__)) from error
-    if tuple(action.shape) != wanted or action.dtype.is_complex:
-        raise NPAError(_rule(agent, wanted, f"{tuple(action.shape)} of {action.dtype}"))
-    if action.layout != torch.strided or action.is_meta:
-        raise NPAError(_rule(agent, wanted, f"a tensor that is {action.layout} on {action.device}"))
-    checked: Tensor = action.detach().to(torch.float32)
-    return checked
-
-
-def _rule(agent: str, wanted: tuple[int, ...], came: str) -> str:
-    return (
-        f"actions[{agent!r}] must be real numbers of shape {wanted}, got {came}: "
-        f"see env.action_space({agent!r})"
-    )
 
 
 def _names(agents: Sequence[str]) -> str:
