@@ -5,8 +5,8 @@
 
 A page is the docstring of an environment's class. Added are the spaces' numbers, which are computed
 from the default configuration, and the tables of arguments, whose meanings are the docstrings of
-the configuration's fields. A section that begins with "As in `OtherEnv`." stands for that section
-of the other environment, so that nothing is written twice.
+the configuration's fields. After each section comes what `NPAEnv` says there of all environments; a
+section that an environment has not is that of `Morphogenesis2DEnv`.
 """
 
 from __future__ import annotations
@@ -45,7 +45,6 @@ observation, reward, terminated, truncated, info = env.step(env.action_space.sam
 # Eight worlds as one batch; device="cuda" puts it on a GPU.
 envs = gym.make_vec("{id}", num_envs=8)
 ```"""
-SAME_AS = re.compile(r"As in `(\w+)`\.\s*")
 COLUMNS = re.compile(r"\| `([^`]+) : ([^`]+)` \|")
 
 
@@ -58,13 +57,12 @@ def environment_class(registration: Registration) -> type[NPAEnv]:
 
 
 def resolved_sections(env_class: type) -> dict[str, str]:
-    """Return the sections with those of other environments put where they are meant."""
-    classes = {cls.__name__: cls for cls in map(environment_class, ENVIRONMENTS)}
-    found = sections(env_class)
-    for heading, text in found.items():
-        if same := SAME_AS.match(text):
-            other = resolved_sections(classes[same[1]])[heading]
-            found[heading] = "\n\n".join(filter(None, (other, text[same.end() :])))
+    """Return the sections with what is said of all environments, in one order."""
+    own, first, shared = map(sections, (env_class, environment_class(ENVIRONMENTS[0]), NPAEnv))
+    found = {"": own[""]}
+    for heading in [name for name in (first | shared) if name]:
+        parts = own.get(heading) or first.get(heading), shared.get(heading)
+        found[heading] = "\n\n".join(part for part in parts if part)
     return found
 
 

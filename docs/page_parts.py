@@ -31,9 +31,8 @@ def field_meanings(config_type: type) -> dict[str, str]:
             say before what the configuration of the task says that is shared with training.
     """
     meanings: dict[str, str] = {}
-    task_config_type = getattr(config_type, "task_config_type", None)
-    bases = [] if task_config_type is None else [task_config_type]
-    for cls in [*bases, *reversed(config_type.__mro__[:-1])]:
+    of_task = getattr(config_type, "task_config_type", None) or object
+    for cls in (*reversed(of_task.__mro__[:-1]), *reversed(config_type.__mro__[:-1])):
         body = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0].body
         for field, text in pairwise(body):
             if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):

@@ -30,11 +30,7 @@ class Morphogenesis2DEnvConfig(EnvConfig):
     seed_radius: float = Morphogenesis2DConfig.seed_radius
 
     def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            NPAError: A field has the wrong type or lies outside its range.
-        """
+        """Check every field."""
         super().__post_init__()
         _ = self.goal
         self.check_start_radius(self.seed_radius)
@@ -151,92 +147,20 @@ class Morphogenesis2DEnv(NPAEnv):
     loss L is the sum of a density error (is there something where there should be?) and
     `colour_weight` times a colour error; 0 is a perfect picture. The picture's middle is moved onto
     the target's first, so where the whole thing lies does not count. Formula:
-    [pictures](../mathematics.md#pictures).
-
-    | `reward` | Reward of step t |
-    |---|---|
-    | `"dense"` | L before the step minus L after it |
-    | `"sparse"` | 0, and minus L in the last step |
-    | `"particle"` | as dense; besides, `info["particle_reward"]` has each particle's own |
-
-    Dense rewards telescope: their sum over an episode is L at its start minus L at its end. So the
-    undiscounted return is largest where the last picture is best, whatever the way there. `info`
-    holds the reward's two parts, as `reward_density` and `reward_colour`. A particle's own reward
-    comes from the errors of the pixels that it covers; the mean of all is the dense reward, up to
-    rounding. In a step that diverges L counts as at least its value at the start, so that leaving
-    the world never pays; the parts in `info` are as they are.
+    [pictures](../mathematics.md#pictures). A particle's own reward comes from the errors of the
+    pixels that it covers.
 
     ## Starting state
 
     Particles are uniform in a disk of radius `seed_radius` around the origin, all states are zero.
-    `reset(seed=k)` begins the sequence of episodes that belongs to k, and `reset()` goes on with
-    the next one. With `seed_pool=K` there are only K different starts.
 
     ## Episode end
 
-    | Cause | Returned as | `info["reason"]` |
-    |---|---|---|
-    | the loss is at most `success_loss` | terminated | `"success"` |
-    | a particle has left the world, or its state has run away | terminated | `"diverged"` |
-    | `max_episode_steps` steps are done, by default 256 | truncated | `"time limit"` |
-
-    `success_loss` is None by default: growth has no natural end, and the picture should last. A
-    particle has left where a coordinate is beyond ±`position_limit`, and its state has run away
-    beyond ±`observation_limit`. The steps of a single environment are counted by Gymnasium, which
-    truncates without a reason; with `reward="sparse"` such an environment has to be told the number
-    of steps twice, as `max_episode_steps` and as `episode_steps`.
+    `success_loss` is None by default: growth has no natural end, and the picture should last.
 
     ## Info
 
-    | Key | In | Value |
-    |---|---|---|
-    | `loss` | reset, step | L as it is now |
-    | `loss_density`, `loss_colour` | reset, step | its two parts |
-    | `reward_density`, `reward_colour` | step | how much each part improved in this step |
-    | `success`, `diverged` | step | whether it did so in this step, bool |
-    | `reason` | last step | why the episode ended, see above |
-    | `particle_reward` | step, where `reward="particle"` | each particle's own reward, shape [N] |
-
-    ## Rendering
-
-    `render_mode="rgb_array"` makes uint8 pictures of shape [R, R, 3], R = `render_size`, that show
-    [-1, 1] × [-1, 1] with y up. `render_mode="human"` shows them in a window while the environment
-    is stepped; it needs `pip install 'npa-envs[human]'` and a screen: without one, it warns once
-    and goes on. `render_style` chooses between the particles' colours, how dense they lie, and
-    their hidden channels.
-
-    ## Arguments
-
-    All are keywords of `gym.make` and `gym.make_vec`. An unknown name, or a value out of range,
-    raises an `NPAError` that says what would be right.
-
-    ## Vectorized environment
-
-    `gym.make_vec(id, num_envs=B)` makes B worlds that one call steps together, on the CPU or, with
-    `device="cuda"`, on a GPU. Observations have shape [B, N, P], actions [B, N, A], rewards and
-    flags [B]. World k after `reset(seed=s)` is the single environment after `reset(seed=s + k)`,
-    bit for bit, for every B.
-
-    - With `output="torch"` everything that comes out is a tensor on the device, and actions may be
-      tensors as well: nothing but the episodes' ends is copied to the host.
-    - Infos are arrays of shape [B], each with a mask of the same name behind an underscore, as
-      Gymnasium's vector environments have them.
-    - With `autoreset_mode="same-step"`, the default, a world whose episode is over starts the next
-      one at once: the last observation is in `infos["final_obs"]`, the last infos, with the reason,
-      in `infos["final_info"]`.
-    - `reset(options={"reset_mask": mask})` resets some worlds and leaves the others alone.
-
-    `env.unwrapped.particles()` returns positions and states, and `place_particles(x, s)` replaces
-    them, at no reward; single environments have both as well.
-
-    ## References
-
-    H. Kim, E. Pajouheshgar, S. Süsstrunk, W. Jakob, J. Park: Neural Particle Automata: Learning
-    Self-Organizing Particle Dynamics. [arXiv 2601.16096](https://arxiv.org/abs/2601.16096), 2026.
-
-    ## Version history
-
-    - v0: first version.
+    The parts of the loss are `density` and `colour`.
     """
 
     task_type = PictureTask

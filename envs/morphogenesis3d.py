@@ -55,11 +55,7 @@ class Morphogenesis3DEnvConfig(EnvConfig):
     """Opacity of a particle, in (0, 1); with a read-out, where that is 0."""
 
     def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            NPAError: A field has the wrong type or lies outside its range.
-        """
+        """Check every field."""
         super().__post_init__()
         if not isinstance(self.readout, str):
             raise NPAError(
@@ -203,68 +199,29 @@ class Morphogenesis3DEnv(NPAEnv):
     mean absolute difference to what they should see, over red, green, blue and alpha; 0 is the
     target. Formulas: [3D morphogenesis](../mathematics.md#3d-morphogenesis).
 
-    | `reward` | Reward of step t |
-    |---|---|
-    | `"dense"` | L before the step minus L after it |
-    | `"sparse"` | 0, and minus L in the last step |
-    | `"particle"` | as dense; besides, `info["particle_reward"]` has each particle's own |
-
-    Dense rewards telescope: their sum over an episode is L at its start minus L at its end. `info`
-    holds the reward as `reward_views` too. A particle's own reward comes from how much better or
-    worse, to first order, the views are for its opacity; the mean of all is the dense reward, up to
-    rounding. In a step that diverges L counts as at least its value at the start, so that it never
-    pays.
+    A particle's own reward comes from how much better or worse, to first order, the views are for
+    its opacity.
 
     ## Starting state
 
-    Particles are uniform in a ball of radius `seed_radius`, all states are zero. `reset(seed=k)`
-    begins the sequence of episodes that belongs to k, and `reset()` goes on with the next one. With
-    `seed_pool=K` there are only K different starts.
+    Particles are uniform in a ball of radius `seed_radius`, all states are zero.
 
     ## Episode end
 
-    | Cause | Returned as | `info["reason"]` |
-    |---|---|---|
-    | the loss is at most `success_loss` | terminated | `"success"` |
-    | a particle has run away | terminated | `"diverged"` |
-    | `max_episode_steps` steps are done, by default 128 | truncated | `"time limit"` |
-
-    `success_loss` is None by default. A particle has run away beyond ±`position_limit`, or with a
-    state beyond ±`observation_limit`. The steps of a single environment are counted by Gymnasium,
-    which truncates without a reason; with `reward="sparse"` such an environment has to be told the
-    number of steps twice, as `max_episode_steps` and as `episode_steps`.
+    `success_loss` is None by default.
 
     ## Info
 
-    | Key | In | Value |
-    |---|---|---|
-    | `loss`, `loss_views` | reset, step | L as it is now |
-    | `reward_views` | step | how much it improved in this step |
-    | `success`, `diverged` | step | whether it did so in this step, bool |
-    | `reason` | last step | why the episode ended, see above |
-    | `particle_reward` | step, where `reward="particle"` | each particle's own reward, shape [N] |
+    The loss has one part, `views`.
 
     ## Rendering
 
-    As in `Morphogenesis2DEnv`. The camera goes round by two degrees a step. With a `readout` the
-    style `"particles"` draws the Gaussians that it says.
-
-    ## Arguments
-
-    As in `Morphogenesis2DEnv`.
-
-    ## Vectorized environment
-
-    As in `Morphogenesis2DEnv`.
+    The camera goes round by two degrees a step. With a `readout` the style `"particles"` draws the
+    Gaussians that it says.
 
     ## References
 
-    As in `Morphogenesis2DEnv`. Gaussians: Kerbl et al. 2023, "3D Gaussian Splatting for Real-Time
-    Radiance Field Rendering".
-
-    ## Version history
-
-    - v0: first version.
+    Gaussians: Kerbl et al. 2023, "3D Gaussian Splatting for Real-Time Radiance Field Rendering".
     """
 
     task_type = SolidTask

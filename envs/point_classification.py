@@ -50,11 +50,7 @@ class PointClassificationEnvConfig(EnvConfig):
     """Rule whose read-out tells classes from states, a file; empty: the last channels are them."""
 
     def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            NPAError: A field has the wrong type or lies outside its range.
-        """
+        """Check every field."""
         super().__post_init__()
         if self.boundary != "open":
             raise NPAError(
@@ -168,11 +164,8 @@ class PointClassificationEnv(NPAEnv):
     Neural Particle Automata, "self-classifying point clouds".
 
     `data="digits"` needs `pip install 'npa-envs[points]'`; see
-    [point clouds](../point_classification.md) for MNIST and data of one's own.
-
-    ## Observation space
-
-    As in `Morphogenesis2DEnv`.
+    [point clouds](../point_classification.md) for MNIST and data of one's own. The observation
+    space is that of `Morphogenesis2DEnv`.
 
     ## Action space
 
@@ -193,72 +186,25 @@ class PointClassificationEnv(NPAEnv):
     plus `overflow_weight` times the mean of |s − clip(s, −1, 1)|. Blank states have
     L = 1 / `class_count`.
 
-    | `reward` | Reward of step t |
-    |---|---|
-    | `"dense"` | L before the step minus L after it |
-    | `"sparse"` | 0, and minus L in the last step |
-    | `"particle"` | as dense; besides, `info["particle_reward"]` has each particle's own |
-
-    Dense rewards telescope: their sum over an episode is L at its start minus L at its end. `info`
-    holds the reward's two parts, as `reward_error` and `reward_overflow`. A particle's own reward
-    is its own loss's; the mean of all is the dense reward, up to rounding. In a step that diverges
-    L counts as at least its value at the start.
+    A particle's own reward is its own loss's.
 
     ## Starting state
 
     A random cloud of the `split`, turned, stretched and shaken as `rotation`, `stretch` and
-    `jitter` say; all states are zero. `reset(seed=k)` begins the sequence of episodes that belongs
-    to k, and `reset()` goes on with the next one. With `seed_pool=K` there are only K different
-    starts. `place_particles` leaves a world the class that it has.
+    `jitter` say; all states are zero. `place_particles` leaves a world the class that it has.
 
     ## Episode end
 
-    | Cause | Returned as | `info["reason"]` |
-    |---|---|---|
-    | the loss is at most `success_loss` | terminated | `"success"` |
-    | a particle's state has run away | terminated | `"diverged"` |
-    | `max_episode_steps` steps are done, by default 64 | truncated | `"time limit"` |
-
-    `success_loss` is None by default. A state has run away beyond ±`observation_limit`. The steps
-    of a single environment are counted by Gymnasium, which truncates without a reason; with
-    `reward="sparse"` such an environment has to be told the number of steps twice, as
-    `max_episode_steps` and as `episode_steps`.
+    `success_loss` is None by default. No particle moves, so that none leaves the world.
 
     ## Info
 
-    | Key | In | Value |
-    |---|---|---|
-    | `loss` | reset, step | L as it is now |
-    | `loss_error`, `loss_overflow` | reset, step | its two parts |
-    | `reward_error`, `reward_overflow` | step | how much each part improved in this step |
-    | `success`, `diverged` | step | whether it did so in this step, bool |
-    | `reason` | last step | why the episode ended, see above |
-    | `particle_reward` | step, where `reward="particle"` | each particle's own reward, shape [N] |
+    The parts of the loss are `error` and `overflow`.
 
     ## Rendering
 
-    `render_mode="rgb_array"` makes uint8 pictures of shape [R, R, 3], R = `render_size`, that show
-    [0, 1] × [0, 1] with y up: a particle has the colour of the class that it says, greyer the less
-    sure it is. `render_mode="human"` shows them in a window while the environment is stepped; it
-    needs `pip install 'npa-envs[human]'` and a screen: without one, it warns once and goes on.
-    `render_style` chooses between these colours, how dense the particles lie, and their hidden
-    channels.
-
-    ## Arguments
-
-    As in `Morphogenesis2DEnv`.
-
-    ## Vectorized environment
-
-    As in `Morphogenesis2DEnv`.
-
-    ## References
-
-    As in `Morphogenesis2DEnv`.
-
-    ## Version history
-
-    - v0: first version.
+    A particle has the colour of the class that it says, greyer the less sure it is, and [0, 1] ×
+    [0, 1] is shown in place of the square named below.
     """
 
     task_type = PointClassificationTask

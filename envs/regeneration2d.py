@@ -67,11 +67,7 @@ class Regeneration2DEnvConfig(Morphogenesis2DEnvConfig):
     `success_loss` is given (dimensionless, in (0, 1])."""
 
     def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            NPAError: A field has the wrong type or lies outside its range.
-        """
+        """Check every field."""
         super().__post_init__()
         kinds = (*SIZES, RANDOM_DAMAGE)
         if self.damage not in kinds:
@@ -192,19 +188,8 @@ class Regeneration2DEnv(NPAEnv):
     so that their hidden states mean something to it;
     `npa_envs.agents.RulePolicy(npa_envs.load_rule("gecko"), env)` shows what it can do. To another
     policy these hidden states are somebody else's notes: `rule="picture"` starts from the target's
-    own points instead, with blank hidden states.
-
-    ## Observation space
-
-    As in `Morphogenesis2DEnv`.
-
-    ## Action space
-
-    As in `Morphogenesis2DEnv`.
-
-    ## Reward
-
-    As in `Morphogenesis2DEnv`.
+    own points instead, with blank hidden states. Spaces, reward and `info` are those of
+    `Morphogenesis2DEnv`.
 
     ## Starting state
 
@@ -221,47 +206,13 @@ class Regeneration2DEnv(NPAEnv):
     | `"random"` | one of the first three, drawn for each episode |
 
     `damage_size` is the disk's radius, the width of the cut, or the noise's standard deviation
-    [length units]; see [damage](../mathematics.md#damage). `reset(seed=k)` begins the sequence of
-    episodes that belongs to k, and `reset()` goes on with the next one.
+    [length units]; see [damage](../mathematics.md#damage).
 
     ## Episode end
 
-    | Cause | Returned as | `info["reason"]` |
-    |---|---|---|
-    | `healed_share` of what the damage added to the loss is gone | terminated | `"success"` |
-    | a particle has left the world, or its state has run away | terminated | `"diverged"` |
-    | `max_episode_steps` steps are done, by default 128 | truncated | `"time limit"` |
-
-    Damage that raises the loss by less than 2 % cannot be healed, so that the episode runs to its
-    limit. With `success_loss` given, success is a loss of at most this instead. A particle has left
-    where a coordinate is beyond ±`position_limit`, and its state has run away beyond
-    ±`observation_limit`. The steps of a single environment are counted by Gymnasium, which
-    truncates without a reason; with `reward="sparse"` such an environment has to be told the number
-    of steps twice, as `max_episode_steps` and as `episode_steps`.
-
-    ## Info
-
-    As in `Morphogenesis2DEnv`.
-
-    ## Rendering
-
-    As in `Morphogenesis2DEnv`.
-
-    ## Arguments
-
-    As in `Morphogenesis2DEnv`.
-
-    ## Vectorized environment
-
-    As in `Morphogenesis2DEnv`.
-
-    ## References
-
-    As in `Morphogenesis2DEnv`.
-
-    ## Version history
-
-    - v0: first version.
+    The episode ends in success once `healed_share` of what the damage added to the loss is gone;
+    with `success_loss` given, once the loss is at most this instead. Damage that raises the loss by
+    less than 2 % cannot be healed, so that the episode runs to its limit.
     """
 
     task_type = RegenerationTask

@@ -41,11 +41,7 @@ class TextureEnvConfig(EnvConfig):
     density_weight: float = TextureConfig.density_weight
 
     def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            NPAError: A field has the wrong type or lies outside its range.
-        """
+        """Check every field."""
         super().__post_init__()
         if self.boundary != "periodic":
             raise NPAError(
@@ -122,15 +118,7 @@ class TextureEnv(NPAEnv):
     its neighbourhood within the radius ε, and one small network, applied to every row of the
     observation alike, is the usual policy. Rules for textures are trained by gradient with
     `npa-envs train texture`; `npa_envs.agents.RulePolicy(npa_envs.load_rule("rule.safetensors"),
-    env)` makes a policy of one.
-
-    ## Observation space
-
-    As in `Morphogenesis2DEnv`.
-
-    ## Action space
-
-    As in `Morphogenesis2DEnv`.
+    env)` makes a policy of one. Spaces are those of `Morphogenesis2DEnv`.
 
     ## Reward
 
@@ -141,62 +129,25 @@ class TextureEnv(NPAEnv):
     `colour_weight`, and that of the density image, times `density_weight`; 0 is the same texture.
     Formulas: [textures](../mathematics.md#textures).
 
-    | `reward` | Reward of step t |
-    |---|---|
-    | `"dense"` | L before the step minus L after it |
-    | `"sparse"` | 0, and minus L in the last step |
-    | `"particle"` | as dense; besides, `info["particle_reward"]` has each particle's own |
-
-    Dense rewards telescope: their sum over an episode is L at its start minus L at its end. `info`
-    holds the reward's two parts, as `reward_colour` and `reward_density`. A particle's own reward
-    comes from how much better or worse, to first order, the texture is for what the particle adds
-    to the picture; the mean of all is the dense reward, up to rounding. In a step that diverges L
-    counts as at least its value at the start, so that it never pays; the parts in `info` are as
-    they are.
+    A particle's own reward comes from how much better or worse, to first order, the texture is for
+    what the particle adds to the picture.
 
     ## Starting state
 
-    Particles are uniform in the box, all states are zero. `reset(seed=k)` begins the sequence of
-    episodes that belongs to k, and `reset()` goes on with the next one. With `seed_pool=K` there
-    are only K different starts.
+    Particles are uniform in the box, all states are zero.
 
     ## Episode end
 
-    | Cause | Returned as | `info["reason"]` |
-    |---|---|---|
-    | the loss is at most `success_loss` | terminated | `"success"` |
-    | a particle's state has run away | terminated | `"diverged"` |
-    | `max_episode_steps` steps are done, by default 128 | truncated | `"time limit"` |
-
-    `success_loss` is None by default. No particle can leave a periodic box; a state has run away
-    beyond ±`observation_limit`. The steps of a single environment are counted by Gymnasium, which
-    truncates without a reason; with `reward="sparse"` such an environment has to be told the number
-    of steps twice, as `max_episode_steps` and as `episode_steps`.
+    `success_loss` is None by default. No particle can leave a periodic box.
 
     ## Info
 
-    As in `Morphogenesis2DEnv`.
-
-    ## Rendering
-
-    As in `Morphogenesis2DEnv`.
-
-    ## Arguments
-
-    As in `Morphogenesis2DEnv`.
+    The parts of the loss are `colour` and `density`.
 
     ## Vectorized environment
 
-    As in `Morphogenesis2DEnv`. With `loss="vgg_ot"` and `reward="particle"` particles' own rewards
-    may differ in their last bits from one number of worlds to another; nothing else does.
-
-    ## References
-
-    As in `Morphogenesis2DEnv`.
-
-    ## Version history
-
-    - v0: first version.
+    With `loss="vgg_ot"` and `reward="particle"` particles' own rewards may differ in their last
+    bits from one number of worlds to another; nothing else does.
     """
 
     task_type = TextureTask

@@ -311,7 +311,7 @@ def test_a_wrong_action_is_refused_and_leaves_the_worlds_as_they_were():
     envs, untouched = batch(), batch()
     with pytest.raises(NPAError, match="step needs worlds: call reset first"):
         envs.step({})
-    with pytest.raises(NPAError, match="state needs worlds"):
+    with pytest.raises(NPAError, match="state needs a world"):
         envs.state()
     with pytest.raises(NPAError, match="reset_mask needs worlds to leave alone"):
         envs.reset(options={"reset_mask": np.array([True, False, True])})

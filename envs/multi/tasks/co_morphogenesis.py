@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from npa_envs.envs.multi.task import Population, SpeciesTask, by_species
-from npa_envs.envs.multi.tasks.growth import GrowthConfig, make_goal, picture_parts, row_half_width
+from npa_envs.envs.multi.task import Population, by_species
+from npa_envs.envs.multi.tasks.picture_loss import PictureLossConfig, PictureLossTask
 from npa_envs.errors import NPAError
 
 USUAL = ("gecko", "heart", "butterfly", "flower", "octopus", "ring")
@@ -17,7 +17,7 @@ USUAL = ("gecko", "heart", "butterfly", "flower", "octopus", "ring")
 
 
 @dataclass(frozen=True, kw_only=True)
-class CoMorphogenesisConfig(GrowthConfig):
+class CoMorphogenesisConfig(PictureLossConfig):
     """What growing side by side, or through each other, can be told besides."""
 
     targets: tuple[str, ...] = ()
@@ -29,11 +29,7 @@ class CoMorphogenesisConfig(GrowthConfig):
     each other, 2 side by side."""
 
     def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            NPAError: A field has the wrong type or lies outside its range.
-        """
+        """Check every field."""
         super().__post_init__()
         names = self.targets
         named = isinstance(names, tuple) and all(isinstance(n, str) and n for n in names)
@@ -54,47 +50,24 @@ class CoMorphogenesisConfig(GrowthConfig):
         return tuple(USUAL[k % len(USUAL)] for k in range(self.species_count))
 
 
-class CoMorphogenesisTask(SpeciesTask):
-    """A splat loss for each species, of its own particles against its own target.
-
-    Args:
-        config: The environment's configuration.
-        device: Where the world lives.
-
-    Raises:
-        NPAError: A target cannot be loaded.
-    """
+class CoMorphogenesisTask(PictureLossTask):
+    """A splat loss for each species, of its own particles against its own target."""
 
     config_type = CoMorphogenesisConfig
     least_species = 1
 
     def __init__(self, config: CoMorphogenesisConfig, device: torch.device) -> None:
-        super().__init__(config, device)
-        self.goals = [
-            make_goal(config, target, count, device)
-            for target, count in zip(config.goals, config.counts, strict=True)
-        ]
-        """Targets and losses, one for each species."""
+        super().__init__(config, device, *zip(config.goals, config.counts, strict=True))
 
     def losses(self, population: Population) -> Mapping[str, Tensor]:
         """Return the density error and the weighted colour error of each species' picture."""
-        parts = [picture_parts(self.goals[k], *population.of(k)) for k in present(population)]
+        parts = [self.picture_parts(k, *population.of(k)) for k in present(population)]
         return {name: by_species([part[name] for part in parts], population) for name in parts[0]}
 
     def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
         """Return each particle's share of its species' splat loss."""
         shares = [self.goals[k].particle_shares(*population.of(k)) for k in present(population)]
         return {"picture": torch.cat(shares, dim=1)}
-
-    @property
-    def pixel_size(self) -> float:
-        """Size of a particle in pictures: the distance of the first target's points."""
-        return self.goals[0].target.pixel_size
-
-    @property
-    def open_half_width(self) -> float:
-        """Half of a picture [length units]: all targets fit where their seeds were."""
-        return row_half_width(self.config)
 
 
 def present(population: Population) -> list[int]:

@@ -9,26 +9,17 @@ import torch
 from torch import Tensor
 
 from npa_envs import world_mean
-from npa_envs.envs.multi.task import Population, SpeciesTask
-from npa_envs.envs.multi.tasks.growth import (
-    OneTargetConfig,
-    make_goal,
-    picture_parts,
-    row_half_width,
-)
+from npa_envs.envs.multi.task import Population
+from npa_envs.envs.multi.tasks.picture_loss import OnePictureConfig, PictureLossTask
 from npa_envs.errors import NPAError
 
 
 @dataclass(frozen=True, kw_only=True)
-class InvasionConfig(OneTargetConfig):
-    """What invasion can be told besides: species start beside each other."""
+class InvasionConfig(OnePictureConfig):
+    """As other pictures, but rewards cannot be shared."""
 
     def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            NPAError: A field has the wrong type or lies outside its range.
-        """
+        """Check every field."""
         super().__post_init__()
         if self.reward != "individual":
             raise NPAError(
@@ -37,35 +28,25 @@ class InvasionConfig(OneTargetConfig):
             )
 
 
-class InvasionTask(SpeciesTask):
-    """The splat loss of species 0; what it gains, the others lose together.
-
-    Args:
-        config: The environment's configuration.
-        device: Where the world lives.
-
-    Raises:
-        NPAError: The target cannot be loaded.
-    """
+class InvasionTask(PictureLossTask):
+    """The splat loss of species 0; what it gains, the others lose together."""
 
     config_type = InvasionConfig
 
     def __init__(self, config: InvasionConfig, device: torch.device) -> None:
-        super().__init__(config, device)
-        self.goal = make_goal(config, config.target, config.counts[0], device)
-        """The task of species 0 with its target and its loss."""
+        super().__init__(config, device, (config.target, config.counts[0]))
 
     def losses(self, population: Population) -> Mapping[str, Tensor]:
         """Return the parts of species 0's splat loss, and minus an equal share for each other."""
         counts = population.counts
         return {
             name: torch.stack([loss, *[-loss / _others(counts)] * (len(counts) - 1)], dim=1)
-            for name, loss in picture_parts(self.goal, *population.of(0)).items()
+            for name, loss in self.picture_parts(0, *population.of(0)).items()
         }
 
     def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
         """Return shares of species 0's splat loss, and minus an equal share for each other one."""
-        own = self.goal.particle_shares(*population.of(0))
+        own = self.goals[0].particle_shares(*population.of(0))
         own_count, other_count = own.shape[1], sum(population.counts[1:])
         share = world_mean(own[..., None])[:, 0] * (-own_count / max(other_count, 1))
         return {"picture": torch.cat((own, share[:, None].expand(-1, other_count)), dim=1)}
@@ -80,16 +61,6 @@ class InvasionTask(SpeciesTask):
     def is_over(self, counts: tuple[int, ...]) -> bool:
         """Return whether one side is gone."""
         return counts[0] == 0 or sum(counts[1:]) == 0
-
-    @property
-    def pixel_size(self) -> float:
-        """Size of a particle in pictures: the distance of the target's points."""
-        return self.goal.target.pixel_size
-
-    @property
-    def open_half_width(self) -> float:
-        """Half of a picture [length units]: the target fits where the seed was."""
-        return row_half_width(self.config)
 
 
 def _others(counts: tuple[int, ...]) -> int:
