@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
-from npa_envs.envs.core.task import EnvTask
+from npa_envs.envs.core.task import GoalTask
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
-from npa_envs.world.randomness import WorldRandom
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,44 +43,27 @@ class Morphogenesis2DEnvConfig(EnvConfig):
 Config = TypeVar("Config", bound=Morphogenesis2DEnvConfig)
 
 
-class PictureTask(EnvTask[Config]):
-    """A picture to grow, compared by the splat loss of `npa_envs.tasks.morphogenesis2d`.
-
-    Args:
-        config: The environment's configuration.
-        device: Where the worlds live.
-
-    Raises:
-        NPAError: The target cannot be loaded.
-    """
+class PictureTask(GoalTask[Config]):
+    """A picture to grow, compared by the splat loss of `npa_envs.tasks.morphogenesis2d`."""
 
     config_type = Morphogenesis2DEnvConfig
+    goal: Morphogenesis2D
 
     def __init__(self, config: Config, device: torch.device) -> None:
         super().__init__(config, device)
         self.goal = Morphogenesis2D(config.goal, device=device)
-        """The task with its target and its loss."""
 
     @classmethod
-    def extra_bytes(cls, config: EnvConfig, world_count: int) -> int:
+    def extra_bytes(cls, config: Any, world_count: int) -> int:
         """Return about how much memory pool and pictures need [bytes]."""
-        assert isinstance(config, Morphogenesis2DEnvConfig), "the task's own configuration"
         copies = 4 if config.reward == "particle" else 1
         pictures = 16 * copies * world_count * config.resolution**2
-        return super().extra_bytes(config, world_count) + pictures
-
-    def seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
-        """Return particles uniform in a disk around the origin, all states zero."""
-        return self.goal.seed(random.world_count, generator=random, device=self.device)
+        return super().extra_bytes(config, world_count) + int(pictures)
 
     def losses(self, x: Tensor, s: Tensor) -> Mapping[str, Tensor]:
         """Return the density error and the weighted colour error of each world."""
         density, colour = self.goal.splat_losses(x, s)
         return {"density": density, "colour": self.config.colour_weight * colour}
-
-    def particle_losses(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return each particle's share of the splat loss."""
-        return self.goal.particle_shares(x, s)
 
     @property
     def pixel_size(self) -> float:
@@ -160,7 +142,10 @@ class Morphogenesis2DEnv(NPAEnv):
 
     ## Info
 
-    The parts of the loss are `density` and `colour`.
+    | Key | In | Value |
+    |---|---|---|
+    | `loss_density`, `loss_colour` | reset, step | the parts of the loss |
+    | `reward_density`, `reward_colour` | step | how much each part improved in this step |
     """
 
     task_type = PictureTask

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,7 +14,7 @@ from torch import Tensor
 
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
-from npa_envs.envs.core.task import TURN, EnvTask
+from npa_envs.envs.core.task import TURN, GoalTask
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.errors import NPAError
 from npa_envs.render import turntable_frames
@@ -21,7 +22,6 @@ from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.checks import check_positive
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D, Morphogenesis3DConfig
-from npa_envs.world.randomness import WorldRandom
 
 PIXEL_BYTES = 200
 """About what comparing one pixel of a view needs [bytes]."""
@@ -77,18 +77,11 @@ class Morphogenesis3DEnvConfig(EnvConfig):
         )
 
 
-class SolidTask(EnvTask[Morphogenesis3DEnvConfig]):
-    """A thing to grow, compared view by view as `npa_envs.tasks.morphogenesis3d` does.
-
-    Args:
-        config: The environment's configuration.
-        device: Where the worlds live.
-
-    Raises:
-        NPAError: The target or the read-out cannot be loaded, or does not fit.
-    """
+class SolidTask(GoalTask[Morphogenesis3DEnvConfig]):
+    """A thing to grow, compared view by view as `npa_envs.tasks.morphogenesis3d` does."""
 
     config_type = Morphogenesis3DEnvConfig
+    goal: Morphogenesis3D
     space_dim = 3
 
     def __init__(self, config: Morphogenesis3DEnvConfig, device: torch.device) -> None:
@@ -96,28 +89,18 @@ class SolidTask(EnvTask[Morphogenesis3DEnvConfig]):
         goal = Morphogenesis3D(config.goal, device=device)
         self._rule = _read_out(config, device) if config.readout else None
         self.goal = goal if self._rule is None else goal.for_rule(self._rule)
-        """The task with its target and its loss."""
 
     @classmethod
-    def extra_bytes(cls, config: EnvConfig, world_count: int) -> int:
+    def extra_bytes(cls, config: Any, world_count: int) -> int:
         """Return about how much memory pool and views need [bytes]."""
-        assert isinstance(config, Morphogenesis3DEnvConfig), "the task's own configuration"
         view = PIXEL_BYTES * config.resolution**2 + SEEN_BYTES * config.particle_count
         copies = 2 if config.reward == "particle" else 1
         views = copies * world_count * config.view_count * view
-        return super().extra_bytes(config, world_count) + views
-
-    def seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
-        """Return particles uniform in a ball around the origin, all states zero."""
-        return self.goal.seed(random.world_count, generator=random, device=self.device)
+        return super().extra_bytes(config, world_count) + int(views)
 
     def losses(self, x: Tensor, s: Tensor) -> Mapping[str, Tensor]:
         """Return the mean absolute difference of each world's views."""
         return {"views": self.goal.metric(x, s)}
-
-    def particle_losses(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return each particle's share of the view loss."""
-        return self.goal.particle_shares(x, s)
 
     def draw(self, x: Tensor, s: Tensor, steps: NDArray[np.int64]) -> NDArray[np.uint8]:
         """Return a picture of each world; with a read-out, of the Gaussians that it says."""
@@ -212,7 +195,10 @@ class Morphogenesis3DEnv(NPAEnv):
 
     ## Info
 
-    The loss has one part, `views`.
+    | Key | In | Value |
+    |---|---|---|
+    | `loss_views` | reset, step | L too, as its one part |
+    | `reward_views` | step | how much it improved in this step |
 
     ## Rendering
 

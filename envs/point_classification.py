@@ -13,7 +13,7 @@ from torch import Tensor
 
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
-from npa_envs.envs.core.task import EnvTask, Start
+from npa_envs.envs.core.task import GoalTask, Start
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule
@@ -76,24 +76,16 @@ class _WorldByWorld(NPARule):
         return torch.stack([super(_WorldByWorld, self).read_out(world) for world in states])
 
 
-class PointClassificationTask(EnvTask[PointClassificationEnvConfig]):
-    """Clouds of digits, and the error of what their particles say of them.
-
-    Args:
-        config: The environment's configuration.
-        device: Where the worlds live.
-
-    Raises:
-        NPAError: The data or the rule cannot be loaded, or the rule does not fit.
-    """
+class PointClassificationTask(GoalTask[PointClassificationEnvConfig]):
+    """Clouds of digits, and the error of what their particles say of them."""
 
     config_type = PointClassificationEnvConfig
+    goal: PointClassification
     static = True
 
     def __init__(self, config: PointClassificationEnvConfig, device: torch.device) -> None:
         super().__init__(config, device)
         self.goal = PointClassification(config.goal, device=device, split=config.split)
-        """The task with its clouds and its loss."""
         if config.rule:
             self.goal = self.goal.for_rule(_read_out_rule(config, device))
         self._coverage = self.goal.clouds.coverage
@@ -199,7 +191,10 @@ class PointClassificationEnv(NPAEnv):
 
     ## Info
 
-    The parts of the loss are `error` and `overflow`.
+    | Key | In | Value |
+    |---|---|---|
+    | `loss_error`, `loss_overflow` | reset, step | the parts of the loss |
+    | `reward_error`, `reward_overflow` | step | how much each part improved in this step |
 
     ## Rendering
 

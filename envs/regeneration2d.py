@@ -80,15 +80,7 @@ class Regeneration2DEnvConfig(Morphogenesis2DEnvConfig):
 
 
 class RegenerationTask(PictureTask[Regeneration2DEnvConfig]):
-    """A grown picture, damaged.
-
-    Args:
-        config: The environment's configuration.
-        device: Where the worlds live.
-
-    Raises:
-        NPAError: The target or the rule cannot be loaded, or the rule does not fit the worlds.
-    """
+    """A grown picture, damaged."""
 
     config_type = Regeneration2DEnvConfig
 

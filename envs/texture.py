@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from npa_envs.envs.core.config import Boundary, EnvConfig
 from npa_envs.envs.core.single import NPAEnv
-from npa_envs.envs.core.task import EnvTask
+from npa_envs.envs.core.task import GoalTask
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.errors import NPAError
 from npa_envs.tasks.texture import Texture, TextureConfig
-from npa_envs.world.randomness import WorldRandom
 
 LOSS_BYTES = 4000
 """About what comparing one pixel of a picture needs [bytes]."""
@@ -55,35 +55,22 @@ class TextureEnvConfig(EnvConfig):
         return self.task_config(TextureConfig)
 
 
-class TextureTask(EnvTask[TextureEnvConfig]):
-    """A texture, compared by a loss of `npa_envs.tasks.losses.texture`.
-
-    Args:
-        config: The environment's configuration.
-        device: Where the worlds live.
-
-    Raises:
-        NPAError: The target cannot be loaded.
-    """
+class TextureTask(GoalTask[TextureEnvConfig]):
+    """A texture, compared by a loss of `npa_envs.tasks.losses.texture`."""
 
     config_type = TextureEnvConfig
+    goal: Texture
 
     def __init__(self, config: TextureEnvConfig, device: torch.device) -> None:
         super().__init__(config, device)
         self.goal = Texture(config.goal, device=device)
-        """The task with its target and its loss."""
 
     @classmethod
-    def extra_bytes(cls, config: EnvConfig, world_count: int) -> int:
+    def extra_bytes(cls, config: Any, world_count: int) -> int:
         """Return about how much memory pool and loss need [bytes]."""
-        assert isinstance(config, TextureEnvConfig), "the task's own configuration"
         copies = 4 if config.reward == "particle" else 1
         pictures = LOSS_BYTES * copies * world_count * config.resolution**2
-        return super().extra_bytes(config, world_count) + pictures
-
-    def seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
-        """Return particles uniform in the box, all states zero."""
-        return self.goal.seed(random.world_count, generator=random, device=self.device)
+        return super().extra_bytes(config, world_count) + int(pictures)
 
     def losses(self, x: Tensor, s: Tensor) -> Mapping[str, Tensor]:
         """Return the weighted losses of each world's colour image and of its density image."""
@@ -92,10 +79,6 @@ class TextureTask(EnvTask[TextureEnvConfig]):
             "colour": self.config.colour_weight * colour,
             "density": self.config.density_weight * density,
         }
-
-    def particle_losses(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return each particle's share of the texture loss."""
-        return self.goal.particle_shares(x, s)
 
     @property
     def pixel_size(self) -> float:
@@ -142,7 +125,10 @@ class TextureEnv(NPAEnv):
 
     ## Info
 
-    The parts of the loss are `colour` and `density`.
+    | Key | In | Value |
+    |---|---|---|
+    | `loss_colour`, `loss_density` | reset, step | the parts of the loss |
+    | `reward_colour`, `reward_density` | step | how much each part improved in this step |
 
     ## Vectorized environment
 

@@ -29,6 +29,13 @@ def small(task: str, **keywords: Any) -> dict[str, Any]:
     return {"task": task} | fields | keywords
 
 
+def few(task: str, **keywords: Any) -> dict[str, Any]:
+    """Keywords of a world of nine particles, each of which is an agent."""
+    if "particle_counts" not in keywords:
+        keywords = {"particle_count": 9} | keywords
+    return small(task, **keywords)
+
+
 def targets_made_once() -> Iterator[None]:
     """Keep targets: to draw and resample one takes longer than what is tested with it."""
     with pytest.MonkeyPatch.context() as patch:

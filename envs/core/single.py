@@ -69,8 +69,6 @@ class NPAEnv(gymnasium.Env[Any, Any]):
     | Key | In | Value |
     |---|---|---|
     | `loss` | reset, step | L as it is now |
-    | `loss_...` | reset, step | each of its parts |
-    | `reward_...` | step | how much each part improved in this step |
     | `success`, `diverged` | step | whether it did so in this step, bool |
     | `reason` | last step | why the episode ended, see above |
     | `particle_reward` | step, where `reward="particle"` | each particle's own reward, shape [N] |

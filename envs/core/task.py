@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar, Generic, NamedTuple, Self, TypeVar
+from typing import Any, ClassVar, Generic, NamedTuple, Self, TypeVar
 
 import numpy as np
 import torch
@@ -121,14 +121,15 @@ class EnvTask(WorldTask[Config]):
         self._pool: Start | None = None
 
     @classmethod
-    def extra_bytes(cls, config: EnvConfig, world_count: int) -> int:
+    def extra_bytes(cls, config: Any, world_count: int) -> int:
         """Return about how much memory the task needs besides the worlds [bytes]: their pool.
 
         Args:
             config: The environment's configuration.
             world_count: Worlds B.
         """
-        return 4 * config.seed_pool * config.particle_count * (cls.space_dim + config.state_dim)
+        numbers = config.particle_count * (cls.space_dim + config.state_dim)
+        return int(4 * config.seed_pool * numbers)
 
     def seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
         """Return fresh worlds: positions [B, N, D] and states [B, N, C].
@@ -232,3 +233,26 @@ class EnvTask(WorldTask[Config]):
         """Size of a particle in pictures: their distance where N fill the unit disk or ball."""
         volume = np.pi if self.space_dim == 2 else 4.0 * np.pi / 3.0
         return float((volume / self.config.particle_count) ** (1.0 / self.space_dim))
+
+
+class GoalTask(EnvTask[Config]):
+    """A task that rules are trained on, too: `npa_envs.tasks` has its targets and losses.
+
+    Raises:
+        NPAError: Something that the task needs cannot be loaded, or does not fit.
+    """
+
+    goal: Any
+    """The task as training sees it."""
+
+    def seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
+        """Return worlds as training begins with them, all states zero."""
+        seeds: tuple[Tensor, Tensor] = self.goal.seed(
+            random.world_count, generator=random, device=self.device
+        )
+        return seeds
+
+    def particle_losses(self, x: Tensor, s: Tensor) -> Tensor:
+        """Return each particle's share of the task's loss."""
+        shares: Tensor = self.goal.particle_shares(x, s)
+        return shares

@@ -486,6 +486,7 @@ def test_step_before_reset_is_an_error(name):
         ({"device": "tpu"}, "device must"),
         ({"reward": "denze"}, "did you mean 'dense'"),
         ({"output": "jax"}, "output must be a known word"),
+        ({"on_divergence": "rest"}, "on_divergence must be a known word, got 'rest': did you"),
         ({"boundary": "wall"}, "boundary must be a known word"),
         ({"boundary": "periodic", "box_size": 0.1}, "box_size must be at least 2 eps"),
         ({"render_mode": "ansi"}, "render_mode must be a known word"),

@@ -1,4 +1,4 @@
-"""Species as agents: PettingZoo's own tests, seeds, deaths, pictures, errors."""
+"""Species as agents: seeds, turns, deaths, pictures, errors."""
 
 from __future__ import annotations
 
@@ -7,52 +7,16 @@ import subprocess
 import sys
 
 import numpy as np
-import pettingzoo
 import pytest
 import torch
-from crowds import TASKS, apart, drawn, make, module_of, pair, small, still, targets_made_once
-from pettingzoo.test import api_test, parallel_api_test, render_test, seed_test
-from pettingzoo.test.max_cycles_test import max_cycles_test
-from pettingzoo.test.seed_test import parallel_seed_test
-from pettingzoo.test.state_test import state_test
+from crowds import TASKS, apart, drawn, make, pair, small, still, targets_made_once
 
 import npa_envs
 from npa_envs.agents import RulePolicy
 from npa_envs.envs import multispecies_v0
-from npa_envs.envs.multi import TASKS as TABLE
-from npa_envs.envs.multi import worlds as cohort_module
 from npa_envs.errors import NPAError
 
-pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:pettingzoo")
 quick_targets = pytest.fixture(scope="module", autouse=True)(targets_made_once)
-
-
-def test_the_tests_know_all_tasks():
-    assert TASKS == tuple(TABLE) == tuple(multispecies_v0.ENVIRONMENTS.values())
-
-
-@pytest.mark.parametrize("task", TASKS)
-def test_passes_the_parallel_api_test(task, capsys):
-    parallel_api_test(make(task, deaths=((1, 3),)), num_cycles=8)
-
-
-@pytest.mark.parametrize("task", TASKS)
-def test_passes_the_api_test(task, capsys):
-    api_test(multispecies_v0.env(**small(task, deaths=((1, 3),))), num_cycles=8)
-    api_test(multispecies_v0.raw_env(**small(task)), num_cycles=8)
-
-
-@pytest.mark.parametrize("task", TASKS)
-def test_passes_the_seed_tests(task):
-    parallel_seed_test(lambda: make(task), num_cycles=5)
-    seed_test(lambda: multispecies_v0.env(**small(task)), num_cycles=5)
-
-
-@pytest.mark.parametrize("task", TASKS)
-def test_passes_the_render_and_state_tests(task, monkeypatch, recwarn):
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    render_test(lambda **mode: multispecies_v0.env(**small(task), **mode))
-    state_test(multispecies_v0.env(**small(task)), make(task), num_cycles=3)
 
 
 def test_a_window_without_a_screen_warns_and_goes_on(monkeypatch):
@@ -64,32 +28,6 @@ def test_a_window_without_a_screen_warns_and_goes_on(monkeypatch):
     assert rewards["species_0"] != 0.0
     assert env.render() is None
     env.close()
-
-
-@pytest.mark.parametrize("task", TASKS)
-def test_passes_the_test_of_max_cycles(task):
-    max_cycles_test(module_of(multispecies_v0, **small(task)))
-
-
-@pytest.mark.parametrize("task", TASKS)
-def test_thirty_steps_are_equal_for_equal_seeds_and_differ_for_others(task):
-    keywords = {"max_cycles": 99, "position_noise": 0.01, "deaths": ((1, 20),)}
-    envs = [make(task, **keywords) for _ in range(3)]
-    first, again, other = (env.reset(seed=s)[0] for env, s in zip(envs, (4, 4, 5), strict=True))
-    assert np.array_equal(first["species_0"], again["species_0"])
-    assert not np.array_equal(first["species_0"], other["species_0"])
-    generators = [np.random.default_rng(0) for _ in envs]
-    for _ in range(30):
-        first, again, other = (
-            env.step(drawn(env, generator)) for env, generator in zip(envs, generators, strict=True)
-        )
-        assert first[1:] == again[1:]
-        for agent in first[0]:
-            assert np.array_equal(first[0][agent], again[0][agent])
-        assert not np.array_equal(first[0]["species_0"], other[0]["species_0"])
-        if not envs[0].agents:
-            break
-    assert envs[0].agents == ([] if task == "invasion" else ["species_0"])
 
 
 def test_episodes_go_on_in_a_sequence_that_a_seed_begins():
@@ -139,19 +77,10 @@ def test_turns_clip_actions_that_are_too_large(recwarn):
     assert np.array_equal(large.state(), right.state())
 
 
-def test_one_pass_perceives_for_all_species(monkeypatch):
+def test_particles_perceive_those_of_all_species():
     env = make(species_count=3)
     env.reset(seed=0)
-    calls = []
-
-    def survey(*worlds):
-        calls.append(worlds[0].shape)
-        return survey_worlds(*worlds)
-
-    survey_worlds = cohort_module.survey_worlds
-    monkeypatch.setattr(cohort_module, "survey_worlds", survey)
     observations, *_ = env.step(still(env))
-    assert calls == [(1, 41, 2)]
     x, s = env.particles()
     z = npa_envs.perceive(x[None], s[None], 0.3, 0.1)[0].numpy()
     seen = np.concatenate([observations[f"species_{k}"] for k in range(3)])
@@ -363,19 +292,6 @@ def test_torch_tensors_come_out_where_asked_for():
     assert torch.equal(torch.from_numpy(arrays.state()), tensors.state())
 
 
-@pytest.mark.parametrize("kind", ["parallel", "aec"])
-@pytest.mark.parametrize("name", multispecies_v0.ENVIRONMENTS)
-def test_the_registry_of_pettingzoo_makes_every_task(kind, name):
-    task = multispecies_v0.ENVIRONMENTS[name]
-    keywords = small(task)
-    del keywords["task"]
-    env = pettingzoo.make(kind, name, **keywords)
-    env.reset(seed=0)
-    assert type(env.unwrapped.worlds.task) is TABLE[task]
-    assert env.possible_agents == ["species_0", "species_1"]
-    assert pettingzoo.spec(kind, name).id == name
-
-
 def test_the_package_is_imported_without_pettingzoo_which_is_asked_for_by_name():
     program = (
         "import sys\n"
@@ -426,6 +342,8 @@ def test_the_package_is_imported_without_pettingzoo_which_is_asked_for_by_name()
         ({"epsilon": 0.2}, "unknown keyword 'epsilon': did you mean 'eps'"),
         ({"seed": 1}, r"unknown keyword 'seed': give it to reset\(seed=...\)"),
         ({"eps": -0.1}, "eps must be a finite number greater than 0"),
+        ({"perception": "own"}, r"perception must be a known word, got 'own'"),
+        ({"on_divergence": "reset"}, "on_divergence must be a known word, got 'reset'"),
     ],
 )
 def test_a_wrong_configuration_is_refused(keywords, message):
@@ -519,8 +437,3 @@ def test_a_species_that_is_gone_leaves_nothing_to_perceive():
     assert np.all(own[:, 1] == 0.0)
     assert np.all(own[:, 5:7] == 0.0)
     assert np.any(own[:, 3:5] != 0.0)
-
-
-def test_an_unknown_perception_is_refused():
-    with pytest.raises(NPAError, match=r"perception must be a known word, got 'own'"):
-        multispecies_v0.parallel_env("mixing", perception="own")

@@ -1,76 +1,19 @@
-"""Particles as agents: PettingZoo's own tests, rewards that add up, ends of single particles."""
+"""Particles as agents: rewards that add up, ends of single particles."""
 
 from __future__ import annotations
 
 import numpy as np
-import pettingzoo
 import pytest
-from crowds import HALF_WAY, TASKS, drawn, module_of, small, still, targets_made_once
-from pettingzoo.test import api_test, parallel_api_test, render_test, seed_test
-from pettingzoo.test.max_cycles_test import max_cycles_test
-from pettingzoo.test.seed_test import parallel_seed_test
-from pettingzoo.test.state_test import state_test
+from crowds import HALF_WAY, TASKS, drawn, few, still, targets_made_once
 
 from npa_envs.envs import multispecies_v0, particles_v0
-from npa_envs.envs.multi import TASKS as TABLE
 from npa_envs.errors import NPAError
 
-pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:pettingzoo")
 quick_targets = pytest.fixture(scope="module", autouse=True)(targets_made_once)
-
-
-def few(task, **keywords):
-    """Keywords of a world of nine particles."""
-    if "particle_counts" not in keywords:
-        keywords = {"particle_count": 9} | keywords
-    return small(task, **keywords)
 
 
 def make(task="mixing", **keywords):
     return particles_v0.parallel_env(**few(task, **keywords))
-
-
-@pytest.mark.parametrize("task", TASKS)
-def test_passes_the_api_tests(task, capsys):
-    parallel_api_test(make(task, deaths=((1, 3),)), num_cycles=6)
-    api_test(particles_v0.env(**few(task, deaths=((1, 3),))), num_cycles=6)
-    api_test(particles_v0.raw_env(**few(task)), num_cycles=6)
-
-
-@pytest.mark.parametrize("task", TASKS)
-def test_passes_the_seed_tests(task):
-    parallel_seed_test(lambda: make(task), num_cycles=3)
-    seed_test(lambda: particles_v0.env(**few(task)), num_cycles=3)
-
-
-@pytest.mark.parametrize("task", TASKS)
-def test_passes_the_render_and_state_tests(task, monkeypatch, recwarn):
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    render_test(lambda **mode: particles_v0.env(**few(task), **mode))
-    state_test(particles_v0.env(**few(task)), make(task), num_cycles=2)
-
-
-@pytest.mark.parametrize("task", TASKS)
-def test_passes_the_test_of_max_cycles(task):
-    max_cycles_test(module_of(particles_v0, **few(task)))
-
-
-@pytest.mark.parametrize("task", TASKS)
-def test_thirty_steps_are_equal_for_equal_seeds_and_differ_for_others(task):
-    keywords = {"max_cycles": 99, "position_noise": 0.01, "deaths": ((1, 20),)}
-    envs = [make(task, **keywords) for _ in range(3)]
-    for env, seed in zip(envs, (4, 4, 5), strict=True):
-        env.reset(seed=seed)
-    generators = [np.random.default_rng(0) for _ in envs]
-    for _ in range(20 if task == "invasion" else 30):
-        first, again, other = (
-            env.step(drawn(env, generator)) for env, generator in zip(envs, generators, strict=True)
-        )
-        assert first[1:] == again[1:]
-        for agent in first[0]:
-            assert np.array_equal(first[0][agent], again[0][agent])
-        assert not np.array_equal(first[0]["particle_0"], other[0]["particle_0"])
-    assert len(envs[0].agents) == (0 if task == "invasion" else 5)
 
 
 def test_every_particle_is_an_agent_and_is_told_its_species():
@@ -154,19 +97,6 @@ def test_particles_of_a_removed_species_end_together():
     _, rewards, *_ = env.step(drawn(env, np.random.default_rng(0)))
     assert len(rewards) == 4
     assert all(rewards.values())
-
-
-@pytest.mark.parametrize("kind", ["parallel", "aec"])
-@pytest.mark.parametrize("name", particles_v0.ENVIRONMENTS)
-def test_the_registry_of_pettingzoo_makes_every_task(kind, name):
-    task = particles_v0.ENVIRONMENTS[name]
-    keywords = few(task)
-    del keywords["task"]
-    env = pettingzoo.make(kind, name, **keywords)
-    env.reset(seed=0)
-    assert type(env.unwrapped.worlds.task) is TABLE[task]
-    assert env.possible_agents == [f"particle_{k}" for k in range(9)]
-    assert tuple(particles_v0.ENVIRONMENTS.values()) == TASKS
 
 
 @pytest.mark.parametrize(

@@ -166,7 +166,7 @@ def test_symbiosis_reaches_its_target_together_only():
     count = load_target("heart", point_count=64).point_count
     env = make("symbiosis", target="heart", particle_count=count)
     env.reset(seed=0)
-    goal = env.worlds.task.goal.target
+    goal = env.worlds.task.goals[0].target
     s = torch.zeros(count, 16)
     s[:, -3:] = goal.colours - 0.5
     env.place_particles(goal.points, s)

@@ -11,7 +11,6 @@ from crowds import TASKS, make, small, targets_made_once
 
 from npa_envs.envs import multispecies_v0
 from npa_envs.envs.core import memory
-from npa_envs.envs.multi import worlds as cohort_module
 from npa_envs.errors import DivergedError, NPAError
 
 quick_targets = pytest.fixture(scope="module", autouse=True)(targets_made_once)
@@ -136,23 +135,6 @@ def test_a_world_does_not_depend_on_the_number_of_worlds(where):
             assert paid[agent][0] == rewards[agent][1]
     assert np.array_equal(one.state()[0], many.state()[1])
     assert not np.array_equal(one.state()[0], many.state()[0])
-
-
-def test_all_worlds_are_perceived_in_one_pass_as_long_as_all_are_whole(monkeypatch):
-    envs = batch(world_count=4, deaths=((0, 2),))
-    envs.reset(seed=0)
-    calls = []
-    survey_worlds = cohort_module.survey_worlds
-
-    def survey(*worlds):
-        calls.append(tuple(worlds[0].shape))
-        return survey_worlds(*worlds)
-
-    monkeypatch.setattr(cohort_module, "survey_worlds", survey)
-    for _ in range(3):
-        envs.step(still(envs))
-    # In the step of a death the survivors perceive again, without the dead.
-    assert calls == [(4, 41, 2), (4, 41, 2), (4, 20, 2), (4, 20, 2)]
 
 
 def test_resetting_one_world_leaves_the_others_as_they_are(where):
