@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
+from npa_envs.cli.output import RuleOptions, StepBar, check_numbers
 from npa_envs.errors import NPAError
 
 if TYPE_CHECKING:
@@ -17,25 +18,12 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluateOptions:
+class EvaluateOptions(RuleOptions):
     """Measure loss, PSNR, overflow and extent of a rule over thousands of steps.
 
     Of a rule that classifies point clouds: the accuracy on clouds it was not trained on, and what
     they say when they are cut or become others.
     """
-
-    rule: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RULE")]
-    """A shipped rule (`npa-envs list`), a file of ours or the authors' (.safetensors, .pth), or a
-    rule of their web demo (models.json#name)."""
-
-    target: str | None = None
-    """The target to measure against; default: the one that the rule was trained on."""
-
-    loss: str | None = None
-    """Textures only: the loss to measure by (`npa-envs list`); default: as trained."""
-
-    data: str | None = None
-    """Point clouds only: "digits", "mnist" or a folder of IDX files; default: as trained."""
 
     data_folder: str | None = None
     """Point clouds only: where torchvision keeps "mnist"; default: as trained."""
@@ -54,23 +42,8 @@ class EvaluateOptions:
     """Also cut the grown worlds and erase a part, and measure how they heal. Point clouds are
     always cut and changed."""
 
-    particle_count: int | None = None
-    """Particles N; default: as trained."""
-
-    eps: float | None = None
-    """Perception radius [length units]; default: as trained."""
-
-    update_prob: float | None = None
-    """Probability of each particle's update in a step; default: as trained."""
-
     json: Path | None = None
     """Also write the table to this JSON file."""
-
-    device: str = "cpu"
-    """Where to run: cpu, cuda, cuda:1."""
-
-    progress: bool = True
-    """Show a progress bar."""
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -81,7 +54,6 @@ def main(arguments: Sequence[str]) -> int:
             be written.
     """
     options = tyro.cli(EvaluateOptions, prog="npa-envs evaluate", args=arguments)
-    from npa_envs.cli.output import StepBar, check_numbers
     from npa_envs.devices import check_device
     from npa_envs.measure.quality.evaluation import CHECKPOINTS, check_steps, evaluate, healing
     from npa_envs.measure.tables import table_text
@@ -94,18 +66,8 @@ def main(arguments: Sequence[str]) -> int:
     check_numbers(options, seed_count=1)
     device = check_device(options.device)
     rule = load_rule(options.rule, device=device).float()
-    trained = task_of_rule(
-        options.rule,
-        rule,
-        device,
-        particle_count=options.particle_count,
-        target=options.target,
-        loss=options.loss,
-        data=options.data,
-        data_folder=options.data_folder,
-        eps=options.eps,
-        update_prob=options.update_prob,
-    )
+    world = options.world() | {"data_folder": options.data_folder}
+    trained = task_of_rule(options.rule, rule, device, **world)
     if trained.doubt is not None:
         raise NPAError(
             f"cannot measure {options.rule!r}: {trained.doubt}: "
@@ -138,7 +100,6 @@ def main(arguments: Sequence[str]) -> int:
 
 def _evaluate_clouds(options: EvaluateOptions, rule: NPARule, task: PointClassification) -> int:
     """Measure and print what a rule says of the clouds of a task."""
-    from npa_envs.cli.output import StepBar
     from npa_envs.measure.quality.classification import (
         CLOUD_CHECKPOINTS,
         accuracies,

@@ -167,12 +167,6 @@ def film_world(
 def write_film(film: Film, folder: Path, name: str, *, fps: float = 25.0) -> list[Path]:
     """Write a film as GIF, MP4 and filmstrip, and return the files.
 
-    Args:
-        film: The film.
-        folder: An existing folder.
-        name: The files' name without suffix.
-        fps: Frames a second.
-
     Raises:
         NPAError: A file cannot be written.
     """

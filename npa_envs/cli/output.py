@@ -1,17 +1,57 @@
-"""Common parts of the commands: folders to write to, numbers and names to check, progress bars."""
+"""Common parts of the commands: options, folders to write to, checks, progress bars."""
 
 from __future__ import annotations
 
 import contextlib
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Annotated, Any
 
+import tyro
 from tqdm import tqdm
 
 from npa_envs.errors import NPAError, suggest
+
+
+@dataclass(frozen=True, kw_only=True)
+class RuleOptions:
+    """Options of commands that run one rule: which one, in which world, and where."""
+
+    rule: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RULE")]
+    """A shipped rule (`npa-envs list`), a file of ours or the authors' (.safetensors, .pth), or a
+    rule of their web demo (models.json#name)."""
+
+    target: str | None = None
+    """The target to measure against; default: the one that the rule was trained on."""
+
+    loss: str | None = None
+    """Textures only: the loss to measure by (`npa-envs list`); default: as trained."""
+
+    data: str | None = None
+    """Point clouds only: "digits", "mnist" or a folder of IDX files; default: as trained."""
+
+    particle_count: int | None = None
+    """Particles N; default: as trained."""
+
+    eps: float | None = None
+    """Perception radius [length units]; default: as trained."""
+
+    update_prob: float | None = None
+    """Probability of each particle's update in a step; default: as trained."""
+
+    device: str = "cpu"
+    """Where to run: cpu, cuda, cuda:1."""
+
+    progress: bool = True
+    """Show a progress bar."""
+
+    def world(self) -> dict[str, Any]:
+        """Return what was said of the rule's world, as `task_of_rule` takes it."""
+        names = ("target", "loss", "data", "particle_count", "eps", "update_prob")
+        return {name: getattr(self, name) for name in names}
 
 
 def writable_folder(path: Path) -> Path:

@@ -6,10 +6,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 
+from npa_envs.cli.output import RuleOptions, StepBar, writable_folder
 from npa_envs.errors import NPAError
 
 SCREEN = 256
@@ -20,16 +21,12 @@ FRAME_COUNT = 150
 
 
 @dataclass(frozen=True, kw_only=True)
-class RolloutOptions:
+class RolloutOptions(RuleOptions):
     """Grow a rule from its seed, damage it on the way, and write a GIF, an MP4 and a filmstrip.
 
     Of a 3D world also a turntable GIF, and the grown cloud as points (PLY) and as Gaussians (PLY,
     .splat).
     """
-
-    rule: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RULE")]
-    """A shipped rule (`npa-envs list`), a file of ours or the authors' (.safetensors, .pth), or a
-    rule of their web demo (models.json#name)."""
 
     steps: int = 512
     """Steps to run."""
@@ -40,24 +37,6 @@ class RolloutOptions:
 
     out: Path = Path("runs/rollout")
     """Folder to write to; created where missing."""
-
-    target: str | None = None
-    """The target to measure against; default: the one that the rule was trained on."""
-
-    loss: str | None = None
-    """Textures only: the loss to measure by (`npa-envs list`); default: as trained."""
-
-    data: str | None = None
-    """Point clouds only: "digits", "mnist" or a folder of IDX files; default: as trained."""
-
-    particle_count: int | None = None
-    """Particles N; default: as trained."""
-
-    eps: float | None = None
-    """Perception radius [length units]; default: as trained."""
-
-    update_prob: float | None = None
-    """Probability of each particle's update in a step; default: as trained."""
 
     resolution: int | None = None
     """Pixels on each side of the film; default: as trained, but at least 256."""
@@ -70,12 +49,6 @@ class RolloutOptions:
 
     seed: int = 0
     """Randomness, 0 to 2^63 - 1; the same seed gives the same film."""
-
-    device: str = "cpu"
-    """Where to run: cpu, cuda, cuda:1."""
-
-    progress: bool = True
-    """Show a progress bar."""
 
     def __post_init__(self) -> None:
         """Check the numbers that nothing else checks.
@@ -104,7 +77,6 @@ def main(arguments: Sequence[str]) -> int:
     import torch
 
     from npa_envs.cli.film import film_world, write_film, write_solid
-    from npa_envs.cli.output import StepBar, writable_folder
     from npa_envs.measure.quality.evaluation import measure
     from npa_envs.rule.files import load_rule
     from npa_envs.tasks.base import ViewTask, seed_worlds, task_toward
@@ -123,19 +95,12 @@ def main(arguments: Sequence[str]) -> int:
             f"raise --steps above {late[0].step}"
         )
     rule = load_rule(options.rule, device=device).float()
-    fields: dict[str, Any] = {
-        "particle_count": options.particle_count,
-        "target": options.target,
-        "loss": options.loss,
-        "data": options.data,
-        "eps": options.eps,
-        "update_prob": options.update_prob,
-    }
-    trained = task_of_rule(options.rule, rule, device, **fields, resolution=options.resolution)
+    world = options.world()
+    trained = task_of_rule(options.rule, rule, device, **world, resolution=options.resolution)
     # Drawn large enough to be seen; measured as trained, so that the figures can be compared.
     task = shown = trained.task
     if options.resolution is None and len(task.target_picture) < SCREEN:
-        shown = task_of_rule(options.rule, rule, device, **fields, resolution=SCREEN).task
+        shown = task_of_rule(options.rule, rule, device, **world, resolution=SCREEN).task
     folder = writable_folder(options.out)
     generator = torch.Generator(device).manual_seed(options.seed)
     x, s, goal = seed_worlds(task, 1, generator=generator, device=device)

@@ -79,10 +79,6 @@ def main(arguments: Sequence[str]) -> int:
 def starting_configuration(task_name: str, arguments: Sequence[str]) -> TrainConfig[Any]:
     """Return the configuration that the options are laid over: preset, file, or the run resumed.
 
-    Args:
-        task_name: The task.
-        arguments: The words after the task.
-
     Raises:
         NPAError: No such preset, the file is wrong, or there is nothing to resume.
     """
@@ -113,13 +109,7 @@ def starting_configuration(task_name: str, arguments: Sequence[str]) -> TrainCon
 def parse(
     task_name: str, base: TrainConfig[Any], arguments: Sequence[str]
 ) -> tuple[TrainOptions, TrainConfig[Any]]:
-    """Lay the command line's options over a configuration.
-
-    Args:
-        task_name: The task.
-        base: The defaults.
-        arguments: The words after the task.
-    """
+    """Lay the command line's options over a configuration."""
 
     def read(kind: Any, defaults: Any) -> tuple[TrainOptions, Any]:
         fields = [("launch", TrainOptions), ("run", kind)]
@@ -221,10 +211,6 @@ def parse_joint(
     read: Callable[[JointOptions], tuple[LaunchT, JointOptions]],
 ) -> tuple[LaunchT, JointTrainConfig[CoMorphogenesis2DConfig]]:
     """Return what the command line says of a run of several species.
-
-    Args:
-        base: The defaults.
-        read: Reads the command line over these defaults.
 
     Raises:
         NPAError: There are fewer than two targets.

@@ -1,4 +1,4 @@
-"""From splatted fields to pictures for the eye."""
+"""Colours of pictures: of splatted fields, of densities, of states."""
 
 from __future__ import annotations
 

@@ -273,9 +273,6 @@ def _caption_font(
     return ImageFont.load_default(10)
 
 
-# Films of 3D worlds that turn.
-
-
 def turntable_frames(
     views: Callable[[Cameras], Tensor],
     *,

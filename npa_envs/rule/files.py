@@ -336,9 +336,6 @@ def read_state_dict(data: bytes) -> RuleParts:
 
     The space dimension and the number of channels follow from the shapes.
 
-    Args:
-        data: The content of the `.pth` file.
-
     Raises:
         NPAError: This is not such a file.
     """

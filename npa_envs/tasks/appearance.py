@@ -1,4 +1,4 @@
-"""How particles look in 3D: from a rule's outputs to Gaussians."""
+"""Looks of particles in 3D: Gaussians from a rule's outputs, and what draws them."""
 
 from __future__ import annotations
 
@@ -84,9 +84,6 @@ class Appearance:
             degree_one = outputs.new_zeros(*lead, 3, 3)
         colours = torch.cat((flat / FLAT, degree_one), dim=-2)
         return Gaussians(self.sigma * torch.exp(stretch), quaternions, opacities, colours, stretch)
-
-
-# What draws Gaussians: the project's own kernels, or gsplat, behind one interface.
 
 
 class Renderer(Protocol):

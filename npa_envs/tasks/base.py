@@ -94,9 +94,6 @@ class ReadOutTask(Protocol):
 
         Its parameters are read anew at each call, so that losses are differentiable in them and
         change with them. The task itself stays as it is.
-
-        Args:
-            rule: The rule, where the worlds are.
         """
 
 
@@ -136,9 +133,6 @@ class ScheduledTask(Protocol):
 
         Recorded graphs read what is written here: always into the same tensors. What is written
         must follow from the iteration alone, so that a resumed run goes on as it would have.
-
-        Args:
-            iteration: Iterations done so far in the run.
         """
 
 
@@ -185,11 +179,7 @@ class TaskConfig:
     """Weight of mean |s − clip(s, −1, 1)| (dimensionless)."""
 
     def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            NPAError: A field has the wrong type or lies outside its range.
-        """
+        """Check every field; raise NPAError where one has a wrong type or lies out of its range."""
         check_positive(self, int, "particle_count", "state_dim", "hidden_dim")
         check_positive(self, int, "resolution", at_least=2)
         check_positive(self, float, "eps")
@@ -295,12 +285,7 @@ TaskT = TypeVar("TaskT", bound=Task)
 
 
 def task_for_rule(task: TaskT, rule: NPARule) -> TaskT:
-    """Return a task as it is for the worlds of one rule; most are the same for all rules.
-
-    Args:
-        task: Any task.
-        rule: The rule that runs the worlds, where they are.
-    """
+    """Return a task as it is for the worlds of one rule; most are the same for all rules."""
     return cast(TaskT, task.for_rule(rule)) if isinstance(task, ReadOutTask) else task
 
 
@@ -319,14 +304,7 @@ def task_toward(task: TaskT, goal: Tensor | None) -> TaskT:
 def seed_worlds(
     task: Task, world_count: int, *, generator: Randomness, device: torch.device
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Return fresh worlds of any task: positions, states, and goals where it has such.
-
-    Args:
-        task: The task.
-        world_count: Worlds B.
-        generator: Randomness, on the device.
-        device: Where the worlds are made.
-    """
+    """Return fresh worlds of any task: positions, states, and goals where it has such."""
     if isinstance(task, GoalTask):
         return task.seed_with_goals(world_count, generator=generator, device=device)
     return *task.seed(world_count, generator=generator, device=device), None

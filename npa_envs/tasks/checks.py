@@ -38,10 +38,6 @@ def check_positive(config: object, kind: type, *names: str, at_least: int = 1) -
 def check_non_negative(config: object, *names: str) -> None:
     """Check that fields are finite numbers of at least 0.
 
-    Args:
-        config: The dataclass that holds the fields.
-        names: The fields to check.
-
     Raises:
         NPAError: A field breaks the rule.
     """
@@ -56,10 +52,6 @@ def check_non_negative(config: object, *names: str) -> None:
 
 def check_fraction(config: object, *names: str) -> None:
     """Check that fields are numbers in (0, 1].
-
-    Args:
-        config: The dataclass that holds the fields.
-        names: The fields to check.
 
     Raises:
         NPAError: A field breaks the rule.

@@ -38,11 +38,7 @@ class GrowthConfig(PoolDamage, TaskConfig):
     """Weight of the mean path length of particles outside of [−1, 1] (per length unit)."""
 
     def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            NPAError: A field has the wrong type or lies outside its range.
-        """
+        """Check every field; raise NPAError where one has a wrong type or lies out of its range."""
         TaskConfig.__post_init__(self)
         PoolDamage.__post_init__(self)
         check_positive(self, int, "state_dim", at_least=3)

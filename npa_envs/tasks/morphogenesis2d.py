@@ -51,11 +51,7 @@ class Morphogenesis2DConfig(GrowthConfig):
     """Weight of the centroids' distance from the origin, where worlds begin (per length unit)."""
 
     def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            NPAError: A field has the wrong type or lies outside its range.
-        """
+        """Check every field; raise NPAError where one has a wrong type or lies out of its range."""
         super().__post_init__()
         check_text(self, "target", "a built-in name, an emoji or a path")
         check_positive(self, int, "target_point_count")

@@ -106,11 +106,7 @@ class Morphogenesis3DConfig(GrowthConfig):
     """What draws views: "own" kernels, or "gsplat" (CUDA, with `cuda_graph` off)."""
 
     def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            NPAError: A field has the wrong type or lies outside its range.
-        """
+        """Check every field; raise NPAError where one has a wrong type or lies out of its range."""
         super().__post_init__()
         check_text(self, "target", "a built-in mesh, a mesh file or a folder of views")
         check_positive(self, int, "readout_hidden_dim", "training_views", "held_out_views")
@@ -201,9 +197,6 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
     def for_rule(self, rule: NPARule) -> Morphogenesis3D:
         """Return the task that sees what a rule reads out of the states; all else is shared.
 
-        Args:
-            rule: The rule, where the worlds are.
-
         Raises:
             NPAError: The rule reads out something else than Gaussians.
         """
@@ -223,11 +216,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         return super().rule_shape | readout
 
     def begin(self, iteration: int) -> None:
-        """Choose the views, backgrounds and blur that `loss` sees from now on.
-
-        Args:
-            iteration: Iterations done so far in the run.
-        """
+        """Choose the views, backgrounds and blur that `loss` sees from now on."""
         self._schedule.begin(iteration)
 
     def gaussians(self, s: Tensor) -> Gaussians:
@@ -357,11 +346,7 @@ class ViewSchedule:
         self.begin(0)
 
     def begin(self, iteration: int) -> None:
-        """Write what an iteration sees; the host does not wait for the device.
-
-        Args:
-            iteration: Iterations done so far in the run.
-        """
+        """Write what an iteration sees; the host does not wait for the device."""
         random = np.random.default_rng((self._seed, iteration))
         index = random.choice(self._view_count, len(self.index), replace=False)
         backgrounds = random.random(self.backgrounds.shape, dtype=np.float32)

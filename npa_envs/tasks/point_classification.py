@@ -76,11 +76,7 @@ class PointClassificationConfig(TaskConfig):
     """Weight of mean |s − clip(s, −1, 1)| (dimensionless)."""
 
     def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            NPAError: A field has the wrong type or lies outside its range.
-        """
+        """Check every field; raise NPAError where one has a wrong type or lies out of its range."""
         super().__post_init__()
         check_text(self, "data", "a name or a path")
         check_text(self, "data_folder", "a path")

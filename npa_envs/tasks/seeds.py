@@ -1,4 +1,4 @@
-"""Where worlds begin."""
+"""Positions that worlds begin with: uniform in a ball or a box."""
 
 from __future__ import annotations
 

@@ -78,11 +78,7 @@ class TextureConfig(TaskConfig):
     """Weight of the path length Σ|Δx| of a rollout (per length unit)."""
 
     def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            NPAError: A field has the wrong type or lies outside its range.
-        """
+        """Check every field; raise NPAError where one has a wrong type or lies out of its range."""
         super().__post_init__()
         check_text(self, "target", "a built-in texture or a path")
         check_loss_name(self.loss)

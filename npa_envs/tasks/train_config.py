@@ -114,11 +114,7 @@ class TrainConfig(Generic[TaskConfigT]):
     """Write TensorBoard events as well as the JSONL log."""
 
     def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            NPAError: A field has the wrong type or lies outside its range.
-        """
+        """Check every field; raise NPAError where one has a wrong type or lies out of its range."""
         check_positive(self, int, "iterations", "repeats", "world_count", "pool_size")
         check_positive(self, int, "seed_interval", "log_interval", "checkpoint_interval")
         check_positive(self, float, "learning_rate", "runaway_limit")

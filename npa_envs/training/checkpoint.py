@@ -93,9 +93,6 @@ class _PatientFile(FileIO):
 def load_checkpoint(path: Path) -> dict[str, Any]:
     """Read a checkpoint on to the CPU; nothing in it is executed.
 
-    Args:
-        path: A file that `save_checkpoint` wrote.
-
     Raises:
         NPAError: There is no such file, it cannot be read, or it is no checkpoint of this version.
     """
@@ -134,12 +131,6 @@ def check_same_run(
     content: dict[str, Any], task_name: str, config: TrainConfig[Any], path: Path
 ) -> None:
     """Check that a checkpoint belongs to the run that is to be resumed.
-
-    Args:
-        content: What `load_checkpoint` returned.
-        task_name: Name of the task of the run.
-        config: Configuration of the run.
-        path: Where the checkpoint lies, for the error.
 
     Raises:
         NPAError: It lacks something, is of another task, of another configuration, or further

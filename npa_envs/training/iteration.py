@@ -78,11 +78,7 @@ class TrainingCycle:
         self._keep = Replayed(self._keep_worlds, device) if graphed else self._keep_worlds
 
     def run(self, iteration: int) -> int:
-        """Train for one iteration, and return the steps of its rollout, T.
-
-        Args:
-            iteration: Iterations done so far in the run.
-        """
+        """Train for one iteration, and return the steps of its rollout, T."""
         config, batch = self._config, self.batch
         lo, hi = config.steps
         steps = int(torch.randint(lo, hi, (), generator=self.generators["schedule"]))
@@ -249,11 +245,7 @@ class EagerIteration:
         self.goal.copy_(goal)
 
     def run(self, steps: int) -> None:
-        """Run the rollout, the loss and the backward pass.
-
-        Args:
-            steps: Steps of the rollout, T.
-        """
+        """Run the rollout, the loss and the backward pass."""
         self._forward_backward(steps)
 
     def _forward_backward(self, steps: int) -> None:
@@ -296,11 +288,7 @@ class GraphedIteration(EagerIteration):
         self._memory_pool = torch.cuda.graph_pool_handle()
 
     def run(self, steps: int) -> None:
-        """Replay the graph for this number of steps, capturing it when it is first asked for.
-
-        Args:
-            steps: Steps of the rollout, T.
-        """
+        """Replay the graph for this number of steps, capturing it when it is first asked for."""
         with torch.cuda.device(self.x0.device):
             if steps not in self._graphs:
                 self._graphs[steps] = capture(
@@ -363,11 +351,7 @@ class RuleOptimiser:
             clear_non_finite(gradient)
 
     def step(self, iteration: int) -> None:
-        """Take one step along the prepared gradients; at the start of a repeat, with fresh moments.
-
-        Args:
-            iteration: Iterations done so far in the run.
-        """
+        """Take a step along the prepared gradients; at a repeat's start, with fresh moments."""
         if iteration > 0 and iteration % self._config.iterations == 0:
             self._adamw = self._fresh()
         for group in self._adamw.param_groups:
@@ -436,12 +420,7 @@ class LossMeter:
         self._arrival = torch.cuda.Event() if on_cuda else None  # type: ignore[no-untyped-call]
 
     def begin(self, number: int, steps: int) -> None:
-        """Say which iteration is observed next.
-
-        Args:
-            number: The iteration's number, counted from 1.
-            steps: Steps of its rollout, T.
-        """
+        """Say which iteration is observed next."""
         self._now[0].fill_(number)
         self._now[1].fill_(steps)
         self._count += 1

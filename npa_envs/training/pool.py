@@ -32,10 +32,6 @@ class WorldPool:
     def sample(self, world_count: int, generator: torch.Generator) -> Tensor:
         """Draw different worlds.
 
-        Args:
-            world_count: How many, B.
-            generator: Randomness, on the pool's device.
-
         Returns:
             Their indices, shape [B].
         """

@@ -168,10 +168,6 @@ class JsonlLog:
 def open_tensorboard(folder: RunFolder, iteration: int) -> Any:
     """Return a TensorBoard writer that hides what an earlier process wrote after `iteration`.
 
-    Args:
-        folder: The run's folder.
-        iteration: Iterations done so far.
-
     Raises:
         MissingDependencyError: TensorBoard is not installed.
         NPAError: Its folder cannot be written to.

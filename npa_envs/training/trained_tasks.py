@@ -1,4 +1,4 @@
-"""The task that a rule was trained on, as its file tells."""
+"""Tasks that rules were trained on, as their files tell."""
 
 from __future__ import annotations
 
@@ -90,10 +90,6 @@ def task_of_rule(
 
 def trained_config(path: Path, metadata: Mapping[str, str]) -> Any:
     """Return the configuration that a rule's file says it was trained with.
-
-    Args:
-        path: The file, for the message of an error.
-        metadata: Its header, with `config` among it.
 
     Raises:
         NPAError: What it says is damaged or of another version.

@@ -182,7 +182,7 @@ class Trainer:
         """
         self._finish_record()
         self._stop_if_diverged()
-        content = {"iteration": self.iteration, "seconds": self._seconds()}
+        content: dict[str, Any] = {"iteration": self.iteration, "seconds": self._seconds()}
         content |= {"rule": self.rule.state_dict(), **self._cycle.state_dict()}
         save_checkpoint(self.folder.checkpoint, self._origin() | content)
         # A rule is passed on: where and on what it was trained is nobody's business.

@@ -102,21 +102,56 @@ def test_tiny_preset_learns(tiny, name):
         assert trained.psnr > untrained.psnr + 1.5
 
 
-@pytest.mark.parametrize(
-    ("name", "fields"),
-    [(name, {}) for name in NAMES] + [("morphogenesis2d", {"memory": "minimal"})],
-)
+RESUMED = [
+    *((name, {}) for name in NAMES),
+    ("morphogenesis2d", {"memory": "recompute"}),
+    ("morphogenesis2d", {"memory": "minimal"}),
+    pytest.param(
+        "morphogenesis2d",
+        {"device": "cuda", "steps": (8, 11), "iterations": 8},
+        marks=[pytest.mark.gpu, needs_cuda],
+    ),
+]
+
+
+@pytest.mark.parametrize(("name", "fields"), RESUMED)
 def test_resumed_run_is_bit_identical(tiny, name, fields):
     fields = {"iterations": 4, "log_interval": 2, "milestones": (), **fields}
     whole = train(tiny(name, "whole", **fields), name, progress=False)
     config = tiny(name, "broken", **fields)
-    trainer = Trainer(task_of(name, config), config, task_name=name)
+    trainer = Trainer(task_of(name, config, config.device), config, task_name=name)
     trainer.iterate()
     trainer.save()
     resumed = train(config, name, resume=True, progress=False)
     assert log_of(resumed.folder) == log_of(whole.folder)
     for ours, theirs in zip(resumed.rule.parameters(), whole.rule.parameters(), strict=True):
         assert torch.equal(ours, theirs)
+
+
+def test_recomputing_trains_the_same_rule_as_storing(tiny):
+    logs = []
+    for memory in ("store", "recompute", "minimal"):
+        config = tiny("morphogenesis2d", memory, iterations=3, memory=memory)
+        logs.append(log_of(train(config, progress=False).folder))
+    for stored, *others in zip(*logs, strict=True):
+        assert all(other == pytest.approx(stored, rel=1e-5) for other in others)
+
+
+@pytest.mark.parametrize(
+    ("name", "fields", "message"),
+    [
+        ("morphogenesis2d", {"target": "geko"}, "gecko"),
+        ("texture", {"loss": "vgg_ot", "resolution": 32}, "vgg16-397923af"),
+    ],
+)
+def test_what_is_missing_is_named_before_anything_is_written(
+    tiny, tmp_path, monkeypatch, name, fields, message
+):
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path / "hub"))
+    config = tiny(name, **fields)
+    with pytest.raises(NPAError, match=message):
+        train(config, name, progress=False)
+    assert not config.out.exists()
 
 
 @pytest.mark.parametrize("name", NAMES)

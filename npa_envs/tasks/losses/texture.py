@@ -1,4 +1,4 @@
-"""How unlike two textures are, whatever lies where: the losses by name, behind one interface."""
+"""Losses of textures by name: how unlike two of them are, whatever lies where."""
 
 from __future__ import annotations
 
@@ -61,27 +61,24 @@ class LossEntry:
     """Prepares a target, shape [K, R, R]."""
 
 
-def _patches(target: Tensor, options: LossOptions) -> TextureLoss:
-    return SlicedWasserstein(
-        target, PatchDescriptor(target, seed=options.seed), tiles=options.tiles
-    )
-
-
-def _filters(target: Tensor, options: LossOptions) -> TextureLoss:
-    return SlicedWasserstein(
-        target, FilterDescriptor(target, seed=options.seed), tiles=options.tiles
-    )
-
-
-def _vgg(target: Tensor, options: LossOptions) -> TextureLoss:
-    return VGGTransport(target, weights=options.vgg_weights, tiles=options.tiles, seed=options.seed)
-
-
 TEXTURE_LOSSES: Mapping[str, LossEntry] = {
-    "vgg_ot": LossEntry("the paper's: optimal transport of VGG16 features; needs weights", _vgg),
-    "patch_swd": LossEntry("sliced Wasserstein distance of raw patches at several sizes", _patches),
+    "vgg_ot": LossEntry(
+        "the paper's: optimal transport of VGG16 features; needs weights",
+        lambda target, options: VGGTransport(
+            target, weights=options.vgg_weights, tiles=options.tiles, seed=options.seed
+        ),
+    ),
+    "patch_swd": LossEntry(
+        "sliced Wasserstein distance of raw patches at several sizes",
+        lambda target, options: SlicedWasserstein(
+            target, PatchDescriptor(target, seed=options.seed), tiles=options.tiles
+        ),
+    ),
     "filter_swd": LossEntry(
-        "sliced Wasserstein distance of two layers of random filters", _filters
+        "sliced Wasserstein distance of two layers of random filters",
+        lambda target, options: SlicedWasserstein(
+            target, FilterDescriptor(target, seed=options.seed), tiles=options.tiles
+        ),
     ),
 }
 """Every texture loss by name."""
@@ -89,9 +86,6 @@ TEXTURE_LOSSES: Mapping[str, LossEntry] = {
 
 def check_loss_name(name: str) -> None:
     """Check that there is a loss of a name.
-
-    Args:
-        name: For example `patch_swd`.
 
     Raises:
         NPAError: There is none.

@@ -1,4 +1,4 @@
-"""Pictures of digits with their classes: scikit-learn's, MNIST, or any files in MNIST's format."""
+"""Clouds of points from pictures of digits: scikit-learn's, MNIST, or files in MNIST's format."""
 
 from __future__ import annotations
 
@@ -79,9 +79,6 @@ def load_pictures(data: str, split: Split = "train", *, folder: str = "data") ->
 
 def read_idx(path: Path) -> NDArray[np.uint8]:
     """Return the bytes of a file in MNIST's IDX format, gzipped or not, in their shape.
-
-    Args:
-        path: The file.
 
     Raises:
         NPAError: It cannot be read, or does not hold what its head says.
@@ -170,8 +167,7 @@ def _find(folder: Path, name: str) -> Path:
     )
 
 
-# Clouds of points: farthest-point samples of pictures, and how they are varied.
-
+# Farthest-point samples of pictures, and how they are varied.
 
 LEVELS = 2048
 """Coordinates are whole numbers below this while points are chosen: squares of distances are exact
@@ -388,14 +384,7 @@ def varied(
 def drawn_indices(
     count: int, world_count: int, generator: Randomness, device: torch.device
 ) -> Tensor:
-    """Return one random number below `count` for each world, int64, shape [B].
-
-    Args:
-        count: How many clouds there are.
-        world_count: Worlds B.
-        generator: Randomness, on `device`.
-        device: Where the numbers are made.
-    """
+    """Return one random number below `count` for each world, int64, shape [B]."""
     if isinstance(generator, WorldRandom):
         return generator.integers(count, 1)[:, 0]
     return torch.randint(count, (world_count,), generator=generator, device=device)

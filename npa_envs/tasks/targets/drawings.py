@@ -1,4 +1,4 @@
-"""A small drawing surface on Pillow: silhouettes as masks, painted one over the other.
+"""Built-in targets, drawn on Pillow: silhouettes as masks, painted one over the other.
 
 Coordinates are in [-1, 1], y upwards. Everything is drawn at three times the final size and
 averaged down, so that edges come out smooth.
@@ -174,7 +174,7 @@ def _pixel(point: tuple[float, float]) -> tuple[float, float]:
     return ((point[0] + 1) * _WORK_SIDE / 2, (1 - point[1]) * _WORK_SIDE / 2)
 
 
-# The built-in targets, drawn by the project itself: RGBA pictures, transparent around.
+# The targets: RGBA pictures, transparent around.
 
 
 def draw_gecko() -> Image.Image:

@@ -102,10 +102,6 @@ def looks_like_path(source: str) -> bool:
 def scaled_square(image: Image.Image, side: int) -> FloatImage:
     """Return a square RGBA picture scaled to `side` pixels: colours times alpha, and alpha.
 
-    Args:
-        image: The picture.
-        side: Pixels along each side.
-
     Returns:
         In [0, 1], shape [side, side, 4]; the first row is the upper one.
     """

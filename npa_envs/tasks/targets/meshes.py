@@ -100,11 +100,7 @@ def ellipsoid(
 
 
 def joined(parts: Sequence[Mesh]) -> Mesh:
-    """Return several meshes as one.
-
-    Args:
-        parts: The meshes; they may reach into each other.
-    """
+    """Return several meshes as one."""
     starts = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
     return Mesh(
         np.concatenate([part.vertices for part in parts]),
@@ -301,8 +297,7 @@ def _fin(outline: FloatArray, turn: float, thickness: float, colour: FloatArray)
     return Mesh(corners, np.array(faces, dtype=np.int64), colours)
 
 
-# Meshes as pictures with alpha: a z-buffer in NumPy, which needs neither OpenGL nor a screen.
-
+# Pictures of meshes: a z-buffer in NumPy, which needs neither OpenGL nor a screen.
 
 LIGHT = (0.35, 0.80, 0.50)
 """Direction that light comes from, fixed in the world."""
@@ -319,10 +314,6 @@ def draw_mesh(mesh: Mesh, cameras: Cameras) -> NDArray[np.float32]:
 
     Light stays where it is when a camera goes round, so all views show one coloured surface. Both
     sides of a triangle are seen. Triangles with a corner nearer than `cameras.near` are left out.
-
-    Args:
-        mesh: The mesh.
-        cameras: V cameras, on any device.
 
     Returns:
         Red, green and blue, each times alpha, and alpha, in [0, 1], shape [V, H, W, 4]; the first

@@ -229,9 +229,6 @@ def scene_reach(views: Views) -> float:
 
     Every point of the scene is at least as far from the origin as the ray on which it is seen; from
     many sides the farthest is seen on such a ray.
-
-    Args:
-        views: Views of the scene.
     """
     cameras, reach = views.cameras, 0.0
     lenses = cameras.intrinsics.double().expand(cameras.count, 4)
