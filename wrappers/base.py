@@ -27,6 +27,10 @@ else:
     AnyWrapper, AnyVectorEnv, AnyVectorWrapper = gymnasium.Wrapper, VectorEnv, VectorWrapper
 
 
+VectorStep = tuple[Any, Any, Any, Any, dict[str, Any]]
+"""Observations, rewards, terminations, truncations and infos of a step of many worlds."""
+
+
 def single_env(env: Any, wrapper: str) -> NPAEnv:
     """Return the environment of this package that lies under wrappers.
 
@@ -314,8 +318,8 @@ class Observations(AnyWrapper):
         return self.observations(observation), reward, terminated, truncated, info
 
 
-class VectorObservations(AnyVectorWrapper):
-    """A wrapper of vector environments that changes observations, the final ones included.
+class EpisodeWrapper(AnyVectorWrapper):
+    """A wrapper of vector environments that follows the worlds' episodes.
 
     Args:
         env: The vector environment.
@@ -325,6 +329,37 @@ class VectorObservations(AnyVectorWrapper):
         super().__init__(env)
         self.clock = EpisodeClock(env)
         """Where each world stands in its episode."""
+
+    def reset(
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start episodes; as for the environment itself."""
+        # A copy: wrappers of Gymnasium take the mask out of what they are given.
+        observations, infos = self.env.reset(seed=seed, options=options and dict(options))
+        self.clock.reset(options)
+        return self.after_reset(observations, infos)
+
+    def step(self, actions: Any) -> VectorStep:
+        """Step; as for the environment itself."""
+        outcome: VectorStep = self.env.step(actions)
+        self.clock.step(*outcome[2:])
+        return self.after_step(outcome)
+
+    @abstractmethod
+    def after_reset(self, observations: Any, infos: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
+        """Return what a reset gives, once the clock knows of it."""
+
+    @abstractmethod
+    def after_step(self, outcome: VectorStep) -> VectorStep:
+        """Return what a step gives, once the clock knows of it."""
+
+
+class VectorObservations(EpisodeWrapper):
+    """A wrapper of vector environments that changes observations, the final ones included.
+
+    Args:
+        env: The vector environment.
+    """
 
     @property
     def observation_space(self) -> Space[Any]:
@@ -368,19 +403,13 @@ class VectorObservations(AnyVectorWrapper):
             observations: As they are, shape [B, N, P].
         """
 
-    def reset(
-        self, *, seed: Any = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
-        """Start episodes; as for the environment itself."""
-        # A copy: wrappers of Gymnasium take the mask out of what they are given.
-        observations, infos = self.env.reset(seed=seed, options=options and dict(options))
-        self.clock.reset(options)
+    def after_reset(self, observations: Any, infos: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
+        """Return changed observations and infos."""
         return self.observations(observations), infos
 
-    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Step; as for the environment itself."""
-        observations, rewards, terminations, truncations, infos = self.env.step(actions)
-        self.clock.step(terminations, truncations, infos)
+    def after_step(self, outcome: VectorStep) -> VectorStep:
+        """Return changed observations, the final ones included, and the rest as it is."""
+        observations, rewards, terminations, truncations, infos = outcome
         observations = self.observations(observations)
         if "final_obs" in infos:
             infos = infos | {"final_obs": self.final_observations(infos["final_obs"])}

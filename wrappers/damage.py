@@ -21,9 +21,9 @@ from npa_envs.tasks.damage import DamageEvent, damage_worlds, parse_damage
 from npa_envs.world.randomness import Purpose
 from npa_envs.wrappers.base import (
     AnyVectorEnv,
-    AnyVectorWrapper,
     AnyWrapper,
-    EpisodeClock,
+    EpisodeWrapper,
+    VectorStep,
     check_untouched,
     single_env,
     vector_env,
@@ -85,9 +85,10 @@ class _DamagesWorlds(RecordConstructorArgs):
     schedule: Schedule
     """When worlds are damaged."""
 
-    def _set_up(self, env: Any, base: NPAEnv | NPAVectorEnv) -> None:
+    _base: NPAEnv | NPAVectorEnv
+
+    def _count_events_beneath(self, env: Any) -> None:
         check_untouched(env, type(self).__name__)
-        self._base = base
         # Events of a stack of wrappers are numbered through, so that no two draw the same place.
         self._first = 0
         while hasattr(env, "env"):
@@ -151,9 +152,9 @@ class DamageEvents(_DamagesWorlds, AnyWrapper):
         every: int | None = None,
     ) -> None:
         self._read_events(events, every)
-        base = single_env(env, type(self).__name__)
+        self._base: NPAEnv = single_env(env, type(self).__name__)
         AnyWrapper.__init__(self, env)
-        self._set_up(env, base)
+        self._count_events_beneath(env)
         self._elapsed = 0
 
     def reset(
@@ -187,7 +188,7 @@ class DamageEvents(_DamagesWorlds, AnyWrapper):
         return observation, info
 
 
-class VectorDamageEvents(_DamagesWorlds, AnyVectorWrapper):
+class VectorDamageEvents(_DamagesWorlds, EpisodeWrapper):
     """`DamageEvents` for vector environments: each world by the steps of its own episode.
 
     World k is damaged as the single environment with the same seed, bit for bit. Arguments and
@@ -198,27 +199,19 @@ class VectorDamageEvents(_DamagesWorlds, AnyVectorWrapper):
         self, env: AnyVectorEnv, events: Event | Sequence[Event], *, every: int | None = None
     ) -> None:
         self._read_events(events, every)
-        base = vector_env(env, type(self).__name__)
-        AnyVectorWrapper.__init__(self, env)
-        self._set_up(env, base)
-        self._clock = EpisodeClock(env)
+        self._base: NPAVectorEnv = vector_env(env, type(self).__name__)
+        EpisodeWrapper.__init__(self, env)
+        self._count_events_beneath(env)
 
-    def reset(
-        self, *, seed: Any = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
-        """Start episodes; as for the environment itself."""
-        # A copy: wrappers of Gymnasium take the mask out of what they are given.
-        observations, infos = self.env.reset(seed=seed, options=options and dict(options))
-        self._clock.reset(options)
-        due = self.schedule.due(self._clock.elapsed) & self._clock.restarted
+    def after_reset(self, observations: Any, infos: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
+        """Damage the worlds whose episodes start from damaged ones."""
+        due = self.schedule.due(self.clock.elapsed) & self.clock.restarted
         return self._damaged(due, observations, infos) if due.any() else (observations, infos)
 
-    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Step; as for the environment itself."""
-        observations, rewards, terminations, truncations, infos = self.env.step(actions)
-        clock = self._clock
-        clock.step(terminations, truncations, infos)
-        due = self.schedule.due(clock.elapsed) & (clock.restarted | ~clock.ended)
+    def after_step(self, outcome: VectorStep) -> VectorStep:
+        """Damage the worlds in whose episodes an event is due."""
+        observations, rewards, terminations, truncations, infos = outcome
+        due = self.schedule.due(self.clock.elapsed) & (self.clock.restarted | ~self.clock.ended)
         if due.any():
             # With copy=False these are the buffers that placing particles writes to.
             rewards, terminations, truncations = map(_copy, (rewards, terminations, truncations))

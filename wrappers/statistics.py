@@ -26,10 +26,10 @@ from npa_envs.tasks.checks import is_real, is_whole
 from npa_envs.world.actions import Physics
 from npa_envs.wrappers.base import (
     AnyVectorEnv,
-    AnyVectorWrapper,
-    EpisodeClock,
+    EpisodeWrapper,
     Observations,
     VectorObservations,
+    VectorStep,
     as_tensor,
     autoreset_mode,
     check_vector_env,
@@ -317,7 +317,7 @@ class VectorNormalizePerception(_NormalizesPerception, VectorObservations, Recor
         self.single_observation_space = self.statistics.space(env.single_observation_space)
 
 
-class TorchRecordEpisodeStatistics(AnyVectorWrapper):
+class TorchRecordEpisodeStatistics(EpisodeWrapper):
     """Keep track of returns and lengths of episodes.
 
     A step in which episodes end has `infos["episode"]` with the tensors `r` (returns), `l` (lengths
@@ -344,7 +344,6 @@ class TorchRecordEpisodeStatistics(AnyVectorWrapper):
                 f"{buffer_length!r}"
             )
         self._key = stats_key
-        self._clock = EpisodeClock(env)
         self.episode_count = 0
         """Episodes that have ended."""
         self.episode_returns: Tensor | None = None
@@ -366,32 +365,27 @@ class TorchRecordEpisodeStatistics(AnyVectorWrapper):
             self._unread.clear()
         return self._returns
 
-    def reset(
-        self, *, seed: Any = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
-        """Start episodes; as for the environment itself."""
-        observations, infos = self.env.reset(seed=seed, options=options and dict(options))
-        self._clock.reset(options)
-        self._restart(self._clock.restarted)
+    def after_reset(self, observations: Any, infos: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
+        """Begin to sum the rewards of new episodes."""
+        self._restart(self.clock.restarted)
         return observations, infos
 
-    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Step; as for the environment itself."""
-        observations, rewards, terminations, truncations, infos = self.env.step(actions)
+    def after_step(self, outcome: VectorStep) -> VectorStep:
+        """Sum the rewards, and tell of the episodes that ended."""
+        observations, rewards, terminations, truncations, infos = outcome
         check_tensor(rewards, type(self).__name__)
-        self._clock.step(terminations, truncations, infos)
         returns = rewards.double()
         if self.episode_returns is not None:
             returns = self.episode_returns + returns
         self.episode_returns = returns
-        if self._clock.ended.any():
+        if self.clock.ended.any():
             infos = infos | self._ended(returns, rewards.device)
         # Where the next step begins an episode, that step is none of the episode's own.
-        self._restart(self._clock.restarted)
+        self._restart(self.clock.restarted)
         return observations, rewards, terminations, truncations, infos
 
     def _ended(self, returns: Tensor, device: torch.device) -> dict[str, Any]:
-        ended, lengths = self._clock.ended, self._clock.lengths
+        ended, lengths = self.clock.ended, self.clock.lengths
         seconds = np.where(ended, np.round(time.perf_counter() - self._began, 6), 0.0)
         mask = torch.from_numpy(ended).to(device)
         self.episode_count += int(ended.sum())
@@ -456,7 +450,7 @@ class TorchNormalizeObservation(VectorObservations):
         return (observations - self.obs_rms.mean.to(observations)) * scale
 
 
-class TorchNormalizeReward(AnyVectorWrapper):
+class TorchNormalizeReward(EpisodeWrapper):
     """Divide rewards by the running standard deviation of the discounted return.
 
     The return begins anew with each episode, however the one before it ended.
@@ -482,24 +476,18 @@ class TorchNormalizeReward(AnyVectorWrapper):
         """Discounted return of each running episode, float64, shape [B]."""
         self.update_running_mean = True
         """Whether the statistics follow what is seen."""
-        self._clock = EpisodeClock(env)
         self._same_step = autoreset_mode(env) is AutoresetMode.SAME_STEP
 
-    def reset(
-        self, *, seed: Any = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
-        """Start episodes; as for the environment itself."""
-        observations, infos = self.env.reset(seed=seed, options=options and dict(options))
-        self._clock.reset(options)
-        self._forget(self._clock.restarted)
+    def after_reset(self, observations: Any, infos: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
+        """Forget the returns of the episodes before."""
+        self._forget(self.clock.restarted)
         return observations, infos
 
-    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Step; as for the environment itself."""
-        observations, rewards, terminations, truncations, infos = self.env.step(actions)
+    def after_step(self, outcome: VectorStep) -> VectorStep:
+        """Return rewards on the scale of the discounted return."""
+        observations, rewards, terminations, truncations, infos = outcome
         check_tensor(rewards, type(self).__name__)
-        clock = self._clock
-        clock.step(terminations, truncations, infos)
+        clock = self.clock
         before = self.accumulated_reward
         returns = rewards.double() if before is None else before * self.gamma + rewards.double()
         counted = returns

@@ -22,6 +22,7 @@ from npa_envs.agents.learning.ppo_common import (
     GaussianRules,
     check_word,
     first_rules,
+    noise_left,
 )
 from npa_envs.agents.learning.problem import WORLDS_PER_SEED, Problem, world_seeds
 from npa_envs.agents.learning.progress import Budget, Progress
@@ -151,14 +152,13 @@ class Learner:
         device: torch.device,
         start: RuleSet | None,
     ) -> None:
-        self.options = options = options.filled(start)
+        self.options, self.pace = options, options.pace(start)
         self.envs = problem.make_envs(
             options.worlds, device=device, row_rewards=options.credit == "particle", copy=False
         )
         self.generator = torch.Generator(device).manual_seed(seed)
         rules = first_rules(problem, seed, start)
-        assert options.initial_std is not None, "filled in above"
-        self.actor = GaussianRules(rules, options.initial_std).to(device)
+        self.actor = GaussianRules(rules, self.pace.initial_std).to(device)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             critic = Critic(
@@ -286,13 +286,13 @@ class Learner:
                 were at the start, and by it the noise of the next round is made less.
         """
         options = self.options
-        rules_learn = self.rounds >= options.critic_rounds
+        rules_learn = self.rounds >= self.pace.critic_rounds
         self.rounds += 1
         self.critic.observe(self.memory.seen[:-1])
         self.critic.rescale(self.memory.targets)
         rate = self.critic_optimizer.param_groups[0]["lr"]
         rate.fill_(options.critic_learning_rate * share_left)
-        self._rate.fill_(options.learning_rate * share_left)
+        self._rate.fill_(self.pace.learning_rate * share_left)
         self._near.fill_(1.0)
         for _ in range(options.epochs):
             for order in self._orders:
@@ -304,7 +304,9 @@ class Learner:
             # All that the host waits for.
             if not bool(self._near):
                 break
-        self.actor.leave_noise(options.noise_left(share_left))
+        self.actor.leave_noise(
+            noise_left(share_left, self.pace.last_noise, options.noise_decay_share)
+        )
 
     def _improve_critic(self) -> None:
         """Let the critic learn once from all of a round, in the order that was drawn."""
@@ -320,7 +322,7 @@ class Learner:
             self._descend(self.critic_optimizer, self._critic_loss(*worlds))
             gain, kl = self._surrogate(part)
             # Rules that have gone too far stay, without a question to the host.
-            self._near *= kl.detach() <= self.options.target_kl
+            self._near *= kl.detach() <= self.pace.target_kl
             self.optimizer.param_groups[0]["lr"].copy_(self._near * self._rate)
             self._descend(self.optimizer, -gain)
 

@@ -1,12 +1,12 @@
-"""What the two forms of PPO share: options, rules that explore, and the critic."""
+"""Parts of both forms of PPO: options, rules that explore, and the critic."""
 
 from __future__ import annotations
 
 import copy
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Literal, Self, get_args
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor, nn
@@ -16,23 +16,27 @@ from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.errors import NPAError, suggest
 from npa_envs.tasks.checks import check_fraction, check_non_negative, check_positive
 
-FRESH = {
-    "learning_rate": 1e-3,
-    "initial_std": 0.2,
-    "last_noise": 0.25,
-    "critic_rounds": 0,
-    "target_kl": 0.2,
-}
-"""What options are where they are None, with fresh rules."""
 
-WARM = {
-    "learning_rate": 1e-4,
-    "initial_std": 0.05,
-    "last_noise": 1.0,
-    "critic_rounds": 4,
-    "target_kl": 0.05,
-}
-"""The same with rules to begin with: noise, haste and a raw critic would undo what they can do."""
+class Pace(NamedTuple):
+    """The options whose defaults depend on whether a run begins with fresh rules."""
+
+    learning_rate: float
+    """Adam's step at the start, from which it falls to zero over the budget."""
+    initial_std: float
+    """Standard deviation of every action column at first (dimensionless)."""
+    last_noise: float
+    """What is left of the standard deviations at the end of the budget (dimensionless)."""
+    critic_rounds: int
+    """Rounds in which the critic learns alone."""
+    target_kl: float
+    """How far particles' actions may move in a round [nats]."""
+
+
+FRESH = Pace(1e-3, 0.2, 0.25, 0, 0.2)
+"""For fresh rules."""
+
+WARM = Pace(1e-4, 0.05, 1.0, 4, 0.05)
+"""For rules to begin with: noise, haste and a raw critic would undo what they can do."""
 
 CriticKind = Literal["particle", "central"]
 """What a value is told of: a "particle" alone, or its whole world besides ("central")."""
@@ -108,26 +112,29 @@ class CommonOptions:
             check_positive(self, int, "critic_rounds", at_least=0)
         check_word("critic", self.critic, get_args(CriticKind))
 
-    def filled(self, start: RuleSet | None) -> Self:
-        """Return the options with those of `FRESH` or `WARM` where they are None.
+    def pace(self, start: RuleSet | None) -> Pace:
+        """Return the options that depend on a start: those of `FRESH` or `WARM` where None.
 
         Args:
             start: Rules to begin with; None: fresh ones.
         """
-        defaults = FRESH if start is None else WARM
-        return replace(self, **{k: v for k, v in defaults.items() if getattr(self, k) is None})
+        given = {name: getattr(self, name) for name in Pace._fields}
+        given = {name: value for name, value in given.items() if value is not None}
+        return (FRESH if start is None else WARM)._replace(**given)
 
-    def noise_left(self, share_left: float) -> float:
-        """Return what is left of the first noise: all at first, then it falls by equal factors.
 
-        What is learned is what is best with noise, and what counts is what it does without: towards
-        the end the two are to be the same.
+def noise_left(share_left: float, last_noise: float, decay_share: float) -> float:
+    """Return what is left of the first noise: all of it at first, then it falls by equal factors.
 
-        Args:
-            share_left: Share of the budget that is left.
-        """
-        assert self.last_noise is not None, "filled in before"
-        return math.pow(self.last_noise, max(0.0, 1.0 - share_left / self.noise_decay_share))
+    What is learned is what is best with noise, and what counts is what it does without: towards the
+    end the two are to be the same.
+
+    Args:
+        share_left: Share of the budget that is left.
+        last_noise: What is left of the noise when nothing is.
+        decay_share: Share of the budget, its last, in which it falls.
+    """
+    return math.pow(last_noise, max(0.0, 1.0 - share_left / decay_share))
 
 
 def check_word(name: str, word: object, words: Sequence[str]) -> None:

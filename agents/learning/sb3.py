@@ -19,7 +19,9 @@ from npa_envs.agents.learning.ppo_common import (
     Critic,
     CriticKind,
     GaussianRules,
+    Pace,
     first_rules,
+    noise_left,
 )
 from npa_envs.agents.learning.problem import Problem, world_seeds
 from npa_envs.agents.learning.progress import Progress
@@ -87,27 +89,27 @@ def train(
     Raises:
         DivergedError: The policy has diverged.
     """
-    chosen: Any = options.filled(start)
+    pace = options.pace(start)
     env = WorldVecEnv(problem.make_envs(device=device))
-    callback = ProgressCallback(progress, chosen)
+    callback = ProgressCallback(progress, options, pace)
     model = PPO(
         WorldRulePolicy,
         env,
-        learning_rate=lambda _: chosen.learning_rate * callback.share_left,
-        n_steps=chosen.steps,
-        batch_size=-(-chosen.steps * env.num_envs // chosen.minibatches),
-        n_epochs=chosen.epochs,
-        gamma=chosen.gamma,
-        gae_lambda=chosen.gae_lambda,
-        clip_range=chosen.clip,
-        ent_coef=chosen.entropy_weight,
-        max_grad_norm=chosen.max_gradient_norm,
-        target_kl=world_kl(chosen.target_kl),
-        tensorboard_log=chosen.tensorboard_log,
+        learning_rate=lambda _: pace.learning_rate * callback.share_left,
+        n_steps=options.steps,
+        batch_size=-(-options.steps * env.num_envs // options.minibatches),
+        n_epochs=options.epochs,
+        gamma=options.gamma,
+        gae_lambda=options.gae_lambda,
+        clip_range=options.clip,
+        ent_coef=options.entropy_weight,
+        max_grad_norm=options.max_gradient_norm,
+        target_kl=world_kl(pace.target_kl),
+        tensorboard_log=options.tensorboard_log,
         policy_kwargs={
             "rules": first_rules(problem, seed, start),
-            "initial_std": chosen.initial_std,
-            "critic": chosen.critic,
+            "initial_std": pace.initial_std,
+            "critic": options.critic,
         },
         seed=seed,
         device=device,
@@ -135,13 +137,15 @@ class ProgressCallback(BaseCallback):
 
     Args:
         progress: The account.
-        options: Of PPO, none of them None any more.
+        options: Of PPO.
+        pace: Those of them that depend on a start.
     """
 
-    def __init__(self, progress: Progress, options: WorldOptions) -> None:
+    def __init__(self, progress: Progress, options: WorldOptions, pace: Pace) -> None:
         super().__init__()
         self.progress = progress
         self.options = options
+        self.pace = pace
         self.rounds = 0
         """Rounds begun."""
         self.share_left = 1.0
@@ -166,9 +170,11 @@ class ProgressCallback(BaseCallback):
     def _on_rollout_start(self) -> None:
         self.progress.look(self.rules)
         self.share_left = max(0.0, 1.0 - self.progress.share)
-        self.actor.leave_noise(self.options.noise_left(self.share_left))
+        self.actor.leave_noise(
+            noise_left(self.share_left, self.pace.last_noise, self.options.noise_decay_share)
+        )
         for parameter in self._learned:
-            parameter.requires_grad_(self.rounds >= (self.options.critic_rounds or 0))
+            parameter.requires_grad_(self.rounds >= self.pace.critic_rounds)
         self.rounds += 1
 
     def _on_step(self) -> bool:

@@ -23,7 +23,7 @@ from npa_envs.agents.learning.ppo import (
     world_bytes,
     world_count,
 )
-from npa_envs.agents.learning.ppo_common import Critic, GaussianRules
+from npa_envs.agents.learning.ppo_common import Critic, GaussianRules, noise_left
 from npa_envs.errors import NPAError
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.cuda_graph import no_garbage_collection
@@ -478,11 +478,11 @@ def test_options_out_of_their_range_are_named(options, message):
 
 
 def test_options_that_are_none_depend_on_a_start():
-    fresh, warm = PPOOptions().filled(None), PPOOptions().filled(HEART.new_rules(0))
+    fresh, warm = PPOOptions().pace(None), PPOOptions().pace(HEART.new_rules(0))
     assert fresh.initial_std > warm.initial_std
     assert fresh.learning_rate > warm.learning_rate
     assert fresh.last_noise < warm.last_noise == 1.0
-    assert PPOOptions(initial_std=0.7).filled(None).initial_std == 0.7
+    assert PPOOptions(initial_std=0.7).pace(None).initial_std == 0.7
 
 
 @pytest.mark.parametrize(
@@ -494,8 +494,8 @@ def test_options_that_are_none_depend_on_a_start():
     ],
 )
 def test_noise_is_kept_at_first_and_then_falls_by_equal_factors(last_noise, decay_share, left):
-    options = PPOOptions(last_noise=last_noise, noise_decay_share=decay_share)
-    assert [options.noise_left(share) for share in (1.0, 0.75, 0.5, 0.25, 0.0)] == left
+    shares = (1.0, 0.75, 0.5, 0.25, 0.0)
+    assert [noise_left(share, last_noise, decay_share) for share in shares] == left
 
 
 @pytest.mark.parametrize(("decay_share", "kept"), [(0.5, 4), (0.25, 6)])
