@@ -56,6 +56,7 @@ class RowCotangents(NamedTuple):
 def perceive_rows_backward(
     perception_bar: Tensor,
     saved_tensors: list[Tensor],
+    listed: list[Tensor],
     *,
     particle_count: int,
     state_dim: int,
@@ -68,7 +69,8 @@ def perceive_rows_backward(
 ) -> tuple[Tensor, Tensor]:
     """Return the cotangents of states, [B N, C], and of positions, [B N, D] or empty.
 
-    The tensors are those of a `SavedPerception`; positions are skipped if it has no states.
+    The tensors are those of a `SavedPerception`, and of the `ListedNeighbours` where there are any;
+    positions are skipped if no states were saved.
     """
     saved = SavedPerception(*saved_tensors)
     total, space_dim = saved.particles.shape[0], saved.particles.shape[1] - 1
@@ -82,12 +84,17 @@ def perceive_rows_backward(
         box,
     )
     bar = perception_bar.contiguous()
-    if plan.listed and saved.states is None:
+    tiled = plan.runs("adjoint") == "cuda"
+    if tiled:
         states_bar = _gather_by_tiles(plan, saved, bar, scale, state_gradient)
-        return states_bar, states_bar.new_empty(0)
-    kernels = adjoint_kernels(space_dim, plan.scalar, plan.width, plan.lanes, state_gradient)
+        if saved.states is None:
+            return states_bar, states_bar.new_empty(0)
+    kernels = adjoint_kernels(
+        space_dim, plan.scalar, plan.width, plan.on_cpu, state_gradient, bool(listed)
+    )
     cotangents = _unscale(kernels, plan, saved, bar, scale, density_gradient)
-    states_bar = _gather_states(kernels, plan, saved, cotangents)
+    if not tiled:
+        states_bar = _gather_states(kernels, plan, saved, listed, cotangents)
     if saved.states is None:
         return states_bar, bar.new_empty(0)
     return states_bar, _gather_positions(kernels, plan, saved, cotangents)
@@ -97,6 +104,7 @@ def perceive_rows_backward(
 def _(
     perception_bar: Tensor,
     saved_tensors: list[Tensor],
+    listed: list[Tensor],
     *,
     state_dim: int,
     **options: Any,
@@ -147,13 +155,18 @@ def _unscale(
 
 
 def _gather_states(
-    kernels: Any, plan: Plan, saved: SavedPerception, cotangents: RowCotangents
+    kernels: Any,
+    plan: Plan,
+    saved: SavedPerception,
+    listed: list[Tensor],
+    cotangents: RowCotangents,
 ) -> Tensor:
     """Return the cotangent of states, [B N, C]."""
+    neighbours, ends = listed or (None, None)
     states_bar = cotangents.bar.new_empty(plan.total, plan.state_dim)
     launch(
         kernels.gather_state_cotangents,
-        (plan.total, plan.group_count, plan.lanes),
+        (plan.total, plan.group_count),
         states_bar.device,
         plan.domain,
         plan.particle_count,
@@ -163,6 +176,8 @@ def _gather_states(
         plan.row_capacity,
         plan.group_count,
         saved.starts,
+        ends,
+        neighbours,
         saved.particles,
         saved.source,
         saved.row_of,

@@ -1,18 +1,196 @@
-"""The two passes of perception over sorted worlds: which kernels run, and with what."""
+"""The backend table: which implementation of each operator runs, and why.
+
+There are two engines. `kernels/portable/` is plain Warp for a CPU and for CUDA, in float32 and
+float64; it reads like `reference.py`. `kernels/cuda/` is for CUDA in float32 on compute capability
+8.0 and above: neighbour lists in 16 bits, sums shared by threads, tensor cores. An operator takes
+the first implementation in `TABLE` whose condition holds for a call. `npa-envs bench --explain`
+prints what was chosen.
+"""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+import functools
+from collections.abc import Callable
+from typing import Literal, NamedTuple
 
 import torch
-from torch import Tensor
 
-from npa_envs.kernels.access import WARP
-from npa_envs.kernels.cuda.density import listed_density
-from npa_envs.kernels.cuda.perceive import listed_perception
-from npa_envs.kernels.portable.perceive import perception_kernels
-from npa_envs.ops.launch import launch
-from npa_envs.ops.sort import Plan, SortedWorlds, density_scale
+Operator = Literal[
+    "sort", "density", "perceive", "adjoint", "position_adjoint", "network", "update"
+]
+
+LARGEST_ROW, LARGEST_UPDATE, LARGEST_HIDDEN = 128, 32, 512
+"""Widest rows and updates, and most hidden units, that the fused network takes."""
+
+UNIT_SHARE = 32
+"""Hidden units that a warp of the fused network serves."""
+
+LARGEST_BLOCK_WORLD = 4096
+"""Particles of the largest world that a block of threads sorts."""
+
+LARGEST_BLOCK_GRID = 4096
+"""Cells of the largest grid that a block of threads has room for."""
+
+
+class Request(NamedTuple):
+    """What is known of a call before its data: all that the table asks for."""
+
+    device: torch.device
+    dtype: torch.dtype
+    particle_count: int = 0
+    """Particles of a world N."""
+    cell_count: int = 0
+    """Cells of a world's grid."""
+    aligned: bool = True
+    """Whether tensors begin at multiples of 16 bytes in memory."""
+    row_width: int = 0
+    """Columns of a row of perception."""
+    update_width: int = 0
+    """Columns of an update."""
+    hidden_dim: int = 0
+    """Hidden units of the rule H."""
+
+
+class Implementation(NamedTuple):
+    """A row of the table."""
+
+    operator: Operator
+    """What it computes."""
+    name: str
+    """What call sites ask for."""
+    where: str
+    """Where it stands."""
+    condition: str
+    """When it runs, in words."""
+    holds: Callable[[Request], bool]
+    """Whether it runs."""
+
+
+@functools.lru_cache
+def is_modern(device: torch.device) -> bool:
+    """Return whether a device has the tensor cores and warp-wide sums of compute capability 8.0."""
+    return device.type == "cuda" and torch.cuda.get_device_capability(device) >= (8, 0)
+
+
+def _cuda(request: Request) -> bool:
+    return request.dtype == torch.float32 and is_modern(request.device)
+
+
+def _block(request: Request) -> bool:
+    return (
+        _cuda(request)
+        and request.aligned
+        and request.particle_count <= LARGEST_BLOCK_WORLD
+        and request.cell_count <= LARGEST_BLOCK_GRID
+    )
+
+
+def _fused(request: Request) -> bool:
+    widths = request.row_width, request.update_width
+    return (
+        _cuda(request)
+        and all(width % 4 == 0 for width in widths)
+        and request.hidden_dim % UNIT_SHARE == 0
+        and request.row_width <= LARGEST_ROW
+        and request.update_width <= LARGEST_UPDATE
+        and request.hidden_dim <= LARGEST_HIDDEN
+    )
+
+
+def _always(request: Request) -> bool:
+    return True
+
+
+_MODERN = "CUDA from compute capability 8.0 on, float32"
+
+TABLE: tuple[Implementation, ...] = (
+    Implementation(
+        "sort",
+        "block",
+        "kernels/cuda/sort.py",
+        f"{_MODERN}, worlds of at most {LARGEST_BLOCK_WORLD} particles and "
+        f"{LARGEST_BLOCK_GRID} cells: a block of threads sorts a world",
+        _block,
+    ),
+    Implementation(
+        "sort", "cuda", "kernels/cuda/sort.py", f"{_MODERN}: a warp moves states together", _cuda
+    ),
+    Implementation("sort", "portable", "kernels/portable/sort.py", "otherwise", _always),
+    Implementation(
+        "density",
+        "cuda",
+        "kernels/cuda/density.py",
+        f"{_MODERN}: neighbours are listed on the way, in 16 bits each",
+        _cuda,
+    ),
+    Implementation("density", "portable", "kernels/portable/density.py", "otherwise", _always),
+    Implementation(
+        "perceive",
+        "cuda",
+        "kernels/cuda/perceive.py",
+        f"{_MODERN}: from neighbour lists",
+        _cuda,
+    ),
+    Implementation("perceive", "portable", "kernels/portable/perceive.py", "otherwise", _always),
+    Implementation(
+        "adjoint",
+        "cuda",
+        "kernels/cuda/adjoint.py",
+        f"{_MODERN}: tiles of eight particles on tensor cores",
+        _cuda,
+    ),
+    Implementation("adjoint", "portable", "kernels/portable/adjoint.py", "otherwise", _always),
+    Implementation(
+        "position_adjoint",
+        "portable",
+        "kernels/portable/adjoint.py",
+        "always; only where detach_positions=False",
+        _always,
+    ),
+    Implementation(
+        "network",
+        "cuda",
+        "kernels/cuda/network.py",
+        f"{_MODERN}, rows of at most {LARGEST_ROW} columns, updates of {LARGEST_UPDATE}, "
+        f"{LARGEST_HIDDEN} hidden units in multiples of {UNIT_SHARE}: tensor cores",
+        _fused,
+    ),
+    Implementation("network", "torch", "torch's products", "otherwise", _always),
+    Implementation("update", "portable", "kernels/portable/update.py", "always", _always),
+)
+"""All implementations; of an operator's, the first whose condition holds runs."""
+
+
+@functools.lru_cache(maxsize=4096)
+def choose(operator: Operator, request: Request) -> Implementation:
+    """Return the implementation of an operator that a call takes."""
+    return next(row for row in TABLE if row.operator == operator and row.holds(request))
+
+
+def describe(request: Request) -> list[str]:
+    """Return a line for each operator: what a call like this takes, where it stands, and why."""
+    chosen = [row for row in TABLE if row == choose(row.operator, request)]
+    return [f"{row.operator:16}  {row.name:8}  {row.where:28}  {row.condition}" for row in chosen]
+
+
+class Listing(NamedTuple):
+    """How the CUDA engine lists neighbours, and how threads share particles.
+
+    It follows from the size of a world alone: the sums of a world, taken in the order that this
+    gives, are the same in every batch.
+    """
+
+    capacity: int
+    """Neighbours that a list has room for: what is longer, perception searches for again."""
+    lanes: int
+    """Threads of a particle in the density pass."""
+    teams: int
+    """Teams of lanes of a row in the perception pass."""
+
+    def shape(self, row_count: int) -> tuple[int, int, int]:
+        """Return the shape of so many lists: 32 of them lie together."""
+        return -(-row_count // 32), self.capacity, 32
+
 
 CAPACITY, LARGE_CAPACITY, HUGE_CAPACITY = 64, 128, 96
 """Neighbours that lists have room for: in small worlds of a batch, elsewhere, in huge worlds."""
@@ -26,263 +204,20 @@ SHARED_WORLD = 4096
 HUGE_WORLD = 2**22
 """Particles of the largest world whose lists of neighbours may take more memory than its rows."""
 
-
-class Terms(NamedTuple):
-    """Which groups of the perception vector a rule reads: the others are not computed."""
-
-    state_gradient: bool = True
-    moment_inverse: str | None = "threshold"
-    density_gradient: bool = True
-
-    @property
-    def correction(self) -> str | None:
-        """How the state gradient is corrected, "threshold" or "smooth"; None: not at all."""
-        return self.moment_inverse if self.state_gradient else None
-
-    def perception_dim(self, space_dim: int, state_dim: int) -> int:
-        """Length P of a perception vector with these groups."""
-        gradients = state_dim * space_dim * self.state_gradient
-        return 2 * state_dim + gradients + space_dim * self.density_gradient
+DENSITY_LANES = 4
+"""Threads of a particle in the density pass of small worlds."""
 
 
-class Listing(NamedTuple):
-    """How neighbours are listed, and how threads share particles, on CUDA.
-
-    It follows from the size of a world alone: the sums of a world, taken in the order that this
-    gives, are the same in every batch.
-    """
-
-    capacity: int
-    """Neighbours that a list has room for: what is longer, perception searches for again."""
-    lanes: int
-    """Threads of a particle in the density pass."""
-    teams: int
-    """Teams of lanes of a row in the perception pass."""
-
-
-class NeighbourLists(NamedTuple):
-    """The neighbours of each row's particle, itself included."""
-
-    listing: Listing
-    """How they were listed."""
-    steps: Tensor
-    """Steps to neighbours in the sorted order, int16; 32 particles together."""
-    lengths: Tensor
-    """Neighbours of each row's particle, int32, [K]."""
-    records: Tensor
-    """Sorted positions with volumes, and in 2D places of states, shape [B N, 4]."""
-
-
-class Densities(NamedTuple):
-    """What the density pass leaves for perception."""
-
-    particles: Tensor
-    """Sorted positions with volumes 1 / rho, shape [B N, D + 1]; empty where nobody asked."""
-    row_density_gradient: Tensor
-    """Density gradients of the rows, float64, [K, D]; empty where perception computes them."""
-    lists: NeighbourLists | None = None
-    """What the density pass found of neighbours."""
-
-
-def plain_kernels(plan: Plan, terms: Terms) -> Any:
-    """Return the plain kernels of a plan."""
-    return perception_kernels(
-        plan.space_dim,
-        plan.scalar,
-        plan.width,
-        plan.lanes,
-        terms.state_gradient,
-        terms.correction,
-    )
-
-
-def rollout_listing(plan: Plan) -> Listing:
-    """Return how rollouts list neighbours: few worlds shall fill a device, too."""
-    if plan.particle_count <= SHARED_WORLD:
-        return Listing(LARGE_CAPACITY, lanes=plan.lanes, teams=2)
+def rollout_listing(particle_count: int) -> Listing:
+    """Return how rollouts of worlds of N particles list neighbours: few worlds shall fill a GPU."""
+    if particle_count <= SHARED_WORLD:
+        return Listing(LARGE_CAPACITY, lanes=DENSITY_LANES, teams=2)
     # The lists of worlds that fill a device's memory would be the largest part of it.
-    huge = plan.particle_count > HUGE_WORLD
+    huge = particle_count > HUGE_WORLD
     return Listing(HUGE_CAPACITY if huge else LARGE_CAPACITY, lanes=1, teams=1)
 
 
-def batch_listing(plan: Plan) -> Listing:
+def batch_listing(particle_count: int) -> Listing:
     """Return how environments list neighbours: whole batches fill a device with less."""
-    small = plan.particle_count <= SMALL_WORLD
+    small = particle_count <= SMALL_WORLD
     return Listing(CAPACITY if small else LARGE_CAPACITY, lanes=1, teams=1)
-
-
-def compute_densities(
-    plan: Plan,
-    ordered: SortedWorlds,
-    terms: Terms,
-    listing: Listing,
-    *,
-    state_place: Tensor | None = None,
-    with_particles: bool = True,
-) -> Densities:
-    """Compute densities, and what perception wants besides: lists or the rows' density gradients.
-
-    Args:
-        plan: Plan of the call.
-        ordered: The sorted worlds.
-        terms: Groups of the perception that follows.
-        listing: How to list neighbours, where the plan says so.
-        state_place: Where the states of sorted particles are, int32, shape [B N]; None: in order.
-        with_particles: Also leave `particles` where neighbours are listed: the adjoint reads them.
-    """
-    if not plan.listed:
-        return compute_density_gradients(plan, ordered, terms)
-    return list_neighbours(plan, ordered, listing, state_place, with_particles)
-
-
-def list_neighbours(
-    plan: Plan,
-    ordered: SortedWorlds,
-    listing: Listing,
-    state_place: Tensor | None,
-    with_particles: bool,
-) -> Densities:
-    """Compute densities, and list the neighbours of the rows: `compute_densities` on CUDA."""
-    capacity, lanes, _ = listing
-    positions = ordered.positions
-    records = positions.new_empty(plan.total, 4)
-    particles = positions.new_empty(plan.total if with_particles else 0, plan.space_dim + 1)
-    blocks = -(-plan.row_capacity // WARP)
-    steps = positions.new_empty(blocks, capacity, WARP, dtype=torch.int16)
-    lengths = positions.new_empty(plan.row_capacity, dtype=torch.int32)
-    launch(
-        listed_density(plan.space_dim, lanes, plan.periodic, capacity, plan.masked),
-        -(-plan.total * lanes // WARP) * WARP,
-        positions.device,
-        plan.domain,
-        ordered.starts,
-        ordered.cell,
-        positions,
-        state_place,
-        ordered.source,
-        ordered.row_of,
-        particles,
-        records,
-        steps.view(-1),
-        lengths,
-    )
-    no_gradient = positions.new_empty(0, plan.space_dim, dtype=torch.float64)
-    return Densities(particles, no_gradient, NeighbourLists(listing, steps, lengths, records))
-
-
-def compute_density_gradients(plan: Plan, ordered: SortedWorlds, terms: Terms) -> Densities:
-    """Compute densities and the rows' density gradients, undefined beyond the last active row."""
-    positions = ordered.positions
-    particles = positions.new_empty(plan.total, plan.space_dim + 1)
-    row_density_gradient = positions.new_empty(
-        plan.row_capacity, plan.space_dim, dtype=torch.float64
-    )
-    launch(
-        plain_kernels(plan, terms).compute_density,
-        (plan.total, plan.lanes),
-        positions.device,
-        plan.domain,
-        plan.particle_count,
-        int(terms.density_gradient),
-        ordered.starts,
-        ordered.source,
-        ordered.row_of,
-        positions,
-        particles,
-        row_density_gradient,
-    )
-    return Densities(particles, row_density_gradient)
-
-
-def perception_launch(
-    plan: Plan,
-    ordered: SortedWorlds,
-    densities: Densities,
-    terms: Terms,
-    scale: float,
-    out: Tensor,
-    *,
-    states: Tensor | None = None,
-    destination: Tensor | None = None,
-    limit: float = 0.0,
-    row_kernel_sum: Tensor | None = None,
-) -> tuple[Any, ...]:
-    """Return what to give to `launch` so that it writes the perception of each row.
-
-    Args:
-        plan: Plan of the call.
-        ordered: The sorted worlds.
-        densities: Their densities.
-        terms: Groups of the perception vector.
-        scale: c = eps / eps0, dimensionless.
-        out: Rows to write, shape [K, row_width].
-        states: States in the caller's order, where `ordered` has none.
-        destination: Row of `out` for each row, int32, shape [K]; default: its own.
-        limit: Entries are clipped to plus and minus this; 0: they are not.
-        row_kernel_sum: Where to write the rows' sums of v K, shape [K, D], for the adjoint.
-    """
-    common = (
-        plan.domain,
-        *(() if plan.listed else (plan.particle_count,)),
-        plan.state_dim,
-        int(terms.density_gradient),
-        scale,
-        density_scale(scale, plan.space_dim, plan.particle_count),
-        plan.row_base,
-    )
-    row_place = ordered.row_place if plan.masked else None
-    lists = densities.lists
-    if lists is not None:
-        capacity, _, teams = lists.listing
-        kernel = listed_perception(
-            plan.space_dim,
-            plan.width,
-            plan.lanes,
-            terms.state_gradient,
-            terms.correction,
-            plan.periodic,
-            plan.group_count > 1,
-            capacity,
-            row_kernel_sum is not None,
-            teams,
-        )
-        threads = plan.row_capacity * plan.group_count * plan.lanes * teams
-        source = ordered.states if states is None else states
-        return (
-            kernel,
-            -(-threads // WARP) * WARP,
-            out.device,
-            *common,
-            plan.row_capacity,
-            plan.group_count,
-            limit,
-            ordered.starts,
-            ordered.cell,
-            ordered.positions,
-            lists.records,
-            source.view(-1, plan.width // plan.lanes),
-            None if states is None else ordered.source,
-            row_place,
-            destination,
-            lists.steps.view(-1),
-            lists.lengths,
-            out,
-            row_kernel_sum,
-        )
-    return (
-        plain_kernels(plan, terms).perceive,
-        (plan.row_capacity, plan.group_count, plan.lanes),
-        out.device,
-        *common,
-        plan.group_count,
-        limit,
-        ordered.starts,
-        densities.particles,
-        ordered.states,
-        ordered.states.view(plan.total, -1),
-        row_place,
-        destination,
-        densities.row_density_gradient,
-        out,
-        row_kernel_sum,
-    )

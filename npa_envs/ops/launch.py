@@ -22,7 +22,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from npa_envs.kernels.access import CUDA_BLOCK, CUDA_LANES
+from npa_envs.kernels.access import CUDA_BLOCK
 from npa_envs.kernels.cpu import SMALLEST_RANGES
 from npa_envs.runtime import quiet_warp, start_warp
 
@@ -126,7 +126,7 @@ SCALARS: dict[torch.dtype, Any] = {torch.float32: wp.float32, torch.float64: wp.
 """Warp's scalar type for each floating dtype that the operators take."""
 
 GROUP_WIDTHS = (4, 8, 16)
-"""Channels of a group: its lanes serve it together; there are several beyond the largest width."""
+"""Channels of a group, which are summed together; there are several beyond the largest width."""
 
 
 def scalar_type(dtype: torch.dtype) -> Any:
@@ -137,17 +137,6 @@ def scalar_type(dtype: torch.dtype) -> Any:
 def channel_width(state_dim: int) -> int:
     """Return how many channels form a group."""
     return next((width for width in GROUP_WIDTHS if width >= state_dim), GROUP_WIDTHS[-1])
-
-
-@functools.lru_cache
-def is_modern(device: torch.device) -> bool:
-    """Return whether a device has the tensor cores and warp-wide sums of compute capability 8.0."""
-    return device.type == "cuda" and torch.cuda.get_device_capability(device) >= (8, 0)
-
-
-def lane_count(device: torch.device) -> int:
-    """Return how many lanes of a device share a particle."""
-    return CUDA_LANES if device.type == "cuda" else 1
 
 
 def warp_device(device: torch.device) -> Any:

@@ -16,10 +16,8 @@ from npa_envs.kernels.cuda.network import (
     two_layer_kernel,
     weight_gradient_kernels,
 )
-from npa_envs.ops.launch import is_modern, launch
-
-LARGEST_ROW, LARGEST_UPDATE, LARGEST_HIDDEN = 128, 32, 512
-"""Widest rows and updates, and most hidden units, that the fused kernels take."""
+from npa_envs.ops.backend import Request, choose
+from npa_envs.ops.launch import launch
 
 
 class ArrangedWeights(NamedTuple):
@@ -32,24 +30,21 @@ class ArrangedWeights(NamedTuple):
 
 
 def fits_network(hidden_weight: Tensor, output_weight: Tensor) -> bool:
-    """Return whether the fused kernels take a rule's folded weights.
-
-    They run on CUDA from compute capability 8.0 on, in float32, for rows of up to 128 columns and
-    updates of up to 32, both multiples of 4, and for up to 512 hidden units, a multiple of 32.
+    """Return whether the backend table gives a rule's folded weights to the fused kernels.
 
     Args:
         hidden_weight: Weights of the hidden units, shape [H, row_width].
         output_weight: Weights of the updates, shape [A', H].
     """
     hidden, width = hidden_weight.shape
-    return (
-        is_modern(hidden_weight.device)
-        and hidden_weight.dtype == torch.float32
-        and width % 4 == output_weight.shape[0] % 4 == hidden % WARP_UNITS == 0
-        and width <= LARGEST_ROW
-        and output_weight.shape[0] <= LARGEST_UPDATE
-        and hidden <= LARGEST_HIDDEN
+    request = Request(
+        hidden_weight.device,
+        hidden_weight.dtype,
+        row_width=width,
+        update_width=output_weight.shape[0],
+        hidden_dim=hidden,
     )
+    return choose("network", request).name == "cuda"
 
 
 def _arrange_layers(first: Tensor, second: Tensor) -> list[Tensor]:

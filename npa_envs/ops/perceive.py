@@ -13,15 +13,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.ops.adjoint import SavedPerception, perceive_rows_backward
-from npa_envs.ops.backend import (
-    Terms,
-    batch_listing,
-    compute_densities,
-    compute_density_gradients,
-    perception_launch,
-    plain_kernels,
-    rollout_listing,
-)
+from npa_envs.ops.backend import batch_listing, rollout_listing
 from npa_envs.ops.checks import (
     Box,
     MomentInverse,
@@ -34,7 +26,15 @@ from npa_envs.ops.checks import (
     checked_moment_inverse,
 )
 from npa_envs.ops.launch import Repeated, launch
+from npa_envs.ops.passes import (
+    Terms,
+    compute_densities,
+    compute_density_gradients,
+    perception_launch,
+    portable_kernels,
+)
 from npa_envs.ops.sort import make_plan, sort_worlds
+from npa_envs.ops.static import StaticRows, StaticTensors, StaticWorlds, all_rows, static_worlds
 
 __all__ = ["Rows", "Terms", "perceive_rows"]
 
@@ -71,7 +71,7 @@ def _perceive_rows(
     terms = Terms(state_gradient, moment_inverse, density_gradient)
     ordered = sort_worlds(plan, x, s, mask)
     densities = compute_densities(
-        plan, ordered, terms, rollout_listing(plan), with_particles=for_adjoint
+        plan, ordered, terms, rollout_listing(plan.particle_count), with_particles=for_adjoint
     )
     perception = x.new_empty(row_capacity, row_width)
     row_kernel_sum = x.new_empty(row_capacity if for_adjoint else 0, plan.space_dim)
@@ -113,7 +113,7 @@ def _(
 ) -> list[Tensor]:
     plan = make_plan(x, x.shape, s.shape[2], row_capacity, mask is not None, eps, box)
     for_adjoint = options[-1]
-    particle_count = plan.total if for_adjoint or not plan.listed else 0
+    particle_count = plan.total if for_adjoint or plan.runs("density") == "portable" else 0
     integers = torch.int32
     saved = SavedPerception(
         perception=x.new_empty(row_capacity, row_width),
@@ -128,6 +128,70 @@ def _(
     return [x.new_empty(row_capacity, dtype=integers), *saved.tensors()]
 
 
+@torch.library.custom_op("npa::perceive_static", mutates_args=())
+def _perceive_static(
+    x: Tensor,
+    s: Tensor,
+    rows: list[Tensor],
+    static: list[Tensor],
+    masked: bool,
+    row_capacity: int,
+    row_width: int,
+    eps: float,
+    scale: float,
+    box: list[float] | None,
+    state_gradient: bool,
+    moment_inverse: str | None,
+    density_gradient: bool,
+    for_adjoint: bool,
+) -> tuple[Tensor, Tensor]:
+    """Return rows of perception of static worlds, and the rows' sums of v K for the adjoint."""
+    plan = make_plan(x, x.shape, s.shape[2], row_capacity, masked, eps, box)
+    terms = Terms(state_gradient, moment_inverse, density_gradient)
+    ordered, densities = static_worlds(plan, StaticTensors.of(static), StaticRows(*rows), x, s)
+    perception = x.new_empty(row_capacity, row_width)
+    kernel_sum = x.new_empty(row_capacity if for_adjoint else 0, plan.space_dim)
+    written = kernel_sum if for_adjoint else None
+    launch(
+        *perception_launch(
+            plan, ordered, densities, terms, scale, perception, row_kernel_sum=written
+        )
+    )
+    return perception, kernel_sum
+
+
+@_perceive_static.register_fake
+def _(
+    x: Tensor,
+    s: Tensor,
+    rows: list[Tensor],
+    static: list[Tensor],
+    masked: bool,
+    row_capacity: int,
+    row_width: int,
+    *options: Any,
+) -> tuple[Tensor, Tensor]:
+    kernel_sum = x.new_empty(row_capacity if options[-1] else 0, x.shape[2])
+    return x.new_empty(row_capacity, row_width), kernel_sum
+
+
+class PerceptionOptions(NamedTuple):
+    """Everything about a call of `perceive_rows` but its tensors, checked."""
+
+    row_capacity: int
+    """Rows K of the result; active particles beyond it are left out."""
+    row_width: int
+    """Columns of a row, at least P: a one follows the perception vector, then zeros."""
+    eps: float
+    """Perception radius [length units]."""
+    scale: float
+    """c = eps / eps0, dimensionless."""
+    box: list[float] | None
+    """Sides of the periodic box [length units], or None in open space."""
+    terms: Terms
+    """Groups of the perception vector."""
+
+
 class _PerceiveRows(torch.autograd.Function):
     """Perception of the active particles, with gathered adjoints for states and positions."""
 
@@ -137,55 +201,113 @@ class _PerceiveRows(torch.autograd.Function):
         x: Tensor,
         s: Tensor,
         mask: Tensor | None,
-        row_capacity: int,
-        row_width: int,
-        eps: float,
-        scale: float,
-        box: list[float] | None,
-        terms: Terms,
+        options: PerceptionOptions,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         row_source, *tensors = _perceive_rows(
-            x,
-            s,
-            mask,
-            row_capacity,
-            row_width,
-            eps,
-            scale,
-            box,
-            *terms,
-            for_adjoint=any(ctx.needs_input_grad),
+            x, s, mask, *options[:-1], *options.terms, for_adjoint=any(ctx.needs_input_grad)
         )
         saved = SavedPerception(*tensors)
         ctx.mark_non_differentiable(saved.row_of, row_source, saved.starts)
         ctx.set_materialize_grads(False)
         if any(ctx.needs_input_grad):
-            ctx.options = (eps, scale, box, terms)
-            ctx.shapes = (x.shape, s.shape, mask is not None)
-            ctx.save_for_backward(*(saved if ctx.needs_input_grad[0] else saved[:-1]))
+            _save(
+                ctx,
+                saved if ctx.needs_input_grad[0] else saved[:-1],
+                (),
+                s,
+                mask is not None,
+                options,
+            )
         return saved.perception, saved.row_of, row_source, saved.starts
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *bars: Tensor | None) -> tuple[Tensor | None, ...]:
         if bars[0] is None:
-            return (None,) * 9
-        eps, scale, box, terms = ctx.options
-        x_shape, s_shape, masked = ctx.shapes
-        states_bar, positions_bar = perceive_rows_backward(
-            bars[0],
-            list(ctx.saved_tensors),
-            particle_count=x_shape[1],
-            state_dim=s_shape[2],
-            masked=masked,
-            eps=eps,
-            scale=scale,
-            box=box,
-            state_gradient=terms.state_gradient,
-            density_gradient=terms.density_gradient,
+            return None, None, None, None
+        states_bar, positions_bar = _pull_back(ctx, bars[0])
+        x_bar = positions_bar.view(*states_bar.shape[:2], -1) if ctx.needs_input_grad[0] else None
+        return x_bar, states_bar, None, None
+
+
+class _PerceiveStatic(torch.autograd.Function):
+    """Perception of the active particles of static worlds, with the same adjoint for states."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        s: Tensor,
+        x: Tensor,
+        masked: bool,
+        static: StaticWorlds,
+        rows: StaticRows,
+        options: PerceptionOptions,
+    ) -> Tensor:
+        tensors = static.tensors
+        perception: Tensor
+        perception, kernel_sum = _perceive_static(
+            x,
+            s,
+            list(rows),
+            tensors.flat(),
+            masked,
+            *options[:-1],
+            *options.terms,
+            for_adjoint=ctx.needs_input_grad[0],
         )
-        x_bar = positions_bar.view(x_shape) if ctx.needs_input_grad[0] else None
-        return (x_bar, states_bar.view(s_shape), None, None, None, None, None, None, None)
+        if ctx.needs_input_grad[0]:
+            saved = SavedPerception(
+                perception=perception,
+                row_of=rows.row_of,
+                starts=rows.starts,
+                source=tensors.everyone,
+                particles=tensors.particles,
+                row_positions=rows.row_positions,
+                row_kernel_sum=kernel_sum,
+            )
+            listed = () if tensors.listed is None else tensors.listed
+            _save(ctx, saved[:-1], listed, s, masked, options)
+        return perception
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, bar: Tensor) -> tuple[Tensor | None, ...]:
+        return _pull_back(ctx, bar)[0], None, None, None, None, None
+
+
+def _save(
+    ctx: Any,
+    tensors: tuple[Tensor | None, ...],
+    listed: tuple[Tensor, ...],
+    s: Tensor,
+    masked: bool,
+    options: PerceptionOptions,
+) -> None:
+    """Save what `_pull_back` reads."""
+    ctx.options, ctx.shape, ctx.masked = options, s.shape, masked
+    ctx.saved_count = len(tensors)
+    ctx.save_for_backward(*tensors, *listed)
+
+
+def _pull_back(ctx: Any, bar: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the cotangents of states, [B, N, C], and of positions, [B N, D] or empty."""
+    options, shape = ctx.options, ctx.shape
+    # Read once: unpacking recomputes what a checkpoint has left out.
+    tensors = list(ctx.saved_tensors)
+    states_bar, positions_bar = perceive_rows_backward(
+        bar,
+        tensors[: ctx.saved_count],
+        tensors[ctx.saved_count :],
+        particle_count=shape[1],
+        state_dim=shape[2],
+        masked=ctx.masked,
+        eps=options.eps,
+        scale=options.scale,
+        box=options.box,
+        state_gradient=options.terms.state_gradient,
+        density_gradient=options.terms.density_gradient,
+    )
+    return states_bar.view(shape), positions_bar
 
 
 def perceive_rows(
@@ -199,6 +321,8 @@ def perceive_rows(
     eps0: float,
     box: tuple[float, ...] | None,
     terms: Terms,
+    static: StaticWorlds | None = None,
+    static_rows: StaticRows | None = None,
 ) -> tuple[Tensor, Rows]:
     """Perceive the active particles of checked worlds.
 
@@ -212,23 +336,27 @@ def perceive_rows(
         eps0: Radius at which the rule was trained [length units].
         box: Sides of the periodic box [length units], or None in open space.
         terms: Groups of the perception vector.
+        static: What `prepare_static` returned of worlds that stay where they are; x and s are then
+            in its order, no gradient flows into x, and the mask is not read.
+        static_rows: Rows of the active particles of static worlds, or None for all.
 
     Returns:
         Rows of perception, dimensionless, shape [K, row_width], zero beyond the last active row,
         and which particles they stand for.
     """
-    perception, row_of, row_source, starts = _PerceiveRows.apply(  # type: ignore[no-untyped-call]
-        x.contiguous(),
-        s.contiguous(),
-        mask,
-        row_capacity,
-        row_width,
-        eps,
-        eps / eps0,
-        None if box is None else list(box),
-        terms,
-    )
+    x, s = x.contiguous(), s.contiguous()
+    sides = None if box is None else list(box)
+    options = PerceptionOptions(row_capacity, row_width, eps, eps / eps0, sides, terms)
+    if static is not None:
+        rows = all_rows(static, x) if static_rows is None else static_rows
+        masked = static_rows is not None
+        perception = _PerceiveStatic.apply(s, x.detach(), masked, static, rows, options)  # type: ignore[no-untyped-call]
+        row_base = x.shape[0] * x.shape[1] if masked else 0
+        return perception, Rows(rows.row_of, rows.row_source, rows.starts, row_base)
     row_base = 0 if mask is None else x.shape[0] * x.shape[1]
+    perception, row_of, row_source, starts = _PerceiveRows.apply(  # type: ignore[no-untyped-call]
+        x, s, mask, options
+    )
     return perception, Rows(row_of, row_source, starts, row_base)
 
 
@@ -298,15 +426,16 @@ def survey(
     """
     x, s = x.contiguous(), s.contiguous()
     plan = make_plan(x, x.shape, s.shape[2], x.shape[0] * x.shape[1], False, eps, box)
-    in_place = plan.listed and plan.state_dim % plan.width == 0 and s.data_ptr() % 16 == 0
-    ordered = sort_worlds(plan, x, None if in_place else s, None, with_rows=not plan.listed)
+    listed = plan.runs("density") == "cuda"
+    in_place = listed and plan.state_dim % plan.width == 0 and s.data_ptr() % 16 == 0
+    ordered = sort_worlds(plan, x, None if in_place else s, None, with_rows=not listed)
     # World k of a batch perceives what it would alone, bit for bit: nothing here may follow from
     # the number of worlds.
     densities = compute_densities(
         plan,
         ordered,
         terms,
-        batch_listing(plan),
+        batch_listing(plan.particle_count),
         state_place=ordered.source if in_place else None,
         with_particles=False,
     )
@@ -451,25 +580,25 @@ def perception_fields(
     state_dim = s.shape[2]
     plan = make_plan(x, x.shape, state_dim, x.shape[0] * x.shape[1], False, radius, sides)
     ordered = sort_worlds(plan, x, s, None)
-    particles, row_density_gradient, _ = compute_density_gradients(plan, ordered, terms)
+    densities = compute_density_gradients(plan, ordered, terms)
     fields = PerceptionFields(
         rho=x.new_empty(plan.total),
         blur=x.new_empty(plan.total, state_dim),
         grad0=x.new_empty(plan.total, state_dim, space_dim),
         moment=x.new_empty(plan.total, space_dim, space_dim),
         grad1=x.new_empty(plan.total, state_dim, space_dim),
-        drho=row_density_gradient[ordered.row_of].to(x.dtype),
+        drho=densities.density_gradient[ordered.row_of].to(x.dtype),
     )
     launch(
-        plain_kernels(plan, terms).gather_fields,
-        (plan.total, plan.group_count, plan.lanes),
+        portable_kernels(plan, terms).gather_fields,
+        (plan.total, plan.group_count),
         x.device,
         plan.domain,
         particle_count,
         state_dim,
         plan.group_count,
         ordered.starts,
-        particles,
+        densities.particles,
         ordered.states,
         ordered.source,
         *fields[:-1],

@@ -9,11 +9,12 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.kernels.access import WARP
-from npa_envs.kernels.cuda.sort import BLOCKS, LARGEST_GRID, STATE_SHARE, sort_small_worlds
+from npa_envs.kernels.access import CUDA_LANES, WARP
+from npa_envs.kernels.cuda.sort import BLOCKS, STATE_SHARE, order_particles, sort_small_worlds
 from npa_envs.kernels.domain import make_domain
-from npa_envs.kernels.portable.sort import cell_kernels
-from npa_envs.ops.launch import channel_width, is_modern, lane_count, launch, scalar_type
+from npa_envs.kernels.portable.sort import sort_kernels
+from npa_envs.ops.backend import Operator, Request, choose
+from npa_envs.ops.launch import channel_width, launch, scalar_type
 
 LARGEST_INDEX = 2**31 - 1
 """Kernels index with 32 bits."""
@@ -33,7 +34,6 @@ class Plan(NamedTuple):
 
     scalar: Any
     width: int
-    lanes: int
     world_count: int
     particle_count: int
     space_dim: int
@@ -41,8 +41,22 @@ class Plan(NamedTuple):
     row_capacity: int
     masked: bool
     domain: Any
-    listed: bool
-    """Whether neighbours are listed: on CUDA, in float32, with instructions of whole warps."""
+    request: Request
+    """What the backend table asks for."""
+
+    def runs(self, operator: Operator, **facts: bool) -> str:
+        """Return the name of the implementation of an operator that runs.
+
+        Args:
+            operator: The operator.
+            facts: Fields of `Request` that differ from the plan's.
+        """
+        return choose(operator, self.request._replace(**facts) if facts else self.request).name
+
+    @property
+    def on_cpu(self) -> bool:
+        """Whether kernels run on a CPU."""
+        return self.request.device.type == "cpu"
 
     @property
     def periodic(self) -> bool:
@@ -122,18 +136,18 @@ def make_plan(
     sides = None if box is None else tuple(box)
     # In 3D, more and smaller cells mean many short runs, which lanes share badly.
     reach = 1 if space_dim == 3 and like.device.type == "cuda" else 2
+    domain = make_domain(space_dim, scalar, eps, sides, particle_count, reach)
     plan = Plan(
         scalar=scalar,
         width=channel_width(int(state_dim)),
-        lanes=lane_count(like.device),
         world_count=world_count,
         particle_count=particle_count,
         space_dim=space_dim,
         state_dim=int(state_dim),
         row_capacity=row_capacity,
         masked=masked,
-        domain=make_domain(space_dim, scalar, eps, sides, particle_count, reach),
-        listed=like.dtype == torch.float32 and is_modern(like.device),
+        domain=domain,
+        request=Request(like.device, like.dtype, particle_count, int(domain.cell_count)),
     )
     largest = max(2 * plan.cell_total, plan.total * (1 + plan.state_dim))
     if largest >= LARGEST_INDEX:
@@ -155,7 +169,7 @@ def sort_worlds(
     capacity = _block_capacity(plan, x, s, mask)
     if capacity:
         return _sort_by_blocks(plan, capacity, x, s, mask, with_rows)
-    kernels = cell_kernels(plan.space_dim, plan.scalar, plan.width, plan.lanes)
+    kernels = sort_kernels(plan.space_dim, plan.scalar, plan.width)
     device, total = x.device, plan.total
     cell, arrival = torch.empty(2, total, dtype=torch.int32, device=device).unbind()
     arrived = torch.empty(total, 2, dtype=torch.int32, device=device)
@@ -190,14 +204,14 @@ def sort_worlds(
     )
 
     ordered = _empty_worlds(plan, x, s, with_rows)
-    # A thread reads and writes its share of a particle's channels at once where it is aligned.
-    share = plan.width // plan.lanes
+    on_cuda = plan.runs("sort", aligned=False) == "cuda"
+    # A thread reads and writes so many adjacent channels at once where they are aligned.
+    share = plan.width // CUDA_LANES if on_cuda else plan.width
     aligned = s is not None and plan.state_dim % share == 0 and s.data_ptr() % 16 == 0
-    # A warp moves the states of as many particles as it has threads.
-    warps = WARP if plan.lanes > 1 else 1
     launch(
-        kernels.order_particles,
-        -(-total // warps) * warps,
+        order_particles(plan.space_dim, plan.width) if on_cuda else kernels.order_particles,
+        # A warp moves the states of as many particles as it has threads.
+        -(-total // WARP) * WARP if on_cuda else total,
         device,
         positions,
         plan.state_dim,
@@ -231,13 +245,12 @@ def _empty_worlds(plan: Plan, x: Tensor, s: Tensor | None, with_rows: bool) -> l
 
 
 def _block_capacity(plan: Plan, *tensors: Tensor | None) -> int:
-    """Return how many particles a block that sorts these worlds has room for, 0 if none has."""
+    """Return how many particles a block that sorts these worlds has room for, 0 if none does."""
+    aligned = not any(tensor is not None and tensor.data_ptr() % 16 for tensor in tensors)
     earlier = plan.world_count * plan.total if plan.masked else 0
-    if not plan.listed or plan.domain.cell_count > LARGEST_GRID or earlier > LARGEST_MASK:
+    if plan.runs("sort", aligned=aligned) != "block" or earlier > LARGEST_MASK:
         return 0
-    if any(tensor is not None and tensor.data_ptr() % 16 for tensor in tensors):
-        return 0
-    return next((size for size in sorted(BLOCKS) if size >= plan.particle_count), 0)
+    return next(size for size in sorted(BLOCKS) if size >= plan.particle_count)
 
 
 def _sort_by_blocks(
@@ -271,6 +284,15 @@ def _sort_by_blocks(
         block_dim=block,
     )
     return SortedWorlds(starts, *ordered)
+
+
+def grouped_states(plan: Plan, s: Tensor) -> Tensor:
+    """Return states in sorted order as kernels read them, [B N G, W]: channels padded to groups."""
+    width = plan.group_count * plan.width
+    states = torch.nn.functional.pad(s, (0, width - plan.state_dim))
+    # Groups are read 16 bytes at a time.
+    states = states.clone() if states.data_ptr() % 16 else states
+    return states.contiguous().view(-1, plan.width)
 
 
 def density_scale(scale: float, space_dim: int, particle_count: int) -> float:

@@ -6,20 +6,15 @@ from collections.abc import Iterable
 
 import torch
 
-from npa_envs.ops.backend import SHARED_WORLD, Terms
+from npa_envs.ops.backend import SHARED_WORLD
 from npa_envs.ops.draws import bernoulli_draw, integer_draw, normal_draw, uniform_draw
 from npa_envs.ops.mean import world_mean
 from npa_envs.ops.network import arrange_weights, run_network
+from npa_envs.ops.passes import Terms
 from npa_envs.ops.perceive import Rows, perceive, perceive_rows, survey
 from npa_envs.ops.pictures.losses import picture_losses
 from npa_envs.ops.pictures.splat import splat
-from npa_envs.ops.static import (
-    perceive_settled,
-    settle,
-    settled_rows,
-    settled_states,
-    update_settled,
-)
+from npa_envs.ops.static import prepare_static, static_rows
 from npa_envs.ops.update import ActionRules, RepeatedActions, update_particles
 
 
@@ -51,7 +46,7 @@ def warmup(
             s = torch.zeros(1, 2, state_dim, dtype=dtype, device=device, requires_grad=True)
             _pull_back(perceive(x, s, 0.1, detach_positions=False))
             _warm_rows(x, s)
-            _warm_settled(x, s)
+            _warm_static(x, s)
             _warm_network(x, s)
             _warm_update(x, s)
             _warm_actions(x, s)
@@ -83,17 +78,26 @@ def _warm_rows(x: torch.Tensor, s: torch.Tensor) -> None:
                     _pull_back(rows)
 
 
-def _warm_settled(x: torch.Tensor, s: torch.Tensor) -> None:
-    """A step of particles that never move."""
-    worlds = settle(x, s.shape[2], eps=0.1, eps0=0.1, box=None, terms=Terms())
-    assert worlds is not None
-    width = Terms().perception_dim(x.shape[2], s.shape[2]) + 1
+def _warm_static(x: torch.Tensor, s: torch.Tensor) -> None:
+    """Perception of particles that never move, with all of them active and with some."""
+    static = prepare_static(x, s.shape[2], eps=0.1, box=None, terms=Terms())
     mask = torch.ones(x.shape[:2], dtype=torch.uint8, device=x.device)
-    (rows,) = settled_rows(worlds, [mask], worlds.total)
-    for row_width in (width, width + -width % 4):
-        states = settled_states(worlds, s)
-        perceived = perceive_settled(worlds, states, rows, row_width=row_width)
-        _pull_back(update_settled(worlds, states, perceived, rows, 1.0))
+    (active,) = static_rows(static, x.detach(), [mask], x.shape[1])
+    for chosen in (None, active):
+        rows, _ = perceive_rows(
+            x,
+            s,
+            mask=None,
+            static_rows=chosen,
+            row_capacity=x.shape[1],
+            row_width=Terms().perception_dim(x.shape[2], s.shape[2]) + 1,
+            eps=0.1,
+            eps0=0.1,
+            box=None,
+            terms=Terms(),
+            static=static,
+        )
+        _pull_back(rows)
 
 
 def _warm_network(x: torch.Tensor, s: torch.Tensor) -> None:

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from npa_envs.ops.backend import Terms
 from npa_envs.ops.checks import MomentInverse
+from npa_envs.ops.passes import Terms
 from npa_envs.ops.perceive import SurveyedWorlds, survey
 from npa_envs.ops.species import perceive_by_species
 from npa_envs.ops.update import ActionRules, RepeatedActions

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
-from typing import Any, Literal, NamedTuple, overload
+from collections.abc import Iterator
+from typing import Literal, NamedTuple, Protocol, overload
 
 import torch
 from torch import Tensor
@@ -23,17 +23,10 @@ from npa_envs.ops.checks import (
     checked_number,
 )
 from npa_envs.ops.perceive import Terms, perceive_rows
-from npa_envs.ops.static import (
-    SettledWorlds,
-    advance_settled,
-    drawn_rows,
-    settle,
-    settled_states,
-    unsettled_states,
-)
-from npa_envs.ops.update import update_particles, wrapped
+from npa_envs.ops.static import StaticRows, StaticWorlds, prepare_static, static_rows
+from npa_envs.ops.update import update_particles
 from npa_envs.rule.rule import FoldedRule, NPARule, check_rule
-from npa_envs.world.divergence import OnDivergence, make_watch
+from npa_envs.world.divergence import DivergenceWatch, OnDivergence, make_watch
 from npa_envs.world.randomness import Randomness, WorldRandom, check_generator
 
 Memory = Literal["store", "recompute", "minimal"]
@@ -41,8 +34,11 @@ Memory = Literal["store", "recompute", "minimal"]
 STORED_INTERVAL: dict[Memory, float] = {"store": 1, "recompute": 3, "minimal": math.inf}
 """The last step and every so-manyth before it store what the backward pass reads."""
 
-FEWEST_SETTLED = 3
-"""Steps from which on it pays to compute once what follows from positions that stay."""
+FEWEST_STATIC = 3
+"""Steps from which on it pays to prepare worlds whose particles never move."""
+
+ROWS_TOGETHER = 2**24
+"""Rows of static worlds that are given together, at most, if they are of several steps."""
 
 OVERFLOW_LOG_PROBABILITY = 34.5
 """Row capacities hold with probability 1 - exp(-34.5), about 1 - 1e-15, for each step."""
@@ -74,6 +70,15 @@ def row_capacity(particle_total: int, update_prob: float) -> int:
     slack = OVERFLOW_LOG_PROBABILITY / 3.0
     margin = slack + math.sqrt(slack * slack + 2.0 * OVERFLOW_LOG_PROBABILITY * variance)
     return min(particle_total, math.ceil(mean + margin))
+
+
+def row_count(mask: Tensor | None, x: Tensor, options: StepOptions) -> int:
+    """Return how many rows hold the active particles of a step of worlds at x; no mask: all."""
+    total = x.shape[0] * x.shape[1]
+    if mask is None:
+        return total
+    # Counting is free on the CPU; on CUDA it would stall the stream.
+    return row_capacity(total, options.update_prob) if mask.is_cuda else max(int(mask.sum()), 1)
 
 
 def check_memory(memory: Memory) -> None:
@@ -123,10 +128,8 @@ def checked_options(
     return StepOptions(radius, sides, update_prob, dt, position_noise, detach_positions)
 
 
-def draw_step(
-    x: Tensor, options: StepOptions, generator: Randomness | None
-) -> tuple[Tensor | None, Tensor | None]:
-    """Draw a step's update mask (uint8, [B, N], None for all) and position noise, in this order."""
+def draw_step(x: Tensor, options: StepOptions, generator: Randomness | None) -> Draws:
+    """Draw a step's update mask and position noise, in this order."""
     mask = noise = None
     if isinstance(generator, WorldRandom):
         generator.advance()
@@ -135,14 +138,14 @@ def draw_step(
         if options.position_noise > 0.0:
             noise = generator.normal(*x.shape[1:], dtype=x.dtype)
             noise *= options.position_noise
-        return mask, noise
+        return Draws(mask, noise)
     if options.update_prob < 1.0:
         mask = torch.empty(x.shape[:2], dtype=torch.uint8, device=x.device)
         mask.bernoulli_(options.update_prob, generator=generator)
     if options.position_noise > 0.0:
         noise = torch.randn(x.shape, dtype=x.dtype, device=x.device, generator=generator)
         noise *= options.position_noise
-    return mask, noise
+    return Draws(mask, noise)
 
 
 def rule_terms(rule: NPARule) -> Terms:
@@ -151,55 +154,168 @@ def rule_terms(rule: NPARule) -> Terms:
     return Terms(rule.state_gradient, inverse, rule.density_gradient)
 
 
-def _advance(
-    rule: NPARule,
-    folded: FoldedRule | None,
-    options: StepOptions,
-    x: Tensor,
-    s: Tensor,
-    path_length: Tensor,
-    mask: Tensor | None,
-    noise: Tensor | None,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Advance checked worlds by one step whose random draws are given."""
-    total = x.shape[0] * x.shape[1]
-    capacity = total
-    if mask is not None:
-        # Counting is free on the CPU; on CUDA it would stall the stream.
-        capacity = (
-            row_capacity(total, options.update_prob) if x.is_cuda else max(int(mask.sum()), 1)
+class Worlds(NamedTuple):
+    """Worlds between two steps of a rollout."""
+
+    x: Tensor
+    """Positions [length units], shape [B, N, D]."""
+    s: Tensor
+    """States, dimensionless, shape [B, N, C]."""
+    path_length: Tensor
+    """Length of each particle's path so far [length units], shape [B, N]."""
+
+
+class Draws(NamedTuple):
+    """What a step draws."""
+
+    mask: Tensor | None
+    """Update mask, uint8, shape [B, N]; None: all particles are updated."""
+    noise: Tensor | None
+    """Position noise [length units], shape [B, N, D], or None."""
+    rows: StaticRows | None = None
+    """Rows of the active particles, where particles never move."""
+
+
+class Step(Protocol):
+    """What a rollout repeats: draws, and an advance that follows from them alone."""
+
+    def draws(self, x: Tensor, steps: int, generator: Randomness | None) -> Iterator[Draws]:
+        """Draw what each of some steps of worlds at x draws."""
+
+    def advance(
+        self,
+        x: Tensor,
+        s: Tensor,
+        path_length: Tensor,
+        mask: Tensor | None,
+        noise: Tensor | None,
+        rows: StaticRows | None,
+    ) -> Worlds:
+        """Return the worlds after one step with these draws."""
+
+    def ordered(self, worlds: Worlds) -> Worlds:
+        """Return worlds of the rollout in the caller's order of particles."""
+
+
+class RuleStep(NamedTuple):
+    """The step of one rule: perceive the active particles, run the network, update."""
+
+    rule: NPARule
+    folded: FoldedRule | None
+    """The rule's weights as they are run; None: it runs as the module that it is."""
+    options: StepOptions
+    static: StaticWorlds | None = None
+    """Where particles never move: worlds in sorted order, prepared once."""
+
+    def draws(self, x: Tensor, steps: int, generator: Randomness | None) -> Iterator[Draws]:
+        """Draw each step's update mask and position noise."""
+        # The rows of static worlds are given some steps at a time, in few launches.
+        total = x.shape[0] * x.shape[1]
+        together = 1 if self.static is None else max(min(16, ROWS_TOGETHER // total), 1)
+        for first in range(0, steps, together):
+            count = min(together, steps - first)
+            drawn = [draw_step(x, self.options, generator) for _ in range(count)]
+            masks = [draws.mask for draws in drawn if draws.mask is not None]
+            if self.static is not None and masks:
+                capacity = row_capacity(total, self.options.update_prob)
+                rows = static_rows(self.static, x.detach(), masks, capacity)
+                drawn = [Draws(None, None, own) for own in rows]
+            yield from drawn
+
+    def advance(
+        self,
+        x: Tensor,
+        s: Tensor,
+        path_length: Tensor,
+        mask: Tensor | None,
+        noise: Tensor | None,
+        rows: StaticRows | None,
+    ) -> Worlds:
+        """Return the worlds after one step with these draws."""
+        rule, options = self.rule, self.options
+        count = len(rows.row_source) if rows is not None else row_count(mask, x, options)
+        perception, active = perceive_rows(
+            x.detach() if options.detach_positions else x,
+            s,
+            mask=mask,
+            row_capacity=count,
+            row_width=rule.perception_dim if self.folded is None else self.folded.row_width,
+            eps=options.eps,
+            eps0=rule.eps0,
+            box=options.box,
+            terms=rule_terms(rule),
+            static=self.static,
+            static_rows=rows,
         )
-    perception, rows = perceive_rows(
-        x.detach() if options.detach_positions else x,
-        s,
-        mask=mask,
-        row_capacity=capacity,
-        row_width=rule.perception_dim if folded is None else folded.row_width,
-        eps=options.eps,
-        eps0=rule.eps0,
-        box=options.box,
-        terms=rule_terms(rule),
-    )
-    return update_particles(
-        rule(perception) if folded is None else folded(perception),
-        x if noise is None else x + noise,
-        s,
-        path_length,
-        rows=rows,
-        reach=rule.alpha * options.eps,
-        dt=options.dt,
-        moving=not rule.static,
-        box=options.box,
-    )
+        return Worlds(
+            *update_particles(
+                rule(perception) if self.folded is None else self.folded(perception),
+                x if noise is None else x + noise,
+                s,
+                path_length,
+                rows=active,
+                reach=rule.alpha * options.eps,
+                dt=options.dt,
+                moving=not rule.static,
+                box=options.box,
+            )
+        )
+
+    def ordered(self, worlds: Worlds) -> Worlds:
+        """Return worlds of the rollout in the caller's order of particles."""
+        return worlds if self.static is None else Worlds(*map(self.static.unsort, worlds))
 
 
-def _settle(rule: NPARule, x: Tensor, steps: int, options: StepOptions) -> SettledWorlds | None:
+def run_steps(
+    step: Step,
+    worlds: Worlds,
+    steps: int,
+    *,
+    generator: Randomness | None,
+    memory: Memory,
+    watch: DivergenceWatch | None,
+) -> Worlds:
+    """Repeat a step on checked worlds; return them in the caller's order.
+
+    Args:
+        step: What to repeat.
+        worlds: The worlds, in the order that the step takes them in.
+        steps: Number of steps T.
+        generator: Source of the draws.
+        memory: What the backward pass reads is stored or recomputed.
+        watch: What looks at the worlds after each step, or None.
+
+    Raises:
+        DivergedError: The watch has seen a world diverge.
+    """
+    interval = STORED_INTERVAL[memory] if torch.is_grad_enabled() else 1
+    # Worlds keep their dtype under autocast: the kernels read what the rules write.
+    with torch.autocast(worlds.x.device.type, enabled=False):
+        for number, draws in enumerate(step.draws(worlds.x, steps, generator)):
+            if (steps - 1 - number) % interval > 0:
+                worlds = checkpoint(
+                    step.advance, *worlds, *draws, use_reentrant=False, preserve_rng_state=False
+                )
+            else:
+                worlds = step.advance(*worlds, *draws)
+            if watch is not None:
+                seen = step.ordered(Worlds(*(value.detach() for value in worlds)))
+                watch.look(seen.x, seen.s)
+        worlds = step.ordered(worlds)
+    if watch is not None:
+        watch.raise_diverged()
+    return worlds
+
+
+def _prepare_static(
+    rule: NPARule, x: Tensor, steps: int, options: StepOptions
+) -> StaticWorlds | None:
     """Compute what follows from positions, where they stay and it pays."""
     moving = not rule.static or options.position_noise > 0.0 or not options.detach_positions
-    if moving or steps < FEWEST_SETTLED:
+    if moving or steps < FEWEST_STATIC:
         return None
-    return settle(
-        x, rule.state_dim, eps=options.eps, eps0=rule.eps0, box=options.box, terms=rule_terms(rule)
+    return prepare_static(
+        x, rule.state_dim, eps=options.eps, box=options.box, terms=rule_terms(rule)
     )
 
 
@@ -348,44 +464,18 @@ def rollout(
     )
     check_generator(generator, x.device, x.shape[0])
     watch = make_watch(on_divergence, x, s)
-    path_length = x.new_zeros(x.shape[:2])
     # Any other rule runs as the module that it is.
     folded = rule.folded() if rule.is_plain() else None
-    interval = STORED_INTERVAL[memory] if torch.is_grad_enabled() else 1
-    # Worlds keep their dtype under autocast: the kernels read what the rule writes.
-    with torch.autocast(x.device.type, enabled=False):
-        settled = _settle(rule, x, steps, options)
-        worlds: tuple[Tensor, ...] = x, s, path_length
-        draws: Iterable[tuple[Any, ...]] = (draw_step(x, options, generator) for _ in range(steps))
-        advance: Callable[..., tuple[Tensor, ...]] = _advance
-        fixed: tuple[Any, ...] = rule, folded, options
-        if settled is not None:
-            worlds = (settled_states(settled, s),)
-            capacity = row_capacity(settled.total, options.update_prob)
-            draws = drawn_rows(
-                settled, lambda: draw_step(x, options, generator)[0], steps, capacity
-            )
-            advance = advance_settled
-            fixed = (
-                rule if folded is None else folded,
-                rule.perception_dim if folded is None else folded.row_width,
-                options.dt,
-                settled,
-            )
-        for number, drawn in enumerate(draws):
-            if (steps - 1 - number) % interval > 0:
-                worlds = checkpoint(
-                    advance, *fixed, *worlds, *drawn, use_reentrant=False, preserve_rng_state=False
-                )
-            else:
-                worlds = advance(*fixed, *worlds, *drawn)
-            if watch is not None and settled is None:
-                watch.look(*worlds[:2])
-            elif watch is not None and settled is not None:
-                watch.look(x, unsettled_states(settled, worlds[0].detach()))
-        if settled is not None:
-            worlds = wrapped(x, options.box), unsettled_states(settled, *worlds), path_length
-    if watch is not None:
-        watch.raise_diverged()
-    x, s, path_length = worlds
-    return (x, s, path_length) if return_path_length else (x, s)
+    static = _prepare_static(rule, x, steps, options)
+    worlds = Worlds(x, s, x.new_zeros(x.shape[:2]))
+    if static is not None:
+        worlds = Worlds(*map(static.sort, worlds))
+    after = run_steps(
+        RuleStep(rule, folded, options, static),
+        worlds,
+        steps,
+        generator=generator,
+        memory=memory,
+        watch=watch,
+    )
+    return (after.x, after.s, after.path_length) if return_path_length else (after.x, after.s)

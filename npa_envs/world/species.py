@@ -3,31 +3,33 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, Literal, NamedTuple, overload
 
 import torch
 from torch import Tensor
-from torch.utils.checkpoint import checkpoint
 
 from npa_envs.errors import NPAError
 from npa_envs.ops.checks import Box, check_world, checked_count, checked_number, entries
 from npa_envs.ops.perceive import perceive_rows
 from npa_envs.ops.species import checked_counts, perceive_by_species
+from npa_envs.ops.static import StaticRows
 from npa_envs.ops.update import update_particles
 from npa_envs.rule.rule import FoldedRule, NPARule
 from npa_envs.world.divergence import OnDivergence, make_watch
 from npa_envs.world.randomness import Randomness, WorldRandom, check_generator
 from npa_envs.world.rollout import (
-    STORED_INTERVAL,
+    Draws,
     Memory,
     StepOptions,
+    Worlds,
     check_memory,
     checked_options,
     draw_step,
     rollout,
     row_capacity,
     rule_terms,
+    run_steps,
 )
 
 
@@ -50,7 +52,7 @@ class Species(NamedTuple):
 
 
 class Community(NamedTuple):
-    """What stays the same over a rollout."""
+    """The step of several rules in one world: a common perception pass, then rule by rule."""
 
     species: list[Species]
     counts: tuple[int, ...]
@@ -60,6 +62,97 @@ class Community(NamedTuple):
     """Share of the updates so drawn that each particle keeps, shape [N]; None: all keep all."""
     told_apart: bool
     """Rules perceive each species' density and density gradient."""
+
+    def draws(self, x: Tensor, steps: int, generator: Randomness | None) -> Iterator[Draws]:
+        """Draw each step's update mask and position noise: as for one rule, thinned by species."""
+        for _ in range(steps):
+            yield self._draw(x, generator)
+
+    def _draw(self, x: Tensor, generator: Randomness | None) -> Draws:
+        mask, noise = draw_step(x, self.options, generator)
+        if self.keep is None:
+            return Draws(mask, noise)
+        if isinstance(generator, WorldRandom):
+            drawn = generator.uniform(x.shape[1])
+        else:
+            drawn = torch.rand(x.shape[:2], device=x.device, generator=generator)
+        kept = (drawn < self.keep).to(torch.uint8)
+        return Draws(kept if mask is None else mask * kept, noise)
+
+    def advance(
+        self,
+        x: Tensor,
+        s: Tensor,
+        path_length: Tensor,
+        mask: Tensor | None,
+        noise: Tensor | None,
+        rows: StaticRows | None,
+    ) -> Worlds:
+        """Advance checked worlds by one step whose random draws are given."""
+        species, options = self.species, self.options
+        first = species[0].rule
+        shared_dim = rule_terms(first).perception_dim(first.space_dim, first.state_dim)
+        shared_width = shared_dim
+        if not self.told_apart:
+            # A folded rule's own row: a one follows the perception vector, then zeros.
+            shared_width = max(
+                own.folded.row_width if own.folded else shared_dim for own in species
+            )
+        perception, active = perceive_rows(
+            x.detach() if options.detach_positions else x,
+            s,
+            mask=mask,
+            row_capacity=_row_total(self, x, mask),
+            row_width=shared_width,
+            eps=options.eps,
+            eps0=first.eps0,
+            box=options.box,
+            terms=rule_terms(first),
+        )
+        appended = None
+        if self.told_apart:
+            appended = perceive_by_species(
+                x, self.counts, eps=options.eps, eps0=first.eps0, box=options.box
+            )
+        row_count = len(perception)
+        outputs, places = [], []
+        for own in species:
+            place, particle = _rows_of_species(
+                active.row_of.view(x.shape[:2]), own, row_count, mask
+            )
+            z = perception.index_select(0, place.clamp(max=row_count - 1))
+            if own.count_ratio != 1.0 and first.density_gradient:
+                begin, end = shared_dim - first.space_dim, shared_dim
+                gradient = _recounted(z[:, begin:end], own.count_ratio)
+                z = torch.cat((z[:, :begin], gradient, z[:, end:]), dim=1)
+            if appended is not None:
+                beside = appended[:, own.first : own.end].flatten(0, 1).index_select(0, particle)
+                if own.count_ratio != 1.0:
+                    beside = _recounted_by_species(beside, len(species), own.count_ratio)
+                z = torch.cat((z, beside), dim=1)
+            outputs.append(_update_of(own, z))
+            places.append(place)
+        width = min(output.shape[1] for output in outputs)
+        update = perception.new_zeros(row_count + 1, width).index_copy(
+            0, torch.cat(places), torch.cat([output[:, :width] for output in outputs])
+        )
+        return Worlds(
+            *update_particles(
+                update[:row_count],
+                x if noise is None else x + noise,
+                s,
+                path_length,
+                rows=active,
+                reach=max(own.rule.alpha for own in species) * options.eps,
+                dt=options.dt,
+                moving=not first.static,
+                box=options.box,
+            )
+        )
+
+    def ordered(self, worlds: Worlds) -> Worlds:
+        """Return the worlds: they are in the caller's order."""
+        return worlds
 
 
 def make_community(
@@ -108,86 +201,6 @@ def make_community(
             ]
         )
     return Community(species, counts, options[0]._replace(update_prob=highest), keep, told_apart)
-
-
-def draw(
-    x: Tensor, community: Community, generator: Randomness | None
-) -> tuple[Tensor | None, Tensor | None]:
-    """Draw a step's update mask and position noise: as `rollout` does, then thinned by species."""
-    mask, noise = draw_step(x, community.options, generator)
-    if community.keep is None:
-        return mask, noise
-    if isinstance(generator, WorldRandom):
-        drawn = generator.uniform(x.shape[1])
-    else:
-        drawn = torch.rand(x.shape[:2], device=x.device, generator=generator)
-    kept = (drawn < community.keep).to(torch.uint8)
-    return kept if mask is None else mask * kept, noise
-
-
-def advance(
-    community: Community,
-    x: Tensor,
-    s: Tensor,
-    path_length: Tensor,
-    mask: Tensor | None,
-    noise: Tensor | None,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Advance checked worlds by one step whose random draws are given."""
-    species, options = community.species, community.options
-    first = species[0].rule
-    shared_dim = rule_terms(first).perception_dim(first.space_dim, first.state_dim)
-    shared_width = shared_dim
-    if not community.told_apart:
-        # A folded rule's own row: a one follows the perception vector, then zeros.
-        shared_width = max(own.folded.row_width if own.folded else shared_dim for own in species)
-    perception, rows = perceive_rows(
-        x.detach() if options.detach_positions else x,
-        s,
-        mask=mask,
-        row_capacity=_row_total(community, x, mask),
-        row_width=shared_width,
-        eps=options.eps,
-        eps0=first.eps0,
-        box=options.box,
-        terms=rule_terms(first),
-    )
-    appended = None
-    if community.told_apart:
-        appended = perceive_by_species(
-            x, community.counts, eps=options.eps, eps0=first.eps0, box=options.box
-        )
-    row_count = len(perception)
-    outputs, places = [], []
-    for own in species:
-        place, particle = _rows_of_species(rows.row_of.view(x.shape[:2]), own, row_count, mask)
-        z = perception.index_select(0, place.clamp(max=row_count - 1))
-        if own.count_ratio != 1.0 and first.density_gradient:
-            begin, end = shared_dim - first.space_dim, shared_dim
-            gradient = _recounted(z[:, begin:end], own.count_ratio)
-            z = torch.cat((z[:, :begin], gradient, z[:, end:]), dim=1)
-        if appended is not None:
-            beside = appended[:, own.first : own.end].flatten(0, 1).index_select(0, particle)
-            if own.count_ratio != 1.0:
-                beside = _recounted_by_species(beside, len(species), own.count_ratio)
-            z = torch.cat((z, beside), dim=1)
-        outputs.append(_update_of(own, z))
-        places.append(place)
-    width = min(output.shape[1] for output in outputs)
-    update = perception.new_zeros(row_count + 1, width).index_copy(
-        0, torch.cat(places), torch.cat([output[:, :width] for output in outputs])
-    )
-    return update_particles(
-        update[:row_count],
-        x if noise is None else x + noise,
-        s,
-        path_length,
-        rows=rows,
-        reach=max(own.rule.alpha for own in species) * options.eps,
-        dt=options.dt,
-        moving=not first.static,
-        box=options.box,
-    )
 
 
 def _row_total(community: Community, x: Tensor, mask: Tensor | None) -> int:
@@ -434,25 +447,15 @@ def rollout_species(
     check_generator(generator, x.device, x.shape[0])
     told_apart = perception == "per_species"
     community = make_community(species_rules, sizes, options, divisors, x, told_apart=told_apart)
-    interval = STORED_INTERVAL[memory] if torch.is_grad_enabled() else 1
-    watch = make_watch(on_divergence, x, s)
-    worlds = x, s, x.new_zeros(x.shape[:2])
-    # Worlds keep their dtype under autocast: the kernels read what the rules write.
-    with torch.autocast(x.device.type, enabled=False):
-        for number in range(steps):
-            drawn = draw(x, community, generator)
-            if (steps - 1 - number) % interval > 0:
-                worlds = checkpoint(
-                    advance, community, *worlds, *drawn,
-                    use_reentrant=False, preserve_rng_state=False,
-                )  # fmt: skip
-            else:
-                worlds = advance(community, *worlds, *drawn)
-            if watch is not None:
-                watch.look(*worlds[:2])
-    if watch is not None:
-        watch.raise_diverged()
-    return worlds if return_path_length else worlds[:2]
+    after = run_steps(
+        community,
+        Worlds(x, s, x.new_zeros(x.shape[:2])),
+        steps,
+        generator=generator,
+        memory=memory,
+        watch=make_watch(on_divergence, x, s),
+    )
+    return (after.x, after.s, after.path_length) if return_path_length else (after.x, after.s)
 
 
 def _checked_rules(rules: Any) -> list[NPARule]:

@@ -290,7 +290,7 @@ def sorted_twice(x, s, mask, row_capacity, box, monkeypatch, **options):
     plan = make_plan(x, x.shape, s.shape[2], row_capacity, mask is not None, 0.1, box)
     given = options.pop("with_states", True)
     found = sort_worlds(plan, x, s if given else None, mask, **options)
-    monkeypatch.setattr(cells, "LARGEST_GRID", 0)
+    monkeypatch.setattr(cells, "_block_capacity", lambda *worlds: 0)
     expected = sort_worlds(plan, x, s if given else None, mask, **options)
     return found, expected
 

@@ -179,13 +179,13 @@ def test_masked_gradients_equal_plain_torch(device):
 
 def test_recomputing_gives_the_gradients_of_storing(device, monkeypatch):
     advanced = []
-    advance = npa_envs.world.rollout._advance
+    advance = npa_envs.world.rollout.RuleStep.advance
 
     def counted(*args):
         advanced[-1] += 1
         return advance(*args)
 
-    monkeypatch.setattr(npa_envs.world.rollout, "_advance", counted)
+    monkeypatch.setattr(npa_envs.world.rollout.RuleStep, "advance", counted)
     rule = small_rule(device, dtype=torch.float32)
     x, s = random_world(2, 200, 2, 5, dtype=torch.float32, device=device)
     results = []

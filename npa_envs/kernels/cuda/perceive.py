@@ -62,6 +62,7 @@ def listed_perception(
     capacity: int,
     for_adjoint: bool,
     teams: int,
+    by_place: bool = False,
 ) -> wp.Kernel:
     """Return the perception kernel of one variant.
 
@@ -77,6 +78,7 @@ def listed_perception(
         for_adjoint: Whether what the adjoint reads is written, too.
         teams: Teams that share a particle where few particles fill the device: each runs through
             its own part of the list, all channels of it.
+        by_place: Whether there is a list for each sorted particle, not for each row.
     """
     scalar = wp.float32
     moment_correction = moment_inverse is not None
@@ -105,7 +107,7 @@ def listed_perception(
         topic = "listed_perception" if moment_correction else "listed_uncorrected_perception"
         topic = "listed_smoothly_corrected_perception" if smooth else topic
     topic += "_in_box" * periodic + "_grouped" * grouped
-    topic += f"_{capacity}" + "_for_adjoint" * for_adjoint
+    topic += f"_{capacity}" + "_for_adjoint" * for_adjoint + "_by_place" * by_place
     module = kernel_module(topic, space_dim, scalar, width, lanes)
     registers = CUDA_REGISTERS if teams == 1 else TEAM_REGISTERS
     load_share = make_wide_load(share, scalar)
@@ -418,7 +420,10 @@ def listed_perception(
             own_place = load_integer(state_place, k)
         own = load_share(states, own_place * part_count + part)
         position = load_vector(sorted_positions, k)
-        length = wp.where(present, load_integer(list_lengths, safe_row), wp.int32(0))
+        list_number = safe_row
+        if wp.static(by_place):
+            list_number = k
+        length = wp.where(present, load_integer(list_lengths, list_number), wp.int32(0))
         searching = length > wp.static(capacity)
         length = wp.where(searching, wp.int32(0), length)
         longest = largest_in_warp(length)
@@ -432,7 +437,7 @@ def listed_perception(
                 part_count,
                 lane,
                 slot,
-                safe_row,
+                list_number,
                 first_entry,
                 fetched,
                 k,

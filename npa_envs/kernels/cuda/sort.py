@@ -12,14 +12,20 @@ import warp as wp
 
 from npa_envs.kernels import native
 from npa_envs.kernels.access import (
+    CUDA_LANES,
+    WARP,
     block_number,
+    load_integer,
     make_read_channels,
     make_wide_load,
     make_wide_store,
     meet_block,
+    of_warp,
     thread_of_block,
 )
 from npa_envs.kernels.domain import domain_types, kernel_module
+
+load_pair = make_wide_load(wp.vec2i, wp.int32)
 
 BLOCKS = {1024: 256, 4096: 1024}
 """Threads of a block by the particles that it has room for."""
@@ -237,3 +243,105 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
                             store_vector(row_positions, row, position)
 
     return sort_worlds
+
+
+@functools.cache
+def order_particles(space_dim: int, width: int) -> wp.Kernel:
+    """Return the last kernel of sorting large worlds, which moves states a warp at a time.
+
+    Args:
+        space_dim: Space dimension D, 2 or 3.
+        width: Channels of a group: 4, 8 or 16.
+    """
+    scalar = wp.float32
+    vector = domain_types(space_dim, scalar).vector
+    share_width = width // CUDA_LANES
+    share = wp.types.vector(share_width, scalar)
+    shares = wp.types.matrix((CUDA_LANES, share_width), scalar)
+    read_channels = make_read_channels(share, scalar)
+    store_vector = make_wide_store(vector, scalar)
+    store_share = make_wide_store(share, scalar)
+
+    @wp.kernel(enable_backward=False, module=kernel_module("order", space_dim, scalar, width))
+    def order_particles(
+        positions: wp.array(dtype=vector),
+        state_dim: wp.int32,
+        group_count: wp.int32,
+        aligned: wp.int32,
+        states: wp.array(dtype=scalar),
+        active_offset: wp.int32,
+        row_base: wp.int32,
+        row_capacity: wp.int32,
+        arrived: wp.array(dtype=wp.vec2i),
+        starts: wp.array(dtype=wp.int32),
+        # outputs
+        source: wp.array(dtype=wp.int32),
+        sorted_cell: wp.array(dtype=wp.int32),
+        row_of: wp.array(dtype=wp.int32),
+        row_source: wp.array(dtype=wp.int32),
+        row_place: wp.array(dtype=wp.int32),
+        sorted_positions: wp.array(dtype=vector),
+        row_positions: wp.array(dtype=vector),
+        sorted_states: wp.array(dtype=share),
+    ):
+        """Move every particle to its rank by index within its cell; give active ones rows.
+
+        States and rows are left out where their arrays are empty. Threads come in whole warps, some
+        of them beyond the last particle.
+        """
+        k = wp.tid()
+        total = arrived.shape[0]
+        own = load_pair(arrived, wp.min(k, total - 1))
+        i = own[0] / 2
+        c = own[1]
+        begin = load_integer(starts, c)
+        first_row = load_integer(starts, active_offset + c) - row_base
+        position = positions[i]
+        rank = wp.int32(0)
+        active_rank = wp.int32(0)
+        for other in range(begin, load_integer(starts, c + 1)):
+            entry = load_pair(arrived, other)[0]
+            if entry < own[0]:
+                rank += 1
+                active_rank += entry & 1
+        place = begin + rank
+        if k < total:
+            store_integer(source, place, i)
+            store_integer(sorted_cell, place, c)
+            store_vector(sorted_positions, place, position)
+            if row_of.shape[0] > 0:
+                row = first_row + active_rank
+                if own[0] & 1 == 0 or row >= row_capacity:
+                    row = wp.int32(-1)
+                store_integer(row_of, i, row)
+                if row >= 0:
+                    store_integer(row_source, row, i)
+                    store_integer(row_place, row, place)
+                    store_vector(row_positions, row, position)
+
+        # A warp moves the states of its particles together: neighbouring threads, neighbouring
+        # shares. All that is read is asked for before any of it is written.
+        if sorted_states.shape[0] > 0:
+            lane = k % wp.static(WARP)
+            parts = group_count * wp.static(CUDA_LANES)
+            for first_turn in range(0, parts, wp.static(CUDA_LANES)):
+                held = shares()
+                for turn in range(wp.static(CUDA_LANES)):
+                    chunk = lane + (first_turn + turn) * wp.static(WARP)
+                    owner = chunk / parts
+                    first = (chunk - owner * parts) * wp.static(share_width)
+                    state = read_channels(states, state_dim, aligned, of_warp(i, owner), first)
+                    for n in range(wp.static(share_width)):
+                        held[turn, n] = state[n]
+                for turn in range(wp.static(CUDA_LANES)):
+                    chunk = lane + (first_turn + turn) * wp.static(WARP)
+                    owner = chunk / parts
+                    part = chunk - owner * parts
+                    to = of_warp(place, owner) * parts + part
+                    state = share()
+                    for n in range(wp.static(share_width)):
+                        state[n] = held[turn, n]
+                    if k - lane + owner < total:
+                        store_share(sorted_states, to, state)
+
+    return order_particles

@@ -16,8 +16,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from npa_envs.kernels.access import make_lane_scatter, make_wide_load
-from npa_envs.kernels.cpu import PAIRS, in_ranges, make_add_scaled, make_sift
+from npa_envs.kernels.access import make_wide_load
+from npa_envs.kernels.cpu import PAIRS, in_ranges, make_add_scaled
 from npa_envs.kernels.domain import domain_types, kernel_module
 from npa_envs.kernels.mathematics import (
     log_scale_adjoint,
@@ -26,6 +26,7 @@ from npa_envs.kernels.mathematics import (
     spiky_factor,
     spiky_radial_slope,
 )
+from npa_envs.kernels.portable.search import make_search
 
 CUDA_REGISTERS = 64
 """Registers of a thread that gathers state cotangents: it mostly waits for memory."""
@@ -33,9 +34,14 @@ CUDA_REGISTERS = 64
 
 @functools.cache
 def adjoint_kernels(
-    space_dim: int, scalar: type, width: int, lanes: int, state_gradient: bool
+    space_dim: int,
+    scalar: type,
+    width: int,
+    on_cpu: bool,
+    state_gradient: bool,
+    listed: bool = False,
 ) -> SimpleNamespace:
-    """Return the kernels of one variant, as `perception_kernels` does."""
+    """Return the kernels of one variant; arguments as for `perception_kernels`."""
     types = domain_types(space_dim, scalar)
     vector, particle, Domain = types.vector, types.particle, types.Domain
     cell_of, segment_count, segment_cells = (
@@ -46,14 +52,17 @@ def adjoint_kernels(
     minimum_image, position_of = types.minimum_image, types.position_of
     group = wp.types.vector(width, scalar)
     group_gradient = wp.types.matrix((space_dim, width), scalar)
-    share = width // lanes
     topic = "adjoint" if state_gradient else "smoothing_adjoint"
-    module = kernel_module(topic, space_dim, scalar, width, lanes)
-    sift, sift_stride = make_sift(space_dim, scalar, vector, lanes)
+    topic = "listed_by_place_" * listed + "unsifted_" * (not on_cpu) + topic
+    module = kernel_module(topic, space_dim, scalar, width)
+    cell_vector = wp.types.vector(space_dim, wp.int32)
+    search = make_search(space_dim, scalar, vector, on_cpu, listed)
+    run_count, run = search.run_count, search.run
+    sift = search.sift
+    indices = wp.types.vector(search.stride, wp.int32)
     add_scaled = make_add_scaled(group, scalar)
     load_group = make_wide_load(group, scalar)
     load_gradient = make_wide_load(group_gradient, scalar)
-    scatter_group = make_lane_scatter(group, scalar, lanes)
 
     @in_ranges(PAIRS)
     @wp.kernel(enable_backward=False, module=module)
@@ -110,6 +119,47 @@ def adjoint_kernels(
                 pull = density_scale * log_scale_adjoint(scaled, bar)
             density_gradient_bar[row] = pull
 
+    @wp.func
+    def run_of_rows(
+        domain: Domain,
+        starts: wp.array(dtype=wp.int32),
+        ends: wp.array(dtype=wp.int32),
+        base: wp.int32,
+        cell: cell_vector,
+        k: wp.int32,
+        r: wp.int32,
+        row_base: wp.int32,
+        row_capacity: wp.int32,
+    ):
+        """First row and one past the last of a run around particle k, or entries of its list."""
+        begin, end = run(domain, starts, ends, base, cell, k, r)
+        if wp.static(not listed):
+            begin -= row_base
+            end = wp.min(end - row_base, row_capacity)
+        return begin, end
+
+    @wp.func
+    def sift_rows(
+        domain: Domain,
+        row_positions: wp.array(dtype=vector),
+        neighbours: wp.array(dtype=wp.int32),
+        row_of: wp.array(dtype=wp.int32),
+        position: vector,
+        first: wp.int32,
+        end: wp.int32,
+    ):
+        """Which rows from `first` on lie within eps of a position, and how many do."""
+        near = indices()
+        count = wp.int32(0)
+        if wp.static(listed):
+            for entry in range(first, wp.min(first + wp.static(search.stride), end)):
+                row = row_of[neighbours[entry]]
+                near[count] = row
+                count += wp.where(row >= 0, 1, 0)
+        else:
+            near, count = sift(domain, row_positions, neighbours, position, first, end)
+        return near, count
+
     @in_ranges(PAIRS)
     @wp.kernel(enable_backward=False, module=module, cuda_max_registers=CUDA_REGISTERS)
     def gather_state_cotangents(
@@ -122,6 +172,8 @@ def adjoint_kernels(
         row_capacity: wp.int32,
         group_count: wp.int32,
         starts: wp.array(dtype=wp.int32),
+        ends: wp.array(dtype=wp.int32),
+        neighbours: wp.array(dtype=wp.int32),
         particles: wp.array(dtype=particle),
         source: wp.array(dtype=wp.int32),
         row_of: wp.array(dtype=wp.int32),
@@ -134,20 +186,23 @@ def adjoint_kernels(
         # outputs
         states_bar: wp.array(dtype=scalar, ndim=2),
     ):
-        """Write the cotangent of every particle's state, from the active rows around it."""
-        k, g, lane = wp.tid()
+        """Write the cotangent of every particle's state, from the active rows around it.
+
+        Where neighbours are listed, particles are in sorted order everywhere.
+        """
+        k, g = wp.tid()
         k += range_start
         entry = particles[k]
         position = position_of(entry)
         total = group()
         base = active_offset + (k / particle_count) * domain.cell_count
         cell = cell_of(domain, position)
-        for segment in range(segment_count(domain, cell)):
-            first_cell, last_cell = segment_cells(domain, cell, segment)
-            begin = starts[base + first_cell] - row_base
-            end = wp.min(starts[base + last_cell] - row_base, row_capacity)
-            for start in range(begin + lane, end, wp.static(sift_stride)):
-                near, count = sift(domain, row_positions, position, start, end)
+        for r in range(run_count(domain, cell)):
+            begin, end = run_of_rows(domain, starts, ends, base, cell, k, r, row_base, row_capacity)
+            for first in range(begin, end, wp.static(search.stride)):
+                near, count = sift_rows(
+                    domain, row_positions, neighbours, row_of, position, first, end
+                )
                 for n in range(count):
                     row = near[n]
                     offset = minimum_image(domain, position - row_positions[row])
@@ -160,14 +215,13 @@ def adjoint_kernels(
                             wp.sqrt(squared), domain.inverse_eps, domain.spiky_norm
                         )
                         total += kernel * load_gradient(gradient_bar, row * group_count + g)
-        mine = entry[wp.static(space_dim)] * scatter_group(total)
+        total = entry[wp.static(space_dim)] * total
         i = source[k]
         row = row_of[i]
-        for c in range(wp.static(share)):
-            local = lane * wp.static(share) + c
-            channel = g * wp.static(width) + local
+        for c in range(wp.static(width)):
+            channel = g * wp.static(width) + c
             if channel < state_dim:
-                bar = mine[c]
+                bar = total[c]
                 if row >= 0:
                     bar += perception_bar[row, channel]
                     if wp.static(state_gradient):
@@ -175,7 +229,7 @@ def adjoint_kernels(
                         for d in range(wp.static(space_dim)):
                             bar -= (
                                 row_kernel_sum[row][d]
-                                * flat_gradient_bar[(place + d) * wp.static(width) + local]
+                                * flat_gradient_bar[(place + d) * wp.static(width) + c]
                             )
                 states_bar[i, channel] = bar
 

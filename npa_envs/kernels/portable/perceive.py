@@ -1,10 +1,9 @@
-"""Density and the fused perception pass: what a particle sees of its neighbourhood.
+"""The perception pass: what each particle sees of its neighbourhood, scaled.
 
-One particle is served by a few lanes (one on the CPU), which split the candidates between them, for
-each group of state channels. Sums run over sorted particles, run by run of cells, and lanes are
-added in a fixed order.
+One thread serves a particle and a group of its state channels. Sums run over sorted particles, run
+by run of cells, or over neighbours listed before in the same order.
 
-Sources: arXiv 2601.16096, section 3 (density, smoothing, gradients, moment matrix, scaling).
+Source: arXiv 2601.16096, section 3 (smoothing, gradients, moment matrix, scaling).
 """
 
 import functools
@@ -12,16 +11,16 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from npa_envs.kernels.access import make_lane_scatter, make_lane_sum, make_wide_load, share_type
-from npa_envs.kernels.cpu import PAIRS, in_ranges, make_add_scaled, make_sift
+from npa_envs.kernels.access import make_wide_load
+from npa_envs.kernels.cpu import PAIRS, in_ranges, make_add_scaled
 from npa_envs.kernels.domain import domain_types, kernel_module
 from npa_envs.kernels.mathematics import (
     log_scaled,
     make_corrected,
     smoothing,
     spiky_factor,
-    spiky_factor_wide,
 )
+from npa_envs.kernels.portable.search import make_search
 
 CUDA_REGISTERS = 128
 """Registers of a thread of the perception pass: more threads in flight are worth a few spills."""
@@ -32,145 +31,72 @@ def perception_kernels(
     space_dim: int,
     scalar: type,
     width: int,
-    lanes: int,
+    on_cpu: bool,
     state_gradient: bool,
     moment_inverse: str | None,
+    listed: bool = False,
 ) -> SimpleNamespace:
-    """Return the kernels of one variant: groups of `width` channels, `lanes` to a particle.
+    """Return the kernels of one variant.
 
     A variant without `state_gradient`, or without a correction of it by a `moment_inverse`, neither
     sums nor holds what only that needs.
+
+    Args:
+        space_dim: Space dimension D.
+        scalar: `wp.float32` or `wp.float64`.
+        width: Channels of a group.
+        on_cpu: Whether candidates are sifted.
+        state_gradient: Whether the state gradient is perceived.
+        moment_inverse: How it is corrected by the moment matrix; None: not at all.
+        listed: Whether neighbours were listed before.
     """
     moment_correction = moment_inverse is not None
     smooth = moment_inverse == "smooth"
     types = domain_types(space_dim, scalar)
     vector, particle, Domain = types.vector, types.particle, types.Domain
-    cell_of, segment_count, segment_cells = (
-        types.cell_of,
-        types.segment_count,
-        types.segment_cells,
-    )
-    minimum_image, position_of = types.minimum_image, types.position_of
+    cell_of, minimum_image, position_of = types.cell_of, types.minimum_image, types.position_of
     wide = wp.types.vector(space_dim, wp.float64)
     group = wp.types.vector(width, scalar)
     group_gradient = wp.types.matrix((space_dim, width), scalar)
     square = wp.types.matrix((space_dim, space_dim), scalar)
-    share = width // lanes
     topic = "smoothing"
     if state_gradient:
         topic = "perception" if moment_correction else "uncorrected_perception"
         topic = "smoothly_corrected_perception" if smooth else topic
-    module = kernel_module(topic, space_dim, scalar, width, lanes)
-    sift, sift_stride = make_sift(space_dim, scalar, particle, lanes)
+    topic = "listed_by_place_" * listed + "unsifted_" * (not on_cpu) + topic
+    module = kernel_module(topic, space_dim, scalar, width)
+    search = make_search(space_dim, scalar, particle, on_cpu, listed)
+    run_count, run, sift = search.run_count, search.run, search.sift
     add_scaled = make_add_scaled(group, scalar)
     load_group = make_wide_load(group, scalar)
-    add_scalar = make_lane_sum(scalar, scalar, lanes)
-    add_wide = make_lane_sum(wide, wp.float64, lanes)
-    add_vector = make_lane_sum(vector, scalar, lanes)
-    add_square = make_lane_sum(square, scalar, lanes)
-    scatter_group = make_lane_scatter(group, scalar, lanes)
-    scatter_gradient = make_lane_scatter(group_gradient, scalar, lanes)
-    gradient_share = share_type(group_gradient, scalar, lanes)
-    corrected = make_corrected(space_dim, scalar, share, moment_inverse)
-
-    @wp.func
-    def spiky_wide(domain: Domain, centre: vector, neighbour: vector):
-        """Spiky gradient kernel of a pair in float64: a Newton step refines 1 / distance."""
-        kernel = wide()
-        r = wide()
-        for d in range(wp.static(space_dim)):
-            r[d] = wp.float64(neighbour[d]) - wp.float64(centre[d])
-            if domain.periodic != 0:
-                images = wp.round((neighbour[d] - centre[d]) * domain.inverse_box[d])
-                r[d] -= wp.float64(images) * wp.float64(domain.box[d])
-        exact = wp.dot(r, r)
-        # The start must be near this very distance: across a seam that of the float32 positions
-        # may be off by a rounding of the box's size.
-        rounded = scalar(exact)
-        if rounded > scalar(0.0):
-            start = scalar(1.0) / wp.sqrt(rounded)
-            kernel = spiky_factor_wide(exact, start, domain.inverse_eps, domain.spiky_norm) * r
-        return kernel
-
-    @in_ranges(PAIRS)
-    @wp.kernel(enable_backward=False, module=module)
-    def compute_density(
-        range_start: wp.int32,
-        domain: Domain,
-        particle_count: wp.int32,
-        density_gradient: wp.int32,
-        starts: wp.array(dtype=wp.int32),
-        source: wp.array(dtype=wp.int32),
-        row_of: wp.array(dtype=wp.int32),
-        sorted_positions: wp.array(dtype=vector),
-        # outputs
-        particles: wp.array(dtype=particle),
-        row_density_gradient: wp.array(dtype=wide),
-    ):
-        """Write every particle's position and volume 1 / rho, and every row's density gradient.
-
-        The density gradient cancels almost fully where particles are dense, and rules amplify its
-        rounding error: it stays in float64 up to its scaling, which costs little.
-        """
-        k, lane = wp.tid()
-        k += range_start
-        position = sorted_positions[k]
-        row = wp.int32(-1)
-        if density_gradient != 0:
-            row = row_of[source[k]]
-        base = (k / particle_count) * domain.cell_count
-        cell = cell_of(domain, position)
-        density = scalar(0.0)
-        gradient = wide()
-        for segment in range(segment_count(domain, cell)):
-            first, last = segment_cells(domain, cell, segment)
-            for j in range(starts[base + first] + lane, starts[base + last], wp.static(lanes)):
-                neighbour = sorted_positions[j]
-                offset = minimum_image(domain, neighbour - position)
-                squared = wp.dot(offset, offset)
-                seen = squared < domain.squared_eps and j != k
-                weight = smoothing(squared, domain.inverse_squared_eps, domain.smoothing_norm)
-                density += wp.where(seen, weight, scalar(0.0))
-                if row >= 0 and seen:
-                    gradient += spiky_wide(domain, position, neighbour)
-        # A particle always sees itself: a position that is not finite would otherwise have rho 0.
-        density = domain.smoothing_norm + add_scalar(density)
-        gradient = add_wide(gradient)
-        if lane == 0:
-            entry = particle()
-            for d in range(wp.static(space_dim)):
-                entry[d] = position[d]
-            entry[wp.static(space_dim)] = scalar(1.0) / density
-            particles[k] = entry
-            if row >= 0:
-                row_density_gradient[row] = gradient
+    corrected = make_corrected(space_dim, scalar, width, moment_inverse)
 
     @wp.func
     def sum_neighbours(
         domain: Domain,
+        particle_count: wp.int32,
         starts: wp.array(dtype=wp.int32),
+        ends: wp.array(dtype=wp.int32),
+        neighbours: wp.array(dtype=wp.int32),
         particles: wp.array(dtype=particle),
         states: wp.array(dtype=group),
-        world: wp.int32,
+        k: wp.int32,
         g: wp.int32,
         group_count: wp.int32,
-        lane: wp.int32,
-        position: vector,
-        own: group,
     ):
-        """Return this lane's share of the smoothed state and of the state gradient, and the sums
-        of v K and of the moment matrix."""
+        """Return the smoothed state, the state gradient, the sum of v K and the moment matrix."""
+        position = position_of(particles[k])
+        own = load_group(states, k * group_count + g)
         blur = group()
         gradient = group_gradient()
         kernel_sum = vector()
         moment = square()
-        base = world * domain.cell_count
+        base = (k / particle_count) * domain.cell_count
         cell = cell_of(domain, position)
-        for segment in range(segment_count(domain, cell)):
-            first, last = segment_cells(domain, cell, segment)
-            end = starts[base + last]
-            for begin in range(starts[base + first] + lane, end, wp.static(sift_stride)):
-                near, count = sift(domain, particles, position, begin, end)
+        for r in range(run_count(domain, cell)):
+            begin, end = run(domain, starts, ends, base, cell, k, r)
+            for first in range(begin, end, wp.static(search.stride)):
+                near, count = sift(domain, particles, neighbours, position, first, end)
                 for n in range(count):
                     j = near[n]
                     entry = particles[j]
@@ -190,13 +116,7 @@ def perception_kernels(
                             gradient[d] = add_scaled(gradient[d], weighted[d], state - own)
                         if wp.static(moment_correction):
                             moment += wp.outer(offset, weighted)
-        gradients = gradient_share()
-        if wp.static(state_gradient):
-            gradients = scatter_gradient(gradient)
-            kernel_sum = add_vector(kernel_sum)
-            if wp.static(moment_correction):
-                moment = add_square(moment)
-        return scatter_group(blur), gradients, kernel_sum, moment
+        return blur, gradient, kernel_sum, moment
 
     @wp.func
     def clipped(value: scalar, limit: scalar):
@@ -219,12 +139,14 @@ def perception_kernels(
         group_count: wp.int32,
         limit: scalar,
         starts: wp.array(dtype=wp.int32),
+        ends: wp.array(dtype=wp.int32),
+        neighbours: wp.array(dtype=wp.int32),
         particles: wp.array(dtype=particle),
         states: wp.array(dtype=group),
         flat_states: wp.array(dtype=scalar, ndim=2),
         row_place: wp.array(dtype=wp.int32),
         row_destination: wp.array(dtype=wp.int32),
-        row_density_gradient: wp.array(dtype=wide),
+        density_gradients: wp.array(dtype=wide),
         # outputs
         perception: wp.array(dtype=scalar, ndim=2),
         row_kernel_sum: wp.array(dtype=vector),
@@ -234,12 +156,10 @@ def perception_kernels(
         Rows beyond the last active one are zero. Rows are written where `row_destination` says, or
         in their own order if it is empty; clipped to plus and minus `limit` unless that is zero.
         """
-        row, g, lane = wp.tid()
+        row, g = wp.tid()
         row += range_start
         if row >= starts[starts.shape[0] - 1] - row_base:
-            for column in range(
-                g * wp.static(lanes) + lane, perception.shape[1], group_count * wp.static(lanes)
-            ):
+            for column in range(g, perception.shape[1], group_count):
                 perception[row, column] = scalar(0.0)
             return
         k = row
@@ -250,21 +170,20 @@ def perception_kernels(
             to = row_destination[row]
         blur, gradient, kernel_sum, moment = sum_neighbours(
             domain,
+            particle_count,
             starts,
+            ends,
+            neighbours,
             particles,
             states,
-            k / particle_count,
+            k,
             g,
             group_count,
-            lane,
-            position_of(particles[k]),
-            load_group(states, k * group_count + g),
         )
         if wp.static(state_gradient and moment_correction):
             gradient = corrected(gradient, moment)
-        mine = g * wp.static(width) + lane * wp.static(share)
-        for c in range(wp.static(share)):
-            channel = mine + c
+        for c in range(wp.static(width)):
+            channel = g * wp.static(width) + c
             if channel < state_dim:
                 perception[to, channel] = clipped(flat_states[k, channel], limit)
                 perception[to, state_dim + channel] = clipped(blur[c], limit)
@@ -276,14 +195,14 @@ def perception_kernels(
                     place = 2 * state_dim + channel * wp.static(space_dim)
                     for d in range(wp.static(space_dim)):
                         perception[to, place + d] = clipped(along[d], limit)
-        if g == 0 and lane == 0:
+        if g == 0:
             if row_kernel_sum.shape[0] > 0:
                 row_kernel_sum[row] = kernel_sum
             column = 2 * state_dim
             if wp.static(state_gradient):
                 column += state_dim * wp.static(space_dim)
             if density_gradient != 0:
-                scaled = density_scale * row_density_gradient[row]
+                scaled = density_scale * density_gradients[k]
                 scaled = log_scaled(scaled)
                 for d in range(wp.static(space_dim)):
                     perception[to, column + d] = clipped(scalar(scaled[d]), limit)
@@ -311,34 +230,31 @@ def perception_kernels(
         corrected_field: wp.array(dtype=scalar, ndim=3),
     ):
         """Write the unscaled fields of every particle, in the caller's order."""
-        k, g, lane = wp.tid()
+        k, g = wp.tid()
         k += range_start
         i = source[k]
-        entry = particles[k]
         blur, gradient, _kernel_sum, moment = sum_neighbours(
             domain,
+            particle_count,
+            starts,
+            starts,
             starts,
             particles,
             states,
-            k / particle_count,
+            k,
             g,
             group_count,
-            lane,
-            position_of(entry),
-            load_group(states, k * group_count + g),
         )
         straight = corrected(gradient, moment)
-        mine = g * wp.static(width) + lane * wp.static(share)
-        for c in range(wp.static(share)):
-            if mine + c < state_dim:
-                blur_field[i, mine + c] = blur[c]
+        for c in range(wp.static(width)):
+            channel = g * wp.static(width) + c
+            if channel < state_dim:
+                blur_field[i, channel] = blur[c]
                 for d in range(wp.static(space_dim)):
-                    gradient_field[i, mine + c, d] = gradient[d, c]
-                    corrected_field[i, mine + c, d] = straight[d, c]
-        if g == 0 and lane == 0:
-            density[i] = scalar(1.0) / entry[wp.static(space_dim)]
+                    gradient_field[i, channel, d] = gradient[d, c]
+                    corrected_field[i, channel, d] = straight[d, c]
+        if g == 0:
+            density[i] = scalar(1.0) / particles[k][wp.static(space_dim)]
             moment_field[i] = moment
 
-    return SimpleNamespace(
-        compute_density=compute_density, perceive=perceive, gather_fields=gather_fields
-    )
+    return SimpleNamespace(perceive=perceive, gather_fields=gather_fields)

@@ -13,12 +13,10 @@ from types import SimpleNamespace
 import warp as wp
 
 from npa_envs.kernels.access import (
-    WARP,
     load_integer,
     make_read_channels,
     make_wide_load,
     make_wide_store,
-    of_warp,
 )
 from npa_envs.kernels.cpu import PARTICLES, in_ranges
 from npa_envs.kernels.domain import domain_types, kernel_module
@@ -29,25 +27,20 @@ store_pair = make_wide_store(wp.vec2i, wp.int32)
 
 
 @functools.cache
-def cell_kernels(space_dim: int, scalar: type, width: int, lanes: int) -> SimpleNamespace:
+def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
     """Return the kernels of one variant.
 
     Args:
         space_dim: Space dimension D, 2 or 3.
         scalar: `wp.float32` or `wp.float64`.
         width: Channels of a group: 4, 8 or 16.
-        lanes: Threads that share a group, 1 on the CPU.
     """
     types = domain_types(space_dim, scalar)
     vector, Domain = types.vector, types.Domain
     cell_of, cell_index = types.cell_of, types.cell_index
-    share = wp.types.vector(width // lanes, scalar)
-    shares = wp.types.matrix((lanes, width // lanes), scalar)
-    warp_size = WARP if lanes > 1 else 1
-    read_channels = make_read_channels(share, scalar)
-    store_vector = make_wide_store(vector, scalar)
-    store_share = make_wide_store(share, scalar)
-    module = kernel_module("cells", space_dim, scalar, width, lanes)
+    group = wp.types.vector(width, scalar)
+    read_channels = make_read_channels(group, scalar)
+    module = kernel_module("sort", space_dim, scalar, width)
 
     @wp.kernel(enable_backward=False, module=module)
     def count_cells(
@@ -115,70 +108,93 @@ def cell_kernels(space_dim: int, scalar: type, width: int, lanes: int) -> Simple
         row_place: wp.array(dtype=wp.int32),
         sorted_positions: wp.array(dtype=vector),
         row_positions: wp.array(dtype=vector),
-        sorted_states: wp.array(dtype=share),
+        sorted_states: wp.array(dtype=group),
     ):
         """Move every particle to its rank by index within its cell; give active ones rows.
 
-        States and rows are left out where their arrays are empty. Threads come in whole warps on
-        CUDA, some of them beyond the last particle.
+        States and rows are left out where their arrays are empty.
         """
         k = range_start + wp.tid()
-        total = arrived.shape[0]
-        own = load_pair(arrived, wp.min(k, total - 1))
+        own = arrived[k]
         i = own[0] / 2
         c = own[1]
-        begin = load_integer(starts, c)
-        first_row = load_integer(starts, active_offset + c) - row_base
-        position = positions[i]
-        rank = wp.int32(0)
-        active_rank = wp.int32(0)
-        for other in range(begin, load_integer(starts, c + 1)):
-            entry = load_pair(arrived, other)[0]
+        place = starts[c]
+        row = starts[active_offset + c] - row_base
+        for other in range(starts[c], starts[c + 1]):
+            entry = arrived[other][0]
             if entry < own[0]:
-                rank += 1
-                active_rank += entry & 1
-        place = begin + rank
-        if k < total:
-            store_integer(source, place, i)
-            store_integer(sorted_cell, place, c)
-            store_vector(sorted_positions, place, position)
-            if row_of.shape[0] > 0:
-                row = first_row + active_rank
-                if own[0] & 1 == 0 or row >= row_capacity:
-                    row = wp.int32(-1)
-                store_integer(row_of, i, row)
-                if row >= 0:
-                    store_integer(row_source, row, i)
-                    store_integer(row_place, row, place)
-                    store_vector(row_positions, row, position)
-
-        # A warp moves the states of its particles together: neighbouring threads, neighbouring
-        # shares. All that is read is asked for before any of it is written.
+                place += 1
+                row += entry & 1
+        source[place] = i
+        sorted_cell[place] = c
+        sorted_positions[place] = positions[i]
+        if row_of.shape[0] > 0:
+            if own[0] & 1 == 0 or row >= row_capacity:
+                row = wp.int32(-1)
+            row_of[i] = row
+            if row >= 0:
+                row_source[row] = i
+                row_place[row] = place
+                row_positions[row] = positions[i]
         if sorted_states.shape[0] > 0:
-            lane = k % wp.static(warp_size)
-            parts = group_count * wp.static(lanes)
-            for first_turn in range(0, parts, wp.static(lanes)):
-                held = shares()
-                for turn in range(wp.static(lanes)):
-                    chunk = lane + (first_turn + turn) * wp.static(warp_size)
-                    owner = chunk / parts
-                    first = (chunk - owner * parts) * wp.static(width // lanes)
-                    state = read_channels(states, state_dim, aligned, of_warp(i, owner), first)
-                    for n in range(wp.static(width // lanes)):
-                        held[turn, n] = state[n]
-                for turn in range(wp.static(lanes)):
-                    chunk = lane + (first_turn + turn) * wp.static(warp_size)
-                    owner = chunk / parts
-                    part = chunk - owner * parts
-                    to = of_warp(place, owner) * parts + part
-                    state = share()
-                    for n in range(wp.static(width // lanes)):
-                        state[n] = held[turn, n]
-                    if k - lane + owner < total:
-                        store_share(sorted_states, to, state)
+            for g in range(group_count):
+                state = read_channels(states, state_dim, aligned, i, g * wp.static(width))
+                sorted_states[place * group_count + g] = state
 
     return SimpleNamespace(
         count_cells=count_cells,
         place_by_arrival=place_by_arrival,
         order_particles=order_particles,
     )
+
+
+@functools.cache
+def give_rows(space_dim: int, scalar: type) -> wp.Kernel:
+    """Return the kernel that gives active particles of worlds that are sorted already their rows.
+
+    Args:
+        space_dim: Space dimension D, 2 or 3.
+        scalar: `wp.float32` or `wp.float64`.
+    """
+    vector = wp.types.vector(space_dim, scalar)
+
+    @wp.kernel(enable_backward=False, module=kernel_module("rows", space_dim, scalar))
+    def give_rows(
+        total: wp.int32,
+        active_offset: wp.int32,
+        active_before: wp.array(dtype=wp.int32, ndim=2),
+        cell_starts: wp.array(dtype=wp.int32),
+        positions: wp.array(dtype=vector),
+        # outputs
+        row_of: wp.array(dtype=wp.int32, ndim=2),
+        row_source: wp.array(dtype=wp.int32, ndim=2),
+        starts: wp.array(dtype=wp.int32, ndim=2),
+        row_positions: wp.array(dtype=vector, ndim=2),
+    ):
+        """Write rows of particles, particles of rows, and where cells' particles and rows begin.
+
+        All of several steps. Threads of a step are as many as particles or starts, whichever are
+        more. `active_before` counts the active particles up to each one, itself included.
+        """
+        step, t = wp.tid()
+        if t < starts.shape[1]:
+            if t < active_offset:
+                starts[step, t] = cell_starts[t]
+            else:
+                first = cell_starts[t - active_offset]
+                before = wp.int32(0)
+                if first > 0:
+                    before = active_before[step, first - 1]
+                starts[step, t] = total + before
+        if t < total:
+            before = wp.int32(0)
+            if t > 0:
+                before = active_before[step, t - 1]
+            row = wp.int32(-1)
+            if active_before[step, t] > before and before < row_source.shape[1]:
+                row = before
+                row_source[step, row] = t
+                row_positions[step, row] = positions[t]
+            row_of[step, t] = row
+
+    return give_rows

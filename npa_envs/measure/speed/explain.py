@@ -13,8 +13,9 @@ from npa_envs.errors import NPAError, suggest
 from npa_envs.measure.speed.launches import Launch, recorded_launches
 from npa_envs.measure.speed.timing import Session
 from npa_envs.measure.speed.workloads import Workload, rollout_call
-from npa_envs.ops.backend import rollout_listing
+from npa_envs.ops.backend import Request, describe, rollout_listing
 from npa_envs.ops.sort import Plan, make_plan
+from npa_envs.rule.rule import NPARule
 from npa_envs.world.rollout import row_capacity, step
 
 LEAST_SHARE = 0.005
@@ -180,10 +181,12 @@ def _reasons(question: Question) -> list[str]:
         "a neighbourhood is a few ranges of sorted particles",
         f"  channels    {plan.group_count} group(s) of {plan.width}, "
         f"{workload.state_dim} used: a kernel is compiled for a group's width",
-        f"  threads     {_threads(plan)}",
-        f"  neighbours  {_neighbours(plan, question)}",
+        f"  neighbours  {_neighbours(plan)}",
         f"  rows        {_rows(plan, question)}",
         f"  gradients   {_gradients(question)}",
+        "",
+        "implementations:",
+        *(f"  {line}" for line in describe(_request(plan, workload.rule(question.device)))),
     ]
 
 
@@ -193,26 +196,21 @@ def _boundary(question: Question) -> str:
     return f"periodic, side {question.box:g}: nearest images, positions are wrapped"
 
 
-def _threads(plan: Plan) -> str:
-    if plan.lanes == 1:
-        return "one a particle: a CPU runs them in ranges, on as many threads as torch uses"
-    if not plan.listed:
-        return f"{plan.lanes} share a particle and split its candidates"
-    listing = rollout_listing(plan)
-    return (
-        f"{listing.lanes} list a particle's neighbours, {listing.teams} x {plan.lanes} sum a row: "
-        "small worlds fill a device with more for each"
+def _request(plan: Plan, rule: NPARule) -> Request:
+    """Return what the backend table asks for."""
+    hidden, output = rule.folded()[:2]
+    return plan.request._replace(
+        row_width=hidden.shape[1], update_width=output.shape[0], hidden_dim=hidden.shape[0]
     )
 
 
-def _neighbours(plan: Plan, question: Question) -> str:
-    if not plan.listed:
-        why = "on a CPU" if question.device.type == "cpu" else "in float64"
-        return f"searched for in each pass: lists are kept in float32 on CUDA, this is {why}"
-    room = rollout_listing(plan).capacity
+def _neighbours(plan: Plan) -> str:
+    if plan.runs("density") == "portable":
+        return "searched for in each pass"
+    listing = rollout_listing(plan.particle_count)
     return (
-        f"listed by the density pass for the perception pass, with room for {room} each: longer "
-        "lists are searched for again"
+        f"listed by the density pass for the perception pass, {listing.lanes} threads a particle, "
+        f"with room for {listing.capacity} each: longer lists are searched for again"
     )
 
 

@@ -1,0 +1,167 @@
+"""Density, and what follows from it of positions alone: volumes, density gradients, neighbours.
+
+Sums run over sorted particles, run by run of cells.
+
+Source: arXiv 2601.16096, section 3.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from npa_envs.kernels.cpu import PAIRS, in_ranges
+from npa_envs.kernels.domain import domain_types, kernel_module
+from npa_envs.kernels.mathematics import smoothing, spiky_factor_wide
+from npa_envs.kernels.portable.search import make_search
+
+
+@functools.cache
+def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespace:
+    """Return the kernels of one variant: one thread a particle."""
+    types = domain_types(space_dim, scalar)
+    vector, particle, Domain = types.vector, types.particle, types.Domain
+    cell_of, segment_count, segment_cells = (
+        types.cell_of,
+        types.segment_count,
+        types.segment_cells,
+    )
+    minimum_image, position_of = types.minimum_image, types.position_of
+    wide = wp.types.vector(space_dim, wp.float64)
+    search = make_search(space_dim, scalar, particle, on_cpu)
+    run_count, run, sift = search.run_count, search.run, search.sift
+    module = kernel_module("density" if on_cpu else "unsifted_density", space_dim, scalar)
+
+    @wp.func
+    def spiky_wide(domain: Domain, centre: vector, neighbour: vector):
+        """Spiky gradient kernel of a pair in float64: a Newton step refines 1 / distance."""
+        kernel = wide()
+        r = wide()
+        for d in range(wp.static(space_dim)):
+            r[d] = wp.float64(neighbour[d]) - wp.float64(centre[d])
+            if domain.periodic != 0:
+                images = wp.round((neighbour[d] - centre[d]) * domain.inverse_box[d])
+                r[d] -= wp.float64(images) * wp.float64(domain.box[d])
+        exact = wp.dot(r, r)
+        # The start must be near this very distance: across a seam that of the float32 positions
+        # may be off by a rounding of the box's size.
+        rounded = scalar(exact)
+        if rounded > scalar(0.0):
+            start = scalar(1.0) / wp.sqrt(rounded)
+            kernel = spiky_factor_wide(exact, start, domain.inverse_eps, domain.spiky_norm) * r
+        return kernel
+
+    @in_ranges(PAIRS)
+    @wp.kernel(enable_backward=False, module=module)
+    def compute_density(
+        range_start: wp.int32,
+        domain: Domain,
+        particle_count: wp.int32,
+        density_gradient: wp.int32,
+        starts: wp.array(dtype=wp.int32),
+        source: wp.array(dtype=wp.int32),
+        row_of: wp.array(dtype=wp.int32),
+        sorted_positions: wp.array(dtype=vector),
+        # outputs
+        particles: wp.array(dtype=particle),
+        density_gradients: wp.array(dtype=wide),
+    ):
+        """Write positions with volumes 1 / rho, and density gradients of particles with rows.
+
+        The density gradient cancels almost fully where particles are dense, and rules amplify its
+        rounding error: it stays in float64 up to its scaling, which costs little.
+        """
+        k = range_start + wp.tid()
+        position = sorted_positions[k]
+        row = wp.int32(-1)
+        if density_gradient != 0:
+            row = row_of[source[k]]
+        base = (k / particle_count) * domain.cell_count
+        cell = cell_of(domain, position)
+        density = scalar(0.0)
+        gradient = wide()
+        for segment in range(segment_count(domain, cell)):
+            first, last = segment_cells(domain, cell, segment)
+            for j in range(starts[base + first], starts[base + last]):
+                neighbour = sorted_positions[j]
+                offset = minimum_image(domain, neighbour - position)
+                squared = wp.dot(offset, offset)
+                seen = squared < domain.squared_eps and j != k
+                weight = smoothing(squared, domain.inverse_squared_eps, domain.smoothing_norm)
+                density += wp.where(seen, weight, scalar(0.0))
+                if row >= 0 and seen:
+                    gradient += spiky_wide(domain, position, neighbour)
+        # A particle always sees itself: a position that is not finite would otherwise have rho 0.
+        entry = particle()
+        for d in range(wp.static(space_dim)):
+            entry[d] = position[d]
+        entry[wp.static(space_dim)] = scalar(1.0) / (domain.smoothing_norm + density)
+        particles[k] = entry
+        if row >= 0:
+            density_gradients[k] = gradient
+
+    @wp.func
+    def list_around(
+        domain: Domain,
+        particle_count: wp.int32,
+        starts: wp.array(dtype=wp.int32),
+        particles: wp.array(dtype=particle),
+        k: wp.int32,
+        begin: wp.int32,
+        neighbours: wp.array(dtype=wp.int32),
+    ):
+        """Write neighbours of particle k from `begin` on, where there is room; return the end."""
+        position = position_of(particles[k])
+        base = (k / particle_count) * domain.cell_count
+        cell = cell_of(domain, position)
+        place = begin
+        for r in range(run_count(domain, cell)):
+            first, end = run(domain, starts, neighbours, base, cell, k, r)
+            for candidate in range(first, end, wp.static(search.stride)):
+                near, count = sift(domain, particles, neighbours, position, candidate, end)
+                if neighbours.shape[0] > 0:
+                    for n in range(count):
+                        neighbours[place + n] = near[n]
+                place += count
+        return place
+
+    @in_ranges(PAIRS)
+    @wp.kernel(enable_backward=False, module=module)
+    def count_neighbours(
+        range_start: wp.int32,
+        domain: Domain,
+        particle_count: wp.int32,
+        starts: wp.array(dtype=wp.int32),
+        particles: wp.array(dtype=particle),
+        nobody: wp.array(dtype=wp.int32),
+        # outputs
+        counts: wp.array(dtype=wp.int32),
+    ):
+        """Write how many neighbours each particle has, itself included; `nobody` is empty."""
+        k = range_start + wp.tid()
+        counts[k] = list_around(domain, particle_count, starts, particles, k, 0, nobody)
+
+    @in_ranges(PAIRS)
+    @wp.kernel(enable_backward=False, module=module)
+    def list_neighbours(
+        range_start: wp.int32,
+        domain: Domain,
+        particle_count: wp.int32,
+        starts: wp.array(dtype=wp.int32),
+        particles: wp.array(dtype=particle),
+        ends: wp.array(dtype=wp.int32),
+        # outputs
+        neighbours: wp.array(dtype=wp.int32),
+    ):
+        """Write each particle's neighbours, from the end of those of the particle before it on."""
+        k = range_start + wp.tid()
+        begin = wp.int32(0)
+        if k > 0:
+            begin = ends[k - 1]
+        list_around(domain, particle_count, starts, particles, k, begin, neighbours)
+
+    return SimpleNamespace(
+        compute_density=compute_density,
+        count_neighbours=count_neighbours,
+        list_neighbours=list_neighbours,
+    )

@@ -1,0 +1,108 @@
+"""The search for neighbours: candidates in runs of cells, or a list that was made before.
+
+On a CPU, candidates are sifted: those that are near are noted first, then summed over. About half
+of the candidates are near: a branch for each is often predicted wrongly, and keeps the sums in
+memory. On CUDA a sift takes a single candidate, so that this is such a branch.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from npa_envs.kernels.domain import domain_types
+
+SIFTED = 32
+"""Candidates of a sift on the CPU."""
+
+
+@functools.cache
+def make_search(
+    space_dim: int, scalar: type, entry_type: type, on_cpu: bool, listed: bool = False
+) -> SimpleNamespace:
+    """Return the Warp functions of a search among sorted entries.
+
+    They are used as
+
+        for r in range(run_count(domain, cell)):
+            begin, end = run(domain, starts, ends, base, cell, k, r)
+            for first in range(begin, end, stride):
+                near, count = sift(domain, entries, neighbours, position, first, end)
+
+    Args:
+        space_dim: Space dimension D, 2 or 3.
+        scalar: `wp.float32` or `wp.float64`.
+        entry_type: Vector type of what is searched, which begins with a position.
+        on_cpu: Whether a sift takes several candidates.
+        listed: Whether `neighbours` holds the neighbours of each particle, up to its `ends`.
+    """
+    types = domain_types(space_dim, scalar)
+    vector, Domain, minimum_image = types.vector, types.Domain, types.minimum_image
+    segment_count, segment_cells = types.segment_count, types.segment_cells
+    cell_vector = wp.types.vector(space_dim, wp.int32)
+    stride = SIFTED if on_cpu else 1
+    indices = wp.types.vector(stride, wp.int32)
+
+    @wp.func
+    def run_count(domain: Domain, cell: cell_vector):
+        """Runs of candidates around a cell."""
+        count = wp.int32(1)
+        if wp.static(not listed):
+            count = segment_count(domain, cell)
+        return count
+
+    @wp.func
+    def run(
+        domain: Domain,
+        starts: wp.array(dtype=wp.int32),
+        ends: wp.array(dtype=wp.int32),
+        base: wp.int32,
+        cell: cell_vector,
+        k: wp.int32,
+        r: wp.int32,
+    ):
+        """First candidate and one past the last of a run of particle k, whose world begins at
+        the cell `base`."""
+        begin = wp.int32(0)
+        end = wp.int32(0)
+        if wp.static(listed):
+            if k > 0:
+                begin = ends[k - 1]
+            end = ends[k]
+        else:
+            first, last = segment_cells(domain, cell, r)
+            begin = starts[base + first]
+            end = starts[base + last]
+        return begin, end
+
+    @wp.func
+    def is_near(domain: Domain, entries: wp.array(dtype=entry_type), position: vector, j: wp.int32):
+        offset = vector()
+        entry = entries[j]
+        for d in range(wp.static(space_dim)):
+            offset[d] = entry[d] - position[d]
+        offset = minimum_image(domain, offset)
+        return wp.where(wp.dot(offset, offset) < domain.squared_eps, 1, 0)
+
+    @wp.func
+    def sift(
+        domain: Domain,
+        entries: wp.array(dtype=entry_type),
+        neighbours: wp.array(dtype=wp.int32),
+        position: vector,
+        first: wp.int32,
+        end: wp.int32,
+    ):
+        """Which candidates from `first` on lie within eps of a position, and how many do."""
+        near = indices()
+        count = wp.int32(0)
+        for c in range(first, wp.min(first + wp.static(stride), end)):
+            if wp.static(listed):
+                near[count] = neighbours[c]
+                count += 1
+            else:
+                near[count] = c
+                count += is_near(domain, entries, position, c)
+        return near, count
+
+    return SimpleNamespace(stride=stride, run_count=run_count, run=run, sift=sift)

@@ -1,0 +1,265 @@
+"""The two passes of perception over sorted worlds: which kernels run, and with what."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from npa_envs.kernels.access import CUDA_LANES, WARP
+from npa_envs.kernels.cuda.density import listed_density
+from npa_envs.kernels.cuda.perceive import listed_perception
+from npa_envs.kernels.portable.density import density_kernels
+from npa_envs.kernels.portable.perceive import perception_kernels
+from npa_envs.ops.backend import Listing
+from npa_envs.ops.launch import launch
+from npa_envs.ops.sort import Plan, SortedWorlds, density_scale
+
+
+class Terms(NamedTuple):
+    """Which groups of the perception vector a rule reads: the others are not computed."""
+
+    state_gradient: bool = True
+    moment_inverse: str | None = "threshold"
+    density_gradient: bool = True
+
+    @property
+    def correction(self) -> str | None:
+        """How the state gradient is corrected, "threshold" or "smooth"; None: not at all."""
+        return self.moment_inverse if self.state_gradient else None
+
+    def perception_dim(self, space_dim: int, state_dim: int) -> int:
+        """Length P of a perception vector with these groups."""
+        gradients = state_dim * space_dim * self.state_gradient
+        return 2 * state_dim + gradients + space_dim * self.density_gradient
+
+
+class NeighbourLists(NamedTuple):
+    """The neighbours of each row's particle, itself included."""
+
+    listing: Listing
+    """How they were listed."""
+    steps: Tensor
+    """Steps to neighbours in the sorted order, int16; 32 particles together."""
+    lengths: Tensor
+    """Neighbours of each row's particle, int32, [K]."""
+    records: Tensor
+    """Sorted positions with volumes, and in 2D places of states, shape [B N, 4]."""
+    by_place: bool = False
+    """There is a list for each sorted particle, not for each row."""
+
+
+class ListedNeighbours(NamedTuple):
+    """The neighbours of each sorted particle, itself included, for the portable kernels."""
+
+    neighbours: Tensor
+    """Their places in the sorted order, int32, shape [E]."""
+    ends: Tensor
+    """Where each particle's neighbours end, int32, shape [B N]."""
+
+
+class Densities(NamedTuple):
+    """What the density pass leaves for perception."""
+
+    particles: Tensor
+    """Sorted positions with volumes 1 / rho, shape [B N, D + 1]; empty where nobody asked."""
+    density_gradient: Tensor
+    """Density gradients of sorted particles that have rows, float64, shape [B N, D]; undefined of
+    the others; empty where perception computes them."""
+    lists: NeighbourLists | None = None
+    """What the density pass of `kernels/cuda/` found of neighbours."""
+    listed: ListedNeighbours | None = None
+    """The neighbours of static worlds on a CPU."""
+
+
+def portable_kernels(plan: Plan, terms: Terms, listed: bool = False) -> Any:
+    """Return the portable perception kernels of a plan."""
+    return perception_kernels(
+        plan.space_dim,
+        plan.scalar,
+        plan.width,
+        plan.on_cpu,
+        terms.state_gradient,
+        terms.correction,
+        listed,
+    )
+
+
+def compute_densities(
+    plan: Plan,
+    ordered: SortedWorlds,
+    terms: Terms,
+    listing: Listing,
+    *,
+    state_place: Tensor | None = None,
+    with_particles: bool = True,
+) -> Densities:
+    """Compute densities, and what perception wants besides: lists or the rows' density gradients.
+
+    Args:
+        plan: Plan of the call.
+        ordered: The sorted worlds.
+        terms: Groups of the perception that follows.
+        listing: How to list neighbours, where the plan says so.
+        state_place: Where the states of sorted particles are, int32, shape [B N]; None: in order.
+        with_particles: Also leave `particles` where neighbours are listed: the adjoint reads them.
+    """
+    if plan.runs("density") == "portable":
+        return compute_density_gradients(plan, ordered, terms)
+    return list_neighbours(plan, ordered, listing, state_place, with_particles)
+
+
+def list_neighbours(
+    plan: Plan,
+    ordered: SortedWorlds,
+    listing: Listing,
+    state_place: Tensor | None,
+    with_particles: bool,
+) -> Densities:
+    """Compute densities, and list the neighbours of the rows: `compute_densities` on CUDA."""
+    capacity, lanes, _ = listing
+    positions = ordered.positions
+    records = positions.new_empty(plan.total, 4)
+    particles = positions.new_empty(plan.total if with_particles else 0, plan.space_dim + 1)
+    steps = positions.new_empty(listing.shape(plan.row_capacity), dtype=torch.int16)
+    lengths = positions.new_empty(plan.row_capacity, dtype=torch.int32)
+    launch(
+        listed_density(plan.space_dim, lanes, plan.periodic, capacity, plan.masked),
+        -(-plan.total * lanes // WARP) * WARP,
+        positions.device,
+        plan.domain,
+        ordered.starts,
+        ordered.cell,
+        positions,
+        state_place,
+        ordered.source,
+        ordered.row_of,
+        particles,
+        records,
+        steps.view(-1),
+        lengths,
+    )
+    no_gradient = positions.new_empty(0, plan.space_dim, dtype=torch.float64)
+    return Densities(particles, no_gradient, NeighbourLists(listing, steps, lengths, records))
+
+
+def compute_density_gradients(plan: Plan, ordered: SortedWorlds, terms: Terms) -> Densities:
+    """Compute densities, and density gradients of the particles that have rows."""
+    positions = ordered.positions
+    particles = positions.new_empty(plan.total, plan.space_dim + 1)
+    density_gradient = positions.new_empty(plan.total, plan.space_dim, dtype=torch.float64)
+    launch(
+        density_kernels(plan.space_dim, plan.scalar, plan.on_cpu).compute_density,
+        plan.total,
+        positions.device,
+        plan.domain,
+        plan.particle_count,
+        int(terms.density_gradient),
+        ordered.starts,
+        ordered.source,
+        ordered.row_of,
+        positions,
+        particles,
+        density_gradient,
+    )
+    return Densities(particles, density_gradient)
+
+
+def perception_launch(
+    plan: Plan,
+    ordered: SortedWorlds,
+    densities: Densities,
+    terms: Terms,
+    scale: float,
+    out: Tensor,
+    *,
+    states: Tensor | None = None,
+    destination: Tensor | None = None,
+    limit: float = 0.0,
+    row_kernel_sum: Tensor | None = None,
+) -> tuple[Any, ...]:
+    """Return what to give to `launch` so that it writes the perception of each row.
+
+    Args:
+        plan: Plan of the call.
+        ordered: The sorted worlds.
+        densities: Their densities.
+        terms: Groups of the perception vector.
+        scale: c = eps / eps0, dimensionless.
+        out: Rows to write, shape [K, row_width].
+        states: States in the caller's order, where `ordered` has none.
+        destination: Row of `out` for each row, int32, shape [K]; default: its own.
+        limit: Entries are clipped to plus and minus this; 0: they are not.
+        row_kernel_sum: Where to write the rows' sums of v K, shape [K, D], for the adjoint.
+    """
+    row_place = ordered.row_place if plan.masked else None
+    numbers = (
+        plan.state_dim,
+        int(terms.density_gradient),
+        scale,
+        density_scale(scale, plan.space_dim, plan.particle_count),
+        plan.row_base,
+    )
+    lists = densities.lists
+    if lists is not None:
+        capacity, _, teams = lists.listing
+        kernel = listed_perception(
+            plan.space_dim,
+            plan.width,
+            CUDA_LANES,
+            terms.state_gradient,
+            terms.correction,
+            plan.periodic,
+            plan.group_count > 1,
+            capacity,
+            row_kernel_sum is not None,
+            teams,
+            lists.by_place,
+        )
+        threads = plan.row_capacity * plan.group_count * CUDA_LANES * teams
+        source = ordered.states if states is None else states
+        return (
+            kernel,
+            -(-threads // WARP) * WARP,
+            out.device,
+            plan.domain,
+            *numbers,
+            plan.row_capacity,
+            plan.group_count,
+            limit,
+            ordered.starts,
+            ordered.cell,
+            ordered.positions,
+            lists.records,
+            source.view(-1, plan.width // CUDA_LANES),
+            None if states is None else ordered.source,
+            row_place,
+            destination,
+            lists.steps.view(-1),
+            lists.lengths,
+            out,
+            row_kernel_sum,
+        )
+    listed = densities.listed
+    return (
+        portable_kernels(plan, terms, listed is not None).perceive,
+        (plan.row_capacity, plan.group_count),
+        out.device,
+        plan.domain,
+        plan.particle_count,
+        *numbers,
+        plan.group_count,
+        limit,
+        ordered.starts,
+        None if listed is None else listed.ends,
+        None if listed is None else listed.neighbours,
+        densities.particles,
+        ordered.states,
+        ordered.states.view(plan.total, -1),
+        row_place,
+        destination,
+        densities.density_gradient,
+        out,
+        row_kernel_sum,
+    )
