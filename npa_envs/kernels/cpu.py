@@ -9,8 +9,6 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
-import warp as wp
-
 from npa_envs.kernels import native
 
 SMALLEST_RANGES: dict[Any, int] = {}
@@ -62,10 +60,3 @@ def make_add_scaled(group: type, scalar: type) -> Any:
     def add_scaled(total: group, factor: scalar, value: group) -> group: ...
 
     return add_scaled
-
-
-@wp.func
-def of_groups(thread: wp.int32, group_count: wp.int32):
-    """Return the particle and the group of a thread, where adjacent ones have adjacent groups."""
-    particle = wp.int32(wp.uint32(thread) / wp.uint32(group_count))
-    return particle, thread - particle * group_count

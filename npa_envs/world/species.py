@@ -69,7 +69,7 @@ class Community(NamedTuple):
             yield self._draw(x, generator)
 
     def _draw(self, x: Tensor, generator: Randomness | None) -> Draws:
-        mask, noise = draw_step(x, self.options, generator)
+        mask, noise, _ = draw_step(x, self.options, generator)
         if self.keep is None:
             return Draws(mask, noise)
         if isinstance(generator, WorldRandom):
