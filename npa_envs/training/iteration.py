@@ -117,9 +117,8 @@ class TrainingCycle:
         """Fill the batch from the pool, and have seeds at hand."""
         config, worlds = self._config, self.generators["worlds"]
         self._index.copy_(self.pool.sample(config.world_count, worlds))
-        x0, s0 = self.pool.read(self._index)
-        if isinstance(self.task, GoalTask):
-            goal = self.pool.read_goals(self._index)
+        x0, s0, goal = self.pool.read(self._index)
+        if isinstance(self.task, GoalTask) and goal is not None:
             if config.damage:
                 x0, s0, goal = self.task.damage_with_goals(x0, s0, goal, worlds)
             self.batch.aim(goal)
@@ -145,10 +144,11 @@ class TrainingCycle:
     def _keep_worlds(self) -> None:
         """Put the batch back into the pool, and take note of what it came to."""
         batch = self.batch
-        fresh = self._fresh_x, self._fresh_s
-        replaced = self.pool.write(self._index, batch.x, batch.s, *fresh)
+        goals = None
         if batch.goal is not None and self._fresh_goal is not None:
-            self.pool.write_goals(self._index, batch.goal, self._fresh_goal, replaced)
+            goals = batch.goal, self._fresh_goal
+        fresh = self._fresh_x, self._fresh_s
+        replaced = self.pool.write(self._index, batch.x, batch.s, *fresh, goals)
         self.meter.observe(replaced)
         self.optimiser.prepare_gradients()
 

@@ -39,17 +39,19 @@ class WorldPool:
         keys = torch.rand(len(self.x), generator=generator, device=self.x.device)
         return keys.topk(world_count).indices
 
-    def read(self, index: Tensor) -> tuple[Tensor, Tensor]:
-        """Return copies of the worlds at `index` [B]: x [B, N, D] and s [B, N, C]."""
-        return self.x.index_select(0, index), self.s.index_select(0, index)
-
-    def read_goals(self, index: Tensor) -> Tensor:
-        """Return a copy of the goals of the worlds at `index` [B], shape [B]."""
-        assert self.goal is not None, "asked for where the task has goals"
-        return self.goal.index_select(0, index)
+    def read(self, index: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Return copies of the worlds at `index` [B]: x [B, N, D], s [B, N, C] and goals [B]."""
+        goal = None if self.goal is None else self.goal.index_select(0, index)
+        return self.x.index_select(0, index), self.s.index_select(0, index), goal
 
     def write(
-        self, index: Tensor, x: Tensor, s: Tensor, fresh_x: Tensor, fresh_s: Tensor
+        self,
+        index: Tensor,
+        x: Tensor,
+        s: Tensor,
+        fresh_x: Tensor,
+        fresh_s: Tensor,
+        goals: tuple[Tensor, Tensor] | None = None,
     ) -> Tensor:
         """Put worlds back; those that are not finite or run away are replaced by fresh ones.
 
@@ -59,6 +61,7 @@ class WorldPool:
             s: States after the rollout, shape [B, N, C].
             fresh_x: Positions of seeds, shape [B, N, D].
             fresh_s: States of seeds, shape [B, N, C].
+            goals: Goals of the worlds and of the seeds, shape [B], where the pool has such.
 
         Returns:
             Which worlds were replaced, shape [B], bool.
@@ -69,19 +72,9 @@ class WorldPool:
         mask = keep[:, None, None]
         self.x.index_copy_(0, index, torch.where(mask, x, fresh_x))
         self.s.index_copy_(0, index, torch.where(mask, s, fresh_s))
+        if self.goal is not None and goals is not None:
+            self.goal.index_copy_(0, index, torch.where(keep, *goals))
         return ~keep
-
-    def write_goals(self, index: Tensor, goal: Tensor, fresh: Tensor, replaced: Tensor) -> None:
-        """Put the goals of worlds back that `write` put back.
-
-        Args:
-            index: Where to, shape [B].
-            goal: Their goals, shape [B].
-            fresh: Goals of the fresh worlds, shape [B].
-            replaced: Which worlds are fresh ones, bool, shape [B].
-        """
-        assert self.goal is not None, "asked for where the task has goals"
-        self.goal.index_copy_(0, index, torch.where(replaced, fresh, goal))
 
 
 def _largest(worlds: Tensor) -> Tensor:

@@ -47,7 +47,7 @@ def test_pool_draws_different_worlds_and_all_of_them_in_the_long_run():
 
 def test_pool_reads_copies():
     pool = make_pool()
-    x, s = pool.read(torch.tensor([4, 2]))
+    x, s, _ = pool.read(torch.tensor([4, 2]))
     assert x[:, 0, 0].tolist() == [4, 2]
     x.zero_()
     s.zero_()
