@@ -1,4 +1,4 @@
-"""Change a configuration by plain field names or by a file: `override`, `load_config`."""
+"""Overrides of configurations: by plain field names, or by a file."""
 
 from __future__ import annotations
 
