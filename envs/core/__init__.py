@@ -1,1 +1,1 @@
-"""What every environment of one rule's worlds shares: configuration, worlds, spaces, views."""
+"""Parts that environments have in common: configuration, tasks, worlds, spaces, views."""

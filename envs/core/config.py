@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar, Literal, Self, TypeVar, get_args
 
@@ -43,7 +43,7 @@ class WorldConfig:
     Lengths are in length units: pictures show [-1, 1] x [-1, 1].
     """
 
-    words: ClassVar[Mapping[str, tuple[str | None, ...]]] = {
+    words: ClassVar[dict[str, tuple[str | None, ...]]] = {
         "moment_inverse": get_args(MomentInverse),
         "boundary": get_args(Boundary),
         "output": get_args(Output),
@@ -51,7 +51,7 @@ class WorldConfig:
     }
     """Fields that take one of a few words."""
 
-    elsewhere: ClassVar[Mapping[str, str]] = {"seed": "give it to reset(seed=...)"}
+    elsewhere: ClassVar[dict[str, str]] = {"seed": "give it to reset(seed=...)"}
     """Names that belong to something else, and where they are said."""
 
     taken_by_make: ClassVar[tuple[str, ...]] = ()

@@ -15,7 +15,6 @@ from npa_envs.envs.core.screen import Screen
 from npa_envs.envs.core.spaces import (
     action_space,
     action_tensor,
-    checked_particles,
     number_tensor,
     observation_space,
     to_output,
@@ -232,9 +231,8 @@ class NPAEnv(gymnasium.Env[Any, Any]):
         """
         if not self._started:
             raise NPAError("particles need a world: call reset first")
-        count, physics = self.config.particle_count, self.worlds.physics
         x, s = (number_tensor(name, value)[None] for name, value in (("x", x), ("s", s)))
-        start = checked_particles(x, s, 1, count, physics, self.task.device)
+        start = self.worlds.checked_particles(x, s, 1, self.config.particle_count)
         with self.worlds.here():
             self.worlds.place(self._world, start)
             observation = self.worlds.perceive()

@@ -9,7 +9,6 @@ import torch
 from gymnasium.spaces import Box
 from torch import Tensor
 
-from npa_envs.envs.core.task import Start
 from npa_envs.errors import NPAError
 from npa_envs.world.actions import Physics
 
@@ -101,41 +100,3 @@ def number_tensor(name: str, value: Any) -> Tensor:
             f"{tensor.device}"
         )
     return tensor
-
-
-def checked_particles(
-    x: Any, s: Any, world_count: int, particle_count: int, physics: Physics, device: torch.device
-) -> Start:
-    """Return particles to be put into worlds, float32 on their device.
-
-    Args:
-        x: Positions [length units], shape [M, N, D].
-        s: States, dimensionless, shape [M, N, C].
-        world_count: Worlds M.
-        particle_count: Particles N.
-        physics: The worlds' constants.
-        device: Where the worlds live.
-
-    Raises:
-        NPAError: A shape is another one, or a number is not finite or beyond its limit.
-    """
-    given = []
-    shapes = (
-        ("x", x, physics.space_dim, physics.position_limit, "position_limit"),
-        ("s", s, physics.state_dim, physics.state_limit, "observation_limit"),
-    )
-    for name, value, width, limit, limit_name in shapes:
-        tensor = number_tensor(name, value).to(device, torch.float32)
-        wanted = (world_count, particle_count, width)
-        if tuple(tensor.shape) != wanted:
-            raise NPAError(
-                f"{name} must have shape {wanted} (worlds, particles, entries), "
-                f"got {tuple(tensor.shape)}: see env.unwrapped.particles()"
-            )
-        if not bool((tensor.abs() <= limit).all()):
-            raise NPAError(
-                f"{name} must be finite and within {limit_name} = {limit:g}, got numbers up to "
-                f"{float(tensor.abs().max())}: clip it, or make the environment with a larger limit"
-            )
-        given.append(tensor)
-    return Start(*given)

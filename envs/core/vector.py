@@ -1,4 +1,4 @@
-"""What environments, batched ones above all, are given when made and reset, checked."""
+"""Many worlds as one Gymnasium vector environment, batched on the device."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from npa_envs.envs.core.screen import Screen
 from npa_envs.envs.core.spaces import (
     action_space,
     action_tensor,
-    checked_particles,
     observation_space,
     to_output,
 )
@@ -36,111 +35,6 @@ AUTORESET_MODES = {
     "disabled": AutoresetMode.DISABLED,
 }
 """What happens to worlds whose episodes are over."""
-
-
-def checked_count(name: str, value: Any) -> int:
-    """Return a number of things, a whole number of at least 1.
-
-    Args:
-        name: What the caller calls it.
-        value: The number.
-
-    Raises:
-        NPAError: It is not.
-    """
-    if isinstance(value, np.integer):
-        value = int(value)
-    if not is_whole(value) or value < 1:
-        raise NPAError(
-            f"{name} must be a whole number of at least 1, got {value!r}: for example {name}=8"
-        )
-    return int(value)
-
-
-def checked_mode(given: str | AutoresetMode) -> AutoresetMode:
-    """Return Gymnasium's mode for a word or for itself.
-
-    Args:
-        given: One of `AUTORESET_MODES`, the value of one of Gymnasium's modes, or such a mode.
-
-    Raises:
-        NPAError: There is no such mode.
-    """
-    if isinstance(given, AutoresetMode):
-        return given
-    by_name = AUTORESET_MODES | {mode.value: mode for mode in AutoresetMode}
-    if not isinstance(given, str) or given not in by_name:
-        raise NPAError(
-            f"autoreset_mode must be a known word, got {given!r}: "
-            f"{suggest(str(given), AUTORESET_MODES)}"
-        )
-    return by_name[given]
-
-
-def worlds_to_reset(options: dict[str, Any] | None, world_count: int) -> NDArray[np.int64]:
-    """Return which worlds `reset` was asked to reset: those of the mask, or all.
-
-    Args:
-        options: What `reset` was given.
-        world_count: Worlds B.
-
-    Raises:
-        NPAError: The mask is no bool array of shape [B], or chooses no world.
-    """
-    options = {} if options is None else options
-    if not isinstance(options, Mapping):
-        raise NPAError(
-            f"options must be a dict or None, got {type(options).__name__}: "
-            "for example options={'reset_mask': mask}"
-        )
-    for name in options:
-        if name != "reset_mask":
-            raise NPAError(f"unknown reset option {name!r}: {suggest(str(name), ['reset_mask'])}")
-    mask = options.get("reset_mask")
-    if mask is None:
-        return np.arange(world_count)
-    given = mask.cpu().numpy() if isinstance(mask, Tensor) else np.asarray(mask)
-    if given.dtype != bool or given.shape != (world_count,):
-        raise NPAError(
-            f"reset_mask must be bool of shape [B] = ({world_count},), got {given.dtype} "
-            f"{given.shape}: True for each world to reset"
-        )
-    if not given.any():
-        raise NPAError("reset_mask must choose at least one world, got none: skip the reset")
-    return np.flatnonzero(given)
-
-
-def world_keys(
-    seed: int | Sequence[int] | None, world_count: int, np_random: np.random.Generator
-) -> Tensor:
-    """Return the key of each world's randomness, int64, shape [B].
-
-    Args:
-        seed: Seed of the first world, each of the others has one more; or a seed for each; None
-            draws the keys.
-        world_count: Worlds B.
-        np_random: What keys are drawn from.
-
-    Raises:
-        NPAError: Another number of seeds than of worlds, or a seed is negative.
-    """
-    if seed is None:
-        drawn = np_random.integers(2**64, size=world_count, dtype=np.uint64)
-        return torch.from_numpy(drawn.view(np.int64))
-    if isinstance(seed, int | np.integer):
-        seed = [int(seed) + k for k in range(world_count)]
-    cure = f"one whole number, or one for each of {world_count} worlds: give seed=0"
-    try:
-        seeds = [operator.index(number) for number in seed]
-    except TypeError as error:
-        raise NPAError(f"seed must be {cure}, got {seed!r}") from error
-    if len(seeds) != world_count:
-        raise NPAError(f"seed must be {cure}, got {len(seeds)}")
-    return WorldRandom(seeds).keys
-
-
-# Many worlds as one Gymnasium vector environment, batched on the device.
-
 
 REASONS = np.array([reason(ending) for ending in range(2 * TIME_LIMIT)], dtype=object)
 """Why an episode ended, in words, for each combination of endings."""
@@ -353,8 +247,8 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
                 f"worlds must be indices below {self.num_envs}, got {chosen.tolist()}: "
                 "for example worlds=[0, 2]"
             )
-        count, physics = self.config.particle_count, self.worlds.physics
-        start = checked_particles(x, s, len(chosen), count, physics, device)
+        count = self.config.particle_count
+        start = self.worlds.checked_particles(x, s, len(chosen), count)
         with self.worlds.here():
             self.worlds.place(chosen, start)
             observation = self.worlds.perceive(self._buffer)
@@ -410,3 +304,107 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
 
     def _show(self) -> None:
         self._screen.show(self.spec.id if self.spec is not None else type(self).__name__)
+
+
+# Arguments of environments that are no fields of a configuration, checked.
+
+
+def checked_count(name: str, value: Any) -> int:
+    """Return a number of things, a whole number of at least 1.
+
+    Args:
+        name: What the caller calls it.
+        value: The number.
+
+    Raises:
+        NPAError: It is not.
+    """
+    if isinstance(value, np.integer):
+        value = int(value)
+    if not is_whole(value) or value < 1:
+        raise NPAError(
+            f"{name} must be a whole number of at least 1, got {value!r}: for example {name}=8"
+        )
+    return int(value)
+
+
+def checked_mode(given: str | AutoresetMode) -> AutoresetMode:
+    """Return Gymnasium's mode for a word or for itself.
+
+    Args:
+        given: One of `AUTORESET_MODES`, the value of one of Gymnasium's modes, or such a mode.
+
+    Raises:
+        NPAError: There is no such mode.
+    """
+    if isinstance(given, AutoresetMode):
+        return given
+    by_name = AUTORESET_MODES | {mode.value: mode for mode in AutoresetMode}
+    if not isinstance(given, str) or given not in by_name:
+        raise NPAError(
+            f"autoreset_mode must be a known word, got {given!r}: "
+            f"{suggest(str(given), AUTORESET_MODES)}"
+        )
+    return by_name[given]
+
+
+def worlds_to_reset(options: dict[str, Any] | None, world_count: int) -> NDArray[np.int64]:
+    """Return which worlds `reset` was asked to reset: those of the mask, or all.
+
+    Args:
+        options: What `reset` was given.
+        world_count: Worlds B.
+
+    Raises:
+        NPAError: The mask is no bool array of shape [B], or chooses no world.
+    """
+    options = {} if options is None else options
+    if not isinstance(options, Mapping):
+        raise NPAError(
+            f"options must be a dict or None, got {type(options).__name__}: "
+            "for example options={'reset_mask': mask}"
+        )
+    for name in options:
+        if name != "reset_mask":
+            raise NPAError(f"unknown reset option {name!r}: {suggest(str(name), ['reset_mask'])}")
+    mask = options.get("reset_mask")
+    if mask is None:
+        return np.arange(world_count)
+    given = mask.cpu().numpy() if isinstance(mask, Tensor) else np.asarray(mask)
+    if given.dtype != bool or given.shape != (world_count,):
+        raise NPAError(
+            f"reset_mask must be bool of shape [B] = ({world_count},), got {given.dtype} "
+            f"{given.shape}: True for each world to reset"
+        )
+    if not given.any():
+        raise NPAError("reset_mask must choose at least one world, got none: skip the reset")
+    return np.flatnonzero(given)
+
+
+def world_keys(
+    seed: int | Sequence[int] | None, world_count: int, np_random: np.random.Generator
+) -> Tensor:
+    """Return the key of each world's randomness, int64, shape [B].
+
+    Args:
+        seed: Seed of the first world, each of the others has one more; or a seed for each; None
+            draws the keys.
+        world_count: Worlds B.
+        np_random: What keys are drawn from.
+
+    Raises:
+        NPAError: Another number of seeds than of worlds, or a seed is negative.
+    """
+    if seed is None:
+        drawn = np_random.integers(2**64, size=world_count, dtype=np.uint64)
+        return torch.from_numpy(drawn.view(np.int64))
+    if isinstance(seed, int | np.integer):
+        seed = [int(seed) + k for k in range(world_count)]
+    cure = f"one whole number, or one for each of {world_count} worlds: give seed=0"
+    try:
+        seeds = [operator.index(number) for number in seed]
+    except TypeError as error:
+        raise NPAError(f"seed must be {cure}, got {seed!r}") from error
+    if len(seeds) != world_count:
+        raise NPAError(f"seed must be {cure}, got {len(seeds)}")
+    return WorldRandom(seeds).keys

@@ -18,8 +18,9 @@ from torch import Tensor
 
 from npa_envs.envs.core.config import EnvConfig, WorldConfig
 from npa_envs.envs.core.memory import check_memory
+from npa_envs.envs.core.spaces import number_tensor
 from npa_envs.envs.core.task import EnvTask, Start, WorldTask
-from npa_envs.errors import DivergedError
+from npa_envs.errors import DivergedError, NPAError
 from npa_envs.world.actions import Actions, Physics, SurveyedWorlds, survey_worlds
 from npa_envs.world.cuda_graph import Beside, Replayed, WeakFunction, sent
 from npa_envs.world.divergence import LARGEST_REPORT, term_name
@@ -116,6 +117,39 @@ class Batch:
         random = self.random.take(worlds)
         random.restart()
         return random
+
+    def checked_particles(self, x: Any, s: Any, world_count: int, particle_count: int) -> Start:
+        """Return particles to be put into some worlds, float32 on the device.
+
+        Args:
+            x: Positions [length units], shape [M, N, D].
+            s: States, dimensionless, shape [M, N, C].
+            world_count: Worlds M.
+            particle_count: Particles N.
+
+        Raises:
+            NPAError: A shape is another one, or a number is not finite or beyond its limit.
+        """
+        given, physics = [], self.physics
+        for name, value, width, limit, limit_name in (
+            ("x", x, physics.space_dim, physics.position_limit, "position_limit"),
+            ("s", s, physics.state_dim, physics.state_limit, "observation_limit"),
+        ):
+            tensor = number_tensor(name, value).to(self.device, torch.float32)
+            wanted = (world_count, particle_count, width)
+            if tuple(tensor.shape) != wanted:
+                raise NPAError(
+                    f"{name} must have shape {wanted} (worlds, particles, entries), "
+                    f"got {tuple(tensor.shape)}: see env.unwrapped.particles()"
+                )
+            if not bool((tensor.abs() <= limit).all()):
+                raise NPAError(
+                    f"{name} must be finite and within {limit_name} = {limit:g}, got numbers up to "
+                    f"{float(tensor.abs().max())}: clip it, or make the environment with a larger "
+                    "limit"
+                )
+            given.append(tensor)
+        return Start(*given)
 
     def here(self) -> contextlib.AbstractContextManager[Any]:
         """Return a context in which the worlds' device is the current one."""

@@ -1,4 +1,4 @@
-"""How well species are mixed around every particle."""
+"""`npa/Mixing-v0` and `npa/Segregation-v0`: species that start apart mix, or mixed ones part."""
 
 from __future__ import annotations
 
@@ -11,6 +11,48 @@ from torch import Tensor
 
 from npa_envs import perceive, world_mean
 from npa_envs.envs.multi.task import Population, SpeciesConfig, SpeciesTask, by_species
+
+
+class MixingTask(SpeciesTask):
+    """Every particle is to see all species in equal parts: its loss is 1 less the local entropy."""
+
+    def losses(self, population: Population) -> Mapping[str, Tensor]:
+        """Return the mean of each species' particle losses."""
+        return {
+            name: by_species(
+                [
+                    world_mean(loss[:, span, None])[:, 0]
+                    for span in population.spans
+                    if span.stop > span.start
+                ],
+                population,
+            )
+            for name, loss in self.particle_losses(population).items()
+        }
+
+    def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
+        """Return 1 less the entropy of species around each particle."""
+        return {"separation": 1.0 - self._entropy(population)}
+
+    def _entropy(self, population: Population) -> Tensor:
+        return local_entropy(population, eps=self.config.eps, box=self.config.box)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SegregationConfig(SpeciesConfig):
+    """As elsewhere, but species start in one disk."""
+
+    seed_distance: float = 0.0
+
+
+class SegregationTask(MixingTask):
+    """Every particle is to see its own species alone: its loss is the local entropy."""
+
+    config_type = SegregationConfig
+
+    def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
+        """Return the entropy of species around each particle."""
+        return {"mixture": self._entropy(population)}
 
 
 def local_entropy(population: Population, *, eps: float, box: float | None) -> Tensor:
@@ -45,52 +87,3 @@ def local_entropy(population: Population, *, eps: float, box: float | None) -> T
     terms = torch.where(there, torch.special.entr(torch.where(there, shares, 1.0)), 0.0)
     entropy: Tensor = terms.sum(dim=2)
     return entropy / math.log(species_count)
-
-
-# `npa/Mixing-v0`: species that start side by side are to mix.
-
-
-class MixingTask(SpeciesTask):
-    """Every particle is to see all species in equal parts: its loss is 1 less the local entropy."""
-
-    def losses(self, population: Population) -> Mapping[str, Tensor]:
-        """Return the mean of each species' particle losses."""
-        return {
-            name: by_species(
-                [
-                    world_mean(loss[:, span, None])[:, 0]
-                    for span in population.spans
-                    if span.stop > span.start
-                ],
-                population,
-            )
-            for name, loss in self.particle_losses(population).items()
-        }
-
-    def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
-        """Return 1 less the entropy of species around each particle."""
-        return {"separation": 1.0 - self._entropy(population)}
-
-    def _entropy(self, population: Population) -> Tensor:
-        return local_entropy(population, eps=self.config.eps, box=self.config.box)
-
-
-# `npa/Segregation-v0`: species that start all mixed are to part.
-
-
-@dataclass(frozen=True, kw_only=True)
-class SegregationConfig(SpeciesConfig):
-    """What segregation can be told besides: nothing, but species start in one disk."""
-
-    seed_distance: float = 0.0
-    """Distance between the centres of neighbouring disks, which lie in a row [length units]."""
-
-
-class SegregationTask(MixingTask):
-    """Every particle is to see its own species alone: its loss is the local entropy."""
-
-    config_type = SegregationConfig
-
-    def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
-        """Return the entropy of species around each particle."""
-        return {"mixture": self._entropy(population)}
