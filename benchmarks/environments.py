@@ -67,132 +67,101 @@ CALM = 0.25
 ACTION_SETS = 4
 CALM_STEPS, COMPARISONS = 16, 9
 """Steps without resets that are timed with and without Python, and how often."""
-ENOUGH_SECONDS = 2.0
+ENOUGH = 2.0
+"""Seconds of a case's episodes that are enough."""
 MAX_EPISODES = 9
 LISTED_KERNELS = 12
 
 
-def python_times(env: Any, actions: list[Any], device: torch.device) -> tuple[float, float]:
-    """Return the times of a step [s] as it is, and where the host only queues the device's work.
+class Prepared:
+    """An environment of a case and random actions, compiled and captured, ready to be timed."""
 
-    Both are medians over the same steps, from the same worlds, without resets; the second neither
-    reads endings nor makes infos. What the first takes longer is what Python costs.
-    """
-    worlds = env.unwrapped.worlds
-    changing = (worlds.x, worlds.s, worlds.random.steps, worlds.elapsed)
-    before = [tensor.clone() for tensor in changing]
-    out = worlds.perceive()
+    def __init__(
+        self, case: Case, start: str, staggered: bool, device: torch.device, quick: bool
+    ) -> None:
+        gc.collect()
+        synchronize(device)
+        if device.type == "cuda":
+            torch.cuda.empty_cache()
+            torch.cuda.reset_peak_memory_stats(device)
+        name, keywords = STARTS[start]
+        if start == "grown":
+            keywords = keywords | {"seed_pool": min(case.world_count, 4)}
+            keywords["grow_steps"] = 4 if quick else 256
+        self.env: Any = gymnasium.make_vec(
+            name,
+            num_envs=case.world_count,
+            vectorization_mode="vector_entry_point",
+            particle_count=case.particle_count,
+            eps=case.eps,
+            max_episode_steps=EPISODE_STEPS,
+            device=str(device),
+            output="torch" if device.type == "cuda" else "numpy",
+            **keywords,
+        )
+        self.env.reset(seed=0)
+        self.device, worlds = device, self.env.unwrapped.worlds
+        if staggered:
+            ages = torch.arange(case.world_count, device=device) * EPISODE_STEPS
+            worlds.elapsed.copy_(ages // case.world_count)
+        generator = torch.Generator(device).manual_seed(0)
+        shape = (ACTION_SETS, case.world_count, case.particle_count, worlds.physics.action_dim)
+        drawn = torch.rand(shape, generator=generator, device=device)
+        sets = list(CALM * (2.0 * drawn - 1.0))
+        cuda = device.type == "cuda"
+        self.actions: list[Any] = sets if cuda else [actions.numpy() for actions in sets]
+        # The first episode compiles and captures; the second does what only follows a reset.
+        self.run(2 * EPISODE_STEPS)
 
-    def queue(action: Any) -> None:
-        worlds.queue(action, out)
+    def run(self, steps: int, step: Callable[[Any], Any] | None = None) -> float:
+        """Return the wall time of some steps [s], of the environment or of another function."""
+        step = step or self.env.step
+        synchronize(self.device)
+        start = time.perf_counter()
+        for k in range(steps):
+            step(self.actions[k % len(self.actions)])
+        synchronize(self.device)
+        return time.perf_counter() - start
 
-    times: dict[Callable[[Any], Any], list[float]] = {env.step: [], queue: []}
-    for _ in range(COMPARISONS):
-        for run, taken in times.items():
-            for tensor, value in zip(changing, before, strict=True):
-                tensor.copy_(value)
-            synchronize(device)
-            start = time.perf_counter()
-            for k in range(CALM_STEPS):
-                run(actions[k % len(actions)])
-            synchronize(device)
-            taken.append((time.perf_counter() - start) / CALM_STEPS)
-    calm, queued = (statistics.median(taken) for taken in times.values())
-    return calm, queued
+    def episodes(self, quick: bool) -> list[float]:
+        """Return the times of several episodes [s], enough of them for a median."""
+        times = [self.run(EPISODE_STEPS)]
+        while not quick and len(times) < MAX_EPISODES and (len(times) < 3 or sum(times) < ENOUGH):
+            times.append(self.run(EPISODE_STEPS))
+        return times
 
+    def neighbours(self) -> float:
+        """Return the mean number of particles within eps of one, in the first world."""
+        x, eps = self.env.unwrapped.particles()[0][0], self.env.unwrapped.config.eps
+        return float((torch.cdist(x[:256], x) < eps).sum(dim=1).float().mean())
 
-def make(case: Case, start: str, device: torch.device, quick: bool) -> Any:
-    """Return the environment of a case."""
-    name, keywords = STARTS[start]
-    if start == "grown":
-        keywords = keywords | {"seed_pool": min(case.world_count, 4)}
-        keywords["grow_steps"] = 4 if quick else 256
-    return gymnasium.make_vec(
-        name,
-        num_envs=case.world_count,
-        vectorization_mode="vector_entry_point",
-        particle_count=case.particle_count,
-        eps=case.eps,
-        max_episode_steps=EPISODE_STEPS,
-        device=str(device),
-        output="torch" if device.type == "cuda" else "numpy",
-        **keywords,
-    )
+    def python_times(self) -> tuple[float, float]:
+        """Return the times of a step [s] as it is, and where the host only queues the work.
 
-
-def random_actions(env: Any, device: torch.device) -> list[Any]:
-    """Return some sets of actions, where and as the environment takes them."""
-    config, physics = env.unwrapped.config, env.unwrapped.worlds.physics
-    generator = torch.Generator(device).manual_seed(0)
-    shape = (env.num_envs, config.particle_count, physics.action_dim)
-    drawn = torch.rand((ACTION_SETS, *shape), generator=generator, device=device)
-    sets = list(CALM * (2.0 * drawn - 1.0))
-    return sets if config.output == "torch" else [actions.numpy() for actions in sets]
-
-
-def run_steps(env: Any, actions: list[Any], device: torch.device, steps: int) -> float:
-    """Return the wall time of some steps, in seconds."""
-    synchronize(device)
-    start = time.perf_counter()
-    for k in range(steps):
-        env.step(actions[k % len(actions)])
-    synchronize(device)
-    return time.perf_counter() - start
-
-
-def timed_episodes(run: Callable[[int], float], quick: bool) -> list[float]:
-    """Return the times of several episodes, enough of them for a median."""
-    times = [run(EPISODE_STEPS)]
-    while (
-        not quick and len(times) < MAX_EPISODES and (len(times) < 3 or sum(times) < ENOUGH_SECONDS)
-    ):
-        times.append(run(EPISODE_STEPS))
-    return times
-
-
-def neighbour_count(env: Any) -> float:
-    """Return the mean number of particles within eps of one, in the first world."""
-    x = env.unwrapped.particles()[0][0]
-    return float((torch.cdist(x[:256], x) < env.unwrapped.config.eps).sum(dim=1).float().mean())
-
-
-class Prepared(NamedTuple):
-    """A case whose kernels are compiled and captured."""
-
-    env: Any
-    run: Callable[[int], float]
-    """Takes so many steps and returns their wall time in seconds."""
-
-
-def prepare(case: Case, start: str, staggered: bool, device: torch.device, quick: bool) -> Prepared:
-    """Return a case that is ready to be timed."""
-    gc.collect()
-    synchronize(device)
-    if device.type == "cuda":
-        torch.cuda.empty_cache()
-        torch.cuda.reset_peak_memory_stats(device)
-    env = make(case, start, device, quick)
-    env.reset(seed=0)
-    if staggered:
-        ages = torch.arange(case.world_count, device=device) * EPISODE_STEPS // case.world_count
-        env.unwrapped.worlds.elapsed.copy_(ages)
-    actions = random_actions(env, device)
-
-    def run(steps: int) -> float:
-        return run_steps(env, actions, device, steps)
-
-    # The first episode compiles and captures; the second does what only follows a reset.
-    run(2 * EPISODE_STEPS)
-    return Prepared(env, run)
+        Both are medians over the same steps, from the same worlds, without resets; the second
+        neither reads endings nor makes infos. What the first takes longer is what Python costs.
+        """
+        worlds = self.env.unwrapped.worlds
+        changing = (worlds.x, worlds.s, worlds.random.steps, worlds.elapsed)
+        before = [tensor.clone() for tensor in changing]
+        out = worlds.perceive()
+        calm: list[float] = []
+        queued: list[float] = []
+        for _ in range(COMPARISONS):
+            for step, times in ((None, calm), (lambda a: worlds.queue(a, out), queued)):
+                for tensor, value in zip(changing, before, strict=True):
+                    tensor.copy_(value)
+                times.append(self.run(CALM_STEPS, step) / CALM_STEPS)
+        return statistics.median(calm), statistics.median(queued)
 
 
 def measure(
     case: Case, start: str, staggered: bool, device: torch.device, quick: bool
 ) -> dict[str, Any]:
     """Return the row of one case."""
-    env, run = prepare(case, start, staggered, device, quick)
+    prepared = Prepared(case, start, staggered, device, quick)
     scale, cuda = 1e6 / EPISODE_STEPS, device.type == "cuda"
-    times = timed_episodes(run, quick)
+    times = prepared.episodes(quick)
     wall = statistics.median(times) * scale
     row = {
         **case._asdict(),
@@ -206,12 +175,12 @@ def measure(
         row["peak_allocated_mib"] = torch.cuda.max_memory_allocated(device) / 2**20
         row["peak_reserved_mib"] = torch.cuda.max_memory_reserved(device) / 2**20
     # Half-way through an episode worlds are as they typically are.
-    run(EPISODE_STEPS // 2)
-    row["neighbours"] = neighbour_count(env)
+    prepared.run(EPISODE_STEPS // 2)
+    row["neighbours"] = prepared.neighbours()
     if cuda and not staggered:
-        calm, queued = python_times(env, random_actions(env, device), device)
+        calm, queued = prepared.python_times()
         row["calm_step_us"], row["queued_us"] = calm * 1e6, queued * 1e6
-    env.close()
+    prepared.env.close()
     return row
 
 
@@ -222,12 +191,12 @@ def add_kernels(row: dict[str, Any], device: torch.device, quick: bool) -> None:
     was once at work may slow down.
     """
     case = Case(*(row[name] for name in Case._fields))
-    env, run = prepare(case, row["start"], row["resets"] == "staggered", device, quick)
+    prepared = Prepared(case, row["start"], row["resets"] == "staggered", device, quick)
     cuda = device.type == "cuda"
     kind = DeviceType.CUDA if cuda else DeviceType.CPU
     with profile(activities=[ProfilerActivity.CUDA if cuda else ProfilerActivity.CPU]) as profiler:
-        run(EPISODE_STEPS)
-    env.close()
+        prepared.run(EPISODE_STEPS)
+    prepared.env.close()
     kernels = [
         {
             "name": entry.key,

@@ -18,18 +18,13 @@ from npa_envs.errors import NPAError, suggest
 
 
 class Sizes(NamedTuple):
-    """A problem, and how it is made small."""
+    """A problem: its environment and keywords, episode, hidden layer, and what makes it quick."""
 
     env_id: str
-    """Id of the environment."""
     keywords: Mapping[str, Any]
-    """What it is told."""
     episode_steps: int
-    """Length of an episode."""
     hidden_dim: int
-    """Width of the rules' hidden layer."""
     quick: Mapping[str, Any]
-    """Keywords of a quick one."""
 
 
 GROWTH = {
@@ -120,14 +115,12 @@ AXES: tuple[Axis, ...] = get_args(Axis)
 
 @dataclass(frozen=True)
 class Job:
-    """One run: a method on a task, from a seed, within a budget along one axis."""
+    """One run: a method of `npa_envs.agents.learning` on a task of `PROBLEMS`, from a seed."""
 
     axis: Axis
     """What its budget is counted in."""
     task: str
-    """Name of the task, from `npa_envs.agents.comparison.plan.PROBLEMS`."""
     method: str
-    """Name of the method, from `npa_envs.agents.learning.METHODS`."""
     seed: int
     """Of the rule's first weights, of training's worlds and of everything that is drawn."""
 
@@ -147,9 +140,7 @@ class Plan:
     tasks: Mapping[str, Mapping[str, Any]]
     """Problems as JSON (`Problem.to_json`), by their names."""
     methods: Sequence[str]
-    """Methods."""
     seeds: Sequence[int]
-    """Seeds."""
     budgets: Mapping[Axis, float]
     """Seconds or particle-steps that each run may take, by axis."""
     options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)

@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from npa_envs.agents.comparison.plan import Job, Plan
-from npa_envs.agents.comparison.run import OUTPUT, REQUEST, RunRecord
+from npa_envs.agents.comparison.run import OUTPUT, REQUEST, Request, RunRecord
 from npa_envs.measure.record import time_limit, write_record
 
 PROGRAM = (sys.executable, "-m", "npa_envs.agents.comparison.run")
@@ -157,13 +157,8 @@ def _start(plan: Plan, job: Job, folder: Path, places: Places, command: str) -> 
     target = folder / job.folder
     part = target.parent / f".{target.name}.{secrets.token_hex(4)}"
     part.mkdir(parents=True)
-    request = {
-        "job": asdict(job),
-        "facts": plan.facts(job),
-        "threads": places.threads,
-        "command": command,
-    }
-    write_record(part / REQUEST, request)
+    request = Request(job, plan.facts(job), places.threads, command)
+    write_record(part / REQUEST, asdict(request))
     environment = os.environ | {"OMP_NUM_THREADS": str(places.threads)}
     with (part / OUTPUT).open("wb") as output:
         process = subprocess.Popen(
@@ -179,20 +174,13 @@ def _start(plan: Plan, job: Job, folder: Path, places: Places, command: str) -> 
 def _finish(plan: Plan, one: _Process, folder: Path, command: str) -> RunRecord:
     """Put the results of a process that is over into their place, and return its record."""
     one.process.communicate()
-    facts = plan.facts(one.job)
-    record = RunRecord.read(one.folder, facts)
+    request = Request(one.job, plan.facts(one.job), command=command)
+    record = RunRecord.read(one.folder, request.facts)
     if record is None:
         code = one.process.returncode
         told = (one.folder / OUTPUT).read_text("utf-8", errors="replace").strip()[-TOLD:]
-        record = RunRecord(
-            job=one.job,
-            facts=facts,
-            status="failed",
-            error=f"its process ended with code {code}: {' '.join(told.split())}",
-            seconds=time.perf_counter() - one.begin,
-            command=command,
-            date=time.strftime("%Y-%m-%d"),
-        )
+        error = f"its process ended with code {code}: {' '.join(told.split())}"
+        record = request.record("failed", one.begin, error=error)
         record.write(one.folder)
     (one.folder / REQUEST).unlink(missing_ok=True)
     target = folder / one.job.folder

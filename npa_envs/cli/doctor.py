@@ -54,9 +54,7 @@ class Finding:
     """One line of the report."""
 
     subject: str
-    """What was looked at."""
     text: str
-    """What was found."""
     cure: str | None = None
     """What to do about it; None where all is well."""
 

@@ -85,28 +85,24 @@ class InteractionSettings:
 
 @dataclass(frozen=True)
 class InteractionRow:
-    """One rule, grown beside another."""
+    """One rule A, grown beside another one, B; figures are means of the worlds.
+
+    `alone` and `together` are A's task metric of its own particles where it grows alone and beside
+    B; `change` is together / alone, `mixing` the `mixing_index` at the end, `displacement` how far
+    A's centroid ends from where it ends alone [length units]. `distance` is between the centres of
+    their seeds [length units], `ratio` A's share of the particles.
+    """
 
     rule: str
-    """The rule that is measured, A."""
     beside: str
-    """The rule beside it, B."""
     distance: float
-    """Distance between the centres of their seeds [length units]."""
     ratio: float
-    """A's share of the particles (dimensionless)."""
     alone: float
-    """A's task metric where it grows alone, mean of the worlds."""
     together: float
-    """A's task metric of its own particles where it grows beside B, mean of the worlds."""
     change: float
-    """together / alone (dimensionless)."""
     mixing: float
-    """`mixing_index` at the end, mean of the worlds (dimensionless)."""
     displacement: float
-    """How far A's centroid ends from where it ends alone, mean of the worlds [length units]."""
     verdict: str
-    """`verdict` of `change` and `mixing`."""
 
 
 def verdict(change: float, mixing: float, margin: float = MARGIN) -> str:
@@ -176,21 +172,17 @@ class Organism:
 
 @dataclass
 class Scenes:
-    """Pictures of the first world of each encounter."""
+    """Pictures of the first worlds, uint8, [R, R, 3]: `len(FRAME_SHARES)` of each encounter."""
 
     frames: list[NDArray[np.uint8]] = field(default_factory=list)
-    """Pictures, uint8, shape [R, R, 3] each; `len(FRAME_SHARES)` of each encounter."""
     captions: list[str] = field(default_factory=list)
-    """One for each frame."""
 
 
 class _Solo(NamedTuple):
-    """A rule grown alone."""
+    """A rule grown alone: its metric [B], infinite where lost, and where it ends [B, 2]."""
 
     losses: Tensor
-    """Its metric, shape [B]; infinite where a world blew up."""
     centroids: Tensor
-    """Where it ends [length units], shape [B, 2]."""
 
 
 class Encounters:

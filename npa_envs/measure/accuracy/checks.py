@@ -85,14 +85,14 @@ class Session:
 
 @dataclass(frozen=True)
 class Check:
-    """A hard case."""
+    """A hard case GROUP/CASE, what is expected in a sentence, and what measures it.
+
+    `run` raises `Skipped` where there is nothing to measure.
+    """
 
     name: str
-    """What it is called, GROUP/CASE or longer."""
     expected: str
-    """What is expected, a sentence."""
     run: Callable[[Session], Finding]
-    """Measures it. Raises `Skipped` where there is nothing to measure."""
 
     @property
     def group(self) -> str:

@@ -47,18 +47,14 @@ CHUNK = 50
 
 @dataclass(frozen=True)
 class Habitat:
-    """A rule in worlds of its task."""
+    """A float32 rule, its seeds x [B, N, D], s [B, N, C], and its horizon in steps."""
 
     rule: NPARule
-    """The rule, float32."""
     task: Task
     """What its worlds are for: radius, box, probability of updates, loss and metric."""
     x: Tensor
-    """Positions of the seeds [length units], shape [B, N, D]."""
     s: Tensor
-    """States of the seeds, shape [B, N, C]."""
     horizon: int
-    """Steps after which the rule is judged."""
 
     def options(self, **changed: Any) -> dict[str, Any]:
         """Return what `rollout` is given: as trained, but for what is changed."""

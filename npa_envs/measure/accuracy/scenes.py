@@ -70,14 +70,6 @@ def _direction(space_dim: int) -> Tensor:
     return slanted.double()
 
 
-def _one(space_dim: int, generator: torch.Generator) -> Tensor:
-    return _uniform(space_dim, generator, 1)
-
-
-def _coincident(space_dim: int, generator: torch.Generator) -> Tensor:
-    return _uniform(space_dim, generator, 1).expand(1, 48, space_dim)
-
-
 def _touching(space_dim: int, generator: torch.Generator) -> Tensor:
     """A pair in each world."""
     distances = torch.tensor([1e-12, 1e-9, 1e-6, 1e-3, 0.5], dtype=torch.float64)
@@ -110,20 +102,6 @@ def _coplanar(space_dim: int, generator: torch.Generator) -> Tensor:
     return flat
 
 
-def _lattice(space_dim: int, generator: torch.Generator) -> Tensor:
-    axis = (torch.arange(5) - 2) * (EPS / 2.0)
-    return torch.cartesian_prod(*(axis,) * space_dim)[None]
-
-
-def _cell_borders(space_dim: int, generator: torch.Generator) -> Tensor:
-    steps = torch.randint(-4, 4, (1, 60, space_dim), generator=generator)
-    return steps * (EPS / 2.0)
-
-
-def _clump(space_dim: int, generator: torch.Generator) -> Tensor:
-    return 0.03 + _uniform(space_dim, generator, 100, EPS / 4.0)
-
-
 def _seam(space_dim: int, generator: torch.Generator) -> Tensor:
     x = _uniform(space_dim, generator, 60, 0.3)
     edges = torch.tensor([-0.5, 0.5, 0.5 - 2.0**-24, -0.5 + 2.0**-24, 0.5 + 2.0**-10])
@@ -148,15 +126,27 @@ def _far(space_dim: int, generator: torch.Generator) -> Tensor:
 
 
 PLACES: dict[str, tuple[str, Callable[[int, torch.Generator], Tensor]]] = {
-    "one": ("a single particle", _one),
-    "coincident": ("48 particles in one place", _coincident),
+    "one": ("a single particle", lambda d, draws: _uniform(d, draws, 1)),
+    "coincident": (
+        "48 particles in one place",
+        lambda d, draws: _uniform(d, draws, 1).expand(1, 48, d),
+    ),
     "touching": ("pairs from 1e-12 length units to ε/2 apart", _touching),
     "at_eps": ("pairs at ε, and at ε (1 ± 2⁻²⁰)", _at_eps),
     "collinear": ("particles on a line, straight and slanted", _collinear),
     "coplanar": ("particles on a plane", _coplanar),
-    "lattice": ("a lattice of ε/2: neighbours at ε exactly", _lattice),
-    "cell_borders": ("particles on the borders of cells", _cell_borders),
-    "clump": ("100 particles in one cell", _clump),
+    "lattice": (
+        "a lattice of ε/2: neighbours at ε exactly",
+        lambda d, draws: torch.cartesian_prod(*((torch.arange(5) - 2) * (EPS / 2.0),) * d)[None],
+    ),
+    "cell_borders": (
+        "particles on the borders of cells",
+        lambda d, draws: torch.randint(-4, 4, (1, 60, d), generator=draws) * (EPS / 2.0),
+    ),
+    "clump": (
+        "100 particles in one cell",
+        lambda d, draws: 0.03 + _uniform(d, draws, 100, EPS / 4.0),
+    ),
     "far": ("crowds at 0, 1e3, 1e6, -1e30 and 3e38", _far),
     "seam": ("particles on both sides of the box's seam and on it", _seam),
     "tight_box": ("particles in a box of exactly 2 ε", _tight_box),

@@ -59,22 +59,12 @@ def two_blobs(particle_count: int, space_dim: int, radius: float, random: WorldR
     return x + shift
 
 
-def larger(particle_count: int, space_dim: int, radius: float, random: WorldRandom) -> Tensor:
-    """Return a disk, a ball in 3D, of `SIZE_FACTOR` times the radius."""
-    return disk(particle_count, space_dim, SIZE_FACTOR * radius, random)
-
-
-def smaller(particle_count: int, space_dim: int, radius: float, random: WorldRandom) -> Tensor:
-    """Return a disk, a ball in 3D, whose radius is divided by `SIZE_FACTOR`."""
-    return disk(particle_count, space_dim, radius / SIZE_FACTOR, random)
-
-
 SHAPES: dict[str, Shape] = {
     "ring": ring,
     "square": square,
     "two blobs": two_blobs,
-    "larger": larger,
-    "smaller": smaller,
+    "larger": lambda n, d, radius, random: disk(n, d, SIZE_FACTOR * radius, random),
+    "smaller": lambda n, d, radius, random: disk(n, d, radius / SIZE_FACTOR, random),
 }
 """Every other shape by its name."""
 

@@ -133,12 +133,10 @@ AFTERWARDS, OTHERWISE = 1001, 1002
 
 @dataclass(frozen=True)
 class Course:
-    """The losses of all seeds after one damage."""
+    """The losses of all seeds at some numbers of steps after one damage."""
 
     damage: str
-    """What was done."""
     steps: tuple[int, ...]
-    """Steps since, increasing."""
     losses: tuple[tuple[float, ...], ...]
     """Loss of each seed at each of `steps`; NaN where a world is not finite."""
     twins: tuple[tuple[float, ...], ...]

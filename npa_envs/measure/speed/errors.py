@@ -74,9 +74,7 @@ def perception_rows(session: Session, workload: Workload) -> list[PerceptionRow]
             name = precision.name
             rows += session.attempt(
                 f"{strategy.name} in {name}, {workload.name}",
-                partial(
-                    _perception_row, session, workload, strategy, name, places, states, exact=exact
-                ),
+                partial(_perception_row, session, workload, strategy, name, places, states, exact),
             )
     return rows
 
@@ -109,48 +107,42 @@ def _perception_row(
     precision: str,
     x: Tensor,
     s: Tensor,
-    *,
     exact: Perceived,
 ) -> PerceptionRow:
-    eps = workload.eps
+    eps, graph = workload.eps, strategy.capturable
     found = perceived(strategy, x, s, eps)
-    graph = strategy.capturable
     costs = [session.cost(lambda: strategy.perceive(x, s, eps), graph=graph)]
-    if strategy.differentiable:
+    cotangent = None
+    if found.cotangent is not None and exact.cotangent is not None:
         weights = functional_weights(found.perception)
         costs.append(session.cost(lambda: _cotangent(strategy, x, s, eps, weights), graph=graph))
-    peaks = [cost.peak_mib for cost in costs if cost.peak_mib is not None]
-    _, smoothed, state_gradient, density_gradient = group_errors(
-        found.perception, exact.perception, workload.space_dim, workload.state_dim
-    )
+        cotangent = relative_error(found.cotangent, exact.cotangent)
+    # States, smoothed states, state gradients, the density gradient.
+    state_dim, space_dim = workload.state_dim, workload.space_dim
+    widths = [state_dim, state_dim, state_dim * space_dim, space_dim]
+    groups = (torch.split(z, widths, -1) for z in (found.perception, exact.perception))
+    _, smoothed, *gradients = (relative_error(a, b) for a, b in zip(*groups, strict=True))
     return PerceptionRow(
         strategy=strategy.name,
         precision=precision,
-        space_dim=workload.space_dim,
+        space_dim=space_dim,
         worlds=workload.world_count,
         particles=workload.particle_count,
         forward_us=costs[0].time,
-        gradient_us=costs[1].time if strategy.differentiable else None,
-        peak_mib=max(peaks, default=None),
+        gradient_us=costs[1].time if len(costs) > 1 else None,
+        peak_mib=peak_of(costs),
         density=relative_error(found.density, exact.density),
         smoothed=smoothed,
-        state_gradient=state_gradient,
-        density_gradient=density_gradient,
+        state_gradient=gradients[0],
+        density_gradient=gradients[1],
         perception=relative_error(found.perception, exact.perception),
-        cotangent=None
-        if found.cotangent is None or exact.cotangent is None
-        else relative_error(found.cotangent, exact.cotangent),
+        cotangent=cotangent,
     )
 
 
-def group_errors(z: Tensor, exact: Tensor, space_dim: int, state_dim: int) -> list[float]:
-    """Return the relative errors of the four groups of perception vectors, [B, N, P].
-
-    They are states, smoothed states, state gradients and the density gradient.
-    """
-    widths = [state_dim, state_dim, state_dim * space_dim, space_dim]
-    pairs = zip(torch.split(z, widths, -1), torch.split(exact, widths, -1), strict=True)
-    return [relative_error(group, expected) for group, expected in pairs]
+def peak_of(costs: Iterable[Cost]) -> float | None:
+    """Return the largest peak of memory of some calls [MiB], None on a CPU."""
+    return max((cost.peak_mib for cost in costs if cost.peak_mib is not None), default=None)
 
 
 # The shipped gecko in motion.
@@ -347,13 +339,12 @@ def _rollout_row(
     task: Runner | None,
 ) -> RolloutRow:
     costs = runner.costs(session)
-    peaks = [cost.peak_mib for cost in costs if cost.peak_mib is not None]
     worlds, weight_gradient = expected
-    errors = [
-        (_largest_distance(x, right_x) / runner.task.eps, relative_error(s, right_s))
-        for (x, s), (right_x, right_s) in zip(runner.marks(MARKS), worlds, strict=True)
-    ]
-    (x_1, s_1), (x_8, s_8), (x_64, s_64) = errors
+    errors = {}
+    for step, (x, s), (right_x, right_s) in zip(MARKS, runner.marks(MARKS), worlds, strict=True):
+        distance = (x.double() - right_x.double()).norm(dim=-1).max()
+        errors[f"x_{step}"] = float(distance) / runner.task.eps
+        errors[f"s_{step}"] = relative_error(s, right_s)
     weights = None
     if runner.strategy.differentiable:
         found = runner.weight_gradient(mask_source(runner.x))
@@ -364,21 +355,11 @@ def _rollout_row(
         particles=runner.x.shape[1],
         step_us=costs[0].time.divided(TIMED_STEPS),
         training_us=costs[1].time.divided(TIMED_STEPS) if len(costs) > 1 else None,
-        peak_mib=max(peaks, default=None),
-        x_1=x_1,
-        s_1=s_1,
-        x_8=x_8,
-        s_8=s_8,
-        x_64=x_64,
-        s_64=s_64,
+        peak_mib=peak_of(costs),
+        **errors,
         weights=weights,
         psnr_512=None if task is None else task.psnr(),
     )
-
-
-def _largest_distance(x: Tensor, expected: Tensor) -> float:
-    """Return the largest distance between two worlds' particles [length units]."""
-    return float((x.double() - expected.double()).norm(dim=-1).max())
 
 
 # How far float32 has drifted from float64 at the end of the paper's rollouts.

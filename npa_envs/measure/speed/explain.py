@@ -27,16 +27,12 @@ LONGEST_NAME = 72
 
 @dataclass(frozen=True)
 class KernelRow:
-    """One kernel in one workload."""
+    """One kernel in one workload: its time [µs] and its launches in a step, all together."""
 
     workload: str
-    """Dimension and (worlds B, particles N, steps T), and whether it trains."""
     us: float
-    """Its time in a step, all launches together [µs]."""
     launches: float
-    """Its launches in a step."""
     kernel: str
-    """Its name."""
 
 
 def kernel_rows(session: Session, workloads: Sequence[Workload]) -> list[KernelRow]:

@@ -22,16 +22,12 @@ GRID_CELLS = 128
 
 
 class GridFields(NamedTuple):
-    """Fields of every particle, unscaled, as in `npa_envs.PerceptionFields`."""
+    """Fields of every particle, unscaled, as those of the same names in `PerceptionFields`."""
 
     rho: Tensor
-    """Density [1 / length^D], shape [B, N]."""
     blur: Tensor
-    """Smoothed states, dimensionless, shape [B, N, C]."""
     grad1: Tensor
-    """State gradients, corrected where |det M| >= 1e-3 [1 / length], shape [B, N, C, D]."""
     drho: Tensor
-    """Density gradients [1 / length^(D+1)], shape [B, N, D]."""
 
 
 def grid_fields(x: Tensor, s: Tensor, eps: float) -> GridFields:

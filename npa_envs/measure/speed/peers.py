@@ -29,30 +29,26 @@ Fields = dict[str, Tensor]
 
 @dataclass(frozen=True)
 class PeerRow:
-    """One operation of one library on one world."""
+    """One or all of `OPERATIONS` of one library on one world, search for neighbours included.
+
+    The error is relative, the largest where several operations are one call.
+    """
 
     peer: str
-    """The library."""
     operation: str
-    """One of `OPERATIONS`, or all of them in one call."""
     space_dim: int
     particles: int
     time_us: Timing
-    """Time of the call, search for neighbours included [µs]."""
     error: float
-    """Relative error, the largest where several operations are one call."""
 
 
 @dataclass(frozen=True)
 class Call:
-    """A call that computes some operations."""
+    """A call that computes some operations; `capturable` where a CUDA graph can hold it."""
 
     operation: str
-    """Which, for the table."""
     run: Callable[[], Fields]
-    """The call."""
     capturable: bool = False
-    """Whether a CUDA graph can hold it."""
 
 
 def peer_rows(session: Session, workload: Workload) -> list[PeerRow]:

@@ -257,12 +257,12 @@ def _slope_row(axis: str, rows: Sequence[ScalingRow]) -> SlopeRow:
 
 # Suite `skips`: what it saves to leave out what a scene does not need.
 
-WORLDS, CPU_WORLDS, SMALL_WORLDS = (
-    Workload(2, 8, 4096, 16),
-    Workload(2, 1, 4096, 4),
-    Workload(2, 1, 256, 2),
-)
-"""Worlds to measure on: of CUDA, of a CPU, of small sessions."""
+SKIPPED = {
+    "cuda": Workload(2, 8, 4096, 16),
+    "cpu": Workload(2, 1, 4096, 4),
+    "small": Workload(2, 1, 256, 2),
+}
+"""Worlds to measure on, by kinds of sessions."""
 
 STATIC_STEPS = 32
 """Steps of a rollout that does once what never changes."""
@@ -345,7 +345,7 @@ def skips(workload: Workload) -> list[Skip]:
 
 def skip_rows(session: Session) -> list[SkipRow]:
     """Return what each omission saves, measured with and without it in one run."""
-    workload = SMALL_WORLDS if session.small else WORLDS if session.cuda else CPU_WORLDS
+    workload = SKIPPED["small" if session.small else session.device.type]
     x, s = workload.worlds(session.device)
 
     def cost(options: dict[str, Any], steps: int | None) -> Timing:
@@ -368,13 +368,13 @@ def _skip_row(skip: Skip, cost: Callable[[dict[str, Any], int | None], Timing]) 
 # Suite `species`: what a world of one species pays for the others that could be there: nothing.
 
 
-SPECIES_WORLDS, CPU_SPECIES_WORLDS, SMALL_SPECIES_WORLDS = (
-    (Workload(2, 8, 4096, 16), Workload(2, 1, 256, 16)),
-    (Workload(2, 1, 4096, 4), Workload(2, 1, 256, 4)),
-    (Workload(2, 1, 256, 2),),
-)
-"""Worlds to measure on: of CUDA, of a CPU, of small sessions. What is paid once shows in few steps
-of few particles."""
+SPECIES = {
+    "cuda": (Workload(2, 8, 4096, 16), Workload(2, 1, 256, 16)),
+    "cpu": (Workload(2, 1, 4096, 4), Workload(2, 1, 256, 4)),
+    "small": (Workload(2, 1, 256, 2),),
+}
+"""Worlds to measure on, by kinds of sessions: what is paid once shows in few steps of few
+particles."""
 
 PAIRS_PER_REPEAT = 3
 """Pairs of readings for each reading of other tables: a ratio of nearly 1 needs more of them."""
@@ -382,33 +382,25 @@ PAIRS_PER_REPEAT = 3
 
 @dataclass(frozen=True)
 class OneSpeciesRow:
-    """The same rule and worlds by both rollouts; times are those of one step."""
+    """The same rule and worlds by `rollout` and by `rollout_species` with one species.
+
+    Times are those of one step [µs] of inference, or of training with a functional's gradient by
+    the rule's weights; `calls` are "graph" where CUDA replays what was captured. `ratio` is the
+    median over pairs of readings in turn; aimed at: at most 1.03.
+    """
 
     workload: str
-    """Dimension and (worlds B, particles N, steps T)."""
     what: str
-    """"inference", or "training": also a functional's gradient by the rule's weights."""
     calls: str
-    """"eager", or "graph" where CUDA replays what was captured and the host does nothing."""
     rollout_us: Timing
-    """A step of `rollout` [µs]."""
     species_us: Timing
-    """A step of `rollout_species` with one species [µs]."""
     ratio: float
-    """Median of species_us / rollout_us over pairs of readings in turn; aimed at: at most 1.03."""
 
 
 def one_species_rows(session: Session) -> list[OneSpeciesRow]:
     """Return what one species costs beside `rollout`, inference and training."""
-    workloads = (
-        SMALL_SPECIES_WORLDS
-        if session.small
-        else SPECIES_WORLDS
-        if session.cuda
-        else CPU_SPECIES_WORLDS
-    )
     rows: list[OneSpeciesRow] = []
-    for workload in workloads:
+    for workload in SPECIES["small" if session.small else session.device.type]:
         for train in (False, True):
             for graph in (False, True) if session.cuda else (False,):
                 what = f"one species, {'training' if train else 'inference'} of {workload.name}"

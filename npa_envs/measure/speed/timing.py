@@ -31,11 +31,8 @@ class Timing:
     """The time of one call [µs]: the median of several readings, and the range of all of them."""
 
     median: float
-    """Median of the readings [µs]."""
     low: float
-    """Shortest reading [µs]."""
     high: float
-    """Longest reading [µs]."""
 
     def __str__(self) -> str:
         """Return the median and how far the readings lie from it."""
@@ -52,7 +49,6 @@ class Cost:
     """What a call costs."""
 
     time: Timing
-    """Time of the call."""
     peak_mib: float | None
     """Peak of memory allocated by torch, above what was there before [MiB]; None on a CPU."""
 
@@ -62,9 +58,7 @@ class Comparison:
     """What two calls cost that were timed in turn."""
 
     first: Timing
-    """Time of the first call."""
     second: Timing
-    """Time of the second call."""
     ratio: float
     """Median over pairs of readings, one right after the other, of the second's time over the
     first's (dimensionless)."""
@@ -160,12 +154,10 @@ Tables = dict[str, list[Any]]
 
 @dataclass(frozen=True)
 class LeftOut:
-    """Something that a suite did not measure."""
+    """Something that a suite did not measure, and the reason in a few words."""
 
     what: str
-    """Strategy, precision, workload or peer."""
     why: str
-    """The reason, in a few words."""
 
 
 @dataclass

@@ -121,16 +121,12 @@ def rollout_call(
 
 
 class Gecko(NamedTuple):
-    """The shipped rule and the task that it was trained on."""
+    """The shipped rule, its task with as many target points as particles, and seeds."""
 
     rule: NPARule
-    """The rule `gecko`, float32."""
     task: Morphogenesis2D
-    """2D morphogenesis with as many target points as particles."""
     x: Tensor
-    """Positions of the seed [length units], shape [B, N, 2]."""
     s: Tensor
-    """States of the seed, shape [B, N, C]."""
 
     def grown(self, steps: int) -> Gecko:
         """Return the same with worlds that are so many float32 steps older."""
