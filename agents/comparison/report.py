@@ -404,7 +404,7 @@ def _frame(record: RunRecord | None, folder: Path) -> NDArray[np.uint8]:
 
 
 def _caption(method: str, seed: int, record: RunRecord | None) -> str:
-    told = "not run" if record is None else record.status
+    told: str = "not run" if record is None else record.status
     if record is not None and told == "done":
         told = f"loss {record.mean_loss:.3f}"
     return f"{method}, seed {seed}: {told}"

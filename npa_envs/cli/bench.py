@@ -141,11 +141,10 @@ def measured_report(options: BenchOptions, device: torch.device, command: str) -
     from npa_envs.cli.output import StepBar, chosen_names, torch_threads
     from npa_envs.measure.record import current_commit
     from npa_envs.measure.speed.strategies import PRECISIONS, STRATEGIES
-    from npa_envs.measure.speed.suites import SUITES, Report
+    from npa_envs.measure.speed.suites import SUITES, Report, ratios
     from npa_envs.measure.speed.timing import Session
 
     name = options.suite or QUICK
-    suite = SUITES[name]
     strategies = chosen_names("strategy", options.strategies, STRATEGIES)
     precisions = chosen_names("precision", options.precisions, PRECISIONS)
     with StepBar(None, show=options.progress, unit="row") as bar, torch_threads(options.threads):
@@ -157,7 +156,8 @@ def measured_report(options: BenchOptions, device: torch.device, command: str) -
             precisions=[PRECISIONS[name] for name in precisions],
             progress=bar.advance,
         )
-        tables, ratios = suite.run(session), suite.ratios(session)
+        tables = SUITES[name](session)
+        held = ratios(session) if name == QUICK else {}
     return Report(
         suite=name,
         command=command,
@@ -166,7 +166,7 @@ def measured_report(options: BenchOptions, device: torch.device, command: str) -
         threads=options.threads,
         tables=tables,
         left_out=session.left_out,
-        ratios=ratios,
+        ratios=held,
     )
 
 

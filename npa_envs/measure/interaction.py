@@ -352,7 +352,9 @@ def read_rows(path: Path, settings: Mapping[str, Any]) -> list[InteractionRow]:
     """
 
     def made(held: dict[str, Any]) -> list[InteractionRow]:
-        rows = [{k: math.inf if v is None else v for k, v in row.items()} for row in held["rows"]]
+        rows: list[dict[str, Any]] = [
+            {k: math.inf if v is None else v for k, v in row.items()} for row in held["rows"]
+        ]
         return [InteractionRow(**row) for row in rows]
 
     found = read_record(path, settings, made, command="interact", key="settings", option="--out")

@@ -78,13 +78,13 @@ def legend_of(figure: Any, panel: Any, place: str = "lower center", **options: A
 
 def draw_band(
     panel: Any,
-    across: Sequence[float],
-    lines: tuple[Sequence[float], Sequence[float], Sequence[float]],
+    across: Any,
+    lines: tuple[Any, Any, Any],
     colour: str,
     label: str,
     **options: Any,
 ) -> None:
-    """Draw a curve and a band around it: its lower end, its middle and its upper end."""
+    """Draw a curve and a band around it: the band's lower end, the curve, the upper end."""
     low, middle, high = lines
     panel.plot(across, middle, color=colour, label=label, **options)
     panel.fill_between(across, low, high, color=colour, alpha=0.2, lw=0)
@@ -116,13 +116,15 @@ def draw_matrix(
     from matplotlib.patches import Rectangle
 
     scale = ScalarMappable(norm, colours)
+    colour_of: Any = scale.get_cmap()
     panel.set(xlim=(-0.5, len(columns) - 0.5), ylim=(len(rows) - 0.5, -0.5), aspect="auto")
     for down, line in enumerate(values):
         for across, value in enumerate(line):
             if value is None:
                 continue
             wrong = math.isnan(value)
-            colour: Any = "black" if wrong else scale.to_rgba(min(max(value, norm.vmin), norm.vmax))
+            within = min(max(float(value), norm.vmin), norm.vmax)
+            colour: Any = "black" if wrong else colour_of(norm(within))
             corner = (across - 0.5, down - 0.5)
             panel.add_patch(Rectangle(corner, 1.0, 1.0, facecolor=colour, edgecolor="white"))
             dark = wrong or sum(colour[:3]) < 1.2

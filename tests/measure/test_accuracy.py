@@ -57,12 +57,8 @@ def test_checks_are_chosen_by_group_by_name_and_by_how_names_begin():
     assert {c.group for c in chosen_checks(checks, ["time", "values"])} == {"time", "values"}
     assert [c.name for c in chosen_checks(checks, ["time/gecko"])] == ["time/gecko"]
     clumps = chosen_checks(checks, ["geometry/clump"])
-    assert [c.name.removeprefix("geometry/clump/") for c in clumps] == [
-        "2d/open",
-        "2d/periodic",
-        "3d/open",
-        "3d/periodic",
-    ]
+    where = ["2d/open", "2d/periodic", "3d/open", "3d/periodic"]
+    assert [c.name.removeprefix("geometry/clump/") for c in clumps] == where
     assert chosen_checks(checks, []) == checks
     with pytest.raises(NPAError, match="unknown check 'geometri': did you mean 'geometry'"):
         chosen_checks(checks, ["geometri"])

@@ -63,8 +63,9 @@ def timing(median: float) -> Timing:
 
 def tiny_suite(monkeypatch: pytest.MonkeyPatch) -> None:
     """Make the suite `quick` a tiny one of the same kind."""
-    suite = suites.Suite(lambda here: {"perception": perception_rows(here, TINY)}, guarded=True)
-    monkeypatch.setitem(suites.SUITES, "quick", suite)
+    monkeypatch.setitem(
+        suites.SUITES, "quick", lambda here: {"perception": perception_rows(here, TINY)}
+    )
     monkeypatch.setattr(suites, "WORKLOAD", Workload(2, 1, 100, 1, hidden_dim=16))
 
 
@@ -293,7 +294,7 @@ def test_each_skip_is_measured_with_and_without():
 
 def test_kernels_are_cudas(device):
     here = Session(device, repeats=1, small=True)
-    rows = suites.SUITES["kernels"].run(here)["kernels"]
+    rows = suites.SUITES["kernels"](here)["kernels"]
     if device.type == "cuda":
         assert any("perceive" in row.kernel for row in rows)
     else:
@@ -333,7 +334,7 @@ def test_calls_are_compared_in_turn_and_each_pair_the_other_way_round(device):
 
 def test_one_species_is_compared_with_the_rollout_that_it_is():
     here = Session(torch.device("cpu"), repeats=1, small=True)
-    rows = suites.SUITES["species"].run(here)["one_species"]
+    rows = suites.SUITES["species"](here)["one_species"]
     assert [(row.what, row.calls) for row in rows] == [
         ("inference", "eager"),
         ("training", "eager"),

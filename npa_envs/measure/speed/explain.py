@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch.autograd import DeviceType  # type: ignore[attr-defined]
 from torch.profiler import ProfilerActivity, profile
 
-from npa_envs.errors import NPAError, suggest
 from npa_envs.measure.speed.launches import Launch, recorded_launches
 from npa_envs.measure.speed.timing import Session
 from npa_envs.measure.speed.workloads import Workload, rollout_call
@@ -75,10 +75,6 @@ def _kernel_rows(workload: str, profiler: profile, steps: int) -> list[KernelRow
 # `--explain`: the kernels that a step of a rule takes, and why these.
 
 
-GRADIENTS = ("none", "weights", "positions")
-"""What is differentiated: nothing; by weights and states; by positions as well."""
-
-
 @dataclass(frozen=True)
 class Question:
     """A step to explain."""
@@ -91,20 +87,8 @@ class Question:
     """Precision."""
     periodic: bool
     """The box is periodic."""
-    gradients: str
-    """One of `GRADIENTS`."""
-
-    def __post_init__(self) -> None:
-        """Check the name.
-
-        Raises:
-            NPAError: `gradients` is none of `GRADIENTS`.
-        """
-        if self.gradients not in GRADIENTS:
-            raise NPAError(
-                f"gradients must be one of {GRADIENTS}, got {self.gradients!r}: "
-                f"{suggest(self.gradients, GRADIENTS)}"
-            )
+    gradients: Literal["none", "weights", "positions"]
+    """What is differentiated: nothing; by weights and states; by positions as well."""
 
     @property
     def box(self) -> float | None:

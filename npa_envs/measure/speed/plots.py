@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
-from npa_envs.measure.plots import check_matplotlib, new_figure, number_plainly, png
+from npa_envs.measure.plots import new_figure, number_plainly, png
 from npa_envs.measure.speed.strategies import PRECISIONS, STRATEGIES
 from npa_envs.measure.speed.suites import Report
 from npa_envs.measure.speed.throughput import AXES, ScalingRow
@@ -38,12 +38,7 @@ class Point(NamedTuple):
 
 
 def pictures(report: Report) -> dict[str, bytes]:
-    """Return PNG files by their names, as many as the report has tables for.
-
-    Raises:
-        MissingDependencyError: As for `check_matplotlib`.
-    """
-    check_matplotlib()
+    """Return PNG files by their names, as many as the report has tables for. Needs matplotlib."""
     drawn = {}
     if "perception" in report.tables:
         drawn["pareto"] = png(_draw_fronts(report))

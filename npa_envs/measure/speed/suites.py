@@ -44,20 +44,6 @@ from npa_envs.measure.tables import as_objects, table_text
 from npa_envs.world.rollout import step
 
 
-@dataclass(frozen=True)
-class Suite:
-    """Some measurements that belong together."""
-
-    run: Callable[[Session], Tables]
-    """Makes its tables."""
-    guarded: bool = False
-    """Whether ratios are measured as well."""
-
-    def ratios(self, session: Session) -> dict[str, float]:
-        """Return how many times faster the library is; empty where the suite does not ask."""
-        return ratios(session) if self.guarded else {}
-
-
 def accuracy(session: Session) -> Tables:
     """Return run time against error: of perception, of rollouts, of other libraries."""
     geckos = [1024] if session.small else [1024, 4096]
@@ -98,18 +84,16 @@ def quick(session: Session) -> Tables:
     return {**accuracy(session), **paper(session)}
 
 
-SUITES = {
-    "quick": Suite(quick, guarded=True),
-    "paper": Suite(paper),
-    "accuracy": Suite(accuracy),
-    "scaling": Suite(scaling),
-    "skips": Suite(lambda session: {"skips": skip_rows(session)}),
-    "species": Suite(lambda session: {"one_species": one_species_rows(session)}),
-    "kernels": Suite(
-        lambda here: {"kernels": kernel_rows(here, SMALL if here.small else PROFILED)}
-    ),
+SUITES: dict[str, Callable[[Session], Tables]] = {
+    "quick": quick,
+    "paper": paper,
+    "accuracy": accuracy,
+    "scaling": scaling,
+    "skips": lambda session: {"skips": skip_rows(session)},
+    "species": lambda session: {"one_species": one_species_rows(session)},
+    "kernels": lambda here: {"kernels": kernel_rows(here, SMALL if here.small else PROFILED)},
 }
-"""Every suite by its name."""
+"""What makes the tables of each suite."""
 
 
 # The report
