@@ -2,6 +2,7 @@
 #   make demo         grow, hurt and heal the shipped rule, train a small one (CPU); writes demo/
 #   make test         the test suite without the slow tests
 #   make test-all     all tests
+#   make test-cuda    the tests of kernels, worlds and training on a GPU, kernels compiled once
 #   make check        ruff, formatting, types, spelling
 #   make bench-check  is the library still as much faster than its alternatives as it was?
 # PIP_ARGS goes to pip: PIP_ARGS='--extra-index-url https://download.pytorch.org/whl/cpu' takes
@@ -19,8 +20,9 @@ DEV := $(VENV)/installed-dev
 INPUTS := pyproject.toml constraints.txt
 
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
+CUDA_WORKERS ?= 8
 
-.PHONY: demo test test-all check bench-check clean
+.PHONY: demo test test-all test-cuda check bench-check clean
 .DELETE_ON_ERROR:
 
 $(BIN)/python:
@@ -44,6 +46,9 @@ test: $(DEV)
 
 test-all: $(DEV)
 	$(PYTEST)
+
+test-cuda: $(DEV)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(CUDA_WORKERS) --device cuda -m '(device or gpu) and not slow'
 
 # Static checkers do not follow the editable finder for envs/, wrappers/ and agents/, so the types
 # are checked in a regular install, made from a copy: setuptools would leave stale files in build/.

@@ -1,4 +1,4 @@
-"""Starting Warp without its notes, and what it says about itself for `npa-envs doctor`."""
+"""Warp's runtime: its quiet start, its devices and its kernel cache."""
 
 from __future__ import annotations
 

@@ -1,10 +1,13 @@
 """Options and fixtures of the whole suite."""
 
 import os
+import tempfile
 from pathlib import Path
 
 import pytest
 import torch
+import warp as wp
+from filelock import FileLock
 
 REFERENCE = Path(
     os.environ.get(
@@ -15,6 +18,31 @@ REFERENCE = Path(
 
 def pytest_addoption(parser):
     parser.addoption("--device", default="cpu", help="device of the numerical tests: cpu or cuda")
+
+
+def pytest_collection_modifyitems(items):
+    """Mark the tests that a CUDA device changes something for: `make test-cuda` runs these alone."""
+    for item in items:
+        reasons = [str(mark.kwargs.get("reason")) for mark in item.iter_markers("skipif")]
+        if "device" in getattr(item, "fixturenames", ()) or any("CUDA" in r for r in reasons):
+            item.add_marker("device")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def compiled_once():
+    """Let one worker compile a module of kernels, and the others load what it has compiled."""
+    if "PYTEST_XDIST_WORKER" not in os.environ:
+        yield
+        return
+    load = wp.Module.load
+
+    def load_in_turn(module, *arguments, **options):
+        with FileLock(Path(tempfile.gettempdir()) / f"{module.name}.lock"):
+            return load(module, *arguments, **options)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(wp.Module, "load", load_in_turn)
+        yield
 
 
 @pytest.fixture(scope="session")

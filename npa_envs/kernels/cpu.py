@@ -1,8 +1,8 @@
-"""Kernels whose launch may be cut into ranges, which the CPU's threads run side by side.
+"""Aids of the CPU: launches cut into ranges for its threads, sums in vector registers.
 
-The first argument of such a kernel, `range_start`, is where its range begins along the launch's
-first dimension: 0 where it runs whole, as on CUDA. No range may read what another one writes, or
-count in it: Warp's atomics on the CPU are for one thread.
+The first argument of a kernel that may be cut, `range_start`, is where its range begins along the
+launch's first dimension: 0 where it runs whole, as on CUDA. No range may read what another one
+writes, or count in it: Warp's atomics on the CPU are for one thread.
 """
 
 import functools

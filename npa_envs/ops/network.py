@@ -1,4 +1,4 @@
-"""The weights of the rule's network, laid out as the fused kernels of `network` read them."""
+"""The rule's network: fused operators on CUDA's tensor cores, their adjoint, and its weights."""
 
 from __future__ import annotations
 
@@ -142,9 +142,6 @@ def arrange_weights(hidden_weight: Tensor, output_weight: Tensor) -> ArrangedWei
     if not fits_network(hidden_weight, output_weight):
         return None
     return arrange(hidden_weight, output_weight, with_backward=torch.is_grad_enabled())
-
-
-# The rule's network as fused operators on CUDA's tensor cores, with their adjoint.
 
 
 ROW_GROUP = 16

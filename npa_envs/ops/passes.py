@@ -1,4 +1,4 @@
-"""The two passes of perception over sorted worlds: which kernels run, and with what."""
+"""The density and the perception pass over sorted worlds: kernels and their arguments."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Perception of the active particles as an opaque torch operator with its gathered adjoints.
+"""Perception: vectors and fields of whole worlds, rows of active particles in rollouts.
 
-A `torch.library` operator keeps Warp out of torch.compile's sight; the autograd function over it
-saves only what the adjoint of the case at hand reads.
+Each is an opaque torch operator, which keeps Warp out of torch.compile's sight; the autograd
+functions over them save only what the adjoint of the case at hand reads.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from npa_envs.ops.checks import (
     checked_flag,
     checked_moment_inverse,
 )
-from npa_envs.ops.launch import Repeated, launch
+from npa_envs.ops.launch import PreparedLaunch, launch
 from npa_envs.ops.passes import (
     Terms,
     compute_densities,
@@ -35,6 +35,151 @@ from npa_envs.ops.passes import (
 )
 from npa_envs.ops.sort import make_plan, sort_worlds
 from npa_envs.ops.static import StaticRows, StaticTensors, StaticWorlds, all_rows, static_worlds
+
+
+class PerceptionFields(NamedTuple):
+    """The unscaled SPH fields at every particle (arXiv 2601.16096, section 3)."""
+
+    rho: Tensor
+    """Density [1 / length^D], shape [B, N]."""
+    blur: Tensor
+    """Smoothed states, dimensionless, shape [B, N, C]."""
+    grad0: Tensor
+    """State gradients without correction [1 / length], shape [B, N, C, D]."""
+    moment: Tensor
+    """Moment matrices M, dimensionless, shape [B, N, D, D]."""
+    grad1: Tensor
+    """State gradients corrected by the inverse of M [1 / length], shape [B, N, C, D]."""
+    drho: Tensor
+    """Density gradients [1 / length^(D+1)], shape [B, N, D]."""
+
+
+def perceive(
+    x: Tensor,
+    s: Tensor,
+    eps: float,
+    eps0: float | None = None,
+    box: Box = None,
+    detach_positions: bool = True,
+    *,
+    state_gradient: bool = True,
+    moment_correction: bool = True,
+    density_gradient: bool = True,
+    moment_inverse: MomentInverse = "threshold",
+) -> Tensor:
+    """Perceive every particle's neighbourhood: z = [s ; smoothed s ; L(c ∇s) ; L(c^(1+D) ∇ρ / N)].
+
+    c = eps / eps0, L(v) = log(1 + |v|) v / |v|. Differentiable in s, and in x where
+    `detach_positions` is False; the moment correction of ∇s is a stopped gradient, as in the paper
+    (arXiv 2601.16096, section 3). Bit-identical from run to run; world k of B equals that world
+    alone.
+
+    Args:
+        x: Particle positions [length units], shape [B, N, D], D = 2 or 3, anywhere in open space.
+        s: Particle states, dimensionless, shape [B, N, C], any C; dtype and device of x.
+        eps: Perception radius [length units].
+        eps0: Radius at which the rule was trained [length units]; default: eps.
+        box: Sides of a periodic box centred on the origin [length units], a number for equal
+            sides, or None for open space.
+        detach_positions: Do not back-propagate into x.
+        state_gradient: Include the state gradient in z.
+        moment_correction: Correct the state gradient by the inverse moment matrix.
+        density_gradient: Include the density gradient in z.
+        moment_inverse: How the moment matrix M is inverted: "threshold", M⁻¹ where
+            |det M| >= 1e-3 and not at all below, as in the paper, which jumps there; or "smooth",
+            (det M adj M + τ² I) / (det² M + τ²), τ = 1e-2, which nears both and never jumps.
+
+    Returns:
+        Perception vectors z, dimensionless, shape [B, N, P], P = C(2+D)+D with every group.
+
+    Raises:
+        NPAError: Shapes, dtypes or devices do not fit, a position is not finite, eps or eps0 is
+            not positive and finite, a box side is below 2 eps, or `moment_inverse` is another word.
+    """
+    check_world(x, s)
+    radius = checked_eps("eps", eps, x.dtype)
+    radius0 = radius if eps0 is None else checked_eps("eps0", eps0, x.dtype)
+    check_scale(radius, radius0, x.shape[2], x.dtype)
+    sides = checked_box(box, x.shape[2], radius)
+    check_finite_positions(x)
+    inverse = checked_moment_inverse(moment_inverse)
+    terms = Terms(
+        checked_flag("state_gradient", state_gradient),
+        inverse if checked_flag("moment_correction", moment_correction) else None,
+        checked_flag("density_gradient", density_gradient),
+    )
+    perception, rows = perceive_rows(
+        x.detach() if checked_flag("detach_positions", detach_positions) else x,
+        s,
+        mask=None,
+        row_capacity=x.shape[0] * x.shape[1],
+        row_width=terms.perception_dim(x.shape[2], s.shape[2]),
+        eps=radius,
+        eps0=radius0,
+        box=sides,
+        terms=terms,
+    )
+    return perception.index_select(0, rows.row_of).view(*x.shape[:2], -1)
+
+
+@torch.no_grad()
+def perception_fields(
+    x: Tensor,
+    s: Tensor,
+    eps: float,
+    box: Box = None,
+    *,
+    moment_inverse: MomentInverse = "threshold",
+) -> PerceptionFields:
+    """Return the unscaled SPH fields of every particle; not differentiable (`perceive` is).
+
+    Args:
+        x: Particle positions [length units], shape [B, N, D].
+        s: Particle states, dimensionless, shape [B, N, C].
+        eps: Perception radius [length units].
+        box: Sides of a periodic box centred on the origin [length units], or None for open space.
+        moment_inverse: How `grad1` is corrected, as in `perceive`.
+
+    Raises:
+        NPAError: As `perceive`.
+    """
+    terms = Terms(moment_inverse=checked_moment_inverse(moment_inverse))
+    check_world(x, s)
+    radius = checked_eps("eps", eps, x.dtype)
+    sides = checked_box(box, x.shape[2], radius)
+    check_finite_positions(x)
+    x, s = x.contiguous(), s.contiguous()
+    world_count, particle_count, space_dim = x.shape
+    state_dim = s.shape[2]
+    plan = make_plan(x, x.shape, state_dim, x.shape[0] * x.shape[1], False, radius, sides)
+    ordered = sort_worlds(plan, x, s, None)
+    densities = compute_density_gradients(plan, ordered, terms)
+    fields = PerceptionFields(
+        rho=x.new_empty(plan.total),
+        blur=x.new_empty(plan.total, state_dim),
+        grad0=x.new_empty(plan.total, state_dim, space_dim),
+        moment=x.new_empty(plan.total, space_dim, space_dim),
+        grad1=x.new_empty(plan.total, state_dim, space_dim),
+        drho=densities.density_gradient[ordered.row_of].to(x.dtype),
+    )
+    launch(
+        portable_kernels(plan, terms).gather_fields,
+        (plan.total, plan.group_count),
+        x.device,
+        plan.domain,
+        particle_count,
+        state_dim,
+        plan.group_count,
+        ordered.starts,
+        densities.particles,
+        ordered.states,
+        ordered.source,
+        *fields[:-1],
+    )
+    return PerceptionFields(
+        *(field.view(world_count, particle_count, *field.shape[1:]) for field in fields)
+    )
+
 
 __all__ = ["Rows", "Terms", "perceive_rows"]
 
@@ -360,7 +505,7 @@ def perceive_rows(
     return perception, Rows(row_of, row_source, starts, row_base)
 
 
-# Perception of every particle, in the caller's order and clipped; without gradients.
+# For environments: every particle, in the caller's order, clipped, without gradients.
 
 
 class SurveyedWorlds:
@@ -378,7 +523,7 @@ class SurveyedWorlds:
         self._launch_of = launch_of
         self._shape = shape
         self._like = like
-        self._repeated: Repeated | None = None
+        self._prepared: PreparedLaunch | None = None
 
     def perceive(self, out: Tensor | None = None) -> Tensor:
         """Return what every particle perceives, clipped, in the caller's order, shape [B, N, P].
@@ -392,9 +537,9 @@ class SurveyedWorlds:
         if out is None:
             out = self._like.new_empty(self._shape)
         rows = out.view(-1, self._shape[-1])
-        if self._repeated is None:
-            self._repeated = Repeated(*self._launch_of(rows), changing=rows)
-        self._repeated(rows)
+        if self._prepared is None:
+            self._prepared = PreparedLaunch(*self._launch_of(rows), changing=rows)
+        self._prepared(rows)
         return out
 
 
@@ -459,150 +604,3 @@ def survey(
 
     perception_dim = terms.perception_dim(plan.space_dim, plan.state_dim)
     return SurveyedWorlds(launch_of, (*x.shape[:2], perception_dim), x)
-
-
-# The public SPH operators over whole worlds: perception vectors and the fields behind them.
-
-
-class PerceptionFields(NamedTuple):
-    """The unscaled SPH fields at every particle (arXiv 2601.16096, section 3)."""
-
-    rho: Tensor
-    """Density [1 / length^D], shape [B, N]."""
-    blur: Tensor
-    """Smoothed states, dimensionless, shape [B, N, C]."""
-    grad0: Tensor
-    """State gradients without correction [1 / length], shape [B, N, C, D]."""
-    moment: Tensor
-    """Moment matrices M, dimensionless, shape [B, N, D, D]."""
-    grad1: Tensor
-    """State gradients corrected by the inverse of M [1 / length], shape [B, N, C, D]."""
-    drho: Tensor
-    """Density gradients [1 / length^(D+1)], shape [B, N, D]."""
-
-
-def perceive(
-    x: Tensor,
-    s: Tensor,
-    eps: float,
-    eps0: float | None = None,
-    box: Box = None,
-    detach_positions: bool = True,
-    *,
-    state_gradient: bool = True,
-    moment_correction: bool = True,
-    density_gradient: bool = True,
-    moment_inverse: MomentInverse = "threshold",
-) -> Tensor:
-    """Perceive every particle's neighbourhood: z = [s ; smoothed s ; L(c ∇s) ; L(c^(1+D) ∇ρ / N)].
-
-    c = eps / eps0, L(v) = log(1 + |v|) v / |v|. Differentiable in s, and in x where
-    `detach_positions` is False; the moment correction of ∇s is a stopped gradient, as in the paper
-    (arXiv 2601.16096, section 3). Bit-identical from run to run; world k of B equals that world
-    alone.
-
-    Args:
-        x: Particle positions [length units], shape [B, N, D], D = 2 or 3, anywhere in open space.
-        s: Particle states, dimensionless, shape [B, N, C], any C; dtype and device of x.
-        eps: Perception radius [length units].
-        eps0: Radius at which the rule was trained [length units]; default: eps.
-        box: Sides of a periodic box centred on the origin [length units], a number for equal
-            sides, or None for open space.
-        detach_positions: Do not back-propagate into x.
-        state_gradient: Include the state gradient in z.
-        moment_correction: Correct the state gradient by the inverse moment matrix.
-        density_gradient: Include the density gradient in z.
-        moment_inverse: How the moment matrix M is inverted: "threshold", M⁻¹ where
-            |det M| >= 1e-3 and not at all below, as in the paper, which jumps there; or "smooth",
-            (det M adj M + τ² I) / (det² M + τ²), τ = 1e-2, which nears both and never jumps.
-
-    Returns:
-        Perception vectors z, dimensionless, shape [B, N, P], P = C(2+D)+D with every group.
-
-    Raises:
-        NPAError: Shapes, dtypes or devices do not fit, a position is not finite, eps or eps0 is
-            not positive and finite, a box side is below 2 eps, or `moment_inverse` is another word.
-    """
-    check_world(x, s)
-    radius = checked_eps("eps", eps, x.dtype)
-    radius0 = radius if eps0 is None else checked_eps("eps0", eps0, x.dtype)
-    check_scale(radius, radius0, x.shape[2], x.dtype)
-    sides = checked_box(box, x.shape[2], radius)
-    check_finite_positions(x)
-    inverse = checked_moment_inverse(moment_inverse)
-    terms = Terms(
-        checked_flag("state_gradient", state_gradient),
-        inverse if checked_flag("moment_correction", moment_correction) else None,
-        checked_flag("density_gradient", density_gradient),
-    )
-    perception, rows = perceive_rows(
-        x.detach() if checked_flag("detach_positions", detach_positions) else x,
-        s,
-        mask=None,
-        row_capacity=x.shape[0] * x.shape[1],
-        row_width=terms.perception_dim(x.shape[2], s.shape[2]),
-        eps=radius,
-        eps0=radius0,
-        box=sides,
-        terms=terms,
-    )
-    return perception.index_select(0, rows.row_of).view(*x.shape[:2], -1)
-
-
-@torch.no_grad()
-def perception_fields(
-    x: Tensor,
-    s: Tensor,
-    eps: float,
-    box: Box = None,
-    *,
-    moment_inverse: MomentInverse = "threshold",
-) -> PerceptionFields:
-    """Return the unscaled SPH fields of every particle; not differentiable (`perceive` is).
-
-    Args:
-        x: Particle positions [length units], shape [B, N, D].
-        s: Particle states, dimensionless, shape [B, N, C].
-        eps: Perception radius [length units].
-        box: Sides of a periodic box centred on the origin [length units], or None for open space.
-        moment_inverse: How `grad1` is corrected, as in `perceive`.
-
-    Raises:
-        NPAError: As `perceive`.
-    """
-    terms = Terms(moment_inverse=checked_moment_inverse(moment_inverse))
-    check_world(x, s)
-    radius = checked_eps("eps", eps, x.dtype)
-    sides = checked_box(box, x.shape[2], radius)
-    check_finite_positions(x)
-    x, s = x.contiguous(), s.contiguous()
-    world_count, particle_count, space_dim = x.shape
-    state_dim = s.shape[2]
-    plan = make_plan(x, x.shape, state_dim, x.shape[0] * x.shape[1], False, radius, sides)
-    ordered = sort_worlds(plan, x, s, None)
-    densities = compute_density_gradients(plan, ordered, terms)
-    fields = PerceptionFields(
-        rho=x.new_empty(plan.total),
-        blur=x.new_empty(plan.total, state_dim),
-        grad0=x.new_empty(plan.total, state_dim, space_dim),
-        moment=x.new_empty(plan.total, space_dim, space_dim),
-        grad1=x.new_empty(plan.total, state_dim, space_dim),
-        drho=densities.density_gradient[ordered.row_of].to(x.dtype),
-    )
-    launch(
-        portable_kernels(plan, terms).gather_fields,
-        (plan.total, plan.group_count),
-        x.device,
-        plan.domain,
-        particle_count,
-        state_dim,
-        plan.group_count,
-        ordered.starts,
-        densities.particles,
-        ordered.states,
-        ordered.source,
-        *fields[:-1],
-    )
-    return PerceptionFields(
-        *(field.view(world_count, particle_count, *field.shape[1:]) for field in fields)
-    )

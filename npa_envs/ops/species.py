@@ -1,4 +1,4 @@
-"""What particles perceive of each species by itself: its density and its density gradient."""
+"""Perception of each species by itself: its density and its density gradient."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The update of particles from a rule's outputs as an opaque torch operator with its adjoint."""
+"""Updates of particles, as torch operators: from a rule's outputs, and from actions in place."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from npa_envs.kernels.portable.update import (
     update_kernels,
 )
 from npa_envs.ops.checks import check_world
-from npa_envs.ops.launch import Repeated, launch, scalar_type
+from npa_envs.ops.launch import PreparedLaunch, launch, scalar_type
 from npa_envs.ops.perceive import Rows
 from npa_envs.ops.sort import LARGEST_INDEX
 
@@ -213,9 +213,6 @@ def wrapped(x: Tensor, box: tuple[float, ...] | None) -> Tensor:
     return x - torch.stack([side * image for side, image in zip(box, images, strict=True)], dim=-1)
 
 
-# Applying actions to worlds: what a step of an environment does to its particles, in place.
-
-
 class ActionRules(NamedTuple):
     """What actions do, the same in every step: the keywords of `apply_actions` of these names."""
 
@@ -289,7 +286,7 @@ def apply_actions(
     )
 
 
-class RepeatedActions:
+class PreparedActions:
     """`apply_actions` on the same worlds again and again, checked first: less of the host's time.
 
     Args:
@@ -323,8 +320,8 @@ class RepeatedActions:
         self._rules = rules
         self._enabled = enabled
         self._step = (mask, noise, enabled, diverged)
-        self._check: Repeated | None = None
-        self._apply: Repeated | None = None
+        self._check: PreparedLaunch | None = None
+        self._apply: PreparedLaunch | None = None
         _check_worlds(self._buffer, x, s, mask, noise, enabled, diverged, rules.moving)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -355,11 +352,11 @@ class RepeatedActions:
         self._check(flat)
         self._apply(flat)
 
-    def _record(self, flat: Tensor) -> tuple[Repeated, Repeated]:
+    def _record(self, flat: Tensor) -> tuple[PreparedLaunch, PreparedLaunch]:
         """Return the launches that check and that apply, both of actions that are aligned."""
         x, s = self._worlds
         thread_count = -(-flat.numel() // VALUES_PER_THREAD)
-        check = Repeated(
+        check = PreparedLaunch(
             find_not_finite(scalar_type(x.dtype)),
             thread_count,
             x.device,
@@ -370,7 +367,7 @@ class RepeatedActions:
         )
         aligned = s.data_ptr() % 16 == 0
         launched = _launch_of(flat, x, s, self._rules, *self._step, aligned=aligned)
-        apply = Repeated(*launched, changing=flat)
+        apply = PreparedLaunch(*launched, changing=flat)
         return check, apply
 
 

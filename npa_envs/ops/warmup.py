@@ -1,4 +1,4 @@
-"""Compiling kernels before they are needed."""
+"""Compilation of kernels before they are needed."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from npa_envs.ops.perceive import Rows, perceive, perceive_rows, survey
 from npa_envs.ops.pictures.losses import picture_losses
 from npa_envs.ops.pictures.splat import splat
 from npa_envs.ops.static import prepare_static, static_rows
-from npa_envs.ops.update import ActionRules, RepeatedActions, update_particles
+from npa_envs.ops.update import ActionRules, PreparedActions, update_particles
 
 
 def warmup(
@@ -152,7 +152,7 @@ def _warm_update(x: torch.Tensor, s: torch.Tensor) -> None:
 
 
 def _warm_actions(x: torch.Tensor, s: torch.Tensor) -> None:
-    actions = RepeatedActions(
+    actions = PreparedActions(
         x.detach().clone(),
         s.detach().clone(),
         ActionRules(0.1, 1.0, 1.0, True, None, 1.0, 1.0),

@@ -1,4 +1,4 @@
-"""Worlds whose updates come from outside: what particles perceive, and what an action does.
+"""Worlds that are acted on from outside: what particles perceive, and what an action does.
 
 The same dynamics as `npa_envs.rollout`, with the rule taken out: an action stands where a rule's
 bounded output stands. Nothing here waits for the device.
@@ -16,7 +16,7 @@ from npa_envs.ops.checks import MomentInverse
 from npa_envs.ops.passes import Terms
 from npa_envs.ops.perceive import SurveyedWorlds, survey
 from npa_envs.ops.species import perceive_by_species
-from npa_envs.ops.update import ActionRules, RepeatedActions
+from npa_envs.ops.update import ActionRules, PreparedActions
 from npa_envs.world.randomness import WorldRandom
 
 __all__ = [
@@ -176,7 +176,7 @@ class Actions:
             position_limit=physics.position_limit,
             state_limit=physics.state_limit,
         )
-        self._apply = RepeatedActions(
+        self._apply = PreparedActions(
             x, s, rules, mask=self._mask, noise=self._noise, enabled=enabled, diverged=diverged
         )
 

@@ -1,4 +1,4 @@
-"""Work on CUDA that is recorded once and replayed from then on, or done beside other work."""
+"""CUDA graphs: work that is recorded once and replayed from then on."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Guards against worlds that leave the numbers: flags on the device, reports on the host."""
+"""Divergence: worlds whose numbers become infinite or NaN, seen on the device."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Worlds in time: one step of a rule, and rollouts that can be differentiated."""
+"""Rollouts: worlds in time, one step of a rule after the other; differentiable."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One step of several rules in one world: a common perception pass, then rule by rule."""
+"""Several rules in one world: each species follows its own rule, and all see each other."""
 
 from __future__ import annotations
 
@@ -31,6 +31,250 @@ from npa_envs.world.rollout import (
     rule_terms,
     run_steps,
 )
+
+SpeciesPerception = Literal["shared", "per_species"]
+
+MODES: tuple[SpeciesPerception, ...] = ("shared", "per_species")
+"""What rules see of species: nothing, or the density and the density gradient of each."""
+
+AGREEMENTS = (
+    "space_dim",
+    "state_dim",
+    "eps0",
+    "static",
+    "state_gradient",
+    "moment_correction",
+    "moment_inverse",
+    "density_gradient",
+)
+"""What rules must have in common to read one perception pass."""
+
+
+@overload
+def rollout_species(
+    rules: Sequence[NPARule],
+    x: Tensor,
+    s: Tensor,
+    steps: int,
+    *,
+    counts: Sequence[int],
+    eps: float | None = ...,
+    update_prob: float | Sequence[float] = ...,
+    box: Box = ...,
+    dt: float = ...,
+    position_noise: float = ...,
+    generator: Randomness | None = ...,
+    detach_positions: bool = ...,
+    perception: SpeciesPerception = ...,
+    density_counts: Sequence[float] | None = ...,
+    memory: Memory = ...,
+    on_divergence: OnDivergence = ...,
+    return_path_length: Literal[False] = ...,
+) -> tuple[Tensor, Tensor]: ...
+
+
+@overload
+def rollout_species(
+    rules: Sequence[NPARule],
+    x: Tensor,
+    s: Tensor,
+    steps: int,
+    *,
+    counts: Sequence[int],
+    eps: float | None = ...,
+    update_prob: float | Sequence[float] = ...,
+    box: Box = ...,
+    dt: float = ...,
+    position_noise: float = ...,
+    generator: Randomness | None = ...,
+    detach_positions: bool = ...,
+    perception: SpeciesPerception = ...,
+    density_counts: Sequence[float] | None = ...,
+    memory: Memory = ...,
+    on_divergence: OnDivergence = ...,
+    return_path_length: Literal[True],
+) -> tuple[Tensor, Tensor, Tensor]: ...
+
+
+def rollout_species(
+    rules: Sequence[NPARule],
+    x: Tensor,
+    s: Tensor,
+    steps: int,
+    *,
+    counts: Sequence[int],
+    eps: float | None = None,
+    update_prob: float | Sequence[float] = 0.5,
+    box: Box = None,
+    dt: float = 1.0,
+    position_noise: float = 0.0,
+    generator: Randomness | None = None,
+    detach_positions: bool = True,
+    perception: SpeciesPerception = "shared",
+    density_counts: Sequence[float] | None = None,
+    memory: Memory = "store",
+    on_divergence: OnDivergence = "ignore",
+    return_path_length: bool = False,
+) -> tuple[Tensor, Tensor] | tuple[Tensor, Tensor, Tensor]:
+    """Run several rules in one world; differentiable, and particle i stays particle i.
+
+    Each step is that of `rollout`, with one perception pass for the particles of all species; then
+    each species' rule updates its own particles. A species' rule reads its neighbours' states
+    whatever their species, as in the paper (arXiv 2601.16096). With one species this is `rollout`,
+    and with several that have one rule it is `rollout` of all particles, up to rounding.
+
+    What rules perceive of densities is divided by the particles of the whole world. A rule that was
+    trained alone then sees less of itself the more others there are, however far away;
+    `density_counts=counts` lets it see itself as it does alone.
+
+    Args:
+        rules: One rule for each species; dtype and device of x. They agree in space dimension,
+            channels, eps0, groups of perception, and in whether particles move; not necessarily in
+            hidden units, alpha or read-out.
+        x: Particle positions [length units], shape [B, N, D], species after species.
+        s: Particle states, dimensionless, shape [B, N, C].
+        steps: Number of steps T, 0 or more.
+        counts: Particles of each species, which sum to N: species k owns `counts[k]` consecutive
+            ones.
+        eps: Perception radius [length units]; default: the rules' eps0.
+        update_prob: Probability of each particle's update in a step, in (0, 1], for all species or
+            one for each.
+        box: Sides of a periodic box centred on the origin [length units], or None for open space.
+        dt: Time step, dimensionless.
+        position_noise: Standard deviation of the noise added to every position in each step
+            [length units].
+        generator: Source of the masks and the noise, on x's device; default: torch's global one.
+            With one `update_prob` it gives what it gives `rollout`.
+        detach_positions: Perception does not back-propagate into positions (the paper's choice).
+        perception: "shared", or "per_species" for rules made with `species_count`: they also
+            perceive the density and the density gradient of each species, as `perceive_species`
+            gives them.
+        density_counts: What each species divides densities and their gradients by, positive;
+            default: N, the particles of the world, for all.
+        memory: What the backward pass reads is stored or recomputed, as in `rollout`.
+        on_divergence: "ignore" worlds that diverge, or "raise" at the end, as in `rollout`.
+        return_path_length: Also return how far each particle travelled.
+
+    Returns:
+        Positions [length units], shape [B, N, D]; states, dimensionless, shape [B, N, C]; and where
+        asked the length of each particle's path [length units], shape [B, N].
+
+    Raises:
+        NPAError: Rules do not agree, counts do not fit, or as for `rollout`.
+        DivergedError: As for `rollout`.
+    """
+    steps = checked_count("steps", steps)
+    species_rules = _checked_rules(rules)
+    check_world(x, s)
+    sizes = checked_counts(counts, x.shape[1])
+    _check_agreement(species_rules, len(sizes), perception)
+    probabilities = _checked_probabilities(update_prob, len(sizes))
+    divisors = _checked_divisors(density_counts, sizes)
+    check_memory(memory)
+    if perception == "shared" and divisors == (float(x.shape[1]),):
+        *after, travelled = rollout(
+            species_rules[0],
+            x,
+            s,
+            steps,
+            eps=eps,
+            box=box,
+            update_prob=probabilities[0],
+            dt=dt,
+            position_noise=position_noise,
+            detach_positions=detach_positions,
+            memory=memory,
+            generator=generator,
+            on_divergence=on_divergence,
+            return_path_length=True,
+        )
+        return (after[0], after[1], travelled) if return_path_length else (after[0], after[1])
+    options = [
+        checked_options(rule, x, s, eps, box, chance, dt, position_noise, detach_positions)
+        for rule, chance in zip(species_rules, probabilities, strict=True)
+    ]
+    check_generator(generator, x.device, x.shape[0])
+    told_apart = perception == "per_species"
+    community = make_community(species_rules, sizes, options, divisors, x, told_apart=told_apart)
+    after = run_steps(
+        community,
+        Worlds(x, s, x.new_zeros(x.shape[:2])),
+        steps,
+        generator=generator,
+        memory=memory,
+        watch=make_watch(on_divergence, x, s),
+    )
+    return (after.x, after.s, after.path_length) if return_path_length else (after.x, after.s)
+
+
+def _checked_rules(rules: Any) -> list[NPARule]:
+    given = None if isinstance(rules, NPARule) else entries(rules)
+    if given is None:
+        raise NPAError(
+            f"rules must hold one rule for each species, got {type(rules).__name__}: "
+            f"give (rule,) for one species"
+        )
+    for number, rule in enumerate(given):
+        if not isinstance(rule, NPARule):
+            raise NPAError(
+                f"rules must be NPARule each, got {type(rule).__name__} as rule {number}: "
+                f"load it with npa_envs.load_rule"
+            )
+    return given
+
+
+def _check_agreement(rules: list[NPARule], species_count: int, perception: str) -> None:
+    """Check that rules fit each other, the number of species and the mode of perception."""
+    if not isinstance(perception, str) or perception not in MODES:
+        raise NPAError(f"perception must be 'shared' or 'per_species', got {perception!r}")
+    if len(rules) != species_count:
+        raise NPAError(
+            f"rules and counts must be one for each species, got {len(rules)} rules and "
+            f"{species_count} counts"
+        )
+    expected = 0 if perception == "shared" else species_count
+    for number, rule in enumerate(rules):
+        for name in AGREEMENTS:
+            first, other = getattr(rules[0], name), getattr(rule, name)
+            if first != other:
+                raise NPAError(
+                    f"rules must agree in {name}, got {first} for rule 0 and {other} for rule "
+                    f"{number}: train them alike"
+                )
+        if rule.species_count != expected:
+            raise NPAError(
+                f"perception {perception!r} of {species_count} species needs rules with "
+                f"species_count={expected}, got {rule.species_count} for rule {number}"
+            )
+
+
+def _checked_probabilities(update_prob: Any, species_count: int) -> list[Any]:
+    """Return one probability for each species; their values are checked with the rules."""
+    given = entries(update_prob)
+    if given is None:
+        return [update_prob] * species_count
+    if len(given) != species_count:
+        raise NPAError(
+            f"update_prob must be one number, or one for each of {species_count} species, "
+            f"got {len(given)}"
+        )
+    return given
+
+
+def _checked_divisors(density_counts: Any, counts: tuple[int, ...]) -> tuple[float, ...]:
+    """Return what each species divides densities by."""
+    if density_counts is None:
+        return (float(sum(counts)),) * len(counts)
+    given = entries(density_counts)
+    if given is None:
+        given = [density_counts]
+    checked = tuple(checked_number("an entry of density_counts", number) for number in given)
+    if len(checked) != len(counts) or not all(0.0 < number < math.inf for number in checked):
+        raise NPAError(
+            f"density_counts must hold one positive number for each of {len(counts)} species, "
+            f"got {density_counts!r}: for example density_counts={counts}"
+        )
+    return checked
 
 
 class Species(NamedTuple):
@@ -278,251 +522,3 @@ def _update_of(own: Species, z: Tensor) -> Tensor:
     length = torch.linalg.vector_norm(delta, dim=1, keepdim=True)
     delta = own.reach_share * delta / (1.0 + (1.0 - own.reach_share) * length)
     return torch.cat((delta, update[:, rule.space_dim :]), dim=1)
-
-
-# Several rules in one world: each species follows its own rule, and all see each other.
-
-
-SpeciesPerception = Literal["shared", "per_species"]
-
-MODES: tuple[SpeciesPerception, ...] = ("shared", "per_species")
-"""What rules see of species: nothing, or the density and the density gradient of each."""
-
-AGREEMENTS = (
-    "space_dim",
-    "state_dim",
-    "eps0",
-    "static",
-    "state_gradient",
-    "moment_correction",
-    "moment_inverse",
-    "density_gradient",
-)
-"""What rules must have in common to read one perception pass."""
-
-
-@overload
-def rollout_species(
-    rules: Sequence[NPARule],
-    x: Tensor,
-    s: Tensor,
-    steps: int,
-    *,
-    counts: Sequence[int],
-    eps: float | None = ...,
-    update_prob: float | Sequence[float] = ...,
-    box: Box = ...,
-    dt: float = ...,
-    position_noise: float = ...,
-    generator: Randomness | None = ...,
-    detach_positions: bool = ...,
-    perception: SpeciesPerception = ...,
-    density_counts: Sequence[float] | None = ...,
-    memory: Memory = ...,
-    on_divergence: OnDivergence = ...,
-    return_path_length: Literal[False] = ...,
-) -> tuple[Tensor, Tensor]: ...
-
-
-@overload
-def rollout_species(
-    rules: Sequence[NPARule],
-    x: Tensor,
-    s: Tensor,
-    steps: int,
-    *,
-    counts: Sequence[int],
-    eps: float | None = ...,
-    update_prob: float | Sequence[float] = ...,
-    box: Box = ...,
-    dt: float = ...,
-    position_noise: float = ...,
-    generator: Randomness | None = ...,
-    detach_positions: bool = ...,
-    perception: SpeciesPerception = ...,
-    density_counts: Sequence[float] | None = ...,
-    memory: Memory = ...,
-    on_divergence: OnDivergence = ...,
-    return_path_length: Literal[True],
-) -> tuple[Tensor, Tensor, Tensor]: ...
-
-
-def rollout_species(
-    rules: Sequence[NPARule],
-    x: Tensor,
-    s: Tensor,
-    steps: int,
-    *,
-    counts: Sequence[int],
-    eps: float | None = None,
-    update_prob: float | Sequence[float] = 0.5,
-    box: Box = None,
-    dt: float = 1.0,
-    position_noise: float = 0.0,
-    generator: Randomness | None = None,
-    detach_positions: bool = True,
-    perception: SpeciesPerception = "shared",
-    density_counts: Sequence[float] | None = None,
-    memory: Memory = "store",
-    on_divergence: OnDivergence = "ignore",
-    return_path_length: bool = False,
-) -> tuple[Tensor, Tensor] | tuple[Tensor, Tensor, Tensor]:
-    """Run several rules in one world; differentiable, and particle i stays particle i.
-
-    Each step is that of `rollout`, with one perception pass for the particles of all species; then
-    each species' rule updates its own particles. A species' rule reads its neighbours' states
-    whatever their species, as in the paper (arXiv 2601.16096). With one species this is `rollout`,
-    and with several that have one rule it is `rollout` of all particles, up to rounding.
-
-    What rules perceive of densities is divided by the particles of the whole world. A rule that was
-    trained alone then sees less of itself the more others there are, however far away;
-    `density_counts=counts` lets it see itself as it does alone.
-
-    Args:
-        rules: One rule for each species; dtype and device of x. They agree in space dimension,
-            channels, eps0, groups of perception, and in whether particles move; not necessarily in
-            hidden units, alpha or read-out.
-        x: Particle positions [length units], shape [B, N, D], species after species.
-        s: Particle states, dimensionless, shape [B, N, C].
-        steps: Number of steps T, 0 or more.
-        counts: Particles of each species, which sum to N: species k owns `counts[k]` consecutive
-            ones.
-        eps: Perception radius [length units]; default: the rules' eps0.
-        update_prob: Probability of each particle's update in a step, in (0, 1], for all species or
-            one for each.
-        box: Sides of a periodic box centred on the origin [length units], or None for open space.
-        dt: Time step, dimensionless.
-        position_noise: Standard deviation of the noise added to every position in each step
-            [length units].
-        generator: Source of the masks and the noise, on x's device; default: torch's global one.
-            With one `update_prob` it gives what it gives `rollout`.
-        detach_positions: Perception does not back-propagate into positions (the paper's choice).
-        perception: "shared", or "per_species" for rules made with `species_count`: they also
-            perceive the density and the density gradient of each species, as `perceive_species`
-            gives them.
-        density_counts: What each species divides densities and their gradients by, positive;
-            default: N, the particles of the world, for all.
-        memory: What the backward pass reads is stored or recomputed, as in `rollout`.
-        on_divergence: "ignore" worlds that diverge, or "raise" at the end, as in `rollout`.
-        return_path_length: Also return how far each particle travelled.
-
-    Returns:
-        Positions [length units], shape [B, N, D]; states, dimensionless, shape [B, N, C]; and where
-        asked the length of each particle's path [length units], shape [B, N].
-
-    Raises:
-        NPAError: Rules do not agree, counts do not fit, or as for `rollout`.
-        DivergedError: As for `rollout`.
-    """
-    steps = checked_count("steps", steps)
-    species_rules = _checked_rules(rules)
-    check_world(x, s)
-    sizes = checked_counts(counts, x.shape[1])
-    _check_agreement(species_rules, len(sizes), perception)
-    probabilities = _checked_probabilities(update_prob, len(sizes))
-    divisors = _checked_divisors(density_counts, sizes)
-    check_memory(memory)
-    if perception == "shared" and divisors == (float(x.shape[1]),):
-        *after, travelled = rollout(
-            species_rules[0],
-            x,
-            s,
-            steps,
-            eps=eps,
-            box=box,
-            update_prob=probabilities[0],
-            dt=dt,
-            position_noise=position_noise,
-            detach_positions=detach_positions,
-            memory=memory,
-            generator=generator,
-            on_divergence=on_divergence,
-            return_path_length=True,
-        )
-        return (after[0], after[1], travelled) if return_path_length else (after[0], after[1])
-    options = [
-        checked_options(rule, x, s, eps, box, chance, dt, position_noise, detach_positions)
-        for rule, chance in zip(species_rules, probabilities, strict=True)
-    ]
-    check_generator(generator, x.device, x.shape[0])
-    told_apart = perception == "per_species"
-    community = make_community(species_rules, sizes, options, divisors, x, told_apart=told_apart)
-    after = run_steps(
-        community,
-        Worlds(x, s, x.new_zeros(x.shape[:2])),
-        steps,
-        generator=generator,
-        memory=memory,
-        watch=make_watch(on_divergence, x, s),
-    )
-    return (after.x, after.s, after.path_length) if return_path_length else (after.x, after.s)
-
-
-def _checked_rules(rules: Any) -> list[NPARule]:
-    given = None if isinstance(rules, NPARule) else entries(rules)
-    if given is None:
-        raise NPAError(
-            f"rules must hold one rule for each species, got {type(rules).__name__}: "
-            f"give (rule,) for one species"
-        )
-    for number, rule in enumerate(given):
-        if not isinstance(rule, NPARule):
-            raise NPAError(
-                f"rules must be NPARule each, got {type(rule).__name__} as rule {number}: "
-                f"load it with npa_envs.load_rule"
-            )
-    return given
-
-
-def _check_agreement(rules: list[NPARule], species_count: int, perception: str) -> None:
-    """Check that rules fit each other, the number of species and the mode of perception."""
-    if not isinstance(perception, str) or perception not in MODES:
-        raise NPAError(f"perception must be 'shared' or 'per_species', got {perception!r}")
-    if len(rules) != species_count:
-        raise NPAError(
-            f"rules and counts must be one for each species, got {len(rules)} rules and "
-            f"{species_count} counts"
-        )
-    expected = 0 if perception == "shared" else species_count
-    for number, rule in enumerate(rules):
-        for name in AGREEMENTS:
-            first, other = getattr(rules[0], name), getattr(rule, name)
-            if first != other:
-                raise NPAError(
-                    f"rules must agree in {name}, got {first} for rule 0 and {other} for rule "
-                    f"{number}: train them alike"
-                )
-        if rule.species_count != expected:
-            raise NPAError(
-                f"perception {perception!r} of {species_count} species needs rules with "
-                f"species_count={expected}, got {rule.species_count} for rule {number}"
-            )
-
-
-def _checked_probabilities(update_prob: Any, species_count: int) -> list[Any]:
-    """Return one probability for each species; their values are checked with the rules."""
-    given = entries(update_prob)
-    if given is None:
-        return [update_prob] * species_count
-    if len(given) != species_count:
-        raise NPAError(
-            f"update_prob must be one number, or one for each of {species_count} species, "
-            f"got {len(given)}"
-        )
-    return given
-
-
-def _checked_divisors(density_counts: Any, counts: tuple[int, ...]) -> tuple[float, ...]:
-    """Return what each species divides densities by."""
-    if density_counts is None:
-        return (float(sum(counts)),) * len(counts)
-    given = entries(density_counts)
-    if given is None:
-        given = [density_counts]
-    checked = tuple(checked_number("an entry of density_counts", number) for number in given)
-    if len(checked) != len(counts) or not all(0.0 < number < math.inf for number in checked):
-        raise NPAError(
-            f"density_counts must hold one positive number for each of {len(counts)} species, "
-            f"got {density_counts!r}: for example density_counts={counts}"
-        )
-    return checked

@@ -9,7 +9,7 @@ import torch
 from npa_envs.errors import NPAError
 from npa_envs.ops import apply_actions
 from npa_envs.ops.perceive import Rows
-from npa_envs.ops.update import ActionRules, RepeatedActions, update_particles
+from npa_envs.ops.update import ActionRules, PreparedActions, update_particles
 
 B, N, C = 3, 77, 5
 REACH, DT, STATE_SCALE = 0.07, 0.8, 0.6
@@ -314,7 +314,7 @@ def repeated(x, s, **options):
         "diverged": torch.zeros(x.shape[0], dtype=torch.uint8, device=x.device),
         **options,
     }
-    return RepeatedActions(x, s, rules, enabled=enabled, **given), (x, s), enabled
+    return PreparedActions(x, s, rules, enabled=enabled, **given), (x, s), enabled
 
 
 @pytest.mark.parametrize("how", ["plain", "strided", "misaligned", "other dtype", "on the host"])

@@ -11,13 +11,12 @@ from worlds import random_world
 
 import npa_envs
 from npa_envs.ops import launch as bridge
-from npa_envs.ops import launch as threads
-from npa_envs.ops import orbit, render_gaussians
-from npa_envs.ops.launch import even_ranges, run_together
+from npa_envs.ops import orbit, render_gaussians, threads
 from npa_envs.ops.perceive import Terms, perceive_rows, survey
 from npa_envs.ops.pictures.losses import picture_losses
 from npa_envs.ops.pictures.splat import splat
-from npa_envs.ops.update import ActionRules, RepeatedActions, update_particles
+from npa_envs.ops.threads import even_ranges, run_together
+from npa_envs.ops.update import ActionRules, PreparedActions, update_particles
 
 STATE_DIM = 5
 SMALL_RANGE = 7
@@ -92,7 +91,7 @@ def acted(x, s):
     """Return worlds after two actions, and what they observe then."""
     x, s = x.clone(), s.clone()
     diverged = torch.zeros(x.shape[0], dtype=torch.uint8)
-    actions = RepeatedActions(
+    actions = PreparedActions(
         x,
         s,
         ActionRules(0.1, 1.0, 1.0, True, None, position_limit=0.6, state_limit=10.0),
@@ -208,7 +207,7 @@ def test_worker_processes_use_one_thread_unless_told_otherwise(tmp_path):
     script.write_text(
         "import multiprocessing\n"
         "import torch\n"
-        "from npa_envs.ops.launch import thread_count\n"
+        "from npa_envs.ops.threads import thread_count\n"
         "def counts(_):\n"
         "    default = thread_count()\n"
         "    torch.set_num_threads(5)\n"

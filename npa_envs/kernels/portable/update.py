@@ -1,4 +1,4 @@
-"""One step's update of positions and states: from a rule's outputs, with its adjoint, or actions.
+"""Updates of positions and states, from a rule's outputs or from actions, with the adjoint.
 
 A displacement is alpha eps delta / (1 + |delta|): it never exceeds alpha eps. An action gives it
 as a fraction of alpha eps.
@@ -327,9 +327,6 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
     return SimpleNamespace(
         apply_update=apply_update, pull_back_update=pull_back_update, apply_actions=apply_actions
     )
-
-
-# Whether numbers are finite, without waiting for the answer.
 
 
 QUAD = 4

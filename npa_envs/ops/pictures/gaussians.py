@@ -1,4 +1,4 @@
-"""Checks at the door of `render_gaussians`."""
+"""Pictures of 3D Gaussians as a differentiable torch operator."""
 
 from __future__ import annotations
 
@@ -133,9 +133,6 @@ def check_cameras(
         )
 
 
-# Pairs of tiles and Gaussians: sorted, drawn, and what tiles pull at them.
-
-
 def _room(ends: Tensor, pairs_per_particle: int) -> int:
     """Return how many pairs a picture has room for."""
     if pairs_per_particle:
@@ -235,9 +232,6 @@ def pull_back_tiles(
         pulled = (*listed, passing.clone(), passing * passing_bar, pulls)
         launch(tile_kernels(scalar).pull_back_tiles, tiles, device, frame, *pulled)
     return pulls
-
-
-# Pictures of 3D Gaussians as a differentiable torch operator.
 
 
 PAIRS_PER_PARTICLE = 8

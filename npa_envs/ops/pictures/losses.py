@@ -1,4 +1,4 @@
-"""Errors of 2D worlds' pictures against a target, without gradient and at once."""
+"""Losses of 2D worlds' pictures against a target, without gradient and at once."""
 
 from __future__ import annotations
 

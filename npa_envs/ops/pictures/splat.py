@@ -303,9 +303,6 @@ def checked_window(
     return side, pixel, spread, begin, end
 
 
-# Pictures of periodic worlds: what leaves one edge comes in at the opposite one.
-
-
 def periodic_splat(
     x: Tensor,
     colour: Tensor,
