@@ -21,7 +21,7 @@ def pytest_addoption(parser):
 
 
 def pytest_collection_modifyitems(items):
-    """Mark the tests that a CUDA device changes something for: `make test-cuda` runs these alone."""
+    """Mark the tests that a CUDA device changes something for: `make test-cuda` runs these."""
     for item in items:
         reasons = [str(mark.kwargs.get("reason")) for mark in item.iter_markers("skipif")]
         if "device" in getattr(item, "fixturenames", ()) or any("CUDA" in r for r in reasons):
