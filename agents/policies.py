@@ -460,16 +460,6 @@ def check_rule_fits(rule: NPARule, wanted: Interface, config: Any) -> None:
         NPAError: It cannot; the message says in what they differ.
     """
     _check_correction(rule)
-    if rule.space_dim != wanted.space_dim:
-        raise NPAError(
-            f"rule must have the environment's space_dim, {wanted.space_dim}, got "
-            f"{rule.space_dim}: choose another environment or another rule"
-        )
-    if rule.state_dim != wanted.state_dim:
-        raise NPAError(
-            f"rule must have the environment's state_dim, {wanted.state_dim}, got "
-            f"{rule.state_dim}: make the environment with state_dim={rule.state_dim}"
-        )
     if rule.static == wanted.moving:
         kind, other = ("static", "moving") if rule.static else ("moving", "static")
         raise NPAError(
@@ -481,19 +471,23 @@ def check_rule_fits(rule: NPARule, wanted: Interface, config: Any) -> None:
             f"rule must tell as many species apart as the environment, {wanted.species_count}, got "
             f"{rule.species_count}: choose another rule, or another perception"
         )
-    if rule.moment_inverse != config.moment_inverse:
-        raise NPAError(
-            f"rule must have the environment's moment_inverse, {config.moment_inverse!r}, got "
-            f"{rule.moment_inverse!r}: make the environment with "
-            f"moment_inverse={rule.moment_inverse!r}"
-        )
-    for name in ("eps0",) if rule.static else ("eps0", "alpha"):
-        own, theirs = getattr(rule, name), getattr(config, name)
-        if not math.isclose(own, theirs, rel_tol=1e-6):
-            raise NPAError(
-                f"rule must have the environment's {name}, {theirs:g}, got {own:g}: make the "
-                f"environment with {name}={own:g}"
-            )
+    theirs = {
+        "space_dim": wanted.space_dim,
+        "state_dim": wanted.state_dim,
+        "moment_inverse": config.moment_inverse,
+        "eps0": config.eps0,
+        # Nothing moves in a static rule's worlds.
+        "alpha": rule.alpha if rule.static else config.alpha,
+    }
+    for name, value in theirs.items():
+        own = getattr(rule, name)
+        if math.isclose(own, value, rel_tol=1e-6) if isinstance(own, float) else own == value:
+            continue
+        shown, found = (f"{n:g}" if isinstance(n, float) else repr(n) for n in (value, own))
+        cure = f"make the environment with {name}={found}"
+        if name == "space_dim":
+            cure = "choose another environment or another rule"
+        raise NPAError(f"rule must have the environment's {name}, {shown}, got {found}: {cure}")
 
 
 def _check_correction(rule: NPARule) -> None:

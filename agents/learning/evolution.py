@@ -95,7 +95,7 @@ def train(
         seeds = draws.integers(FIRST_EVALUATION_SEED, size=options.worlds_per_candidate).tolist()
         weights = torch.as_tensor(np.stack(proposed), dtype=torch.float32).to(device)
         found = fitness(envs, candidates, weights, seeds, problem.episode_steps)
-        strategy.tell(proposed, _costs(found.cpu().double().numpy()))
+        strategy.tell(proposed, costs(found.cpu().double().numpy()))
         candidates.put(strategy.mean)
         return world_count * problem.particle_count * problem.episode_steps
 
@@ -254,9 +254,13 @@ def _strategy(candidates: Population, options: EvolutionOptions, draws: np.rando
     return cma.CMAEvolutionStrategy(candidates.vector(), options.sigma, words)
 
 
-def _costs(found: NDArray[np.float64]) -> list[float]:
-    """Return what is to be minimised; candidates without a finite return are the worst of all."""
+def costs(found: NDArray[np.float64]) -> list[float]:
+    """Return what is to be minimised; candidates without a finite return are the worst of all.
+
+    Args:
+        found: Their mean returns, shape [K].
+    """
     finite = np.isfinite(found)
     worst = found[finite].min() - 1.0 if finite.any() else 0.0
-    costs: list[float] = (-np.where(finite, found, worst)).tolist()
-    return costs
+    minimised: list[float] = (-np.where(finite, found, worst)).tolist()
+    return minimised

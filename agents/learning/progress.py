@@ -195,8 +195,7 @@ class Progress:
         Raises:
             NPAError: Nothing has started yet.
         """
-        if not self._started:
-            raise NPAError("advance needs a start: call progress.start(rules) after the set-up")
+        self._check_started("advance")
         self.particle_steps += particle_steps
         if self._device.type == "cuda":
             event = torch.cuda.Event()  # type: ignore[no-untyped-call]
@@ -216,8 +215,7 @@ class Progress:
             NPAError: Nothing has started yet.
             DivergedError: A weight of the rules is not finite, or an action.
         """
-        if not self._started:
-            raise NPAError("look needs a start: call progress.start(rules) after the set-up")
+        self._check_started("look")
         fresh = self.particle_steps > self.log[-1].particle_steps
         due = self.share >= (self._looks + 1) / self._entries
         if not fresh or not (force or due):
@@ -227,6 +225,10 @@ class Progress:
         self._looks = int(self.share * self._entries)
         self._evaluate(actor)
         self._since = time.perf_counter()
+
+    def _check_started(self, caller: str) -> None:
+        if not self._started:
+            raise NPAError(f"{caller} needs a start: call progress.start(rules) after the set-up")
 
     def _evaluate(self, actor: RuleSet | Callable[[Any], Any]) -> None:
         if self._envs is None:

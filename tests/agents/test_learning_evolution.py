@@ -10,7 +10,7 @@ import torch
 
 from npa_envs.agents import evaluate_policy
 from npa_envs.agents.learning import Budget, Problem, RuleSet, train
-from npa_envs.agents.learning.evolution import Population, _costs, fitness
+from npa_envs.agents.learning.evolution import Population, costs, fitness
 from npa_envs.errors import MissingDependencyError, NPAError
 
 GROWTH = {
@@ -142,8 +142,8 @@ def test_what_comes_after_an_episode_is_over_does_not_count(device):
 
 
 def test_candidates_without_a_finite_return_are_the_worst():
-    assert _costs(np.array([1.0, np.nan, 3.0, -np.inf])) == [-1.0, 0.0, -3.0, 0.0]
-    assert _costs(np.array([np.nan, np.nan])) == [0.0, 0.0]
+    assert costs(np.array([1.0, np.nan, 3.0, -np.inf])) == [-1.0, 0.0, -3.0, 0.0]
+    assert costs(np.array([np.nan, np.nan])) == [0.0, 0.0]
 
 
 def test_evolution_gets_better(device):

@@ -502,7 +502,8 @@ def test_without_stable_baselines3_the_error_names_the_extra():
 def test_a_star_imports_every_wrapper_that_needs_no_extra():
     code = (
         "import sys\n"
-        "sys.modules['stable_baselines3'] = None\n"
+        "for name in ('stable_baselines3', 'pettingzoo', 'ray', 'torchrl', 'rsl_rl'):\n"
+        "    sys.modules[name] = None\n"
         "from npa_envs.wrappers import *\n"
         "print(DamageEvents.__name__, VectorSpeciesTags.__name__, TorchNormalizeReward.__name__)\n"
         "assert 'ParticleVecEnv' not in globals()\n"
