@@ -10,6 +10,14 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
+from npa_envs.cli.output import (
+    MeasureOptions,
+    StepBar,
+    check_numbers,
+    chosen_names,
+    torch_threads,
+    writable_folder,
+)
 from npa_envs.errors import NPAError
 
 if TYPE_CHECKING:
@@ -24,7 +32,7 @@ QUICK = "quick"
 
 
 @dataclass(frozen=True, kw_only=True)
-class BenchOptions:
+class BenchOptions(MeasureOptions):
     """Measure run time against error, the paper's table or scaling; or explain what a step runs."""
 
     suite: str | None = None
@@ -32,9 +40,6 @@ class BenchOptions:
 
     quick: bool = False
     """Small worlds only: about a minute on a CPU."""
-
-    device: str = "cpu"
-    """Where to run: cpu, cuda, cuda:1."""
 
     strategies: tuple[str, ...] = ()
     """Ways to perceive: library, plain, hash_grid, dense, neighbour_cap; default: all."""
@@ -45,9 +50,6 @@ class BenchOptions:
     repeats: int = 7
     """Readings of every time; tables show their median and range."""
 
-    threads: int = 1
-    """CPU threads of torch and of the kernels."""
-
     output: Path | None = None
     """Folder for SUITE_DEVICE.json and plots; default: nothing is written."""
 
@@ -56,9 +58,6 @@ class BenchOptions:
 
     check: Path | None = None
     """JSON of stored ratios: end with code 1 where one is missed threefold. Suite quick."""
-
-    commit: str | None = None
-    """Commit that is measured; default: that of the checkout."""
 
     explain: bool = False
     """Measure nothing: say which kernels a step launches, and why. The options below tell which."""
@@ -87,9 +86,6 @@ class BenchOptions:
     gradients: Literal["none", "weights", "positions"] = "weights"
     """What it is differentiated by: nothing, weights and states, or positions as well."""
 
-    progress: bool = True
-    """Show a progress bar."""
-
 
 def main(arguments: Sequence[str]) -> int:
     """Measure, print, write and check; return 1 where `--check` found a ratio that was missed.
@@ -98,7 +94,6 @@ def main(arguments: Sequence[str]) -> int:
         NPAError: There is no such suite, device, strategy or precision, or a file is wrong.
     """
     options = tyro.cli(BenchOptions, prog="npa-envs bench", args=arguments)
-    from npa_envs.cli.output import check_numbers, chosen_names, writable_folder
     from npa_envs.devices import check_device
     from npa_envs.measure.plots import check_matplotlib
     from npa_envs.measure.speed.suites import SUITES, missed_ratios, stored_ratios
@@ -138,7 +133,6 @@ def measured_report(options: BenchOptions, device: torch.device, command: str) -
     Raises:
         NPAError: There is no such strategy or precision.
     """
-    from npa_envs.cli.output import StepBar, chosen_names, torch_threads
     from npa_envs.measure.record import current_commit
     from npa_envs.measure.speed.strategies import PRECISIONS, STRATEGIES
     from npa_envs.measure.speed.suites import SUITES, Report, ratios

@@ -12,6 +12,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from npa_envs.cli.output import (
+    MeasureOptions,
+    StepBar,
+    check_numbers,
+    chosen_names,
+    writable_folder,
+)
 from npa_envs.errors import NPAError, suggest
 
 if TYPE_CHECKING:
@@ -28,7 +35,7 @@ QUICK_EPISODES, QUICK_STEPS = 4, 200_000
 
 
 @dataclass(frozen=True, kw_only=True)
-class CompareOptions:
+class CompareOptions(MeasureOptions):
     """Compare methods on tasks over seeds, for equal wall time, equal particle-steps, or both.
 
     Every run is a process of its own. One that fails is recorded with its error, and the others go
@@ -65,9 +72,6 @@ class CompareOptions:
     """Tiny worlds and, unless said otherwise, few steps: figures that say nothing but that it
     runs."""
 
-    device: str = "cpu"
-    """Where to run: cpu, cuda, cuda:1."""
-
     devices: tuple[str, ...] = ()
     """Several devices that runs are dealt out to, for example cuda:0 cuda:1; default: --device."""
 
@@ -75,17 +79,8 @@ class CompareOptions:
     """Runs at once; default: one for each device. Those on one device share its time, which counts
     where wall time is equal: with --seconds, as many on each device."""
 
-    threads: int = 1
-    """CPU threads of each run."""
-
     max_seconds: float = math.inf
     """No run begins after so long; the next call goes on."""
-
-    commit: str | None = None
-    """Commit that is measured; default: that of the checkout."""
-
-    progress: bool = True
-    """Show a progress bar."""
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -98,7 +93,6 @@ def main(arguments: Sequence[str]) -> int:
     options = tyro.cli(CompareOptions, prog="npa-envs compare", args=arguments)
     from npa_envs.agents.comparison.report import write_pictures, write_table
     from npa_envs.agents.comparison.scheduler import Places, held_records, run_jobs
-    from npa_envs.cli.output import StepBar, writable_folder
 
     # Records are not to tell where on which machine they were written.
     words = ["OUT" if word == str(options.output) else word for word in arguments]
@@ -146,7 +140,6 @@ def make_plan(options: CompareOptions) -> Plan:
     """
     from npa_envs.agents.comparison.plan import LEFT_OUT, PROBLEMS, Plan, make_problem
     from npa_envs.agents.learning import METHODS, REMOVED
-    from npa_envs.cli.output import check_numbers, chosen_names
 
     check_numbers(options, seeds=1, episodes=1, jobs=1, threads=1)
     tasks = chosen_names("task", options.tasks, PROBLEMS)

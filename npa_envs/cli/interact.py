@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from npa_envs.cli.output import StepBar, check_numbers, writable_folder
 from npa_envs.errors import NPAError
 
 if TYPE_CHECKING:
@@ -83,7 +84,6 @@ def main(arguments: Sequence[str]) -> int:
             written to or holds results of other settings.
     """
     options = tyro.cli(InteractOptions, prog="npa-envs interact", args=arguments)
-    from npa_envs.cli.output import StepBar, check_numbers, writable_folder
     from npa_envs.devices import check_device
     from npa_envs.measure.interaction import Encounters, heat_map, read_rows, write_rows
     from npa_envs.measure.plots import write_plots

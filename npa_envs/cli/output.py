@@ -74,6 +74,23 @@ def writable_folder(path: Path) -> Path:
     return path
 
 
+@dataclass(frozen=True, kw_only=True)
+class MeasureOptions:
+    """Options of the commands that measure and keep records."""
+
+    device: str = "cpu"
+    """Where to run: cpu, cuda, cuda:1."""
+
+    threads: int = 1
+    """CPU threads of torch and of the kernels, of each run; figures are the same, times are not."""
+
+    commit: str | None = None
+    """Commit that is measured; default: that of the checkout."""
+
+    progress: bool = True
+    """Show a progress bar."""
+
+
 def check_numbers(options: Any, **least: int) -> None:
     """Check that options of a command, where given, are at least so large, and its time limit.
 

@@ -10,6 +10,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from npa_envs.cli.output import (
+    MeasureOptions,
+    StepBar,
+    check_numbers,
+    chosen_names,
+    torch_threads,
+    writable_folder,
+)
+
 if TYPE_CHECKING:
     import torch
 
@@ -21,7 +30,7 @@ QUICK_SEEDS, QUICK_PARTICLES = 2, 256
 
 
 @dataclass(frozen=True, kw_only=True)
-class RobustnessOptions:
+class RobustnessOptions(MeasureOptions):
     """Measure how rules grow under other conditions, and how they recover from damage.
 
     Unlike `npa-envs stress` this expects nothing and gives no verdicts: it is a table of figures
@@ -45,24 +54,12 @@ class RobustnessOptions:
     quick: bool = False
     """Small worlds, few steps and values: figures that say nothing but that it runs."""
 
-    device: str = "cpu"
-    """Where to run: cpu, cuda, cuda:1."""
-
-    threads: int = 1
-    """CPU threads of torch and of the kernels; the figures are the same."""
-
     output: Path | None = None
     """Folder for robustness_RULE.json, robustness.md, and curves (extra `bench`); default: nothing
     is written."""
 
-    commit: str | None = None
-    """Commit that is measured; default: that of the checkout."""
-
     max_seconds: float | None = None
     """Stop after this time; the same command goes on. Default: never."""
-
-    progress: bool = True
-    """Show a progress bar."""
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -73,13 +70,6 @@ def main(arguments: Sequence[str]) -> int:
             written to or holds figures of other settings.
     """
     options = tyro.cli(RobustnessOptions, prog="npa-envs robustness", args=arguments)
-    from npa_envs.cli.output import (
-        StepBar,
-        check_numbers,
-        chosen_names,
-        torch_threads,
-        writable_folder,
-    )
     from npa_envs.devices import check_device
     from npa_envs.measure.accuracy.habitats import rule_names
     from npa_envs.measure.record import measured_facts, time_limit

@@ -9,6 +9,14 @@ from typing import TYPE_CHECKING
 
 import tyro
 
+from npa_envs.cli.output import (
+    MeasureOptions,
+    StepBar,
+    check_numbers,
+    torch_threads,
+    writable_folder,
+)
+
 if TYPE_CHECKING:
     from npa_envs.measure.accuracy.checks import Check
 
@@ -16,7 +24,7 @@ FAILED = 1
 
 
 @dataclass(frozen=True, kw_only=True)
-class StressOptions:
+class StressOptions(MeasureOptions):
     """Check hard geometry, hard values, long runs of rules, gradients, precision.
 
     Every check has an expectation, figures and a verdict: pass, fail, a range (where something
@@ -27,9 +35,6 @@ class StressOptions:
     quick: bool = False
     """Small worlds, few steps, some rules: about a minute on two CPU cores."""
 
-    device: str = "cpu"
-    """Where to run: cpu, cuda, cuda:1."""
-
     only: tuple[str, ...] = ()
     """Groups (geometry, values, time, gradients, precision), checks (time/gecko), or the first
     words of checks (geometry/clump); default: all."""
@@ -37,23 +42,14 @@ class StressOptions:
     max_seconds: float | None = None
     """Begin no check after so long [s]; what is left is skipped, and run by the next call."""
 
-    threads: int = 1
-    """CPU threads of torch and of the kernels; the figures are the same."""
-
     seed: int = 0
     """What random worlds are drawn from."""
 
     output: Path | None = None
     """Folder for stress_DEVICE.json and heat maps (extra `bench`); default: nothing is written."""
 
-    commit: str | None = None
-    """Commit that is measured; default: that of the checkout."""
-
     list: bool = False
     """Run nothing: say which checks there are and what each expects."""
-
-    progress: bool = True
-    """Show a progress bar."""
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -64,7 +60,6 @@ def main(arguments: Sequence[str]) -> int:
             figures of other settings.
     """
     options = tyro.cli(StressOptions, prog="npa-envs stress", args=arguments)
-    from npa_envs.cli.output import StepBar, check_numbers, torch_threads, writable_folder
     from npa_envs.devices import check_device
     from npa_envs.measure.accuracy import suite
     from npa_envs.measure.accuracy.checks import Session
