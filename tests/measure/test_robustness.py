@@ -379,24 +379,22 @@ def test_a_record_comes_back_as_it_was_written(tmp_path: Path):
     assert repr(RuleRecord.read(path, {"a": 1})) == repr(written)
 
 
-def test_tables_say_who_recovered_when_and_what_was_not_measured():
+def test_stored_records_give_the_stored_tables():
+    folder = Path(__file__).resolve().parents[2] / "benchmarks" / "results" / "robustness_h200"
+    places = [folder / f"robustness_{name}.json" for name in rule_names()]
+    held = {path: json.loads(path.read_text("utf-8")) for path in places if path.exists()}
+    records = [RuleRecord.read(path, content["facts"]) for path, content in held.items()]
+    assert tables(records) == (folder / "robustness.md").read_text("utf-8")
+
+
+def test_tables_say_what_was_not_measured_and_what_is_not_finite():
     course = Course("erase", (0, 16), ((2.0, 1.0), (2.0, 3.0)), ((1.0, 1.0), (1.0, 1.0)))
-    noise = dataclasses.replace(course, damage="noise", losses=course.losses[1:] * 2)
-    text = tables([record(course, noise), record(rule="dots")])
-    assert text.startswith("Where rules work: ")
-    heads = "| rule | eps | particles | update_prob | dt | noise | shape |"
+    text = tables([record(course), record(rule="dots")])
     ranges = "1 … 2 | 1 alone (not measured: 2) | 0.5 alone | – | – | – |"
-    assert f"{heads}\n{'| --- ' * 7}|\n| heart | {ranges}\n| dots | {ranges}" in text
-    assert "| heart | 1/2, 16 |" in text
-    assert "| heart | 2 → 2 (1/2) |" in text
-    assert "| dots | – |" in text
+    assert f"| heart | {ranges}\n| dots | {ranges}" in text
+    for line in ("| heart | 1/2, 16 |", "| heart | 2 → 2 (1/2) |", "| dots | – |"):
+        assert line in text
     assert "| heart | 0.75 | 1 | 1.67 | nan |" in text
-    assert "| heart | 0.75 | 1 | – |" in text
-    end = " rule × damage × seed, 50.0%; within 1.1 at the end: 1, 50.0%."
-    asked = "Recovered of what rules are asked to heal (erase, cut, clump, half): 1 of 2"
-    assert asked + end in text
-    beyond = "Recovered of what is beyond that (noise, side): 0 of 2 rule × damage × seed, 0.0%;"
-    assert beyond in text
 
 
 def test_curves_are_drawn_by_task():
