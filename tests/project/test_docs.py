@@ -21,7 +21,10 @@ ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
 OWN = DOCS / "own_environment.md"
 PAGES = [DOCS / "environments" / f"{registration.name}.md" for registration in ENVIRONMENTS]
+MAP = DOCS / "architecture.md"
 TEXTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
+FOLDERS = "npa_envs|envs|wrappers|agents|tests|benchmarks|docs"
+"""Folders by which a path in a text is known for one."""
 SMALL = {"particle_count": 64, "eps": 0.3, "resolution": 16}
 NO_PICTURE = ("PointClassification",)
 BY_ID = {registration.id: registration for registration in ENVIRONMENTS}
@@ -321,3 +324,41 @@ def test_links_lead_somewhere(path):
         assert there.exists(), f"{target} is not there"
         if anchor:
             assert anchor in anchors(there), f"{there.name} has no heading {anchor}"
+
+
+def in_package(name: str) -> Path:
+    """Return where a path lies that may leave out `npa_envs/`."""
+    return ROOT / name if (ROOT / name).exists() else ROOT / "npa_envs" / name
+
+
+@pytest.mark.parametrize("path", TEXTS, ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_paths_in_code_exist(path):
+    text = path.read_text()
+    named = re.findall(rf"`((?:{FOLDERS})/[\w./]*|\w+/[\w/]*\.(?:py|cuh))`", text)
+    gone = [name for name in named if "NAME" not in name and not in_package(name).exists()]
+    assert gone == []
+
+
+def test_the_map_names_what_is_there():
+    """Of the drawings' lines, of the way of `eps`, and of "`name` in `file`"."""
+    text = MAP.read_text()
+    trail = re.findall(r"((?:npa_envs|envs)/[\w/]+\.py): ([\w.]+)", text)
+    assert len(trail) == 10
+    drawn = re.findall(r"((?:world|ops|rule|envs/core)/\w+\.py) +([A-Za-z_]\w*(?:\.\w+)?) ", text)
+    assert len(drawn) > 10
+    told = [pair[::-1] for pair in re.findall(r"`([\w.]+)` (?:in|of) `([\w/]+\.py)`", text)]
+    for file, names in re.findall(r"`([\w/]+\.py)` \((`[\w`, ]+)\)", text):
+        told += [(file, name) for name in re.findall(r"\w+", names)]
+    assert len(told) > 20
+    for file, name in [*trail, *drawn, *told]:
+        for part in name.split("."):
+            defined = rf"^ *(?:def|class) {part}\b|^ *{part}\b(?:: .*)? = |^    {part}:"
+            there = re.search(defined, in_package(file).read_text(), re.MULTILINE)
+            assert there, f"{file} has no {name}"
+
+
+def test_the_index_leads_to_every_page():
+    links = re.findall(r"\]\(([^)#]+)", (DOCS / "index.md").read_text())
+    linked = {(DOCS / name).resolve() for name in links}
+    pages = {*DOCS.glob("*.md"), DOCS / "environments" / "README.md"}
+    assert pages - {DOCS / "index.md"} <= linked
