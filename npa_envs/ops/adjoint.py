@@ -84,17 +84,14 @@ def perceive_rows_backward(
         box,
     )
     bar = perception_bar.contiguous()
-    tiled = plan.runs("adjoint") == "cuda"
-    if tiled:
+    if plan.runs("adjoint", position_gradient=saved.states is not None) == "cuda":
         states_bar = _gather_by_tiles(plan, saved, bar, scale, state_gradient)
-        if saved.states is None:
-            return states_bar, states_bar.new_empty(0)
+        return states_bar, states_bar.new_empty(0)
     kernels = adjoint_kernels(
         space_dim, plan.scalar, plan.width, plan.on_cpu, state_gradient, bool(listed)
     )
     cotangents = _unscale(kernels, plan, saved, bar, scale, density_gradient)
-    if not tiled:
-        states_bar = _gather_states(kernels, plan, saved, listed, cotangents)
+    states_bar = _gather_states(kernels, plan, saved, listed, cotangents)
     if saved.states is None:
         return states_bar, bar.new_empty(0)
     return states_bar, _gather_positions(kernels, plan, saved, cotangents)

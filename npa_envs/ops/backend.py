@@ -15,9 +15,7 @@ from typing import Literal, NamedTuple
 
 import torch
 
-Operator = Literal[
-    "sort", "density", "perceive", "adjoint", "position_adjoint", "network", "update"
-]
+Operator = Literal["sort", "density", "perceive", "adjoint", "network", "update"]
 
 LARGEST_ROW, LARGEST_UPDATE, LARGEST_HIDDEN = 128, 32, 512
 """Widest rows and updates, and most hidden units, that the fused network takes."""
@@ -43,6 +41,8 @@ class Request(NamedTuple):
     """Cells of a world's grid."""
     aligned: bool = True
     """Whether tensors begin at multiples of 16 bytes in memory."""
+    position_gradient: bool = False
+    """Whether positions get a gradient through perception."""
     row_width: int = 0
     """Columns of a row of perception."""
     update_width: int = 0
@@ -136,17 +136,10 @@ TABLE: tuple[Implementation, ...] = (
         "adjoint",
         "cuda",
         "kernels/cuda/adjoint.py",
-        f"{_MODERN}: tiles of eight particles on tensor cores",
-        _cuda,
+        f"{_MODERN}, positions get no gradient: tiles of eight particles on tensor cores",
+        lambda request: _cuda(request) and not request.position_gradient,
     ),
     Implementation("adjoint", "portable", "kernels/portable/adjoint.py", "otherwise", _always),
-    Implementation(
-        "position_adjoint",
-        "portable",
-        "kernels/portable/adjoint.py",
-        "always; only where detach_positions=False",
-        _always,
-    ),
     Implementation(
         "network",
         "cuda",
@@ -170,7 +163,7 @@ def choose(operator: Operator, request: Request) -> Implementation:
 def describe(request: Request) -> list[str]:
     """Return a line for each operator: what a call like this takes, where it stands, and why."""
     chosen = [row for row in TABLE if row == choose(row.operator, request)]
-    return [f"{row.operator:16}  {row.name:8}  {row.where:28}  {row.condition}" for row in chosen]
+    return [f"{row.operator:8}  {row.name:8}  {row.where:28}  {row.condition}" for row in chosen]
 
 
 class Listing(NamedTuple):
