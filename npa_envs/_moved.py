@@ -43,16 +43,29 @@ class _MovedLoader(Loader):
 
 
 class MovedFinder(MetaPathFinder):
-    """Finds the modules of the table under their old names, after all other finders."""
+    """Finds the modules of the table under their old names, and refuses modules within them.
+
+    It comes before all other finders: they would find a module within a moved package by the
+    package's path, and run it a second time, which registers torch operators anew.
+    """
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        """Return how to load an old name, or None for all others."""
+        """Return how to load an old name, or None for all others.
+
+        Raises:
+            ModuleNotFoundError: The name lies within an old one.
+        """
+        package = fullname.rpartition(".")[0]
+        if package in MOVED:
+            raise ModuleNotFoundError(
+                f"no module {fullname}: {package} is now {MOVED[package]}", name=fullname
+            )
         return ModuleSpec(fullname, _MovedLoader()) if fullname in MOVED else None
 
 
 def keep_old_names() -> None:
     """Let the old names be imported; once, however often it is called."""
     if not any(type(finder).__name__ == "MovedFinder" for finder in sys.meta_path):
-        sys.meta_path.append(MovedFinder())
+        sys.meta_path.insert(0, MovedFinder())

@@ -43,3 +43,22 @@ def test_import_leaves_the_global_settings_of_torch_alone() -> None:
         "print(settings() == before, torch.equal(state, torch.get_rng_state()))"
     )
     assert run(program) == "True True\n"
+
+
+def test_old_names_of_modules_are_the_new_modules() -> None:
+    program = (
+        "import warnings; warnings.simplefilter('ignore')\n"
+        "import npa_envs.sph, npa_envs.tasks.task, npa_envs.ops, npa_envs.tasks.base\n"
+        "print(npa_envs.sph is npa_envs.ops, npa_envs.tasks.task is npa_envs.tasks.base)"
+    )
+    assert run(program) == "True True\n"
+
+
+def test_modules_within_old_names_are_not_run_a_second_time() -> None:
+    program = (
+        "import warnings; warnings.simplefilter('ignore')\n"
+        "import npa_envs.sph\n"
+        "try: import npa_envs.sph.perceive\n"
+        "except ModuleNotFoundError as error: print(error)\n"
+    )
+    assert run(program) == "no module npa_envs.sph.perceive: npa_envs.sph is now npa_envs.ops\n"
