@@ -44,14 +44,20 @@ class Plan(NamedTuple):
     request: Request
     """What the backend table asks for."""
 
-    def runs(self, operator: Operator, **facts: bool) -> str:
+    def runs(
+        self, operator: Operator, *, aligned: bool = True, position_gradient: bool = False
+    ) -> str:
         """Return the name of the implementation of an operator that runs.
 
         Args:
             operator: The operator.
-            facts: Fields of `Request` that differ from the plan's.
+            aligned: As in `Request`.
+            position_gradient: As in `Request`.
         """
-        return choose(operator, self.request._replace(**facts) if facts else self.request).name
+        request = self.request
+        if not aligned or position_gradient:
+            request = request._replace(aligned=aligned, position_gradient=position_gradient)
+        return choose(operator, request).name
 
     @property
     def on_cpu(self) -> bool:

@@ -68,7 +68,7 @@ class StaticTensors(NamedTuple):
     def of(cls, tensors: list[Tensor]) -> StaticTensors:
         """Return what `flat` made a list of."""
         count = len(cls._fields) - 1
-        return cls(*tensors[:count], lists=tensors[count:])
+        return cls._make([*tensors[:count], tensors[count:]])
 
 
 class StaticWorlds(NamedTuple):

@@ -196,7 +196,7 @@ def rollout_species(
     check_generator(generator, x.device, x.shape[0])
     told_apart = perception == "per_species"
     community = make_community(species_rules, sizes, options, divisors, x, told_apart=told_apart)
-    after = run_steps(
+    worlds = run_steps(
         community,
         Worlds(x, s, x.new_zeros(x.shape[:2])),
         steps,
@@ -204,7 +204,9 @@ def rollout_species(
         memory=memory,
         watch=make_watch(on_divergence, x, s),
     )
-    return (after.x, after.s, after.path_length) if return_path_length else (after.x, after.s)
+    if return_path_length:
+        return worlds.x, worlds.s, worlds.path_length
+    return worlds.x, worlds.s
 
 
 def _checked_rules(rules: Any) -> list[NPARule]:
