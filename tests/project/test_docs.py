@@ -15,6 +15,7 @@ from gymnasium.utils.env_checker import check_env
 
 import npa_envs
 from npa_envs.agents.learning import METHODS, Budget, train
+from npa_envs.ops.backend import Request, describe
 from npa_envs.registration import ENVIRONMENTS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -355,6 +356,11 @@ def test_the_map_names_what_is_there():
             defined = rf"^ *(?:def|class) {part}\b|^ *{part}\b(?:: .*)? = |^    {part}:"
             there = re.search(defined, in_package(file).read_text(), re.MULTILINE)
             assert there, f"{file} has no {name}"
+
+
+def test_the_page_on_benchmarks_shows_the_backend_table():
+    chosen = describe(Request(torch.device("cpu"), torch.float32))
+    assert "\n".join(f"  {line}" for line in chosen) in (DOCS / "benchmarks.md").read_text()
 
 
 def test_the_index_leads_to_every_page():
