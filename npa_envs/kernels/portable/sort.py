@@ -162,7 +162,7 @@ def give_rows(space_dim: int, scalar: type) -> wp.Kernel:
     def give_rows(
         total: wp.int32,
         active_offset: wp.int32,
-        active_before: wp.array(dtype=wp.int32, ndim=2),
+        active_before: wp.array(dtype=wp.int32),
         cell_starts: wp.array(dtype=wp.int32),
         positions: wp.array(dtype=vector),
         # outputs
@@ -174,9 +174,13 @@ def give_rows(space_dim: int, scalar: type) -> wp.Kernel:
         """Write rows of particles, particles of rows, and where cells' particles and rows begin.
 
         All of several steps. Threads of a step are as many as particles or starts, whichever are
-        more. `active_before` counts the active particles up to each one, itself included.
+        more. `active_before` counts the active particles of these and earlier steps up to each one,
+        itself included.
         """
         step, t = wp.tid()
+        earlier = wp.int32(0)
+        if step > 0:
+            earlier = active_before[step * total - 1]
         if t < starts.shape[1]:
             if t < active_offset:
                 starts[step, t] = cell_starts[t]
@@ -184,14 +188,15 @@ def give_rows(space_dim: int, scalar: type) -> wp.Kernel:
                 first = cell_starts[t - active_offset]
                 before = wp.int32(0)
                 if first > 0:
-                    before = active_before[step, first - 1]
+                    before = active_before[step * total + first - 1] - earlier
                 starts[step, t] = total + before
         if t < total:
             before = wp.int32(0)
             if t > 0:
-                before = active_before[step, t - 1]
+                before = active_before[step * total + t - 1] - earlier
+            active = active_before[step * total + t] - earlier > before
             row = wp.int32(-1)
-            if active_before[step, t] > before and before < row_source.shape[1]:
+            if active and before < row_source.shape[1]:
                 row = before
                 row_source[step, row] = t
                 row_positions[step, row] = positions[t]
