@@ -15,6 +15,10 @@ from npa_envs.kernels.domain import domain_types, kernel_module
 from npa_envs.kernels.mathematics import smoothing, spiky_factor_wide
 from npa_envs.kernels.portable.search import make_search
 
+BLOCK = 4096
+"""Candidates whose weights are summed before they are added to the others: of a million summed one
+after the other, too much is rounded away."""
+
 
 @functools.cache
 def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespace:
@@ -79,23 +83,33 @@ def density_kernels(space_dim: int, scalar: type, on_cpu: bool) -> SimpleNamespa
         base = (k / particle_count) * domain.cell_count
         cell = cell_of(domain, position)
         density = scalar(0.0)
+        earlier = scalar(0.0)
+        counted = wp.int32(0)
         gradient = wide()
         for segment in range(segment_count(domain, cell)):
             first, last = segment_cells(domain, cell, segment)
-            for j in range(starts[base + first], starts[base + last]):
-                neighbour = sorted_positions[j]
-                offset = minimum_image(domain, neighbour - position)
-                squared = wp.dot(offset, offset)
-                seen = squared < domain.squared_eps and j != k
-                weight = smoothing(squared, domain.inverse_squared_eps, domain.smoothing_norm)
-                density += wp.where(seen, weight, scalar(0.0))
-                if row >= 0 and seen:
-                    gradient += spiky_wide(domain, position, neighbour)
+            end = starts[base + last]
+            for block in range(starts[base + first], end, wp.static(BLOCK)):
+                stop = wp.min(block + wp.static(BLOCK), end)
+                for j in range(block, stop):
+                    neighbour = sorted_positions[j]
+                    offset = minimum_image(domain, neighbour - position)
+                    squared = wp.dot(offset, offset)
+                    seen = squared < domain.squared_eps and j != k
+                    weight = smoothing(squared, domain.inverse_squared_eps, domain.smoothing_norm)
+                    density += wp.where(seen, weight, scalar(0.0))
+                    if row >= 0 and seen:
+                        gradient += spiky_wide(domain, position, neighbour)
+                counted += stop - block
+                if counted >= wp.static(BLOCK):
+                    earlier += density
+                    density = scalar(0.0)
+                    counted = wp.int32(0)
         # A particle always sees itself: a position that is not finite would otherwise have rho 0.
         entry = particle()
         for d in range(wp.static(space_dim)):
             entry[d] = position[d]
-        entry[wp.static(space_dim)] = scalar(1.0) / (domain.smoothing_norm + density)
+        entry[wp.static(space_dim)] = scalar(1.0) / (domain.smoothing_norm + (earlier + density))
         particles[k] = entry
         if row >= 0:
             density_gradients[k] = gradient
