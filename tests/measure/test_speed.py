@@ -333,7 +333,7 @@ def test_calls_are_compared_in_turn_and_each_pair_the_other_way_round(device):
 
 
 def test_one_species_is_compared_with_the_rollout_that_it_is():
-    here = Session(torch.device("cpu"), repeats=1, small=True)
+    here = Session(torch.device("cpu"), repeats=3, small=True)
     rows = suites.SUITES["species"](here)["one_species"]
     assert [(row.what, row.calls) for row in rows] == [
         ("inference", "eager"),

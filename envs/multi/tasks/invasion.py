@@ -35,6 +35,8 @@ class InvasionTask(PictureLossTask):
 
     def __init__(self, config: InvasionConfig, device: torch.device) -> None:
         super().__init__(config, device, (config.target, config.counts[0]))
+        self.goal = self.goals[0]
+        """The picture of species 0, whose target's colour scripted policies take."""
 
     def losses(self, population: Population) -> Mapping[str, Tensor]:
         """Return the parts of species 0's splat loss, and minus an equal share for each other."""
@@ -46,7 +48,7 @@ class InvasionTask(PictureLossTask):
 
     def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
         """Return shares of species 0's splat loss, and minus an equal share for each other one."""
-        own = self.goals[0].particle_shares(*population.of(0))
+        own = self.goal.particle_shares(*population.of(0))
         own_count, other_count = own.shape[1], sum(population.counts[1:])
         share = world_mean(own[..., None])[:, 0] * (-own_count / max(other_count, 1))
         return {"picture": torch.cat((own, share[:, None].expand(-1, other_count)), dim=1)}

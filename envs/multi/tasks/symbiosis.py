@@ -27,6 +27,8 @@ class SymbiosisTask(PictureLossTask):
 
     def __init__(self, config: SymbiosisConfig, device: torch.device) -> None:
         super().__init__(config, device, (config.target, sum(config.counts)))
+        self.goal = self.goals[0]
+        """The picture of all particles, whose target's colour scripted policies take."""
 
     def losses(self, population: Population) -> Mapping[str, Tensor]:
         """Return the density error and the weighted colour error, the same for every species."""
@@ -36,7 +38,7 @@ class SymbiosisTask(PictureLossTask):
 
     def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
         """Return each particle's share of the splat loss."""
-        return {"picture": self.goals[0].particle_shares(population.x, population.s)}
+        return {"picture": self.goal.particle_shares(population.x, population.s)}
 
     # One picture in the middle, however far from it species begin.
     open_half_width = SpeciesTask.open_half_width
