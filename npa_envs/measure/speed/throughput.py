@@ -327,7 +327,7 @@ def skips(workload: Workload) -> list[Skip]:
         ),
         Skip("displacements", "static=True", rebuilt, {**static, **rebuilt}),
         Skip(
-            "cells, densities, moments and pair weights",
+            "cells, densities and neighbour lists",
             "static=True, without position_noise",
             {**static, **rebuilt},
             static,
