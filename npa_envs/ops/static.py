@@ -76,8 +76,6 @@ class StaticWorlds(NamedTuple):
 
     tensors: StaticTensors
     """What perception needs of positions."""
-    shape: torch.Size
-    """Worlds and particles, [B, N]."""
 
     def sort(self, values: Tensor) -> Tensor:
         """Return values of particles, [B, N, ...], in sorted order; differentiable."""
@@ -174,9 +172,7 @@ def _(
         starts=integers(plan.start_count),
         cell=integers(total),
         particles=x.new_empty(total, space_dim + 1),
-        density_gradient=x.new_empty(
-            0 if plan.runs("density") == "cuda" else total, space_dim, dtype=torch.float64
-        ),
+        density_gradient=x.new_empty(0 if on_cuda else total, space_dim, dtype=torch.float64),
         lists=lists,
     ).flat()
 
@@ -203,7 +199,7 @@ def prepare_static(
     tensors = _prepare_static(
         x.detach().contiguous(), state_dim, eps, None if box is None else list(box), *terms
     )
-    return StaticWorlds(StaticTensors.of(tensors), x.shape[:2])
+    return StaticWorlds(StaticTensors.of(tensors))
 
 
 class StaticRows(NamedTuple):
