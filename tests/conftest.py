@@ -60,3 +60,13 @@ def reference():
     if not REFERENCE.is_dir():
         pytest.skip("the folder of reference answers is not here")
     return REFERENCE
+
+
+@pytest.fixture(params=[torch.float32, torch.float64], ids=["float32", "float64"])
+def dtype(request):
+    return request.param
+
+
+@pytest.fixture(params=[2, 3], ids=["2d", "3d"])
+def space_dim(request):
+    return request.param

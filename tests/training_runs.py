@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from circle_task import CircleTask, plain_rollout
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
+from worlds import tensors
 
 from npa_envs.training import JsonlLog, Trainer
 from npa_envs.training.iteration import TrainingCycle
@@ -83,19 +83,8 @@ class Recording(TorchDispatchMode):
         return out
 
 
-def tensors(*values):
-    return [leaf for leaf in tree_leaves(values) if isinstance(leaf, torch.Tensor)]
-
-
 def make_cycle(config, task, device="cpu", rollout=None):
     device = torch.device(device)
     schedule = torch.Generator().manual_seed(config.seed)
     rule = task.make_rule(schedule).to(device, config.torch_dtype)
     return TrainingCycle(task, rule, config, device, schedule, rollout), rule
-
-
-def assert_same(ours, theirs):
-    ours, theirs = tensors(ours), tensors(theirs)
-    assert len(ours) == len(theirs) > 0
-    for one, other in zip(ours, theirs, strict=True):
-        assert torch.equal(one, other)

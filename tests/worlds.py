@@ -1,6 +1,21 @@
-"""Random and hard worlds for the numerical tests, and how errors are measured."""
+"""Random and hard worlds for the numerical tests, and how results are compared."""
 
 import torch
+from torch.utils._pytree import tree_leaves
+
+from npa_envs.ops.perceive import Terms, perceive_rows
+
+
+def tensors(*values):
+    return [leaf for leaf in tree_leaves(values) if isinstance(leaf, torch.Tensor)]
+
+
+def assert_same(ours, theirs):
+    """Compare all tensors in two structures, bit for bit."""
+    ours, theirs = tensors(ours), tensors(theirs)
+    assert len(ours) == len(theirs) > 0
+    for one, other in zip(ours, theirs, strict=True):
+        assert torch.equal(one, other)
 
 
 def relative_error(value, expected):
@@ -31,3 +46,57 @@ def degenerate_world(space_dim, state_dim, *, dtype, device):
     x = torch.cat((scattered, line, clump, coincident, pair, isolated))[None]
     s = torch.randn(1, x.shape[1], state_dim, generator=generator)
     return x.to(device, dtype), s.to(device, dtype)
+
+
+def sides(box, space_dim):
+    """Return the sides of a box: None, "square" or "oblong"."""
+    if box is None:
+        return None
+    return (1.4,) * space_dim if box == "square" else (1.4, 1.9, 1.5)[:space_dim]
+
+
+def exact(*values):
+    """Return copies in float64 on the CPU, where the oracles work."""
+    return [value.detach().cpu().double() for value in values]
+
+
+def cotangents(values, seed=1):
+    """Return normal numbers like the values, the same for every dtype and device."""
+    generator = torch.Generator().manual_seed(seed)
+    return [
+        torch.randn(v.shape, generator=generator, dtype=torch.float64).to(v).detach()
+        for v in values
+    ]
+
+
+def with_gradients(function, *inputs):
+    """Return what a function makes of inputs, then their gradients along random cotangents."""
+    leaves = [value.detach().clone().requires_grad_() for value in inputs]
+    found = tensors(function(*leaves))
+    gradients = torch.autograd.grad(found, leaves, cotangents(found))
+    return [*(value.detach() for value in found), *gradients]
+
+
+def random_mask(x, probability=0.5):
+    """Return an update mask of worlds, uint8, shape [B, N]."""
+    mask = torch.rand(x.shape[:2], generator=torch.Generator().manual_seed(2)) < probability
+    return mask.to(x.device, torch.uint8)
+
+
+def rows_of(
+    x, s, mask=None, *, eps=0.3, eps0=None, box=None, terms=None, width=None, capacity=None
+):
+    """Perceive the active particles, by default in as many rows and columns as they need."""
+    terms = terms or Terms()
+    active = x.shape[0] * x.shape[1] if mask is None else max(int(mask.sum()), 1)
+    return perceive_rows(
+        x,
+        s,
+        mask=mask,
+        row_capacity=capacity or active,
+        row_width=width or terms.perception_dim(x.shape[2], s.shape[2]),
+        eps=eps,
+        eps0=eps0 or eps,
+        box=box,
+        terms=terms,
+    )

@@ -1,7 +1,8 @@
-"""Errors of pictures at once, against the differentiable path, and what is refused."""
+"""Errors of a task's pictures: in one pass as by the differentiable path, alone as in a batch."""
 
 import pytest
 import torch
+from worlds import assert_same, tensors
 
 from npa_envs import NPAError, WorldRandom
 from npa_envs.ops.pictures.losses import picture_losses
@@ -9,11 +10,6 @@ from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfi
 
 ERRORS = {torch.float32: 3e-6, torch.float64: 1e-13}
 """Largest relative difference between both paths (worst seen 3e-7 and 4e-16)."""
-
-
-@pytest.fixture(params=ERRORS, ids=("float32", "float64"))
-def dtype(request):
-    return request.param
 
 
 @pytest.fixture(params=[(333, 33), (77, 101), (500, 64)], ids=("33px", "101px", "64px"))
@@ -41,25 +37,39 @@ def test_losses_are_the_same_with_and_without_gradient(worlds, dtype):
         assert float(expected.detach().min()) > 1e-3
         torch.testing.assert_close(value, expected.detach(), rtol=ERRORS[dtype], atol=0.0)
     with torch.no_grad():
-        again = task.splat_losses(x, s)
-    assert all(torch.equal(a, b) for a, b in zip(again, losses, strict=True))
+        assert_same(task.splat_losses(x, s), losses)
 
 
-def test_losses_are_the_same_on_every_run_and_in_every_batch(worlds):
+def test_nothing_depends_on_the_run_the_batch_or_the_memory(worlds):
     task, x, s = worlds
-    losses = task.splat_losses(x, s)
-    for _ in range(3):
-        assert all(torch.equal(a, b) for a, b in zip(task.splat_losses(x, s), losses, strict=True))
-    for world in range(5):
-        alone = task.splat_losses(x[world : world + 1].clone(), s[world : world + 1].clone())
-        assert all(torch.equal(a[0], b[world]) for a, b in zip(alone, losses, strict=True))
+    functions = (task.splat_losses, task.splat_errors, task.picture, task.metric)
+    for function in functions:
+        together = function(x, s)
+        assert_same(function(x, s), together)
+        assert_same(function(x.mT.contiguous().mT, s.mT.contiguous().mT), together)
+        for world in range(5):
+            alone = function(x[world : world + 1].clone(), s[world : world + 1].clone())
+            for value, expected in zip(tensors(alone), tensors(together), strict=True):
+                assert torch.equal(value[0], expected[world])
 
 
-def test_states_may_be_strided(worlds):
+def test_errors_are_what_their_formula_says_and_losses_are_their_means(worlds):
     task, x, s = worlds
-    losses = task.splat_losses(x, s)
-    strided = task.splat_losses(x.mT.contiguous().mT, s.mT.contiguous().mT)
-    assert all(torch.equal(a, b) for a, b in zip(strided, losses, strict=True))
+    difference = (task.picture(x, s) - task.target_picture.to(x)).double()
+    growth = difference.abs() + difference**2
+    density, colour = task.splat_errors(x, s)
+    expected = growth[..., :3].mean(dim=-1) * torch.exp(-growth[..., 3])
+    torch.testing.assert_close(density.double(), growth[..., 3], rtol=1e-6, atol=1e-9)
+    torch.testing.assert_close(colour.double(), expected, rtol=1e-5, atol=1e-9)
+    for loss, errors in zip(task.splat_losses(x, s), (density, colour), strict=True):
+        assert errors.shape == (5, task.config.resolution, task.config.resolution)
+        torch.testing.assert_close(loss, errors.mean(dim=(1, 2)))
+
+
+def test_a_centred_picture_has_the_targets_mean(worlds):
+    task, x, s = worlds
+    moved = task.picture(x + 0.25, s)
+    torch.testing.assert_close(moved, task.picture(x, s), rtol=0.0, atol=2e-3)
 
 
 def test_a_world_that_is_not_finite_leaves_the_others_alone(worlds):

@@ -1,13 +1,13 @@
-"""The splat renderer and its adjoint against plain torch."""
+"""Pictures of open and of periodic worlds, and their adjoints, against plain torch."""
 
 import pytest
 import torch
-from worlds import relative_error
+from worlds import assert_same, exact, relative_error, with_gradients
 
 from npa_envs import NPAError
 from npa_envs import reference as oracle
 from npa_envs.kernels.pictures.splat import make_lens
-from npa_envs.ops import splat
+from npa_envs.ops import periodic_splat, splat
 from npa_envs.ops.launch import launch, scalar_type
 from npa_envs.ops.pictures.splat import (
     Splats,
@@ -17,41 +17,85 @@ from npa_envs.ops.pictures.splat import (
     sort_splats,
 )
 
-# Worst error measured, then the bound.
+# Worst relative error measured, then the bound, of open pictures and of periodic ones.
 BOUND = {torch.float32: 5e-6, torch.float64: 1e-13}  # 8e-7, 4e-16
+PERIODIC_BOUND = {torch.float32: 1e-5, torch.float64: 3e-14}  # 2.0e-6, 3.3e-15
+
+OPTIONS = {"resolution": 24, "pixel_size": 0.11, "sigma": 0.9}
+
+both_pictures = pytest.mark.parametrize("draw", [splat, periodic_splat])
 
 
-def scattered(world_count, particle_count, dtype, device, seed=0):
+def scattered(world_count, particle_count, dtype, device):
     """Particles inside the window, on its edge and outside."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     x = torch.rand(world_count, particle_count, 2, generator=generator) * 2.6 - 1.3
     colour = torch.rand(world_count, particle_count, 3, generator=generator)
     return x.to(device, dtype), colour.to(device, dtype)
 
 
+def in_the_box(world_count, particle_count, dtype, device):
+    """Particles all over the box, some of them almost on its edges."""
+    x, colour = scattered(world_count, particle_count, dtype, device)
+    x = x / 1.3
+    x[:, 0], x[:, 1], x[:, 2, 0] = -0.9999, 0.9999, -0.9999
+    return x, colour
+
+
+def periodic_oracle(x, colour, *, resolution, pixel_size, sigma, lo=-1.0, hi=1.0):
+    """Every particle with its eight images, each over the whole picture, in plain torch."""
+    spread = sigma * resolution * pixel_size / (hi - lo)
+    radius = -(-3.0 * spread // 1.0)
+    place = (x - lo) / (hi - lo) * resolution - 0.5
+    pixel = torch.arange(resolution, dtype=x.dtype, device=x.device)
+    weights = []
+    for d in range(2):
+        centre = (place[..., d] + 0.5).floor().detach()
+        patch = centre[..., None] + torch.arange(-radius, radius + 1).to(x)
+        total = torch.exp(-((patch - place[..., d, None]) ** 2) / (2 * spread**2)).sum(-1)
+        row = 0.0
+        for turn in range(-3, 4):
+            away = pixel + turn * resolution
+            inside = (away - centre[..., None]).abs() <= radius
+            value = torch.exp(-((away - place[..., d, None]) ** 2) / (2 * spread**2))
+            row = row + torch.where(inside, value, torch.zeros_like(value))
+        weights.append(row / total[..., None])
+    painted = torch.cat((colour, torch.ones_like(colour[..., :1])), dim=-1)
+    area = (resolution * pixel_size / (hi - lo)) ** 2
+    return area * torch.einsum("bnq,bnp,bnc->bpqc", *weights, painted)
+
+
 @pytest.mark.parametrize("options", [{}, {"sigma": 0.6}, {"lo": -1.5, "hi": 0.5}])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=("float32", "float64"))
 def test_picture_and_adjoints_equal_the_oracle(dtype, options, device):
-    x, colour = scattered(3, 61, dtype, device)
-    exact = [t.cpu().double().clone().requires_grad_() for t in (x, colour)]
-    expected = oracle.splat(*exact, resolution=37, pixel_size=0.09, **options)
-    cotangent = torch.randn(
-        expected.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1)
+    options = {"resolution": 37, "pixel_size": 0.09} | options
+    worlds = scattered(3, 61, dtype, device)
+    found = with_gradients(lambda *worlds: splat(*worlds, **options), *worlds)
+    expected = with_gradients(lambda *worlds: oracle.splat(*worlds, **options), *exact(*worlds))
+    for value, answer, factor in zip(found, expected, (1, 4, 1), strict=True):
+        assert relative_error(value, answer) < BOUND[dtype] * factor
+
+
+@pytest.mark.parametrize("options", [{}, {"sigma": 0.4}, {"sigma": 9.0}, {"lo": -1.0, "hi": 0.5}])
+def test_periodic_picture_and_adjoints_equal_a_sum_over_images(dtype, options, device):
+    options = OPTIONS | options
+    x, colour = in_the_box(3, 61, dtype, device)
+    x = torch.where(x > options.get("hi", 1.0), x - 1.47, x)
+    found = with_gradients(lambda *worlds: periodic_splat(*worlds, **options), x, colour)
+    expected = with_gradients(
+        lambda *worlds: periodic_oracle(*worlds, **options), *exact(x, colour)
     )
-    expected.backward(cotangent)
-    x.requires_grad_()
-    colour.requires_grad_()
-    picture = splat(x, colour, resolution=37, pixel_size=0.09, **options)
-    picture.backward(cotangent.to(picture))
-    assert relative_error(picture, expected) < BOUND[dtype]
-    assert relative_error(x.grad, exact[0].grad) < BOUND[dtype] * 4
-    assert relative_error(colour.grad, exact[1].grad) < BOUND[dtype]
+    for value, answer in zip(found, expected, strict=True):
+        assert relative_error(value, answer) < PERIODIC_BOUND[dtype]
 
 
-def test_gradients_pass_gradcheck(device):
+@both_pictures
+def test_gradients_pass_gradcheck(draw, device):
     x, colour = scattered(1, 11, torch.float64, device)
+    # Across the seam and outside.
+    places = [[-0.99, 0.97], [0.98, -0.31], [0.12, 0.23], [3.05, -2.96]]
+    x[0, :4] = torch.tensor(places, dtype=torch.float64)
     assert torch.autograd.gradcheck(
-        lambda x, c: splat(x, c, resolution=12, pixel_size=0.2),
+        lambda x, c: draw(x, c, resolution=12, pixel_size=0.2),
         (x.requires_grad_(), colour.requires_grad_()),
     )
 
@@ -99,13 +143,35 @@ def test_cotangents_may_lie_anywhere_in_memory(device):
     assert torch.equal(torch.autograd.grad(picture, x, shifted)[0], expected)
 
 
-def test_a_particle_inside_the_window_has_the_area_of_a_target_pixel(device):
-    x = torch.tensor([[[0.123, -0.234]]], dtype=torch.float64, device=device)
-    colour = torch.tensor([[[0.2, 0.4, 0.8]]], dtype=torch.float64, device=device)
-    picture = splat(x, colour, resolution=64, pixel_size=0.1)
-    area = (64 * 0.1 / 2.0) ** 2
-    expected = torch.tensor([0.2, 0.4, 0.8, 1.0], dtype=torch.float64) * area
-    torch.testing.assert_close(picture.sum(dim=(0, 1, 2)).cpu(), expected)
+@pytest.mark.parametrize("shift", [(12, 12), (0, 7), (23, -5)])
+def test_moving_all_particles_rolls_the_picture(shift, device):
+    x, colour = in_the_box(2, 200, torch.float64, device)
+    picture = periodic_splat(x, colour, **OPTIONS)
+    moved = x + torch.tensor(shift, dtype=x.dtype, device=device) * (2.0 / 24)
+    rolled = periodic_splat(moved, colour, **OPTIONS)
+    expected = picture.roll((shift[1], shift[0]), dims=(1, 2))
+    torch.testing.assert_close(rolled, expected, rtol=0.0, atol=1e-12)
+
+
+@both_pictures
+def test_every_particle_has_the_area_of_a_target_pixel(draw, device):
+    """In an open picture inside the window, in a periodic one anywhere."""
+    x, colour = in_the_box(1, 300, torch.float64, device)
+    x = 0.5 * x if draw is splat else 3.0 * x
+    area = (24 * 0.11 / 2.0) ** 2
+    expected = torch.cat((colour, torch.ones_like(colour[..., :1])), dim=-1).sum((0, 1)) * area
+    torch.testing.assert_close(draw(x, colour, **OPTIONS).sum((0, 1, 2)), expected)
+
+
+def test_away_from_the_seam_it_is_the_open_picture(device):
+    x, colour = in_the_box(1, 50, torch.float64, device)
+    x = 0.5 * x
+    # The open picture's first and last pixels are centred on the window's edges.
+    half = 1.0 / 24
+    h = OPTIONS["pixel_size"] * 23 / 24
+    expected = splat(x, colour, **OPTIONS | {"pixel_size": h}, lo=-1.0 + half, hi=1.0 - half)
+    picture = periodic_splat(x, colour, **OPTIONS)
+    torch.testing.assert_close(picture, expected, rtol=1e-11, atol=1e-13)
 
 
 def test_rows_point_up_and_columns_right(device):
@@ -115,22 +181,25 @@ def test_rows_point_up_and_columns_right(device):
     assert (row, column) == (8, 48)
 
 
-def test_pictures_are_bit_identical_and_independent_of_the_batch(device):
+@both_pictures
+def test_pictures_are_bit_identical_and_independent_of_the_batch(draw, device):
     x, colour = scattered(4, 500, torch.float32, device)
-    pictures = splat(x, colour, resolution=50, pixel_size=0.06)
-    assert torch.equal(pictures, splat(x, colour, resolution=50, pixel_size=0.06))
+    pictures = draw(x, colour, resolution=50, pixel_size=0.06)
+    assert torch.equal(pictures, draw(x, colour, resolution=50, pixel_size=0.06))
     for k in range(4):
-        alone = splat(x[k : k + 1], colour[k : k + 1], resolution=50, pixel_size=0.06)
+        alone = draw(x[k : k + 1], colour[k : k + 1], resolution=50, pixel_size=0.06)
         assert torch.equal(pictures[k], alone[0])
 
 
-def test_particles_far_away_or_not_finite_leave_the_picture_alone(device):
+HOSTILE = [(draw, value) for draw in (splat, periodic_splat) for value in ("inf", "nan")]
+
+
+@pytest.mark.parametrize(("draw", "value"), [*HOSTILE, (splat, 1e30), (splat, -1e8)])
+def test_particles_far_away_or_not_finite_leave_the_picture_alone(draw, value, device):
     x, colour = scattered(1, 20, torch.float32, device)
-    expected = splat(x, colour, resolution=40, pixel_size=0.06)
-    for value in (1e30, -1e8, float("inf"), float("nan")):
-        hostile = torch.cat((x, torch.full_like(x[:, :1], value)), dim=1)
-        colours = torch.cat((colour, colour[:, :1]), dim=1)
-        assert torch.equal(splat(hostile, colours, resolution=40, pixel_size=0.06), expected)
+    hostile = torch.cat((x, torch.full_like(x[:, :1], float(value))), dim=1)
+    colours = torch.cat((colour, colour[:, :1]), dim=1)
+    assert_same(draw(hostile, colours, **OPTIONS), draw(x, colour, **OPTIONS))
 
 
 @pytest.mark.parametrize("sigma", [0.3, 0.04, 1e-3])
@@ -142,23 +211,19 @@ def test_narrow_gaussians_keep_their_area(sigma, device):
     assert float(picture[..., 3].sum()) == pytest.approx(40.0, rel=1e-5)
 
 
+@both_pictures
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"resolution": 1}, "resolution must be at least 2"),
+        ({"x": torch.zeros(1, 2, 3)}, "x and colour must have shapes"),
+        ({"x": torch.zeros(2, 2)}, r"x\[None\]"),
         ({"pixel_size": 0.0}, "pixel_size must be positive"),
         ({"sigma": float("nan")}, "sigma must be positive"),
         ({"lo": 1.0}, "lo < hi"),
     ],
 )
-def test_bad_numbers_are_refused(change, message):
-    options = {"resolution": 16, "pixel_size": 0.1} | change
+def test_what_does_not_fit_is_refused(draw, change, message):
+    given = {"x": torch.zeros(1, 2, 2), "colour": torch.zeros(1, 2, 3)} | OPTIONS
     with pytest.raises(NPAError, match=message):
-        splat(torch.zeros(1, 2, 2), torch.zeros(1, 2, 3), **options)
-
-
-def test_bad_shapes_are_refused():
-    with pytest.raises(NPAError, match=r"x and colour must have shapes"):
-        splat(torch.zeros(1, 2, 3), torch.zeros(1, 2, 3), resolution=16, pixel_size=0.1)
-    with pytest.raises(NPAError, match=r"x\[None\]"):
-        splat(torch.zeros(2, 2), torch.zeros(1, 2, 3), resolution=16, pixel_size=0.1)
+        draw(**given | change)

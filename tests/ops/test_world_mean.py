@@ -1,21 +1,14 @@
-"""Means over worlds: exact values, independence of the batch, gradients; the pictures from them."""
+"""Means over worlds: exact values, independence of the batch, gradients."""
 
 import pytest
 import torch
 
-from npa_envs import WorldRandom
 from npa_envs.errors import NPAError
 from npa_envs.ops import world_mean
-from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 
 ERRORS = {torch.float32: 3e-7, torch.float64: 2e-15}
 """Largest difference from the mean in float64 of numbers of size about 3: one rounding (worst seen
 1.2e-7 and 2.2e-16)."""
-
-
-@pytest.fixture(params=ERRORS, ids=("float32", "float64"))
-def dtype(request):
-    return request.param
 
 
 def numbers(*shape, dtype, device):
@@ -90,55 +83,3 @@ def test_it_can_be_captured_and_both_devices_agree():
 def test_wrong_values_are_clear_errors(values, message):
     with pytest.raises(NPAError, match=message):
         world_mean(values)
-
-
-class TestMorphogenesis2D:
-    """Pictures and metrics of a world, alone and among others."""
-
-    @pytest.fixture(params=[(333, 33), (77, 101)], ids=("33px", "101px"))
-    def worlds(self, request, dtype, device):
-        particle_count, resolution = request.param
-        config = Morphogenesis2DConfig(
-            particle_count=particle_count, resolution=resolution, target_point_count=200
-        )
-        task = Morphogenesis2D(config, device=device)
-        random = WorldRandom(range(5), device=device)
-        x, s = task.seed(5, generator=random, device=device)
-        s = s + 0.3 * random.normal(*s.shape[1:])
-        return task, x.to(dtype), s.to(dtype)
-
-    def test_no_picture_and_no_metric_depends_on_the_batch(self, worlds):
-        task, x, s = worlds
-        functions = (
-            lambda x, s: (task.picture(x, s),),
-            task.splat_errors,
-            task.splat_losses,
-            lambda x, s: (task.metric(x, s),),
-        )
-        for function in functions:
-            together = function(x, s)
-            for world in range(5):
-                alone = function(x[world : world + 1].clone(), s[world : world + 1].clone())
-                for value, expected in zip(alone, together, strict=True):
-                    assert torch.equal(value[0], expected[world])
-
-    def test_losses_are_the_means_of_the_errors(self, worlds):
-        task, x, s = worlds
-        resolution = task.config.resolution
-        for loss, errors in zip(task.splat_losses(x, s), task.splat_errors(x, s), strict=True):
-            assert errors.shape == (5, resolution, resolution)
-            torch.testing.assert_close(loss, errors.mean(dim=(1, 2)))
-
-    def test_errors_are_what_their_formula_says(self, worlds):
-        task, x, s = worlds
-        difference = (task.picture(x, s) - task.target_picture.to(x)).double()
-        growth = difference.abs() + difference**2
-        density, colour = task.splat_errors(x, s)
-        expected = growth[..., :3].mean(dim=-1) * torch.exp(-growth[..., 3])
-        torch.testing.assert_close(density.double(), growth[..., 3], rtol=1e-6, atol=1e-9)
-        torch.testing.assert_close(colour.double(), expected, rtol=1e-5, atol=1e-9)
-
-    def test_a_centred_picture_has_the_targets_mean(self, worlds):
-        task, x, s = worlds
-        moved = task.picture(x + 0.25, s)
-        torch.testing.assert_close(moved, task.picture(x, s), rtol=0.0, atol=2e-3)

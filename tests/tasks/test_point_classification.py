@@ -8,7 +8,8 @@ import gymnasium
 import pytest
 import torch
 from small_digits import write_idx
-from training_runs import Recording, assert_same, make_cycle
+from training_runs import Recording, make_cycle
+from worlds import assert_same
 
 from npa_envs.agents import RulePolicy
 from npa_envs.cli import main

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 from circle_task import CircleTask, circle_config, plain_rollout
-from training_runs import Recording, assert_same, make_cycle
+from training_runs import Recording, make_cycle
+from worlds import assert_same
 
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
 from npa_envs.training import preset
