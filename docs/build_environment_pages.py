@@ -28,7 +28,6 @@ from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.spaces import action_space, observation_space
 from npa_envs.envs.core.vector import NPAVectorEnv
-from npa_envs.envs.core.worlds import make_physics
 from npa_envs.registration import ENVIRONMENTS, Registration
 
 DOCS = Path(__file__).resolve().parent
@@ -137,7 +136,7 @@ def page(registration: Registration) -> str:
     env_class = environment_class(registration)
     task = env_class.task_type
     config = task.config_type()
-    physics = make_physics(config, task)
+    physics = config.physics(task.space_dim, static=task.static)
     count = config.particle_count
     spaces = {
         "Observation space": observation_space(physics, count),

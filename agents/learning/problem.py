@@ -25,7 +25,6 @@ from npa_envs.devices import check_device
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.task import EnvTask
 from npa_envs.envs.core.vector import NPAVectorEnv, worlds_to_reset
-from npa_envs.envs.core.worlds import make_physics
 from npa_envs.envs.multi.task import SpeciesConfig, SpeciesTask
 from npa_envs.envs.multi.tasks import ENVIRONMENTS as SPECIES
 from npa_envs.envs.multi.tasks import task_type as species_task_type
@@ -161,7 +160,7 @@ class Problem:
     @property
     def physics(self) -> Physics:
         """The worlds' constants."""
-        return make_physics(self.config, self.task_type)
+        return self.config.physics(self.task_type.space_dim, static=self.task_type.static)
 
     @property
     def interface(self) -> Interface:

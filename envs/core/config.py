@@ -20,7 +20,7 @@ from npa_envs.tasks.checks import (
     is_real,
     is_whole,
 )
-from npa_envs.world.actions import MomentInverse
+from npa_envs.world.actions import MomentInverse, Physics
 
 Boundary = Literal["open", "periodic"]
 Reward = Literal["dense", "sparse", "particle"]
@@ -170,6 +170,31 @@ class WorldConfig:
     def box(self) -> float | None:
         """Side of the periodic box [length units], or None in open space."""
         return self.box_size if self.boundary == "periodic" else None
+
+    def physics(self, space_dim: int, *, static: bool) -> Physics:
+        """Return the constants of the worlds: what `npa_envs.world.actions` acts and perceives by.
+
+        Args:
+            space_dim: Space dimension D.
+            static: Whether particles stay where they are.
+        """
+        return Physics(
+            space_dim=space_dim,
+            state_dim=self.state_dim,
+            eps=self.eps,
+            eps0=self.eps0,
+            reach=self.alpha * self.eps,
+            state_scale=self.state_scale,
+            update_prob=self.update_prob,
+            dt=self.dt,
+            position_noise=self.position_noise,
+            box=None if self.box is None else (self.box,) * space_dim,
+            moving=not static,
+            moment_inverse=self.moment_inverse,
+            perception_limit=self.observation_limit,
+            position_limit=self.position_limit,
+            state_limit=self.observation_limit,
+        )
 
     @property
     def torch_device(self) -> torch.device:

@@ -21,7 +21,7 @@ from npa_envs.envs.core.memory import check_memory
 from npa_envs.envs.core.spaces import number_tensor
 from npa_envs.envs.core.task import EnvTask, Start, WorldTask
 from npa_envs.errors import DivergedError, NPAError
-from npa_envs.world.actions import Actions, Physics, SurveyedWorlds, survey_worlds
+from npa_envs.world.actions import Actions, SurveyedWorlds, survey_worlds
 from npa_envs.world.cuda_graph import Beside, Replayed, WeakFunction, sent
 from npa_envs.world.divergence import LARGEST_REPORT, term_name
 from npa_envs.world.randomness import WorldRandom
@@ -37,27 +37,6 @@ FLAGS = ("success", "diverged")
 # starts them, would wait for it for ever.
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
-
-
-def make_physics(config: WorldConfig, task_type: type[WorldTask[Any]]) -> Physics:
-    """Return the constants of the worlds that a configuration describes."""
-    return Physics(
-        space_dim=task_type.space_dim,
-        state_dim=config.state_dim,
-        eps=config.eps,
-        eps0=config.eps0,
-        reach=config.alpha * config.eps,
-        state_scale=config.state_scale,
-        update_prob=config.update_prob,
-        dt=config.dt,
-        position_noise=config.position_noise,
-        box=None if config.box is None else (config.box,) * task_type.space_dim,
-        moving=not task_type.static,
-        moment_inverse=config.moment_inverse,
-        perception_limit=config.observation_limit,
-        position_limit=config.position_limit,
-        state_limit=config.observation_limit,
-    )
 
 
 def total(parts: Tensor) -> Tensor:
@@ -93,7 +72,7 @@ class Batch:
         self.device = device = config.torch_device
         self.world_count = world_count
         self.particle_count = particle_count
-        self.physics = physics = make_physics(config, task_type)
+        self.physics = physics = config.physics(task_type.space_dim, static=task_type.static)
         """The worlds' constants."""
         check_memory(world_count, particle_count, physics, device, extra_bytes)
         self.x = torch.zeros(world_count, particle_count, physics.space_dim, device=device)

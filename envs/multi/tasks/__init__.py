@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from npa_envs.envs.multi.task import SpeciesTask
-from npa_envs.envs.multi.tasks.co_morphogenesis import CoMorphogenesisTask
-from npa_envs.envs.multi.tasks.invasion import InvasionTask
 from npa_envs.envs.multi.tasks.mixing import MixingTask, SegregationTask
-from npa_envs.envs.multi.tasks.symbiosis import SymbiosisTask
+from npa_envs.envs.multi.tasks.pictures import CoMorphogenesisTask, InvasionTask, SymbiosisTask
 from npa_envs.errors import NPAError, suggest
 
 TASKS: dict[str, type[SpeciesTask]] = {

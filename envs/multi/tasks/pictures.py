@@ -1,0 +1,239 @@
+"""Tasks in which species grow pictures: one each, one together, or one that the others prevent."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from npa_envs import world_mean
+from npa_envs.envs.multi.task import Population, SpeciesConfig, SpeciesTask, by_species
+from npa_envs.errors import NPAError
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
+
+USUAL = ("gecko", "heart", "butterfly", "flower", "octopus", "ring")
+"""What species grow that are told nothing, in turn."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PictureLossConfig(SpeciesConfig):
+    """Adds the loss of `Morphogenesis2DConfig`, which explains it."""
+
+    task_config_type = Morphogenesis2DConfig
+
+    resolution: int = 64
+    sigma: float = Morphogenesis2DConfig.sigma
+    colour_weight: float = Morphogenesis2DConfig.colour_weight
+    render_style: str = "particles"
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        super().__post_init__()
+        _ = self.goal()
+
+    def goal(
+        self, target: str = Morphogenesis2DConfig.target, particle_count: int = 1
+    ) -> Morphogenesis2DConfig:
+        """Return what the task of growing a target with so many particles is told.
+
+        Args:
+            target: A built-in name, an emoji, or the path of a picture.
+            particle_count: Particles that the target is made for; as many points are in it.
+        """
+        return self.task_config(
+            Morphogenesis2DConfig,
+            target=target,
+            target_point_count=particle_count,
+            particle_count=particle_count,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class OnePictureConfig(PictureLossConfig):
+    """Adds the picture of tasks that have but one."""
+
+    target: str = Morphogenesis2DConfig.target
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        super().__post_init__()
+        _ = self.goal(self.target)
+
+
+class PictureLossTask(SpeciesTask):
+    """Pictures to grow, each compared by the splat loss of `npa_envs.tasks.morphogenesis2d`.
+
+    Args:
+        config: The environment's configuration.
+        device: Where the world lives.
+        pictures: Names of targets, and the particles that each is made for.
+
+    Raises:
+        NPAError: A target cannot be loaded.
+    """
+
+    def __init__(self, config: Any, device: torch.device, *pictures: tuple[str, int]) -> None:
+        super().__init__(config, device)
+        self.goals = [Morphogenesis2D(config.goal(*picture), device=device) for picture in pictures]
+        """The tasks of growing each picture, with targets and losses."""
+
+    def picture_parts(self, k: int, x: Tensor, s: Tensor) -> dict[str, Tensor]:
+        """Return density error and weighted colour error against picture k, shape [B] each."""
+        density, colour = self.goals[k].splat_losses(x, s)
+        return {"density": density, "colour": self.config.colour_weight * colour}
+
+    @property
+    def pixel_size(self) -> float:
+        """Size of a particle in pictures: the distance of the first target's points."""
+        return self.goals[0].target.pixel_size
+
+    @property
+    def open_half_width(self) -> float:
+        """Half of a picture [length units] in which a target fits where each seed was."""
+        return float(1.0 + 0.5 * (self.config.species_count - 1) * self.config.seed_distance)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CoMorphogenesisConfig(PictureLossConfig):
+    """What growing side by side, or through each other, can be told besides."""
+
+    targets: tuple[str, ...] = ()
+    """What each species grows: built-in names (`npa-envs list`), emoji, or paths of pictures;
+    empty: built-in ones."""
+
+    seed_distance: float = 1.0
+    """Distance between the centres of neighbouring disks [length units]; 0 grows pictures through
+    each other, 2 side by side."""
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        super().__post_init__()
+        names = self.targets
+        named = isinstance(names, tuple) and all(isinstance(n, str) and n for n in names)
+        if names and (not named or len(names) != self.species_count):
+            raise NPAError(
+                f"targets must be {self.species_count} names, emoji or paths, one for each of "
+                f"species_count = {self.species_count}, got {names!r}: for example "
+                f"targets={self._usual}"
+            )
+
+    @property
+    def goals(self) -> tuple[str, ...]:
+        """What each species grows."""
+        return self.targets or self._usual
+
+    @property
+    def _usual(self) -> tuple[str, ...]:
+        return tuple(USUAL[k % len(USUAL)] for k in range(self.species_count))
+
+
+class CoMorphogenesisTask(PictureLossTask):
+    """A splat loss for each species, of its own particles against its own target."""
+
+    config_type = CoMorphogenesisConfig
+    least_species = 1
+
+    def __init__(self, config: CoMorphogenesisConfig, device: torch.device) -> None:
+        super().__init__(config, device, *zip(config.goals, config.counts, strict=True))
+
+    def losses(self, population: Population) -> Mapping[str, Tensor]:
+        """Return the density error and the weighted colour error of each species' picture."""
+        parts = [self.picture_parts(k, *population.of(k)) for k in _present(population)]
+        return {name: by_species([part[name] for part in parts], population) for name in parts[0]}
+
+    def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
+        """Return each particle's share of its species' splat loss."""
+        shares = [self.goals[k].particle_shares(*population.of(k)) for k in _present(population)]
+        return {"picture": torch.cat(shares, dim=1)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class InvasionConfig(OnePictureConfig):
+    """As other pictures, but rewards cannot be shared."""
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        super().__post_init__()
+        if self.reward != "individual":
+            raise NPAError(
+                f"reward must be 'individual' in invasion, got {self.reward!r}: the sum of all "
+                "rewards is zero, so there is nothing to share"
+            )
+
+
+class InvasionTask(PictureLossTask):
+    """The splat loss of species 0; what it gains, the others lose together."""
+
+    config_type = InvasionConfig
+
+    def __init__(self, config: InvasionConfig, device: torch.device) -> None:
+        super().__init__(config, device, (config.target, config.counts[0]))
+        self.goal = self.goals[0]
+        """The picture of species 0, whose target's colour scripted policies take."""
+
+    def losses(self, population: Population) -> Mapping[str, Tensor]:
+        """Return the parts of species 0's splat loss, and minus an equal share for each other."""
+        invaders = population.counts[1:]
+        there = max(sum(count > 0 for count in invaders), 1)
+        return {
+            name: torch.stack([loss, *[-loss / there] * len(invaders)], dim=1)
+            for name, loss in self.picture_parts(0, *population.of(0)).items()
+        }
+
+    def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
+        """Return shares of species 0's splat loss, and minus an equal share for each other one."""
+        own = self.goal.particle_shares(*population.of(0))
+        own_count, other_count = own.shape[1], sum(population.counts[1:])
+        share = world_mean(own[..., None])[:, 0] * (-own_count / max(other_count, 1))
+        return {"picture": torch.cat((own, share[:, None].expand(-1, other_count)), dim=1)}
+
+    def settle(self, rewards: Tensor, live: Tensor, species: Tensor) -> Tensor:
+        """Return rewards of which the sum is zero: invaders pay in equal parts for species 0."""
+        invading = species > 0
+        gained = torch.where(invading, 0.0, rewards).sum(dim=1, keepdim=True)
+        payers = live & invading
+        return torch.where(payers, -gained / payers.sum(dim=1, keepdim=True).clamp_min(1), rewards)
+
+    def is_over(self, counts: tuple[int, ...]) -> bool:
+        """Return whether one side is gone."""
+        return counts[0] == 0 or sum(counts[1:]) == 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class SymbiosisConfig(OnePictureConfig):
+    """As other pictures, but all species start in one disk."""
+
+    seed_distance: float = 0.0
+
+
+class SymbiosisTask(PictureLossTask):
+    """The splat loss of all particles' picture, against a target of as many points."""
+
+    config_type = SymbiosisConfig
+    least_species = 1
+
+    def __init__(self, config: SymbiosisConfig, device: torch.device) -> None:
+        super().__init__(config, device, (config.target, sum(config.counts)))
+        self.goal = self.goals[0]
+        """The picture of all particles, whose target's colour scripted policies take."""
+
+    def losses(self, population: Population) -> Mapping[str, Tensor]:
+        """Return the density error and the weighted colour error, the same for every species."""
+        parts = self.picture_parts(0, population.x, population.s)
+        count = len(population.counts)
+        return {name: loss[:, None].expand(-1, count) for name, loss in parts.items()}
+
+    def particle_losses(self, population: Population) -> Mapping[str, Tensor]:
+        """Return each particle's share of the splat loss."""
+        return {"picture": self.goal.particle_shares(population.x, population.s)}
+
+    # One picture in the middle, however far from it species begin.
+    open_half_width = SpeciesTask.open_half_width
+
+
+def _present(population: Population) -> list[int]:
+    """Return the species that have particles."""
+    return [k for k, count in enumerate(population.counts) if count]
