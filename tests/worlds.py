@@ -3,6 +3,7 @@
 import torch
 from torch.utils._pytree import tree_leaves
 
+import npa_envs
 from npa_envs.ops.perceive import Terms, perceive_rows
 
 
@@ -16,6 +17,12 @@ def assert_same(ours, theirs):
     assert len(ours) == len(theirs) > 0
     for one, other in zip(ours, theirs, strict=True):
         assert torch.equal(one, other)
+
+
+def assert_near(values, expected, bound):
+    """Compare tensors number by number; the bound is of the largest difference."""
+    for value, answer in zip(values, expected, strict=True):
+        assert float((value.cpu() - answer.cpu()).detach().abs().max()) < bound
 
 
 def relative_error(value, expected):
@@ -46,6 +53,18 @@ def degenerate_world(space_dim, state_dim, *, dtype, device):
     x = torch.cat((scattered, line, clump, coincident, pair, isolated))[None]
     s = torch.randn(1, x.shape[1], state_dim, generator=generator)
     return x.to(device, dtype), s.to(device, dtype)
+
+
+def lively_rule(
+    device, dtype=torch.float64, space_dim=2, state_dim=5, *, seed=0, hidden_dim=12, eps0=0.2,
+    gain=8.0, **options,
+):  # fmt: skip
+    """Return a rule whose updates are large enough to matter."""
+    torch.manual_seed(seed)
+    rule = npa_envs.NPARule(space_dim, state_dim, hidden_dim, eps0=eps0, **options)
+    with torch.no_grad():
+        rule.output.weight *= gain
+    return rule.to(device, dtype)
 
 
 def sides(box, space_dim):

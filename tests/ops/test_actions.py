@@ -5,6 +5,7 @@ import pickle
 
 import pytest
 import torch
+from worlds import assert_same, random_mask
 
 from npa_envs.errors import NPAError
 from npa_envs.ops import apply_actions
@@ -13,20 +14,12 @@ from npa_envs.ops.update import ActionRules, PreparedActions, update_particles
 
 B, N, C = 3, 77, 5
 REACH, DT, STATE_SCALE = 0.07, 0.8, 0.6
+RULES = {"reach": REACH, "dt": DT, "state_scale": STATE_SCALE, "moving": True, "box": None}
 LIMITS = {"position_limit": 50.0, "state_limit": 20.0}
+GIVEN = {"mask": None, "noise": None, "enabled": None, **RULES, **LIMITS}
 ERRORS = {torch.float32: 1e-6, torch.float64: 3e-15}
 """Largest difference from the formula in float64, for values of size about 3 (worst seen 2.2e-7
 and 2.2e-16: one rounding)."""
-
-
-@pytest.fixture(params=[2, 3], ids=["2d", "3d"])
-def space_dim(request):
-    return request.param
-
-
-@pytest.fixture(params=ERRORS, ids=("float32", "float64"))
-def dtype(request):
-    return request.param
 
 
 @pytest.fixture
@@ -43,19 +36,7 @@ def applied(action, x, s, **options):
     """Return new positions and states, and which worlds diverged; x and s are left alone."""
     x, s = x.clone(), s.clone()
     diverged = torch.zeros(x.shape[0], dtype=torch.uint8, device=x.device)
-    given = {
-        "mask": None,
-        "noise": None,
-        "reach": REACH,
-        "dt": DT,
-        "state_scale": STATE_SCALE,
-        "moving": True,
-        "box": None,
-        "enabled": None,
-        "diverged": diverged,
-        **LIMITS,
-        **options,
-    }
+    given = {**GIVEN, "diverged": diverged, **options}
     apply_actions(action, x, s, **given)
     return x, s, given["diverged"]
 
@@ -80,11 +61,6 @@ def assert_near(values, expected, dtype):
         assert float((value.double() - right).abs().max()) <= ERRORS[dtype]
 
 
-def random_mask(device, probability=0.5):
-    generator = torch.Generator().manual_seed(2)
-    return (torch.rand(B, N, generator=generator) < probability).to(device, torch.uint8)
-
-
 def test_particles_follow_the_formula(world, dtype):
     *moved, diverged = applied(*world)
     assert_near(moved, formula(*world), dtype)
@@ -95,7 +71,7 @@ def test_particles_follow_the_formula(world, dtype):
 
 def test_particles_outside_the_mask_stay_as_they_are(world, dtype, device):
     action, x, s = world
-    mask = random_mask(device)
+    mask = random_mask(x)
     idle = mask == 0
     action = torch.where(idle[..., None], torch.nan, action)
     *moved, diverged = applied(action, x, s, mask=mask)
@@ -107,7 +83,7 @@ def test_particles_outside_the_mask_stay_as_they_are(world, dtype, device):
 
 def test_noise_moves_every_particle(world, dtype, device):
     action, x, s = world
-    mask = random_mask(device)
+    mask = random_mask(x)
     noise = 0.01 * torch.randn_like(x)
     *moved, _ = applied(action, x, s, mask=mask, noise=noise)
     assert_near(moved, formula(action, x, s, mask, noise), dtype)
@@ -141,7 +117,7 @@ def test_a_rule_is_a_policy(world, dtype, device, box):
     action, x, s = world
     space_dim = x.shape[2]
     box = None if box is None else (box,) * space_dim
-    mask = random_mask(device)
+    mask = random_mask(x)
     # Every particle has its own row; those outside the mask have none.
     own = torch.arange(B * N, dtype=torch.int32, device=device)
     rows = Rows(torch.where(mask.view(-1) == 1, own, -1), own, own, 0)
@@ -227,21 +203,19 @@ def test_nothing_happens_where_it_is_switched_off(world, device):
     action, x, s = world
     off, on = (torch.full((1,), k, dtype=torch.uint8, device=device) for k in (0, 1))
     wild = torch.full_like(action, math.nan)
-    held = applied(wild, x, s, enabled=off, noise=torch.ones_like(x), position_limit=0.1)
-    assert torch.equal(held[0], x)
-    assert torch.equal(held[1], s)
-    assert held[2].tolist() == [0] * B
-    for value, expected in zip(applied(*world, enabled=on), applied(*world), strict=True):
-        assert torch.equal(value, expected)
+    *held, diverged = applied(wild, x, s, enabled=off, noise=torch.ones_like(x), position_limit=0.1)
+    assert_same(held, [x, s])
+    assert diverged.tolist() == [0] * B
+    assert_same(applied(*world, enabled=on), applied(*world))
 
 
 def test_a_world_moves_in_any_batch_as_it_moves_alone(world, device):
-    together = applied(*world, mask=random_mask(device))
+    mask = random_mask(world[1])
+    together = applied(*world, mask=mask)
     for k in range(B):
         part = slice(k, k + 1)
-        alone = applied(*(tensor[part] for tensor in world), mask=random_mask(device)[part])
-        for value, expected in zip(alone, together, strict=True):
-            assert torch.equal(value, expected[part])
+        alone = applied(*(tensor[part] for tensor in world), mask=mask[part])
+        assert_same(alone, [value[part] for value in together])
 
 
 @pytest.mark.gpu
@@ -280,34 +254,17 @@ def test_tensors_that_do_not_fit_are_clear_errors(change, message):
         "action": torch.zeros(2, 4, 6),
         "x": torch.zeros(2, 4, 2),
         "s": torch.zeros(2, 4, 4),
-        **change,
+        "diverged": torch.zeros(2, dtype=torch.uint8),
     }
     with pytest.raises(NPAError, match=message):
-        apply_actions(
-            given.pop("action"),
-            given.pop("x"),
-            given.pop("s"),
-            **{
-                "mask": None,
-                "noise": None,
-                "reach": 0.1,
-                "dt": 1.0,
-                "state_scale": 1.0,
-                "moving": True,
-                "box": None,
-                "enabled": None,
-                "diverged": torch.zeros(2, dtype=torch.uint8),
-                **LIMITS,
-                **given,
-            },
-        )
+        apply_actions(**GIVEN | given | change)
 
 
 def repeated(x, s, **options):
     """Return the actions on copies of a world, with these copies, and what switches them off."""
     x, s = x.clone(), s.clone()
     enabled = torch.ones(1, dtype=torch.uint8, device=x.device)
-    rules = ActionRules(REACH, DT, STATE_SCALE, True, None, *LIMITS.values())
+    rules = ActionRules(**RULES, **LIMITS)
     given = {
         "mask": None,
         "noise": None,
@@ -332,8 +289,7 @@ def test_repeated_actions_are_the_same_wherever_they_lie(how, world, device):
         }[how](sign * action)
         act(given)
         expected = applied(sign * action, *expected)[:2]
-    assert torch.equal(moved, expected[0])
-    assert torch.equal(changed, expected[1])
+    assert_same((moved, changed), expected)
     assert enabled.item() == 1
 
 
@@ -345,13 +301,11 @@ def test_one_number_that_is_not_finite_is_found_wherever_it_lies(world, device):
             bad = action.contiguous().clone()
             bad.view(-1)[place] = wild
             act(bad)
-            assert enabled.item() == 0
-            assert torch.equal(moved, x)
-            assert torch.equal(changed, s)
             # Nothing but the caller switches them on again.
-            act(action)
-            assert enabled.item() == 0
-            assert torch.equal(moved, x)
+            for _ in range(2):
+                assert enabled.item() == 0
+                assert_same((moved, changed), (x, s))
+                act(action)
             enabled.fill_(1)
     act(torch.full_like(action, torch.finfo(action.dtype).max))
     assert enabled.item() == 1

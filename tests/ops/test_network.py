@@ -2,14 +2,15 @@
 
 import pytest
 import torch
+from worlds import assert_same, relative_error
 
 import npa_envs
 from npa_envs.rule.rule import NPARule, fold_weights
 
 # Norms of errors over norms of answers, against float64; beside, the worst measured on an H200.
 FORWARD_TOLERANCE = 1e-6  # 2.5e-7
-ROW_GRADIENT_TOLERANCE = 1e-6  # 2.1e-7
-WEIGHT_GRADIENT_TOLERANCE = 1e-5  # 6.9e-6
+# Of the update, of the gradients by rows (2.1e-7) and by both weights (6.9e-6).
+TOLERANCES = (FORWARD_TOLERANCE, 1e-6, 1e-5, 1e-5)
 
 SIZES = [
     # space_dim, state_dim, hidden_dim, static
@@ -46,14 +47,20 @@ def random_rows(rule, folded, row_count):
 
 
 def pulled_back(function, inputs, cotangent):
+    """Return what a function gives, then the gradients of its inputs."""
     inputs = [value.detach().requires_grad_() for value in inputs]
     update = function(*inputs)
-    bars = torch.autograd.grad(update, inputs, cotangent.expand_as(update))
-    return update.detach(), bars
+    return update.detach(), *torch.autograd.grad(update, inputs, cotangent.expand_as(update))
 
 
-def error(value, answer):
-    return ((value.double() - answer).norm() / answer.norm()).item()
+@pytest.fixture
+def rule(device):
+    return trained_like_rule(device)
+
+
+@pytest.fixture
+def folded(rule):
+    return rule.folded()
 
 
 def plain_update(rows, hidden_weight, output_weight):
@@ -78,27 +85,21 @@ def test_network_and_its_gradients_equal_float64(sizes, row_count, device):
     got = pulled_back(lambda x, *w: fold_weights(*w)(x), inputs, cotangent)
     wide = [value.double() for value in inputs]
     want = pulled_back(plain_update, wide, cotangent.double())
-    assert error(got[0], want[0]) < FORWARD_TOLERANCE
-    assert error(got[1][0], want[1][0]) < ROW_GRADIENT_TOLERANCE
-    for value, answer in zip(got[1][1:], want[1][1:], strict=True):
-        assert error(value, answer) < WEIGHT_GRADIENT_TOLERANCE
+    for value, answer, tolerance in zip(got, want, TOLERANCES, strict=True):
+        assert relative_error(value, answer) < tolerance
 
 
 @pytest.mark.parametrize("scale", [1e-20, 1e-6, 1e6, 1e20])
-def test_network_is_as_accurate_at_any_scale(scale, device):
-    rule = trained_like_rule(device)
-    folded = rule.folded()
+def test_network_is_as_accurate_at_any_scale(scale, rule, folded, device):
     rows = random_rows(rule, folded, 200) * scale
     expected = plain_update(
         rows.double(), folded.hidden_weight.double(), folded.output_weight.double()
     )
-    assert error(folded(rows), expected) < FORWARD_TOLERANCE
+    assert relative_error(folded(rows), expected) < FORWARD_TOLERANCE
 
 
-def test_a_row_depends_on_no_other_row(device):
+def test_a_row_depends_on_no_other_row(rule, folded, device):
     needs_cuda(device)
-    rule = trained_like_rule(device)
-    folded = rule.folded()
     rows = random_rows(rule, folded, 1003)
     cotangent = torch.randn(1003, folded.output_weight.shape[0], device=device)
     copies = 2**16 // 1003 + 1
@@ -113,40 +114,31 @@ def test_a_row_depends_on_no_other_row(device):
     assert torch.equal(folded(rows[5:6]), folded(rows)[5:6])
 
 
-def test_network_is_bit_identical_from_run_to_run(device):
-    rule = trained_like_rule(device)
-    folded = rule.folded()
+def test_network_is_bit_identical_from_run_to_run(rule, folded, device):
     rows = random_rows(rule, folded, 5000)
     inputs = (rows, folded.hidden_weight, folded.output_weight)
     cotangent = torch.randn(5000, folded.output_weight.shape[0], device=device)
     runs = [pulled_back(lambda x, *w: fold_weights(*w)(x), inputs, cotangent) for _ in range(2)]
-    assert torch.equal(runs[0][0], runs[1][0])
-    assert all(torch.equal(*pair) for pair in zip(runs[0][1], runs[1][1], strict=True))
+    assert_same(*runs)
 
 
-def test_network_without_gradients_is_the_same(device):
-    rule = trained_like_rule(device)
+def test_network_without_gradients_is_the_same(rule):
     rows = random_rows(rule, rule.folded(), 300)
     with torch.no_grad():
         quiet = rule.folded()(rows)
     assert torch.equal(quiet, rule.folded()(rows).detach())
 
 
-def test_rows_may_lie_anywhere(device):
-    rule = trained_like_rule(device)
-    folded = rule.folded()
+def test_rows_may_lie_anywhere(rule, folded, device):
     rows = random_rows(rule, folded, 50)
     shifted = torch.zeros(rows.numel() + 1, device=device)[1:].view_as(rows).copy_(rows)
     strided = rows.repeat_interleave(2, dim=1)[:, ::2]
-    expected, (expected_bar,) = pulled_back(folded, [rows], torch.ones(50, 1, device=device))
+    ones = torch.ones(50, 1, device=device)
     for same in (shifted, strided):
-        update, (rows_bar,) = pulled_back(folded, [same], torch.ones(50, 1, device=device))
-        assert torch.equal(update, expected)
-        assert torch.equal(rows_bar, expected_bar)
+        assert_same(pulled_back(folded, [same], ones), pulled_back(folded, [rows], ones))
 
 
-def test_weights_folded_without_gradients_still_have_them(device):
-    rule = trained_like_rule(device)
+def test_weights_folded_without_gradients_still_have_them(rule):
     with torch.no_grad():
         weights = rule.folded()
     rows = random_rows(rule, weights, 100).requires_grad_()
@@ -156,9 +148,7 @@ def test_weights_folded_without_gradients_still_have_them(device):
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
-def test_values_that_are_not_finite_stay_so(value, device):
-    rule = trained_like_rule(device)
-    folded = rule.folded()
+def test_values_that_are_not_finite_stay_so(value, rule, folded, device):
     rows = random_rows(rule, folded, 40)
     clean = folded(rows)
     rows[7, 3] = value
@@ -168,9 +158,7 @@ def test_values_that_are_not_finite_stay_so(value, device):
     assert torch.equal(update[8:], clean[8:])
 
 
-def test_rows_of_zeros_give_zeros_and_no_gradient(device):
-    rule = trained_like_rule(device)
-    folded = rule.folded()
+def test_rows_of_zeros_give_zeros_and_no_gradient(folded, device):
     rows = torch.zeros(50, folded.row_width, device=device, requires_grad=True)
     update = folded(rows)
     grads = torch.autograd.grad(update.sum(), (rows, *folded[:2]), retain_graph=True)
@@ -178,14 +166,12 @@ def test_rows_of_zeros_give_zeros_and_no_gradient(device):
     assert not any(grad.any() for grad in grads)
 
 
-def test_gradient_of_one_input_equals_that_of_all(device):
-    rule = trained_like_rule(device)
-    folded = rule.folded()
+def test_gradient_of_one_input_equals_that_of_all(rule, folded, device):
     rows = random_rows(rule, folded, 100).requires_grad_()
     total = folded(rows).square().sum()
     together = torch.autograd.grad(total, (rows, *folded[:2]), retain_graph=True)
     alone = [torch.autograd.grad(total, x, retain_graph=True)[0] for x in (rows, *folded[:2])]
-    assert all(torch.equal(a, b) for a, b in zip(together, alone, strict=True))
+    assert_same(alone, together)
 
 
 @pytest.mark.parametrize("hidden_dim", [24, 544])
@@ -202,9 +188,8 @@ def test_float64_uses_plain_products(device):
     assert trained_like_rule(device).double().folded().arranged is None
 
 
-def test_a_compiled_network_equals_the_eager_one(device):
+def test_a_compiled_network_equals_the_eager_one(rule, device):
     needs_cuda(device)
-    rule = trained_like_rule(device)
     rows = random_rows(rule, rule.folded(), 300)
 
     def squares(rows):
@@ -213,16 +198,14 @@ def test_a_compiled_network_equals_the_eager_one(device):
     compiled = torch.compile(squares, backend="aot_eager", fullgraph=True)
     got = torch.autograd.grad(compiled(rows), list(rule.parameters()))
     want = torch.autograd.grad(squares(rows), list(rule.parameters()))
-    assert all(torch.equal(*pair) for pair in zip(got, want, strict=True))
+    assert_same(got, want)
 
 
-def test_rollout_of_a_world_is_the_same_alone_and_in_a_batch(device):
+def test_rollout_of_a_world_is_the_same_alone_and_in_a_batch(rule, device):
     needs_cuda(device)
-    rule = trained_like_rule(device)
     x = torch.rand(40, 1024, 2, device=device) - 0.5
     s = torch.randn(40, 1024, 16, device=device) * 0.1
     with torch.no_grad():
         batch = npa_envs.rollout(rule, x, s, 3, update_prob=1.0)
         alone = npa_envs.rollout(rule, x[7:8], s[7:8], 3, update_prob=1.0)
-    assert torch.equal(batch[0][7:8], alone[0])
-    assert torch.equal(batch[1][7:8], alone[1])
+    assert_same([value[7:8] for value in batch], alone)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from worlds import random_world, relative_error
+from worlds import assert_near, assert_same, cotangents, lively_rule, random_world, relative_error
 
 import npa_envs
 from npa_envs import reference as oracle
@@ -12,15 +12,6 @@ from npa_envs.ops.perceive import Rows
 from npa_envs.ops.update import update_particles
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.world.rollout import row_capacity
-
-
-def small_rule(device, dtype=torch.float64, seed=0, gain=8.0, **options):
-    """A rule whose updates are large enough to matter."""
-    torch.manual_seed(seed)
-    rule = npa_envs.NPARule(2, 5, 12, eps0=0.2, **options).to(device, dtype)
-    with torch.no_grad():
-        rule.output.weight *= gain
-    return rule
 
 
 def plain_rollout(rule, x, s, steps, *, eps, box=None, dt=1.0, masks=None, detach_positions=True):
@@ -88,43 +79,30 @@ def test_a_rule_of_the_authors_grows_its_picture(device, aubergine, reference):
         assert psnr >= 24.0, f"seed {seed}: {psnr:.1f} dB"
 
 
+def pulled(values):
+    """Return a random functional of values, of which some have no gradient."""
+    return sum((bar * v).sum() for bar, v in zip(cotangents(values), values, strict=True))
+
+
 @pytest.mark.parametrize("static", [False, True])
 @pytest.mark.parametrize("box", [None, (1.4, 1.8)])
 @pytest.mark.parametrize("detach_positions", [True, False])
 def test_rollout_and_its_gradients_equal_plain_torch(box, detach_positions, static, device):
-    rule = small_rule("cpu", static=static, moment_correction=False)
+    rule = lively_rule("cpu", static=static, moment_correction=False)
     x, s = random_world(2, 40, 2, 5, dtype=torch.float64, device="cpu")
+    options = {"eps": 0.3, "box": box, "dt": 0.7, "detach_positions": detach_positions}
     x0, s0 = x.clone().requires_grad_(), s.clone().requires_grad_()
-    expected = plain_rollout_without_moment(
-        rule, x0, s0, 4, eps=0.3, box=box, dt=0.7, detach_positions=detach_positions
-    )
-    weights = [torch.randn(value.shape, dtype=torch.float64) for value in expected]
-    loss = sum((w * v).sum() for w, v in zip(weights, expected, strict=True))
+    expected = plain_rollout_without_moment(rule, x0, s0, 4, **options)
     inputs = [s0, *rule.parameters()] + ([] if static and detach_positions else [x0])
-    gradients = torch.autograd.grad(loss, inputs, allow_unused=True)
+    wanted = torch.autograd.grad(pulled(expected), inputs, allow_unused=True)
 
-    twin = small_rule(device, static=static, moment_correction=False)
-    x1 = x.to(device).requires_grad_()
-    s1 = s.to(device).requires_grad_()
-    values = npa_envs.rollout(
-        twin,
-        x1,
-        s1,
-        4,
-        eps=0.3,
-        box=box,
-        update_prob=1.0,
-        dt=0.7,
-        detach_positions=detach_positions,
-        return_path_length=True,
-    )
-    loss = sum((w.to(device) * v).sum() for w, v in zip(weights, values, strict=True))
+    twin = lively_rule(device, static=static, moment_correction=False)
+    x1, s1 = x.to(device).requires_grad_(), s.to(device).requires_grad_()
+    found = npa_envs.rollout(twin, x1, s1, 4, update_prob=1.0, return_path_length=True, **options)
     inputs = [s1, *twin.parameters()] + ([] if static and detach_positions else [x1])
-    for value, answer in zip(values, expected, strict=True):
-        assert (value.cpu() - answer).abs().max() < 1e-12
-    for value, answer in zip(
-        torch.autograd.grad(loss, inputs, allow_unused=True), gradients, strict=True
-    ):
+    gradients = torch.autograd.grad(pulled(found), inputs, allow_unused=True)
+    assert_near(found, expected, 1e-12)
+    for value, answer in zip(gradients, wanted, strict=True):
         assert relative_error(value, answer) < 1e-11
 
 
@@ -139,7 +117,7 @@ def plain_rollout_without_moment(rule, *args, **options):
 
 
 def test_update_masks_select_the_particles_that_change(device):
-    rule = small_rule(device)
+    rule = lively_rule(device)
     x, s = random_world(2, 500, 2, 5, dtype=torch.float64, device=device)
     generator = torch.Generator(device).manual_seed(4)
     after_x, after_s = npa_envs.step(rule, x, s, update_prob=0.3, generator=generator)
@@ -153,24 +131,22 @@ def test_update_masks_select_the_particles_that_change(device):
 
 
 def test_masked_gradients_equal_plain_torch(device):
-    rule = small_rule(device, moment_correction=False)
+    rule = lively_rule(device, moment_correction=False)
     x, s = random_world(2, 60, 2, 5, dtype=torch.float64, device=device)
     generator = torch.Generator(device).manual_seed(9)
     s1 = s.clone().requires_grad_()
-    values = npa_envs.rollout(
-        rule, x, s1, 3, eps=0.3, update_prob=0.4, generator=generator, return_path_length=True
-    )
-    twin_generator = torch.Generator(device).manual_seed(9)
+    options = {"update_prob": 0.4, "generator": generator, "return_path_length": True}
+    values = npa_envs.rollout(rule, x, s1, 3, eps=0.3, **options)
+    again = torch.Generator(device).manual_seed(9)
     masks = [
-        torch.empty(2, 60, dtype=torch.uint8, device=device)
-        .bernoulli_(0.4, generator=twin_generator)
-        .cpu()
-        .double()
+        torch.empty(2, 60, dtype=torch.uint8, device=device).bernoulli_(0.4, generator=again)
         for _ in range(3)
     ]
-    twin = small_rule("cpu", moment_correction=False)
+    twin = lively_rule("cpu", moment_correction=False)
     s0 = s.cpu().clone().requires_grad_()
-    expected = plain_rollout_without_moment(twin, x.cpu(), s0, 3, eps=0.3, masks=masks)
+    expected = plain_rollout_without_moment(
+        twin, x.cpu(), s0, 3, eps=0.3, masks=[mask.cpu().double() for mask in masks]
+    )
     got = torch.autograd.grad(sum(v.square().sum() for v in values), [s1, *rule.parameters()])
     want = torch.autograd.grad(sum(v.square().sum() for v in expected), [s0, *twin.parameters()])
     for value, answer in zip(got, want, strict=True):
@@ -186,7 +162,7 @@ def test_recomputing_gives_the_gradients_of_storing(device, monkeypatch):
         return advance(*args)
 
     monkeypatch.setattr(npa_envs.world.rollout.RuleStep, "advance", counted)
-    rule = small_rule(device, dtype=torch.float32)
+    rule = lively_rule(device, dtype=torch.float32)
     x, s = random_world(2, 200, 2, 5, dtype=torch.float32, device=device)
     results = []
     for memory in ("store", "recompute", "minimal"):
@@ -200,21 +176,19 @@ def test_recomputing_gives_the_gradients_of_storing(device, monkeypatch):
             out[0].square().sum() + out[1].square().sum(), [s_, *rule.parameters()]
         )
         results.append((*out, *gradients))
-    for stored, *others in zip(*results, strict=True):
-        assert all(torch.equal(stored, other) for other in others)
+    assert_same(results[1:], [results[0]] * 2)
     # Of five steps, "recompute" stores the last and the second, "minimal" the last.
     assert advanced == [5, 5 + 3, 5 + 4]
 
 
 def test_seeded_rollouts_are_bit_identical(device):
-    rule = small_rule(device, dtype=torch.float32)
+    rule = lively_rule(device, dtype=torch.float32)
     x, s = random_world(3, 300, 2, 5, dtype=torch.float32, device=device)
     runs = []
     for _ in range(2):
         generator = torch.Generator(device).manual_seed(5)
         runs.append(npa_envs.rollout(rule, x, s, 6, position_noise=0.01, generator=generator))
-    assert torch.equal(runs[0][0], runs[1][0])
-    assert torch.equal(runs[0][1], runs[1][1])
+    assert_same(*runs)
     other = npa_envs.rollout(
         rule, x, s, 6, position_noise=0.01, generator=torch.Generator(device).manual_seed(6)
     )
@@ -222,15 +196,14 @@ def test_seeded_rollouts_are_bit_identical(device):
 
 
 def test_steps_one_by_one_equal_a_rollout(device):
-    rule = small_rule(device)
+    rule = lively_rule(device)
     x, s = random_world(1, 100, 2, 5, dtype=torch.float64, device=device)
     generator = torch.Generator(device).manual_seed(2)
     expected = npa_envs.rollout(rule, x, s, 4, generator=generator)
     generator = torch.Generator(device).manual_seed(2)
     for _ in range(4):
         x, s = npa_envs.step(rule, x, s, generator=generator)
-    assert torch.equal(x, expected[0])
-    assert torch.equal(s, expected[1])
+    assert_same((x, s), expected)
 
 
 def test_particles_keep_their_identity(device):
@@ -255,7 +228,7 @@ def test_position_noise_has_its_standard_deviation(device):
 
 
 def test_periodic_positions_stay_in_the_box(device):
-    rule = small_rule(device, gain=200.0)
+    rule = lively_rule(device, gain=200.0)
     x, s = random_world(2, 150, 2, 5, dtype=torch.float64, device=device)
     x, s, path = npa_envs.rollout(rule, x, s, 12, box=(1.4, 1.6), return_path_length=True)
     assert (x[..., 0].abs() <= 0.7).all()
@@ -264,7 +237,7 @@ def test_periodic_positions_stay_in_the_box(device):
 
 
 def test_particles_that_are_off_are_wrapped_too(device):
-    rule = small_rule(device)
+    rule = lively_rule(device)
     x, s = random_world(1, 60, 2, 5, dtype=torch.float64, device=device)
     wrapped, same = npa_envs.step(rule, x + 5.0, s, box=1.0, update_prob=1e-9)
     assert wrapped.abs().max() <= 0.5
@@ -322,8 +295,7 @@ def test_columns_that_nothing_reads_change_nothing(space_dim, state_dim, moving,
 
     plain = run(0)
     for padding in range(1, 5):
-        for value, expected in zip(run(padding), plain, strict=True):
-            assert torch.equal(value, expected)
+        assert_same(run(padding), plain)
     changed = row_of.view(3, 85) >= 0
     change = update.new_zeros(255, state_dim)
     change[row_source.long()] = 0.7 * update[:, width - state_dim :]
@@ -331,50 +303,47 @@ def test_columns_that_nothing_reads_change_nothing(space_dim, state_dim, moving,
     assert torch.equal(plain[1][~changed], s[~changed])
 
 
-def test_a_rule_with_a_hook_is_run_as_a_module(device):
-    rule = small_rule(device)
+class Doubled(npa_envs.NPARule):
+    def forward(self, perception):
+        return 2.0 * super().forward(perception)
+
+
+@pytest.mark.parametrize("how", ["hook", "override"])
+def test_a_rule_that_is_no_plain_network_is_used_as_it_is(how, device):
+    plain, doubled = lively_rule(device), lively_rule(device)
+    if how == "hook":
+        handle = doubled.register_forward_hook(lambda module, inputs, output: 2.0 * output)
+    else:
+        doubled = Doubled(**plain.hyper_parameters()).to(device, torch.float64)
+        doubled.load_state_dict(plain.state_dict())
     x, s = random_world(1, 50, 2, 5, dtype=torch.float64, device=device)
-    _, plain = npa_envs.step(rule, x, s, update_prob=1.0)
-    handle = rule.register_forward_hook(lambda module, inputs, output: 2.0 * output)
-    _, hooked = npa_envs.step(rule, x, s, update_prob=1.0)
-    torch.testing.assert_close(hooked - s, 2.0 * (plain - s), rtol=1e-12, atol=1e-13)
-    handle.remove()
-    assert rule.is_plain()
-    rule.output = torch.nn.Linear(12, 7, dtype=torch.float64, device=device)
-    assert not rule.is_plain()
+    _, once = npa_envs.step(plain, x, s, update_prob=1.0)
+    _, twice = npa_envs.step(doubled, x, s, update_prob=1.0)
+    torch.testing.assert_close(twice - s, 2.0 * (once - s), rtol=1e-12, atol=1e-13)
+    assert not doubled.is_plain()
+    if how == "hook":
+        handle.remove()
+        assert doubled.is_plain()
+        doubled.output = torch.nn.Linear(12, 7, dtype=torch.float64, device=device)
+        assert not doubled.is_plain()
 
 
 def test_worlds_keep_their_precision_under_autocast(device):
-    rule = small_rule(device, dtype=torch.float32)
+    rule = lively_rule(device, dtype=torch.float32)
     x, s = random_world(1, 50, 2, 5, dtype=torch.float32, device=device)
     expected = npa_envs.rollout(rule, x, s, 2, update_prob=1.0)
     with torch.autocast(device.type, dtype=torch.bfloat16):
         values = npa_envs.rollout(rule, x, s, 2, update_prob=1.0)
-    assert torch.equal(values[0], expected[0])
-    assert torch.equal(values[1], expected[1])
+    assert_same(values, expected)
 
 
 def test_displacement_never_exceeds_alpha_eps(device):
-    rule = small_rule(device, gain=1e4)
+    rule = lively_rule(device, gain=1e4)
     x, s = random_world(1, 100, 2, 5, dtype=torch.float64, device=device)
     moved, _ = npa_envs.step(rule, x, s, eps=0.2, update_prob=1.0)
     length = (moved - x).norm(dim=-1)
     assert length.max() <= rule.alpha * 0.2 * (1 + 1e-12)
     assert length.max() > 0.9 * rule.alpha * 0.2
-
-
-def test_a_rule_that_overrides_its_network_is_used_as_it_is(device):
-    class Doubled(npa_envs.NPARule):
-        def forward(self, perception):
-            return 2.0 * super().forward(perception)
-
-    plain = small_rule(device)
-    doubled = Doubled(2, 5, 12, eps0=0.2).to(device, torch.float64)
-    doubled.load_state_dict(plain.state_dict())
-    x, s = random_world(1, 50, 2, 5, dtype=torch.float64, device=device)
-    _, once = npa_envs.step(plain, x, s, update_prob=1.0)
-    _, twice = npa_envs.step(doubled, x, s, update_prob=1.0)
-    torch.testing.assert_close(twice - s, 2.0 * (once - s), rtol=1e-12, atol=1e-13)
 
 
 @pytest.mark.parametrize("update_prob", [0.01, 0.05, 0.5, 0.95])
@@ -389,27 +358,24 @@ def test_row_capacity_holds_far_more_than_ever_drawn(particle_total, update_prob
 
 
 def test_folded_rule_equals_the_network(device):
-    rule = small_rule(device)
+    rule = lively_rule(device)
     z = torch.randn(33, rule.perception_dim, dtype=torch.float64, device=device)
     folded = rule.folded()
-    rows = torch.zeros(33, folded.row_width, dtype=torch.float64, device=device)
-    rows[:, : rule.perception_dim] = z
+    rows = torch.nn.functional.pad(z, (0, folded.row_width - rule.perception_dim))
     rows[:, rule.perception_dim] = 1.0
-    update = folded(rows)
-    torch.testing.assert_close(update[:, : rule.update_dim], rule(z), rtol=1e-13, atol=1e-14)
-    cotangent = torch.randn(33, rule.update_dim, dtype=torch.float64, device=device)
-    got = torch.autograd.grad(
-        (update[:, : rule.update_dim] * cotangent).sum(), list(rule.parameters())
+    update = folded(rows)[:, : rule.update_dim]
+    torch.testing.assert_close(update, rule(z), rtol=1e-13, atol=1e-14)
+    parameters = list(rule.parameters())
+    got, want = (
+        torch.autograd.grad(value, parameters, cotangents([value])) for value in (update, rule(z))
     )
-    want = torch.autograd.grad((rule(z) * cotangent).sum(), list(rule.parameters()))
-    for value, answer in zip(got, want, strict=True):
-        torch.testing.assert_close(value, answer, rtol=1e-12, atol=1e-13)
+    torch.testing.assert_close(got, want, rtol=1e-12, atol=1e-13)
 
 
 def test_a_captured_rollout_equals_the_eager_one(device):
     if device.type != "cuda":
         pytest.skip("graphs are CUDA's")
-    rule = small_rule(device, dtype=torch.float32)
+    rule = lively_rule(device, dtype=torch.float32)
     x, s = random_world(2, 3000, 2, 5, dtype=torch.float32, device=device)
     generator = torch.Generator(device).manual_seed(3)
     expected = npa_envs.rollout(rule, x, s, 5, generator=generator)
@@ -421,5 +387,4 @@ def test_a_captured_rollout_equals_the_eager_one(device):
     generator.manual_seed(3)
     graph.replay()
     torch.cuda.synchronize()
-    assert torch.equal(captured[0], expected[0])
-    assert torch.equal(captured[1], expected[1])
+    assert_same(captured, expected)

@@ -1,11 +1,19 @@
 """Several rules in one world: what they see of each other, and that physics exists once."""
 
+import functools
 import re
 from pathlib import Path
 
 import pytest
 import torch
-from worlds import degenerate_world, random_world, relative_error
+from worlds import (
+    assert_near,
+    assert_same,
+    degenerate_world,
+    lively_rule,
+    random_world,
+    relative_error,
+)
 
 import npa_envs
 from npa_envs import reference as oracle
@@ -15,13 +23,7 @@ FIELD_ERRORS = {torch.float64: 1e-13, torch.float32: 2e-6}
 """Largest relative error of fields by species (worst seen 2e-15 and 2e-7)."""
 
 
-def make_rule(device="cpu", *, seed=0, space_dim=2, hidden_dim=12, gain=8.0, **options):
-    """A rule in float64 whose updates are large enough to matter."""
-    torch.manual_seed(seed)
-    rule = npa_envs.NPARule(space_dim, 5, hidden_dim, eps0=0.3, **options).to(device, torch.float64)
-    with torch.no_grad():
-        rule.output.weight *= gain
-    return rule
+make_rule = functools.partial(lively_rule, eps0=0.3)
 
 
 def make_world(device, particle_count=60, space_dim=2, world_count=2):
@@ -44,33 +46,22 @@ def fields_by_species(x, counts, eps, box):
     return torch.stack(rho, dim=2), torch.stack(drho, dim=2)
 
 
+@pytest.mark.parametrize("counts", [(50,), (1, 49), (13, 30, 7)])
 @pytest.mark.parametrize(
     ("space_dim", "box"), [(2, None), (2, (1.4, 1.8)), (3, None), (3, (1.4, 1.5, 1.6))]
 )
 @pytest.mark.parametrize("static", [False, True])
-def test_species_with_one_rule_are_one_species(space_dim, box, static, device):
+def test_species_with_one_rule_are_one_species(counts, space_dim, box, static, device):
     rule = make_rule(device, space_dim=space_dim, static=static)
     x, s = make_world(device, 50, space_dim)
-    expected = npa_envs.rollout(rule, x, s, 20, box=box, generator=seeded(device))
+    options = {"box": box, "return_path_length": True}
+    options |= {} if static else {"update_prob": 0.4, "dt": 0.5, "position_noise": 0.01}
+    expected = npa_envs.rollout(rule, x, s, 20, generator=seeded(device), **options)
     found = npa_envs.rollout_species(
-        [rule, rule, rule], x, s, 20, counts=(13, 30, 7), box=box, generator=seeded(device)
+        [rule] * len(counts), x, s, 20, counts=counts, generator=seeded(device), **options
     )
     assert (expected[1] - s).abs().max() > 0.1
-    for value, answer in zip(found, expected, strict=True):
-        assert (value - answer).abs().max() < 1e-12
-
-
-def test_one_species_draws_and_does_what_a_rollout_does(device):
-    rule = make_rule(device)
-    x, s = make_world(device)
-    options = {"update_prob": 0.4, "dt": 0.5, "position_noise": 0.01, "eps": 0.25}
-    expected = npa_envs.rollout(rule, x, s, 6, generator=seeded(device), **options)
-    for split in ([60], [1, 59]):
-        found = npa_envs.rollout_species(
-            [rule] * len(split), x, s, 6, counts=split, generator=seeded(device), **options
-        )
-        for value, answer in zip(found, expected, strict=True):
-            assert (value - answer).abs().max() < 1e-12
+    assert_near(found, expected, 1e-12)
 
 
 def test_swapping_species_with_their_particles_swaps_what_comes_out(device):
@@ -81,8 +72,7 @@ def test_swapping_species_with_their_particles_swaps_what_comes_out(device):
         [second, first], x.roll(40, 1), s.roll(40, 1), 8, counts=[40, 20], update_prob=1.0
     )
     assert (x1 - x).abs().max() > 0.05
-    assert (x2.roll(-40, 1) - x1).abs().max() < 1e-12
-    assert (s2.roll(-40, 1) - s1).abs().max() < 1e-12
+    assert_near((x2.roll(-40, 1), s2.roll(-40, 1)), (x1, s1), 1e-12)
 
 
 def test_each_species_follows_its_own_rule(device):
@@ -92,9 +82,10 @@ def test_each_species_follows_its_own_rule(device):
     x, s = make_world(device)
     after = npa_envs.rollout_species(rules, x, s, 1, counts=counts, update_prob=1.0)
     alone = [npa_envs.step(rule, x, s, update_prob=1.0) for rule in rules]
-    for value, *own in zip(after, *alone, strict=True):
-        expected = torch.cat((own[0][:, :25], own[1][:, 25:]), dim=1)
-        assert (value - expected).abs().max() < 1e-13
+    expected = [
+        torch.cat((one[:, :25], two[:, 25:]), dim=1) for one, two in zip(*alone, strict=True)
+    ]
+    assert_near(after, expected, 1e-13)
 
 
 def test_rules_that_are_no_plain_networks_run_as_they_are(device):
@@ -111,8 +102,7 @@ def test_rules_that_are_no_plain_networks_run_as_they_are(device):
     expected = npa_envs.rollout(plain, x, s, 5, generator=seeded(device))
     for rules in ([doubled, plain], [doubled, doubled]):
         found = npa_envs.rollout_species(rules, x, s, 5, counts=[20, 40], generator=seeded(device))
-        assert (found[0] - expected[0]).abs().max() < 1e-12
-        assert (found[1] - expected[1]).abs().max() < 1e-12
+        assert_near(found, expected, 1e-12)
 
 
 @pytest.mark.parametrize("told_apart", [False, True])
@@ -136,8 +126,7 @@ def test_species_out_of_reach_see_themselves_as_alone(told_apart, device):
         assert (first[0][:, :20] - x[:, :20] - step).abs().max() < 1e-12
     else:
         alone = npa_envs.rollout(rules[0], x[:, :20], s[:, :20], 5, update_prob=1.0)
-        assert (own[0][:, :20] - alone[0]).abs().max() < 1e-11
-        assert (own[1][:, :20] - alone[1]).abs().max() < 1e-11
+        assert_near([value[:, :20] for value in own], alone, 1e-11)
     assert (own[0] - shared[0]).abs().max() > 1e-4
 
 
@@ -165,8 +154,7 @@ def test_a_species_that_sleeps_stays_where_it_is_and_leaves_others_their_updates
         )
         expected_x, expected_s = awake_x.clone(), awake_s.clone()
         expected_x[:, asleep], expected_s[:, asleep] = x[:, asleep], s[:, asleep]
-        assert (after_x - expected_x).abs().max() < 1e-13
-        assert (after_s - expected_s).abs().max() < 1e-13
+        assert_near((after_x, after_s), (expected_x, expected_s), 1e-13)
 
 
 def test_equal_probabilities_of_each_draw_what_one_does(device):
@@ -178,8 +166,7 @@ def test_equal_probabilities_of_each_draw_what_one_does(device):
         )
         for chance in (0.5, [0.5, 0.5], torch.tensor(0.5))
     ]
-    assert torch.equal(runs[0][0], runs[1][0])
-    assert torch.equal(runs[0][1], runs[2][1])
+    assert_same(runs[1:], [runs[0]] * 2)
 
 
 @pytest.mark.parametrize("perception", ["shared", "per_species"])
@@ -224,14 +211,9 @@ def test_gradients_of_many_steps_with_one_rule_are_those_of_a_rollout(device):
         rule = make_rule(device)
         start = s.clone().requires_grad_()
         place = x.clone().requires_grad_()
+        options = {"detach_positions": False, "generator": seeded(device)}
         out = npa_envs.rollout_species(
-            [rule] * len(counts),
-            place,
-            start,
-            6,
-            counts=counts,
-            detach_positions=False,
-            generator=seeded(device),
+            [rule] * len(counts), place, start, 6, counts=counts, **options
         )
         loss = out[0].square().sum() + out[1].square().sum()
         results.append(torch.autograd.grad(loss, [start, place, *rule.parameters()]))
@@ -239,39 +221,19 @@ def test_gradients_of_many_steps_with_one_rule_are_those_of_a_rollout(device):
         assert relative_error(value, answer) < 1e-11
 
 
-def test_recomputing_gives_the_gradients_of_storing_and_paths_are_those_of_a_rollout(device):
+def test_recomputing_gives_the_gradients_of_storing(device):
     rules = [make_rule(device), make_rule(device, seed=1)]
     x, s = make_world(device)
     results = []
     for memory in ("store", "recompute", "minimal"):
-        out = npa_envs.rollout_species(
-            rules,
-            x,
-            s,
-            5,
-            counts=[20, 40],
-            generator=seeded(device),
-            memory=memory,
-            return_path_length=True,
-        )
+        options = {"memory": memory, "return_path_length": True, "generator": seeded(device)}
+        out = npa_envs.rollout_species(rules, x, s, 5, counts=[20, 40], **options)
         loss = sum(value.square().sum() for value in out)
         parameters = [*rules[0].parameters(), *rules[1].parameters()]
         results.append([*out, *torch.autograd.grad(loss, parameters)])
-    for stored, *others in zip(*results, strict=True):
-        assert all(torch.equal(stored, other) for other in others)
-    for counts in ([60], [25, 35]):
-        options = {"generator": seeded(device), "return_path_length": True}
-        *_, path = npa_envs.rollout_species(
-            rules[:1] * len(counts), x, s, 5, counts=counts, **options
-        )
-        options = {"generator": seeded(device), "return_path_length": True}
-        *_, expected = npa_envs.rollout(rules[0], x, s, 5, **options)
-        assert path.shape == (2, 60)
-        assert (path - expected).abs().max() < 1e-12
+    assert_same(results[1:], [results[0]] * 2)
 
 
-@pytest.mark.parametrize("dtype", FIELD_ERRORS, ids=("float64", "float32"))
-@pytest.mark.parametrize("space_dim", [2, 3])
 @pytest.mark.parametrize("periodic", [False, True])
 def test_fields_of_each_species_are_sums_over_it(dtype, space_dim, periodic, device):
     counts = [70, 1, 130]
@@ -328,16 +290,9 @@ def test_rules_of_species_read_what_is_perceived_of_each(update_prob, device):
     rules = [make_rule(device, seed=k, species_count=2) for k in range(2)]
     counts = [20, 40]
     x, s = make_world(device)
+    options = {"eps": 0.25, "update_prob": update_prob, "perception": "per_species"}
     found = npa_envs.rollout_species(
-        rules,
-        x,
-        s,
-        1,
-        counts=counts,
-        eps=0.25,
-        update_prob=update_prob,
-        generator=seeded(device),
-        perception="per_species",
+        rules, x, s, 1, counts=counts, generator=seeded(device), **options
     )
     mask = torch.ones(2, 60, dtype=torch.uint8, device=device)
     if update_prob < 1.0:
@@ -350,15 +305,11 @@ def test_rules_of_species_read_what_is_perceived_of_each(update_prob, device):
     assert (found[1] - s - update[..., 2:]).abs().max() < 1e-12
 
 
-def test_a_rule_that_tells_species_apart_survives_its_file(tmp_path):
-    rule = make_rule(species_count=3)
-    assert rule.perception_dim == npa_envs.NPARule(2, 5, 12).perception_dim + 9
-    npa_envs.save_rule(rule, tmp_path / "rule.safetensors")
-    loaded = npa_envs.load_rule(tmp_path / "rule.safetensors")
-    assert loaded.hyper_parameters() == rule.hyper_parameters()
-    assert loaded.species_count == 3
-    assert torch.equal(loaded.hidden.weight, rule.hidden.weight)
-    assert "species_count" not in make_rule().hyper_parameters()
+def test_a_rule_that_tells_species_apart_perceives_more_and_says_so():
+    rule, plain = make_rule("cpu", species_count=3), make_rule("cpu")
+    assert rule.perception_dim == plain.perception_dim + 9
+    assert rule.hyper_parameters() == plain.hyper_parameters() | {"species_count": 3}
+    assert "species_count" not in plain.hyper_parameters()
 
 
 @pytest.mark.gpu
@@ -372,22 +323,17 @@ def test_devices_agree_and_a_rollout_can_be_captured(perception):
     for device in ("cpu", "cuda"):
         rules = [make_rule(device, seed=k, species_count=told, gain=2.0) for k in range(2)]
         random = npa_envs.WorldRandom([1, 2], device=device)
+        worlds = x.to(device), s.to(device)
         with torch.no_grad():
-            results.append(
-                npa_envs.rollout_species(
-                    rules, x.to(device), s.to(device), 4, generator=random, **options
-                )
-            )
-    for value, answer in zip(*results, strict=True):
-        assert (value - answer.cpu()).abs().max() < 1e-10
+            results.append(npa_envs.rollout_species(rules, *worlds, 4, generator=random, **options))
+    assert_near(*results, 1e-10)
     random = npa_envs.WorldRandom([1, 2], device="cuda")
     x, s = x.cuda(), s.cuda()
     graph = torch.cuda.CUDAGraph()
     with torch.no_grad(), torch.cuda.graph(graph):
         captured = npa_envs.rollout_species(rules, x, s, 4, generator=random, **options)
     graph.replay()
-    for value, answer in zip(captured, results[0], strict=True):
-        assert (value.cpu() - answer).abs().max() < 1e-10
+    assert_near(captured, results[0], 1e-10)
 
 
 def test_the_code_about_species_runs():
@@ -401,84 +347,75 @@ def test_the_code_about_species_runs():
     assert names["config"].task.counts == (512, 512)
 
 
-class TestErrors:
-    """Every mistake is named, with what came."""
+@pytest.mark.parametrize(
+    ("other", "message"),
+    [
+        ({"state_dim": 6}, "agree in state_dim, got 5 for rule 0 and 6 for rule 1"),
+        ({"space_dim": 3}, "agree in space_dim, got 2 for rule 0 and 3"),
+        ({"eps0": 0.2}, r"agree in eps0, got 0\.3 for rule 0 and 0\.2"),
+        ({"static": True}, "agree in static, got False for rule 0"),
+        (
+            {"density_gradient": False},
+            "agree in density_gradient, got True for rule 0 and False for rule 1",
+        ),
+        (
+            {"species_count": 2},
+            "'shared' of 2 species needs rules with species_count=0, got 2 for rule 1",
+        ),
+    ],
+)
+def test_rules_of_one_world_must_agree(other, message):
+    rules = [make_rule("cpu"), make_rule("cpu", **other)]
+    with pytest.raises(NPAError, match=message):
+        npa_envs.rollout_species(rules, *make_world("cpu"), 1, counts=[20, 40])
 
-    @pytest.mark.parametrize(
-        ("rules", "options", "message"),
-        [
-            (make_rule(), {}, r"one rule for each species, got NPARule: give \(rule,\)"),
-            ([make_rule(), "gecko"], {}, "NPARule each, got str as rule 1"),
-            ([make_rule()], {}, "one for each species, got 1 rules and 2 counts"),
-            (
-                [make_rule(), npa_envs.NPARule(2, 6, 8, eps0=0.3)],
-                {},
-                "agree in state_dim, got 5 for rule 0 and 6 for rule 1",
-            ),
-            (
-                [make_rule(), make_rule(space_dim=3)],
-                {},
-                "agree in space_dim, got 2 for rule 0 and 3",
-            ),
-            (
-                [make_rule(), npa_envs.NPARule(2, 5, 8, eps0=0.2)],
-                {},
-                r"agree in eps0, got 0\.3 for rule 0 and 0\.2",
-            ),
-            ([make_rule(), make_rule(static=True)], {}, "agree in static, got False for rule 0"),
-            (
-                [make_rule(), make_rule(density_gradient=False)],
-                {},
-                "agree in density_gradient, got True for rule 0 and False for rule 1",
-            ),
-            (
-                [make_rule(), make_rule(species_count=2)],
-                {},
-                "'shared' of 2 species needs rules with species_count=0, got 2 for rule 1",
-            ),
-            (
-                [make_rule(), make_rule()],
-                {"perception": "per_species"},
-                "needs rules with species_count=2, got 0 for rule 0",
-            ),
-            (None, {"perception": "own"}, "'shared' or 'per_species', got 'own'"),
-            (None, {"counts": [20, 41]}, r"sum to the 60 particles .* \(20, 41\), .* to 61"),
-            (None, {"counts": [60, 0]}, r"at least 1 for every species, got \(60, 0\)"),
-            (None, {"counts": 60}, r"one number of particles for each species, got 60"),
-            (None, {"counts": [20.5, 39.5]}, "an entry of counts must be an integer"),
-            (None, {"counts": []}, "1 to 64 species, got 0"),
-            (None, {"density_counts": [60]}, r"each of 2 species, got \[60\]: .*=\(20, 40\)"),
-            (None, {"density_counts": [20, 0]}, "one positive number for each of 2 species"),
-            (None, {"memory": "little"}, "'store', 'recompute' or 'minimal', got 'little'"),
-            (None, {"update_prob": [0.5]}, "one for each of 2 species, got 1"),
-            (None, {"update_prob": [0.5, 1.5]}, r"lie in \(0, 1\], got 1\.5"),
-            (None, {"update_prob": "half"}, "must be a number, got 'half'"),
-            (None, {"box": 0.1}, "at least 2 eps"),
-            (None, {"steps": -1}, "steps must be an integer of at least 0"),
-        ],
-    )
-    def test_rollouts_refuse_what_does_not_fit(self, rules, options, message):
-        x, s = make_world("cpu")
-        rules = [make_rule(), make_rule(seed=1)] if rules is None else rules
-        arguments = {"counts": [20, 40], "steps": 1} | options
-        with pytest.raises(NPAError, match=message):
-            npa_envs.rollout_species(rules, x, s, **arguments)
 
-    def test_a_plain_rollout_refuses_rules_that_tell_species_apart(self):
-        x, s = make_world("cpu")
-        with pytest.raises(NPAError, match=r"species_count=2: run it with npa_envs\.rollout_spec"):
-            npa_envs.rollout(make_rule(species_count=2), x, s, 1)
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"rules": make_rule("cpu")}, r"one rule for each species, got NPARule: give \(rule,\)"),
+        ({"rules": [make_rule("cpu"), "gecko"]}, "NPARule each, got str as rule 1"),
+        ({"rules": [make_rule("cpu")]}, "one for each species, got 1 rules and 2 counts"),
+        ({"perception": "per_species"}, "needs rules with species_count=2, got 0 for rule 0"),
+        ({"perception": "own"}, "'shared' or 'per_species', got 'own'"),
+        ({"counts": [20, 41]}, r"sum to the 60 particles .* \(20, 41\), .* to 61"),
+        ({"counts": [60, 0]}, r"at least 1 for every species, got \(60, 0\)"),
+        ({"counts": 60}, r"one number of particles for each species, got 60"),
+        ({"counts": [20.5, 39.5]}, "an entry of counts must be an integer"),
+        ({"counts": []}, "1 to 64 species, got 0"),
+        ({"density_counts": [60]}, r"each of 2 species, got \[60\]: .*=\(20, 40\)"),
+        ({"density_counts": [20, 0]}, "one positive number for each of 2 species"),
+        ({"memory": "little"}, "'store', 'recompute' or 'minimal', got 'little'"),
+        ({"update_prob": [0.5]}, "one for each of 2 species, got 1"),
+        ({"update_prob": [0.5, 1.5]}, r"lie in \(0, 1\], got 1\.5"),
+        ({"update_prob": "half"}, "must be a number, got 'half'"),
+        ({"box": 0.1}, "at least 2 eps"),
+        ({"steps": -1}, "steps must be an integer of at least 0"),
+    ],
+)
+def test_rollouts_refuse_what_does_not_fit(change, message):
+    x, s = make_world("cpu")
+    given = {"rules": [make_rule("cpu"), make_rule("cpu", seed=1)], "counts": [20, 40], "steps": 1}
+    with pytest.raises(NPAError, match=message):
+        npa_envs.rollout_species(x=x, s=s, **given | change)
 
-    def test_a_number_of_species_is_checked(self):
-        with pytest.raises(NPAError, match="species_count must be at least 0, got -1"):
-            npa_envs.NPARule(2, 5, 12, species_count=-1)
 
-    def test_fields_refuse_what_does_not_fit(self):
-        x, s = make_world("cpu")
-        with pytest.raises(NPAError, match=r"x must have shape \[B, N, D\]"):
-            npa_envs.species_fields(x[0], [60], eps=0.3)
-        with pytest.raises(NPAError, match="sum to the 60 particles"):
-            npa_envs.perceive_species(x, s, [50], 0.3)
-        x[1, 3] = torch.nan
-        with pytest.raises(NPAError, match="world 1, particle 3"):
-            npa_envs.species_fields(x, [60], eps=0.3)
+def test_a_plain_rollout_refuses_rules_that_tell_species_apart():
+    with pytest.raises(NPAError, match=r"species_count=2: run it with npa_envs\.rollout_spec"):
+        npa_envs.rollout(make_rule("cpu", species_count=2), *make_world("cpu"), 1)
+
+
+def test_a_number_of_species_is_checked():
+    with pytest.raises(NPAError, match="species_count must be at least 0, got -1"):
+        npa_envs.NPARule(2, 5, 12, species_count=-1)
+
+
+def test_fields_refuse_what_does_not_fit():
+    x, s = make_world("cpu")
+    with pytest.raises(NPAError, match=r"x must have shape \[B, N, D\]"):
+        npa_envs.species_fields(x[0], [60], eps=0.3)
+    with pytest.raises(NPAError, match="sum to the 60 particles"):
+        npa_envs.perceive_species(x, s, [50], 0.3)
+    x[1, 3] = torch.nan
+    with pytest.raises(NPAError, match="world 1, particle 3"):
+        npa_envs.species_fields(x, [60], eps=0.3)
