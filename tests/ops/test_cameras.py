@@ -195,21 +195,28 @@ def test_bad_turntables_are_refused(change, message):
         orbit(**{"count": 3, **SIZE, **change})
 
 
-def test_a_camera_must_look_somewhere_and_not_along_up():
-    with pytest.raises(NPAError, match="another place than its own"):
-        look_at(torch.zeros(2, 3), (0.0, 0.0, 0.0))
-    with pytest.raises(NPAError, match="choose another up"):
-        look_at(torch.tensor([0.0, 3.0, 0.0]), (0.0, 0.0, 0.0))
-    with pytest.raises(NPAError, match=r"eyes must be .* shape \[..., 3\]"):
-        look_at(torch.zeros(4), (0.0, 0.0, 0.0))
-    with pytest.raises(NPAError, match="targets must have shape"):
-        look_at(torch.zeros(2, 3), torch.zeros(3, 3))
-    with pytest.raises(NPAError, match="up must be 3 numbers"):
-        look_at(torch.zeros(2, 3), (1.0, 0.0, 0.0), up=(0.0, 1.0))
+@pytest.mark.parametrize(
+    ("eyes", "targets", "up", "message"),
+    [
+        ((2, 3), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), "another place than its own"),
+        ((4,), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), r"eyes must be .* shape \[..., 3\]"),
+        ((2, 3), torch.zeros(3, 3), (0.0, 1.0, 0.0), "targets must have shape"),
+        ((2, 3), (1.0, 0.0, 0.0), (0.0, 1.0), "up must be 3 numbers"),
+        ((2, 3), (0.0, 3.0, 0.0), (0.0, 1.0, 0.0), "choose another up"),
+    ],
+)
+def test_a_camera_must_look_somewhere_and_not_along_up(eyes, targets, up, message):
+    with pytest.raises(NPAError, match=message):
+        look_at(torch.zeros(eyes), targets, up=up)
 
 
-def test_poses_of_wrong_shape_or_no_motion_are_refused():
-    with pytest.raises(NPAError, match="camera_to_world must have shape"):
-        cameras_of_poses(torch.zeros(2, 3, 4), 0.7, **SIZE)
-    with pytest.raises(NPAError, match="rigid motions"):
-        cameras_of_poses(2.0 * torch.eye(4)[None], 0.7, **SIZE)
+@pytest.mark.parametrize(
+    ("poses", "message"),
+    [
+        (torch.zeros(2, 3, 4), "camera_to_world must have shape"),
+        (2.0 * torch.eye(4)[None], "rigid motions"),
+    ],
+)
+def test_poses_of_wrong_shape_or_no_motion_are_refused(poses, message):
+    with pytest.raises(NPAError, match=message):
+        cameras_of_poses(poses, 0.7, **SIZE)

@@ -14,6 +14,7 @@ import hypothesis.strategies as st
 import torch
 from legal_worlds import GRID, UNIT, every, within
 from torch import Tensor
+from worlds import assert_same
 
 import npa_envs
 from npa_envs.ops import Cameras, orbit, periodic_splat, render_gaussians, splat
@@ -100,8 +101,7 @@ def test_pictures_do_not_depend_on_the_order_of_particles(p):
     picture, *bars = p.drawn()
     turned, *turned_bars = replace(p, x=p.x[:, order], colour=p.colour[:, order]).drawn()
     within(turned, picture, p.allowed)
-    for value, answer in zip(turned_bars, bars, strict=True):
-        assert torch.equal(value, answer[:, order])
+    assert_same(turned_bars, [bar[:, order] for bar in bars])
 
 
 @every(pictures)
@@ -110,8 +110,7 @@ def test_a_picture_in_a_batch_is_that_of_its_world(p):
     for k in range(p.x.shape[0]):
         only = slice(k, k + 1)
         alone = replace(p, x=p.x[only], colour=p.colour[only], cotangent=p.cotangent[only])
-        for value, answer in zip(alone.drawn(), together, strict=True):
-            assert torch.equal(value[0], answer[k])
+        assert_same([value[0] for value in alone.drawn()], [value[k] for value in together])
 
 
 @every(lambda device: st.tuples(pictures(device), st.integers(-6, 6)))
@@ -120,10 +119,7 @@ def test_pictures_do_not_depend_on_the_unit_of_length(drawn):
     factor = 2.0**power
     picture, x_bar, colour_bar = p.drawn()
     lengths = {name: getattr(p, name) * factor for name in ("x", "pixel_size", "lo", "hi")}
-    scaled, scaled_x_bar, scaled_colour_bar = replace(p, **lengths).drawn()
-    assert torch.equal(scaled, picture)
-    assert torch.equal(scaled_x_bar, x_bar / factor)
-    assert torch.equal(scaled_colour_bar, colour_bar)
+    assert_same(replace(p, **lengths).drawn(), (picture, x_bar / factor, colour_bar))
 
 
 @every(lambda device: st.tuples(pictures(device), st.tuples(*[st.integers(-40, 40)] * 2)))
@@ -196,8 +192,7 @@ def test_views_do_not_depend_on_the_order_of_gaussians(scene):
     turned = replace(scene, gaussians=tuple(part[:, order] for part in scene.gaussians)).drawn()
     assert torch.equal(turned[0], image)
     assert torch.equal(turned[1], alpha)
-    for value, answer in zip(turned[2:], bars, strict=True):
-        assert torch.equal(value, answer[:, order])
+    assert_same(turned[2:], [bar[:, order] for bar in bars])
 
 
 @every(scenes)
@@ -206,8 +201,7 @@ def test_a_view_in_a_batch_is_that_of_its_world(scene):
     for k in range(scene.cotangent.shape[0]):
         parts = tuple(part[k : k + 1] for part in scene.gaussians)
         alone = replace(scene, gaussians=parts, cotangent=scene.cotangent[k : k + 1])
-        for value, answer in zip(alone.drawn(), together, strict=True):
-            assert torch.equal(value[0], answer[k])
+        assert_same([value[0] for value in alone.drawn()], [value[k] for value in together])
 
 
 @every(lambda device: st.tuples(scenes(device), st.integers(-6, 6)))
@@ -225,8 +219,7 @@ def test_views_do_not_depend_on_the_unit_of_length(drawn):
     )
     (image, alpha, means_bar, scales_bar, *bars), found = scene.drawn(), scaled.drawn()
     expected = (image, alpha, means_bar / factor, scales_bar / factor, *bars)
-    for value, answer in zip(found, expected, strict=True):
-        assert torch.equal(value, answer)
+    assert_same(found, expected)
 
 
 @st.composite

@@ -17,6 +17,7 @@ from legal_worlds import (
     with_shift,
     within,
 )
+from worlds import assert_same
 
 import npa_envs
 
@@ -59,6 +60,11 @@ def rule_of(w, seed=0, **options):
 def run(w, rule, steps=3, **options):
     with torch.no_grad():
         return npa_envs.rollout(rule, w.x, w.s, steps, eps=w.eps, box=w.box, **options)
+
+
+def streams(w):
+    seeds = [w.seed + 7 * k for k in range(w.shape[0])]
+    return npa_envs.WorldRandom(seeds, device=w.x.device)
 
 
 def modulo(w, positions):
@@ -130,15 +136,13 @@ def test_perception_does_not_depend_on_the_unit_of_length(drawn):
 
 @every(some())
 def test_a_batch_perceives_as_its_worlds_do(w):
-    z, cotangent = perceive(w), w.normal(*perceive(w).shape)
-    bars = gradients(w, cotangent)
+    z = perceive(w)
+    cotangent = w.normal(*z.shape)
+    together = z, *fields_of(w), *gradients(w, cotangent)
     for k in range(w.shape[0]):
         alone = w.alone(k)
-        assert torch.equal(perceive(alone)[0], z[k])
-        for value, answer in zip(fields_of(alone), fields_of(w), strict=True):
-            assert torch.equal(value[0], answer[k])
-        for value, answer in zip(gradients(alone, cotangent[k : k + 1]), bars, strict=True):
-            assert torch.equal(value[0], answer[k])
+        found = perceive(alone), *fields_of(alone), *gradients(alone, cotangent[k : k + 1])
+        assert_same([value[0] for value in found], [value[k] for value in together])
 
 
 @every(some(dtypes=DOUBLE))
@@ -157,10 +161,8 @@ def test_a_rollout_does_not_depend_on_the_place(drawn):
     w, shift = drawn
     clear_of_threshold(w)
     rule, options = rule_of(w), {"steps": 1, "position_noise": 0.1 * w.eps}
-    x, s = run(w, rule, generator=npa_envs.WorldRandom(_seeds(w), device=w.x.device), **options)
-    there = w.moved(shift)
-    generator = npa_envs.WorldRandom(_seeds(w), device=w.x.device)
-    moved_x, moved_s = run(there, rule, generator=generator, **options)
+    x, s = run(w, rule, generator=streams(w), **options)
+    moved_x, moved_s = run(w.moved(shift), rule, generator=streams(w), **options)
     away = modulo(w, moved_x - x - shift.to(x))
     within(away, torch.zeros_like(x), ROLLOUT_BOUND * w.eps)
     alike((moved_s,), (s,), ROLLOUT_BOUND)
@@ -172,22 +174,19 @@ def test_a_rollout_does_not_depend_on_the_unit_of_length(drawn):
     rule = rule_of(w, static=w.seed % 3 == 0)
     results = []
     for world in (w, w.scaled(factor)):
-        generator = npa_envs.WorldRandom(_seeds(w), device=w.x.device)
-        results.append(run(world, rule, generator=generator, position_noise=0.1 * world.eps))
+        results.append(run(world, rule, generator=streams(w), position_noise=0.1 * world.eps))
     (x, s), (scaled_x, scaled_s) = results
-    assert torch.equal(scaled_x, x * factor)
-    assert torch.equal(scaled_s, s)
+    assert_same((scaled_x, scaled_s), (x * factor, s))
 
 
 @every(some(dtypes=DOUBLE))
 def test_a_world_goes_in_a_batch_as_it_goes_alone(w):
     """Up to rounding: a product of matrices may round rows otherwise where there are more."""
     clear_of_threshold(w)
-    rule, seeds = rule_of(w, static=w.seed % 3 == 0), _seeds(w)
-    together = run(w, rule, 1, generator=npa_envs.WorldRandom(seeds, device=w.x.device))
-    for k, seed in enumerate(seeds):
-        generator = npa_envs.WorldRandom(seed, device=w.x.device)
-        x, s = run(w.alone(k), rule, 1, generator=generator)
+    rule = rule_of(w, static=w.seed % 3 == 0)
+    together = run(w, rule, 1, generator=streams(w))
+    for k in range(w.shape[0]):
+        x, s = run(w.alone(k), rule, 1, generator=streams(w).take(slice(k, k + 1)))
         within(modulo(w, x[0] - together[0][k]), torch.zeros_like(x[0]), ROLLOUT_BOUND * w.eps)
         alike((s[0],), (together[1][k],), ROLLOUT_BOUND)
 
@@ -205,8 +204,7 @@ def test_species_have_a_share_of_the_fields_in_any_order_and_company(w):
     within(turned.drho, shares.drho[:, order], allowed.drho[:, order, None] + 1e-30)
     for k in range(w.shape[0]):
         alone = npa_envs.species_fields(w.x[k : k + 1], counts, eps=w.eps, box=w.box)
-        assert torch.equal(alone.rho[0], shares.rho[k])
-        assert torch.equal(alone.drho[0], shares.drho[k])
+        assert_same([value[0] for value in alone], [value[k] for value in shares])
 
 
 @every(with_scale(dtypes=DOUBLE))
@@ -225,14 +223,9 @@ def test_species_go_their_way_in_any_order_and_unit_of_length(drawn):
     x, s = go(w, w.x, w.s)
     larger = w.scaled(factor)
     scaled_x, scaled_s = go(larger, larger.x, larger.s)
-    assert torch.equal(scaled_x, x * factor)
-    assert torch.equal(scaled_s, s)
+    assert_same((scaled_x, scaled_s), (x * factor, s))
     ends = torch.arange(w.shape[1], device=w.x.device).split(counts)
     order = torch.cat([part.flip(0) for part in ends])
     moved_x, moved_s = go(w, w.x[:, order], w.s[:, order])
     within(modulo(w, moved_x - x[:, order]), torch.zeros_like(x), ROLLOUT_BOUND * w.eps)
     alike((moved_s,), (s[:, order],), ROLLOUT_BOUND)
-
-
-def _seeds(w):
-    return [w.seed + 7 * k for k in range(w.shape[0])]

@@ -1,18 +1,18 @@
 """Launches on the CPU in ranges: the same bits for every number of threads, also after a fork."""
 
+import contextlib
+import multiprocessing
 import os
-import subprocess
-import sys
 import threading
 
 import pytest
 import torch
-from worlds import random_world
+from worlds import assert_same, random_mask, random_world, rows_of, with_gradients
 
 import npa_envs
 from npa_envs.ops import launch as bridge
 from npa_envs.ops import orbit, render_gaussians, threads
-from npa_envs.ops.perceive import Terms, perceive_rows, survey
+from npa_envs.ops.perceive import Terms, survey
 from npa_envs.ops.pictures.losses import picture_losses
 from npa_envs.ops.pictures.splat import splat
 from npa_envs.ops.threads import even_ranges, run_together
@@ -46,60 +46,35 @@ def cuts(monkeypatch):
 
 def stepped(x, s):
     """Return perception of half of the particles, their update, and the cotangents of both."""
-    x, s = x.clone().requires_grad_(), s.clone().requires_grad_()
-    generator = torch.Generator().manual_seed(1)
-    mask = (torch.rand(x.shape[:2], generator=generator) < 0.5).to(torch.uint8)
-    width = Terms().perception_dim(x.shape[2], STATE_DIM) + 1
-    perception, rows = perceive_rows(
-        x,
-        s,
-        mask=mask,
-        row_capacity=int(mask.sum()),
-        row_width=width,
-        eps=0.3,
-        eps0=0.3,
-        box=None,
-        terms=Terms(),
-    )
-    # No product: torch's own may depend on its number of threads.
-    update = perception[:, : x.shape[2] + STATE_DIM]
-    moved = update_particles(
-        update,
-        x,
-        s,
-        x.new_zeros(x.shape[:2]),
-        rows=rows,
-        reach=0.1,
-        dt=1.0,
-        moving=True,
-        box=None,
-    )
-    bars = [torch.randn(m.shape, generator=generator, dtype=m.dtype) for m in moved]
-    return [perception, *moved, *torch.autograd.grad(moved, (x, s), bars)]
+    mask = random_mask(x)
+
+    def moved(x, s):
+        perception, rows = rows_of(
+            x, s, mask, width=Terms().perception_dim(x.shape[2], STATE_DIM) + 1
+        )
+        # No product: torch's own may depend on its number of threads.
+        update = perception[:, : x.shape[2] + STATE_DIM]
+        path = x.new_zeros(x.shape[:2])
+        options = {"reach": 0.1, "dt": 1.0, "moving": True, "box": None}
+        return perception, *update_particles(update, x, s, path, rows=rows, **options)
+
+    return with_gradients(moved, x, s)
 
 
 def states_only(x, s):
     """Return perception of every particle and the cotangent of states alone; its fields."""
-    s = s.clone().requires_grad_()
-    perception = npa_envs.perceive(x, s, 0.3)
-    (s_bar,) = torch.autograd.grad(perception.sin().sum(), s)
-    fields = npa_envs.perception_fields(x, s.detach(), 0.3)
-    return [perception, s_bar, *fields]
+    found = with_gradients(lambda s: npa_envs.perceive(x, s, 0.3), s)
+    return [*found, *npa_envs.perception_fields(x, s, 0.3)]
 
 
 def acted(x, s):
     """Return worlds after two actions, and what they observe then."""
     x, s = x.clone(), s.clone()
     diverged = torch.zeros(x.shape[0], dtype=torch.uint8)
-    actions = PreparedActions(
-        x,
-        s,
-        ActionRules(0.1, 1.0, 1.0, True, None, position_limit=0.6, state_limit=10.0),
-        mask=None,
-        noise=None,
-        enabled=torch.ones(1, dtype=torch.uint8),
-        diverged=diverged,
-    )
+    rules = ActionRules(0.1, 1.0, 1.0, True, None, position_limit=0.6, state_limit=10.0)
+    enabled = torch.ones(1, dtype=torch.uint8)
+    given = {"mask": None, "noise": None, "enabled": enabled, "diverged": diverged}
+    actions = PreparedActions(x, s, rules, **given)
     generator = torch.Generator().manual_seed(2)
     for _ in range(2):
         shape = (*x.shape[:2], x.shape[2] + STATE_DIM)
@@ -111,13 +86,12 @@ def acted(x, s):
 
 def drawn(x, s):
     """Return pictures, their cotangents, and losses."""
-    x, colour = x[..., :2].clone().requires_grad_(), s[..., -3:].clone().requires_grad_()
-    picture = splat(x, colour, resolution=24, pixel_size=0.05)
-    bars = torch.autograd.grad(picture.square().sum(), (x, colour))
-    losses = picture_losses(
-        x.detach(), s, picture.detach()[0], goal=x.new_zeros(2), shift=0.5, pixel_size=0.05
+    x = x[..., :2].contiguous()
+    found = with_gradients(
+        lambda x, colour: splat(x, colour, resolution=24, pixel_size=0.05), x, s[..., -3:]
     )
-    return [picture, *bars, *losses]
+    losses = picture_losses(x, s, found[0][0], goal=x.new_zeros(2), shift=0.5, pixel_size=0.05)
+    return [*found, *losses]
 
 
 def rendered(x, s):
@@ -125,15 +99,12 @@ def rendered(x, s):
     means = torch.nn.functional.pad(x, (0, 3 - x.shape[2]))
     scales = 0.1 + 0.1 * s[..., :3].sigmoid()
     gaussians = [means, scales, s[..., :4], s[..., 4].sigmoid(), s[..., 1:4]]
-    gaussians = [t.detach().clone().requires_grad_() for t in gaussians]
-    pictures = render_gaussians(*gaussians, orbit(3, width=50, height=40))[:2]
-    bars = [torch.linspace(-1.0, 1.0, p.numel()).view_as(p) for p in pictures]
-    return [*pictures, *torch.autograd.grad(pictures, gaussians, bars)]
+    cameras = orbit(3, width=50, height=40)
+    return with_gradients(lambda *inputs: render_gaussians(*inputs, cameras)[:2], *gaussians)
 
 
 @pytest.mark.parametrize("run", [stepped, states_only, acted, drawn, rendered])
 @pytest.mark.parametrize(("world_count", "particle_count"), [(1, 101), (3, 57)])
-@pytest.mark.parametrize("space_dim", [2, 3])
 def test_results_are_the_same_bits_for_every_number_of_threads(
     run, world_count, particle_count, space_dim, set_threads, cuts
 ):
@@ -146,25 +117,21 @@ def test_results_are_the_same_bits_for_every_number_of_threads(
     for thread_count in (2, 3):
         cuts.clear()
         set_threads(thread_count)
-        for value, alone in zip(run(x, s), expected, strict=True):
-            assert torch.equal(value, alone)
+        assert_same(run(x, s), expected)
         assert max(cuts) == thread_count * threads.SHARES
 
 
-def test_a_step_of_a_large_world_is_cut(set_threads, cuts, monkeypatch):
+@pytest.mark.parametrize(("particle_count", "ranges"), [(2000, [3, 3]), (1000, [])])
+def test_launches_over_large_worlds_alone_are_cut(
+    particle_count, ranges, set_threads, cuts, monkeypatch
+):
     monkeypatch.setattr(bridge, "even_ranges", even_ranges)
-    x, s = random_world(1, 2000, 2, STATE_DIM, dtype=torch.float32, device="cpu")
+    x, s = random_world(1, particle_count, 2, STATE_DIM, dtype=torch.float32, device="cpu")
     set_threads(2)
     npa_envs.perceive(x, s, 0.1)
-    assert cuts == [3, 3]
-
-
-def test_small_worlds_are_not_cut(set_threads, cuts, monkeypatch):
-    monkeypatch.setattr(bridge, "even_ranges", even_ranges)
-    x, s = random_world(1, 1000, 2, STATE_DIM, dtype=torch.float32, device="cpu")
-    set_threads(2)
-    stepped(x, s)
-    assert not cuts
+    if not ranges:
+        stepped(x, s)
+    assert cuts == ranges
 
 
 @pytest.mark.parametrize("count", [0, 1, 20, 21, 1000])
@@ -202,43 +169,50 @@ def test_an_error_in_another_thread_is_raised_after_every_call(set_threads):
     assert done == [True]
 
 
-def test_worker_processes_use_one_thread_unless_told_otherwise(tmp_path):
-    script = tmp_path / "workers.py"
-    script.write_text(
-        "import multiprocessing\n"
-        "import torch\n"
-        "from npa_envs.ops.threads import thread_count\n"
-        "def counts(_):\n"
-        "    default = thread_count()\n"
-        "    torch.set_num_threads(5)\n"
-        "    return default, thread_count()\n"
-        "if __name__ == '__main__':\n"
-        "    torch.set_num_threads(3)\n"
-        "    assert thread_count() == 3\n"
-        "    with multiprocessing.get_context('spawn').Pool(1) as pool:\n"
-        "        assert pool.map(counts, [0]) == [(1, 5)]\n"
-    )
-    environment = {k: v for k, v in os.environ.items() if k != "OMP_NUM_THREADS"}
-    done = subprocess.run([sys.executable, str(script)], env=environment, capture_output=True)
-    assert done.returncode == 0, done.stderr.decode()
+@pytest.fixture(scope="module")
+def worker():
+    """Calls a function of this module in a process that multiprocessing has started."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("OMP_NUM_THREADS", raising=False)
+        with multiprocessing.get_context("spawn").Pool(1) as pool:
+            yield lambda function: pool.apply_async(function).get(timeout=120)
 
 
-def test_a_forked_process_starts_threads_of_its_own():
+@contextlib.contextmanager
+def one_more_thread():
+    """Ask for another number of threads than torch's own, which a worker does not take."""
+    default = torch.get_num_threads()
+    torch.set_num_threads(default + 1)
+    yield default + 1
+    torch.set_num_threads(default)
+
+
+def threads_of_a_worker():
+    own = threads.thread_count()
+    with one_more_thread() as asked:
+        return own, threads.thread_count() == asked
+
+
+def test_worker_processes_use_one_thread_unless_told_otherwise(set_threads, worker):
+    set_threads(3)
+    assert threads.thread_count() == 3
+    assert worker(threads_of_a_worker) == (1, True)
+
+
+def perceive_after_a_fork():
+    """Return whether a forked process perceives the same, with threads."""
+    x = torch.rand(1, 1500, 2, generator=torch.Generator().manual_seed(0))
+    s = x.repeat(1, 1, 2)
+    with one_more_thread() as asked:
+        expected = npa_envs.perceive(x, s, 0.1)
+        child = os.fork()
+        if child == 0:
+            torch.set_num_threads(asked)
+            same = torch.equal(npa_envs.perceive(x, s, 0.1), expected)
+            os._exit(0 if same and threading.active_count() > 1 else 1)
+        return os.waitpid(child, 0)[1] == 0
+
+
+def test_a_forked_process_starts_threads_of_its_own(worker):
     """Its parent's are gone: what is handed to them would never run."""
-    program = (
-        "import os, threading, torch, npa_envs\n"
-        "torch.set_num_threads(2)\n"
-        "x = torch.rand(1, 1500, 2, generator=torch.Generator().manual_seed(0))\n"
-        "s = x.repeat(1, 1, 2)\n"
-        "expected = npa_envs.perceive(x, s, 0.1)\n"
-        "child = os.fork()\n"
-        "if child == 0:\n"
-        "    torch.set_num_threads(2)\n"
-        "    same = torch.equal(npa_envs.perceive(x, s, 0.1), expected)\n"
-        "    os._exit(0 if same and threading.active_count() > 1 else 1)\n"
-        "print(os.waitpid(child, 0)[1])\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, timeout=120
-    )
-    assert done.stdout == "0\n", done.stderr
+    assert worker(perceive_after_a_fork)
