@@ -15,7 +15,7 @@ from types import ModuleType
 
 MOVED = {
     "npa_envs.agents.learning.sb3_world": "npa_envs.agents.learning.sb3",
-    "npa_envs.classification": "npa_envs.measure.quality.classification",
+    "npa_envs.classification": "npa_envs.measure.quality",
     "npa_envs.envs.species": "npa_envs.envs.multi",
     "npa_envs.sph": "npa_envs.ops",
     "npa_envs.tasks.clouds": "npa_envs.tasks.targets.clouds",

@@ -15,7 +15,7 @@ from fuzz_values import Target
 from torch import Tensor
 
 import npa_envs
-from npa_envs.measure.quality.scores import scores
+from npa_envs.measure.quality import scores
 from npa_envs.ops import Cameras, orbit, periodic_splat, render_gaussians, splat
 from npa_envs.ops.pictures.cameras import cameras_of_poses, look_at
 from npa_envs.render import draw_worlds, to_uint8, turntable_frames, write_gif, write_png

@@ -167,13 +167,14 @@ def measured_report(options: BenchOptions, device: torch.device, command: str) -
 def _write(report: Report, folder: Path, *, plots: bool) -> None:
     from npa_envs.files import write_text
     from npa_envs.measure.plots import write_plots
-    from npa_envs.measure.speed.plots import pictures
+    from npa_envs.measure.speed.suites import pictures
 
     path = folder / f"{report.suite}_{report.device.type}.json"
     write_text(path, report.json())
     done = [f"wrote {path}"]
     if plots:
-        done += write_plots(lambda: pictures(report), path.with_name(f"{path.stem}_*.png"), "plots")
+        place = path.with_name(f"{path.stem}_*.png")
+        done += write_plots(lambda: pictures(report.tables), place, "plots")
     print("\n".join(done))
 
 

@@ -92,7 +92,7 @@ def main(arguments: Sequence[str]) -> int:
     """
     options = tyro.cli(CompareOptions, prog="npa-envs compare", args=arguments)
     from npa_envs.agents.comparison.report import write_pictures, write_table
-    from npa_envs.agents.comparison.scheduler import Places, held_records, run_jobs
+    from npa_envs.agents.comparison.run import Places, held_records, run_jobs
 
     # Records are not to tell where on which machine they were written.
     words = ["OUT" if word == str(options.output) else word for word in arguments]

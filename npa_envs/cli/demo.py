@@ -119,7 +119,7 @@ def grow_and_heal(options: DemoOptions, report: Report) -> None:
 
     from npa_envs.cli.film import Film, film_world, write_film
     from npa_envs.cli.output import StepBar
-    from npa_envs.measure.quality.evaluation import measure
+    from npa_envs.measure.quality import measure
     from npa_envs.rule.files import load_rule
     from npa_envs.tasks.damage import DamageEvent, damage_worlds
     from npa_envs.training import check_device
@@ -170,7 +170,7 @@ def train_small(options: DemoOptions, report: Report) -> None:
 
     from npa_envs.cli.film import film_world, write_film
     from npa_envs.cli.output import StepBar
-    from npa_envs.measure.quality.evaluation import measure
+    from npa_envs.measure.quality import measure
     from npa_envs.render import to_uint8, write_filmstrip
     from npa_envs.training import (
         RunFolder,

@@ -55,7 +55,7 @@ def main(arguments: Sequence[str]) -> int:
     """
     options = tyro.cli(EvaluateOptions, prog="npa-envs evaluate", args=arguments)
     from npa_envs.devices import check_device
-    from npa_envs.measure.quality.evaluation import CHECKPOINTS, check_steps, evaluate, healing
+    from npa_envs.measure.quality import CHECKPOINTS, check_steps, evaluate, healing
     from npa_envs.measure.tables import table_text
     from npa_envs.rule.files import load_rule
     from npa_envs.tasks.point_classification import PointClassification
@@ -100,7 +100,7 @@ def main(arguments: Sequence[str]) -> int:
 
 def _evaluate_clouds(options: EvaluateOptions, rule: NPARule, task: PointClassification) -> int:
     """Measure and print what a rule says of the clouds of a task."""
-    from npa_envs.measure.quality.classification import (
+    from npa_envs.measure.quality import (
         CLOUD_CHECKPOINTS,
         accuracies,
         changes_of_mind,

@@ -16,7 +16,7 @@ class ListOptions:
 def main(arguments: Sequence[str]) -> int:
     """Print everything that has a name."""
     tyro.cli(ListOptions, prog="npa-envs list", args=arguments)
-    from npa_envs.measure.quality.scores import score_line, scores
+    from npa_envs.measure.quality import score_line, scores
     from npa_envs.registration import ENVIRONMENTS
     from npa_envs.rule.files import load_rule, shipped_rules
     from npa_envs.tasks.losses.texture import TEXTURE_LOSSES

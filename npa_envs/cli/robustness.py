@@ -73,8 +73,7 @@ def main(arguments: Sequence[str]) -> int:
     from npa_envs.devices import check_device
     from npa_envs.measure.accuracy.habitats import rule_names
     from npa_envs.measure.record import measured_facts, time_limit
-    from npa_envs.measure.robustness.study import MOST_PARTICLES, RuleRecord, measure_rule
-    from npa_envs.measure.robustness.tables import tables
+    from npa_envs.measure.robustness.study import MOST_PARTICLES, RuleRecord, measure_rule, tables
 
     check_numbers(options, seed_count=1, first_seed=0, most_particles=1, threads=1)
     enough = time_limit(options.max_seconds)
@@ -144,7 +143,7 @@ def _write(folder: Path, text: str, records: Sequence[RuleRecord]) -> list[str]:
     """Write the tables and, where matplotlib is installed, the curves; return what was done."""
     from npa_envs.files import write_text
     from npa_envs.measure.plots import write_plots
-    from npa_envs.measure.robustness.tables import pictures
+    from npa_envs.measure.robustness.study import pictures
 
     write_text(folder / "robustness.md", text)
     done = [f"wrote {folder}: robustness.md and a record for each rule"]

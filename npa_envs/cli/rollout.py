@@ -77,7 +77,7 @@ def main(arguments: Sequence[str]) -> int:
     import torch
 
     from npa_envs.cli.film import film_world, write_film, write_solid
-    from npa_envs.measure.quality.evaluation import measure
+    from npa_envs.measure.quality import measure
     from npa_envs.rule.files import load_rule
     from npa_envs.tasks.base import ViewTask, seed_worlds, task_toward
     from npa_envs.tasks.damage import parse_damage

@@ -16,7 +16,6 @@ from PIL import Image
 
 from npa_envs.agents import RandomPolicy, ZeroPolicy
 from npa_envs.agents.comparison import run as one_run
-from npa_envs.agents.comparison import scheduler
 from npa_envs.agents.comparison.plan import LEFT_OUT, PROBLEMS, Job, Plan, make_problem
 from npa_envs.agents.comparison.report import (
     Estimate,
@@ -29,8 +28,16 @@ from npa_envs.agents.comparison.report import (
     write_strips,
     write_table,
 )
-from npa_envs.agents.comparison.run import PICTURE, SIZE, Point, RunRecord, final_picture
-from npa_envs.agents.comparison.scheduler import Places, held_records, run_jobs
+from npa_envs.agents.comparison.run import (
+    PICTURE,
+    SIZE,
+    Places,
+    Point,
+    RunRecord,
+    final_picture,
+    held_records,
+    run_jobs,
+)
 from npa_envs.agents.learning import METHODS, Problem, RuleSet
 from npa_envs.cli import main
 from npa_envs.cli.compare import CompareOptions, make_plan
@@ -89,7 +96,7 @@ def child(monkeypatch):
 
     def set_body(body: str, before: str = "") -> None:
         code = CHILD.format(body=body, before=before)
-        monkeypatch.setattr(scheduler, "PROGRAM", (sys.executable, "-c", code))
+        monkeypatch.setattr(one_run, "PROGRAM", (sys.executable, "-c", code))
 
     set_body("")
     return set_body
@@ -312,7 +319,7 @@ def test_the_process_of_a_run_ends_with_the_comparison(tmp_path, told):
     request = {"job": dataclasses.asdict(job), "facts": made.facts(job)}
     (tmp_path / "request.json").write_text(json.dumps(request))
     process = subprocess.Popen(
-        [*scheduler.PROGRAM, str(tmp_path)], stdin=subprocess.PIPE, stderr=subprocess.PIPE
+        [*one_run.PROGRAM, str(tmp_path)], stdin=subprocess.PIPE, stderr=subprocess.PIPE
     )
     try:
         process.stdin.write(told)

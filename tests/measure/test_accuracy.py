@@ -13,7 +13,7 @@ import torch
 from npa_envs import reference
 from npa_envs.cli import main
 from npa_envs.errors import NPAError
-from npa_envs.measure.accuracy import endurance, geometry, gradients, precision, suite
+from npa_envs.measure.accuracy import habitats, hard_cases, numerics, suite
 from npa_envs.measure.accuracy import scenes as accuracy
 from npa_envs.measure.accuracy.checks import GROUPS, Check, Finding, Session, Skipped
 from npa_envs.measure.accuracy.habitats import habitat
@@ -192,7 +192,7 @@ def test_a_wrong_operator_is_found_out(factor, monkeypatch):
     def wrong(*arguments, **options):
         return right(*arguments, **options) * factor
 
-    for module in (accuracy, geometry, precision, gradients):
+    for module in (accuracy, hard_cases, numerics):
         right = module.perceive
         monkeypatch.setattr(module, "perceive", wrong)
     for name in ("geometry/clump/2d/open", "geometry/threshold/2d", "geometry/outside/3d"):
@@ -204,7 +204,7 @@ def test_a_wrong_operator_is_found_out(factor, monkeypatch):
 
 @pytest.mark.parametrize(
     ("module", "name"),
-    [(geometry, "geometry/smooth_inverse/2d"), (accuracy, "precision/repeated/2d")],
+    [(hard_cases, "geometry/smooth_inverse/2d"), (accuracy, "precision/repeated/2d")],
 )
 def test_jumps_and_results_that_change_from_call_to_call_are_found_out(module, name, monkeypatch):
     right, calls = module.perceive, iter(range(1000))
@@ -256,7 +256,7 @@ def test_a_rule_that_blows_up_is_found_out(factor, count, verdict, device, monke
             rule.output.weight *= factor
         return dataclasses.replace(home, rule=rule, x=home.x[:, :count], s=home.s[:, :count])
 
-    monkeypatch.setattr(endurance, "habitat", tampered)
+    monkeypatch.setattr(habitats, "habitat", tampered)
     entry = run_check(CHECKS["time/heart" if count == 1 else "time/dots"], session(device))
     if count == 1:
         # A world that extends nowhere is measured all the same.

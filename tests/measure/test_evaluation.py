@@ -9,9 +9,9 @@ import pytest
 import torch
 from circle_task import PARTICLE_COUNT, STATE_DIM, CircleTask
 
-import npa_envs.measure.quality.evaluation
+import npa_envs.measure.quality
 from npa_envs.errors import NPAError
-from npa_envs.measure.quality.evaluation import (
+from npa_envs.measure.quality import (
     EvaluationRow,
     HealingRow,
     evaluate,
@@ -63,7 +63,7 @@ def test_rule_is_run_for_as_many_steps_as_the_table_says(monkeypatch):
     def count(rule, x, s, steps, **options):
         return x, s + steps
 
-    monkeypatch.setattr(npa_envs.measure.quality.evaluation, "rollout", count)
+    monkeypatch.setattr(npa_envs.measure.quality, "rollout", count)
     done = []
     rows = evaluate(
         make_rule(0.0), CircleTask(), checkpoints=[2, 5, 30], seeds=[0], progress=done.append
@@ -94,7 +94,7 @@ def shrink(rate):
 
 
 def test_healing_counts_the_steps_until_the_loss_is_back(monkeypatch):
-    monkeypatch.setattr(npa_envs.measure.quality.evaluation, "rollout", shrink(0.98))
+    monkeypatch.setattr(npa_envs.measure.quality, "rollout", shrink(0.98))
     rows = healing(
         make_rule(0.0),
         CircleTask(),
@@ -133,7 +133,7 @@ def test_erased_disk_blanks_states_of_the_grown_world(monkeypatch):
         seen.append((s == 0).all(-1).float().mean(1).tolist())
         return x, torch.ones_like(s)
 
-    monkeypatch.setattr(npa_envs.measure.quality.evaluation, "rollout", fill)
+    monkeypatch.setattr(npa_envs.measure.quality, "rollout", fill)
     healing(
         make_rule(0.0),
         CircleTask(),

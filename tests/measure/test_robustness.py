@@ -34,10 +34,13 @@ from npa_envs.measure.robustness.recovery import (
     recovery_step,
     wrapped,
 )
-from npa_envs.measure.robustness.study import Response, RuleRecord, grow, responses
-from npa_envs.measure.robustness.tables import (
+from npa_envs.measure.robustness.study import (
+    Response,
+    RuleRecord,
+    grow,
     pictures,
     recovered_share,
+    responses,
     tables,
     where_it_works,
     working_range,

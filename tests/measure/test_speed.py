@@ -25,12 +25,11 @@ from npa_envs.measure.speed.errors import (
     perception_rows,
     rollout_rows,
 )
-from npa_envs.measure.speed.explain import Question, explain, recorded_launches
+from npa_envs.measure.speed.explain import Question, explain
 from npa_envs.measure.speed.hash_grid import grid_fields
 from npa_envs.measure.speed.peers import PEERS, peer_rows
-from npa_envs.measure.speed.plots import Point, front, pictures
 from npa_envs.measure.speed.strategies import NEIGHBOUR_CAP, PRECISIONS, STRATEGIES, nearest
-from npa_envs.measure.speed.suites import Report
+from npa_envs.measure.speed.suites import Point, Report, front, pictures
 from npa_envs.measure.speed.throughput import (
     PAPER,
     aim_rows,
@@ -44,6 +43,7 @@ from npa_envs.measure.speed.throughput import (
 from npa_envs.measure.speed.timing import LeftOut, Session, Timing, compare, measure
 from npa_envs.measure.speed.workloads import Workload, gecko
 from npa_envs.ops import perceive
+from npa_envs.runtime import recorded_launches
 from npa_envs.world.rollout import rollout
 
 TINY = Workload(2, 2, 150, 2, hidden_dim=16, eps=0.2)
@@ -391,7 +391,7 @@ def test_pictures_are_drawn_of_what_was_measured():
         "perception": perception_rows(session(), Workload(2, 1, 60, 1)),
         "rollouts": [rollout_row(), rollout_row(precision="mixed", s_8=1e-3)],
     }
-    drawn = pictures(report_of(tables))
+    drawn = pictures(tables)
     assert list(drawn) == ["pareto"]
     assert drawn["pareto"].startswith(b"\x89PNG")
 

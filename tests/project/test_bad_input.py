@@ -7,7 +7,7 @@ import torch
 
 import npa_envs
 from npa_envs import NPAError, NPARule, perceive, perception_fields, rollout
-from npa_envs.measure.quality.scores import scores
+from npa_envs.measure.quality import scores
 from npa_envs.ops import orbit, periodic_splat, splat
 from npa_envs.render import to_uint8, write_gif
 from npa_envs.tasks.damage import damage_worlds, parse_damage

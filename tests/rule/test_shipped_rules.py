@@ -9,9 +9,7 @@ import pytest
 import npa_envs
 from npa_envs.cli import main
 from npa_envs.errors import NPAError
-from npa_envs.measure.quality.classification import accuracies
-from npa_envs.measure.quality.evaluation import evaluate
-from npa_envs.measure.quality.scores import score_line, scores
+from npa_envs.measure.quality import accuracies, evaluate, score_line, scores
 from npa_envs.rule.files import rule_metadata, shipped_rules
 from npa_envs.training.trained_tasks import task_of_rule
 

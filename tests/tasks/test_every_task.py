@@ -8,7 +8,7 @@ from small_digits import write_idx
 from training_runs import log_of
 
 from npa_envs.errors import NPAError
-from npa_envs.measure.quality.evaluation import evaluate
+from npa_envs.measure.quality import evaluate
 from npa_envs.rule.files import load_rule
 from npa_envs.tasks.base import seed_worlds, task_toward
 from npa_envs.training import TASKS, Trainer, preset, task_entry, train

@@ -14,7 +14,7 @@ import torch
 
 from npa_envs.cli import main
 from npa_envs.errors import MissingDependencyError, NPAError
-from npa_envs.measure.quality.evaluation import measure
+from npa_envs.measure.quality import measure
 from npa_envs.ops import orbit
 from npa_envs.render import turntable_frames, write_gaussians, write_points, write_splat
 from npa_envs.rule.rule import NPARule

@@ -14,7 +14,7 @@ from worlds import assert_same
 from npa_envs.agents import RulePolicy
 from npa_envs.cli import main
 from npa_envs.errors import NPAError
-from npa_envs.measure.quality.classification import (
+from npa_envs.measure.quality import (
     _chimera,
     _cut,
     _partners,

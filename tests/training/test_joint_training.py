@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from npa_envs.errors import NPAError
-from npa_envs.measure.quality.evaluation import evaluate
+from npa_envs.measure.quality import evaluate
 from npa_envs.rule.files import load_rule, rule_metadata
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2D, CoMorphogenesis2DConfig
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig

@@ -21,11 +21,9 @@ from npa_envs.measure.accuracy.checks import (
     Verdict,
     group_of,
 )
-from npa_envs.measure.accuracy.endurance import endurance_checks
-from npa_envs.measure.accuracy.geometry import geometry_checks
-from npa_envs.measure.accuracy.gradients import gradients_checks
-from npa_envs.measure.accuracy.precision import precision_checks
-from npa_envs.measure.accuracy.values import values_checks
+from npa_envs.measure.accuracy.habitats import endurance_checks
+from npa_envs.measure.accuracy.hard_cases import geometry_checks, values_checks
+from npa_envs.measure.accuracy.numerics import gradients_checks, precision_checks
 from npa_envs.measure.plots import draw_matrix, new_figure, png
 from npa_envs.measure.record import read_record, time_limit, write_record
 from npa_envs.measure.tables import table_text

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from npa_envs.measure.quality.evaluation import psnr
+from npa_envs.measure.quality import psnr
 from npa_envs.measure.speed.strategies import PRECISIONS, STRATEGIES, Precision, Strategy
 from npa_envs.measure.speed.timing import Cost, Session, Timing, relative_error
 from npa_envs.measure.speed.workloads import Gecko, Workload, gecko

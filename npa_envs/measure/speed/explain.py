@@ -10,12 +10,12 @@ import torch
 from torch.autograd import DeviceType  # type: ignore[attr-defined]
 from torch.profiler import ProfilerActivity, profile
 
-from npa_envs.measure.speed.launches import Launch, recorded_launches
 from npa_envs.measure.speed.timing import Session
 from npa_envs.measure.speed.workloads import Workload, rollout_call
 from npa_envs.ops.backend import Request, describe, rollout_listing
 from npa_envs.ops.sort import Plan, make_plan
 from npa_envs.rule.rule import NPARule
+from npa_envs.runtime import Launch, recorded_launches
 from npa_envs.world.rollout import row_capacity, step
 
 LEAST_SHARE = 0.005

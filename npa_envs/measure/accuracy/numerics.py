@@ -1,0 +1,431 @@
+"""Numerics: how far gradients can be trusted, and what precision, order and batches change."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from functools import partial
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from npa_envs.measure.accuracy.checks import Check, Finding, Session, Skipped, in_2d_and_3d
+from npa_envs.measure.accuracy.habitats import WORKS, Habitat, habitat
+from npa_envs.measure.accuracy.hard_cases import differing
+from npa_envs.measure.accuracy.scenes import (
+    EPS,
+    SIDE,
+    STATE_DIM,
+    Perceived,
+    Scene,
+    error_limits,
+    functional_weights,
+    perceived,
+    relative_error,
+    scenes,
+)
+from npa_envs.measure.speed.strategies import PRECISIONS, Precision
+from npa_envs.ops import perceive
+from npa_envs.rule.files import load_rule
+from npa_envs.rule.rule import NPARule
+from npa_envs.world.cuda_graph import capture
+from npa_envs.world.randomness import WorldRandom
+from npa_envs.world.rollout import rollout
+
+# The group `gradients`: how they grow with the steps, finite differences, float32's errors.
+
+RULES = ("gecko", "dots", "digits", "duck")
+"""One rule of each task."""
+
+QUICK_RULES = ("gecko", "dots")
+"""Rules of a quick run."""
+
+STEPS, QUICK_STEPS = 512, 32
+"""The longest rollouts that are differentiated."""
+
+QUICK_SHARE = 0.25
+"""Particles of a quick run, over what others of it have."""
+
+COMPARED_STEPS = 128
+"""The longest ones that are also run in float64."""
+
+ONE_STEP_ERROR = 1e-5
+"""Relative error of float32 that one step may have, forwards and backwards."""
+
+USABLE_ERROR = 1e-2
+"""Relative error of float32 up to which it is told how many steps a gradient takes."""
+
+DIFFERENCE = 1e-6
+"""Relative distance between a directional derivative and a finite difference in float64."""
+
+
+class Outcome(NamedTuple):
+    """A rollout, and gradients of a random linear functional of where it ends."""
+
+    x: Tensor
+    """Positions [length units], shape [B, N, D]."""
+    s: Tensor
+    """States, shape [B, N, C]."""
+    by_weights: Tensor
+    """Gradient by all of the rule's weights, shape [1, W]."""
+    by_states: Tensor
+    """Gradient by the states at the start, shape [B, N, C]."""
+
+
+def gradients_checks(*, quick: bool) -> list[Check]:
+    """Return the checks of the group `gradients`; when quick only of some rules."""
+    checks = []
+    for name in QUICK_RULES if quick else RULES:
+        checks += [
+            Check(
+                f"gradients/norm/{name}",
+                "gradients of a functional by weights and by states at the start are finite "
+                "whatever the number of steps; their norms are told",
+                partial(_run_norm, name),
+            ),
+            Check(
+                f"gradients/float32/{name}",
+                "one step in float32 is within 1e-5 of one in float64, also its gradients; after "
+                "how many steps they still agree to 1e-2 is told",
+                partial(_run_float32, name),
+            ),
+        ]
+    for space_dim in (2, 3):
+        for periodic in (False, True):
+            where = f"{space_dim}d/{'periodic' if periodic else 'open'}"
+            checks.append(
+                Check(
+                    f"gradients/finite_differences/{where}",
+                    "in float64, derivatives along smooth motions and along random states are what "
+                    "finite differences say, in every hard scene",
+                    partial(_run_differences, space_dim, periodic),
+                )
+            )
+    return checks
+
+
+def powers_of_two(most: int) -> list[int]:
+    """Return 1, 2, 4, ... up to a number."""
+    return [2**k for k in range(int(math.log2(most)) + 1)]
+
+
+def outcome(home: Habitat, session: Session, steps: int, dtype: torch.dtype) -> Outcome:
+    """Return a rollout from the seed and its gradients; the same masks in every dtype."""
+    rule = NPARule(**home.rule.hyper_parameters()).to(home.x.device)
+    rule.load_state_dict(home.rule.state_dict())
+    rule.to(dtype)
+    start = home.s.to(dtype).requires_grad_()
+    x, s, path_length = rollout(
+        rule,
+        home.x.to(dtype),
+        start,
+        steps,
+        generator=session.generator(1),
+        memory="minimal" if steps > 8 else "store",
+        return_path_length=True,
+        **home.options(),
+    )
+    weights = torch.Generator().manual_seed(3)
+    worlds = torch.cat((x, s, path_length[..., None]), dim=2)
+    # A mean over particles, so that norms at different N can be compared.
+    terms = worlds * torch.randn(worlds.shape, generator=weights).to(worlds)
+    loss = terms.sum(-1).mean()
+    network = [*rule.hidden.parameters(), *rule.output.parameters()]
+    by_states, *by_weights = torch.autograd.grad(loss, [start, *network])
+    flat = [gradient.flatten() for gradient in by_weights]
+    return Outcome(x.detach(), s.detach(), torch.cat(flat)[None], by_states)
+
+
+def _home(session: Session, name: str) -> Habitat:
+    return habitat(session, name, particles=QUICK_SHARE if session.quick else 1.0, looks=False)
+
+
+def _run_norm(name: str, session: Session) -> Finding:
+    home = _home(session, name)
+    figures: dict[str, float] = {}
+    not_finite = 0.0
+    for steps in powers_of_two(QUICK_STEPS if session.quick else STEPS):
+        found = outcome(home, session, steps, torch.float32)
+        figures[f"weights_{steps}"] = float(found.by_weights.norm())
+        figures[f"states_{steps}"] = float(found.by_states.norm())
+        for gradient in (found.by_weights, found.by_states):
+            not_finite = max(not_finite, float((~gradient.isfinite()).double().mean()))
+    return Finding(figures | {"not_finite": not_finite}, {"not_finite": 0.0})
+
+
+def _run_float32(name: str, session: Session) -> Finding:
+    home = _home(session, name)
+    counts = powers_of_two(QUICK_STEPS if session.quick else COMPARED_STEPS)
+    figures: dict[str, float] = {}
+    usable = dict.fromkeys(Outcome._fields, 0)
+    for steps in counts:
+        found = outcome(home, session, steps, torch.float32)
+        exact = outcome(home, session, steps, torch.float64)
+        for what, value, right in zip(Outcome._fields, found, exact, strict=True):
+            figures[f"{what}_{steps}"] = error = relative_error(value, right)
+            if error <= USABLE_ERROR and usable[what] in (0, steps // 2):
+                usable[what] = steps
+    limits = {f"{what}_1": ONE_STEP_ERROR for what in Outcome._fields}
+    told = ", ".join(f"{what} {steps}" for what, steps in usable.items())
+    return Finding(figures, limits, holds=f"steps within 1e-2, of {counts[-1]}: {told}")
+
+
+def _run_differences(space_dim: int, periodic: bool, session: Session) -> Finding:
+    figures = {}
+    for scene in scenes(space_dim, periodic=periodic, seed=session.seed):
+        for what in ("states", "positions"):
+            # Far away there is no number beside a coordinate that is near enough to it.
+            if (scene.name, what) != ("far", "positions"):
+                figures[f"{scene.name}_{what}"] = _difference(scene, session, what)
+    return Finding(figures, dict.fromkeys(figures, DIFFERENCE))
+
+
+def _difference(scene: Scene, session: Session, what: str) -> float:
+    """Return how far a directional derivative is from a finite difference, relatively.
+
+    Positions move along a smooth periodic field that is 0 at the origin: particles in one place
+    stay together, and those that nearly touch do so in proportion. The correction by the moment
+    matrix is a stopped gradient and is left out.
+    """
+    x, s = scene.x.to(session.device), scene.s.to(session.device)
+    generator = torch.Generator().manual_seed(6)
+    if what == "states":
+        along = torch.randn(s.shape, generator=generator).to(s)
+    else:
+        mixing = torch.randn(x.shape[2], x.shape[2], generator=generator).to(x)
+        along = torch.sin(2.0 * math.pi * x / (scene.box[0] if scene.box else SIDE)) @ mixing * EPS
+
+    def functional(moved_x: Tensor, moved_s: Tensor) -> Tensor:
+        z = perceive(
+            moved_x, moved_s, EPS, EPS, scene.box, detach_positions=False, moment_correction=False
+        )
+        weights = torch.randn(z.shape, generator=torch.Generator().manual_seed(3)).to(z)
+        return (z * weights).sum()
+
+    def at(way: float) -> Tensor:
+        moved = way * along
+        return functional(x, s + moved) if what == "states" else functional(x + moved, s)
+
+    # Second derivatives jump at ε: an error in proportion, for pairs that lie there.
+    change = 1e-7
+    quotient = float(at(change) - at(-change)) / (2.0 * change)
+    given = (s if what == "states" else x).clone().requires_grad_()
+    value = functional(x, given) if what == "states" else functional(given, s)
+    (gradient,) = torch.autograd.grad(value, given)
+    slope = float((gradient * along).sum())
+    # The terms may cancel: then their size is what the difference is small against.
+    size = float((gradient * along).abs().sum())
+    return abs(slope - quotient) / size if size > 0.0 else abs(quotient)
+
+
+# The group `precision`: what must matter little or not at all.
+
+SHORT = ("tf32", "bf16_storage", "mixed")
+"""Precisions below float32, as `npa-envs bench` has them."""
+
+SHORT_RULES = ("gecko", "dots", "digits")
+"""Rules that are run in them."""
+
+QUICK_SHORT_RULES = ("heart", "dots")
+"""Those of a quick run."""
+
+TWO_ERRORS = 2.0
+"""Two answers that are each as far off as the group `geometry` allows are this far apart."""
+
+BIT_STEPS = 16
+"""Steps of rollouts that are compared bit by bit."""
+
+
+def precision_checks(*, quick: bool) -> list[Check]:
+    """Return the checks of the group `precision`; when quick only of some rules."""
+    checks = [
+        Check(
+            f"precision/{name}/{rule}",
+            f"the rule at its horizon is finite, its metric at most {WORKS:g} times that of "
+            f"float32, with {PRECISIONS[name].summary}",
+            partial(_run_short, PRECISIONS[name], rule),
+        )
+        for name in SHORT
+        for rule in (QUICK_SHORT_RULES if quick else SHORT_RULES)
+    ]
+    by_dimension = {
+        "order": (
+            "particles in another order perceive the same but for rounding, in every hard scene",
+            _run_order,
+        ),
+        "repeated": (
+            "perception and gradients of every hard scene are the same bits when repeated",
+            _run_repeated,
+        ),
+        "batch": (
+            "every world of a batch perceives the bits that it perceives alone",
+            _run_batch,
+        ),
+    }
+    return [
+        *checks,
+        *in_2d_and_3d("precision", by_dimension),
+        Check(
+            "precision/devices",
+            "a CUDA device perceives what the CPU does but for rounding, in every hard scene",
+            _run_devices,
+        ),
+        Check(
+            "precision/graph",
+            f"a rollout of {BIT_STEPS} steps recorded in a CUDA graph has the bits of one that "
+            "is not",
+            _run_graph,
+        ),
+    ]
+
+
+def _every_scene(space_dim: int, session: Session) -> Iterator[Scene]:
+    for periodic in (False, True):
+        yield from scenes(space_dim, periodic=periodic, seed=session.seed)
+
+
+def _on(scene: Scene, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Return positions and states of a scene in float32."""
+    return scene.x.to(device, torch.float32), scene.s.to(device, torch.float32)
+
+
+def _run_short(precision: Precision, name: str, session: Session) -> Finding:
+    why = precision.obstacle(session.device)
+    if why is not None:
+        raise Skipped(why)
+    home = habitat(session, name)
+    found = _metric(home, precision, session)
+    base = _metric(home, PRECISIONS["float32"], session)
+    figures = {"metric": found, "metric_float32": base, "ratio": found / base}
+    return Finding(figures, {"ratio": WORKS})
+
+
+@torch.no_grad()
+def _metric(home: Habitat, precision: Precision, session: Session) -> float:
+    """Return the metric at the horizon; NaN where worlds are not finite."""
+    rule = precision.rule(home.rule)
+    x, s = home.x, precision.kept(home.s)
+    generator = session.generator(1)
+    at_once = 1 if precision.short_states else home.horizon
+    with precision.active():
+        for _ in range(home.horizon // at_once):
+            x, s = rollout(rule, x, s, at_once, generator=generator, **home.options())
+            s = precision.kept(s)
+    finite = bool(x.isfinite().all()) and bool(s.isfinite().all())
+    return home.metric(x, s) if finite else float("nan")
+
+
+def _error_share(scene: Scene, found: Perceived, other: Perceived) -> float:
+    """Return how far two perceptions of a scene are apart, over the error that one may have."""
+    exact = perceived(scene.x, scene.s, scene.box, by_reference=True)
+    allowed = error_limits(scene.x, scene.s, scene.box, exact)
+    shares = [
+        relative_error(a, b) / allowed[f"{what}_float32"]
+        for what, a, b in zip(Perceived._fields, found, other, strict=True)
+    ]
+    # NaN must not be skipped.
+    return float(torch.tensor(shares).max())
+
+
+def _compared(pairs: Iterable[tuple[Scene, Perceived, Perceived]]) -> Finding:
+    """Return the largest distance of two perceptions, and the scenes where it is too large."""
+    shares = {
+        f"{scene.name}/{'open' if scene.box is None else 'periodic'}": _error_share(scene, a, b)
+        for scene, a, b in pairs
+    }
+    largest = float(torch.tensor(list(shares.values())).max())
+    wrong = [name for name, share in shares.items() if not share <= TWO_ERRORS]
+    return Finding(
+        {"over_allowed_error": largest},
+        {"over_allowed_error": TWO_ERRORS},
+        note=f"too far apart: {', '.join(wrong)}" if wrong else "",
+    )
+
+
+def _run_order(space_dim: int, session: Session) -> Finding:
+    def pairs() -> Iterator[tuple[Scene, Perceived, Perceived]]:
+        for scene in _every_scene(space_dim, session):
+            x, s = _on(scene, session.device)
+            order = torch.randperm(x.shape[1], generator=torch.Generator().manual_seed(7))
+            order = order.to(session.device)
+            weights = functional_weights(x, s)
+            found = perceived(x[:, order], s[:, order], scene.box, weights=weights[:, order])
+            back = order.argsort()
+            found = Perceived(*(tensor[:, back] for tensor in found))
+            yield scene, found, perceived(x, s, scene.box, weights=weights)
+
+    return _compared(pairs())
+
+
+def _run_devices(session: Session) -> Finding:
+    if not session.cuda:
+        raise Skipped("there is one device only: run it with --device cuda")
+
+    def pairs() -> Iterator[tuple[Scene, Perceived, Perceived]]:
+        for space_dim in (2, 3):
+            for scene in _every_scene(space_dim, session):
+                found = perceived(*_on(scene, session.device), scene.box)
+                yield scene, found, perceived(*_on(scene, torch.device("cpu")), scene.box)
+
+    return _compared(pairs())
+
+
+def _run_repeated(space_dim: int, session: Session) -> Finding:
+    figures = dict.fromkeys(Perceived._fields, 0.0)
+    for scene in _every_scene(space_dim, session):
+        x, s = _on(scene, session.device)
+        first, second = (perceived(x, s, scene.box) for _ in range(2))
+        for what, a, b in zip(Perceived._fields, first, second, strict=True):
+            figures[what] += differing(a, b)
+    return Finding(figures, dict.fromkeys(figures, 0.0))
+
+
+def _run_batch(space_dim: int, session: Session) -> Finding:
+    """Worlds of other scenes stand beside each, so that all have the same number of particles."""
+    figures = {"open": 0.0, "periodic": 0.0}
+    for periodic in (False, True):
+        some = [
+            scene
+            for scene in scenes(space_dim, periodic=periodic, seed=session.seed)
+            if scene.name != "tight_box"
+        ]
+        # Each scene over and over until the world is full.
+        count = max(scene.x.shape[1] for scene in some)
+        x = torch.cat([scene.x.repeat(1, count, 1)[:, :count] for scene in some])
+        x = x.to(session.device, torch.float32)
+        s = torch.randn(*x.shape[:2], STATE_DIM, generator=torch.Generator().manual_seed(5))
+        s = s.to(session.device)
+        together = perceive(x, s, EPS, box=some[0].box)
+        for k in range(len(x)):
+            alone = perceive(x[k : k + 1], s[k : k + 1], EPS, box=some[0].box)
+            figures["periodic" if periodic else "open"] += differing(together[k], alone[0])
+    return Finding(figures, dict.fromkeys(figures, 0.0))
+
+
+@torch.no_grad()
+def _run_graph(session: Session) -> Finding:
+    if not session.cuda:
+        raise Skipped("graphs are CUDA's: run it with --device cuda")
+    rule = load_rule("gecko", device=session.device).float()
+    home = habitat(session, "gecko", world_count=3, looks=False)
+    random = WorldRandom([0, 1, 2], device=session.device)
+    x, s = torch.empty_like(home.x), torch.empty_like(home.s)
+
+    def run() -> None:
+        worlds = rollout(rule, home.x, home.s, BIT_STEPS, generator=random, **home.options())
+        x.copy_(worlds[0])
+        s.copy_(worlds[1])
+
+    run()
+    eager = x.clone(), s.clone()
+    figures = {"positions": 0.0, "states": 0.0}
+    graph = capture(run, session.device, warm_up=run)
+    for _ in range(2):
+        random.steps.zero_()
+        x.zero_()
+        s.zero_()
+        graph.replay()
+        figures["positions"] += differing(x, eager[0])
+        figures["states"] += differing(s, eager[1])
+    return Finding(figures, dict.fromkeys(figures, 0.0))

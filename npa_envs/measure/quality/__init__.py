@@ -1,1 +1,0 @@
-"""How good trained rules are, in numbers."""
