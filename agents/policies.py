@@ -84,10 +84,7 @@ class Interface(NamedTuple):
 
 
 def unwrapped(env: Any) -> Any:
-    """Return the NPA environment within wrappers.
-
-    Args:
-        env: A single or a vector environment of `npa_envs`, wrapped or not.
+    """Return the NPA environment, single or vector, within wrappers.
 
     Raises:
         NPAError: It is none.
@@ -155,13 +152,10 @@ class Policy:
 
     @torch.no_grad()
     def __call__(self, observation: Array) -> Array:
-        """Return the actions for observations.
-
-        Args:
-            observation: Shape [N, P] or [B, N, P].
+        """Return the actions for observations, shape [N, P] or [B, N, P].
 
         Raises:
-            NPAError: It has another shape.
+            NPAError: The shape is another one.
         """
         if isinstance(observation, Tensor):
             return self._act_on(observation).to(observation.device)
@@ -294,11 +288,7 @@ class SpreadPolicy(Policy):
         return self.interface.action(displacement, self.state_step(observation))
 
     def state_step(self, observation: Tensor) -> Tensor:
-        """Return changes of the states, dimensionless, shape [B, N, C]: none.
-
-        Args:
-            observation: What is perceived, shape [B, N, P].
-        """
+        """Return changes of the states, dimensionless, shape [B, N, C]: none."""
         return torch.zeros_like(self.interface.states(observation))
 
 
@@ -368,12 +358,7 @@ class MendPolicy(SpreadPolicy):
 
 
 def rule_interface(rule: NPARule, state_scale: float) -> Interface:
-    """Return what observations and actions mean to a rule.
-
-    Args:
-        rule: The rule.
-        state_scale: State step of an action of 1, dimensionless.
-    """
+    """Return what observations and actions mean to a rule."""
     moving = not rule.static
     return Interface(rule.space_dim, rule.state_dim, moving, state_scale, rule.species_count)
 
@@ -404,24 +389,14 @@ def bounded_update(rule: NPARule, observation: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def bounded(rule: NPARule, update: Tensor) -> tuple[Tensor, Tensor]:
-    """Return displacements and state steps of raw updates, as `bounded_update` does.
-
-    Args:
-        rule: Says whether particles move.
-        update: What its network gives, shape [K, A].
-    """
+    """Return displacements and state steps of raw updates [K, A], as `bounded_update` does."""
     moved = 0 if rule.static else rule.space_dim
     delta, state_step = update[:, :moved], update[:, moved:]
     return delta / (1.0 + delta.norm(dim=1, keepdim=True)), state_step
 
 
 def perceived(rule: NPARule, rows: Tensor) -> Tensor:
-    """Return what a rule reads of observations, in its order.
-
-    Args:
-        rule: The rule.
-        rows: What environments offer, shape [K, P].
-    """
+    """Return what a rule reads of observations [K, P], in its order."""
     if rule.state_gradient and rule.density_gradient:
         return rows
     first, end = 2 * rule.state_dim, rule_interface(rule, 1.0).shared_dim
@@ -450,11 +425,6 @@ def _check_fit(rule: NPARule, env: Any) -> None:
 
 def check_rule_fits(rule: NPARule, wanted: Interface, config: Any) -> None:
     """Check that a rule can act in an environment as it does in a rollout.
-
-    Args:
-        rule: The rule.
-        wanted: What the environment's observations and actions mean.
-        config: The environment's configuration.
 
     Raises:
         NPAError: It cannot; the message says in what they differ.

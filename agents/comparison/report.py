@@ -375,9 +375,6 @@ def write_strips(records: Sequence[RunRecord], folder: Path) -> list[Path]:
     """Write a filmstrip for each task and axis: a column for each method, a row for each seed.
 
     The pictures of the runs are read from below the comparison's folder.
-
-    Raises:
-        NPAError: A file cannot be written.
     """
     written = []
     for axis in AXES:

@@ -47,8 +47,10 @@ METHODS: dict[str, str] = {
     "scripted": "npa_envs.agents.learning.baselines:train_scripted",
 }
 """Where methods are: functions `f(problem, progress, seed, *, device, start, ...)` that return a
-`RuleSet` or a policy. Their options are further keyword arguments, or the fields of a dataclass
-which is the default of an argument `options`. Others may be added."""
+`RuleSet` or a policy. `progress` keeps the budget and the learning curve, `seed` is that of new
+rules and of all draws, `start` are rules to begin with, which are copied, or None. A method's
+options are further keyword arguments, or the fields of a dataclass which is the default of an
+argument `options`. Others may be added."""
 
 REMOVED = {
     "ppo_rows": "take 'ppo_world', Stable-Baselines3's PPO with a likelihood a world, which in the "

@@ -38,13 +38,6 @@ def train_random(
 ) -> Policy:
     """Return the policy that acts at random; nothing is spent.
 
-    Args:
-        problem: Where it acts.
-        progress: The learning curve, which gets one entry.
-        seed: Of its actions.
-        device: Where the worlds are.
-        start: Not for this method.
-
     Raises:
         NPAError: There is something to start from.
     """
@@ -62,7 +55,7 @@ def train_zero(
     device: torch.device,
     start: RuleSet | None = None,
 ) -> Policy:
-    """Return the policy that does nothing; arguments and errors of `train_random`."""
+    """Return the policy that does nothing; errors of `train_random`."""
     _check_no_start(start)
     policy = ZeroPolicy(problem.make_envs(1, device=device))
     progress.start(policy)
@@ -80,17 +73,9 @@ def train_scripted(
 ) -> Policy:
     """Return the scripted policy that fits best.
 
-    Doing nothing, and all of `SCRIPTED` that the problem's task allows at each gain, play one
-    episode in each of the problem's worlds, from seeds that evaluations do not use, until all have
-    done so or the budget is spent. The best one is taken.
-
-    Args:
-        problem: Where it acts.
-        progress: The budget, and the learning curve: of nothing, and of the policy.
-        seed: Of the worlds in which policies are compared.
-        device: Where the worlds are.
-        start: Not for this method.
-        gains: How fast policies spread, as fractions of α ε, or gather where it is negative.
+    Doing nothing, and all of `SCRIPTED` that the problem's task allows at each gain (a fraction of
+    α ε; negative ones gather), play one episode in each of the problem's worlds, from seeds that
+    evaluations do not use, until all have done so or the budget is spent. The best one is taken.
 
     Raises:
         NPAError: There is something to start from, or no scripted policy does better than nothing.

@@ -48,11 +48,7 @@ class CloneOptions:
     """Learning rate at the end, as a share of the first."""
 
     def __post_init__(self) -> None:
-        """Check every field but the teacher.
-
-        Raises:
-            NPAError: One lies outside its range.
-        """
+        """Check every field but the teacher; raises NPAError."""
         if not (is_real(self.student_share) and 0.0 <= self.student_share <= 1.0):
             raise NPAError(f"student_share must lie in [0, 1], got {self.student_share!r}: try 0.5")
         check_positive(self, int, "collect_steps", "kept_steps", "updates", "batch_worlds")
@@ -82,17 +78,6 @@ def train(
     the share of what it does that is not explained. The student acts in some of the worlds, and is
     told what the teacher would have done there (dataset aggregation, Ross et al. 2011), as its
     errors lead it to where the teacher never comes.
-
-    Args:
-        problem: Where teacher and student act.
-        progress: The budget and the learning curve.
-        seed: Of all draws, of worlds, and of new rules.
-        device: Where worlds and rules are.
-        start: Rules to begin with; copied.
-        options: How, and from whom.
-
-    Returns:
-        The rules.
 
     Raises:
         NPAError: There is no teacher, or it does not fit the problem.
@@ -139,10 +124,7 @@ def _teacher(problem: Problem, source: Source | Sequence[Source] | RuleSet | Non
 def unexplained(rules: RuleSet, observation: Tensor, action: Tensor) -> Tensor:
     """Return the squared error of rules over the variance of the actions, a scalar.
 
-    Args:
-        rules: The student.
-        observation: What is perceived, shape [B, N, P].
-        action: What the teacher does, shape [B, N, A].
+    Observations have shape [B, N, P], the teacher's actions [B, N, A].
     """
     parts, errors = [], (rules.mean(observation) - action).square()
     for span in rules.spans:
@@ -155,10 +137,7 @@ def unexplained(rules: RuleSet, observation: Tensor, action: Tensor) -> Tensor:
 class Demonstrations:
     """The last worlds that were seen, and what the teacher does in them, on the device.
 
-    Args:
-        capacity: Worlds that are kept, W.
-        observation: What was seen in some worlds, shape [B, N, P]: for shape and device.
-        action: What the teacher does there, shape [B, N, A], likewise.
+    At most `capacity` worlds W are kept, of the shape and device of an observation and an action.
     """
 
     def __init__(self, capacity: int, observation: Tensor, action: Tensor) -> None:
@@ -178,12 +157,7 @@ class Demonstrations:
         self.count += len(observation)
 
     def draw(self, world_count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Return some worlds drawn with replacement: observations and the teacher's actions.
-
-        Args:
-            world_count: How many, B.
-            generator: Randomness, on the device.
-        """
+        """Return some worlds drawn with replacement: observations and the teacher's actions."""
         kept, device = min(self.count, len(self.observations)), self.observations.device
         chosen = torch.randint(kept, (world_count,), generator=generator, device=device)
         return self.observations[chosen], self.actions[chosen]

@@ -45,11 +45,7 @@ class EvolutionOptions:
     (Xavier, gain 1; dimensionless)."""
 
     def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            NPAError: One lies outside its range.
-        """
+        """Check every field; raises NPAError."""
         check_positive(self, int, "population", at_least=4)
         check_positive(self, int, "worlds_per_candidate")
         check_positive(self, float, "sigma")
@@ -69,16 +65,7 @@ def train(
 ) -> RuleSet:
     """Evolve rules until the budget is spent, and return the mean of the last generation.
 
-    Args:
-        problem: What is to be learned.
-        progress: The budget, and who looks on.
-        seed: Of the first weights, of candidates and of worlds.
-        device: Where worlds live and candidates are evaluated; candidates are drawn on the host.
-        start: The mean to begin with; None: a new rule.
-        options: How.
-
-    Returns:
-        The rules, on the device.
+    Candidates are drawn on the host and tried on the device.
 
     Raises:
         MissingDependencyError: cma is not installed.
@@ -108,9 +95,6 @@ class Population:
     A row holds the weights of the update networks, one species after the other: W1, b1, W2. What
     else a rule has (its read-out) is not changed.
 
-    Args:
-        rules: Gives the architecture, and the weights to begin with.
-
     Raises:
         NPAError: A rule is more than its two layers.
     """
@@ -131,11 +115,7 @@ class Population:
             return nn.utils.parameters_to_vector(self._parts).double().cpu().numpy()
 
     def put(self, vector: NDArray[np.float64]) -> None:
-        """Give the rules these weights.
-
-        Args:
-            vector: Shape [W].
-        """
+        """Give the rules these weights, shape [W]."""
         first = self._parts[0]
         with torch.no_grad():
             nn.utils.vector_to_parameters(
@@ -157,14 +137,9 @@ class Population:
 
     @torch.no_grad()
     def actions(self, weights: Tensor, observation: Tensor) -> Tensor:
-        """Return what each candidate does in its own worlds.
+        """Return what each of K candidates does in its own M worlds, shape [K * M, N, A].
 
-        Args:
-            weights: Of K candidates, shape [K, W].
-            observation: Of all worlds, candidate by candidate, shape [K * M, N, P].
-
-        Returns:
-            Actions, shape [K * M, N, A].
+        Weights have shape [K, W]; observations, candidate by candidate, [K * M, N, P].
         """
         candidates = len(weights)
         parts, at = [], 0
@@ -205,17 +180,10 @@ def _updates(rule: NPARule, weights: Tensor, rows: Tensor) -> Tensor:
 def fitness(
     envs: Any, candidates: Population, weights: Tensor, seeds: list[int], episode_steps: int
 ) -> Tensor:
-    """Return the mean return of each candidate over worlds that start from the same seeds.
+    """Return the mean return of each candidate over worlds from the same seeds, shape [K].
 
-    Args:
-        envs: K * M worlds of `Problem.make_envs`, in which candidate k owns the M from k * M on.
-        candidates: Their architecture.
-        weights: Of K candidates, shape [K, W].
-        seeds: Of each candidate's worlds, M of them.
-        episode_steps: Length of an episode.
-
-    Returns:
-        On the worlds' device, shape [K].
+    Of the K * M worlds, candidate k, whose weights are a row of [K, W], owns the M from k * M on,
+    one for each of the seeds.
     """
     observation, _ = envs.reset(seed=seeds * len(weights))
     returns = torch.zeros(envs.num_envs, device=weights.device)
@@ -255,11 +223,7 @@ def _strategy(candidates: Population, options: EvolutionOptions, draws: np.rando
 
 
 def costs(found: NDArray[np.float64]) -> list[float]:
-    """Return what is to be minimised; candidates without a finite return are the worst of all.
-
-    Args:
-        found: Their mean returns, shape [K].
-    """
+    """Return what is to be minimised of mean returns [K]; what is not finite is the worst."""
     finite = np.isfinite(found)
     worst = found[finite].min() - 1.0 if finite.any() else 0.0
     minimised: list[float] = (-np.where(finite, found, worst)).tolist()

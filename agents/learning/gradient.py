@@ -84,17 +84,6 @@ def train(
     paper (arXiv 2601.16096). State steps are clamped to the action space, as environments clip
     them; that environments clip observations is not seen.
 
-    Args:
-        problem: What is to be learned.
-        progress: The budget and the learning curve.
-        seed: Of all draws, and of new rules.
-        device: Where worlds and rules are.
-        start: Rules to begin with; copied.
-        options: How.
-
-    Returns:
-        The rules.
-
     Raises:
         NPAError: An option is out of its range, or the environment's loss has no gradient.
         DivergedError: The rules' weights are not finite.
@@ -134,11 +123,7 @@ class _Schedule(TrainConfig[Any]):
     """Learning rate at the end, as a share of the first (dimensionless)."""
 
     def learning_rate_at(self, iteration: int) -> float:
-        """Return the learning rate now: half a cosine over the budget.
-
-        Args:
-            iteration: Iterations done so far; the budget counts, and not they.
-        """
+        """Return the learning rate now: half a cosine over the budget, whatever the iteration."""
         return annealed(self.learning_rate, self.last_rate, self.progress.share)
 
 
@@ -183,10 +168,6 @@ def _trainer_config(
 def episode_task(problem: Problem, device: torch.device) -> EpisodeTask:
     """Return a problem's task for the gradient's trainer.
 
-    Args:
-        problem: The environment.
-        device: Where the worlds live.
-
     Raises:
         NPAError: The problem is a game or its species die, so that no gradient descends its loss.
     """
@@ -216,13 +197,6 @@ class EpisodeTask:
     """Worlds as a problem's episodes start, and their loss; worlds move by the problem's physics.
 
     It is a `npa_envs.tasks.base.Task` as far as the training cycle asks for one.
-
-    Args:
-        problem: The environment.
-        device: Where the worlds live.
-
-    Raises:
-        NPAError: No gradient leads from the environment's loss to its particles.
     """
 
     def __init__(self, problem: Problem, device: torch.device) -> None:
@@ -257,26 +231,14 @@ class EpisodeTask:
     def seed(
         self, world_count: int, *, generator: torch.Generator, device: torch.device
     ) -> tuple[Tensor, Tensor]:
-        """Return worlds at the beginning of their episodes.
-
-        Args:
-            world_count: Worlds B.
-            generator: Randomness, on the device.
-            device: Where the worlds are made.
-
-        Returns:
-            Positions [length units], shape [B, N, D]; states, dimensionless, shape [B, N, C].
-        """
+        """Return worlds as episodes begin: positions [B, N, D] and states [B, N, C]."""
         x, s, *_ = self._start(world_count, generator, device)
         return x, s
 
     def loss(self, x: Tensor, s: Tensor, path_length: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the environment's loss, the mean over worlds and species, and its named parts.
 
-        Args:
-            x: Positions [length units], shape [B, N, D].
-            s: States, dimensionless, shape [B, N, C].
-            path_length: How far each particle travelled: nothing is paid for that.
+        Nothing is paid for the path length.
 
         Raises:
             NPAError: No gradient leads from it to what requires one.
@@ -349,13 +311,7 @@ class GoalEpisodeTask(EpisodeTask):
     def seed_with_goals(
         self, world_count: int, *, generator: torch.Generator, device: torch.device
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return worlds at the beginning of their episodes, and their goals, int64, shape [B].
-
-        Args:
-            world_count: Worlds B.
-            generator: Randomness, on the device.
-            device: Where the worlds are made.
-        """
+        """Return worlds at the beginning of their episodes, and their goals, int64, shape [B]."""
         x, s, _, goal = self._start(world_count, generator, device)
         return x, s, goal
 
@@ -392,12 +348,7 @@ class _ClampInward(torch.autograd.Function):
 
 
 def clamp_inward(values: Tensor, limit: float) -> Tensor:
-    """Return values clipped to ± a limit, so that those beyond it can be learned to come back.
-
-    Args:
-        values: Any shape.
-        limit: Above 0.
-    """
+    """Return values clipped to ± a limit, so that those beyond it can be learned to come back."""
     clamped: Tensor = _ClampInward.apply(values, limit)  # type: ignore[no-untyped-call]
     return clamped
 
@@ -416,13 +367,9 @@ class ClampedWeights(FoldedRule):
 
 
 class ClampedRule(NPARule):
-    """A rule that shares another one's weights, with state steps within ± `limit`.
+    """A rule that shares another one's weights, with state steps within ± `limit` (dimensionless).
 
     In a rollout it does what the other does in an environment with that `state_scale`.
-
-    Args:
-        rule: The other rule.
-        limit: Largest state step, dimensionless.
     """
 
     def __init__(self, rule: NPARule, limit: float) -> None:
@@ -432,11 +379,7 @@ class ClampedRule(NPARule):
         self.rule_is_plain = rule.is_plain()
 
     def forward(self, perception: Tensor) -> Tensor:
-        """Map perception vectors to updates with clamped state steps; as `NPARule`.
-
-        Args:
-            perception: Perception vectors z, dimensionless, shape [..., P].
-        """
+        """Map perception vectors [..., P] to updates with clamped state steps; as `NPARule`."""
         update = super().forward(perception)
         first = self.update_dim - self.state_dim
         return torch.cat(

@@ -69,11 +69,7 @@ class PPOOptions(CommonOptions):
     """Units in a hidden layer of the critic."""
 
     def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            NPAError: One lies outside its range.
-        """
+        """Check every field; raises NPAError."""
         super().__post_init__()
         check_positive(self, int, "critic_width")
         check_non_negative(self, "critic_learning_rate")
@@ -110,14 +106,6 @@ def train(
 ) -> RuleSet:
     """Return the rules that proximal policy optimisation finds within a budget.
 
-    Args:
-        problem: What is to be learned.
-        progress: Keeps the budget, and looks at the rules now and then.
-        seed: Of all that is drawn.
-        device: Where everything lives.
-        start: Rules to begin with; None: fresh ones.
-        options: How.
-
     Raises:
         DivergedError: The policy has diverged.
     """
@@ -134,15 +122,7 @@ def train(
 
 
 class Learner:
-    """Rules, critic, worlds and what was seen of them.
-
-    Args:
-        problem: What is to be learned.
-        options: How.
-        seed: Of worlds, noise, shuffles and first weights.
-        device: Where everything lives.
-        start: Rules to begin with; None: fresh ones.
-    """
+    """Rules, critic, worlds and what was seen of them; the seed is that of all that is drawn."""
 
     def __init__(
         self,
@@ -214,11 +194,7 @@ class Learner:
 
     @torch.no_grad()
     def play(self) -> Round:
-        """Act for T steps in all worlds, and judge what was done.
-
-        Returns:
-            The round, where the next one will be.
-        """
+        """Act for T steps in all worlds, and judge what was done; the next round replaces it."""
         memory = self.memory
         memory.seen[0].copy_(memory.seen[-1])
         last_seen = {}
@@ -281,9 +257,8 @@ class Learner:
     def improve(self, share_left: float) -> None:
         """Let rules and critic learn from the last round.
 
-        Args:
-            share_left: Share of the budget that is left; learning rates are this part of what they
-                were at the start, and by it the noise of the next round is made less.
+        Learning rates are the share of the budget that is left of what they were at the start, and
+        by it the noise of the next round is made less.
         """
         options = self.options
         rules_learn = self.rounds >= self.pace.critic_rounds
@@ -406,11 +381,7 @@ class Round(NamedTuple):
 class Memory:
     """Where rounds are written, each over the one before, as what is recorded stays at its place.
 
-    Args:
-        steps: Steps T of a round.
-        observation: What is perceived at first, shape [B, N, P].
-        action_dim: Columns A of an action.
-        own_advantages: Each particle has an advantage of its own; else a world has one.
+    A particle has an advantage of its own where `own_advantages`; else a world has one.
     """
 
     def __init__(
@@ -467,16 +438,9 @@ def generalised_advantages(
 
     An episode that terminated is worth nothing more; one that was cut off would have gone on, and
     is worth what the critic says of where it was cut. No sum goes on into the next episode.
-    Source: Schulman et al., arXiv 1506.02438, equation 16.
-
-    Args:
-        rewards: Of each step, shape [T, ...].
-        values: What the critic says of the states before each step, likewise.
-        following: What it says of the states after each step, before any restart, likewise.
-        terminated: Whether the episode ended by itself in the step, bool, likewise.
-        ended: Whether it ended or was cut off, bool, likewise.
-        gamma: Discount of a reward one step later (dimensionless).
-        gae_lambda: Discount of what was not foreseen, besides (dimensionless).
+    All arguments have shape [T, ...]: `values` are what the critic says of the states before each
+    step, `following` of those after it, before any restart; `ended` says where an episode
+    terminated or was cut off. Source: Schulman et al., arXiv 1506.02438, equation 16.
     """
     surprises = rewards + gamma * following.masked_fill(terminated, 0.0) - values
     discounts = (gamma * gae_lambda) * (~ended).to(rewards.dtype)
@@ -489,12 +453,7 @@ def generalised_advantages(
 
 
 def over_particles(values: Tensor, weights: Tensor) -> Tensor:
-    """Return weighted means over the particles of worlds, 0 where nothing has weight, [..., 1].
-
-    Args:
-        values: Shape [..., N].
-        weights: Likewise, not negative.
-    """
+    """Return means of values [..., N] by weights of at least 0, 0 where all are 0; [..., 1]."""
     total = (values * weights).sum(dim=-1, keepdim=True)
     return total / weights.sum(dim=-1, keepdim=True).clamp(min=1e-8)
 
@@ -504,10 +463,7 @@ def standardised(values: Tensor, weights: Tensor) -> Tensor:
 
     A step's mean over all worlds is what it is worth whatever is done: how far an episode has come,
     which a critic learns only with time. A single world is compared with its own other steps.
-
-    Args:
-        values: Shape [T, B, N], or [T, B, 1] for one number a world.
-        weights: Shape [T, B, N], not negative.
+    Values have shape [T, B, N], or [T, B, 1] for one number a world, weights [T, B, N].
     """
     shares = weights if values.shape == weights.shape else weights.amax(-1, True)
     alike = (1, 2) if values.shape[1] > 1 else (0, 1, 2)
@@ -519,13 +475,8 @@ def standardised(values: Tensor, weights: Tensor) -> Tensor:
 def clipped_gain(log_ratio: Tensor, advantages: Tensor, weights: Tensor, *, clip: float) -> Tensor:
     """Return the weighted mean of min(r A, clip(r) A), for r the ratio of likelihoods to before.
 
+    All have shape [M, N], or [M, 1] for one ratio a world; ratios count up to 1 ± `clip`.
     Source: Schulman et al., arXiv 1707.06347, equation 7.
-
-    Args:
-        log_ratio: Logarithms of the ratios, one a particle or one a world, shape [M, N] or [M, 1].
-        advantages: Likewise.
-        weights: Likewise, not negative.
-        clip: Ratios count up to 1 plus or minus this (dimensionless).
     """
     ratio = log_ratio.exp()
     clipped = ratio.clamp(1.0 - clip, 1.0 + clip)
@@ -539,12 +490,6 @@ def world_count(problem: Problem, options: PPOOptions, device: torch.device, bud
     They are what the options say; where those say nothing, the problem's on the CPU, and on a GPU
     about `MANY_PARTICLES` particles' worth, if memory and budget allow, never fewer than the
     problem's.
-
-    Args:
-        problem: What is to be learned.
-        options: How.
-        device: Where the worlds live.
-        budget: What may be spent.
     """
     if options.worlds is not None:
         return options.worlds
@@ -561,13 +506,7 @@ def world_count(problem: Problem, options: PPOOptions, device: torch.device, bud
 
 
 def world_bytes(problem: Problem, options: PPOOptions, device: torch.device) -> int:
-    """Return about how much memory a world takes: itself, its rounds and what is learned [bytes].
-
-    Args:
-        problem: What is to be learned.
-        options: How.
-        device: Where it lives.
-    """
+    """Return about what memory a world takes: itself, its rounds and what is learned [bytes]."""
     interface, count = problem.interface, problem.particle_count
     columns = interface.perception_dim + interface.action_dim
     # Of each step what was seen, done and paid; of a minibatch's besides what gradients need.

@@ -94,11 +94,7 @@ class CommonOptions:
     """A value follows from a particle's own perception, or from its whole world ("central")."""
 
     def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            NPAError: One lies outside its range.
-        """
+        """Check every field; raises NPAError."""
         check_positive(self, int, "steps", "epochs", "minibatches")
         check_positive(self, float, "max_gradient_norm")
         check_non_negative(self, "entropy_weight")
@@ -113,11 +109,7 @@ class CommonOptions:
         check_word("critic", self.critic, get_args(CriticKind))
 
     def pace(self, start: RuleSet | None) -> Pace:
-        """Return the options that depend on a start: those of `FRESH` or `WARM` where None.
-
-        Args:
-            start: Rules to begin with; None: fresh ones.
-        """
+        """Return the options that depend on a start: those of `FRESH` or `WARM` where None."""
         given = {name: getattr(self, name) for name in Pace._fields}
         given = {name: value for name, value in given.items() if value is not None}
         return (FRESH if start is None else WARM)._replace(**given)
@@ -127,23 +119,13 @@ def noise_left(share_left: float, last_noise: float, decay_share: float) -> floa
     """Return what is left of the first noise: all of it at first, then it falls by equal factors.
 
     What is learned is what is best with noise, and what counts is what it does without: towards the
-    end the two are to be the same.
-
-    Args:
-        share_left: Share of the budget that is left.
-        last_noise: What is left of the noise when nothing is.
-        decay_share: Share of the budget, its last, in which it falls.
+    end, in the last `decay_share` of the budget, the two are to become the same.
     """
     return math.pow(last_noise, max(0.0, 1.0 - share_left / decay_share))
 
 
 def check_word(name: str, word: object, words: Sequence[str]) -> None:
     """Check that an option is one of a few words.
-
-    Args:
-        name: The option.
-        word: What it is.
-        words: What it can be.
 
     Raises:
         NPAError: It is none of them.
@@ -158,11 +140,6 @@ def first_rules(problem: Problem, seed: int, start: RuleSet | None) -> RuleSet:
     Fresh rules have random output layers, and what they do in each step adds up: in
     `npa/Regeneration2D-v0` they take apart what is whole. Layers of zeros leave it alone, and learn
     just as well, as what is hidden is random still.
-
-    Args:
-        problem: What is to be learned.
-        seed: Of the other weights.
-        start: Rules to begin with; None: fresh ones.
     """
     if start is not None:
         return start
@@ -177,13 +154,7 @@ HALF_LOG_TAU = 0.5 * math.log(2.0 * math.pi)
 
 
 def gaussian_log_prob(mean: Tensor, log_std: Tensor, action: Tensor) -> Tensor:
-    """Return the log-probability of each row of actions, shape [...].
-
-    Args:
-        mean: Shape [..., A].
-        log_std: Logarithms of the standard deviations, likewise, or broadcast to it.
-        action: What was done, like the mean.
-    """
+    """Return the log-probability of each row of actions [..., A], shape [...]."""
     noise = (action - mean) * torch.exp(-log_std)
     return -(0.5 * noise.square() + log_std + HALF_LOG_TAU).sum(dim=-1)
 
@@ -193,11 +164,7 @@ class GaussianRules(nn.Module):
 
     Each particle has a likelihood of its own, summed over its action's columns. That of a world is
     the mean over its particles, never the sum: with N A columns the ratio of two sums is far from
-    one after the smallest update.
-
-    Args:
-        rules: Means; copied, so the caller's stay as they are.
-        initial_std: Standard deviation of every action column at first (dimensionless).
+    one after the smallest update. The rules given are copied.
     """
 
     row_species: Tensor
@@ -223,48 +190,25 @@ class GaussianRules(nn.Module):
 
     @torch.no_grad()
     def leave_noise(self, left: float) -> None:
-        """Scale all standard deviations, what was learned of them stays.
-
-        Args:
-            left: What is to be left of those at first, above 0 (dimensionless).
-        """
+        """Scale standard deviations to a share of the first; what was learned of them stays."""
         self.log_std.add_(math.log(left / self._left))
         self._left = left
 
     def sample(
         self, observation: Tensor, generator: torch.Generator | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Draw actions, and return them with their log-probabilities.
-
-        Args:
-            observation: Shape [M, N, P].
-            generator: Where the noise comes from, on the observation's device; None: torch's own.
-
-        Returns:
-            Actions [M, N, A], not clipped, and log-probabilities [M, N].
-        """
+        """Draw actions for observations [M, N, P], not clipped, with log-probabilities [M, N]."""
         mean, log_std = self.rules.mean(observation), self.row_log_std()
         noise = torch.randn(mean.shape, generator=generator, device=mean.device)
         action = mean + log_std.exp() * noise
         return action, gaussian_log_prob(mean, log_std, action)
 
     def log_prob(self, observation: Tensor, action: Tensor) -> Tensor:
-        """Return the log-probability of each particle's action, shape [M, N].
-
-        Args:
-            observation: Shape [M, N, P].
-            action: Shape [M, N, A].
-        """
+        """Return the log-probability of each particle's action, shape [M, N]."""
         return gaussian_log_prob(self.rules.mean(observation), self.row_log_std(), action)
 
     def row_log_prob(self, species: int, rows: Tensor, action: Tensor) -> Tensor:
-        """Return the log-probability of the actions of particles of one species, shape [K].
-
-        Args:
-            species: Its number.
-            rows: What they perceive, shape [K, P].
-            action: What they did, shape [K, A].
-        """
+        """Return log-probabilities [K] of actions [K, A] of one species that perceives [K, P]."""
         mean = self._each[species].mean(rows[:, None])[:, 0]
         return gaussian_log_prob(mean, self.log_std[species], action)
 
@@ -283,14 +227,9 @@ FARTHEST = 8.0
 class Critic(nn.Module):
     """Values of particles, which standardises what it sees and predicts by running moments.
 
-    A critic is not exported, so that it may see more, and otherwise, than a rule does.
-
-    Args:
-        perception_dim: Columns P of an observation.
-        counts: Particles of each species.
-        kind: "particle": a value follows from the particle's own perception; "central": from that
-            and from features of all particles of its world, averaged.
-        width: Units of a hidden layer.
+    A critic is not exported, so that it may see more, and otherwise, than a rule does. A value of
+    the kind "particle" follows from the particle's own perception, "central" from that and from
+    features of all particles of its world, averaged.
     """
 
     mean: Tensor
@@ -323,11 +262,7 @@ class Critic(nn.Module):
         self.register_buffer("updates", torch.zeros(2))
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Return the value of every particle, in units of the rewards, shape [M, N].
-
-        Args:
-            observation: Shape [M, N, P].
-        """
+        """Return values of particles that observe [M, N, P], in units of the rewards, [M, N]."""
         spread = (self.square - self.mean.square()).clamp(min=1e-6).sqrt()
         seen = ((observation - self.mean) / spread).clamp(-FARTHEST, FARTHEST)
         features = torch.tanh(self.features(seen))
@@ -339,11 +274,7 @@ class Critic(nn.Module):
 
     @torch.no_grad()
     def observe(self, observation: Tensor) -> None:
-        """Take observations into the moments that inputs are standardised by.
-
-        Args:
-            observation: Shape [..., P].
-        """
+        """Take observations [..., P] into the moments that inputs are standardised by."""
         rate = self._rate(0)
         rows = observation.flatten(0, -2)
         self.mean.lerp_(rows.mean(dim=0), rate)
@@ -351,11 +282,7 @@ class Critic(nn.Module):
 
     @torch.no_grad()
     def rescale(self, targets: Tensor) -> None:
-        """Take targets into the scale of values; what the critic says now keeps its meaning.
-
-        Args:
-            targets: Values to be predicted, of any shape.
-        """
+        """Take targets into the scale of values; what the critic says now keeps its meaning."""
         before = self.scale.clone()
         size = targets.square().mean().sqrt().clamp(min=1e-8)
         self.scale.lerp_(size, self._rate(1))

@@ -87,11 +87,7 @@ class Problem:
     """Width of the hidden layer of new rules."""
 
     def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            NPAError: A field has the wrong type or lies outside its range.
-        """
+        """Check every field; raises NPAError."""
         check_positive(self, int, "episode_steps", "num_envs", "hidden_dim")
         if not isinstance(self.keywords, Mapping):
             raise NPAError(
@@ -187,10 +183,7 @@ class Problem:
         return sum(self.counts)
 
     def make_task(self, device: str | torch.device = "cpu") -> EnvTask[Any] | SpeciesTask:
-        """Return the task by itself: starts and losses.
-
-        Args:
-            device: Where the worlds live.
+        """Return the task by itself, starts and losses, for worlds on a device.
 
         Raises:
             NPAError: Something that the task needs cannot be loaded.
@@ -291,10 +284,6 @@ class Problem:
 
 def world_seeds(seed: int, count: int) -> range:
     """Return the seeds of the worlds that a run learns in, which no other run has.
-
-    Args:
-        seed: Of the run, at least 0.
-        count: How many worlds.
 
     Raises:
         NPAError: There are too many, or the seed is so large that they are those of evaluations.
@@ -404,10 +393,6 @@ class ConcatenatedSpeciesEnv:
         self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Tensor, dict[str, Any]]:
         """Start episodes; arguments and errors of `MultiSpeciesVectorEnv.reset`.
-
-        Args:
-            seed: Of the worlds' sequences of episodes.
-            options: `{"reset_mask": mask}` resets only some worlds.
 
         Returns:
             Observations, shape [B, N, P], and infos with `loss`.

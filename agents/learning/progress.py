@@ -33,11 +33,7 @@ class Budget:
     """Steps of an environment or a rollout, times the particles that took them."""
 
     def __post_init__(self) -> None:
-        """Check both.
-
-        Raises:
-            NPAError: Neither is given, or one is not positive.
-        """
+        """Check both; raises NPAError."""
         if self.seconds is None and self.particle_steps is None:
             raise NPAError(
                 "a budget must say something: Budget(seconds=60) or particle_steps=10**7"
@@ -136,9 +132,7 @@ class Progress:
     def run(self, rules: RuleSet, iteration: Callable[[], int]) -> RuleSet:
         """Learn until the budget is spent, and return the rules.
 
-        Args:
-            rules: What is learned, evaluated now and then.
-            iteration: Lets the rules learn a little, and returns the particle-steps that it took.
+        An iteration lets the rules learn a little, and returns the particle-steps that it took.
 
         Raises:
             NPAError: It has started before.
@@ -152,10 +146,7 @@ class Progress:
         return rules
 
     def start(self, actor: RuleSet | Callable[[Any], Any]) -> None:
-        """Evaluate what the learner begins with, and begin to count.
-
-        Args:
-            actor: The rules, or a policy.
+        """Evaluate the rules or the policy that the learner begins with, and begin to count.
 
         Raises:
             NPAError: It has started before.
@@ -187,10 +178,7 @@ class Progress:
         return self.share >= 1.0
 
     def advance(self, particle_steps: int) -> None:
-        """Take down what an iteration took.
-
-        Args:
-            particle_steps: Steps times the particles that took them.
+        """Take down the particle-steps that an iteration took.
 
         Raises:
             NPAError: Nothing has started yet.
@@ -257,23 +245,13 @@ class Progress:
 
 
 def annealed(rate: float, last_rate: float, share: float) -> float:
-    """Return a learning rate that falls along half a cosine.
-
-    Args:
-        rate: At the beginning.
-        last_rate: At the end, as a share of the first (dimensionless).
-        share: Share of the budget that is spent; beyond 1 it stays.
-    """
+    """Return a rate that falls along half a cosine, to `last_rate` of itself at share 1."""
     wave = 0.5 * (1.0 + math.cos(math.pi * min(share, 1.0)))
     return rate * (last_rate + (1.0 - last_rate) * wave)
 
 
 def check_finite(rules: RuleSet, particle_steps: int) -> None:
     """Check that rules have not diverged; waits for the device.
-
-    Args:
-        rules: The rules.
-        particle_steps: What was spent on them, for the message.
 
     Raises:
         DivergedError: A weight is infinite or NaN.

@@ -215,12 +215,6 @@ def starting_rules(
 ) -> RuleSet:
     """Return rules for a learner to change: copies of those given, or new ones, on a device.
 
-    Args:
-        problem: What is to be learned.
-        seed: Of new rules.
-        device: Where they are to be.
-        start: What to begin with, or None.
-
     Raises:
         NPAError: What was given is no set of rules, or does not fit the problem.
     """

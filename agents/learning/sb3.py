@@ -55,11 +55,7 @@ class WorldOptions(CommonOptions):
     """Folder for Stable-Baselines3's own log; None: nowhere."""
 
     def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            NPAError: One lies outside its range.
-        """
+        """Check every field; raises NPAError."""
         super().__post_init__()
         check_positive(self, float, "clip")
 
@@ -78,13 +74,7 @@ def train(
 ) -> RuleSet:
     """Return the rules that Stable-Baselines3's PPO finds within a budget.
 
-    Args:
-        problem: What is to be learned.
-        progress: Keeps the budget, and looks at the rules now and then.
-        seed: Of all that is drawn; Stable-Baselines3 seeds torch and NumPy as a whole.
-        device: Where worlds and networks are; what is seen goes through the host.
-        start: Rules to begin with; None: fresh ones.
-        options: How.
+    Stable-Baselines3 seeds torch and NumPy as a whole; what is seen goes through the host.
 
     Raises:
         DivergedError: The policy has diverged.
@@ -121,25 +111,16 @@ def train(
 
 
 def world_kl(particle_kl: float) -> float:
-    """Return the `target_kl` at which a round ends when particles' actions have moved so far.
+    """Return the `target_kl` that ends a round when particles' actions have moved so far [nats].
 
     The mean log-ratio of many particles is close to minus their divergence k, of which
     Stable-Baselines3's estimate, r - 1 - log r, makes k² / 2.
-
-    Args:
-        particle_kl: Divergence of a particle's actions [nats].
     """
     return 0.5 * particle_kl**2 / EXCESS
 
 
 class ProgressCallback(BaseCallback):
-    """Keeps a learner's account while Stable-Baselines3 learns, and stops it in time.
-
-    Args:
-        progress: The account.
-        options: Of PPO.
-        pace: Those of them that depend on a start.
-    """
+    """Keeps a learner's account while Stable-Baselines3 learns, and stops it in time."""
 
     def __init__(self, progress: Progress, options: WorldOptions, pace: Pace) -> None:
         super().__init__()
@@ -192,16 +173,8 @@ class ProgressCallback(BaseCallback):
 class WorldRulePolicy(ActorCriticPolicy):
     """A policy for rows of `WorldVecEnv`: all particles of a world act by their species' rule.
 
-    Log-probability, entropy and value of a world are means over its particles.
-
-    Args:
-        observation_space: Of a world, shape [N, P].
-        action_space: Of a world, shape [N, A].
-        lr_schedule: Learning rate by the share of the steps that is left.
-        rules: The actor's means to begin with; copied.
-        initial_std: Standard deviation of every action column at first.
-        critic: A value follows from a particle alone, or from its world.
-        keywords: For `ActorCriticPolicy`.
+    Log-probability, entropy and value of a world are means over its particles. The rules, which
+    are copied, are the actor's means to begin with.
     """
 
     def __init__(
@@ -229,12 +202,7 @@ class WorldRulePolicy(ActorCriticPolicy):
         )
 
     def forward(self, obs: Tensor, deterministic: bool = False) -> tuple[Tensor, Tensor, Tensor]:
-        """Return actions, values [M, 1] and log-probabilities [M] while worlds are played.
-
-        Args:
-            obs: Of M worlds, shape [M, N, P].
-            deterministic: Act by the mean.
-        """
+        """Return actions, values [M, 1] and log-probabilities [M] for worlds [M, N, P]."""
         self.critic.observe(obs)
         if deterministic:
             action = self.actor.rules.mean(obs)
@@ -244,22 +212,13 @@ class WorldRulePolicy(ActorCriticPolicy):
         return action, self.predict_values(obs), log_prob.mean(dim=1)
 
     def evaluate_actions(self, obs: Any, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return values [M, 1], log-probabilities [M] and entropies [M] of what was done.
-
-        Args:
-            obs: Of M worlds, shape [M, N, P].
-            actions: What they did, N A numbers each.
-        """
+        """Return values [M, 1], log-probabilities [M] and entropies [M] of what was done."""
         log_prob = self.actor.log_prob(obs, actions.view(*obs.shape[:2], -1))
         entropy = self.actor.entropy().expand(len(obs))
         return self.predict_values(obs), log_prob.mean(dim=1), entropy
 
     def predict_values(self, obs: Any) -> Tensor:
-        """Return the values of worlds, shape [M, 1].
-
-        Args:
-            obs: Shape [M, N, P].
-        """
+        """Return the values of worlds, shape [M, 1]."""
         values: Tensor = self.critic(obs)
         return values.mean(dim=1, keepdim=True)
 

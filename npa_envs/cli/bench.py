@@ -88,11 +88,7 @@ class BenchOptions(MeasureOptions):
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Measure, print, write and check; return 1 where `--check` found a ratio that was missed.
-
-    Raises:
-        NPAError: There is no such suite, device, strategy or precision, or a file is wrong.
-    """
+    """Measure, print, write and check; return 1 where `--check` found a ratio that was missed."""
     options = tyro.cli(BenchOptions, prog="npa-envs bench", args=arguments)
     from npa_envs.devices import check_device
     from npa_envs.measure.plots import check_matplotlib

@@ -84,12 +84,7 @@ class CompareOptions(MeasureOptions):
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run what is missing, print and write; return 1 where a run failed.
-
-    Raises:
-        NPAError: There is no such task, method, option or device, a number is out of range, or the
-            folder cannot be written to or holds figures of other settings.
-    """
+    """Run what is missing, print and write; return 1 where a run failed."""
     options = tyro.cli(CompareOptions, prog="npa-envs compare", args=arguments)
     from npa_envs.agents.comparison.report import write_pictures, write_table
     from npa_envs.agents.comparison.run import Places, held_records, run_jobs

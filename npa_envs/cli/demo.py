@@ -65,11 +65,7 @@ class DemoOptions:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Show what the words after `npa-envs demo` ask for; return 0.
-
-    Raises:
-        NPAError: A value is wrong, or a file cannot be written.
-    """
+    """Show what the words after `npa-envs demo` ask for; return 0."""
     options = tyro.cli(DemoOptions, prog="npa-envs demo", args=arguments)
     from npa_envs.cli.output import torch_threads, writable_folder
     from npa_envs.files import write_text

@@ -60,13 +60,10 @@ class Finding:
 
 
 def examine() -> list[Finding]:
-    """Look at versions, devices, the kernel cache, fonts and ffmpeg.
+    """Look at versions, devices, the kernel cache, fonts and ffmpeg, in the order to read it.
 
     Starts Warp and, where there is one, asks CUDA for its devices. A check that fails in an
     unforeseen way is a finding itself.
-
-    Returns:
-        What was found, in the order to read it.
     """
     checks: dict[str, Callable[[], list[Finding]]] = {
         "python": _python,

@@ -47,12 +47,7 @@ class EvaluateOptions(RuleOptions):
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Measure and print.
-
-    Raises:
-        NPAError: The rule or a value is wrong, its target is not known, or the JSON file cannot
-            be written.
-    """
+    """Measure and print."""
     options = tyro.cli(EvaluateOptions, prog="npa-envs evaluate", args=arguments)
     from npa_envs.devices import check_device
     from npa_envs.measure.quality import CHECKPOINTS, check_steps, evaluate, healing

@@ -61,15 +61,9 @@ class Film:
         mark: bool = False,
         step: int | None = None,
     ) -> None:
-        """Add a frame.
+        """Add a picture of worlds x [1, N, D], s [1, N, C].
 
-        Args:
-            task: Draws the picture.
-            x: Positions [length units], shape [1, N, D].
-            s: States, shape [1, N, C].
-            caption: What it shows.
-            mark: Whether it must be in the filmstrip.
-            step: Steps from the seed, if the frame may stand for them in the filmstrip.
+        A marked one is in the filmstrip; others may stand there for their steps from the seed.
         """
         if mark:
             self.marked.append(len(self.frames))
@@ -82,9 +76,6 @@ class Film:
         """Return frames for a filmstrip: early ones, those with damage, the last, some between.
 
         A film that ends with the early steps gives those with damage, and others evenly spread.
-
-        Args:
-            count: Frames to take in all, if there are as many.
         """
         last = len(self.frames) - 1
         if max(self.steps.values(), default=0) <= EARLY_STEPS[-1]:
@@ -115,16 +106,9 @@ def film_world(
     progress: Callable[[int], None] = lambda _: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> tuple[Tensor, Tensor, Film]:
-    """Run one world and take pictures of it.
+    """Run one world x [1, N, D], s [1, N, C] with damages on the way, and take pictures of it.
 
     Args:
-        rule: The rule, on the device of `x`.
-        task: Gives the world's constants and the picture.
-        x: Positions [length units], shape [1, N, D].
-        s: States, shape [1, N, C].
-        steps: Steps to run.
-        generator: Randomness of updates and damage.
-        damages: What to do to the world on the way, by its `step`.
         every: Steps between two frames.
         first_step: Steps that the world has behind it.
         film: A film to go on with.
@@ -181,12 +165,6 @@ def write_film(film: Film, folder: Path, name: str, *, fps: float = 25.0) -> lis
 
 def write_solid(task: ViewTask, x: Tensor, s: Tensor, folder: Path) -> list[Path]:
     """Write a grown 3D world as a turntable and as files for other programs; return the files.
-
-    Args:
-        task: Draws the world.
-        x: Positions [length units], shape [1, N, 3].
-        s: States, shape [1, N, C].
-        folder: An existing folder.
 
     Raises:
         NPAError: A file cannot be written.

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from npa_envs.cli.output import StepBar, check_numbers, writable_folder
+from npa_envs.cli.output import RunOptions, StepBar, check_numbers, writable_folder
 from npa_envs.errors import NPAError
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ TASK = "morphogenesis2d"
 
 
 @dataclass(frozen=True, kw_only=True)
-class InteractOptions:
+class InteractOptions(RunOptions):
     """Grow every rule beside every other one, and measure what that does to it.
 
     Every ordered pair of rules, also of a rule with itself, at every distance and ratio: the first
@@ -69,20 +69,9 @@ class InteractOptions:
     out: Path = Path("runs/interact")
     """Folder to write to; created where missing."""
 
-    device: str = "cpu"
-    """Where to run: cpu, cuda, cuda:1."""
-
-    progress: bool = True
-    """Show a progress bar."""
-
 
 def main(arguments: Sequence[str]) -> int:
-    """Bring together, measure, write.
-
-    Raises:
-        NPAError: A rule or a value is wrong, rules cannot share a world, or the folder cannot be
-            written to or holds results of other settings.
-    """
+    """Bring together, measure, write."""
     options = tyro.cli(InteractOptions, prog="npa-envs interact", args=arguments)
     from npa_envs.devices import check_device
     from npa_envs.measure.interaction import Encounters, heat_map, read_rows, write_rows

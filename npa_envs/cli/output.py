@@ -17,7 +17,18 @@ from npa_envs.errors import NPAError, suggest
 
 
 @dataclass(frozen=True, kw_only=True)
-class RuleOptions:
+class RunOptions:
+    """Options of commands that run worlds."""
+
+    device: str = "cpu"
+    """Where to run: cpu, cuda, cuda:1."""
+
+    progress: bool = True
+    """Show a progress bar."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RuleOptions(RunOptions):
     """Options of commands that run one rule: which one, in which world, and where."""
 
     rule: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RULE")]
@@ -41,12 +52,6 @@ class RuleOptions:
 
     update_prob: float | None = None
     """Probability of each particle's update in a step; default: as trained."""
-
-    device: str = "cpu"
-    """Where to run: cpu, cuda, cuda:1."""
-
-    progress: bool = True
-    """Show a progress bar."""
 
     def world(self) -> dict[str, Any]:
         """Return what was said of the rule's world, as `task_of_rule` takes it."""
@@ -75,20 +80,14 @@ def writable_folder(path: Path) -> Path:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MeasureOptions:
+class MeasureOptions(RunOptions):
     """Options of the commands that measure and keep records."""
-
-    device: str = "cpu"
-    """Where to run: cpu, cuda, cuda:1."""
 
     threads: int = 1
     """CPU threads of torch and of the kernels, of each run; figures are the same, times are not."""
 
     commit: str | None = None
     """Commit that is measured; default: that of the checkout."""
-
-    progress: bool = True
-    """Show a progress bar."""
 
 
 def check_numbers(options: Any, **least: int) -> None:
@@ -133,12 +132,9 @@ def torch_threads(count: int) -> Iterator[None]:
 
 
 class StepBar:
-    """A progress bar that counts steps; a context manager.
+    """A progress bar that counts steps or another unit; a context manager.
 
-    Args:
-        total: Steps to come; None where that is not known.
-        show: Whether to show it at all.
-        unit: What is counted.
+    `total` is None where it is not known.
     """
 
     def __init__(self, total: int | None, *, show: bool, unit: str = "step") -> None:

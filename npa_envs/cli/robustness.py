@@ -63,12 +63,7 @@ class RobustnessOptions(MeasureOptions):
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Measure, print and write.
-
-    Raises:
-        NPAError: There is no such rule or device, a number is out of range, or the folder cannot be
-            written to or holds figures of other settings.
-    """
+    """Measure, print and write."""
     options = tyro.cli(RobustnessOptions, prog="npa-envs robustness", args=arguments)
     from npa_envs.devices import check_device
     from npa_envs.measure.accuracy.habitats import rule_names

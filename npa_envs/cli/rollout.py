@@ -51,11 +51,7 @@ class RolloutOptions(RuleOptions):
     """Randomness, 0 to 2^63 - 1; the same seed gives the same film."""
 
     def __post_init__(self) -> None:
-        """Check the numbers that nothing else checks.
-
-        Raises:
-            NPAError: One is out of range.
-        """
+        """Check the numbers that nothing else checks; raises NPAError."""
         for name in ("steps", "every"):
             value = getattr(self, name)
             if value is not None and value < 1:
@@ -68,11 +64,7 @@ class RolloutOptions(RuleOptions):
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Grow, film and write what the words after `npa-envs rollout` ask for; return 0.
-
-    Raises:
-        NPAError: The rule, the damage or another value is wrong, or a file cannot be written.
-    """
+    """Grow, film and write what the words after `npa-envs rollout` ask for; return 0."""
     options = tyro.cli(RolloutOptions, prog="npa-envs rollout", args=arguments)
     import torch
 

@@ -53,12 +53,7 @@ class StressOptions(MeasureOptions):
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Check, print and write; return 1 where a check failed.
-
-    Raises:
-        NPAError: There is no such check or device, or the folder cannot be written to or holds
-            figures of other settings.
-    """
+    """Check, print and write; return 1 where a check failed."""
     options = tyro.cli(StressOptions, prog="npa-envs stress", args=arguments)
     from npa_envs.devices import check_device
     from npa_envs.measure.accuracy import suite

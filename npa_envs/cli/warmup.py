@@ -27,11 +27,7 @@ class WarmupOptions:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Compile what the words after `npa-envs warmup` ask for; return 0.
-
-    Raises:
-        NPAError: There is no such device, or a dimension is not 2 or 3.
-    """
+    """Compile what the words after `npa-envs warmup` ask for; return 0."""
     options = tyro.cli(WarmupOptions, prog="npa-envs warmup", args=arguments)
     import torch
 

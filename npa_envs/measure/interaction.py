@@ -55,11 +55,7 @@ class InteractionSettings:
     """Share by which a loss must change to count as changed, in (0, 1)."""
 
     def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            NPAError: A field lies outside its range.
-        """
+        """Check every field; raises NPAError."""
         for name, count, least in (
             ("particle_count", self.particle_count, 2),
             ("steps", self.steps, 1),

@@ -99,18 +99,10 @@ def draw_matrix(
     colours: str,
     norm: Any,
 ) -> Any:
-    """Draw a matrix and write each number into its cell.
+    """Draw a matrix, write each number into its cell, and return what `figure.colorbar` takes.
 
-    Args:
-        panel: Matplotlib's axes.
-        rows: Names of the rows.
-        columns: Names of the columns.
-        values: The numbers; NaN is black, None stays blank.
-        colours: Name of matplotlib's colour map.
-        norm: Maps numbers to [0, 1]; what is beyond has the colour of the end.
-
-    Returns:
-        What `figure.colorbar` takes.
+    NaN is black, None stays blank; `norm` maps numbers to [0, 1] of a colour map, and what is
+    beyond has the colour of the end.
     """
     from matplotlib.cm import ScalarMappable
     from matplotlib.patches import Rectangle
@@ -144,11 +136,8 @@ def number_plainly(
 ) -> None:
     """Label a logarithmic axis at 1, 2, 5, 10 ... or at some values, without powers of ten.
 
-    Args:
-        axis: Matplotlib's.
-        values: The values; None: some in each decade.
-        within: Which, as multiples of the power of ten.
-        text: What a value's label is; None: with k or M for thousands and millions.
+    Without values there are those `within` each decade, as multiples of the power of ten. Without
+    `text` labels have k or M for thousands and millions.
     """
     from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocator
 

@@ -60,9 +60,6 @@ def to_uint8(picture: Tensor, background: Background = "white") -> NDArray[np.ui
 def background_colour(background: Background) -> tuple[float, float, float]:
     """Return red, green and blue in [0, 1] of a colour name, "#rrggbb" or a triple.
 
-    Args:
-        background: The colour.
-
     Raises:
         NPAError: The name is unknown, or the triple is not three numbers in [0, 1].
     """
@@ -134,16 +131,9 @@ _RGB_FROM_LMS = (
 
 
 def density_colours(density: Tensor, background: tuple[float, float, float]) -> NDArray[np.uint8]:
-    """Return the ramp's colour for each density.
+    """Return the ramp's colours, [..., 3], of finite densities [...] of 0 or more (dimensionless).
 
     Density 0 is the background, 1 the middle of the ramp; crowding nears its end.
-
-    Args:
-        density: Finite densities of 0 or more (dimensionless), any shape.
-        background: Red, green and blue in [0, 1].
-
-    Returns:
-        Colours, shape [..., 3].
     """
     share = 1.0 - torch.exp2(-density.clamp(min=0.0))
     entry = (share * (RAMP_LENGTH - 1)).round().to(torch.int32).cpu().numpy()
@@ -153,14 +143,7 @@ def density_colours(density: Tensor, background: tuple[float, float, float]) -> 
 
 @functools.lru_cache(maxsize=16)
 def ramp(background: tuple[float, float, float]) -> NDArray[np.uint8]:
-    """Return a table of colours in even steps, from the background to the far end of the stops.
-
-    Args:
-        background: Red, green and blue in [0, 1].
-
-    Returns:
-        Colours, shape [`RAMP_LENGTH`, 3].
-    """
+    """Return `RAMP_LENGTH` colours in even steps, from the background to the last stop."""
     stops = [[int(stop[k : k + 2], 16) / 255 for k in (1, 3, 5)] for stop in RAMP_STOPS]
     first = oklab(torch.tensor([background], dtype=torch.float64))
     if first[0, 0] > LIGHT_BACKGROUND:
@@ -179,13 +162,8 @@ def state_colours(hidden: Tensor) -> Tensor:
     """Return a colour for each hidden state; the same state has the same colour everywhere.
 
     Each channel pulls towards a hue of its own, in its negative towards the opposite one, and
-    lighter or darker. A state of zeros, as every seed has, is grey.
-
-    Args:
-        hidden: States without their colour channels (dimensionless), shape [..., H]; H may be 0.
-
-    Returns:
-        Red, green and blue in [0, 1], shape [..., 3].
+    lighter or darker. A state of zeros, as every seed has, is grey. States without their colour
+    channels, [..., H] with H 0 or more, become colours in [0, 1], [..., 3].
     """
     count = hidden.shape[-1]
     pull = []

@@ -48,11 +48,7 @@ def write_png(path: str | Path, frame: Frame) -> None:
 
 
 def encode_frame(frame: Frame, kind: Literal["PNG", "JPEG"]) -> bytes:
-    """Return the content of a picture's file, soon rather than small.
-
-    Args:
-        frame: Pixels, uint8, shape [H, W, 3].
-        kind: A PNG is exact, a JPEG is nearly so.
+    """Return the content of a picture's file, soon rather than small: PNG is exact, JPEG nearly so.
 
     Raises:
         NPAError: A wrong shape or dtype.
@@ -177,11 +173,7 @@ def write_filmstrip(
 
 
 def check_rate(fps: float, *, highest: float = 1000) -> None:
-    """Check a film's rate.
-
-    Args:
-        fps: Frames a second.
-        highest: The most that are allowed; `GIF_HIGHEST_RATE` for a GIF.
+    """Check a film's rate [frames a second]; `GIF_HIGHEST_RATE` is the highest for a GIF.
 
     Raises:
         NPAError: It is not in [0.1, highest].

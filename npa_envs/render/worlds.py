@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 import torch
@@ -128,39 +128,24 @@ def draw_worlds(
         # Nobody sees a place that is no number, but the images of all others in a periodic box.
         nowhere = math.nan if periodic else limit
         places, colour = places.where(shown, nowhere), colour.where(shown, 0.0)
-        lens = _Lens(resolution, pixel_size, sigma, half_width, periodic)
+        draw = partial(
+            periodic_splat if periodic else splat,
+            resolution=resolution,
+            pixel_size=pixel_size,
+            lo=-half_width,
+            hi=half_width,
+        )
         if style == "density":
-            density = lens.draw(places, colour)[..., 3]
+            density = draw(places, colour, sigma=sigma)[..., 3]
             if depth is not None:
                 density = density * (pixel_size / half_width)
             return density_colours(density.flip(-2), behind)
         if depth is None:
-            return to_uint8(lens.draw(places, colour), behind)
-        return to_uint8(_stack_layers(lens, places, depth.where(shown, 0.0), colour), behind)
-
-
-@dataclass(frozen=True)
-class _Lens:
-    """The square around the origin that is drawn, and how."""
-
-    resolution: int
-    pixel_size: float
-    sigma: float
-    half_width: float
-    periodic: bool
-
-    def draw(self, x: Tensor, colour: Tensor, *, scale: float = 1.0) -> Tensor:
-        """Return colour sums and density, [B, R, R, 4], of spots `scale` times their size."""
-        drawn_by = periodic_splat if self.periodic else splat
-        return drawn_by(
-            x,
-            colour,
-            resolution=self.resolution,
-            pixel_size=self.pixel_size,
-            sigma=self.sigma * scale,
-            lo=-self.half_width,
-            hi=self.half_width,
-        )
+            return to_uint8(draw(places, colour, sigma=sigma), behind)
+        depth = depth.where(shown, 0.0)
+        light = 1.0 - SHADE * (0.5 - 0.5 * depth / half_width).clamp(0.0, 1.0)
+        beads = partial(draw, sigma=BEAD * sigma)
+        return to_uint8(_stack_layers(beads, places, depth, colour * light), behind)
 
 
 def _middle(centre: Tensor | Sequence[float] | None, x: Tensor) -> Tensor:
@@ -200,22 +185,22 @@ def _seen_from(x: Tensor, azimuth: float, elevation: float) -> tuple[Tensor, Ten
     return torch.stack((across, up), dim=-1), near[..., None]
 
 
-def _stack_layers(lens: _Lens, places: Tensor, depth: Tensor, colour: Tensor) -> Tensor:
+def _stack_layers(
+    draw: Callable[[Tensor, Tensor], Tensor], places: Tensor, depth: Tensor, colour: Tensor
+) -> Tensor:
     """Lay splats of particles at about the same depth over each other, the nearest on top."""
-    light = 1.0 - SHADE * (0.5 - 0.5 * depth / lens.half_width).clamp(0.0, 1.0)
     order = depth.argsort(dim=1, descending=True, stable=True)
     places = places.gather(1, order.expand_as(places))
-    colour = (colour * light).gather(1, order.expand_as(colour))
-    picture = places.new_zeros(len(places), lens.resolution, lens.resolution, 4)
-    through = torch.ones_like(picture[..., :1])
+    colour = colour.gather(1, order.expand_as(colour))
+    picture, through = places.new_zeros(()), places.new_ones(())
     layers = min(LAYERS, places.shape[1])
     for part, tint in zip(
         places.tensor_split(layers, 1), colour.tensor_split(layers, 1), strict=True
     ):
-        layer = lens.draw(part, tint, scale=BEAD)
+        layer = draw(part, tint)
         density = layer[..., 3:]
         passing = torch.exp(-OPACITY * density)
         share = through * (1.0 - passing)
-        picture += share * layer / density.clamp(min=torch.finfo(density.dtype).tiny)
+        picture = picture + share * layer / density.clamp(min=torch.finfo(density.dtype).tiny)
         through = through * passing
     return picture

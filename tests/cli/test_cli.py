@@ -28,14 +28,14 @@ TINY = ["morphogenesis2d", "--preset", "tiny", "--iterations", "6", "--no-progre
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def trained(tmp_path_factory):
     """The folder of a run of six iterations."""
     folder = tmp_path_factory.mktemp("runs") / "ring"
     assert main(["train", *TINY, "--milestones", "--out", str(folder)]) == 0
     return folder
 
 
-def error_of(capsys: pytest.CaptureFixture[str], words: list[str]) -> str:
+def error_of(capsys, words):
     """Run a command that must be refused, and return its message."""
     assert main(words) == 2
     captured = capsys.readouterr()
@@ -44,14 +44,26 @@ def error_of(capsys: pytest.CaptureFixture[str], words: list[str]) -> str:
     return captured.err
 
 
-def test_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
+def raising(error):
+    def fail(*_, **__):
+        raise error
+
+    return fail
+
+
+@pytest.fixture
+def rule(trained):
+    return str(trained / "rule.safetensors")
+
+
+def test_help_names_every_command(capsys):
     assert main(["--help"]) == 0
     text = capsys.readouterr().out
     assert [name for name in COMMANDS if f"\n  {name} " not in text] == []
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_every_command_explains_itself(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_command_explains_itself(name, capsys):
     try:
         code: object = main([name, "--help"])
     except SystemExit as end:
@@ -60,22 +72,19 @@ def test_every_command_explains_itself(name: str, capsys: pytest.CaptureFixture[
     assert f"usage: npa-envs {name}" in capsys.readouterr().out
 
 
-def test_no_command_is_a_usage_error_and_a_misspelt_one_is_suggested(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_no_command_is_a_usage_error(capsys):
     assert main([]) == 2
-    capsys.readouterr()
-    assert "unknown command 'demoo': did you mean 'demo'?" in error_of(capsys, ["demoo"])
+    assert "usage: npa-envs COMMAND" in capsys.readouterr().out
 
 
-def test_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:
+def test_version_is_that_of_the_package(capsys):
     import npa_envs
 
     assert main(["--version"]) == 0
     assert capsys.readouterr().out == f"npa-envs {npa_envs.__version__}\n"
 
 
-def test_help_starts_without_torch() -> None:
+def test_help_starts_without_torch():
     program = (
         "import sys\nfrom npa_envs.cli import main\nmain(['--help'])\n"
         "print([m for m in ('torch', 'warp', 'tyro') if m in sys.modules])"
@@ -84,44 +93,28 @@ def test_help_starts_without_torch() -> None:
     assert done.stdout.endswith("\n[]\n"), done.stdout + done.stderr
 
 
-def test_list_names_tasks_presets_and_targets(capsys: pytest.CaptureFixture[str]) -> None:
+def test_list_names_tasks_presets_and_targets(capsys):
     assert main(["list"]) == 0
     text = capsys.readouterr().out
     for word in ("morphogenesis2d", "paper", "fast", "tiny", "gecko", "butterfly"):
         assert word in text
 
 
-def test_doctor_reports_versions_and_the_kernel_cache(capsys: pytest.CaptureFixture[str]) -> None:
+def test_doctor_reports_what_there_is_and_goes_on_where_a_check_breaks(capsys, monkeypatch):
     code = main(["doctor"])
     text = capsys.readouterr().out
     assert code == (1 if re.search("^!", text, re.MULTILINE) else 0)
     assert re.search(rf"^  torch +{re.escape(torch.__version__)}$", text, re.MULTILINE)
     for subject in ("kernel cache", "ffmpeg", "warp devices"):
         assert re.search(rf"^  {subject} +\S", text, re.MULTILINE)
-
-
-def test_doctor_goes_on_where_a_check_breaks(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def broken() -> list[str]:
-        raise OSError("no driver")
-
-    monkeypatch.setattr("npa_envs.runtime.warp_devices", broken)
+    monkeypatch.setattr("npa_envs.runtime.warp_devices", raising(OSError("no driver")))
     assert main(["doctor"]) == 1
     text = capsys.readouterr().out
-    assert "! warp devices" in text
-    assert "OSError: no driver" in text
+    assert re.search(r"^! warp devices +OSError: no driver$", text, re.MULTILINE)
     assert "ffmpeg" in text
 
 
-def test_warmup_refuses_what_it_cannot_compile(capsys: pytest.CaptureFixture[str]) -> None:
-    assert "2, 3 or both" in error_of(capsys, ["warmup", "--space-dims", "4"])
-    assert "device must" in error_of(capsys, ["warmup", "--device", "cuda:99"])
-
-
-def test_train_writes_a_rule_that_loads_and_says_where(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_train_writes_a_rule_that_loads_and_says_where(tmp_path, capsys):
     folder = tmp_path / "run"
     words = ["train", *TINY, "--milestones", "3", "5", "--target", "heart", "--out", str(folder)]
     assert main(words) == 0
@@ -136,9 +129,7 @@ def test_train_writes_a_rule_that_loads_and_says_where(
     assert load_rule(folder / "rule.safetensors").hidden_dim == config["task"]["hidden_dim"]
 
 
-def test_a_configuration_file_goes_over_the_preset_and_options_over_the_file(
-    tmp_path: Path,
-) -> None:
+def test_a_configuration_file_goes_over_the_preset_and_options_over_the_file(tmp_path):
     from npa_envs.cli.train import parse, starting_configuration
 
     path = tmp_path / "run.yaml"
@@ -151,9 +142,7 @@ def test_a_configuration_file_goes_over_the_preset_and_options_over_the_file(
     assert config.iterations == 40
 
 
-def test_a_run_stopped_by_time_resumes_to_the_same_rule(
-    tmp_path: Path, trained: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_stopped_by_time_resumes_to_the_same_rule(tmp_path, trained, capsys):
     folder = tmp_path / "run"
     words = ["train", *TINY, "--milestones", "--out", str(folder)]
     assert main([*words, "--max-seconds", "1e-9"]) == 0
@@ -167,9 +156,7 @@ def test_a_run_stopped_by_time_resumes_to_the_same_rule(
     assert all(torch.equal(got[name], expected[name]) for name in expected)
 
 
-def test_a_folder_with_a_run_is_not_overwritten_unasked(
-    trained: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_folder_with_a_run_is_not_overwritten_unasked(trained, capsys):
     before = (trained / "rule.safetensors").read_bytes()
     message = error_of(capsys, ["train", *TINY, "--milestones", "--out", str(trained)])
     assert "holds one" in message
@@ -179,38 +166,64 @@ def test_a_folder_with_a_run_is_not_overwritten_unasked(
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ([], "needs a task first"),
-        (["--preset", "tiny"], "needs a task first"),
-        (["morphogenesis"], "unknown task 'morphogenesis': did you mean 'morphogenesis"),
-        (["morphogenesis2d", "--preset", "papr"], "unknown preset 'papr'"),
-        (["morphogenesis2d", "--preset"], "expected one argument"),
-        (["morphogenesis2d", "--resume", "--out", "/nowhere"], "no checkpoint to resume from"),
-        (["morphogenesis2d", "--config", "/nowhere.yaml"], "cannot read the configuration file"),
-        ([*TINY, "--max-seconds", "-1"], "max_seconds must be positive"),
-        ([*TINY, "--milestones", "--target", "/nowhere.png"], "nowhere.png"),
+        ("demoo", "unknown command 'demoo': did you mean 'demo'?"),
+        ("warmup --space-dims 4", "2, 3 or both"),
+        ("warmup --device cuda:99", "device must"),
+        ("train", "needs a task first"),
+        ("train --preset tiny", "needs a task first"),
+        ("train morphogenesis", "unknown task 'morphogenesis': did you mean 'morphogenesis"),
+        ("train morphogenesis2d --preset papr", "unknown preset 'papr'"),
+        ("train morphogenesis2d --preset", "expected one argument"),
+        ("train morphogenesis2d --resume --out /nowhere", "no checkpoint to resume from"),
+        ("train morphogenesis2d --config /nowhere.yaml", "cannot read the configuration file"),
+        ("train TINY --out OUT --max-seconds -1", "max_seconds must be positive"),
+        ("train TINY --out OUT --target /nowhere.png", "nowhere.png"),
+        ("rollout nosuchrule --out OUT", "unknown rule 'nosuchrule'"),
+        ("rollout RULE --out OUT --damage 5:burn", "unknown damage 'burn'"),
+        ("rollout RULE --out OUT --damage 5", "STEP:KIND"),
+        ("rollout RULE --out OUT --damage 5:cut:-1", "positive size"),
+        ("rollout RULE --out OUT --steps 20 --damage 20:cut", "before the last of 20 steps"),
+        ("rollout RULE --out OUT --target nosuchtarget", "nosuchtarget"),
+        ("rollout RULE --out OUT --eps -1", "eps must be"),
+        ("rollout RULE --out OUT --device cuda:99", "device must be"),
+        ("rollout RULE --out FILE/inside", "out must be a folder"),
+        ("rollout 3D --out OUT", "got space_dim=3"),
+        ("evaluate UNTOLD --no-progress", "give --target"),
     ],
 )
-def test_train_refuses_a_mistake_in_one_line(
-    words: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = [] if "--out" in words or len(words) < 3 else ["--out", str(tmp_path / "run")]
-    assert message in error_of(capsys, ["train", *words, *out])
+def test_a_mistake_is_refused_in_one_line_and_nothing_is_written(
+    words, message, rule, tmp_path, capsys
+):
+    names = {"OUT": tmp_path / "out", "FILE/inside": tmp_path / "file/a", "RULE": rule}
+    names |= {"3D": tmp_path / "3d.safetensors", "UNTOLD": tmp_path / "untold.safetensors"}
+    (tmp_path / "file").touch()
+    save_rule(NPARule(3, 8, 16), names["3D"])
+    save_rule(NPARule(2, 8, 16, eps0=0.2), names["UNTOLD"])
+    given = [str(names.get(word, word)) for word in words.split()]
+    given = [
+        part for word in given for part in ([*TINY, "--milestones"] if word == "TINY" else [word])
+    ]
+    assert message in error_of(capsys, given)
+    assert not list(tmp_path.rglob("growth.gif"))
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
-    [(["--iterations", "0"], "iterations must be a whole number"), (["--iters", "3"], "--iters")],
+    [
+        (["train", *TINY, "--iterations", "0"], "iterations must be a whole number"),
+        (["train", *TINY, "--iters", "3"], "--iters"),
+        (["rollout", "gecko", "--fps", "51"], "fps must be in"),
+        (["rollout", "gecko", "--seed", "-1"], "seed must be in"),
+    ],
 )
-def test_train_refuses_a_wrong_field(
-    words: list[str], message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_wrong_option_is_refused_by_the_parser(words, message, capsys):
     with pytest.raises(SystemExit) as end:
-        main(["train", "morphogenesis2d", "--preset", "tiny", *words])
+        main(words)
     assert end.value.code == 2
     assert message in capsys.readouterr().err
 
 
-def test_ctrl_c_leaves_a_checkpoint_and_says_how_to_go_on(tmp_path: Path) -> None:
+def test_ctrl_c_leaves_a_checkpoint_and_says_how_to_go_on(tmp_path):
     folder = tmp_path / "run"
     words = ["train", *TINY[:3], "--iterations", "100000", "--milestones", "--out", str(folder)]
     process = subprocess.Popen(
@@ -232,22 +245,10 @@ def test_ctrl_c_leaves_a_checkpoint_and_says_how_to_go_on(tmp_path: Path) -> Non
     assert (folder / "checkpoint.pt").is_file()
 
 
-def test_rollout_writes_films_that_open(
-    tmp_path: Path, trained: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_rollout_writes_films_that_open(tmp_path, rule, capsys):
     out = tmp_path / "a" / "film"
-    words = ["rollout", str(trained / "rule.safetensors"), "--steps", "20", "--every", "5"]
-    words += [
-        "--damage",
-        "0:cut",
-        "8:cut",
-        "--damage",
-        "10:erase:0.3",
-        "10:clump",
-        "--out",
-        str(out),
-        "--no-progress",
-    ]
+    words = ["rollout", rule, "--steps", "20", "--every", "5", "--damage", "0:cut", "8:cut"]
+    words += ["--damage", "10:erase:0.3", "10:clump", "--out", str(out), "--no-progress"]
     assert main(words) == 0
     text = capsys.readouterr().out
     assert re.search(r"step 20: loss \d+\.\d+, PSNR +\d+\.\d+ dB", text)
@@ -263,8 +264,8 @@ def test_rollout_writes_films_that_open(
         assert f"wrote {out / name}" in text
 
 
-def test_rollout_repeats_itself(tmp_path: Path, trained: Path) -> None:
-    words = ["rollout", str(trained / "rule.safetensors"), "--steps", "12", "--no-progress"]
+def test_rollout_repeats_itself(tmp_path, rule):
+    words = ["rollout", rule, "--steps", "12", "--no-progress"]
     for name in ("a", "b"):
         assert main([*words, "--damage", "6:erase", "--out", str(tmp_path / name)]) == 0
     assert main([*words, "--seed", "1", "--out", str(tmp_path / "c")]) == 0
@@ -273,9 +274,7 @@ def test_rollout_repeats_itself(tmp_path: Path, trained: Path) -> None:
     assert films[0] != films[2]
 
 
-def test_rollout_runs_a_rule_whose_file_names_no_task(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_rollout_runs_a_rule_whose_file_names_no_task(tmp_path, capsys):
     save_rule(NPARule(2, 8, 16, eps0=0.2), tmp_path / "rule.safetensors")
     words = ["rollout", str(tmp_path / "rule.safetensors"), "--steps", "2", "--no-progress"]
     words += ["--particle-count", "100", "--resolution", "24", "--out", str(tmp_path)]
@@ -288,36 +287,6 @@ def test_rollout_runs_a_rule_whose_file_names_no_task(
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["nosuchrule"], "unknown rule 'nosuchrule'"),
-        (["RULE", "--damage", "5:burn"], "unknown damage 'burn'"),
-        (["RULE", "--damage", "5"], "STEP:KIND"),
-        (["RULE", "--damage", "5:cut:-1"], "positive size"),
-        (["RULE", "--damage", "20:cut"], "damage must come before the last of 20 steps"),
-        (["RULE", "--target", "nosuchtarget"], "nosuchtarget"),
-        (["RULE", "--eps", "-1"], "eps must be"),
-        (["RULE", "--device", "cuda:99"], "device must be"),
-        (["RULE", "--out", "FILE/inside"], "out must be a folder"),
-    ],
-)
-def test_rollout_refuses_a_mistake_in_one_line(
-    words: list[str],
-    message: str,
-    trained: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    (tmp_path / "file").touch()
-    names = {"RULE": str(trained / "rule.safetensors"), "FILE/inside": str(tmp_path / "file/a")}
-    words = [names.get(word, word) for word in words]
-    out = [] if "--out" in words else ["--out", str(tmp_path / "film")]
-    command = ["rollout", *words, "--steps", "20", "--no-progress", *out]
-    assert message in error_of(capsys, command)
-    assert not (tmp_path / "film" / "growth.gif").exists()
-
-
-@pytest.mark.parametrize(
     ("name", "value", "message"),
     [
         ("fps", 51.0, r"fps must be in \[0\.1, 50\], got 51"),
@@ -326,34 +295,23 @@ def test_rollout_refuses_a_mistake_in_one_line(
         ("seed", 2**63, r"seed must be in \[0, 2\^63\)"),
     ],
 )
-def test_rollout_refuses_numbers_out_of_range_before_it_starts(
-    name: str, value: float, message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_rollout_refuses_numbers_out_of_range(name, value, message):
     with pytest.raises(NPAError, match=message):
         RolloutOptions(**{"rule": "gecko", name: value})
-    with pytest.raises(SystemExit) as ended:
-        main(["rollout", "gecko", f"--{name}", str(value)])
-    assert ended.value.code == 2
-    assert f"{name} must be in" in capsys.readouterr().err
 
 
 def test_rollout_notices_before_the_first_step_that_it_cannot_write(
-    trained: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    def refuse(**_: object) -> None:
-        raise PermissionError(13, "Permission denied")
-
+    rule, tmp_path, monkeypatch, capsys
+):
+    refuse = raising(PermissionError(13, "Permission denied"))
     monkeypatch.setattr("npa_envs.cli.output.tempfile.TemporaryFile", refuse)
     monkeypatch.setattr("npa_envs.cli.film.rollout", lambda *_, **__: pytest.fail("a step ran"))
-    words = ["rollout", str(trained / "rule.safetensors"), "--steps", "9", "--out", str(tmp_path)]
+    words = ["rollout", rule, "--steps", "9", "--out", str(tmp_path)]
     assert "out must be a folder that can be written to" in error_of(capsys, words)
 
 
-def test_rollout_makes_about_150_frames(tmp_path: Path, trained: Path) -> None:
-    words = ["rollout", str(trained / "rule.safetensors"), "--steps", "299", "--no-progress"]
+def test_rollout_makes_about_150_frames(tmp_path, rule):
+    words = ["rollout", rule, "--steps", "299", "--no-progress"]
     assert main([*words, "--resolution", "16", "--out", str(tmp_path)]) == 0
     with Image.open(tmp_path / "growth.gif") as film:
         assert film.size == (16, 16)
@@ -369,9 +327,7 @@ def test_rollout_makes_about_150_frames(tmp_path: Path, trained: Path) -> None:
         (70, 10, set(), ["0", "10", "20", "30", "40", "50", "60", "70"]),
     ],
 )
-def test_filmstrip_shows_growth_damage_and_the_end(
-    steps: int, every: int, damages: set[int], shown: list[str]
-) -> None:
+def test_filmstrip_shows_growth_damage_and_the_end(steps, every, damages, shown):
     film = Film()
     task = SimpleNamespace(picture=lambda *_: torch.zeros(1, 4, 4, 4))
     x = s = torch.zeros(1, 1, 2)
@@ -384,10 +340,8 @@ def test_filmstrip_shows_growth_damage_and_the_end(
     assert len(frames) == len(shown)
 
 
-def test_evaluate_prints_a_row_for_each_checkpoint(
-    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = ["evaluate", str(trained / "rule.safetensors"), "--checkpoints", "2", "5", "--json"]
+def test_evaluate_prints_a_row_for_each_checkpoint(rule, tmp_path, capsys):
+    words = ["evaluate", rule, "--checkpoints", "2", "5", "--json"]
     words += [str(tmp_path / "table.json"), "--seed-count", "3", "--no-progress"]
     assert main(words) == 0
     text = capsys.readouterr().out
@@ -399,26 +353,14 @@ def test_evaluate_prints_a_row_for_each_checkpoint(
 
 
 @pytest.mark.parametrize("config", ["{", "null", "[]", '{"colour": 3}', '{"state_dim": "many"}'])
-def test_a_rule_with_damaged_metadata_is_refused(
-    config: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_rule_with_damaged_metadata_is_refused(config, tmp_path, capsys):
     path = tmp_path / "damaged.safetensors"
     save_rule(NPARule(), path, metadata={"task": "morphogenesis2d", "config": config})
     assert main(["evaluate", str(path), "--checkpoints", "1", "--no-progress"]) == 2
     assert f"the metadata of '{path}'" in capsys.readouterr().err
 
 
-def test_evaluate_wants_to_know_the_target(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    save_rule(NPARule(2, 8, 16, eps0=0.2), tmp_path / "rule.safetensors")
-    words = ["evaluate", str(tmp_path / "rule.safetensors"), "--no-progress"]
-    assert "give --target" in error_of(capsys, words)
-
-
-def test_a_rule_outlives_the_picture_that_it_was_trained_on(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_rule_outlives_the_picture_that_it_was_trained_on(tmp_path, capsys):
     picture = tmp_path / "square.png"
     pixels = np.zeros((16, 16, 4), dtype=np.uint8)
     pixels[4:12, 4:12] = (200, 30, 30, 255)
@@ -435,40 +377,19 @@ def test_a_rule_outlives_the_picture_that_it_was_trained_on(
     assert "PSNR" in capsys.readouterr().out
 
 
-def test_only_moving_rules_in_2d_are_shown(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    save_rule(NPARule(3, 8, 16), tmp_path / "rule.safetensors")
-    words = ["rollout", str(tmp_path / "rule.safetensors"), "--out", str(tmp_path)]
-    assert "got space_dim=3" in error_of(capsys, words)
-
-
-def test_an_interrupted_command_ends_without_a_traceback(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def interrupt(_: object) -> int:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("npa_envs.cli.listing.main", interrupt)
+def test_a_message_of_several_lines_becomes_one_and_an_interruption_has_no_traceback(
+    monkeypatch, capsys
+):
+    monkeypatch.setattr("npa_envs.cli.listing.main", raising(NPAError("x must be\n  positive")))
+    assert error_of(capsys, ["list"]) == "npa-envs: error: x must be positive\n"
+    monkeypatch.setattr("npa_envs.cli.listing.main", raising(KeyboardInterrupt))
     assert main(["list"]) == 130
     assert capsys.readouterr().err == "npa-envs: interrupted\n"
 
 
-def test_a_message_of_several_lines_becomes_one(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def fail(_: object) -> int:
-        raise NPAError("x must be\n  positive")
-
-    monkeypatch.setattr("npa_envs.cli.listing.main", fail)
-    assert error_of(capsys, ["list"]) == "npa-envs: error: x must be positive\n"
-
-
-def test_demo_shows_growth_healing_and_training(
-    tmp_path: Path, trained: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_demo_shows_growth_healing_and_training(tmp_path, rule, capsys):
     out = tmp_path / "demo"
-    words = ["demo", "--rule", str(trained / "rule.safetensors"), "--out", str(out)]
+    words = ["demo", "--rule", rule, "--out", str(out)]
     assert main([*words, "--train-seconds", "1", "--no-progress"]) == 0
     text = capsys.readouterr().out
     assert len(re.findall(r"PSNR +\d+\.\d+ dB", text)) == 6

@@ -40,7 +40,7 @@ from npa_envs.measure.speed.throughput import (
     throughput_rows,
     varied,
 )
-from npa_envs.measure.speed.timing import LeftOut, Session, Timing, compare, measure
+from npa_envs.measure.speed.timing import LeftOut, Session, Timing, compare
 from npa_envs.measure.speed.workloads import Workload, gecko
 from npa_envs.ops import perceive
 from npa_envs.runtime import recorded_launches
@@ -151,7 +151,7 @@ def test_a_precision_keeps_weights_and_rounds_what_it_says():
 
 def test_the_time_of_a_call_is_a_median_within_its_range():
     calls = []
-    cost = measure(lambda: calls.append(0), torch.device("cpu"), repeats=5)
+    cost = Session(torch.device("cpu"), repeats=5).cost(lambda: calls.append(0))
     assert 0.0 < cost.time.low <= cost.time.median <= cost.time.high
     assert len(calls) > 100
     assert cost.peak_mib is None

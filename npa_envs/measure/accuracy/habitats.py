@@ -97,12 +97,8 @@ def habitat(
 ) -> Habitat:
     """Return a shipped rule with seeds of its task.
 
-    Args:
-        session: Where, and whether worlds are to be small.
-        name: The rule's name.
-        world_count: Worlds B.
-        particles: Particles over those it was trained with or, in a quick run, over the most there.
-        looks: Whether loss or metric will be asked for; a 3D target takes long to make.
+    `particles` is over those it was trained with or, in a quick run, over the most there. Where the
+    world `looks` at nothing, neither loss nor metric is asked for: a 3D target takes long to make.
     """
     key = ("task", name, particles, looks)
     rule, task = session.once(key, lambda: _task(session, name, particles, looks))

@@ -162,11 +162,8 @@ def threshold_scenes(space_dim: int, threshold: float) -> tuple[Tensor, Tensor]:
     """Return worlds whose first particle's moment matrix has a determinant around a threshold.
 
     The particles are a corner, one on each other axis, and one whose height over those says how
-    flat the corner is.
-
-    Returns:
-        Positions [length units], shape [B, 1 + D, D], and how far each determinant was to lie from
-        the threshold, relatively, shape [B].
+    flat the corner is. Positions [B, 1 + D, D] come with how far each determinant was to lie from
+    the threshold, relatively, [B].
     """
     offsets = torch.tensor([1e-1, 1e-3, 1e-5, 1e-7, 0.0, -1e-7, -1e-5, -1e-3, -1e-1]).double()
     worlds = torch.zeros(len(offsets), 1 + space_dim, space_dim, dtype=torch.float64)

@@ -241,14 +241,9 @@ def run_checks(
 ) -> None:
     """Run checks that the record does not have yet, and put what came of them there.
 
-    Args:
-        checks: What to run, in this order.
-        session: Where and how.
-        record: Takes the entries.
-        max_seconds: No check begins after so long [s]; those that are left out are skipped, but
-            for what an earlier run found of them.
-        written: Called with the record after each check.
-        progress: Called with 1 after each check.
+    No check begins after `max_seconds`; those that are left out are skipped, but for what an
+    earlier run found of them. After each check `written` is called with the record, `progress`
+    with 1.
     """
     time_is_up = time_limit(max_seconds)
     for check in checks:

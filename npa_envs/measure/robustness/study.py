@@ -124,17 +124,11 @@ def measure_rule(
     path: Path | None = None,
     enough: Callable[[], bool] = lambda: False,
 ) -> RuleRecord:
-    """Return what a rule bears and heals.
+    """Return what a rule bears and heals; conditions of more than `most_particles` are left out.
 
-    Args:
-        name: The rule's name.
-        ground: The rule, and what is measured.
-        most_particles: Particles of all worlds; conditions with more are left out.
-        facts: What the figures follow from.
-        command: The command line, for the record.
-        before: What an earlier run has measured: it is not measured again.
-        path: File that is written after the damages and after each value; None: none.
-        enough: Asked before each value: whether to stop there, with a record that is not done.
+    What an earlier run has measured `before` is not measured again. The file is written after the
+    damages and after each value. Before each value it is asked whether that is `enough`: then the
+    record is not done.
     """
     begin = time.perf_counter() - (0.0 if before is None else before.seconds)
     home, trained = grow(ground)

@@ -70,32 +70,6 @@ def synchronize(device: torch.device) -> None:
         torch.cuda.synchronize(device)
 
 
-def measure(
-    run: Callable[[], object],
-    device: torch.device,
-    *,
-    repeats: int,
-    graph: bool = True,
-    generator: torch.Generator | None = None,
-) -> Cost:
-    """Return what a call costs once its kernels are compiled.
-
-    Slow calls get fewer readings than `repeats`. On CUDA, `graph` captures the call, which may draw
-    from the generator, and times its replay.
-    """
-    run()
-    synchronize(device)
-    if device.type != "cuda":
-        return Cost(_timing(run, device, repeats), None)
-    gc.collect()
-    torch.cuda.empty_cache()
-    torch.cuda.reset_peak_memory_stats(device)
-    before = torch.cuda.memory_allocated(device)
-    replay = capture(run, device, generator=generator, warm_up=run).replay if graph else run
-    timing = _timing(replay, device, repeats)
-    return Cost(timing, (torch.cuda.max_memory_allocated(device) - before) / 2**20)
-
-
 def compare(
     first: Sampled, second: Sampled, device: torch.device, *, repeats: int, graph: bool = True
 ) -> Comparison:
@@ -191,8 +165,23 @@ class Session:
         graph: bool = True,
         generator: torch.Generator | None = None,
     ) -> Cost:
-        """Return what a call costs; arguments as `measure`."""
-        return measure(run, self.device, repeats=self.repeats, graph=graph, generator=generator)
+        """Return what a call costs once its kernels are compiled.
+
+        Slow calls get fewer readings. On CUDA, `graph` captures the call, which may draw from the
+        generator, and times its replay.
+        """
+        device = self.device
+        run()
+        synchronize(device)
+        if not self.cuda:
+            return Cost(_timing(run, device, self.repeats), None)
+        gc.collect()
+        torch.cuda.empty_cache()
+        torch.cuda.reset_peak_memory_stats(device)
+        before = torch.cuda.memory_allocated(device)
+        replay = capture(run, device, generator=generator, warm_up=run).replay if graph else run
+        timing = _timing(replay, device, self.repeats)
+        return Cost(timing, (torch.cuda.max_memory_allocated(device) - before) / 2**20)
 
     def attempt(self, what: str, make: Callable[[], Row]) -> list[Row]:
         """Return the row that a call makes, none where the device's memory does not suffice."""

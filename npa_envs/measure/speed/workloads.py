@@ -93,13 +93,9 @@ def rollout_call(
 ) -> tuple[Callable[[], None], torch.Generator]:
     """Return a call that rolls worlds x [B, N, D], s [B, N, C] out, and the source of its masks.
 
-    Args:
-        workload: Rule, radius, probability of updates and steps.
-        train: Also take the gradient of a random linear functional by the rule's weights.
-        gradients: Without that, let autograd store what it would read.
-        rule: Options of the rule.
-        roll: What rolls worlds out.
-        options: Its options, instead of the workload's.
+    To `train` is to take the gradient of a random linear functional by the rule's weights;
+    `gradients` without that let autograd store what it would read. `rule` are options of the rule,
+    `options` those of `roll` instead of the workload's.
     """
     network = workload.rule(x.device, **(rule or {}))
     generator = torch.Generator(x.device).manual_seed(1)
