@@ -4,35 +4,30 @@ Importing it registers the Gymnasium environments `npa/...`. Names are imported 
 used, so that the import starts neither torch nor Warp, and the command line answers at once.
 """
 
+from importlib import import_module as _import_module
 from typing import TYPE_CHECKING, Any
 
-from npa_envs._checkout import extend_path as _extend_path
-from npa_envs._moved import keep_old_names as _keep_old_names
+from npa_envs._module_search import extend_path as _extend_path
+from npa_envs._module_search import keep_old_names as _keep_old_names
 from npa_envs.registration import register_environments as _register_environments
 
 if TYPE_CHECKING:
-    from npa_envs.api import (
-        DivergedError,
-        MissingDependencyError,
-        NPAError,
-        NPARule,
+    from npa_envs.errors import DivergedError, MissingDependencyError, NPAError
+    from npa_envs.ops import (
         PerceptionFields,
         SpeciesFields,
-        WorldRandom,
-        describe_divergence,
-        divergence,
-        load_rule,
         perceive,
         perceive_species,
         perception_fields,
-        rollout,
-        rollout_species,
-        save_rule,
-        shipped_rules,
         species_fields,
-        step,
         world_mean,
     )
+    from npa_envs.rule.files import load_rule, save_rule, shipped_rules
+    from npa_envs.rule.rule import NPARule
+    from npa_envs.world.divergence import describe_divergence, divergence
+    from npa_envs.world.randomness import WorldRandom
+    from npa_envs.world.rollout import rollout, step
+    from npa_envs.world.species import rollout_species
 
 _extend_path(__path__, __file__)
 _keep_old_names()
@@ -63,13 +58,23 @@ __all__ = [
     "world_mean",
 ]
 
+_HOMES = {
+    "errors": {"DivergedError", "MissingDependencyError", "NPAError"},
+    "rule.files": {"load_rule", "save_rule", "shipped_rules"},
+    "rule.rule": {"NPARule"},
+    "world.divergence": {"describe_divergence", "divergence"},
+    "world.randomness": {"WorldRandom"},
+    "world.rollout": {"rollout", "step"},
+    "world.species": {"rollout_species"},
+}
+"""Where the names are; all others are of `npa_envs.ops`."""
+
 
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from npa_envs import api
-
-    return getattr(api, name)
+    home = next((module for module, names in _HOMES.items() if name in names), "ops")
+    return getattr(_import_module(f"npa_envs.{home}"), name)
 
 
 def __dir__() -> list[str]:

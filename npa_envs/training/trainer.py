@@ -31,10 +31,16 @@ from npa_envs.rule.files import load_rule, save_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task, differing_fields, task_for_rule, task_toward
 from npa_envs.tasks.train_config import TrainConfig
-from npa_envs.training.checkpoint import check_same_run, load_checkpoint, save_checkpoint
 from npa_envs.training.iteration import Rollout, TrainingCycle
 from npa_envs.training.overrides import config_to_dict
-from npa_envs.training.run_folder import JsonlLog, RunFolder, open_tensorboard
+from npa_envs.training.run_folder import (
+    JsonlLog,
+    RunFolder,
+    check_same_run,
+    load_checkpoint,
+    open_tensorboard,
+    save_checkpoint,
+)
 
 
 @dataclass(frozen=True)

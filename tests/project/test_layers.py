@@ -36,8 +36,7 @@ INSIDES = ("npa_envs.kernels", "npa_envs.ops", "npa_envs.reference")
 """For who uses worlds and operators through `npa_envs.world` and the public names alone."""
 ORACLES = ("npa_envs.kernels", "npa_envs.reference")
 LADDER = {
-    "npa_envs._checkout": rung(0),
-    "npa_envs._moved": Rung(0, frozenset({COMPUTED_NAME})),
+    "npa_envs._module_search": Rung(0, frozenset({COMPUTED_NAME})),
     "npa_envs.errors": rung(0),
     "npa_envs.registration": rung(0, "gymnasium"),
     "npa_envs.devices": rung(1, "torch"),
@@ -58,8 +57,7 @@ LADDER = {
     ),
     "npa_envs.render": rung(7, "torch numpy PIL imageio imageio_ffmpeg pygame", never=ORACLES),
     "npa_envs.training": rung(8, "torch numpy tqdm yaml tensorboard", never=ORACLES),
-    "npa_envs.api": rung(8, "torch", never=ORACLES),
-    "npa_envs": rung(9, "torch", never=ORACLES),
+    "npa_envs": Rung(9, frozenset({COMPUTED_NAME}), never=ORACLES),
     "npa_envs.measure.record": rung(2, "torch", never=INSIDES),
     "npa_envs.measure.tables": rung(2),
     "npa_envs.measure.plots": rung(2, "matplotlib"),

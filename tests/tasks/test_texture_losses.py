@@ -5,14 +5,17 @@ import pytest
 import torch
 
 from npa_envs.errors import NPAError
-from npa_envs.tasks.losses import sliced
-from npa_envs.tasks.losses.sliced import (
+from npa_envs.tasks.losses.texture import (
+    FILTERS,
+    FLOOR,
+    TEXTURE_LOSSES,
     FilterDescriptor,
+    LossOptions,
     PatchDescriptor,
     SlicedWasserstein,
+    make_texture_loss,
     quantiles,
 )
-from npa_envs.tasks.losses.texture import TEXTURE_LOSSES, LossOptions, make_texture_loss
 from npa_envs.tasks.targets.textures import load_texture
 
 SLICED = ("patch_swd", "filter_swd")
@@ -50,7 +53,7 @@ def plain_distance(tables, expected_tables):
     total = 0.0
     for found, expected in zip(tables, expected_tables, strict=True):
         difference = np.sort(found, axis=0) - np.sort(expected, axis=0)
-        scale = expected.var(axis=0, ddof=1).mean() + sliced.FLOOR
+        scale = expected.var(axis=0, ddof=1).mean() + FLOOR
         total += (difference**2).mean() / scale
     return total
 
@@ -98,8 +101,8 @@ def test_directions_are_unit_and_at_right_angles():
         product = directions.T.double() @ directions.double()
         torch.testing.assert_close(product, torch.eye(75).double(), rtol=0.0, atol=1e-6)
     first, _ = FilterDescriptor(texture("dots", dtype=torch.float64), seed=0)._levels[0]
-    torch.testing.assert_close(first.norm(dim=0), torch.ones(sliced.FILTERS).double())
-    torch.testing.assert_close(first[:, 3:].sum(0), torch.zeros(sliced.FILTERS - 3).double())
+    torch.testing.assert_close(first.norm(dim=0), torch.ones(FILTERS).double())
+    torch.testing.assert_close(first[:, 3:].sum(0), torch.zeros(FILTERS - 3).double())
 
 
 @pytest.mark.parametrize("name", SLICED)

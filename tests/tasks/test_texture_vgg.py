@@ -6,23 +6,24 @@ import pytest
 import torch
 
 from npa_envs.errors import NPAError
-from npa_envs.tasks.losses.optimal_transport import (
-    LAYERS,
+from npa_envs.tasks.losses.texture import (
+    VGG_LAYERS,
+    VGG_WIDTHS,
     WEIGHTS_FILE,
-    WIDTHS,
+    LossOptions,
     VGGFeatures,
     load_vgg_weights,
+    make_texture_loss,
     moment_distance,
     relaxed_transport,
 )
-from npa_envs.tasks.losses.texture import LossOptions, make_texture_loss
 from npa_envs.tasks.targets.textures import load_texture
 
 
 def random_weights():
     generator = torch.Generator().manual_seed(0)
     weights, index, channels = {}, 0, 3
-    for group in WIDTHS:
+    for group in VGG_WIDTHS:
         for width in group:
             scale = math.sqrt(2.0 / (9 * channels))
             shape = (width, channels, 3, 3)
@@ -52,7 +53,7 @@ def colours(name, resolution=32):
 def plain_vgg16(weights):
     """The network as torchvision builds it, with average pooling."""
     layers, index, channels = [], 0, 3
-    for group in WIDTHS:
+    for group in VGG_WIDTHS:
         for width in group:
             layer = torch.nn.Conv2d(channels, width, 3, padding=1, padding_mode="circular")
             layer.weight.data = weights[f"features.{index}.weight"]
@@ -77,9 +78,9 @@ def test_features_are_those_of_the_layers_as_torchvision_counts_them(weights):
     with torch.no_grad():
         for number, layer in enumerate(plain_vgg16(weights)):
             field = layer(field)
-            if number in LAYERS:
+            if number in VGG_LAYERS:
                 expected.append(field)
-    found = VGGFeatures(weights, LAYERS, images)(images, wrap=True)
+    found = VGGFeatures(weights, VGG_LAYERS, images)(images, wrap=True)
     assert [f.shape[1:] for f in found] == [
         (64, 32, 32),
         (128, 16, 16),

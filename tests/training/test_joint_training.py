@@ -11,7 +11,7 @@ from npa_envs.rule.files import load_rule, rule_metadata
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2D, CoMorphogenesis2DConfig
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
 from npa_envs.training import TrainConfig, train_together
-from npa_envs.training.checkpoint import load_checkpoint
+from npa_envs.training.run_folder import load_checkpoint
 from npa_envs.world.species import rollout_species
 
 

@@ -23,7 +23,7 @@ from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule, rule_metadata, save_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.training import DivergedError, JsonlLog, check_device, load_config, override
-from npa_envs.training.checkpoint import load_checkpoint, save_checkpoint
+from npa_envs.training.run_folder import load_checkpoint, save_checkpoint
 
 TESTS = Path(__file__).resolve().parents[1]
 

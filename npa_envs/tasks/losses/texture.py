@@ -1,16 +1,19 @@
-"""Losses of textures by name: how unlike two of them are, whatever lies where."""
+"""Texture losses: how unlike two textures are, whatever lies where."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import pickle
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from pathlib import Path
+from typing import Any, Protocol
 
+import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from npa_envs.errors import NPAError, suggest
-from npa_envs.tasks.losses.optimal_transport import VGGTransport
-from npa_envs.tasks.losses.sliced import FilterDescriptor, PatchDescriptor, SlicedWasserstein
+from npa_envs.ops import world_mean
 
 DEFAULT_LOSS = "patch_swd"
 """The loss that needs nothing but what is here."""
@@ -116,3 +119,514 @@ def make_texture_loss(
             f"{tuple(target.shape)}: channels come first"
         )
     return TEXTURE_LOSSES[name].make(target.detach(), options)
+
+
+# Sliced Wasserstein distances. A texture is described, size after size, by many numbers at each
+# place. Two are alike where each of these numbers is distributed alike over the places: sorted,
+# they are compared one by one.
+
+PATCH = 5
+"""Pixels along each side of a patch."""
+
+LEVELS = 4
+"""Sizes at most, each half of the one before."""
+
+SMALLEST = 12
+"""Pixels along each side of the smallest size at least."""
+
+PLACES = 64
+"""Places along each side that are compared at most; at finer sizes some pixels are left out."""
+
+FILTERS = 24
+"""Random filters of the first layer; each gives two features, above zero and below."""
+
+SECOND_PATCH = 3
+"""Features along each side that a filter of the second layer sees."""
+
+FLOOR = 0.01
+"""Variance that is added to the target's, so that an even target can be compared with, too."""
+
+
+ALIGNMENT = 64
+"""Bytes that a table's address is a multiple of."""
+
+
+class Descriptor(Protocol):
+    """What numbers describe images."""
+
+    def __call__(self, images: Tensor, *, wrap: bool, thinned: bool) -> list[Tensor]:
+        """Return the numbers at each place of images, a table for each size, [B, M, F] each.
+
+        Args:
+            images: The images, shape [B, K, R, R].
+            wrap: Whether their opposite edges meet; otherwise places near them are left out.
+            thinned: Whether at most `PLACES` along each side are enough.
+        """
+
+
+class SlicedWasserstein:
+    """The distance of images from a target; satisfies `TextureLoss`.
+
+    For each size it is the mean over the numbers of the squared 2-Wasserstein distance between
+    their distributions, relative to the target's own variance; the sizes' are added.
+
+    Args:
+        target: The texture (dimensionless), shape [K, R, R].
+        descriptor: What is compared.
+        tiles: Whether the target's opposite edges meet.
+
+    Raises:
+        NPAError: The target is too small.
+    """
+
+    def __init__(self, target: Tensor, descriptor: Descriptor, *, tiles: bool) -> None:
+        _, height, _ = target.shape
+        if height < SMALLEST:
+            raise NPAError(
+                f"resolution must be at least {SMALLEST} pixels, got {height}: for example 64"
+            )
+        self._descriptor = descriptor
+        self._shape = tuple(target.shape)
+        with torch.no_grad():
+            # The worlds' own number of places decides how finely the target's are resolved.
+            thinned = descriptor(target[None], wrap=True, thinned=True)
+            described = descriptor(target[None].double(), wrap=tiles, thinned=False)
+            self._quantiles = [
+                quantiles(numbers[0].T, found.shape[1]).to(target)
+                for numbers, found in zip(described, thinned, strict=True)
+            ]
+            self._scales = [1.0 / (numbers[0].var(0).mean() + FLOOR) for numbers in described]
+
+    def __call__(self, images: Tensor) -> Tensor:
+        """Return the distance of each image (dimensionless), shape [B]; differentiable.
+
+        Args:
+            images: Pictures that tile (dimensionless), shape [B, K, R, R].
+
+        Raises:
+            NPAError: They have another shape than the target.
+        """
+        check_images(images, self._shape)
+        described = self._descriptor(images, wrap=True, thinned=True)
+        total = images.new_zeros(len(images))
+        for numbers, expected, scale in zip(described, self._quantiles, self._scales, strict=True):
+            ordered = numbers.transpose(1, 2).contiguous().sort(dim=-1).values
+            squares = (ordered - expected.to(ordered)).square()
+            distance = world_mean(squares.flatten(1)[..., None])[:, 0]
+            total = total + scale.to(distance) * distance
+        return total
+
+
+class PatchDescriptor:
+    """Square patches of all channels, seen from random directions.
+
+    There are as many directions as a patch has numbers, at right angles to each other.
+
+    Args:
+        like: An image of the shape that is to be described, [K, R, R], on the device.
+        seed: What the directions are drawn from.
+    """
+
+    def __init__(self, like: Tensor, *, seed: int) -> None:
+        generator = torch.Generator().manual_seed(seed)
+        size = like.shape[0] * PATCH * PATCH
+        self._directions = [
+            orthogonal(size, size, generator).to(like) for _ in range(level_count(like.shape[-1]))
+        ]
+
+    def __call__(self, images: Tensor, *, wrap: bool, thinned: bool) -> list[Tensor]:
+        """Return the patches' coordinates, [B, M, K PATCH²] for each size."""
+        sizes = pyramid(images, len(self._directions))
+        return [
+            products(patches(level, PATCH, stride=stride_of(level, thinned), wrap=wrap), direction)
+            for level, direction in zip(sizes, self._directions, strict=True)
+        ]
+
+
+class FilterDescriptor:
+    """Two layers of random filters with rectifiers between them: edges, spots and their corners.
+
+    The filters of the first layer sum to zero, but for one for each channel that averages; those of
+    the second see its features from random directions.
+
+    Args:
+        like: An image of the shape that is to be described, [K, R, R], on the device.
+        seed: What the filters are drawn from.
+    """
+
+    def __init__(self, like: Tensor, *, seed: int) -> None:
+        generator = torch.Generator().manual_seed(seed)
+        channels, area = like.shape[0], PATCH * PATCH
+        self._levels: list[tuple[Tensor, Tensor]] = []
+        for _ in range(level_count(like.shape[-1])):
+            first = torch.randn(channels * area, FILTERS, generator=generator, dtype=torch.float64)
+            first -= first.mean(0)
+            first /= first.norm(dim=0)
+            means = torch.eye(channels, dtype=torch.float64).repeat_interleave(area, 0) / PATCH
+            first[:, :channels] = means
+            second = orthogonal(2 * FILTERS * SECOND_PATCH**2, 2 * FILTERS, generator)
+            self._levels.append((first.to(like), second.to(like)))
+
+    def __call__(self, images: Tensor, *, wrap: bool, thinned: bool) -> list[Tensor]:
+        """Return the features of both layers, [B, M, 2 FILTERS] for each size and layer."""
+        result = []
+        for level, (first, second) in zip(
+            pyramid(images, len(self._levels)), self._levels, strict=True
+        ):
+            signed = products(patches(level, PATCH, stride=1, wrap=wrap), first)
+            features = torch.cat((signed, -signed), dim=2).relu()
+            side = level.shape[-1] - (0 if wrap else PATCH - 1)
+            field = features.transpose(1, 2).reshape(len(images), -1, side, side)
+            stride = stride_of(level, thinned)
+            result.append(field[:, :, ::stride, ::stride].flatten(2).transpose(1, 2))
+            seen = patches(field, SECOND_PATCH, stride=stride, wrap=wrap)
+            result.append(products(seen, second))
+        return result
+
+
+def check_images(images: Tensor, shape: tuple[int, ...]) -> None:
+    """Check that images have the target's shape.
+
+    Args:
+        images: What is compared.
+        shape: The target's shape, (K, R, R).
+
+    Raises:
+        NPAError: They do not.
+    """
+    if images.ndim != 4 or tuple(images.shape[1:]) != shape:
+        raise NPAError(
+            f"images must have shape [B, K, R, R] with (K, R, R) = {shape} as the target, got "
+            f"{tuple(images.shape)}: draw them at the target's resolution"
+        )
+
+
+def level_count(resolution: int) -> int:
+    """Return how many sizes an image is looked at in."""
+    count = 1
+    while count < LEVELS and resolution % 2 == 0 and resolution // 2 >= SMALLEST:
+        resolution //= 2
+        count += 1
+    return count
+
+
+def pyramid(images: Tensor, count: int) -> list[Tensor]:
+    """Return images [B, K, R, R] and `count` - 1 smaller ones, each of means of 2 x 2 pixels."""
+    levels = [images]
+    while len(levels) < count:
+        fine = levels[-1]
+        # Written out: each sum has an order of its own, whatever the size of the batch.
+        rows = fine[:, :, ::2] + fine[:, :, 1::2]
+        levels.append(0.25 * (rows[..., ::2] + rows[..., 1::2]))
+    return levels
+
+
+def stride_of(level: Tensor, thinned: bool) -> int:
+    """Return how many pixels lie between places."""
+    return max(1, level.shape[-1] // PLACES) if thinned else 1
+
+
+def patches(images: Tensor, size: int, *, stride: int, wrap: bool) -> Tensor:
+    """Return the square patches of images as rows, shape [B, M, K size²].
+
+    Args:
+        images: The images, shape [B, K, R, R].
+        size: Pixels along each side, odd.
+        stride: Pixels from one patch to the next.
+        wrap: Whether patches reach across the edges; otherwise M is smaller.
+    """
+    if wrap:
+        reach = size // 2
+        images = torch.cat((images[:, :, -reach:], images, images[:, :, :reach]), dim=2)
+        images = torch.cat((images[..., -reach:], images, images[..., :reach]), dim=3)
+    windows = images.unfold(2, size, stride).unfold(3, size, stride)
+    return windows.permute(0, 2, 3, 1, 4, 5).flatten(3).flatten(1, 2)
+
+
+def products(rows: Tensor, weights: Tensor) -> Tensor:
+    """Return the rows of each image times weights, shape [B, M, F].
+
+    Image by image: the product of a whole batch may round otherwise than that of one image, and so
+    may that of numbers that lie otherwise in memory.
+
+    Args:
+        rows: Contiguous rows, shape [B, M, E].
+        weights: Shape [E, F].
+    """
+    weights = weights.to(rows)
+    tables = [one if one.data_ptr() % ALIGNMENT == 0 else one.clone() for one in rows]
+    return torch.stack([table @ weights for table in tables])
+
+
+def orthogonal(size: int, count: int, generator: torch.Generator) -> Tensor:
+    """Return `count` directions at right angles to each other as columns, shape [size, count].
+
+    Args:
+        size: Numbers in each, at least `count`.
+        count: Directions.
+        generator: What they are drawn from, on the CPU.
+    """
+    normal = torch.randn(size, count, generator=generator, dtype=torch.float64)
+    basis: Tensor = torch.linalg.qr(normal).Q
+    return basis
+
+
+def quantiles(values: Tensor, count: int) -> Tensor:
+    """Return `count` evenly spread quantiles of each row, sorted; the values themselves where fit.
+
+    Args:
+        values: Numbers, shape [F, M].
+        count: Quantiles, in the middles of `count` equal shares of probability.
+    """
+    ordered = values.sort(dim=1).values
+    total = ordered.shape[1]
+    if total == count:
+        return ordered
+    place = (torch.arange(count, dtype=values.dtype, device=values.device) + 0.5) / count
+    place = (place * total - 0.5).clamp(0.0, total - 1.0)
+    low = place.floor().long()
+    share = place - low
+    return ordered[:, low] * (1.0 - share) + ordered[:, (low + 1).clamp(max=total - 1)] * share
+
+
+# The paper's loss: relaxed optimal transport between features of VGG16, and their moments, after
+# Kolkin, Salavon and Shakhnarovich, "Style Transfer by Relaxed Optimal Transport and Self-
+# Similarity" (2019). Of VGG16 (Simonyan and Zisserman 2014) only the weights are needed, not
+# torchvision: the layers are few. Average pooling takes the place of maximum pooling, and worlds
+# are padded with what lies on their other side.
+
+VGG_LAYERS = (1, 6, 11, 18, 25)
+"""Layers of VGG16 that are compared, in torchvision's counting."""
+
+VGG_PLACES = 1024
+"""Places of a layer that are compared at most."""
+
+VGG_SMALLEST = 32
+"""Pixels along each side that leave the deepest layer more than one place."""
+
+TINY_SQUARE = 1e-12
+"""Squared length of a feature vector below which it counts as no direction."""
+
+
+class VGGTransport:
+    """The distance of images from a target; satisfies `TextureLoss`.
+
+    For each layer it is the relaxed earth mover's distance under the cosine distance of features,
+    plus the mean absolute differences of their means and of their covariances; the layers' are
+    added. A layer with more than 1024 places is compared at 1024 of them, drawn once.
+
+    Args:
+        target: The texture (dimensionless), shape [3, R, R], or [1, R, R] for a density.
+        weights: File of VGG16's weights; empty: torch's folder of downloads.
+        tiles: Whether the target's opposite edges meet.
+        seed: What the places are drawn from.
+
+    Raises:
+        NPAError: There are no such weights, the file is damaged, or the target is too small or has
+            another number of channels.
+    """
+
+    def __init__(self, target: Tensor, *, weights: str = "", tiles: bool, seed: int) -> None:
+        channels, height, _ = target.shape
+        if channels not in (1, 3):
+            raise NPAError(f"vgg_ot compares images of 1 or 3 channels, got {channels}")
+        if height < VGG_SMALLEST:
+            raise NPAError(
+                f"resolution must be at least {VGG_SMALLEST} pixels for vgg_ot, got {height}: "
+                "for example 128"
+            )
+        self._shape = tuple(target.shape)
+        self._features = VGGFeatures(load_vgg_weights(weights), VGG_LAYERS, target)
+        generator = torch.Generator().manual_seed(seed)
+        self._places: list[Tensor | None] = []
+        self._expected = []
+        with torch.no_grad():
+            for field in self._features(target[None], wrap=tiles):
+                count = field.shape[2] * field.shape[3]
+                chosen = None
+                if count > VGG_PLACES:
+                    drawn = torch.randperm(count, generator=generator)[:VGG_PLACES]
+                    chosen = drawn.sort().values.to(target.device)
+                self._places.append(chosen)
+                self._expected.append(_rows(field, chosen))
+
+    def __call__(self, images: Tensor) -> Tensor:
+        """Return the distance of each image (dimensionless), shape [B]; differentiable.
+
+        Without gradient images are compared one by one, so that no image depends on the others.
+
+        Args:
+            images: Pictures that tile (dimensionless), shape [B, K, R, R].
+
+        Raises:
+            NPAError: They have another shape than the target.
+        """
+        check_images(images, self._shape)
+        if torch.is_grad_enabled() and images.requires_grad:
+            return self._compare(images)
+        return torch.cat([self._compare(image[None]) for image in images])
+
+    def _compare(self, images: Tensor) -> Tensor:
+        total = images.new_zeros(len(images))
+        layers = zip(self._features(images, wrap=True), self._places, self._expected, strict=True)
+        for field, places, expected in layers:
+            found = _rows(field, places)
+            total = total + relaxed_transport(found, expected) + moment_distance(found, expected)
+        return total
+
+
+def relaxed_transport(first: Tensor, second: Tensor) -> Tensor:
+    """Return the relaxed earth mover's distance of rows under the cosine distance, shape [B].
+
+    Either side may send all to the nearest of the other; the larger of both costs is taken, each
+    a lower bound of the cost of transport.
+
+    Args:
+        first: Rows, shape [B, M, F].
+        second: Rows, shape [1, L, F] or [B, L, F].
+    """
+    costs = 1.0 - _directions(first) @ _directions(second).transpose(1, 2)
+    there, back = costs.amin(dim=2).mean(dim=1), costs.amin(dim=1).mean(dim=1)
+    return torch.maximum(there, back)
+
+
+def moment_distance(first: Tensor, second: Tensor) -> Tensor:
+    """Return the mean absolute differences of means and of covariances, added, shape [B].
+
+    Args:
+        first: Rows, shape [B, M, F].
+        second: Rows, shape [1, L, F] or [B, L, F].
+    """
+    (mean, covariance), (other_mean, other_covariance) = _moments(first), _moments(second)
+    difference = (mean - other_mean).abs().mean(dim=(1, 2))
+    return difference + (covariance - other_covariance).abs().mean(dim=(1, 2))
+
+
+def _rows(field: Tensor, places: Tensor | None) -> Tensor:
+    rows = field.flatten(2)
+    return (rows if places is None else rows.index_select(2, places)).transpose(1, 2)
+
+
+def _directions(rows: Tensor) -> Tensor:
+    return rows * (rows.square().sum(dim=-1, keepdim=True) + TINY_SQUARE).rsqrt()
+
+
+def _moments(rows: Tensor) -> tuple[Tensor, Tensor]:
+    mean = rows.mean(dim=1, keepdim=True)
+    centred = rows - mean
+    return mean, centred.transpose(1, 2) @ centred / (rows.shape[1] - 1)
+
+
+WEIGHTS_FILE = "vgg16-397923af.pth"
+"""Name of torchvision's file of weights trained on ImageNet."""
+
+WEIGHTS_URL = f"https://download.pytorch.org/models/{WEIGHTS_FILE}"
+"""Where it can be had."""
+
+VGG_WIDTHS = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
+"""Channels of the convolutions; a pooling layer lies between two groups."""
+
+VGG_MEAN, VGG_DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+"""Of ImageNet's red, green and blue, by which images are normalised."""
+
+
+class VGGFeatures:
+    """Features of images at some layers.
+
+    Args:
+        weights: Weight and bias by name, as in torchvision's state dict: `features.0.weight`, ...
+        layers: Numbers of the layers whose outputs are wanted, in torchvision's counting: each
+            convolution, rectifier and pooling counts as one, from 0.
+        like: A tensor of the dtype and on the device that the features are wanted in.
+
+    Raises:
+        NPAError: A weight is missing or has another shape.
+    """
+
+    def __init__(self, weights: Mapping[str, Any], layers: Sequence[int], like: Tensor) -> None:
+        self._layers = frozenset(layers)
+        self._steps: list[tuple[Tensor, Tensor] | None] = []
+        index, channels = 0, 3
+        for group in VGG_WIDTHS:
+            for width in group:
+                weight = _checked(weights, f"features.{index}.weight", (width, channels, 3, 3))
+                bias = _checked(weights, f"features.{index}.bias", (width,))
+                self._steps.append((weight.to(like), bias.to(like)))
+                index, channels = index + 2, width
+            self._steps.append(None)
+            index += 1
+        self._mean = like.new_tensor(VGG_MEAN)[:, None, None]
+        self._deviation = like.new_tensor(VGG_DEVIATION)[:, None, None]
+
+    def __call__(self, images: Tensor, *, wrap: bool) -> list[Tensor]:
+        """Return the features at each layer, shape [B, F, R', R'] each, ever coarser.
+
+        Args:
+            images: Red, green and blue, or one channel that stands for all three (dimensionless),
+                shape [B, 3, R, R] or [B, 1, R, R].
+            wrap: Whether opposite edges meet; otherwise images are mirrored at their edges.
+        """
+        mode = "circular" if wrap else "reflect"
+        # In the weights' precision, whatever the worlds' is.
+        field = (images.to(self._mean) - self._mean) / self._deviation
+        found = []
+        index, last = 0, max(self._layers)
+        for step in self._steps:
+            if step is None:
+                field = F.avg_pool2d(field, 2)
+                index += 1
+            else:
+                field = F.conv2d(F.pad(field, (1, 1, 1, 1), mode=mode), *step).relu()
+                # A convolution and its rectifier; layers are read behind the latter.
+                index += 2
+            if index - 1 in self._layers:
+                found.append(field)
+            if index > last:
+                break
+        return found
+
+
+def load_vgg_weights(path: str | Path = "") -> dict[str, Any]:
+    """Return the weights of VGG16 by name, on the CPU.
+
+    Args:
+        path: The file; empty: `vgg16-397923af.pth` in torch's folder of downloads. Nothing is
+            downloaded.
+
+    Raises:
+        NPAError: There is no such file, or it is damaged or holds something else.
+    """
+    folder = Path(torch.hub.get_dir()) / "checkpoints"
+    file = Path(path).expanduser() if str(path) else folder / WEIGHTS_FILE
+    if not file.is_file():
+        raise NPAError(
+            f"vgg_ot needs VGG16's weights, and there is no file {str(file)!r}: "
+            f"download {WEIGHTS_URL} (528 MiB) to {str(folder / WEIGHTS_FILE)!r}, for example with "
+            f"python -c \"import torch; torch.hub.load_state_dict_from_url('{WEIGHTS_URL}')\", "
+            "or give the path of such a file as vgg_weights, or choose loss='patch_swd' or "
+            "'filter_swd', which need no weights"
+        )
+    try:
+        content = torch.load(file, map_location="cpu", weights_only=True, mmap=True)
+    except (OSError, RuntimeError, ValueError, EOFError, pickle.UnpicklingError) as error:
+        raise NPAError(
+            f"VGG16's weights {str(file)!r} cannot be read, the file is damaged or no torch file "
+            f"({' '.join(str(error).split())[:120]}): download {WEIGHTS_URL} again"
+        ) from error
+    if not isinstance(content, dict):
+        raise NPAError(
+            f"VGG16's weights {str(file)!r} must be a state dict, got {type(content).__name__}: "
+            f"download {WEIGHTS_URL}"
+        )
+    return content
+
+
+def _checked(weights: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> Tensor:
+    tensor = weights.get(name)
+    if not isinstance(tensor, Tensor) or tuple(tensor.shape) != shape:
+        found = tuple(tensor.shape) if isinstance(tensor, Tensor) else "nothing"
+        raise NPAError(
+            f"VGG16's weights must hold {name} of shape {shape}, got {found}: "
+            f"give torchvision's file, {WEIGHTS_URL}"
+        )
+    return tensor.detach()
