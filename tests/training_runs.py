@@ -83,6 +83,15 @@ class Recording(TorchDispatchMode):
         return out
 
 
+def lively_rule(task, dtype=torch.float32):
+    """An untrained rule whose read-out, where there is one, says something other than nothing."""
+    rule = task.make_rule(torch.Generator().manual_seed(1)).to(dtype)
+    with torch.no_grad():
+        for parameter in () if rule.readout is None else rule.readout.parameters():
+            parameter.normal_(std=0.5, generator=torch.Generator().manual_seed(2))
+    return rule
+
+
 def make_cycle(config, task, device="cpu", rollout=None):
     device = torch.device(device)
     schedule = torch.Generator().manual_seed(config.seed)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from typing import Any
+from typing import Any, TypeGuard
 
 from npa_envs.errors import NPAError
 
@@ -23,16 +23,11 @@ def check_positive(config: object, kind: type, *names: str, at_least: int = 1) -
     for name in names:
         value = getattr(config, name)
         if kind is int:
-            if not is_whole(value) or value < at_least:
-                raise NPAError(
-                    f"{name} must be a whole number of at least {at_least}, got {value!r}: "
-                    f"for example {name}={_example(config, name, at_least)}"
-                )
-        elif not is_real(value) or value <= 0:
-            raise NPAError(
-                f"{name} must be a finite number greater than 0, got {value!r}: "
-                f"for example {name}={_example(config, name, 1.0)}"
-            )
+            ok = is_whole(value) and value >= at_least
+            _require(ok, config, name, f"be a whole number of at least {at_least}", at_least)
+        else:
+            ok = is_real(value) and value > 0
+            _require(ok, config, name, "be a finite number greater than 0", 1.0)
 
 
 def check_non_negative(config: object, *names: str) -> None:
@@ -43,11 +38,8 @@ def check_non_negative(config: object, *names: str) -> None:
     """
     for name in names:
         value = getattr(config, name)
-        if not is_real(value) or value < 0:
-            raise NPAError(
-                f"{name} must be a finite number of at least 0, got {value!r}: "
-                f"for example {name}={_example(config, name, 0.0)}"
-            )
+        ok = is_real(value) and value >= 0
+        _require(ok, config, name, "be a finite number of at least 0", 0.0)
 
 
 def check_fraction(config: object, *names: str) -> None:
@@ -58,11 +50,7 @@ def check_fraction(config: object, *names: str) -> None:
     """
     for name in names:
         value = getattr(config, name)
-        if not is_real(value) or not 0 < value <= 1:
-            raise NPAError(
-                f"{name} must lie in (0, 1], got {value!r}: "
-                f"for example {name}={_example(config, name, 0.5)}"
-            )
+        _require(is_real(value) and 0 < value <= 1, config, name, "lie in (0, 1]", 0.5)
 
 
 def check_text(config: object, name: str, what: str) -> None:
@@ -77,11 +65,7 @@ def check_text(config: object, name: str, what: str) -> None:
         NPAError: It is not.
     """
     value = getattr(config, name)
-    if not isinstance(value, str) or not value:
-        raise NPAError(
-            f"{name} must be {what}, got {value!r}: "
-            f"for example {name}={_example(config, name, 'name')!r}"
-        )
+    _require(isinstance(value, str) and value != "", config, name, f"be {what}", "name")
 
 
 def check_seed(config: object, name: str, *, bits: int = 63) -> None:
@@ -96,14 +80,11 @@ def check_seed(config: object, name: str, *, bits: int = 63) -> None:
         NPAError: It cannot.
     """
     value = getattr(config, name)
-    if not is_whole(value) or not 0 <= value < 2**bits:
-        raise NPAError(
-            f"{name} must be a whole number of at least 0 and below 2**{bits}, got {value!r}: "
-            f"for example {name}=0"
-        )
+    ok = is_whole(value) and 0 <= value < 2**bits
+    _require(ok, config, name, f"be a whole number of at least 0 and below 2**{bits}", 0)
 
 
-def is_whole(value: Any) -> bool:
+def is_whole(value: Any) -> TypeGuard[int]:
     """Return whether `value` is an int (a bool is not)."""
     return isinstance(value, int) and not isinstance(value, bool)
 
@@ -115,5 +96,20 @@ def is_real(value: Any) -> bool:
     return real and -sys.float_info.max <= value <= sys.float_info.max
 
 
-def _example(config: object, name: str, otherwise: object) -> object:
-    return getattr(type(config), name, otherwise)
+def _require(ok: bool, config: object, name: str, rule: str, otherwise: object) -> None:
+    """Raise an error that shows the field's default, or `otherwise`, for example."""
+    if not ok:
+        example = getattr(type(config), name, otherwise)
+        raise NPAError(
+            f"{name} must {rule}, got {getattr(config, name)!r}: for example {name}={example!r}"
+        )
+
+
+def check_count(name: str, value: object, cure: str = "") -> None:
+    """Check that an argument is a whole number of at least 1.
+
+    Raises:
+        NPAError: It is not.
+    """
+    if not is_whole(value) or value < 1:
+        raise NPAError(f"{name} must be an integer of at least 1, got {value!r}{cure}")

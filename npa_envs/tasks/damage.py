@@ -16,14 +16,8 @@ from npa_envs.errors import NPAError, suggest
 from npa_envs.ops import world_mean
 from npa_envs.ops.checks import check_world, checked_number
 from npa_envs.tasks.checks import check_non_negative, is_real, is_whole
-from npa_envs.tasks.seeds import uniform_ball
-from npa_envs.world.randomness import (
-    Randomness,
-    WorldRandom,
-    check_generator,
-    normal_draws,
-    uniform_draws,
-)
+from npa_envs.tasks.seeds import drawn_indices, uniform_ball
+from npa_envs.world.randomness import Randomness, check_generator, normal_draws, uniform_draws
 
 DAMAGE_SIZES = {"erase": 0.2, "cut": 0.1, "clump": 0.2, "noise": 0.05}
 """Kinds of damage with their usual size: radius, gap, radius, standard deviation [length units]."""
@@ -156,14 +150,8 @@ def random_particle(x: Tensor, generator: Randomness | None = None) -> Tensor:
     """
     check_world(x, x)
     check_generator(generator, x.device, x.shape[0])
-    world_count, particle_count, _ = x.shape
-    if isinstance(generator, WorldRandom):
-        chosen = generator.integers(particle_count, 1, 1)
-    else:
-        chosen = torch.randint(
-            particle_count, (world_count, 1, 1), generator=generator, device=x.device
-        )
-    return x.take_along_dim(chosen, dim=1).squeeze(1)
+    chosen = drawn_indices(x.shape[1], x.shape[0], generator, x.device)
+    return x.take_along_dim(chosen[:, None, None], dim=1).squeeze(1)
 
 
 def erase_state(x: Tensor, s: Tensor, *, centre: Tensor, radius: float | Tensor) -> Tensor:

@@ -18,16 +18,15 @@ from npa_envs.ops import splat, world_mean
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import ParticleTask, TaskConfig
 from npa_envs.tasks.checks import check_non_negative, check_positive, check_seed, check_text
+from npa_envs.tasks.seeds import drawn_indices
 from npa_envs.tasks.targets.clouds import (
     PointClouds,
     Split,
-    drawn_indices,
     load_clouds,
-    share_of_worlds,
     varied,
 )
 from npa_envs.tasks.train_config import TrainConfig, fast_run, tiny_run
-from npa_envs.world.randomness import Randomness
+from npa_envs.world.randomness import Randomness, uniform_draws
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -229,7 +228,8 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         if share == 0.0:
             return x, s, goal
         other, _, other_goal = self.seed_with_goals(len(x), generator=generator, device=x.device)
-        mutated = share_of_worlds(share, len(x), generator, x.device)
+        single = x.new_empty(0, dtype=torch.float32)
+        mutated = uniform_draws(generator, (len(x), 1), single)[:, 0] < share
         x = torch.where(mutated[:, None, None], other.to(x.dtype), x)
         return x, s, torch.where(mutated, other_goal, goal)
 

@@ -104,6 +104,15 @@ def uniform_box(
     return torch.stack([side * (share[..., d] - 0.5) for d, side in enumerate(sides)], dim=-1)
 
 
+def drawn_indices(
+    count: int, world_count: int, generator: Randomness | None, device: torch.device
+) -> Tensor:
+    """Return one random number below `count` for each world, int64, shape [B]."""
+    if isinstance(generator, WorldRandom):
+        return generator.integers(count, 1)[:, 0]
+    return torch.randint(count, (world_count,), generator=generator, device=device)
+
+
 def _check_points(number_count: int, dtype: torch.dtype) -> None:
     if dtype not in DTYPES:
         raise NPAError(f"dtype must be torch.float32 or torch.float64, got {dtype}")

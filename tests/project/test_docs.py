@@ -224,10 +224,23 @@ def test_the_other_code_about_own_environments_runs_as_it_says(ring, monkeypatch
     assert last == pytest.approx(float(told[2]), abs=2e-3)
 
 
-def test_the_code_about_training_runs(capsys):
-    (block,) = code_blocks(DOCS / "training.md")
-    exec(compile(block, "training.md", "exec"), {})
-    assert capsys.readouterr().out.startswith("random: ")
+@pytest.mark.parametrize("page", ["training", "textures", "point_classification", "morphogenesis3d"])
+def test_the_code_of_a_page_runs(page, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (block,) = code_blocks(DOCS / f"{page}.md")
+    names = {}
+    exec(compile(block, f"{page}.md", "exec"), names)
+    told = capsys.readouterr().out
+    if page == "training":
+        assert told.startswith("random: ")
+    elif page == "textures":
+        assert told.count("tensor([") == 2
+    elif page == "point_classification":
+        assert "AccuracyRow(step=8" in told
+        assert names["points"].shape == (1, 128, 2)
+    else:
+        assert [frame.shape for frame in names["frames"]] == [(256, 256, 3)] * 4
+        assert (tmp_path / "seed.ply").stat().st_size > 512 * 26 * 4
 
 
 def test_the_code_about_several_species_runs():
@@ -274,29 +287,6 @@ def test_the_code_about_ppo_runs(capsys):
     told = capsys.readouterr().out.splitlines()
     forms = ("ppo", "ppo_world")
     assert [line.split(":")[0] for line in told] == [form for form in forms for _ in range(3)]
-
-
-def test_the_code_about_3d_morphogenesis_runs(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (block,) = code_blocks(DOCS / "morphogenesis3d.md")
-    names = {}
-    exec(compile(block, "morphogenesis3d.md", "exec"), names)
-    assert [frame.shape for frame in names["frames"]] == [(256, 256, 3)] * 4
-    assert (tmp_path / "seed.ply").stat().st_size > 512 * 26 * 4
-
-
-def test_the_code_about_textures_runs(capsys):
-    (block,) = code_blocks(DOCS / "textures.md")
-    exec(compile(block, "textures.md", "exec"), {})
-    assert capsys.readouterr().out.count("tensor([") == 2
-
-
-def test_the_code_about_point_clouds_runs(capsys):
-    (block,) = code_blocks(DOCS / "point_classification.md")
-    names = {}
-    exec(compile(block, "point_classification.md", "exec"), names)
-    assert "AccuracyRow(step=8" in capsys.readouterr().out
-    assert names["points"].shape == (1, 128, 2)
 
 
 def test_the_code_of_the_readme_runs():

@@ -76,18 +76,16 @@ def test_a_killed_process_keeps_the_old_file(tmp_path: Path) -> None:
     assert target.read_bytes() == b"new"
 
 
-def test_missing_folder_is_named(tmp_path: Path) -> None:
-    with pytest.raises(NPAError, match=r"folder '.*nowhere' does not exist: create it first"):
-        write_bytes(tmp_path / "nowhere" / "a.bin", b"1")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_folder_is_no_target_and_a_file_is_no_folder(tmp_path: Path) -> None:
-    with pytest.raises(NPAError, match="that is a folder"):
-        write_bytes(tmp_path, b"1")
+def test_what_cannot_be_written_to_is_named(tmp_path: Path) -> None:
     (tmp_path / "plain").write_bytes(b"")
-    with pytest.raises(NPAError, match="is a file, not a folder"):
-        write_bytes(tmp_path / "plain" / "a.bin", b"1")
+    for path, message in (
+        (tmp_path, "that is a folder"),
+        (tmp_path / "plain" / "a.bin", "is a file, not a folder"),
+        (tmp_path / "no" / "a.bin", r"folder '.*no' does not exist: create it first"),
+    ):
+        with pytest.raises(NPAError, match=message):
+            write_bytes(path, b"1")
+    assert list(tmp_path.iterdir()) == [tmp_path / "plain"]
 
 
 def _fail_with(number: int) -> Any:
@@ -98,13 +96,26 @@ def _fail_with(number: int) -> Any:
     return refuse
 
 
-@pytest.mark.parametrize("number", [errno.EACCES, errno.EROFS])
-def test_no_permission_is_said(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+@pytest.mark.parametrize(
+    ("place", "name", "number", "message"),
+    [
+        (os, "open", errno.EACCES, r"cannot write .*a\.bin.*no write permission.*ls -ld"),
+        (os, "open", errno.EROFS, r"cannot write .*a\.bin.*no write permission.*ls -ld"),
+        (Path, "write_bytes", errno.ENOSPC, r"cannot write .*a\.bin.*disk is full.*nothing was"),
+        (os, "fsync", errno.ENOSPC, r"cannot write .*a\.bin.*disk is full.*nothing was changed"),
+        (os, "replace", errno.ENOSPC, r"cannot write .*a\.bin.*disk is full.*nothing was changed"),
+    ],
+)
+def test_what_the_system_refuses_is_said_and_keeps_the_old_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: Any, name: str, number: int, message: str
 ) -> None:
-    monkeypatch.setattr(os, "open", _fail_with(number))
-    with pytest.raises(NPAError, match=r"cannot write .*a\.bin.*no write permission.*ls -ld"):
-        write_bytes(tmp_path / "a.bin", b"1")
+    target = tmp_path / "a.bin"
+    target.write_bytes(b"old")
+    monkeypatch.setattr(place, name, _fail_with(number))
+    with pytest.raises(NPAError, match=message):
+        write_bytes(target, b"new")
+    assert target.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [target]
 
 
 @pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="root may write anywhere")
@@ -115,33 +126,6 @@ def test_a_read_only_folder_is_refused_before_any_work(tmp_path: Path) -> None:
             pytest.fail("the block must not run")
     finally:
         tmp_path.chmod(0o700)
-
-
-def test_disk_full_while_writing_keeps_the_old_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    target = tmp_path / "a.bin"
-    target.write_bytes(b"old")
-
-    def full(self: Path, data: bytes) -> int:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(Path, "write_bytes", full)
-    with pytest.raises(NPAError, match=r"cannot write .*a\.bin.*disk is full.*nothing was changed"):
-        write_bytes(target, b"new")
-    assert target.read_bytes() == b"old"
-    assert list(tmp_path.iterdir()) == [target]
-
-
-def test_disk_full_on_the_last_flush_keeps_the_old_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    target = tmp_path / "a.bin"
-    target.write_bytes(b"old")
-    monkeypatch.setattr(os, "fsync", _fail_with(errno.ENOSPC))
-    with pytest.raises(NPAError, match="disk is full"):
-        write_bytes(target, b"new")
-    assert target.read_bytes() == b"old"
 
 
 def test_a_real_full_disk_is_recognised_whatever_the_writer_raises(tmp_path: Path) -> None:

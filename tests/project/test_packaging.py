@@ -64,42 +64,29 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return work / "site"
 
 
-def test_wheel_puts_one_name_into_site_packages(site: Path) -> None:
+def test_wheel_holds_every_source_file_the_rules_and_the_license(site: Path) -> None:
+    sources = [p for kind in ("*.py", "*.cuh") for p in (ROOT / "npa_envs").rglob(kind)]
+    sources += (ROOT / "npa_envs/rule/shipped").glob("*.*")
+    mapped = [p for name in MAPPED_PACKAGES for p in (ROOT / name).rglob("*.py")]
+    expected = {"py.typed", *(p.relative_to(ROOT / "npa_envs").as_posix() for p in sources)}
+    expected |= {p.relative_to(ROOT).as_posix() for p in mapped}
+    package = site / "npa_envs"
+    built = {p.relative_to(package).as_posix() for p in package.rglob("*") if p.is_file()}
+    assert built == expected
     names = {p.name for p in site.iterdir() if not p.name.endswith(".dist-info")}
     assert names == {"npa_envs"}
-
-
-def test_wheel_holds_every_source_file_and_the_rules(site: Path) -> None:
-    sources = [p for kind in ("*.py", "*.cuh") for p in (ROOT / "npa_envs").rglob(kind)]
-    expected = {p.relative_to(ROOT).as_posix() for p in sources}
-    for name in MAPPED_PACKAGES:
-        expected |= {
-            f"npa_envs/{p.relative_to(ROOT).as_posix()}" for p in (ROOT / name).rglob("*.py")
-        }
-    expected |= {
-        f"npa_envs/rule/shipped/{p.name}" for p in (ROOT / "npa_envs/rule/shipped").glob("*.*")
-    }
-    expected.add("npa_envs/py.typed")
-    built = {p.relative_to(site).as_posix() for p in (site / "npa_envs").rglob("*") if p.is_file()}
-    assert built == expected
-
-
-def test_license_travels_with_the_wheel(site: Path) -> None:
     (license_file,) = site.glob("npa_envs-*.dist-info/licenses/LICENSE")
     assert license_file.read_bytes() == (ROOT / "LICENSE").read_bytes()
 
 
-def test_installed_package_imports_from_outside_the_checkout(site: Path, tmp_path: Path) -> None:
-    files = run_python(tmp_path, PRINT_FILES, search=site)
-    names = ["npa_envs", "npa_envs/envs", "npa_envs/wrappers", "npa_envs/agents"]
-    assert files == [str(site / name / "__init__.py") for name in names]
-
-
-def test_checkout_imports_from_its_root_after_a_plain_install(site: Path, tmp_path: Path) -> None:
-    checkout = copy_sources(tmp_path / "checkout")
-    files = run_python(checkout, PRINT_FILES, search=site)
-    names = ["npa_envs", "envs", "wrappers", "agents"]
-    assert files == [str(checkout / name / "__init__.py") for name in names]
+@pytest.mark.parametrize("installed", [True, False], ids=["installed", "from a checkout's root"])
+def test_all_packages_are_found_in_one_place(site: Path, tmp_path: Path, installed: bool) -> None:
+    """A checkout's own come first in its root, even after a plain install."""
+    place = site / "npa_envs" if installed else copy_sources(tmp_path / "checkout")
+    files = run_python(tmp_path if installed else place, PRINT_FILES, search=site)
+    first = place if installed else place / "npa_envs"
+    names = [first, place / "envs", place / "wrappers", place / "agents"]
+    assert files == [str(name / "__init__.py") for name in names]
 
 
 def test_folders_called_envs_in_site_packages_are_not_taken_for_ours(tmp_path: Path) -> None:

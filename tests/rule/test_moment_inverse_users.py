@@ -14,9 +14,6 @@ from npa_envs.envs import multispecies_v0
 from npa_envs.training import Trainer, load_config
 from npa_envs.training.trainer import initial_rule
 
-# Rules
-
-
 def strong_rule(device, dtype=torch.float64, **options):
     """A rule whose updates are large enough to matter."""
     torch.manual_seed(0)
@@ -71,11 +68,7 @@ def test_the_choice_is_saved_with_a_rule_and_files_without_it_mean_the_threshold
     assert npa_envs.load_rule(tmp_path / "plain.safetensors").moment_inverse == "threshold"
     assert b"moment_inverse" not in (tmp_path / "plain.safetensors").read_bytes()
     assert npa_envs.load_rule("gecko").moment_inverse == "threshold"
-
-
-def test_a_file_with_another_word_is_refused(tmp_path):
-    path = tmp_path / "rule.safetensors"
-    npa_envs.save_rule(npa_envs.NPARule(moment_inverse="smooth"), path)
+    path = tmp_path / "smooth.safetensors"
     path.write_bytes(path.read_bytes().replace(b'\\"smooth\\"', b'\\"smoosh\\"'))
     with pytest.raises(npa_envs.NPAError, match="got 'smoosh'"):
         npa_envs.load_rule(path)
@@ -86,9 +79,6 @@ def test_species_must_agree(device):
     rules = [npa_envs.NPARule(moment_inverse="smooth").to(device), npa_envs.NPARule().to(device)]
     with pytest.raises(npa_envs.NPAError, match="moment_inverse"):
         npa_envs.rollout_species(rules, x, s, 1, counts=(10, 10))
-
-
-# Training and environments
 
 
 def test_training_gives_its_rule_the_choice(tmp_path):

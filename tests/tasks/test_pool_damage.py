@@ -19,6 +19,17 @@ def changed(before, after):
     return (before != after).flatten(1).any(dim=1)
 
 
+@pytest.mark.parametrize("space_dim", [2, 3])
+def test_a_ball_of_states_is_erased_in_every_world(space_dim):
+    x, s = worlds(40, space_dim)
+    generator = torch.Generator().manual_seed(2)
+    found, states = hurt(x, s, PoolDamage(damage_radius=0.3), generator=generator)
+    assert found is x
+    for places, blank in zip(x, (states == 0.0).all(dim=-1), strict=True):
+        assert 0 < int(blank.sum()) < 150
+        assert float(torch.cdist(places[blank], places[blank]).max()) <= 0.6
+
+
 @pytest.mark.parametrize("what", ["clump_radius", "cut_gap", "flake_radius"])
 @pytest.mark.parametrize("space_dim", [2, 3])
 def test_a_quarter_of_the_worlds_is_hit(what, space_dim):

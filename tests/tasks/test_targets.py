@@ -1,5 +1,9 @@
+"""Targets of points: built-in drawings, and pictures cut out, scaled and read from files."""
+
 from __future__ import annotations
 
+import io
+import os
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +12,7 @@ import torch
 from PIL import Image, ImageDraw
 
 from npa_envs.errors import NPAError
+from npa_envs.tasks.targets.images import read_image, resample
 from npa_envs.tasks.targets.points import (
     PointTarget,
     builtin_targets,
@@ -116,15 +121,11 @@ def test_ring_runs_around_the_colour_wheel(builtins):
 
 @pytest.mark.parametrize("point_count", [64, 500, 1024, 4096, 16384])
 def test_point_count_is_met_within_one_percent(point_count):
-    target = target_from_image(disk_picture(), name="disk", point_count=point_count)
+    target = target_from_image(disk_picture(), name="disk", point_count=point_count, extent=1.0)
     assert abs(target.point_count - point_count) <= max(4, 0.01 * point_count)
-
-
-def test_pixel_size_follows_from_the_extent():
-    target = target_from_image(disk_picture(), name="disk", point_count=4096, extent=1.0)
-    diameter = 2 * (4096 / np.pi) ** 0.5
-    assert target.pixel_size == pytest.approx(1.0 / diameter, rel=0.02)
-    wider = target_from_image(disk_picture(), name="disk", point_count=4096, extent=2.0)
+    diameter = 2 * (point_count / np.pi) ** 0.5
+    assert 1.0 / target.pixel_size == pytest.approx(diameter, abs=1.4)
+    wider = target_from_image(disk_picture(), name="disk", point_count=point_count, extent=2.0)
     torch.testing.assert_close(wider.points, 2 * target.points)
 
 
@@ -148,36 +149,68 @@ def test_wide_picture_keeps_its_proportions():
     assert width == pytest.approx(1.8, abs=1e-4)
 
 
-def test_unknown_name_suggests_the_nearest():
-    with pytest.raises(NPAError, match=r"did you mean 'gecko'\?.*known: .*ring"):
-        load_target("gekco")
-    with pytest.raises(NPAError, match="built-in name"):
-        load_target("")
-    with pytest.raises(NPAError, match="string or a Path, got int"):
-        load_target(7)
-
-
-def test_a_path_object_is_never_a_builtin_name():
-    with pytest.raises(NPAError, match="does not exist"):
-        load_target(Path("gecko"))
-
-
 def test_an_existing_file_without_suffix_is_a_path(tmp_path, monkeypatch):
     disk_picture().save(tmp_path / "picture", format="PNG")
     monkeypatch.chdir(tmp_path)
     assert load_target("picture", point_count=100).name == "picture"
 
 
-@pytest.mark.parametrize("point_count", [0, -5, 2.5, True])
-def test_bad_point_count_is_a_clear_error(point_count):
-    with pytest.raises(NPAError, match="point_count must be an integer"):
-        load_target("heart", point_count=point_count)
+@pytest.mark.parametrize(
+    ("source", "options", "message"),
+    [
+        *(("heart", {"point_count": n}, "point_count must be an int") for n in (0, -5, 2.5, True)),
+        *(("heart", {"extent": n}, "extent must be finite") for n in (0.0, -1.0, np.nan, np.inf)),
+        ("gekco", {}, r"did you mean 'gecko'\?.*known: .*ring"),
+        ("", {}, "built-in name"),
+        (7, {}, "string or a Path, got int"),
+        # A path is never a built-in name.
+        (Path("gecko"), {}, "does not exist"),
+        ("nowhere.png", {}, "does not exist"),
+        (Path(__file__).parent, {}, "is a folder"),
+    ],
+)
+def test_sources_that_are_none_are_clear_errors(source, options, message):
+    with pytest.raises(NPAError, match=message):
+        load_target(source, **options)
 
 
-@pytest.mark.parametrize("extent", [0.0, -1.0, float("nan"), float("inf")])
-def test_bad_extent_is_a_clear_error(extent):
-    with pytest.raises(NPAError, match="extent must be finite"):
-        load_target("heart", extent=extent)
+def encoded(image: Image.Image, kind: str = "PNG", share: float = 1.0) -> bytes:
+    """The first part of a picture's file."""
+    buffer = io.BytesIO()
+    image.save(buffer, kind)
+    return buffer.getvalue()[: int(share * buffer.tell())]
+
+
+NOISE = Image.fromarray(np.random.default_rng(0).integers(0, 255, (50, 50, 3), dtype=np.uint8))
+BAD_PICTURES = {
+    "empty": (b"", "empty file"),
+    "text": (b"this is no picture, only text", "none that Pillow knows"),
+    **{
+        kind: (encoded(disk_picture("RGB", "white"), kind, 0.5), "truncated or damaged")
+        for kind in ("PNG", "JPEG", "WEBP")
+    },
+    "transparent": (
+        encoded(Image.new("RGBA", (20, 20), (255, 0, 0, 100))),
+        r"alpha above 0.5, the highest is 0.39",
+    ),
+    "busy border": (encoded(NOISE), r"one colour \(the background\).*transparent background"),
+    "plain": (encoded(Image.new("RGB", (50, 50), "white")), "one colour all over"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_PICTURES)
+def test_pictures_that_are_no_targets_are_clear_errors(tmp_path, case):
+    content, message = BAD_PICTURES[case]
+    path = tmp_path / "bad.png"
+    path.write_bytes(content)
+    with pytest.raises(NPAError, match=message) as caught:
+        load_target(path)
+    assert str(path) in str(caught.value)
+
+
+def test_a_picture_without_pixels_is_a_clear_error():
+    with pytest.raises(NPAError, match="0 x 5 pixels"):
+        target_from_image(Image.new("RGBA", (0, 5)), name="nothing")
 
 
 def test_loading_twice_gives_the_same_target(builtins):
@@ -186,3 +219,118 @@ def test_loading_twice_gives_the_same_target(builtins):
     assert torch.equal(again.colours, builtins["heart"].colours)
     assert again.pixel_size == builtins["heart"].pixel_size
     assert torch.equal(again.to("cpu").points, again.points)
+
+
+def test_colours_of_transparent_pixels_do_not_leak():
+    image = Image.new("RGBA", (400, 400), (255, 0, 255, 0))
+    ImageDraw.Draw(image).ellipse((50, 50, 350, 350), fill=(0, 255, 0, 255))
+    target = target_from_image(image, name="disk", point_count=700)
+    torch.testing.assert_close(
+        target.colours, torch.tensor([0.0, 1, 0]).expand_as(target.colours), atol=0.02, rtol=0
+    )
+
+
+def test_fine_pattern_of_a_large_picture_is_averaged():
+    board = (np.indices((1500, 1500)).sum(axis=0) % 2 * 255).astype(np.uint8)
+    image = Image.fromarray(np.stack([board] * 3 + [np.full_like(board, 255)], axis=-1))
+    target = target_from_image(image, name="board", point_count=2500)
+    assert (target.colours - 0.5).abs().max() < 0.03
+
+
+@pytest.mark.parametrize("side", [1, 2, 5])
+def test_tiny_picture_is_enlarged(side):
+    target = target_from_image(Image.new("RGBA", (side, side), BLUE), name="dot", point_count=1000)
+    assert abs(target.point_count - 1000) <= 60
+    assert (target.colours == torch.tensor([0.0, 0, 1])).all()
+
+
+def test_thin_lines_of_a_large_picture_survive():
+    image = Image.new("RGBA", (1200, 1200), (0, 0, 0, 0))
+    draw = ImageDraw.Draw(image)
+    for k in range(10):
+        draw.line((20, 60 + 120 * k, 1180, 60 + 120 * k), fill=RED, width=1)
+    found = np.asarray(resample(image, 500))[..., 3] >= 128
+    assert 250 < found.sum() < 20000
+
+
+@pytest.mark.parametrize("count", [1, 100, 1024])
+def test_line_too_thin_for_so_few_points_is_a_clear_error(tmp_path, count):
+    image = Image.new("RGBA", (4000, 3), (0, 0, 0, 0))
+    ImageDraw.Draw(image).line((0, 1, 3999, 1), fill=RED)
+    image.save(tmp_path / "line.png")
+    with pytest.raises(NPAError, match=f"'line' is too thin to be resampled to {count} points"):
+        load_target(tmp_path / "line.png", point_count=count)
+    assert load_target(tmp_path / "line.png", point_count=4000).point_count == 4000
+
+
+@pytest.mark.parametrize(
+    ("suffix", "options"), [("jpg", {"quality": 90}), ("webp", {}), ("bmp", {})]
+)
+def test_picture_without_transparency_is_cut_out_of_its_background(tmp_path, suffix, options):
+    path = tmp_path / f"disk.{suffix}"
+    disk_picture("RGB", "white").save(path, **options)
+    target = load_target(str(path), point_count=1000)
+    reference = target_from_image(disk_picture(), name="disk", point_count=1000)
+    assert target.pixel_size == pytest.approx(reference.pixel_size, rel=0.03)
+    assert (target.colours[:, 0] > 0.85).all()
+    assert (target.colours[:, 1:] < 0.25).float().mean() > 0.97
+
+
+def test_opaque_alpha_channel_counts_as_none(tmp_path):
+    disk_picture("RGBA", (255, 255, 255, 255)).save(tmp_path / "disk.png")
+    target = load_target(tmp_path / "disk.png", point_count=1000)
+    assert target.colours[:, 1].max() < 0.25
+
+
+def test_background_enclosed_by_the_object_stays(tmp_path):
+    image = Image.new("RGB", (100, 100), "white")
+    ImageDraw.Draw(image).ellipse((10, 10, 90, 90), fill="white", outline=RED, width=10)
+    image.save(tmp_path / "ring.png")
+    alpha = np.asarray(read_image(tmp_path / "ring.png"))[..., 3]
+    assert alpha[50, 50] == 255
+    assert alpha[2, 2] == 0
+
+
+def test_background_is_followed_around_corners(tmp_path):
+    image = Image.new("RGB", (90, 90), "white")
+    draw = ImageDraw.Draw(image)
+    for k in range(4):
+        draw.rectangle((10 + 20 * k, 8, 14 + 20 * k, 80), fill=BLUE)
+    draw.rectangle((10, 76, 74, 80), fill=BLUE)
+    draw.rectangle((70, 8, 86, 12), fill=BLUE)
+    draw.rectangle((82, 8, 86, 60), fill=BLUE)
+    image.save(tmp_path / "maze.png")
+    alpha = np.asarray(read_image(tmp_path / "maze.png"))[..., 3]
+    assert (alpha[np.asarray(image)[..., 0] == 255] == 0).all()
+
+
+def test_sixteen_bit_grey_is_scaled_not_clipped(tmp_path):
+    levels = np.full((40, 40), 65535, dtype=np.uint16)
+    levels[10:30, 10:30] = 16384
+    Image.fromarray(levels).save(tmp_path / "grey.png")
+    target = load_target(tmp_path / "grey.png", point_count=400)
+    assert (target.colours - 0.25).abs().max() < 0.02
+
+
+def test_picture_is_turned_as_its_exif_says(tmp_path):
+    image = Image.new("RGB", (80, 40), "white")
+    ImageDraw.Draw(image).rectangle((10, 10, 70, 30), fill=BLUE)
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    image.save(tmp_path / "turned.jpg", exif=exif)
+    assert read_image(tmp_path / "turned.jpg").size == (40, 80)
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root reads everything")
+def test_unreadable_picture_is_a_clear_error(tmp_path):
+    disk_picture().save(tmp_path / "secret.png")
+    (tmp_path / "secret.png").chmod(0)
+    with pytest.raises(NPAError, match="permissions"):
+        load_target(tmp_path / "secret.png")
+
+
+def test_decompression_bomb_is_a_clear_error(tmp_path, monkeypatch):
+    disk_picture().save(tmp_path / "bomb.png")
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 1000)
+    with pytest.raises(NPAError, match="at most 2000 pixels"):
+        load_target(tmp_path / "bomb.png")

@@ -20,7 +20,8 @@ from npa_envs.tasks.losses.texture import (
 from npa_envs.tasks.targets.textures import load_texture
 
 
-def random_weights():
+@pytest.fixture(scope="module")
+def weights():
     generator = torch.Generator().manual_seed(0)
     weights, index, channels = {}, 0, 3
     for group in VGG_WIDTHS:
@@ -32,11 +33,6 @@ def random_weights():
             index, channels = index + 2, width
         index += 1
     return weights
-
-
-@pytest.fixture(scope="module")
-def weights():
-    return random_weights()
 
 
 @pytest.fixture(scope="module")
@@ -90,13 +86,10 @@ def test_features_are_those_of_the_layers_as_torchvision_counts_them(weights):
     ]
     for a, b in zip(found, expected, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-5)
-
-
-def test_a_density_stands_for_all_three_colours(weights):
-    image = torch.rand(1, 1, 32, 32, generator=torch.Generator().manual_seed(1))
-    features = VGGFeatures(weights, (1,), image)
-    (grey,) = features(image.expand(1, 3, 32, 32), wrap=True)
-    assert torch.equal(features(image, wrap=True)[0], grey)
+    # A density stands for all three colours.
+    features, density = VGGFeatures(weights, (1,), images), images[:, :1]
+    (grey,) = features(density.expand(2, 3, 32, 32), wrap=True)
+    assert torch.equal(features(density, wrap=True)[0], grey)
 
 
 def test_transport_and_moments_equal_plain_arithmetic():
@@ -151,8 +144,12 @@ def test_without_gradient_no_image_depends_on_the_others(options):
     values = loss(images)
     for k in range(3):
         assert torch.equal(loss(images[k : k + 1]), values[k : k + 1])
-    with_gradient = loss(images.requires_grad_())
+    with_gradient = loss(images.clone().requires_grad_())
     torch.testing.assert_close(with_gradient.detach(), values, rtol=1e-4, atol=1e-5)
+    # Worlds of double precision are compared too.
+    double = loss(images.double())
+    assert double.dtype == torch.float64
+    torch.testing.assert_close(double.float(), values)
 
 
 def test_densities_and_targets_that_do_not_tile_are_compared_too(options):
@@ -165,51 +162,35 @@ def test_densities_and_targets_that_do_not_tile_are_compared_too(options):
     assert float(edged(density[None])) > 1e-3
 
 
-def test_worlds_of_double_precision_are_compared_too(options):
-    loss = make_texture_loss("vgg_ot", colours("cells"), options)
-    image = torch.rand(1, 3, 32, 32, generator=torch.Generator().manual_seed(1))
-    double = loss(image.double())
-    assert double.dtype == torch.float64
-    torch.testing.assert_close(double.float(), loss(image))
-
-
-def test_missing_weights_are_an_error_that_says_how_to_get_them(tmp_path, monkeypatch):
+def test_weights_are_looked_for_in_the_folder_of_downloads(tmp_path, monkeypatch):
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+    path = tmp_path / "checkpoints" / WEIGHTS_FILE
     with pytest.raises(NPAError) as caught:
         make_texture_loss("vgg_ot", colours("cells"))
-    message = str(caught.value)
     for part in (
-        str(tmp_path / "checkpoints" / WEIGHTS_FILE),
+        str(path),
         f"https://download.pytorch.org/models/{WEIGHTS_FILE}",
         "torch.hub.load_state_dict_from_url",
         "vgg_weights",
         "loss='patch_swd'",
     ):
-        assert part in message
-
-
-def test_weights_are_found_in_the_folder_of_downloads(tmp_path, monkeypatch):
-    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
-    (tmp_path / "checkpoints").mkdir()
-    torch.save({"features.0.bias": torch.ones(64)}, tmp_path / "checkpoints" / WEIGHTS_FILE)
+        assert part in str(caught.value)
+    path.parent.mkdir()
+    torch.save({"features.0.bias": torch.ones(64)}, path)
     assert torch.equal(load_vgg_weights()["features.0.bias"], torch.ones(64))
 
 
 def test_damaged_and_foreign_weights_are_refused(tmp_path, weights):
-    (tmp_path / "broken.pth").write_bytes(b"no weights")
-    torch.save([1, 2], tmp_path / "list.pth")
+    path = tmp_path / "bad.pth"
     short = {name: weight for name, weight in weights.items() if name != "features.7.weight"}
-    for name, content, message in (
-        ("broken.pth", None, "damaged or no torch file"),
-        ("list.pth", [1, 2], "must be a state dict, got list"),
-        ("short.pth", short, "must hold features.7.weight"),
+    for content, message in (
+        (None, "damaged or no torch file"),
+        ([1, 2], "must be a state dict, got list"),
+        (short, "must hold features.7.weight"),
     ):
-        if content is not None:
-            torch.save(content, tmp_path / name)
+        torch.save(content, path) if content else path.write_bytes(b"no weights")
         with pytest.raises(NPAError, match=message):
-            make_texture_loss(
-                "vgg_ot", colours("cells"), LossOptions(vgg_weights=str(tmp_path / name))
-            )
+            make_texture_loss("vgg_ot", colours("cells"), LossOptions(vgg_weights=str(path)))
 
 
 def test_wrong_targets_are_refused(options):

@@ -5,10 +5,12 @@ from __future__ import annotations
 import pytest
 import torch
 from circle_task import CircleTask, circle_config, plain_rollout
+from small_digits import write_idx
 from training_runs import Recording, make_cycle
 from worlds import assert_same
 
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
+from npa_envs.tasks.point_classification import PointClassification
 from npa_envs.training import preset
 
 needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
@@ -22,6 +24,14 @@ def circle_cycle(tmp_path, **fields):
 def tiny_cycle(tmp_path, **fields):
     config = preset("tiny", out=tmp_path, **fields)
     return make_cycle(config, Morphogenesis2D(config.task))
+
+
+def clouds_cycle(tmp_path, **fields):
+    """Worlds with goals, which mutate and are varied."""
+    data = {"data": str(write_idx(tmp_path / "idx")), "class_count": 3}
+    varied = {"mutated_share": 0.3, "rotation": 20.0, "stretch": 0.1, "jitter": 0.01}
+    config = preset("tiny", "point_classification", out=tmp_path, **data, **varied, **fields)
+    return make_cycle(config, PointClassification(config.task))
 
 
 def runaway():
@@ -40,6 +50,7 @@ def runaway():
         (circle_cycle, {}),
         (circle_cycle, {"dtype": "float64", "damage": False, "normalise_gradients": False}),
         (tiny_cycle, {}),
+        (clouds_cycle, {"steps": (2, 4), "pool_size": 10}),
     ],
 )
 def test_replayed_operations_train_the_same_rule_as_called_ones(tmp_path, make, fields):
@@ -51,6 +62,7 @@ def test_replayed_operations_train_the_same_rule_as_called_ones(tmp_path, make, 
             cycle.meter.send()
         assert replayed.meter.receive() == called.meter.receive()
         assert_same(replayed.batch.x0, called.batch.x0)
+        assert replayed.batch.goal is None or torch.equal(replayed.batch.goal, called.batch.goal)
         assert_same(replayed_rule.state_dict(), called_rule.state_dict())
     assert_same(replayed.state_dict(), called.state_dict())
     assert len(replayed._draw.recorded) > 5

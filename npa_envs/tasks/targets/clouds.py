@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.errors import MissingDependencyError, NPAError, suggest
-from npa_envs.world.randomness import Randomness, WorldRandom, normal_draws, uniform_draws
+from npa_envs.world.randomness import Randomness, normal_draws, uniform_draws
 
 Split = Literal["train", "test"]
 
@@ -230,31 +230,6 @@ def varied(
     if jitter > 0.0:
         x = x + jitter * normal_draws(generator, (world_count, particle_count, 2), x)
     return x
-
-
-def drawn_indices(
-    count: int, world_count: int, generator: Randomness, device: torch.device
-) -> Tensor:
-    """Return one random number below `count` for each world, int64, shape [B]."""
-    if isinstance(generator, WorldRandom):
-        return generator.integers(count, 1)[:, 0]
-    return torch.randint(count, (world_count,), generator=generator, device=device)
-
-
-def share_of_worlds(
-    share: float, world_count: int, generator: Randomness, device: torch.device
-) -> Tensor:
-    """Return for each world whether it is one of a random share, bool, shape [B].
-
-    Args:
-        share: Probability of each, in [0, 1].
-        world_count: Worlds B.
-        generator: Randomness, on `device`.
-        device: Where the numbers are made.
-    """
-    if isinstance(generator, WorldRandom):
-        return generator.uniform(1)[:, 0] < share
-    return torch.rand(world_count, generator=generator, device=device) < share
 
 
 # Pictures of digits with their classes.

@@ -17,6 +17,7 @@ from PIL import Image, ImageChops, ImageColor, ImageDraw
 from torch import Tensor
 
 from npa_envs.errors import NPAError, suggest
+from npa_envs.tasks.checks import check_count
 from npa_envs.tasks.targets.emoji import is_emoji, render_emoji
 from npa_envs.tasks.targets.images import (
     OPAQUE,
@@ -92,10 +93,7 @@ def load_target(
             few points, or a number is out of range.
         MissingDependencyError: An emoji is asked for, and no colour-emoji font is installed.
     """
-    if isinstance(point_count, bool) or not isinstance(point_count, int) or point_count < 1:
-        raise NPAError(
-            f"point_count must be an integer of at least 1, got {point_count!r}: try 4096"
-        )
+    check_count("point_count", point_count, ": try 4096")
     if not (math.isfinite(extent) and extent > 0):
         raise NPAError(f"extent must be finite and above 0 length units, got {extent!r}: try 1.8")
     name, image = load_target_image(source)

@@ -20,6 +20,7 @@ from PIL import ImageColor
 from torch import Tensor
 
 from npa_envs.errors import NPAError, suggest
+from npa_envs.tasks.checks import check_count
 from npa_envs.tasks.targets.images import (
     looks_like_path,
     open_image,
@@ -90,8 +91,7 @@ def load_texture(
             f"target must be a built-in texture or the path of a picture, got {source!r}: "
             "for example 'cells'"
         )
-    if isinstance(resolution, bool) or not isinstance(resolution, int) or resolution < 1:
-        raise NPAError(f"resolution must be an integer of at least 1, got {resolution!r}: try 128")
+    check_count("resolution", resolution, ": try 128")
     if isinstance(source, str) and source in PATTERNS:
         drawn = draw_pattern(source, resolution)
         return _target(source, drawn, True, device)

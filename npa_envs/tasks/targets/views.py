@@ -14,7 +14,7 @@ from torch import Tensor
 
 from npa_envs.errors import NPAError
 from npa_envs.ops import Cameras, cameras_of_poses, look_at, orbit
-from npa_envs.tasks.checks import is_real
+from npa_envs.tasks.checks import check_count, is_real
 from npa_envs.tasks.targets.images import open_image, scaled_square
 from npa_envs.tasks.targets.meshes import RADIUS, draw_mesh, load_mesh
 
@@ -92,8 +92,7 @@ def load_views(
         )
     counts = {"training_count": training_count, "held_out_count": held_out_count}
     for name, value in {"resolution": resolution, **counts}.items():
-        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-            raise NPAError(f"{name} must be an integer of at least 1, got {value!r}")
+        check_count(name, value)
     folder = Path(os.path.expanduser(source))
     if folder.is_dir():
         return read_nerf(folder, resolution, training_count, held_out_count).to(device)
