@@ -224,7 +224,9 @@ def test_the_other_code_about_own_environments_runs_as_it_says(ring, monkeypatch
     assert last == pytest.approx(float(told[2]), abs=2e-3)
 
 
-@pytest.mark.parametrize("page", ["training", "textures", "point_classification", "morphogenesis3d"])
+@pytest.mark.parametrize(
+    "page", ["training", "textures", "point_classification", "morphogenesis3d"]
+)
 def test_the_code_of_a_page_runs(page, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (block,) = code_blocks(DOCS / f"{page}.md")

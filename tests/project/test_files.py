@@ -107,7 +107,12 @@ def _fail_with(number: int) -> Any:
     ],
 )
 def test_what_the_system_refuses_is_said_and_keeps_the_old_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: Any, name: str, number: int, message: str
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    place: Any,
+    name: str,
+    number: int,
+    message: str,
 ) -> None:
     target = tmp_path / "a.bin"
     target.write_bytes(b"old")

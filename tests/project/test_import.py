@@ -52,5 +52,3 @@ def test_old_names_are_the_new_modules_and_nothing_within_them_runs_a_second_tim
     )
     refused = "no module npa_envs.sph.perceive: npa_envs.sph is now npa_envs.ops"
     assert run(program) == f"True True\n{refused}\n"
-
-

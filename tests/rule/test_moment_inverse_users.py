@@ -14,6 +14,7 @@ from npa_envs.envs import multispecies_v0
 from npa_envs.training import Trainer, load_config
 from npa_envs.training.trainer import initial_rule
 
+
 def strong_rule(device, dtype=torch.float64, **options):
     """A rule whose updates are large enough to matter."""
     torch.manual_seed(0)

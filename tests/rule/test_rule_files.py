@@ -18,12 +18,7 @@ from torch import Tensor
 from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule, rule_metadata, save_rule, shipped_rules
 from npa_envs.rule.rule import NPARule
-
-REFERENCE = Path(__file__).resolve().parents[3] / "shared" / "reference"
-AUBERGINE = REFERENCE / "authors_demo_aubergine.json"
-needs_reference = pytest.mark.skipif(
-    not AUBERGINE.is_file(), reason="the reference numbers are not beside the checkout"
-)
+from npa_envs.world.rollout import rollout
 
 RULES: dict[str, Callable[[], NPARule]] = {
     "plain 2D": lambda: NPARule(),
@@ -393,14 +388,11 @@ def test_an_unknown_name_suggests_a_shipped_rule(
     assert load_rule("gecko").hyper_parameters() == NPARule().hyper_parameters()
 
 
-@needs_reference
-def test_the_authors_aubergine_has_the_layout_that_its_rollout_shows() -> None:
+def test_the_authors_aubergine_has_the_layout_that_its_rollout_shows(reference: Path) -> None:
     """A wrong order of rows or columns moves particles by 0.3 and more in these eight steps."""
-    from npa_envs.world.rollout import rollout
-
-    rule = load_rule(f"{AUBERGINE}#aubergine").double()
+    rule = load_rule(f"{reference / 'authors_demo_aubergine.json'}#aubergine").double()
     assert (rule.eps0, rule.alpha, rule.state_dim, rule.hidden_dim) == (0.1, 0.5, 16, 128)
-    numbers = np.load(REFERENCE / "rollout_aubergine_8_steps.npz")
+    numbers = np.load(reference / "rollout_aubergine_8_steps.npz")
     x = torch.from_numpy(numbers["x0"])[None]
     s = torch.zeros(1, x.shape[1], 16, dtype=torch.float64)
     with torch.no_grad():

@@ -107,5 +107,3 @@ def test_scores_of_an_unknown_rule_are_refused():
     for name, message in (("geko", r"unknown rule 'geko'.*gecko"), (3, "unknown rule 3: known: b")):
         with pytest.raises(NPAError, match=message):
             scores(name)
-
-

@@ -8,11 +8,7 @@ import torch
 from npa_envs.errors import NPAError
 from npa_envs.tasks.damage import clump, cut, erase_state, random_particle
 
-
 B, N, C = 3, 257, 5
-
-
-
 
 
 @pytest.fixture(params=[(2, torch.float32), (3, torch.float64)], ids=["2d", "3d"])

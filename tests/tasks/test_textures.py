@@ -117,5 +117,3 @@ def test_bad_pictures_are_refused(tmp_path):
     ):
         with pytest.raises(NPAError, match=message):
             load_texture(tmp_path / name)
-
-

@@ -42,16 +42,12 @@ def test_pool_draws_different_worlds_and_all_of_them_in_the_long_run():
         counts[index] += 1
     # Each count is hypergeometric with mean 200 and standard deviation 8.2.
     assert (counts - 200).abs().max() < 41
-
-
-def test_pool_reads_copies():
-    pool = make_pool()
+    # What is read is a copy.
     x, s, _ = pool.read(torch.tensor([4, 2]))
     assert x[:, 0, 0].tolist() == [4, 2]
     x.zero_()
     s.zero_()
-    assert pool.x[4, 0, 0] == 4
-    assert pool.s[2, 0, 0] == 2
+    assert (pool.x[4, 0, 0], pool.s[2, 0, 0]) == (4, 2)
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 11.0, -11.0])
@@ -87,32 +83,24 @@ def test_gradient_that_is_not_finite_becomes_zero_and_its_neighbour_stays(bad, d
         assert gradient.tolist() == cleared
 
 
-def step_with(config, gradient_values):
+def test_first_step_of_each_repeat_has_the_full_learning_rate_and_fresh_moments(tmp_path):
+    config = circle_config(tmp_path, iterations=3, repeats=2, milestones=[1], decay=0.1)
+    path = []
     parameter = nn.Parameter(torch.zeros(1))
     optimiser = RuleOptimiser([parameter], config)
-    path = []
-    for iteration, value in enumerate(gradient_values):
+    for iteration, value in enumerate((1.0, 1.0, 1.0, -1.0)):
         parameter.grad = torch.tensor([value])
         optimiser.prepare_gradients()
         optimiser.step(iteration)
         path.append(parameter.item())
-    return path
-
-
-def test_first_step_of_each_repeat_has_the_full_learning_rate_and_fresh_moments(tmp_path):
-    config = circle_config(tmp_path, iterations=3, repeats=2, milestones=[1], decay=0.1)
-    path = step_with(config, [1.0, 1.0, 1.0, -1.0])
     # With fresh moments AdamW's first step is the learning rate, against the gradient's sign.
     assert path[0] == pytest.approx(-0.01, rel=1e-3)
     assert path[1] - path[0] == pytest.approx(-0.001, rel=1e-3)
     assert path[3] - path[2] == pytest.approx(0.01, rel=1e-3)
-
-
-def test_weight_decay_shrinks_weights_without_gradient(tmp_path):
-    parameter = nn.Parameter(torch.ones(1))
-    optimiser = RuleOptimiser([parameter], circle_config(tmp_path, weight_decay=0.5))
+    # Weights without gradient decay.
+    parameter, config = nn.Parameter(torch.ones(1)), circle_config(tmp_path, weight_decay=0.5)
     parameter.grad = torch.zeros(1)
-    optimiser.step(0)
+    RuleOptimiser([parameter], config).step(0)
     assert parameter.item() == pytest.approx(1 - 0.01 * 0.5)
 
 
@@ -158,14 +146,9 @@ def test_iteration_leaves_the_worlds_the_terms_and_the_gradients(tmp_path):
     for ours, parameter in zip(gradients, rule.parameters(), strict=True):
         assert ours.abs().max() > 0
         torch.testing.assert_close(ours, parameter.grad, rtol=1e-12, atol=0)
-
-
-def test_masks_differ_from_run_to_run(tmp_path):
-    _, _, iteration = make_iteration(circle_config(tmp_path))
+    # Masks differ from run to run.
     iteration.run(5)
-    first = iteration.x.clone()
-    iteration.run(5)
-    assert not torch.equal(first, iteration.x)
+    assert not torch.equal(iteration.x, x.detach())
 
 
 def test_a_parameter_outside_the_loss_gets_a_zero_gradient(tmp_path):
@@ -262,19 +245,69 @@ def test_a_cuda_device_must_be_there(monkeypatch):
     assert check_device("cpu") == torch.device("cpu") == check_device(torch.device("cpu"))
 
 
-def flip_a_byte(path, offset):
+def changed_byte(path):
+    save_checkpoint(path, {"pool": torch.zeros(1000)})
+    load_checkpoint(path)
     data = bytearray(path.read_bytes())
-    data[offset] ^= 1
+    data[data.index(bytes(4000)) + 2000] ^= 1
     path.write_bytes(data)
 
 
-def test_a_changed_byte_anywhere_in_a_checkpoints_tensors_is_noticed(tmp_path):
-    path = tmp_path / "checkpoint.pt"
+def truncated(path):
     save_checkpoint(path, {"pool": torch.zeros(1000)})
-    load_checkpoint(path)
-    flip_a_byte(path, path.read_bytes().index(bytes(4000)) + 2000)
-    with pytest.raises(NPAError, match=r"checkpoint\.pt' is not a checkpoint or is damaged"):
-        load_checkpoint(path)
+    path.write_bytes(path.read_bytes()[:-500])
+
+
+def other_zip(path):
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("a.txt", "text")
+
+
+def other_version(path):
+    save_checkpoint(path, {})
+    torch.save(torch.load(path, weights_only=True) | {"format_version": 99}, path)
+
+
+class Trap:
+    """Unpickling it would leave a file behind."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return self.path.with_name("ran").touch, ()
+
+
+DAMAGED = r"checkpoint\.pt' is not a checkpoint or is damaged"
+BAD_CHECKPOINTS = {
+    "garbage": (lambda path: path.write_bytes(b"x" * 100), DAMAGED),
+    "empty": (lambda path: path.write_bytes(b""), DAMAGED),
+    "truncated": (truncated, DAMAGED),
+    "a changed byte": (changed_byte, DAMAGED),
+    "another zip file": (other_zip, DAMAGED),
+    "code": (
+        lambda path: torch.save({"format": "npa-envs checkpoint", "trap": Trap(path)}, path),
+        DAMAGED,
+    ),
+    "another file of torch": (
+        lambda path: torch.save({"weights": torch.zeros(2)}, path),
+        "is not a checkpoint of npa-envs",
+    ),
+    "no version": (
+        lambda path: torch.save({"format": "npa-envs checkpoint"}, path),
+        "has checkpoint format None, this version reads 1",
+    ),
+    "another version": (other_version, "has checkpoint format 99, this version reads 1"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_CHECKPOINTS)
+def test_what_is_no_checkpoint_is_refused_and_never_run(tmp_path, case):
+    write, message = BAD_CHECKPOINTS[case]
+    write(tmp_path / "checkpoint.pt")
+    with pytest.raises(NPAError, match=message):
+        load_checkpoint(tmp_path / "checkpoint.pt")
+    assert [path.name for path in tmp_path.iterdir()] == ["checkpoint.pt"]
 
 
 @pytest.mark.parametrize("error", [IndexError, AttributeError, AssertionError, MemoryError])
@@ -284,19 +317,8 @@ def test_whatever_torch_raises_names_the_checkpoint(tmp_path, monkeypatch, error
 
     save_checkpoint(tmp_path / "checkpoint.pt", {})
     monkeypatch.setattr(torch, "load", fail)
-    with pytest.raises(NPAError, match=r"checkpoint\.pt' is not a checkpoint or is damaged"):
+    with pytest.raises(NPAError, match=DAMAGED):
         load_checkpoint(tmp_path / "checkpoint.pt")
-
-
-def test_a_zip_file_of_another_kind_is_no_checkpoint(tmp_path):
-    path = tmp_path / "checkpoint.pt"
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("a.txt", "text")
-    with pytest.raises(NPAError, match="is not a checkpoint or is damaged"):
-        load_checkpoint(path)
-    torch.save({"format": "npa-envs checkpoint"}, path)
-    with pytest.raises(NPAError, match="has checkpoint format None, this version reads 1"):
-        load_checkpoint(path)
 
 
 def complete_content(config):
