@@ -16,7 +16,8 @@ import pytest
 import torch
 from circle_task import CircleTask, circle_config, plain_rollout
 from PIL import Image
-from training_runs import Killed, KilledTask, assert_same, kill, log_of, train, trainer_of
+from training_runs import Killed, KilledTask, kill, log_of, train, trainer_of
+from worlds import assert_same
 
 import npa_envs
 from npa_envs.errors import NPAError
