@@ -61,43 +61,29 @@ def assert_near(values, expected, dtype):
         assert float((value.double() - right).abs().max()) <= ERRORS[dtype]
 
 
-def test_particles_follow_the_formula(world, dtype):
-    *moved, diverged = applied(*world)
-    assert_near(moved, formula(*world), dtype)
-    assert diverged.tolist() == [0] * B
-    step = (moved[0] - world[1]).norm(dim=-1)
-    assert float(step.max()) == pytest.approx(REACH * DT, rel=1e-5)
-
-
-def test_particles_outside_the_mask_stay_as_they_are(world, dtype, device):
+@pytest.mark.parametrize("moving", [True, False], ids=["moving", "static"])
+@pytest.mark.parametrize("noisy", [False, True], ids=["quiet", "noisy"])
+@pytest.mark.parametrize("masked", [False, True], ids=["all", "masked"])
+def test_particles_follow_the_formula(masked, noisy, moving, world, dtype):
+    """Outside the mask noise alone moves them, whatever their actions are."""
     action, x, s = world
-    mask = random_mask(x)
+    if not moving:
+        action = action[..., :C].contiguous()
+    mask = random_mask(x, 0.5 if masked else 1.0)
+    noise = 0.01 * torch.randn_like(x) if noisy else None
     idle = mask == 0
-    action = torch.where(idle[..., None], torch.nan, action)
-    *moved, diverged = applied(action, x, s, mask=mask)
-    assert_near(moved, formula(action.nan_to_num(), x, s, mask), dtype)
-    assert torch.equal(moved[0][idle], x[idle])
-    assert torch.equal(moved[1][idle], s[idle])
+    given = torch.where(idle[..., None], torch.nan, action)
+    options = {"noise": noise, "moving": moving}
+    *moved, diverged = applied(given, x, s, mask=mask if masked else None, **options)
+    assert_near(moved, formula(action, x, s, mask, **options), dtype)
     assert diverged.tolist() == [0] * B
-
-
-def test_noise_moves_every_particle(world, dtype, device):
-    action, x, s = world
-    mask = random_mask(x)
-    noise = 0.01 * torch.randn_like(x)
-    *moved, _ = applied(action, x, s, mask=mask, noise=noise)
-    assert_near(moved, formula(action, x, s, mask, noise), dtype)
-    assert torch.equal(moved[0][mask == 0], (x + noise)[mask == 0])
-
-
-def test_static_particles_change_their_states_alone(world, dtype, device):
-    action, x, s = world
-    action = action[..., :C].contiguous()
-    noise = 0.01 * torch.randn_like(x)
-    moved, changed, _ = applied(action, x, s, moving=False)
-    assert torch.equal(moved, x)
-    assert_near((changed,), formula(action, x, s, moving=False)[1:], dtype)
-    assert torch.equal(applied(action, x, s, moving=False, noise=noise)[0], x + noise)
+    resting = x if noise is None else x + noise
+    assert_same([value[idle] for value in moved], [resting[idle], s[idle]])
+    if not moving:
+        assert torch.equal(moved[0], resting)
+    elif not noisy:
+        step = (moved[0] - x).norm(dim=-1)
+        assert float(step.max()) == pytest.approx(REACH * DT, rel=1e-5)
 
 
 def test_positions_are_wrapped_into_the_box(world, dtype, device):
@@ -156,33 +142,20 @@ def test_values_beyond_their_limits_are_held_and_mark_their_world_alone(world, d
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-def test_actions_that_are_no_numbers_do_not_reach_the_worlds(world, device, bad):
+def test_actions_that_are_no_numbers_do_not_reach_the_worlds(world, bad):
     action, x, s = world
     expected = applied(action, x, s)
-    action = action.clone()
-    action[2, 9, 0] = bad
+    action[2, 9, 0] = action[0, 4, -1] = bad
     moved, changed, diverged = applied(action, x, s)
-    assert diverged.tolist() == [0, 0, 1]
-    # An infinite direction has no unit vector: inf / inf is not a number.
+    # An infinite direction has no unit vector, inf / inf is not a number; an infinite change of a
+    # state is clipped to the largest one.
+    finite = not math.isnan(bad)
+    assert diverged.tolist() == [int(not finite), 0, 1]
     assert moved[2, 9, 0] == 0.0
-    moved[2, 9] = expected[0][2, 9]
-    assert torch.equal(moved, expected[0])
-    assert torch.equal(changed, expected[1])
-
-
-def test_a_state_action_that_is_not_a_number_zeroes_that_state(world):
-    action, x, s = world
-    expected = applied(action, x, s)
-    action = action.clone()
-    action[0, 4, -1] = math.nan
-    action[1, 4, -1] = math.inf
-    moved, changed, diverged = applied(action, x, s)
-    assert diverged.tolist() == [1, 0, 0]
-    assert changed[0, 4, -1] == 0.0
-    # An infinite change is clipped to the largest one.
-    right = float(s[1, 4, -1]) + DT * STATE_SCALE
-    assert float(changed[1, 4, -1]) == pytest.approx(right, rel=1e-6)
-    assert torch.equal(moved, expected[0])
+    right = float(s[0, 4, -1]) + math.copysign(DT * STATE_SCALE, bad) if finite else 0.0
+    assert float(changed[0, 4, -1]) == pytest.approx(right, rel=1e-6)
+    moved[2, 9], changed[0, 4, -1] = expected[0][2, 9], expected[1][0, 4, -1]
+    assert_same((moved, changed), expected[:2])
 
 
 def test_noise_that_is_not_a_number_is_held_too(world):

@@ -112,14 +112,6 @@ def expected_pictures(gaussians, cameras, *, background=None, dilation=0.3):
     )
 
 
-def with_lists(gaussians, cameras, pairs_per_particle=0):
-    """Return what the operator behind `render_gaussians` gives: pictures, stops, lists of tiles."""
-    lens = (cameras.world_to_camera, cameras.intrinsics)
-    size = (cameras.width, cameras.height)
-    given = [t.detach() for t in gaussians]
-    return _gaussians(*given, *lens, *size, cameras.near, 0.3, pairs_per_particle)
-
-
 def pulled(gaussians, cameras, **options):
     """Return image, alpha and the gradients of both along random cotangents."""
     pictures = render_gaussians(*gaussians, cameras, **options)
@@ -167,9 +159,12 @@ def test_blocks_and_tiles_draw_the_same(name, device):
     """What CUDA draws with, beside what the CPU draws with."""
     gaussians, cameras = SCENES[name].of(torch.float32, device)
     means, *_, colours = gaussians
-    picture, _, passing, stops, footprints, *lists = with_lists(gaussians, cameras)
-    _, _, starts, owners, _ = lists
     size = (cameras.width, cameras.height)
+    given = [t.detach() for t in gaussians], cameras.world_to_camera, cameras.intrinsics
+    picture, _, passing, stops, footprints, *lists = _gaussians(
+        *given[0], *given[1:], *size, cameras.near, 0.3, 0
+    )
+    _, _, starts, owners, _ = lists
     frame = _frame(means, colours, cameras.world_to_camera, size, cameras.near, 0.3)
     drawn = [torch.full_like(t.view(stops.shape[0], -1), torch.nan) for t in (picture, passing)]
     ends = torch.empty_like(stops)
@@ -206,17 +201,6 @@ def single(mean, *, scale=(0.1, 0.1, 0.1), opacity=0.5, colour=(1.0, 0.5, 0.25),
         torch.tensor(values, **options)[None, None]
         for values in (mean, scale, (1.0, 0.0, 0.0, 0.0), opacity, colour)
     ]
-
-
-def test_a_gaussian_on_a_tile_border_is_the_same_on_both_sides(device):
-    """Its middle lies where four tiles meet: at pixel 16 across and down."""
-    gaussians = single((0.0, 0.0, 2.0), device=device)
-    image, alpha, _ = render_gaussians(*gaussians, frontal(32, 32, device=device))
-    assert float(alpha.max()) > 0.45
-    torch.testing.assert_close(image.flip(2), image, rtol=1e-12, atol=0.0)
-    torch.testing.assert_close(image.flip(3), image, rtol=1e-12, atol=0.0)
-    (expected, _) = expected_pictures([t.cpu() for t in gaussians], frontal(32, 32))
-    assert relative_error(image, expected) < PICTURE_BOUND[torch.float64]
 
 
 def test_a_gaussian_has_its_opacity_colour_and_place(device):
@@ -497,23 +481,6 @@ class TestRoom:
         assert bool(pictures.overflow.all())
         assert torch.equal(pictures.image, render_gaussians(*near, camera).image)
         assert float(full.alpha[..., 15:17].min(-1).values.max()) > 0.1
-
-    def test_pairs_are_sorted_by_tile_and_depth(self, device):
-        """Straight from the lists: no pair twice, each as near as the next or nearer."""
-        gaussians, cameras = self.scene.of(torch.float32, device)
-        *_, slots, starts, owners, places = with_lists(gaussians, cameras, 16)
-        motion = cameras.world_to_camera[0]
-        depths = (gaussians[0] @ motion[:3, :3].mT + motion[:3, 3])[..., 2].view(-1)
-        bounds = starts.tolist()
-        assert len(bounds) == 2 * 16 + 1
-        assert bounds[-1] > 100
-        for tile in range(32):
-            owned = owners[bounds[tile] : bounds[tile + 1]].long()
-            assert bool((owned // 40 == tile // 16).all())
-            assert bool((depths[owned].diff() > 0.0).all())
-        used = places[: bounds[-1]]
-        assert used.unique().numel() == bounds[-1]
-        assert bool((slots[owners[: bounds[-1]].long()] <= used).all())
 
 
 def test_a_gaussian_is_seen_from_the_near_plane_on(device):

@@ -143,16 +143,6 @@ def test_cotangents_may_lie_anywhere_in_memory(device):
     assert torch.equal(torch.autograd.grad(picture, x, shifted)[0], expected)
 
 
-@pytest.mark.parametrize("shift", [(12, 12), (0, 7), (23, -5)])
-def test_moving_all_particles_rolls_the_picture(shift, device):
-    x, colour = in_the_box(2, 200, torch.float64, device)
-    picture = periodic_splat(x, colour, **OPTIONS)
-    moved = x + torch.tensor(shift, dtype=x.dtype, device=device) * (2.0 / 24)
-    rolled = periodic_splat(moved, colour, **OPTIONS)
-    expected = picture.roll((shift[1], shift[0]), dims=(1, 2))
-    torch.testing.assert_close(rolled, expected, rtol=0.0, atol=1e-12)
-
-
 @both_pictures
 def test_every_particle_has_the_area_of_a_target_pixel(draw, device):
     """In an open picture inside the window, in a periodic one anywhere."""

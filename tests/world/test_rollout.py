@@ -79,77 +79,48 @@ def test_a_rule_of_the_authors_grows_its_picture(device, aubergine, reference):
         assert psnr >= 24.0, f"seed {seed}: {psnr:.1f} dB"
 
 
+def plain_rollout_without_moment(*args, **options):
+    """`plain_rollout` with the uncorrected state gradient."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(oracle, "MOMENT_THRESHOLD", float("inf"))
+        return plain_rollout(*args, **options)
+
+
 def pulled(values):
     """Return a random functional of values, of which some have no gradient."""
     return sum((bar * v).sum() for bar, v in zip(cotangents(values), values, strict=True))
 
 
+@pytest.mark.parametrize("update_prob", [1.0, 0.4])
 @pytest.mark.parametrize("static", [False, True])
 @pytest.mark.parametrize("box", [None, (1.4, 1.8)])
 @pytest.mark.parametrize("detach_positions", [True, False])
-def test_rollout_and_its_gradients_equal_plain_torch(box, detach_positions, static, device):
-    rule = lively_rule("cpu", static=static, moment_correction=False)
-    x, s = random_world(2, 40, 2, 5, dtype=torch.float64, device="cpu")
+def test_rollout_and_its_gradients_equal_plain_torch(
+    box, detach_positions, static, update_prob, device
+):
+    x, s = random_world(2, 60, 2, 5, dtype=torch.float64, device="cpu")
     options = {"eps": 0.3, "box": box, "dt": 0.7, "detach_positions": detach_positions}
-    x0, s0 = x.clone().requires_grad_(), s.clone().requires_grad_()
-    expected = plain_rollout_without_moment(rule, x0, s0, 4, **options)
-    inputs = [s0, *rule.parameters()] + ([] if static and detach_positions else [x0])
-    wanted = torch.autograd.grad(pulled(expected), inputs, allow_unused=True)
+    masks = None
+    if update_prob < 1.0:
+        generator = torch.Generator(device).manual_seed(9)
+        blank = torch.empty(2, 60, dtype=torch.uint8, device=device)
+        masks = [
+            blank.bernoulli_(update_prob, generator=generator).cpu().double() for _ in range(4)
+        ]
 
-    twin = lively_rule(device, static=static, moment_correction=False)
-    x1, s1 = x.to(device).requires_grad_(), s.to(device).requires_grad_()
-    found = npa_envs.rollout(twin, x1, s1, 4, update_prob=1.0, return_path_length=True, **options)
-    inputs = [s1, *twin.parameters()] + ([] if static and detach_positions else [x1])
-    gradients = torch.autograd.grad(pulled(found), inputs, allow_unused=True)
+    def run(rollout, device, **more):
+        rule = lively_rule(device, static=static, moment_correction=False)
+        start, states = (value.to(device).clone().requires_grad_() for value in (x, s))
+        found = rollout(rule, start, states, 4, **options, **more)
+        inputs = [states, *rule.parameters()] + ([] if static and detach_positions else [start])
+        return found, torch.autograd.grad(pulled(found), inputs, allow_unused=True)
+
+    expected, wanted = run(plain_rollout_without_moment, "cpu", masks=masks)
+    generator = torch.Generator(device).manual_seed(9)
+    more = {"update_prob": update_prob, "generator": generator, "return_path_length": True}
+    found, gradients = run(npa_envs.rollout, device, **more)
     assert_near(found, expected, 1e-12)
     for value, answer in zip(gradients, wanted, strict=True):
-        assert relative_error(value, answer) < 1e-11
-
-
-def plain_rollout_without_moment(rule, *args, **options):
-    """`plain_rollout` with the uncorrected state gradient."""
-    original = oracle.MOMENT_THRESHOLD
-    oracle.MOMENT_THRESHOLD = float("inf")
-    try:
-        return plain_rollout(rule, *args, **options)
-    finally:
-        oracle.MOMENT_THRESHOLD = original
-
-
-def test_update_masks_select_the_particles_that_change(device):
-    rule = lively_rule(device)
-    x, s = random_world(2, 500, 2, 5, dtype=torch.float64, device=device)
-    generator = torch.Generator(device).manual_seed(4)
-    after_x, after_s = npa_envs.step(rule, x, s, update_prob=0.3, generator=generator)
-    twin = torch.Generator(device).manual_seed(4)
-    mask = torch.empty(2, 500, dtype=torch.uint8, device=device).bernoulli_(0.3, generator=twin)
-    all_x, all_s = npa_envs.step(rule, x, s, update_prob=1.0)
-    changed = mask.bool()[..., None]
-    assert 0.2 < mask.double().mean() < 0.4
-    torch.testing.assert_close(after_x, torch.where(changed, all_x, x), rtol=1e-13, atol=1e-13)
-    torch.testing.assert_close(after_s, torch.where(changed, all_s, s), rtol=1e-13, atol=1e-13)
-
-
-def test_masked_gradients_equal_plain_torch(device):
-    rule = lively_rule(device, moment_correction=False)
-    x, s = random_world(2, 60, 2, 5, dtype=torch.float64, device=device)
-    generator = torch.Generator(device).manual_seed(9)
-    s1 = s.clone().requires_grad_()
-    options = {"update_prob": 0.4, "generator": generator, "return_path_length": True}
-    values = npa_envs.rollout(rule, x, s1, 3, eps=0.3, **options)
-    again = torch.Generator(device).manual_seed(9)
-    masks = [
-        torch.empty(2, 60, dtype=torch.uint8, device=device).bernoulli_(0.4, generator=again)
-        for _ in range(3)
-    ]
-    twin = lively_rule("cpu", moment_correction=False)
-    s0 = s.cpu().clone().requires_grad_()
-    expected = plain_rollout_without_moment(
-        twin, x.cpu(), s0, 3, eps=0.3, masks=[mask.cpu().double() for mask in masks]
-    )
-    got = torch.autograd.grad(sum(v.square().sum() for v in values), [s1, *rule.parameters()])
-    want = torch.autograd.grad(sum(v.square().sum() for v in expected), [s0, *twin.parameters()])
-    for value, answer in zip(got, want, strict=True):
         assert relative_error(value, answer) < 1e-11
 
 
@@ -181,39 +152,21 @@ def test_recomputing_gives_the_gradients_of_storing(device, monkeypatch):
     assert advanced == [5, 5 + 3, 5 + 4]
 
 
-def test_seeded_rollouts_are_bit_identical(device):
+def test_seeded_rollouts_are_bit_identical_also_step_by_step(device):
     rule = lively_rule(device, dtype=torch.float32)
     x, s = random_world(3, 300, 2, 5, dtype=torch.float32, device=device)
-    runs = []
-    for _ in range(2):
-        generator = torch.Generator(device).manual_seed(5)
-        runs.append(npa_envs.rollout(rule, x, s, 6, position_noise=0.01, generator=generator))
-    assert_same(*runs)
-    other = npa_envs.rollout(
-        rule, x, s, 6, position_noise=0.01, generator=torch.Generator(device).manual_seed(6)
-    )
-    assert not torch.equal(runs[0][0], other[0])
 
+    def run(seed):
+        generator = torch.Generator(device).manual_seed(seed)
+        return npa_envs.rollout(rule, x, s, 6, position_noise=0.01, generator=generator)
 
-def test_steps_one_by_one_equal_a_rollout(device):
-    rule = lively_rule(device)
-    x, s = random_world(1, 100, 2, 5, dtype=torch.float64, device=device)
-    generator = torch.Generator(device).manual_seed(2)
-    expected = npa_envs.rollout(rule, x, s, 4, generator=generator)
-    generator = torch.Generator(device).manual_seed(2)
-    for _ in range(4):
-        x, s = npa_envs.step(rule, x, s, generator=generator)
-    assert_same((x, s), expected)
-
-
-def test_particles_keep_their_identity(device):
-    """An untrained rule hardly moves anything, so particle i must stay where particle i was."""
-    rule = npa_envs.NPARule(2, 4, 8, eps0=0.2).to(device)
-    x, s = random_world(2, 400, 2, 4, dtype=torch.float32, device=device)
-    after_x, after_s = npa_envs.rollout(rule, x, 1e-3 * s, 3)
-    assert (after_x - x).abs().max() < 0.1
-    assert relative_error(after_x, x) < 0.1
-    assert (after_s - 1e-3 * s).abs().max() < 1.0
+    expected = run(5)
+    assert_same(run(5), expected)
+    assert not torch.equal(run(6)[0], expected[0])
+    generator, here = torch.Generator(device).manual_seed(5), (x, s)
+    for _ in range(6):
+        here = npa_envs.step(rule, *here, position_noise=0.01, generator=generator)
+    assert_same(here, expected)
 
 
 def test_position_noise_has_its_standard_deviation(device):
@@ -268,7 +221,6 @@ def test_rows_beyond_the_last_active_one_pull_nothing_back(device):
 @pytest.mark.parametrize("box", [None, 1.4])
 @pytest.mark.parametrize("moving", [True, False])
 @pytest.mark.parametrize("state_dim", [5, 16])
-@pytest.mark.parametrize("space_dim", [2, 3])
 def test_columns_that_nothing_reads_change_nothing(space_dim, state_dim, moving, box, device):
     """How wide a row is decides how many numbers are read and written at once."""
     x, s = random_world(3, 85, space_dim, state_dim, dtype=torch.float32, device=device)
@@ -280,7 +232,6 @@ def test_columns_that_nothing_reads_change_nothing(space_dim, state_dim, moving,
     rows = Rows(row_of, row_source, starts, row_base=255)
     width = state_dim + space_dim * moving
     update = torch.randn(120, width, generator=generator).to(device)
-    cotangents = [torch.randn(shape, generator=generator) for shape in (x.shape, s.shape, (3, 85))]
 
     def run(padding):
         padded = torch.nn.functional.pad(update, (0, padding), value=7.0).requires_grad_()
@@ -289,7 +240,7 @@ def test_columns_that_nothing_reads_change_nothing(space_dim, state_dim, moving,
         moved = update_particles(
             padded, x, s, path, rows=rows, reach=0.1, dt=0.7, moving=moving, box=sides
         )
-        (bar,) = torch.autograd.grad(moved, padded, [value.to(device) for value in cotangents])
+        (bar,) = torch.autograd.grad(moved, padded, cotangents(moved))
         assert (bar[:, width:] == 0).all()
         return *moved, bar[:, :width]
 
