@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from npa_envs.envs.multi.parallel import CrowdEnv, aec_env, clipped, register
+from npa_envs.envs.multi.parallel import CrowdEnv, in_turns, register
 from npa_envs.envs.multi.tasks import ENVIRONMENTS
 from npa_envs.envs.multi.vector import MultiSpeciesVectorEnv
 
@@ -209,12 +209,12 @@ def batched(
 
 def raw_env(task: str = "mixing", species_count: int = 2, **config: Any) -> Any:
     """Return `parallel_env` with species that act in turn, and the world after the last of them."""
-    return aec_env(parallel_env(task, species_count, **config))
+    return in_turns(parallel_env(task, species_count, **config))
 
 
 def env(task: str = "mixing", species_count: int = 2, **config: Any) -> Any:
     """Return `raw_env` with actions clipped into their spaces."""
-    return clipped(raw_env(task, species_count, **config))
+    return in_turns(parallel_env(task, species_count, **config), clips=True)
 
 
 for _id, _task in ENVIRONMENTS.items():

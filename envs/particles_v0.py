@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 from npa_envs.envs.core.config import plain
-from npa_envs.envs.multi.parallel import CrowdEnv, aec_env, clipped, register
+from npa_envs.envs.multi.parallel import CrowdEnv, in_turns, register
 from npa_envs.envs.multi.tasks import ENVIRONMENTS as OF_SPECIES
 from npa_envs.envs.multi.tasks import task_type
 from npa_envs.errors import NPAError
@@ -144,12 +144,12 @@ def parallel_env(task: str = "mixing", species_count: int = 2, **config: Any) ->
 
 def raw_env(task: str = "mixing", species_count: int = 2, **config: Any) -> Any:
     """Return `parallel_env` with particles that act in turn, and the world after the last one."""
-    return aec_env(parallel_env(task, species_count, **config))
+    return in_turns(parallel_env(task, species_count, **config))
 
 
 def env(task: str = "mixing", species_count: int = 2, **config: Any) -> Any:
     """Return `raw_env` with actions clipped into their spaces."""
-    return clipped(raw_env(task, species_count, **config))
+    return in_turns(parallel_env(task, species_count, **config), clips=True)
 
 
 for _id, _task in ENVIRONMENTS.items():

@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import gymnasium
+import numpy as np
+import torch
 
 from npa_envs.registration import ENVIRONMENTS
 
@@ -35,3 +37,17 @@ def make_vec(name: str, world_count: int, **keywords: Any) -> gymnasium.vector.V
         vectorization_mode="vector_entry_point",
         **small(name, **keywords),
     )
+
+
+def assert_same(left: Any, right: Any, where: str = "") -> None:
+    """Compare what steps and resets return, bit for bit: tuples and dicts of arrays or tensors."""
+    if isinstance(left, dict):
+        assert left.keys() == right.keys(), where
+        for key, value in left.items():
+            assert_same(value, right[key], f"{where}.{key}")
+    elif isinstance(left, tuple | list):
+        for k, (value, other) in enumerate(zip(left, right, strict=True)):
+            assert_same(value, other, f"{where}[{k}]")
+    else:
+        arrays = [v.cpu().numpy() if isinstance(v, torch.Tensor) else v for v in (left, right)]
+        assert np.array_equal(*arrays), where

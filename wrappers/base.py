@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.envs.core.single import NPAEnv
-from npa_envs.envs.core.vector import NPAVectorEnv
+from npa_envs.envs.core.vector import AUTORESET_MODES, NPAVectorEnv
 from npa_envs.errors import NPAError
 
 if TYPE_CHECKING:
@@ -27,16 +27,15 @@ else:
     AnyWrapper, AnyVectorEnv, AnyVectorWrapper = gymnasium.Wrapper, VectorEnv, VectorWrapper
 
 
+MAKE_VECTOR = "make it with gym.make_vec(..., vectorization_mode='vector_entry_point')"
+"""How an environment of many worlds is made, for errors."""
+
 VectorStep = tuple[Any, Any, Any, Any, dict[str, Any]]
 """Observations, rewards, terminations, truncations and infos of a step of many worlds."""
 
 
 def single_env(env: Any, wrapper: str) -> NPAEnv:
-    """Return the environment of this package that lies under wrappers.
-
-    Args:
-        env: A Gymnasium environment of one world.
-        wrapper: Name of the wrapper that needs it, for the error.
+    """Return the environment of this package that lies under wrappers, for a wrapper of that name.
 
     Raises:
         NPAError: It is none of this package, or a vector environment.
@@ -53,18 +52,14 @@ def single_env(env: Any, wrapper: str) -> NPAEnv:
 
 
 def vector_env(env: Any, wrapper: str) -> NPAVectorEnv:
-    """Return the vector environment of this package that lies under wrappers.
-
-    Args:
-        env: A Gymnasium vector environment.
-        wrapper: Name of the wrapper that needs it, for the error.
+    """Return the vector environment that lies under wrappers, likewise.
 
     Raises:
         NPAError: It is none of this package.
     """
     base = getattr(env, "unwrapped", None)
     if not isinstance(base, NPAVectorEnv):
-        cure = "make it with gym.make_vec(..., vectorization_mode='vector_entry_point')"
+        cure = MAKE_VECTOR
         if isinstance(base, NPAEnv) and wrapper.startswith("Vector"):
             cure = f"use {wrapper.removeprefix('Vector')} for a single environment"
         raise NPAError(
@@ -75,10 +70,6 @@ def vector_env(env: Any, wrapper: str) -> NPAVectorEnv:
 
 def torch_env(env: Any, adapter: str) -> NPAVectorEnv:
     """Return the vector environment under wrappers, for an adapter that keeps tensors it is given.
-
-    Args:
-        env: A Gymnasium vector environment.
-        adapter: Name of the adapter, for the error.
 
     Raises:
         NPAError: It is none of this package, hands out arrays, or overwrites what it handed out.
@@ -98,32 +89,15 @@ def torch_env(env: Any, adapter: str) -> NPAVectorEnv:
 
 
 def check_vector_env(env: Any, wrapper: str) -> None:
-    """Check that something is a vector environment of Gymnasium's.
-
-    Args:
-        env: What a wrapper was given.
-        wrapper: Name of the wrapper, for the error.
-
-    Raises:
-        NPAError: It is none.
-    """
+    """Check that what a wrapper was given is a vector environment of Gymnasium's."""
     if not isinstance(env, VectorEnv):
         raise NPAError(
-            f"{wrapper} needs a vector environment, got {type(env).__name__}: "
-            "make it with gym.make_vec(..., vectorization_mode='vector_entry_point')"
+            f"{wrapper} needs a vector environment, got {type(env).__name__}: {MAKE_VECTOR}"
         )
 
 
 def check_untouched(env: Any, wrapper: str) -> None:
-    """Check that the wrappers beneath leave observations as the environment gives them.
-
-    Args:
-        env: A wrapped environment of one world or of many.
-        wrapper: Name of the wrapper that is to lie there, for the error.
-
-    Raises:
-        NPAError: They have another space.
-    """
+    """Check that the wrappers beneath leave observations as the environment gives them."""
     name = "single_observation_space" if isinstance(env, VectorEnv) else "observation_space"
     here, there = getattr(env, name), getattr(env.unwrapped, name)
     if here != there:
@@ -134,28 +108,19 @@ def check_untouched(env: Any, wrapper: str) -> None:
 
 
 def autoreset_mode(env: AnyVectorEnv) -> AutoresetMode:
-    """Return what a vector environment does with worlds whose episodes are over.
-
-    Args:
-        env: The environment.
-    """
+    """Return what a vector environment does with worlds whose episodes are over."""
     return AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
 
 
+def check_autoreset(mode: AutoresetMode, word: str, rule: str) -> None:
+    """Check that an environment restarts worlds as an adapter needs it: by a mode, in words."""
+    if mode is not AUTORESET_MODES[word]:
+        raise NPAError(f"env must {rule}, got {mode}: make it with autoreset_mode={word!r}")
+
+
 def check_same_step(mode: AutoresetMode) -> None:
-    """Check that worlds restart by themselves, as rows have to.
-
-    Args:
-        mode: How the environment restarts worlds.
-
-    Raises:
-        NPAError: Not in the step that ends their episodes.
-    """
-    if mode is not AutoresetMode.SAME_STEP:
-        raise NPAError(
-            f"env must restart worlds in the step that ends their episodes, got {mode}: "
-            "make it with autoreset_mode='same-step'"
-        )
+    """Check that worlds restart by themselves, as rows have to."""
+    check_autoreset(mode, "same-step", "restart worlds in the step that ends their episodes")
 
 
 def as_tensor(values: Any) -> Tensor:
@@ -181,9 +146,8 @@ def world_indices(mask: NDArray[np.bool_], device: torch.device) -> Tensor:
 def own_rewards(infos: dict[str, Any]) -> Any:
     """Return each particle's reward of the last step, shape [B, N], or None where there is none.
 
-    Args:
-        infos: Of the step; with same-step autoreset worlds that restarted say in their final infos
-            what their last step was worth.
+    With same-step autoreset worlds that restarted say in their final infos what their last step
+    was worth.
     """
     own = infos.get("particle_reward")
     last = infos.get("final_info", {}).get("particle_reward")
@@ -194,25 +158,13 @@ def own_rewards(infos: dict[str, Any]) -> Any:
 
 
 def row_space(space: Any) -> Box:
-    """Return the space of one particle of a world's.
-
-    Args:
-        space: A box of shape [N, ...].
-    """
+    """Return the space of one particle of a world's, a box of shape [N, ...]."""
     assert isinstance(space, Box), "environments of this package have boxes"
     return Box(space.low[0], space.high[0], dtype=np.float32)
 
 
 def check_row_actions(actions: Any, *wanted: int) -> None:
-    """Check that there is an action for each row.
-
-    Args:
-        actions: What a library gives.
-        wanted: Rows, then the columns of an action.
-
-    Raises:
-        NPAError: They have another shape, which could be read as that of other rows.
-    """
+    """Check the shape of actions, which could else be read as those of other rows."""
     if tuple(np.shape(actions)) != wanted:
         raise NPAError(
             f"actions must have shape [rows, A] = {wanted}, got {tuple(np.shape(actions))}: "
@@ -246,11 +198,7 @@ class EpisodeClock:
         self.observed = np.ones(env.num_envs, dtype=bool)
 
     def reset(self, options: dict[str, Any] | None) -> None:
-        """Follow a reset.
-
-        Args:
-            options: What the environment was given; `reset_mask` says which worlds.
-        """
+        """Follow a reset; `reset_mask` among its options says of which worlds."""
         mask = None if options is None else options.get("reset_mask")
         self.restarted = np.ones_like(self.ended) if mask is None else to_host(mask).copy()
         self.observed = self.restarted
@@ -259,13 +207,7 @@ class EpisodeClock:
         self.ended = self.ended & ~self.restarted
 
     def step(self, terminations: Any, truncations: Any, infos: dict[str, Any]) -> None:
-        """Follow a step.
-
-        Args:
-            terminations: Of the step, bool, shape [B], arrays or tensors.
-            truncations: Likewise.
-            infos: Of the step.
-        """
+        """Follow a step, by what the environment returned: arrays or tensors, shape [B]."""
         self.observed = np.ones_like(self.ended)
         next_step = self._mode is AutoresetMode.NEXT_STEP
         self.restarted = self.ended if next_step else np.zeros_like(self.ended)
@@ -282,22 +224,14 @@ class EpisodeClock:
 
 
 class Observations(AnyWrapper):
-    """A wrapper of environments of one world that changes observations.
-
-    Args:
-        env: The environment.
-    """
+    """A wrapper of environments of one world that changes observations."""
 
     restarted = False
     """Whether the last observation is the first of an episode."""
 
     @abstractmethod
     def observations(self, observations: Any) -> Any:
-        """Return an observation changed.
-
-        Args:
-            observations: As it is, shape [N, P].
-        """
+        """Return an observation, shape [N, P], changed."""
 
     def new_ones(self, observations: Any) -> Any:
         """Return what the world gave; as that of `VectorObservations`."""
@@ -319,11 +253,7 @@ class Observations(AnyWrapper):
 
 
 class EpisodeWrapper(AnyVectorWrapper):
-    """A wrapper of vector environments that follows the worlds' episodes.
-
-    Args:
-        env: The vector environment.
-    """
+    """A wrapper of vector environments that follows the worlds' episodes."""
 
     def __init__(self, env: AnyVectorEnv) -> None:
         super().__init__(env)
@@ -355,11 +285,7 @@ class EpisodeWrapper(AnyVectorWrapper):
 
 
 class VectorObservations(EpisodeWrapper):
-    """A wrapper of vector environments that changes observations, the final ones included.
-
-    Args:
-        env: The vector environment.
-    """
+    """A wrapper of vector environments that changes observations, the final ones included."""
 
     @property
     def observation_space(self) -> Space[Any]:
@@ -373,11 +299,7 @@ class VectorObservations(EpisodeWrapper):
         self._observation_space = space
 
     def new_ones(self, observations: Any) -> Any:
-        """Return the observations of those worlds that gave new ones, shape [M, N, P].
-
-        Args:
-            observations: Of all worlds after a reset or a step, shape [B, N, P].
-        """
+        """Return, of all observations [B, N, P], those of worlds that gave new ones, [M, N, P]."""
         observed = self.clock.observed
         if observed.all():
             return observations
@@ -387,20 +309,13 @@ class VectorObservations(EpisodeWrapper):
 
     @abstractmethod
     def observations(self, observations: Any) -> Any:
-        """Return the observations of all worlds changed.
-
-        Args:
-            observations: As they are, shape [B, N, P].
-        """
+        """Return the observations of all worlds, shape [B, N, P], changed."""
 
     @abstractmethod
     def final_observations(self, observations: Any) -> Any:
-        """Return observations changed, of which those of ended episodes are the last ones.
+        """Return observations changed, [B, N, P], after `observations` of the same step.
 
-        Called after `observations` of the same step.
-
-        Args:
-            observations: As they are, shape [B, N, P].
+        Those of ended episodes are the last ones.
         """
 
     def after_reset(self, observations: Any, infos: dict[str, Any]) -> tuple[Any, dict[str, Any]]:

@@ -7,14 +7,13 @@ from typing import Any
 
 import numpy as np
 from gymnasium.spaces import Space
-from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from npa_envs.errors import NPAError
 from npa_envs.wrappers.base import (
     AnyVectorEnv,
     autoreset_mode,
+    check_autoreset,
     check_row_actions,
     own_rewards,
     row_space,
@@ -46,12 +45,9 @@ class ParticleRows(AnyVectorEnv):
 
     def __init__(self, env: AnyVectorEnv) -> None:
         base = vector_env(env, type(self).__name__)
-        mode = autoreset_mode(env)
-        if mode is not AutoresetMode.NEXT_STEP:
-            raise NPAError(
-                f"env must restart worlds in the step after the last one, got {mode}: "
-                "make it with autoreset_mode='next-step'"
-            )
+        check_autoreset(
+            autoreset_mode(env), "next-step", "restart worlds in the step after the last one"
+        )
         self.vector_env = env
         """The environment whose particles these are."""
         self.world_count = base.num_envs
@@ -130,11 +126,7 @@ class ParticleRows(AnyVectorEnv):
         return self.vector_env.render()
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Close the environment.
-
-        Args:
-            kwargs: What `close` was given.
-        """
+        """Close the environment."""
         self.vector_env.close(**kwargs)
 
     def _repeated(self, values: Any) -> NDArray[Any]:

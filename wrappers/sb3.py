@@ -93,10 +93,7 @@ class RowVecEnv(VecEnv):
         return outcome
 
     def step_async(self, actions: NDArray[Any]) -> None:
-        """Keep the actions for `step_wait`.
-
-        Args:
-            actions: Of each row, shape [B R, A].
+        """Keep the actions of all rows, shape [B R, A], for `step_wait`.
 
         Raises:
             NPAError: They have another shape, which could be read as that of other rows.
@@ -168,11 +165,7 @@ class RowVecEnv(VecEnv):
         return list(pictures or ())
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """Return an attribute of the environment, once for each row.
-
-        Args:
-            attr_name: Its name; wrappers are asked first.
-            indices: Which rows; None: all of them.
+        """Return an attribute of the environment, once for each row; wrappers are asked first.
 
         Raises:
             AttributeError: There is none of that name.
@@ -180,15 +173,10 @@ class RowVecEnv(VecEnv):
         return [getattr(self._holder(attr_name), attr_name)] * len(self._chosen(indices))
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Set an attribute of the environment.
-
-        Args:
-            attr_name: Its name; set where it is found, else in the innermost environment.
-            value: The value.
-            indices: None, or all rows: they share the environment.
+        """Set an attribute of the environment where it is found, else of the innermost one.
 
         Raises:
-            NPAError: Only some rows are chosen.
+            NPAError: Only some rows are chosen, which share one environment.
         """
         if len(set(self._chosen(indices))) != self.num_envs:
             raise NPAError("indices must be all rows, which share one environment: give None")
@@ -203,12 +191,6 @@ class RowVecEnv(VecEnv):
     ) -> list[Any]:
         """Call a method of the environment once, and return its result for each row.
 
-        Args:
-            method_name: Its name; wrappers are asked first.
-            method_args: Its arguments.
-            indices: Which rows; None: all of them.
-            method_kwargs: Its keyword arguments.
-
         Raises:
             AttributeError: There is none of that name.
         """
@@ -216,12 +198,7 @@ class RowVecEnv(VecEnv):
         return [result] * len(self._chosen(indices))
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
-        """Return for each row whether the environment is wrapped with a class.
-
-        Args:
-            wrapper_class: The class.
-            indices: Which rows; None: all of them.
-        """
+        """Return for each row whether the environment is wrapped with a class."""
         wrapped = any(isinstance(layer, wrapper_class) for layer in self._layers())
         return [wrapped] * len(self._chosen(indices))
 
@@ -243,11 +220,7 @@ class RowVecEnv(VecEnv):
 
 
 def on_host(*given: Any) -> list[NDArray[Any]]:
-    """Return new arrays with what arrays or tensors hold, after one wait for the device.
-
-    Args:
-        given: Arrays or tensors.
-    """
+    """Return new arrays with what arrays or tensors hold, after one wait for the device."""
     copies = []
     for values in given:
         tensor = as_tensor(values)

@@ -32,17 +32,7 @@ ASSIGNMENTS = ("blocks", "random")
 
 
 class SpeciesPlan:
-    """How many particles each species has, and which.
-
-    Args:
-        particle_count: Particles N.
-        species_count: Species K.
-        fractions: Share of each species, of any sum; None: equal shares.
-        assignment: "blocks" or "random".
-
-    Raises:
-        NPAError: An argument is wrong, or a species would have no particle.
-    """
+    """How many particles each species has, and which; arguments are those of `SpeciesTags`."""
 
     def __init__(
         self,
@@ -97,11 +87,7 @@ class SpeciesPlan:
         return blocks[keys.argsort(dim=1, stable=True)]
 
     def space(self, space: Space[Any], wrapper: str) -> Box:
-        """Return the space of observations with tags.
-
-        Args:
-            space: The space of the observations as they are, shape [N, P].
-            wrapper: Name of the wrapper that appends them, for the error.
+        """Return the space of observations with tags, for a wrapper of that name, by that without.
 
         Raises:
             NPAError: It has no row for each particle.

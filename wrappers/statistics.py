@@ -19,8 +19,11 @@ import torch
 from gymnasium.spaces import Box
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
 from torch import Tensor
 
+from npa_envs.envs.core.single import NPAEnv
+from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.errors import NPAError, suggest
 from npa_envs.tasks.checks import is_real, is_whole
 from npa_envs.world.actions import Physics
@@ -164,21 +167,19 @@ class PerceptionStatistics:
         scale = self._spread((self.moments.var + self.epsilon).rsqrt()).to(z)
         return like(((z - mean) * scale).clamp_(-self.clip, self.clip), observation)
 
-    def space(self, space: Box) -> Box:
-        """Return the space of normalised observations.
-
-        Args:
-            space: The space of the observations as they are.
+    def space(self, space: Any) -> Box:
+        """Return the space of normalised observations, by that of the observations as they are.
 
         Raises:
             NPAError: It holds more than perception.
         """
-        if len(space.shape) != 2 or space.shape[1] != self.perception_dim:
+        shape = (*(space.shape or ()),)
+        if len(shape) != 2 or shape[1] != self.perception_dim:
             raise NPAError(
                 f"observations must be perception vectors, shape [N, {self.perception_dim}], got "
-                f"shape {space.shape}: normalise before other wrappers change them"
+                f"shape {shape}: normalise before other wrappers change them"
             )
-        return Box(-self.clip, self.clip, space.shape, np.float32)
+        return Box(-self.clip, self.clip, shape, np.float32)
 
     def _spread(self, statistics: Tensor) -> Tensor:
         """Return the number of each entry of a perception vector, shape [P]."""
@@ -187,7 +188,7 @@ class PerceptionStatistics:
         return torch.cat((statistics[:centred], gradients))
 
 
-class _NormalizesPerception:
+class _NormalizesPerception(RecordConstructorArgs):
     """The part of both wrappers that keeps statistics of perception and normalises by them."""
 
     statistics: PerceptionStatistics
@@ -196,13 +197,13 @@ class _NormalizesPerception:
 
     def _choose_statistics(
         self,
-        physics: Physics,
+        base: NPAEnv | NPAVectorEnv,
         clip: float | None,
         epsilon: float | None,
         training: bool,
         statistics: PerceptionStatistics | None,
-    ) -> dict[str, Any]:
-        """Take the given statistics, or make new ones; return what a spec holds of them.
+    ) -> None:
+        """Take the given statistics, or make new ones for an environment of this package.
 
         Raises:
             NPAError: There are statistics and other numbers beside them, or one is wrong.
@@ -210,7 +211,7 @@ class _NormalizesPerception:
         named = (("clip", clip), ("epsilon", epsilon))
         given = {name: value for name, value in named if value is not None}
         if statistics is None:
-            statistics = PerceptionStatistics(physics, **given)
+            statistics = PerceptionStatistics(base.worlds.physics, **given)
         elif not isinstance(statistics, PerceptionStatistics):
             raise NPAError(
                 f"statistics must be those of another wrapper, got {type(statistics).__name__}: "
@@ -225,7 +226,9 @@ class _NormalizesPerception:
         if not isinstance(training, bool | np.bool_):
             raise NPAError(f"training must be True or False, got {training!r}")
         self.statistics, self.training = statistics, bool(training)
-        return {"clip": statistics.clip, "epsilon": statistics.epsilon, "training": training}
+        RecordConstructorArgs.__init__(
+            self, clip=statistics.clip, epsilon=statistics.epsilon, training=training
+        )
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return the statistics, for `torch.save` or safetensors."""
@@ -253,7 +256,7 @@ class _NormalizesPerception:
         return self.statistics.normalize(observations)
 
 
-class NormalizePerception(_NormalizesPerception, Observations, RecordConstructorArgs):
+class NormalizePerception(_NormalizesPerception, Observations):
     """Bring perception to one scale, by running statistics.
 
     The environment's spec holds how, and not the statistics: save those with `state_dict`.
@@ -284,15 +287,13 @@ class NormalizePerception(_NormalizesPerception, Observations, RecordConstructor
         training: bool = True,
         statistics: PerceptionStatistics | None = None,
     ) -> None:
-        physics = single_env(env, type(self).__name__).worlds.physics
-        recorded = self._choose_statistics(physics, clip, epsilon, training, statistics)
-        RecordConstructorArgs.__init__(self, **recorded)
-        super().__init__(env)
-        assert isinstance(env.observation_space, Box), "environments of this package have boxes"
+        base = single_env(env, type(self).__name__)
+        self._choose_statistics(base, clip, epsilon, training, statistics)
+        Observations.__init__(self, env)
         self.observation_space = self.statistics.space(env.observation_space)
 
 
-class VectorNormalizePerception(_NormalizesPerception, VectorObservations, RecordConstructorArgs):
+class VectorNormalizePerception(_NormalizesPerception, VectorObservations):
     """`NormalizePerception` for vector environments, of NumPy arrays or tensors on a device.
 
     Final observations are normalised and not counted, nor are those of worlds that a reset leaves
@@ -309,11 +310,9 @@ class VectorNormalizePerception(_NormalizesPerception, VectorObservations, Recor
         training: bool = True,
         statistics: PerceptionStatistics | None = None,
     ) -> None:
-        physics = vector_env(env, type(self).__name__).worlds.physics
-        recorded = self._choose_statistics(physics, clip, epsilon, training, statistics)
-        RecordConstructorArgs.__init__(self, **recorded)
-        super().__init__(env)
-        assert isinstance(env.single_observation_space, Box), "ours are boxes"
+        base = vector_env(env, type(self).__name__)
+        self._choose_statistics(base, clip, epsilon, training, statistics)
+        VectorObservations.__init__(self, env)
         self.single_observation_space = self.statistics.space(env.single_observation_space)
 
 
@@ -399,13 +398,9 @@ class TorchRecordEpisodeStatistics(EpisodeWrapper):
         }
         return {self._key: episode, f"_{self._key}": mask}
 
-    def _restart(self, worlds: Any) -> None:
-        if not worlds.any():
-            return
+    def _restart(self, worlds: NDArray[np.bool_]) -> None:
         self._began[worlds] = time.perf_counter()
-        if self.episode_returns is not None:
-            chosen = world_indices(worlds, self.episode_returns.device)
-            self.episode_returns = self.episode_returns.index_fill(0, chosen, 0.0)
+        self.episode_returns = forgotten(self.episode_returns, worlds)
 
 
 class TorchNormalizeObservation(VectorObservations):
@@ -480,7 +475,7 @@ class TorchNormalizeReward(EpisodeWrapper):
 
     def after_reset(self, observations: Any, infos: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
         """Forget the returns of the episodes before."""
-        self._forget(self.clock.restarted)
+        self.accumulated_reward = forgotten(self.accumulated_reward, self.clock.restarted)
         return observations, infos
 
     def after_step(self, outcome: VectorStep) -> VectorStep:
@@ -497,27 +492,20 @@ class TorchNormalizeReward(EpisodeWrapper):
         if self.update_running_mean and len(counted):
             var, mean = torch.var_mean(counted, dim=0, correction=0)
             self.return_rms.update(mean, var, len(counted))
-        self.accumulated_reward = returns
-        self._forget(clock.restarted)
+        self.accumulated_reward = forgotten(returns, clock.restarted)
         scale = (self.return_rms.var + self.epsilon).rsqrt().to(rewards)
         return observations, rewards * scale, terminations, truncations, infos
 
-    def _forget(self, worlds: Any) -> None:
-        if self.accumulated_reward is not None and worlds.any():
-            chosen = world_indices(worlds, self.accumulated_reward.device)
-            self.accumulated_reward = self.accumulated_reward.index_fill(0, chosen, 0.0)
+
+def forgotten(sums: Tensor | None, worlds: NDArray[np.bool_]) -> Tensor | None:
+    """Return sums of each world, shape [B], that begin anew at 0 in some of them."""
+    if sums is None or not worlds.any():
+        return sums
+    return sums.index_fill(0, world_indices(worlds, sums.device), 0.0)
 
 
 def check_tensor(values: Any, wrapper: str) -> None:
-    """Check that an environment hands out tensors.
-
-    Args:
-        values: What it handed out.
-        wrapper: The wrapper that asks, for the error.
-
-    Raises:
-        NPAError: It does not.
-    """
+    """Check that what an environment handed out to a wrapper is a tensor."""
     if not isinstance(values, Tensor):
         raise NPAError(
             f"{wrapper} needs torch tensors, got {type(values).__name__}: make the environment "
@@ -526,15 +514,7 @@ def check_tensor(values: Any, wrapper: str) -> None:
 
 
 def above_zero(name: str, value: float) -> float:
-    """Return a number that must be finite and greater than 0.
-
-    Args:
-        name: Its name, for the error.
-        value: The number.
-
-    Raises:
-        NPAError: It is not.
-    """
+    """Return a number that must be finite and greater than 0, by its name."""
     if not is_real(value) or value <= 0:
         raise NPAError(f"{name} must be a finite number greater than 0, got {value!r}")
     return float(value)

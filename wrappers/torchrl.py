@@ -6,11 +6,10 @@ from typing import Any
 
 import torch
 from gymnasium.spaces import Box
-from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
 from npa_envs.errors import MissingDependencyError, NPAError
-from npa_envs.wrappers.base import AnyVectorEnv, autoreset_mode, torch_env
+from npa_envs.wrappers.base import AnyVectorEnv, autoreset_mode, check_autoreset, torch_env
 
 try:
     from tensordict import TensorDict, TensorDictBase
@@ -50,12 +49,7 @@ class NPATorchRLEnv(EnvBase):  # type: ignore[misc]
 
     def __init__(self, env: AnyVectorEnv, *, rows: bool = False) -> None:
         base = torch_env(env, type(self).__name__)
-        mode = autoreset_mode(env)
-        if mode is not AutoresetMode.DISABLED:
-            raise NPAError(
-                f"env must leave restarts to TorchRL, got {mode}: "
-                "make it with autoreset_mode='disabled'"
-            )
+        check_autoreset(autoreset_mode(env), "disabled", "leave restarts to TorchRL")
         worlds, count = base.num_envs, base.config.particle_count
         batch = (worlds, count) if rows else (worlds,)
         super().__init__(device=base.worlds.x.device, batch_size=torch.Size(batch))
@@ -115,11 +109,7 @@ class NPATorchRLEnv(EnvBase):  # type: ignore[misc]
         self._first_seed = seed
 
     def close(self, *, raise_if_closed: bool = True) -> None:
-        """Close the environment.
-
-        Args:
-            raise_if_closed: Whether closing twice is an error, as for any of TorchRL's.
-        """
+        """Close the environment; twice is an error if wanted, as for any of TorchRL's."""
         super().close(raise_if_closed=raise_if_closed)
         self.vector_env.close()
 

@@ -281,12 +281,7 @@ class EnvConfig(WorldConfig):
     """Episodes start from one of so many worlds, made once; 0: from a fresh one each time."""
 
     def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            NPAError: A field has the wrong type or lies outside its range, or this machine does not
-                have the device.
-        """
+        """Check every field; as `WorldConfig`."""
         super().__post_init__()
         check_positive(self, int, "episode_steps")
         if self.success_loss is not None:

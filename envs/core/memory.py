@@ -16,7 +16,6 @@ OBSERVATION_COPIES = 4
 LARGEST_INDEX = 2**31 - 1
 """Kernels index the particles' states with 32 bits."""
 
-
 LISTED_BYTES = 320
 """What CUDA keeps of a particle's neighbours, at most: a list of 128, and what is sorted."""
 
@@ -61,17 +60,10 @@ def check_memory(
     device: torch.device,
     extra_bytes: int = 0,
 ) -> None:
-    """Check that worlds fit into a device's memory and into the kernels' indices.
-
-    Args:
-        world_count: Worlds B.
-        particle_count: Particles in each, N.
-        physics: The worlds' constants.
-        device: Where they shall live.
-        extra_bytes: What the task needs besides.
+    """Check that B worlds fit into a device's memory and into the kernels' indices.
 
     Raises:
-        NPAError: They do not.
+        NPAError: They do not, with what the task needs besides (`extra_bytes`).
     """
     what = f"{world_count} world(s) of {particle_count} particles"
     cure = "choose a smaller particle_count or fewer worlds"

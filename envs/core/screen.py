@@ -20,7 +20,6 @@ class Drawn(Protocol):
     """Worlds that can be drawn."""
 
     world_count: int
-    """Worlds B."""
 
     def pictures(self, count: int) -> NDArray[np.uint8]:
         """Return pictures of the first worlds, uint8, shape [count, R, R, 3]."""
@@ -54,11 +53,7 @@ class Screen:
         return self._worlds.pictures(self._worlds.world_count)
 
     def show(self, title: str) -> None:
-        """Show the worlds as they are, the first ones where they are many; only if "human".
-
-        Args:
-            title: What the window's bar says when it is opened.
-        """
+        """Show the worlds as they are, the first ones where they are many; only if "human"."""
         if self._config.render_mode != "human":
             return
         count, size = self._worlds.world_count, self._config.render_size

@@ -14,33 +14,18 @@ from npa_envs.world.actions import Physics
 
 
 def observation_space(physics: Physics, particle_count: int) -> Box:
-    """Return the space of a world's observations: float32, shape [N, P], ± the perception limit.
-
-    Args:
-        physics: The world's constants.
-        particle_count: Particles N.
-    """
+    """Return the space of a world's observations: float32, shape [N, P], ± the perception limit."""
     limit = physics.perception_limit
     return Box(-limit, limit, (particle_count, physics.perception_dim), np.float32)
 
 
 def action_space(physics: Physics, particle_count: int) -> Box:
-    """Return the space of a world's actions: float32, shape [N, A], in [-1, 1].
-
-    Args:
-        physics: The world's constants.
-        particle_count: Particles N.
-    """
+    """Return the space of a world's actions: float32, shape [N, A], in [-1, 1]."""
     return Box(-1.0, 1.0, (particle_count, physics.action_dim), np.float32)
 
 
 def to_output(tensor: Tensor, output: str) -> Any:
-    """Return a tensor as it is handed out.
-
-    Args:
-        tensor: Anything on the device.
-        output: "torch" or "numpy".
-    """
+    """Return a tensor as it is handed out: as it is for "torch", as an array for "numpy"."""
     return tensor if output == "torch" else tensor.cpu().numpy()
 
 
@@ -81,11 +66,7 @@ def action_tensor(
 
 
 def number_tensor(name: str, value: Any) -> Tensor:
-    """Return real numbers of any library as a dense tensor.
-
-    Args:
-        name: What the caller calls them.
-        value: The numbers.
+    """Return real numbers of any library, which the caller calls so, as a dense tensor.
 
     Raises:
         NPAError: They are none.

@@ -310,11 +310,7 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
 
 
 def checked_count(name: str, value: Any) -> int:
-    """Return a number of things, a whole number of at least 1.
-
-    Args:
-        name: What the caller calls it.
-        value: The number.
+    """Return what the caller calls so, a whole number of at least 1.
 
     Raises:
         NPAError: It is not.
@@ -349,11 +345,7 @@ def checked_mode(given: str | AutoresetMode) -> AutoresetMode:
 
 
 def worlds_to_reset(options: dict[str, Any] | None, world_count: int) -> NDArray[np.int64]:
-    """Return which worlds `reset` was asked to reset: those of the mask, or all.
-
-    Args:
-        options: What `reset` was given.
-        world_count: Worlds B.
+    """Return which of B worlds the options of `reset` ask for: those of the mask, or all.
 
     Raises:
         NPAError: The mask is no bool array of shape [B], or chooses no world.
@@ -386,11 +378,8 @@ def world_keys(
 ) -> Tensor:
     """Return the key of each world's randomness, int64, shape [B].
 
-    Args:
-        seed: Seed of the first world, each of the others has one more; or a seed for each; None
-            draws the keys.
-        world_count: Worlds B.
-        np_random: What keys are drawn from.
+    The seed is that of the first world, each of the others has one more; or there is one for each;
+    without any, keys are drawn from the generator.
 
     Raises:
         NPAError: Another number of seeds than of worlds, or a seed is negative.

@@ -84,12 +84,10 @@ class Batch:
         """One stream of randomness for each world."""
 
     def next_streams(self, worlds: Tensor, keys: Tensor | None) -> WorldRandom:
-        """Return the streams of randomness that some worlds' next episodes begin with.
+        """Return the streams of randomness that some worlds', [M], next episodes begin with.
 
-        Args:
-            worlds: Which, int64, shape [M].
-            keys: Keys of new streams, int64, shape [M], which begin with their first episode; None:
-                each world goes on to its next one.
+        Those with keys, int64, shape [M], are new and begin with their first episode; without, each
+        world goes on to its next one.
         """
         if keys is not None:
             return WorldRandom.from_keys(keys.to(self.device))
@@ -98,13 +96,7 @@ class Batch:
         return random
 
     def checked_particles(self, x: Any, s: Any, world_count: int, particle_count: int) -> Start:
-        """Return particles to be put into some worlds, float32 on the device.
-
-        Args:
-            x: Positions [length units], shape [M, N, D].
-            s: States, dimensionless, shape [M, N, C].
-            world_count: Worlds M.
-            particle_count: Particles N.
+        """Return particles to be put into M worlds of N, float32 on the device.
 
         Raises:
             NPAError: A shape is another one, or a number is not finite or beyond its limit.
@@ -224,11 +216,9 @@ class Worlds(Batch):
 
     @torch.no_grad()
     def start(self, worlds: Tensor, keys: Tensor | None = None) -> Start:
-        """Start episodes in some worlds and return their particles.
+        """Start episodes in some worlds, int64, shape [M], and return their particles.
 
-        Args:
-            worlds: Which, int64, shape [M].
-            keys: As for `next_streams`.
+        Keys are those of `next_streams`.
         """
         random = self.next_streams(worlds, keys)
         start = self.task.start(random)
@@ -248,12 +238,7 @@ class Worlds(Batch):
 
     @torch.no_grad()
     def place(self, worlds: Tensor, start: Start) -> None:
-        """Put particles into some worlds, at no reward.
-
-        Args:
-            worlds: Which, int64, shape [M].
-            start: Their particles.
-        """
+        """Put particles into some worlds, int64, shape [M], at no reward."""
         x, s = start.x.contiguous(), start.s.contiguous()
         task = self.task
         if self._aimed is not task:
@@ -277,20 +262,14 @@ class Worlds(Batch):
 
     @torch.no_grad()
     def perceive(self, out: Tensor | None = None) -> Tensor:
-        """Return what is perceived in all worlds as they are, shape [B, N, P].
-
-        Args:
-            out: Where to write it; a new tensor otherwise.
-        """
+        """Return what is perceived in all worlds as they are, shape [B, N, P], written to `out`."""
         return survey_worlds(self.x, self.s, self.physics).perceive(out)
 
     @torch.no_grad()
     def reseed(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
-        """Start some worlds anew within their episodes; the last step's pay and flags stay.
+        """Start some worlds, [M], anew within their episodes; the last step's pay and flags stay.
 
-        Args:
-            worlds: Which, shape [M].
-            observation: Where to write what is perceived in them, shape [B, N, P].
+        What is perceived in them is written into the observation of all, shape [B, N, P].
         """
         index = sent(worlds, self.x.device)
         paid, elapsed = self.report.copy(), self.elapsed.clone()
@@ -417,11 +396,7 @@ class Worlds(Batch):
         return endings & ~np.uint8(DIVERGED)
 
     def pictures(self, count: int) -> NDArray[np.uint8]:
-        """Return pictures of the first worlds, uint8, shape [count, R, R, 3].
-
-        Args:
-            count: How many.
-        """
+        """Return pictures of the first worlds, uint8, shape [count, R, R, 3]."""
         steps = self.elapsed[:count].cpu().numpy()
         pictures: NDArray[np.uint8] = self.task.draw(self.x[:count], self.s[:count], steps)
         return pictures
@@ -542,12 +517,7 @@ class Restarts:
         return self.__dict__ | {"_chunks": {}}
 
     def __call__(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
-        """Start the next episodes of some worlds.
-
-        Args:
-            worlds: Which, shape [M].
-            observation: Where to write what is perceived in them, shape [B, N, P].
-        """
+        """Start the next episodes of some worlds, [M], and write what is perceived, [B, N, P]."""
         if not self._recorded:
             self._start()(sent(worlds, self._device)).perceive(observation)
             return

@@ -56,12 +56,14 @@ class AgentsEnv:
         word = "particle" if by_particle else "species"
         self.possible_agents = [f"{word}_{k}" for k in range(worlds.agent_count)]
         """Names of the agents."""
-        counts = [span.stop - span.start for span in episodes.spans]
-        rows = [() if by_particle else (count,) for count in counts]
-        # Of observations and of actions, by agents.
-        self._spaces = agent_spaces(
-            worlds.physics, worlds.perception_dim, self.possible_agents, rows
-        )
+        limit = worlds.physics.perception_limit
+        self._observation_spaces: dict[str, Box] = {}
+        self._action_spaces: dict[str, Box] = {}
+        for agent, span in zip(self.possible_agents, episodes.spans, strict=True):
+            ahead = () if by_particle else (span.stop - span.start,)
+            seen, done = (*ahead, worlds.perception_dim), (*ahead, worlds.physics.action_dim)
+            self._observation_spaces[agent] = Box(-limit, limit, seen, np.float32)
+            self._action_spaces[agent] = Box(-1.0, 1.0, done, np.float32)
         self._state_space = state_space(worlds.physics, worlds.particle_count)
         self.np_random: np.random.Generator | None = None
         self._started = False
@@ -74,9 +76,7 @@ class AgentsEnv:
     def _next_keys(self, seed: int | Sequence[int] | None, first: int | None) -> Tensor | None:
         """Return keys of all worlds' randomness where it begins anew, [B], or None to go on.
 
-        Args:
-            seed: What `reset` was given.
-            first: What the generator of later keys begins with.
+        The seed is what `reset` was given; the generator of later keys begins with the first one.
         """
         if seed is None and self.np_random is not None:
             return None
@@ -100,34 +100,8 @@ class AgentsEnv:
         self._screen.show(f"{self.metadata['name']}: {self._task_name}")
 
 
-def agent_spaces(
-    physics: Physics, perception_dim: int, agents: Sequence[str], rows: Sequence[tuple[int, ...]]
-) -> tuple[dict[str, Box], dict[str, Box]]:
-    """Return the spaces of agents' observations and actions, float32.
-
-    Args:
-        physics: The world's constants.
-        perception_dim: Numbers that a particle perceives.
-        agents: Their names.
-        rows: What comes before the last dimension of each one's arrays: [N_k], or nothing.
-    """
-    limit = physics.perception_limit
-    observations: dict[str, Box] = {}
-    actions: dict[str, Box] = {}
-    for agent, ahead in zip(agents, rows, strict=True):
-        seen, done = (*ahead, perception_dim), (*ahead, physics.action_dim)
-        observations[agent] = Box(-limit, limit, seen, np.float32)
-        actions[agent] = Box(-1.0, 1.0, done, np.float32)
-    return observations, actions
-
-
 def state_space(physics: Physics, particle_count: int) -> Box:
-    """Return the space of [position ; state ; present] of all particles, [N, D + C + 1], float32.
-
-    Args:
-        physics: The world's constants.
-        particle_count: Particles that an episode starts with, N.
-    """
+    """Return the space of [position ; state ; present] of N particles, [N, D + C + 1], float32."""
     places = [physics.position_limit] * physics.space_dim
     high = np.array([*places, *[physics.state_limit] * physics.state_dim, 1.0], np.float32)
     low = np.append(-high[:-1], np.float32(0.0))

@@ -104,14 +104,9 @@ class Episodes:
             self._host_left = self._host_left.pin_memory()
 
     def start(self, worlds: NDArray[np.int64], keys: Tensor | None = None) -> Tensor:
-        """Start episodes in some worlds with all agents, and return what is perceived there.
+        """Start episodes in some worlds, [M], with all agents; return what is perceived, [M, N, P].
 
-        Args:
-            worlds: Which, shape [M].
-            keys: As for `SpeciesWorlds.start`.
-
-        Returns:
-            Shape [M, N, P].
+        Keys are those of `SpeciesWorlds.start`.
         """
         population = self.worlds.start(worlds, keys)
         parts, seen = self.worlds.opened(population)
@@ -232,12 +227,7 @@ class Account:
         self._at_start = self._carried = zeros
 
     def open(self, parts: Parts, worlds: Tensor) -> None:
-        """Begin episodes in some worlds.
-
-        Args:
-            parts: Of all agents there, shape [M, A] each.
-            worlds: Which worlds, int64, shape [M].
-        """
+        """Begin episodes in some worlds, int64, [M], by parts of all agents there, [M, A] each."""
         opened = _stacked(parts)
         if not self.part_names:
             self.part_names = tuple(parts)
@@ -250,11 +240,7 @@ class Account:
         self._carried = self._carried.index_fill(0, worlds, 0.0)
 
     def carry_over(self, parts: Parts) -> None:
-        """Count from other losses on, at no reward.
-
-        Args:
-            parts: Of all agents; of those that ended nobody asks.
-        """
+        """Count from other losses on, at no reward; of agents that ended nobody asks."""
         self._parts = self._before = _stacked(parts)
         loss = total(self._parts)
         self._carried = self._carried + (loss - self.loss)

@@ -46,7 +46,7 @@ class CrowdEnv(AgentsEnv, pettingzoo.ParallelEnv):  # type: ignore[misc]
 
     def __init__(self, task: str, keywords: dict[str, Any], *, by_particle: bool) -> None:
         super().__init__(task, keywords, 1, by_particle=by_particle)
-        self.observation_spaces, self.action_spaces = self._spaces
+        self.observation_spaces, self.action_spaces = self._observation_spaces, self._action_spaces
         self.state_space = self._state_space
         """Space of `state`: float32, shape [N, 2 + C + 1]."""
         self.agents: list[str] = []
@@ -216,22 +216,15 @@ class CrowdEnv(AgentsEnv, pettingzoo.ParallelEnv):  # type: ignore[misc]
             raise NPAError(f"agent must be one that exists, got {agent!r}: {hint}")
 
 
-def aec_env(parallel: Any) -> Any:
+def in_turns(parallel: Any, *, clips: bool = False) -> Any:
     """Return an environment as one in which agents act in turn, with PettingZoo's checks of order.
 
     Args:
         parallel: An environment in which all act at once.
+        clips: Whether actions are clipped into their spaces, which is then said.
     """
-    return parallel_to_aec(parallel)
-
-
-def clipped(raw: Any) -> Any:
-    """Return an environment of turns that clips actions into their spaces, and says so.
-
-    Args:
-        raw: What `aec_env` returned.
-    """
-    return OrderEnforcingWrapper(ClipOutOfBoundsWrapper(raw))
+    turns = parallel_to_aec(parallel)
+    return OrderEnforcingWrapper(ClipOutOfBoundsWrapper(turns)) if clips else turns
 
 
 def register(name: str, module: str, keywords: dict[str, Any]) -> None:

@@ -82,12 +82,7 @@ class SpeciesConfig(WorldConfig):
     "states" (hidden channels)."""
 
     def __post_init__(self) -> None:
-        """Check every field.
-
-        Raises:
-            NPAError: A field has the wrong type or lies outside its range, or this machine does not
-                have the device.
-        """
+        """Check every field; as `WorldConfig`."""
         super().__post_init__()
         check_positive(self, int, "species_count", "max_cycles")
         if self.species_count > LARGEST_COUNT:

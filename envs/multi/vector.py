@@ -81,7 +81,8 @@ class MultiSpeciesVectorEnv(AgentsEnv):
         super().__init__(task, config, self.world_count, by_particle=False)
         self.agents = self.possible_agents
         """The same: every species gets and gives arrays at all times."""
-        self.single_observation_spaces, self.single_action_spaces = self._spaces
+        self.single_observation_spaces = self._observation_spaces
+        self.single_action_spaces = self._action_spaces
         self.single_state_space = self._state_space
         """Space of one world's `state`: float32, shape [N, 2 + C + 1]."""
 

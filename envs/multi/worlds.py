@@ -83,12 +83,7 @@ class SpeciesWorlds(Batch):
 
     @torch.no_grad()
     def start(self, worlds: NDArray[np.int64], keys: Tensor | None = None) -> Population:
-        """Start episodes in some worlds, and return their particles.
-
-        Args:
-            worlds: Which, shape [M].
-            keys: As for `next_streams`.
-        """
+        """Start episodes in some worlds, [M], and return their particles."""
         self._disband()
         index = sent(worlds, self.device)
         random = self.next_streams(index, keys)
@@ -116,8 +111,7 @@ class SpeciesWorlds(Batch):
     def perceived(self, *, stepped: bool = False) -> Tensor:
         """Return what particles perceive, shape [B, N, P]; zeros where they or their world ended.
 
-        Args:
-            stepped: Nothing has changed since the last `act`.
+        `stepped` says, here and below, that nothing has changed since the last `act`.
         """
         if self.cohorts == [self._whole]:
             return self._whole.perceived(stepped=stepped)
@@ -129,11 +123,7 @@ class SpeciesWorlds(Batch):
 
     @torch.no_grad()
     def measured(self, *, stepped: bool = False) -> dict[str, Tensor]:
-        """Return the parts of every agent's loss, float32, shape [B, A]; 0 of those that ended.
-
-        Args:
-            stepped: Nothing has changed since the last `act`.
-        """
+        """Return the parts of every agent's loss, float32, shape [B, A]; 0 of those that ended."""
         found: dict[str, Tensor] = {}
         for cohort in self.cohorts:
             for name, part in (cohort.parts if stepped else cohort.measured()).items():
@@ -144,11 +134,7 @@ class SpeciesWorlds(Batch):
 
     @torch.no_grad()
     def opened(self, population: Population) -> tuple[dict[str, Tensor], Tensor]:
-        """Return losses, shape [M, A], and perception, shape [M, N, P], of worlds just started.
-
-        Args:
-            population: What `start` returned.
-        """
+        """Return losses, [M, A], and perception, [M, N, P], of worlds that `start` returned."""
         judge = self._judge
         return judge.measured(population, self._whole.columns), judge.perceived(population)
 
@@ -161,20 +147,12 @@ class SpeciesWorlds(Batch):
         return gone
 
     def remove(self, agents: NDArray[np.bool_]) -> None:
-        """Take agents' particles out of their worlds.
-
-        Args:
-            agents: Whose, shape [B, A].
-        """
+        """Take the particles of some agents, shape [B, A], out of their worlds."""
         self._disband()
         self.there &= ~agents
 
     def close(self, worlds: NDArray[np.bool_]) -> None:
-        """Let some worlds stay as they are until they start again.
-
-        Args:
-            worlds: Which, shape [B].
-        """
+        """Let some worlds, shape [B], stay as they are until they start again."""
         self._disband()
         self.open &= ~worlds
 
@@ -196,11 +174,7 @@ class SpeciesWorlds(Batch):
         there.s.copy_(placed.s)
 
     def population(self, world: int) -> Population:
-        """Return the particles that are in a world.
-
-        Args:
-            world: Its number.
-        """
+        """Return the particles that are in a world."""
         self._collect()
         columns = np.flatnonzero(self.there[world][self.owner])
         kind = self.species[columns]
@@ -218,11 +192,7 @@ class SpeciesWorlds(Batch):
         return torch.where(there, rows, 0.0)
 
     def pictures(self, count: int) -> NDArray[np.uint8]:
-        """Return pictures of the first worlds, uint8, shape [count, R, R, 3].
-
-        Args:
-            count: How many.
-        """
+        """Return pictures of the first worlds, uint8, shape [count, R, R, 3]."""
         return np.concatenate([self.task.draw(self.population(k)) for k in range(count)])
 
     @property
@@ -320,11 +290,7 @@ class Cohort:
         return self.__dict__ | {"_surveyed": None}
 
     def act(self, action: Tensor) -> None:
-        """Apply actions, and see what came of them; nothing waits for the device.
-
-        Args:
-            action: Finite, shape [M, N now, A].
-        """
+        """Apply finite actions, shape [M, N now, A], and see what came of them without waiting."""
         self._draw()
         self._actions.apply(action)
         self._look()
@@ -334,11 +300,7 @@ class Cohort:
         return self._judge.measured(self.population, self.columns)
 
     def perceived(self, *, stepped: bool = False) -> Tensor:
-        """Return what the particles perceive, shape [M, N now, P].
-
-        Args:
-            stepped: Nothing has changed since the last `act`.
-        """
+        """Return what the particles perceive, shape [M, N now, P]."""
         return self._judge.perceived(self.population, self._surveyed if stepped else None)
 
     def _look_around(self) -> None:
@@ -377,9 +339,7 @@ class Judge:
     def measured(self, population: Population, columns: Tensor) -> dict[str, Tensor]:
         """Return the parts of every agent's loss, float32, shape [M, A]; 0 of those that are gone.
 
-        Args:
-            population: Particles of M worlds.
-            columns: Their numbers, int64, shape [N now].
+        The numbers of the population's particles are its `columns`, int64, shape [N now].
         """
         if not self.by_particle:
             return dict(self.task.losses(population))
@@ -392,11 +352,8 @@ class Judge:
     def perceived(self, population: Population, surveyed: SurveyedWorlds | None = None) -> Tensor:
         """Return what particles perceive, by one pass for all species, shape [M, N now, P].
 
-        Telling species apart takes another one, again for all of them.
-
-        Args:
-            population: Particles of M worlds.
-            surveyed: The same worlds sorted, where they are already.
+        Telling species apart takes another one, again for all of them. Worlds that are surveyed
+        already are not sorted again.
         """
         x, s, physics = population.x, population.s, self.physics
         seen = (surveyed or survey_worlds(x, s, physics)).perceive()

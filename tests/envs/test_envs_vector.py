@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.vector import AutoresetMode
-from small_envs import IDS, make, make_vec
+from small_envs import IDS, assert_same, make, make_vec
 
 from npa_envs.errors import DivergedError, NPAError
 
@@ -79,14 +79,10 @@ def test_vector_equals_single_over_200_steps_with_autoresets(name, reward, where
 @every_id
 def test_world_does_not_depend_on_the_number_of_worlds(name, where):
     few, many = make_vec(name, 2, **where), make_vec(name, 9, **where)
-    left, _ = few.reset(seed=3)
-    right, _ = many.reset(seed=3)
-    assert np.array_equal(left, right[:2])
+    assert np.array_equal(few.reset(seed=3)[0], many.reset(seed=3)[0][:2])
     for action in batches(many, 10):
-        left, left_reward, *_ = few.step(action[:2])
-        right, right_reward, *_ = many.step(action)
-        assert np.array_equal(left, right[:2])
-        assert np.array_equal(left_reward, right_reward[:2])
+        left, right = few.step(action[:2]), many.step(action)
+        assert_same(left[:4], [value[:2] for value in right[:4]])
 
 
 @every_id
@@ -151,10 +147,7 @@ def test_what_was_handed_out_may_be_changed(name):
     right, _ = spoilt.reset(options={"reset_mask": mask})
     assert np.array_equal(left, right)
     assert list(left_infos["_loss"]) == [True, False, False]
-    left, right = kept.step(action), spoilt.step(action)
-    for one, other in zip(left[:4], right[:4], strict=True):
-        assert np.array_equal(one, other)
-    assert all(np.array_equal(left[4][key], right[4][key]) for key in left[4])
+    assert_same(kept.step(action), spoilt.step(action))
     x, s = kept.unwrapped.particles()
     left = kept.unwrapped.place_particles(x[1:2], s[1:2], worlds=[1])
     assert np.array_equal(left, kept.unwrapped.worlds.perceive())
@@ -199,15 +192,11 @@ def test_gymnasiums_own_batches_of_single_worlds_agree(name, mode):
     assert left_infos.keys() == right_infos.keys()
     for action in batches(ours, 11, scale=0.2):
         left, right = ours.step(action), theirs.step(action)
-        for one, other in zip(left[:4], right[:4], strict=True):
-            assert np.array_equal(one, other)
+        assert_same(left[:4], right[:4])
         assert ("final_obs" in left[4]) == ("final_obs" in right[4])
-        for key in right[4]:
-            if key == "final_obs":
-                both = zip(left[4][key], right[4][key], strict=True)
-                assert all(np.array_equal(one, other) for one, other in both)
-            elif not isinstance(right[4][key], dict):
-                assert np.array_equal(left[4][key], right[4][key]), key
+        for key, value in right[4].items():
+            if not isinstance(value, dict):
+                assert_same(list(left[4][key]), list(value), key)
 
 
 @every_id
@@ -255,13 +244,7 @@ def test_shared_arrays_hold_what_new_ones_would(name, mode):
     own.reset(seed=0)
     for action in batches(own, 8, scale=0.2):
         left, right = own.step(action), shared.step(action)
-        for one, other in zip(left[:4], right[:4], strict=True):
-            assert np.array_equal(one, other)
-        assert left[4].keys() == right[4].keys()
-        for key in left[4].keys() - {"final_info"}:
-            assert np.array_equal(left[4][key], right[4][key]), key
-        for key, value in left[4].get("final_info", {}).items():
-            assert np.array_equal(value, right[4]["final_info"][key]), key
+        assert_same(left, right)
         assert np.shares_memory(first, right[0])
     mask = {"reset_mask": np.array([True, False, True])}
     assert np.array_equal(own.reset(options=mask)[0], shared.reset(options=dict(mask))[0])
@@ -284,32 +267,35 @@ def test_bad_action_in_one_world_changes_none(name, where):
 def test_wrong_use_is_a_clear_error(name):
     envs = make_vec(name, 3)
     zeros = np.zeros((3, *envs.single_action_space.shape), np.float32)
-    with pytest.raises(NPAError, match="call reset first"):
-        envs.step(zeros)
-    with pytest.raises(NPAError, match="reset all of them first"):
-        envs.reset(options={"reset_mask": np.array([True, False, False])})
-    envs.reset(seed=0)
-    with pytest.raises(NPAError, match=r"action must be real numbers of shape \[B, N, A\]"):
-        envs.step(zeros[:2])
-    with pytest.raises(NPAError, match="reset_mask must be bool"):
-        envs.reset(options={"reset_mask": np.array([1, 0, 0])})
-    with pytest.raises(NPAError, match="reset_mask must choose"):
-        envs.reset(options={"reset_mask": np.zeros(3, bool)})
-    with pytest.raises(NPAError, match="seed must be one whole number, or one for each of 3"):
-        envs.reset(seed=[1, 2])
-    with pytest.raises(NPAError, match=r"seed must be one whole number.*got 1.5"):
-        envs.reset(seed=1.5)
-    with pytest.raises(NPAError, match="unknown reset option 'reset_masks': did you mean"):
-        envs.reset(options={"reset_masks": np.zeros(3, bool)})
-    with pytest.raises(NPAError, match="worlds must be indices below 3"):
+
+    def reset(mask):
+        return lambda: envs.reset(options={"reset_mask": np.array(mask)})
+
+    def placed_elsewhere():
         envs.unwrapped.place_particles(*envs.unwrapped.particles(), worlds=[0, 1, 3])
+
+    before = [
+        (lambda: envs.step(zeros), "call reset first"),
+        (reset([True, False, False]), "reset all of them first"),
+    ]
+    after = [
+        (lambda: envs.step(zeros[:2]), r"action must be real numbers of shape \[B, N, A\]"),
+        (reset([1, 0, 0]), "reset_mask must be bool"),
+        (reset([False] * 3), "reset_mask must choose"),
+        (lambda: envs.reset(seed=[1, 2]), "seed must be one whole number, or one for each of 3"),
+        (lambda: envs.reset(seed=1.5), r"seed must be one whole number.*got 1.5"),
+        (lambda: envs.reset(options={"reset_masks": 0}), "unknown reset option .*: did you mean"),
+        (placed_elsewhere, "worlds must be indices below 3"),
+        (lambda: make_vec(name, 0), "num_envs must be"),
+        (lambda: make_vec(name, 1, max_episode_steps=0), "max_episode_steps must be"),
+        (lambda: make_vec(name, 1, autoreset_mode="disable"), "did you mean 'disabled'"),
+    ]
+    for cases in (before, after):
+        for call, message in cases:
+            with pytest.raises(NPAError, match=message):
+                call()
+        envs.reset(seed=0)
     assert make_vec(name, np.int64(2), max_episode_steps=-1).num_envs == 2
-    with pytest.raises(NPAError, match="num_envs must be"):
-        make_vec(name, 0)
-    with pytest.raises(NPAError, match="max_episode_steps must be"):
-        make_vec(name, 1, max_episode_steps=0)
-    with pytest.raises(NPAError, match="did you mean 'disabled'"):
-        make_vec(name, 1, autoreset_mode="disable")
 
 
 @every_id
@@ -323,16 +309,6 @@ def test_each_world_has_its_picture(name):
     single.reset(seed=1)
     single.step(batches(envs, 1)[0][1])
     assert np.array_equal(pictures[1], single.render())
-
-
-@every_id
-def test_window_shows_worlds_side_by_side(name, monkeypatch):
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    envs = make_vec(name, 3, render_mode="human")
-    envs.reset(seed=0)
-    assert envs.render() is None
-    envs.close()
-    envs.close()
 
 
 @pytest.mark.gpu

@@ -10,6 +10,7 @@ from pettingzoo.test import api_test, parallel_api_test, render_test, seed_test
 from pettingzoo.test.max_cycles_test import max_cycles_test
 from pettingzoo.test.seed_test import parallel_seed_test
 from pettingzoo.test.state_test import state_test
+from small_envs import assert_same
 
 from npa_envs.envs import multispecies_v0, particles_v0
 from npa_envs.envs.multi import TASKS as TABLE
@@ -69,9 +70,7 @@ def test_thirty_steps_are_equal_for_equal_seeds_and_differ_for_others(task, kind
         first, again, other = (
             env.step(drawn(env, generator)) for env, generator in zip(envs, generators, strict=True)
         )
-        assert first[1:] == again[1:]
-        for name in first[0]:
-            assert np.array_equal(first[0][name], again[0][name])
+        assert_same(first, again)
         assert not np.array_equal(first[0][agent], other[0][agent])
     assert (envs[0].agents == []) == (task == "invasion")
     assert len(envs[0].agents) < len(envs[0].possible_agents)

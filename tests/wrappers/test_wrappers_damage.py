@@ -30,14 +30,10 @@ def episodes_of_one(seed, events, count=2, **keywords):
             yield observation, reward, info
 
 
-@pytest.mark.parametrize("text", ["100:cut", "0:erase:0.25", "7:noise:0.01"])
-def test_an_event_is_written_as_it_is_read(text):
-    assert str(parse_damage(text)) == text
-
-
-def test_an_event_without_a_size_has_the_usual_one():
-    assert parse_damage("5:clump").extent == 0.2
-    assert parse_damage("5:clump").text == "clump 0.2"
+def test_an_event_is_written_as_it_is_read_and_has_the_usual_size_without_one():
+    for text in ("100:cut", "0:erase:0.25", "7:noise:0.01"):
+        assert str(parse_damage(text)) == text
+    assert (parse_damage("5:clump").extent, parse_damage("5:clump").text) == (0.2, "clump 0.2")
     assert DamageEvent(5, "clump", 0.3).extent == 0.3
 
 
@@ -178,6 +174,8 @@ def test_a_stack_tells_of_worlds_that_only_one_of_its_wrappers_damaged(output):
     observations, *_, infos = envs.step(policy(observations))
     assert infos["_loss_damage"].tolist() == [True, True, True]
     assert all(infos["loss_damage"].tolist())
+    assert isinstance(infos["loss_damage"], torch.Tensor) == (output == "torch")
+    assert isinstance(observations, torch.Tensor) == (output == "torch")
 
 
 @pytest.mark.parametrize(
@@ -263,15 +261,6 @@ def test_reused_buffers_show_the_same():
     assert all((reward != 0).all() for reward in ways[0][1::3])
     for one, other in zip(*ways, strict=True):
         np.testing.assert_array_equal(one, other)
-
-
-def test_torch_environments_give_tensors():
-    envs = VectorDamageEvents(batched(output="torch"), "1:cut")
-    observations, _ = envs.reset(seed=0)
-    observations, _, _, _, infos = envs.step(policy(observations))
-    assert isinstance(observations, torch.Tensor)
-    assert infos["loss_damage"].shape == (3,)
-    assert infos["_loss_damage"].tolist() == [True] * 3
 
 
 def test_the_spec_says_what_is_done():

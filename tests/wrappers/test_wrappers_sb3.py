@@ -10,12 +10,13 @@ import pytest
 import torch
 import wrapped_envs
 from crowds import small
-from wrapped_envs import ACTIONS, SMALL, STEPS, policy
+from small_envs import assert_same
+from wrapped_envs import ACTIONS, STEPS, policy
 
 import npa_envs
 from npa_envs.agents.learning import Problem
 from npa_envs.envs import multispecies_v0, particles_v0
-from npa_envs.errors import MissingDependencyError, NPAError
+from npa_envs.errors import NPAError
 from npa_envs.wrappers import VectorDamageEvents, VectorNormalizePerception, VectorSpeciesTags
 
 sb3 = pytest.importorskip("stable_baselines3")
@@ -29,16 +30,17 @@ from npa_envs.wrappers import (  # noqa: E402
     WorldVecEnv,
 )
 
-EITHER_ADAPTER = pytest.mark.parametrize("adapter", [ParticleVecEnv, WorldVecEnv])
-
 
 def batched(count=2, **keywords):
     return wrapped_envs.batched(count, **{"reward": "particle", **keywords})
 
 
-@EITHER_ADAPTER
-def test_rows_are_those_of_the_worlds_in_order(adapter):
-    rows, envs = adapter(batched()), batched()
+@pytest.mark.parametrize(
+    ("adapter", "reward"),
+    [(ParticleVecEnv, "particle"), (ParticleVecEnv, "dense"), (WorldVecEnv, "particle")],
+)
+def test_rows_are_those_of_the_worlds_in_order(adapter, reward):
+    rows, envs = adapter(batched(reward=reward)), batched(reward=reward)
     each = 64 if adapter is ParticleVecEnv else 1
     assert rows.num_envs == 2 * each
     shapes = ((66,), (ACTIONS,)) if each == 64 else ((64, 66), (64, ACTIONS))
@@ -53,18 +55,19 @@ def test_rows_are_those_of_the_worlds_in_order(adapter):
         np.testing.assert_array_equal(seen, observation.reshape(-1, *shapes[0]))
         assert done.all() == done.any() == truncations.all() == (step % STEPS == 0)
         last = vector_infos.get("final_info", vector_infos)
-        paid = last["particle_reward"].reshape(-1) if each == 64 else team
+        own = each == 64 and reward == "particle"
+        paid = last["particle_reward"].reshape(-1) if own else np.repeat(team, each)
         np.testing.assert_array_equal(rewards, paid)
+        assert rewards.dtype == np.float32
         assert (rewards != 0).any()
         if not done.any():
             assert infos == [{}] * rows.num_envs
             continue
         final = vector_infos["final_obs"].reshape(-1, *shapes[0])
         for row in (0, each - 1, each, 2 * each - 1):
-            np.testing.assert_array_equal(infos[row]["terminal_observation"], final[row])
-            assert infos[row]["TimeLimit.truncated"] is True
-            assert infos[row]["is_success"] is False
-            assert len(infos[row]) == 3
+            np.testing.assert_array_equal(infos[row].pop("terminal_observation"), final[row])
+            assert infos[row] == {"TimeLimit.truncated": True, "is_success": False}
+            infos[row]["terminal_observation"] = final[row]
 
 
 def test_rows_of_finished_worlds_alone_have_infos_and_a_terminal_observation():
@@ -82,7 +85,7 @@ def test_rows_of_finished_worlds_alone_have_infos_and_a_terminal_observation():
     assert [bool(info) for info in infos] == done.tolist()
 
 
-@EITHER_ADAPTER
+@pytest.mark.parametrize("adapter", [ParticleVecEnv, WorldVecEnv])
 def test_success_is_no_time_limit(adapter):
     rows = adapter(batched(success_loss=1e6))
     seen = rows.reset()
@@ -93,44 +96,23 @@ def test_success_is_no_time_limit(adapter):
     assert infos[1]["terminal_observation"].shape == seen[1].shape
 
 
-def test_a_team_reward_goes_to_every_particle():
-    rows, envs = ParticleVecEnv(batched(reward="dense")), batched(reward="dense")
-    rows.seed(0)
-    seen, _ = rows.reset(), envs.reset(seed=0)
-    _, rewards, _, _ = rows.step(policy(seen))
-    _, team, *_ = envs.step(policy(seen).reshape(2, 64, ACTIONS))
-    np.testing.assert_array_equal(rewards, np.repeat(team, 64))
-    assert rewards.dtype == np.float32
-
-
-@pytest.mark.parametrize("output", ["numpy", "torch"])
-def test_what_was_handed_out_is_not_overwritten(output):
-    rows = ParticleVecEnv(batched(copy=False, output=output))
-    seen = rows.reset()
-    kept, copies = [seen], [seen.copy()]
-    for _ in range(STEPS + 1):
-        seen, rewards, _, _ = rows.step(policy(seen))
-        kept += [seen, rewards]
-        copies += [seen.copy(), rewards.copy()]
-    for array, copy in zip(kept, copies, strict=True):
-        np.testing.assert_array_equal(array, copy)
-
-
-def test_torch_environments_give_the_same_rows():
+def test_tensors_give_the_same_rows_as_arrays_and_none_is_overwritten():
     ways = []
     for output in ("numpy", "torch"):
-        rows = ParticleVecEnv(batched(output=output))
+        rows = ParticleVecEnv(batched(copy=False, output=output))
         rows.seed(7)
         seen = rows.reset()
-        way = [seen]
+        way, copies = [seen], [seen.copy()]
         for _ in range(STEPS + 2):
             seen, rewards, done, infos = rows.step(policy(seen))
-            way += [seen, rewards, done]
+            given = [seen, rewards, done]
             if done.any():
-                way.append(np.stack([info["terminal_observation"] for info in infos]))
+                given.append(np.stack([info["terminal_observation"] for info in infos]))
+            way += given
+            copies += [array.copy() for array in given]
+        assert_same(way, copies)
         ways.append(way)
-    for one, other in zip(*ways, strict=True):
-        np.testing.assert_array_equal(one, other)
+    assert_same(*ways)
 
 
 def test_without_bootstrapping_an_end_is_an_end():
@@ -190,17 +172,6 @@ def test_wrappers_beneath_are_seen():
     np.testing.assert_array_equal(seen[:, 66:].argmax(axis=1), envs.species.reshape(-1))
 
 
-@pytest.mark.parametrize("mode", ["next-step", "disabled"])
-def test_other_autoreset_modes_are_refused(mode):
-    with pytest.raises(NPAError, match="autoreset_mode='same-step'"):
-        ParticleVecEnv(batched(autoreset_mode=mode))
-
-
-def test_other_environments_are_refused():
-    with pytest.raises(NPAError, match="vector_entry_point"):
-        ParticleVecEnv(gym.make("npa/Morphogenesis2D-v0", **SMALL))
-
-
 def test_monitor_and_normalize_work_on_top():
     rows = VecNormalize(VecMonitor(ParticleVecEnv(batched())), gamma=0.9)
     rows.seed(0)
@@ -251,18 +222,6 @@ def test_species_stand_one_after_the_other_in_a_world():
         np.testing.assert_array_equal(rewards, paid.numpy())
     assert done.all()
     np.testing.assert_array_equal(infos[1]["terminal_observation"], told["final_obs"][1].numpy())
-
-
-def test_worlds_without_a_row_for_each_particle_are_refused():
-    with pytest.raises(NPAError, match="single_observation_space of env must be a box with a row"):
-        WorldVecEnv(wrapped_envs.single())
-
-
-def test_actions_of_another_shape_are_refused_by_worlds():
-    rows = WorldVecEnv(batched())
-    rows.reset()
-    with pytest.raises(NPAError, match=r"got \(2, 63, 18\)"):
-        rows.step(np.zeros((2, 63, ACTIONS), np.float32))
 
 
 # Particles of several species as rows
@@ -381,30 +340,67 @@ def test_tensors_give_the_same_rows(device):
         assert all(np.array_equal(a, b) for a, b in zip(mine[:3], theirs[:3], strict=True))
 
 
-def test_what_belongs_to_no_batch_of_species_is_refused():
-    with pytest.raises(NPAError, match=r"env must be a batch of worlds .* got MultiSpeciesEnv"):
-        SpeciesVecEnv(multispecies_v0.parallel_env(**small("mixing")))
-    with pytest.raises(NPAError, match="make it with autoreset_mode='same-step'"):
-        SpeciesVecEnv(batch(autoreset_mode="disabled"))
-    with pytest.raises(NPAError, match="others must name species, got 'species_7'"):
-        SpeciesVecEnv(batch(), others={"species_7": still})
-    with pytest.raises(NPAError, match="others must leave at least one species"):
-        SpeciesVecEnv(batch(), others={"species_0": still, "species_1": still})
-    with pytest.raises(NPAError, match="species must be one whose particles are rows"):
-        SpeciesVecEnv(batch(), others={"species_0": still}).policy(None, "species_0")
-    with pytest.raises(NPAError, match=r"got object for 'species_0': RowPolicy\(model\) makes one"):
-        SpeciesVecEnv(batch(), others={"species_0": object()})
-
-
-def test_rows_need_worlds_and_an_action_each():
-    rows = SpeciesVecEnv(batch(**DEADLY), others={"species_1": still})
-    with pytest.raises(NPAError, match="step needs worlds: call reset first"):
-        rows.step(np.zeros((6, 18)))
+def rows_of(adapter, envs, **keywords):
+    """An adapter that has been reset."""
+    rows = adapter(envs(), **keywords)
     rows.reset()
-    # As many numbers as wanted, but of twelve rows.
-    with pytest.raises(NPAError, match=r"\[rows, A\] = \(6, 18\), got \(12, 9\): one for each row"):
-        rows.step(np.zeros((12, 9)))
-    assert rows.step(np.zeros((6, 18)))[1].shape == (6,)
+    return rows
+
+
+OTHER = {"others": {"species_1": still}}
+
+
+@pytest.mark.parametrize(
+    ("use", "message"),
+    [
+        (lambda: ParticleVecEnv(batched(autoreset_mode="next-step")), "autoreset_mode='same-step'"),
+        (lambda: ParticleVecEnv(batched(autoreset_mode="disabled")), "autoreset_mode='same-step'"),
+        (lambda: SpeciesVecEnv(batch(autoreset_mode="disabled")), "autoreset_mode='same-step'"),
+        (lambda: ParticleVecEnv(wrapped_envs.single()), "vector_entry_point"),
+        (
+            lambda: WorldVecEnv(wrapped_envs.single()),
+            "single_observation_space of env must be a box with a row",
+        ),
+        (
+            lambda: rows_of(WorldVecEnv, batched).step(np.zeros((2, 63, ACTIONS), np.float32)),
+            r"got \(2, 63, 18\)",
+        ),
+        # As many numbers as wanted, but of twelve rows.
+        (
+            lambda: rows_of(SpeciesVecEnv, lambda: batch(**DEADLY), **OTHER).step(
+                np.zeros((12, 9))
+            ),
+            r"\[rows, A\] = \(6, 18\), got \(12, 9\): one for each row",
+        ),
+        (
+            lambda: SpeciesVecEnv(batch(**DEADLY), **OTHER).step(np.zeros((6, 18))),
+            "step needs worlds: call reset first",
+        ),
+        (
+            lambda: SpeciesVecEnv(multispecies_v0.parallel_env(**small("mixing"))),
+            r"env must be a batch of worlds .* got MultiSpeciesEnv",
+        ),
+        (
+            lambda: SpeciesVecEnv(batch(), others={"species_7": still}),
+            "others must name species, got 'species_7'",
+        ),
+        (
+            lambda: SpeciesVecEnv(batch(), others={"species_0": still, "species_1": still}),
+            "others must leave at least one species",
+        ),
+        (
+            lambda: SpeciesVecEnv(batch(), **OTHER).policy(None, "species_1"),
+            "species must be one whose particles are rows",
+        ),
+        (
+            lambda: SpeciesVecEnv(batch(), others={"species_0": object()}),
+            r"got object for 'species_0': RowPolicy\(model\) makes one",
+        ),
+    ],
+)
+def test_what_is_refused(use, message):
+    with pytest.raises(NPAError, match=message):
+        use()
 
 
 LEARN = {"particle_count": 32, "state_dim": 4, "max_cycles": 16}
@@ -481,50 +477,46 @@ def test_supersuit_trains_on_particles(one_thread):
 
 # Names that are imported when they are asked for
 
+EXTRAS = ("stable_baselines3", "pettingzoo", "ray", "torchrl", "rsl_rl")
+WITHOUT_EXTRAS = "".join(f"sys.modules[{name!r}] = None\n" for name in EXTRAS)
 
-def test_without_stable_baselines3_the_error_names_the_extra():
-    code = (
-        "import sys\n"
-        "sys.modules['stable_baselines3'] = None\n"
-        "import npa_envs.wrappers as wrappers\n"
-        "wrappers.VectorDamageEvents\n"
-        "from npa_envs.errors import MissingDependencyError\n"
-        "try:\n"
-        "    wrappers.ParticleVecEnv\n"
-        "except MissingDependencyError as error:\n"
-        "    print(error)\n"
+
+@pytest.mark.parametrize(
+    ("code", "printed"),
+    [
+        (
+            "import npa_envs.wrappers as wrappers\n"
+            "assert 'torch' not in sys.modules\n"
+            "wrappers.DamageEvents, wrappers.TorchNormalizeReward\n"
+            "assert 'stable_baselines3' not in sys.modules\n"
+            "assert {*wrappers.__all__, 'ParticleVecEnv'} <= set(dir(wrappers))\n",
+            "",
+        ),
+        (
+            WITHOUT_EXTRAS + "from npa_envs.wrappers import *\n"
+            "assert 'ParticleVecEnv' not in globals()\n"
+            "print(DamageEvents.__name__, VectorSpeciesTags.__name__)\n",
+            "DamageEvents VectorSpeciesTags",
+        ),
+        (
+            WITHOUT_EXTRAS + "import npa_envs.wrappers as wrappers\n"
+            "from npa_envs.errors import MissingDependencyError\n"
+            "assert issubclass(MissingDependencyError, ImportError)\n"
+            "try:\n    wrappers.ParticleVecEnv\n"
+            "except MissingDependencyError as error:\n    print(error)\n",
+            "pip install 'npa-envs[sb3]'",
+        ),
+    ],
+    ids=["no trainer", "star", "missing"],
+)
+def test_a_wrapper_is_imported_when_it_is_asked_for(code, printed):
+    done = subprocess.run(
+        [sys.executable, "-c", "import sys\n" + code], capture_output=True, text=True
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "pip install 'npa-envs[sb3]'" in done.stdout
-    assert issubclass(MissingDependencyError, ImportError)
-
-
-def test_a_star_imports_every_wrapper_that_needs_no_extra():
-    code = (
-        "import sys\n"
-        "for name in ('stable_baselines3', 'pettingzoo', 'ray', 'torchrl', 'rsl_rl'):\n"
-        "    sys.modules[name] = None\n"
-        "from npa_envs.wrappers import *\n"
-        "print(DamageEvents.__name__, VectorSpeciesTags.__name__, TorchNormalizeReward.__name__)\n"
-        "assert 'ParticleVecEnv' not in globals()\n"
-        "import npa_envs.wrappers as wrappers\n"
-        "assert 'ParticleVecEnv' in dir(wrappers)\n"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["DamageEvents", "VectorSpeciesTags", "TorchNormalizeReward"]
+    assert done.returncode == 0, done.stderr
+    assert printed in done.stdout
 
 
 def test_an_unknown_wrapper_is_an_attribute_error():
     with pytest.raises(AttributeError, match="no attribute 'Absent'"):
         npa_envs.wrappers.Absent  # noqa: B018
-
-
-def test_importing_the_wrappers_imports_no_trainer():
-    code = (
-        "import sys, npa_envs.wrappers as wrappers\n"
-        "assert 'torch' not in sys.modules\n"
-        "wrappers.DamageEvents, wrappers.TorchNormalizeReward\n"
-        "assert 'stable_baselines3' not in sys.modules\n"
-        "assert set(wrappers.__all__) <= set(dir(wrappers))\n"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)

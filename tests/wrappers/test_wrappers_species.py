@@ -28,10 +28,14 @@ def test_tags_stand_behind_the_observation():
 
 
 @pytest.mark.parametrize("assignment", ["blocks", "random"])
-def test_fractions_are_kept(assignment):
+def test_fractions_are_kept_and_the_worlds_left_as_they_are(assignment):
     env = SpeciesTags(single(), 3, fractions=[2, 1, 1], assignment=assignment)
+    plain = single()
     env.reset(seed=0)
+    plain.reset(seed=0)
     assert np.bincount(env.species).tolist() == [32, 16, 16]
+    for _ in range(3):
+        np.testing.assert_array_equal(env.step(ACTION)[0][:, :66], plain.step(ACTION)[0])
 
 
 def test_random_species_are_drawn_for_each_episode_and_hold_through_it():
@@ -47,14 +51,6 @@ def test_random_species_are_drawn_for_each_episode_and_hold_through_it():
     np.testing.assert_array_equal(env.species, species)
 
 
-def test_tags_leave_the_worlds_as_they_are():
-    env, plain = SpeciesTags(single(), 2, assignment="random"), single()
-    env.reset(seed=0)
-    plain.reset(seed=0)
-    for _ in range(3):
-        np.testing.assert_array_equal(env.step(ACTION)[0][:, :66], plain.step(ACTION)[0])
-
-
 @pytest.mark.parametrize("mode", ["same-step", "next-step", "disabled"])
 @pytest.mark.parametrize("output", ["numpy", "torch"])
 def test_world_k_has_the_species_of_the_single_environment(mode, output):
@@ -68,7 +64,9 @@ def test_world_k_has_the_species_of_the_single_environment(mode, output):
         wanted.append((one, env.species))
     one, two = (np.stack(each) for each in zip(*wanted, strict=True))
     actions = np.stack([ACTION] * 3)
-    envs.reset(seed=20)
+    observations, _ = envs.reset(seed=20)
+    assert envs.single_observation_space.shape == (64, 69)
+    assert envs.observation_space.contains(np.asarray(observations))
     np.testing.assert_array_equal(np.asarray(envs.species), one)
     for _ in range(STEPS):
         before = np.asarray(envs.species)
@@ -91,14 +89,6 @@ def test_world_k_has_the_species_of_the_single_environment(mode, output):
         two[1] = one[1]
     assert isinstance(observations, torch.Tensor) == (output == "torch")
     np.testing.assert_array_equal(np.asarray(observations)[..., 66:].argmax(axis=-1), two)
-
-
-def test_the_batched_space_holds_the_tags():
-    envs = VectorSpeciesTags(batched(), 2)
-    assert envs.observation_space.shape == (3, 64, 68)
-    observations, _ = envs.reset(seed=0)
-    assert envs.observation_space.contains(observations)
-    assert envs.single_observation_space.shape == (64, 68)
 
 
 def test_tags_stand_behind_what_other_wrappers_make_of_the_rows():

@@ -39,6 +39,17 @@ def expected_scales(z):
     return mean, np.sqrt(var)
 
 
+def walked(env, plain, count, seed=0):
+    """Step two environments alike; return their last observations, and all of the second one."""
+    normal, (z, _) = env.reset(seed=seed)[0], plain.reset(seed=seed)
+    seen = [z]
+    for _ in range(count):
+        action = policy(z)
+        normal, z = env.step(action)[0], plain.step(action)[0]
+        seen.append(z)
+    return normal, z, seen
+
+
 @pytest.mark.parametrize("kind", ["single", "vector", "torch"])
 def test_statistics_are_those_of_everything_seen(kind):
     if kind == "single":
@@ -46,14 +57,7 @@ def test_statistics_are_those_of_everything_seen(kind):
     else:
         output = "torch" if kind == "torch" else "numpy"
         env, plain = VectorNormalizePerception(batched(output=output)), batched()
-    normal, _ = env.reset(seed=2)
-    z, _ = plain.reset(seed=2)
-    seen = [z]
-    for _ in range(STEPS - 2):
-        action = policy(z)
-        normal, *_ = env.step(action)
-        z, *_ = plain.step(action)
-        seen.append(z)
+    normal, z, seen = walked(env, plain, STEPS - 2, seed=2)
     mean, deviation = expected_scales(np.stack(seen))
     wanted = np.clip((z - mean) / deviation, -10, 10)
     assert isinstance(normal, torch.Tensor) == (kind == "torch")
@@ -64,13 +68,7 @@ def test_statistics_are_those_of_everything_seen(kind):
 
 
 def test_directions_stay_what_they_are():
-    env, plain = NormalizePerception(single()), single()
-    env.reset(seed=0)
-    z, _ = plain.reset(seed=0)
-    for _ in range(3):
-        action = policy(z)
-        normal, *_ = env.step(action)
-        z, *_ = plain.step(action)
+    normal, z, _ = walked(NormalizePerception(single()), single(), 3)
     for before, after in (
         (z[:, 2 * C : -D].reshape(64, C, D), normal[:, 2 * C : -D].reshape(64, C, D)),
         (z[:, -D:], normal[:, -D:]),
@@ -81,16 +79,9 @@ def test_directions_stay_what_they_are():
         assert ((before * after).sum(axis=-1) >= 0).all()
 
 
-def test_particles_are_scaled_alike():
-    statistics = PerceptionStatistics(single().unwrapped.worlds.physics)
-    z = np.random.default_rng(0).normal(size=(64, P)).astype(np.float32)
-    statistics.update(z)
-    order = np.random.default_rng(1).permutation(64)
-    np.testing.assert_array_equal(statistics.normalize(z)[order], statistics.normalize(z[order]))
-
-
-def test_batches_add_up_whatever_their_sizes():
-    z = np.random.default_rng(0).normal(3.0, 2.0, size=(1000, P)).astype(np.float32)
+def test_batches_add_up_whatever_their_sizes_and_particles_are_scaled_alike():
+    random = np.random.default_rng(0)
+    z = random.normal(3.0, 2.0, size=(1000, P)).astype(np.float32)
     physics = single().unwrapped.worlds.physics
     whole, parts = PerceptionStatistics(physics), PerceptionStatistics(physics)
     whole.update(z)
@@ -99,6 +90,8 @@ def test_batches_add_up_whatever_their_sizes():
     for name, value in whole.moments.state_dict().items():
         torch.testing.assert_close(parts.moments.state_dict()[name], value, rtol=1e-6, atol=1e-6)
     assert whole.moments.count == pytest.approx(1000, abs=1e-3)
+    order = random.permutation(1000)
+    np.testing.assert_array_equal(whole.normalize(z)[order], whole.normalize(z[order]))
 
 
 def test_frozen_statistics_stay_and_can_be_saved_and_shared(tmp_path):
@@ -119,29 +112,29 @@ def test_frozen_statistics_stay_and_can_be_saved_and_shared(tmp_path):
         assert torch.equal(value, state[name])
 
 
-@pytest.mark.parametrize("output", ["numpy", "torch"])
-def test_a_reset_of_one_world_counts_only_what_it_perceives(output):
-    keywords = {"autoreset_mode": "disabled", "output": output}
-    env = VectorNormalizePerception(batched(4, **keywords))
-    plain = batched(4, autoreset_mode="disabled")
-    env.reset(seed=3)
-    z, _ = plain.reset(seed=3)
-    seen = [z]
-    for _ in range(2):
-        action = policy(z)
-        env.step(action)
-        z, *_ = plain.step(action)
-        seen.append(z)
+def expected_entries(z):
+    """Mean and standard deviation of each particle's entries, from all samples at once."""
+    z = z.astype(np.float64)
+    return z.mean(axis=0), np.sqrt(z.var(axis=0) + 1e-8)
+
+
+@pytest.mark.parametrize(("each", "output"), [(False, "numpy"), (False, "torch"), (True, "torch")])
+def test_a_reset_of_one_world_counts_only_what_it_perceives(each, output):
+    keywords = {"autoreset_mode": "disabled"}
+    wrapper = TorchNormalizeObservation if each else VectorNormalizePerception
+    env, plain = wrapper(batched(4, output=output, **keywords)), batched(4, **keywords)
+    _, z, seen = walked(env, plain, 2, seed=3)
     options = {"reset_mask": np.array([False, True, False, False])}
-    normal, _ = env.reset(options=options)
-    z, _ = plain.reset(options=options)
-    assert env.statistics.moments.count == pytest.approx(13 * 64, abs=1e-3)
-    mean, deviation = expected_scales(np.concatenate([*seen, z[1:2]]))
-    wanted = np.clip((z - mean) / deviation, -10, 10)
+    normal, (z, _) = env.reset(options=options)[0], plain.reset(options=options)
+    moments, samples = (env.obs_rms, 1) if each else (env.statistics.moments, 64)
+    assert moments.count == pytest.approx(13 * samples, abs=1e-3)
+    expected = expected_entries if each else expected_scales
+    mean, deviation = expected(np.concatenate([*seen, z[1:2]]))
+    wanted = (z - mean) / deviation
+    wanted = wanted if each else np.clip(wanted, -10, 10)
     np.testing.assert_allclose(np.asarray(normal), wanted, rtol=1e-3, atol=1e-3)
-    z, *_ = plain.step(policy(z))
     env.step(np.zeros((4, 64, ACTIONS), np.float32))
-    assert env.statistics.moments.count == pytest.approx(17 * 64, abs=1e-3)
+    assert moments.count == pytest.approx(17 * samples, abs=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -175,7 +168,6 @@ def test_the_spec_of_shared_statistics_holds_their_numbers_and_not_themselves():
     np.testing.assert_array_equal(made.reset(seed=4)[0], env.reset(seed=4)[0])
     vector = VectorNormalizePerception(batched(), statistics=trained.statistics)
     assert vector.statistics is trained.statistics
-    assert vector._saved_kwargs == {"clip": 3.0, "epsilon": 0.1, "training": True}
 
 
 def shared(wrapper, make, **keywords):
@@ -217,9 +209,12 @@ def test_blank_worlds_give_finite_numbers():
             ),
             r"mean must have shape \(49,\), got \(3,\)",
         ),
+        (lambda: TorchRecordEpisodeStatistics(batched(), 0), "buffer_length must be"),
+        (lambda: TorchNormalizeObservation(batched(), epsilon=0.0), "epsilon must be"),
+        (lambda: TorchNormalizeReward(batched(), gamma=1.5), r"gamma must lie in \[0, 1\]"),
     ],
 )
-def test_a_mistake_about_perception_is_named(make, message):
+def test_a_mistake_is_named(make, message):
     with pytest.raises(NPAError, match=message):
         make()
 
@@ -243,12 +238,8 @@ def actions(step):
 @pytest.mark.parametrize("wrapper", [VectorNormalizePerception, TorchNormalizeObservation])
 def test_final_observations_are_normalised_and_not_counted(wrapper):
     env, plain = wrapper(batched(output="torch")), batched(output="torch")
-    env.reset(seed=1)
-    z, _ = plain.reset(seed=1)
-    for _ in range(STEPS):
-        action = policy(z)
-        *_, infos = env.step(action)
-        z, *_, plain_infos = plain.step(action)
+    _, z, _ = walked(env, plain, STEPS - 1, seed=1)
+    infos, plain_infos = env.step(policy(z))[4], plain.step(policy(z))[4]
     perceived = wrapper is VectorNormalizePerception
     moments, samples = (env.statistics.moments, 64) if perceived else (env.obs_rms, 1)
     assert moments.count == pytest.approx((STEPS + 1) * 3 * samples, abs=1e-3)
@@ -261,15 +252,12 @@ def test_episodes_are_recorded_as_by_gymnasium(mode):
     ours, theirs = pair(
         TorchRecordEpisodeStatistics, RecordEpisodeStatistics, mode, buffer_length=5
     )
-    ours.reset(seed=0)
-    theirs.reset(seed=0)
     # World 1 falls out of step with the others.
-    for step in range(2):
-        ours.step(actions(step))
-        theirs.step(actions(step))
-    mask = np.array([False, True, False])
-    ours.reset(options={"reset_mask": mask})
-    theirs.reset(options={"reset_mask": mask})
+    for env in (ours, theirs):
+        env.reset(seed=0)
+        for step in range(2):
+            env.step(actions(step))
+        env.reset(options={"reset_mask": np.array([False, True, False])})
     episodes = 0
     for step in range(3 * STEPS):
         *_, infos = ours.step(actions(step))
@@ -321,27 +309,6 @@ def test_observations_are_normalised_as_by_gymnasium():
     assert ours.observation_space.shape == (3, 64, 66)
 
 
-def test_a_reset_of_one_world_counts_only_that_world():
-    ours = TorchNormalizeObservation(batched(4, autoreset_mode="disabled", output="torch"))
-    plain = batched(4, autoreset_mode="disabled", output="torch")
-    seen = [plain.reset(seed=0)[0]]
-    ours.reset(seed=0)
-    for step in range(2):
-        action = np.concatenate((actions(step), actions(step + 100)[:1]))
-        ours.step(action)
-        seen.append(plain.step(action)[0])
-    options = {"reset_mask": np.array([False, False, True, False])}
-    one, _ = ours.reset(options=options)
-    other, _ = plain.reset(options=options)
-    wanted = torch.cat((*seen, other[2:3])).double()
-    rms = ours.obs_rms
-    assert rms.count == pytest.approx(13, abs=1e-3)
-    torch.testing.assert_close(rms.mean, wanted.mean(dim=0), rtol=1e-4, atol=1e-4)
-    torch.testing.assert_close(
-        one, ((other - rms.mean) / (rms.var + 1e-8).sqrt()).float(), rtol=1e-4, atol=1e-4
-    )
-
-
 def test_rewards_are_normalised_as_by_gymnasium():
     ours, theirs = pair(TorchNormalizeReward, NormalizeReward, gamma=0.9)
     ours.reset(seed=0)
@@ -379,16 +346,17 @@ def test_the_return_begins_anew_with_each_episode(mode):
     torch.testing.assert_close(env.return_rms.var, wanted.var(correction=0), rtol=1e-4, atol=4e-6)
 
 
-def test_they_stack():
-    env = TorchNormalizeReward(
-        TorchNormalizeObservation(TorchRecordEpisodeStatistics(batched(output="torch")))
-    )
+def test_they_stack_and_stay_on_the_device(device):
+    env = TorchRecordEpisodeStatistics(batched(output="torch", device=str(device)))
+    env = TorchNormalizeReward(TorchNormalizeObservation(env))
     env.reset(seed=0)
     for step in range(STEPS):
         observations, rewards, _, _, infos = env.step(actions(step))
     assert infos["episode"]["l"].tolist() == [STEPS] * 3
     assert observations.isfinite().all()
     assert rewards.shape == (3,)
+    for tensor in (observations, rewards, infos["_episode"], infos["episode"]["r"]):
+        assert tensor.device.type == device.type
 
 
 @pytest.mark.parametrize(
@@ -403,31 +371,3 @@ def test_numpy_environments_are_sent_to_gymnasium(wrapper):
 
     with pytest.raises(NPAError, match=f"vector.{wrapper.__name__.removeprefix('Torch')}"):
         use()
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda env: TorchRecordEpisodeStatistics(env, 0), "buffer_length must be"),
-        (lambda env: TorchNormalizeObservation(env, epsilon=0.0), "epsilon must be"),
-        (lambda env: TorchNormalizeReward(env, gamma=1.5), r"gamma must lie in \[0, 1\]"),
-    ],
-)
-def test_a_mistake_is_named(make, message):
-    with pytest.raises(NPAError, match=message):
-        make(batched(output="torch"))
-
-
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-def test_everything_stays_on_the_device():
-    env = TorchNormalizeReward(
-        TorchNormalizeObservation(
-            TorchRecordEpisodeStatistics(batched(output="torch", device="cuda"))
-        )
-    )
-    env.reset(seed=0)
-    for step in range(STEPS):
-        observations, rewards, _, _, infos = env.step(actions(step))
-    for tensor in (observations, rewards, infos["_episode"], infos["episode"]["r"]):
-        assert tensor.is_cuda
