@@ -136,7 +136,8 @@ class Policy:
         interface: What observations and actions mean: `interface_of(env)`.
 
     Raises:
-        NPAError: When called: the observation has another shape.
+        NPAError: When made with an `env` that is no environment of `npa_envs`; when called: the
+            observation has another shape.
     """
 
     def __init__(self, interface: Interface) -> None:
@@ -218,9 +219,6 @@ class ZeroPolicy(Policy):
 
     Args:
         env: The environment that it is to act in.
-
-    Raises:
-        NPAError: It is no environment of `npa_envs`.
     """
 
     def __init__(self, env: Any) -> None:
@@ -241,7 +239,7 @@ class RandomPolicy(Policy):
         seed: Of the sequence of actions, at least 0.
 
     Raises:
-        NPAError: `env` is no environment of `npa_envs`, or the seed is no such integer.
+        NPAError: The seed is no such integer.
     """
 
     def __init__(self, env: Any, seed: int = 0) -> None:
@@ -273,7 +271,7 @@ class SpreadPolicy(Policy):
         gain: Displacement, as a fraction of α ε, at a perceived c^{1+D} ∇ρ / N of 1.
 
     Raises:
-        NPAError: `env` is no environment of `npa_envs`, or the gain no finite number.
+        NPAError: The gain is no finite number.
     """
 
     def __init__(self, env: Any, gain: float = 0.03) -> None:
@@ -301,8 +299,7 @@ class PaintPolicy(SpreadPolicy):
         gain: That of `SpreadPolicy`.
 
     Raises:
-        NPAError: `env` is no environment of `npa_envs` or has no target's colour to take, or the
-            colour does not have three numbers.
+        NPAError: `env` has no target's colour to take, or the colour does not have three numbers.
     """
 
     def __init__(
@@ -341,9 +338,6 @@ class MendPolicy(SpreadPolicy):
         env: The environment that it is to act in.
         blank: A particle is blank where the norm of its state is below this, dimensionless.
         gain: That of `SpreadPolicy`, small so that what is whole stays nearly as it is.
-
-    Raises:
-        NPAError: `env` is no environment of `npa_envs`.
     """
 
     def __init__(self, env: Any, blank: float = 0.1, gain: float = 0.003) -> None:

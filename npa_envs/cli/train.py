@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, make_dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import tyro
 
@@ -180,8 +180,6 @@ def _report(result: TrainResult, rules: Sequence[Path], look: str, resume_comman
 
 # Options of tasks of several species: flat, although configurations nest.
 
-LaunchT = TypeVar("LaunchT")
-
 
 @dataclass(frozen=True, kw_only=True)
 class SpeciesOptions(Morphogenesis2DConfig):
@@ -208,8 +206,8 @@ class JointOptions(JointTrainConfig[SpeciesOptions]):
 
 def parse_joint(
     base: JointTrainConfig[CoMorphogenesis2DConfig],
-    read: Callable[[JointOptions], tuple[LaunchT, JointOptions]],
-) -> tuple[LaunchT, JointTrainConfig[CoMorphogenesis2DConfig]]:
+    read: Callable[[JointOptions], tuple[TrainOptions, JointOptions]],
+) -> tuple[TrainOptions, JointTrainConfig[CoMorphogenesis2DConfig]]:
     """Return what the command line says of a run of several species.
 
     Raises:

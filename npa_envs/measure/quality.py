@@ -128,12 +128,11 @@ def evaluate(
         NPAError: `checkpoints` or `seeds` are empty or out of order.
     """
     check_steps("checkpoints", checkpoints)
-    worlds = _Worlds(rule, task, seeds, check_device(device), progress)
-    x, s, task = worlds.x, worlds.s, worlds.task
+    runner, x, s = _from_seeds(rule, task, seeds, check_device(device), progress)
     rows = []
     for step, before in zip(checkpoints, (0, *checkpoints), strict=False):
-        x, s = worlds.run(x, s, step - before)
-        rows.append(measure(task, x, s, step))
+        x, s = runner.run(x, s, step - before)
+        rows.append(measure(runner.task, x, s, step))
     return rows
 
 
@@ -214,14 +213,14 @@ def healing(
     check_steps("grow_steps", [grow_steps])
     check_steps("heal_steps", [heal_steps])
     check_steps("every", [every])
-    worlds = _Worlds(rule, task, seeds, check_device(device), progress)
-    x, s = worlds.run(worlds.x, worlds.s, grow_steps)
-    task = worlds.task
+    runner, x, s = _from_seeds(rule, task, seeds, check_device(device), progress)
+    x, s = runner.run(x, s, grow_steps)
+    task = runner.task
     before = task.metric(x, s)
     normal = torch.randn(
-        len(x), x.shape[2], generator=worlds.generator, dtype=x.dtype, device=x.device
+        len(x), x.shape[2], generator=runner.generator, dtype=x.dtype, device=x.device
     )
-    centre = random_particle(x, generator=worlds.generator)
+    centre = random_particle(x, generator=runner.generator)
     damaged = {
         f"cut, gap {cut_gap:g}": cut(x, s, centre=x.mean(1), normal=normal, gap=cut_gap),
         f"erased disk, radius {erase_radius:g}": (
@@ -235,7 +234,7 @@ def healing(
         steps = [0]
         while steps[-1] < heal_steps:
             more = min(every, heal_steps - steps[-1])
-            hurt_x, hurt_s = worlds.run(hurt_x, hurt_s, more)
+            hurt_x, hurt_s = runner.run(hurt_x, hurt_s, more)
             losses.append(task.metric(hurt_x, hurt_s))
             steps.append(steps[-1] + more)
         rows.append(_healing_row(name, before, torch.stack(losses), steps))
@@ -328,27 +327,24 @@ def accuracies(
         NPAError: `checkpoints` are empty or out of order.
     """
     check_steps("checkpoints", checkpoints)
-    clouds = _Clouds(rule, task, seed, progress)
+    runner = Runner(rule, task, task.clouds.x.device, seed, progress)
+    places = task.clouds.x.to(runner.dtype)
     sums = torch.zeros(len(checkpoints), 5, dtype=torch.float64)
-    for index in clouds.batches():
-        x, label, s = clouds.blank(index)
-        aimed = clouds.task.toward(label)
-        before = 0
-        for row, step in enumerate(checkpoints):
-            s = clouds.states(x, s, step - before)
-            before = step
-            outputs = clouds.task.outputs(s)
+    for index, label, blank in _batches(task):
+        x, s = places[index], blank.to(runner.dtype)
+        aimed = runner.task.toward(label)
+        for row, (step, before) in enumerate(zip(checkpoints, (0, *checkpoints), strict=False)):
+            _, s = runner.run(x, s, step - before)
+            outputs = runner.task.outputs(s)
             says, most = particle_classes(outputs), majority(outputs)
-            overflow = (s - s.clamp(-1.0, 1.0)).abs().mean((1, 2))
-            figures = (
-                (most == label).double(),
+            sums[row] += _sums(
+                most == label,
                 (says == label[:, None]).double().mean(1),
                 (says == most[:, None]).double().mean(1),
-                aimed.metric(x, s).double(),
-                overflow.double(),
+                aimed.metric(x, s),
+                (s - s.clamp(-1.0, 1.0)).abs().mean((1, 2)),
             )
-            sums[row] += torch.stack([figure.sum() for figure in figures]).cpu()
-    means = (sums / clouds.cloud_count).tolist()
+    means = (sums / len(places)).tolist()
     return [AccuracyRow(step, *row) for step, row in zip(checkpoints, means, strict=True)]
 
 
@@ -383,30 +379,27 @@ def changes_of_mind(
     """
     check_steps("settle_steps", [settle_steps])
     check_steps("steps", [1 + step for step in steps])
-    clouds = _Clouds(rule, task, seed, progress)
-    partner = _partners(clouds.label)
+    runner = Runner(rule, task, task.clouds.x.device, seed, progress)
+    places, classes = task.clouds.x.to(runner.dtype), task.clouds.label
+    partner = _partners(classes)
     names = (f"{CUT_SHARE:.0%} cut off", "upper half mutated", "all mutated")
     sums = torch.zeros(len(names), len(steps), 3, dtype=torch.float64)
-    for index in clouds.batches():
-        x, label, s = clouds.blank(index)
-        other_x, other = clouds.x[partner[index]], clouds.label[partner[index]]
-        s = clouds.states(x, s, settle_steps)
+    for index, label, blank in _batches(task):
+        x, other_x, other = places[index], places[partner[index]], classes[partner[index]]
+        _, s = runner.run(x, blank.to(runner.dtype), settle_steps)
         changed = (
-            (*_cut(x, s, clouds.generator), label),
+            (*_cut(x, s, runner.generator), label),
             (*_chimera(x, s, other_x), other),
             (other_x, s, other),
         )
         for number, (new_x, new_s, goal) in enumerate(changed):
-            before = 0
-            for row, step in enumerate(steps):
-                new_s = clouds.states(new_x, new_s, step - before)
-                before = step
-                outputs = clouds.task.outputs(new_s)
+            for row, (step, before) in enumerate(zip(steps, (0, *steps), strict=False)):
+                _, new_s = runner.run(new_x, new_s, step - before)
+                outputs = runner.task.outputs(new_s)
                 most = majority(outputs)
                 right = (particle_classes(outputs) == goal[:, None]).double().mean(1)
-                figures = ((most == goal).double(), right, (most == label).double())
-                sums[number, row] += torch.stack([figure.sum() for figure in figures]).cpu()
-    means = (sums / clouds.cloud_count).tolist()
+                sums[number, row] += _sums(most == goal, right, most == label)
+    means = (sums / len(places)).tolist()
     return [
         ChangeRow(name, step, *row)
         for name, rows in zip(names, means, strict=True)
@@ -491,56 +484,35 @@ class Runner:
         return x, s
 
 
-class _Worlds(Runner):
-    """One seed world for each of `seeds` (x [B, N, D], s [B, N, C]), and what lets them grow."""
-
-    def __init__(
-        self,
-        rule: NPARule,
-        task: PictureTask,
-        seeds: Sequence[int],
-        device: torch.device,
-        progress: Callable[[int], None] | None,
-    ) -> None:
-        if not seeds:
-            raise NPAError(
-                "seeds must hold at least one number, got none: for example seeds=(0, 1)"
-            )
-        super().__init__(rule, task, device, seeds[0] + len(seeds), progress)
-        worlds = [
-            task.seed(1, generator=torch.Generator(device).manual_seed(seed), device=device)
-            for seed in seeds
-        ]
-        self.x, self.s = (torch.cat(parts).to(self.dtype) for parts in zip(*worlds, strict=True))
+def _from_seeds(
+    rule: NPARule,
+    task: PictureTask,
+    seeds: Sequence[int],
+    device: torch.device,
+    progress: Callable[[int], None] | None,
+) -> tuple[Runner, Tensor, Tensor]:
+    """Return what runs one world for each of the seeds, and these, x [B, N, D] and s [B, N, C]."""
+    if not seeds:
+        raise NPAError("seeds must hold at least one number, got none: for example seeds=(0, 1)")
+    runner = Runner(rule, task, device, seeds[0] + len(seeds), progress)
+    worlds = [
+        task.seed(1, generator=torch.Generator(device).manual_seed(seed), device=device)
+        for seed in seeds
+    ]
+    x, s = (torch.cat(parts).to(runner.dtype) for parts in zip(*worlds, strict=True))
+    return runner, x, s
 
 
-class _Clouds(Runner):
-    """A rule on the clouds of a task, some at a time."""
+def _batches(task: PointClassification) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """Yield indices [B], classes [B] and blank states [B, N, C] of some clouds after the other."""
+    x, label = task.clouds.x, task.clouds.label
+    for index in torch.arange(len(label), device=x.device).split(BATCH):
+        yield index, label[index], x.new_zeros(len(index), x.shape[1], task.config.state_dim)
 
-    def __init__(
-        self,
-        rule: NPARule,
-        task: PointClassification,
-        seed: int,
-        progress: Callable[[int], None] | None,
-    ) -> None:
-        super().__init__(rule, task, task.clouds.x.device, seed, progress)
-        self.x, self.label = task.clouds.x.to(self.dtype), task.clouds.label
-        self.cloud_count = len(self.label)
 
-    def batches(self) -> Iterator[Tensor]:
-        """Yield the indices of some clouds after the other."""
-        indices = torch.arange(self.cloud_count, device=self.x.device)
-        yield from torch.split(indices, BATCH)
-
-    def blank(self, index: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return positions [B, N, 2], classes [B] and blank states [B, N, C] of some clouds."""
-        x = self.x[index]
-        return x, self.label[index], x.new_zeros(*x.shape[:2], self.task.config.state_dim)
-
-    def states(self, x: Tensor, s: Tensor, steps: int) -> Tensor:
-        """Return the states after some steps; positions stay as they are."""
-        return self.run(x, s, steps)[1]
+def _sums(*figures: Tensor) -> Tensor:
+    """Return the sums over clouds of figures [B], float64, on the host."""
+    return torch.stack([figure.double().sum() for figure in figures]).cpu()
 
 
 def check_steps(name: str, steps: Sequence[int]) -> None:

@@ -3,44 +3,25 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from learning_problems import digits, heart, species
 
 from npa_envs.agents import evaluate_policy
 from npa_envs.agents.learning import Budget, Problem, RuleSet, train
 from npa_envs.agents.learning.evolution import Population, costs, fitness
-from npa_envs.errors import MissingDependencyError, NPAError
+from npa_envs.errors import MissingDependencyError
 
-GROWTH = {
-    "target": "heart",
-    "particle_count": 48,
-    "eps": 0.2,
-    "eps0": 0.2,
-    "seed_radius": 0.4,
-    "colour_weight": 20.0,
-    "resolution": 32,
-    "state_dim": 4,
-    "state_scale": 0.1,
+GROWTH = {"eps": 0.2, "eps0": 0.2, "colour_weight": 20.0, "resolution": 32, "state_scale": 0.1}
+SMALL = {
+    "growth": heart(**GROWTH),
+    "points": digits(particle_count=40, state_dim=16, eps=0.2, eps0=0.2),
+    "mixing": species(episode_steps=6, particle_counts=[24, 17], perception="per_species"),
 }
-PROBLEMS = {
-    "growth": Problem(
-        env_id="npa/Morphogenesis2D-v0", keywords=GROWTH, episode_steps=8, hidden_dim=12
-    ),
-    "points": Problem(
-        env_id="npa/PointClassification-v0",
-        keywords={"particle_count": 40, "eps": 0.2, "eps0": 0.2},
-        episode_steps=6,
-        hidden_dim=12,
-    ),
-    "mixing": Problem(
-        env_id="npa/Mixing-v0",
-        keywords={"particle_counts": [24, 17], "state_dim": 4, "perception": "per_species"},
-        episode_steps=6,
-        hidden_dim=12,
-    ),
-}
+PROBLEMS = {name: replace(problem, hidden_dim=12) for name, problem in SMALL.items()}
 
 
 @pytest.fixture(params=PROBLEMS)
@@ -125,12 +106,7 @@ def test_the_fitness_of_a_population_is_that_of_one_candidate_after_the_other(pr
 
 def test_what_comes_after_an_episode_is_over_does_not_count(device):
     # Every step succeeds, so that a world begins a new episode with each.
-    problem = Problem(
-        env_id="npa/Morphogenesis2D-v0",
-        keywords={**GROWTH, "success_loss": 1e6},
-        episode_steps=8,
-        hidden_dim=12,
-    )
+    problem = replace(heart(**GROWTH, success_loss=1e6), hidden_dim=12)
     population, weights = candidates_of(problem, device, 2)
     envs = problem.make_envs(2, device=device)
     found = fitness(envs, population, weights, [4], problem.episode_steps)
@@ -148,13 +124,7 @@ def test_candidates_without_a_finite_return_are_the_worst():
 
 def test_evolution_gets_better(device):
     pytest.importorskip("cma")
-    problem = Problem(
-        env_id="npa/Morphogenesis2D-v0",
-        keywords=GROWTH,
-        episode_steps=16,
-        num_envs=8,
-        hidden_dim=12,
-    )
+    problem = replace(PROBLEMS["growth"], episode_steps=16, num_envs=8)
     budget = Budget(particle_steps=40 * 16 * 48 * 16)
     trained = train("evolution", problem, budget, 0, device=device, population=16, entries=4)
     first, last = trained.log[0], trained.log[-1]
@@ -163,44 +133,17 @@ def test_evolution_gets_better(device):
     assert last.mean_return > 3.0 * last.standard_error > 0.0
 
 
-def test_the_same_seed_evolves_the_same_rules_and_a_start_is_the_first_mean():
+def test_a_start_is_the_first_mean_and_stays_as_it_is():
     pytest.importorskip("cma")
-    problem = PROBLEMS["growth"]
-    start = problem.new_rules(9)
+    start = PROBLEMS["growth"].new_rules(9)
     before = Population(start).vector()
-    ran = [
-        train(
-            "evolution",
-            problem,
-            Budget(particle_steps=1),
-            seed,
-            start=start,
-            population=4,
-            sigma=0.01,
-            evaluation_seeds=range(2),
-        )
-        for seed in (1, 1, 2)
-    ]
-    first, second, third = (Population(one.rules).vector() for one in ran)
-    assert np.array_equal(first, second)
-    assert not np.array_equal(first, third)
+    options = {"population": 4, "sigma": 0.01, "evaluation_seeds": range(2)}
+    trained = train(
+        "evolution", PROBLEMS["growth"], Budget(particle_steps=1), 1, start=start, **options
+    )
     assert np.array_equal(Population(start).vector(), before)
-    far = np.abs(first - before) / Population(start).scales()
+    far = np.abs(Population(trained.rules).vector() - before) / Population(start).scales()
     assert 0.0 < far.max() < 0.1
-
-
-@pytest.mark.parametrize(
-    ("option", "words"),
-    [
-        ({"population": 2}, "population must be a whole number of at least 4"),
-        ({"sigma": 0.0}, "sigma must be a finite number greater than 0"),
-        ({"worlds_per_candidate": 0}, "worlds_per_candidate must be a whole number"),
-        ({"sigmas": 0.1}, "sigma"),
-    ],
-)
-def test_wrong_options_are_refused(option, words):
-    with pytest.raises(NPAError, match=words):
-        train("evolution", PROBLEMS["growth"], Budget(particle_steps=1), 0, **option)
 
 
 def test_a_missing_library_is_named_with_its_cure(monkeypatch):

@@ -159,16 +159,36 @@ def test_learning_rates_fall_from_the_first_to_the_last():
         ("gradient", {"learning_rat": 1.0}, "did you mean 'learning_rate'"),
         ("zero", {"learning_rate": 1.0}, "has no option 'learning_rate'"),
         ("zero", {"device": "tpu"}, "device"),
+        ("zero", {"seed": -1}, "seed must be"),
+        ("zero", {"start": heart().new_rules(0)}, "start must be None"),
+        ("evolution", {"population": 2}, "population must be a whole number of at least 4"),
+        ("evolution", {"sigma": 0.0}, "sigma must be a finite number greater than 0"),
+        ("evolution", {"worlds_per_candidate": 0}, "worlds_per_candidate must be a whole number"),
+        ("evolution", {"sigmas": 0.1}, "did you mean 'sigma'"),
+        ("clone", {}, "teacher must be given"),
+        ("clone", {"teacher": "heart", "student_share": 1.5}, "student_share"),
+        ("clone", {"teacher": "heart", "kept_steps": 2}, "must be at least collect_steps"),
+        ("clone", {"teacher": "heart", "updates": 0}, "updates"),
+        ("clone", {"teacher": "heart"}, "state_dim"),
+        (
+            "ppo",
+            {"ratio": "both"},
+            "ratio must be a known word, got 'both': known: particle, world",
+        ),
+        ("ppo", {"credit": "particle", "ratio": "world"}, "needs ratio='particle'"),
+        ("ppo", {"gamma": 0.0}, r"gamma must lie in \(0, 1\], got 0.0"),
+        ("ppo", {"last_noise": 0.0}, r"last_noise must lie in \(0, 1\], got 0.0"),
+        ("ppo", {"noise_decay_share": 0.0}, r"noise_decay_share must lie in \(0, 1\], got 0.0"),
+        ("ppo", {"minibatches": 0}, "minibatches must be a whole number of at least 1"),
+        ("ppo", {"worlds": 0}, "worlds must be a whole number of at least 1"),
+        ("ppo", {"critic": "all"}, "must be a known word, got 'all': known: central, particle"),
     ],
 )
-def test_unknown_methods_and_options_are_refused(method, options, message):
+def test_wrong_methods_and_options_are_refused(method, options, message):
+    seed = options.get("seed", 0)
+    options = {name: value for name, value in options.items() if name != "seed"}
     with pytest.raises(NPAError, match=message):
-        train(method, heart(), Budget(particle_steps=10), 0, **options)
-
-
-def test_a_seed_must_be_one():
-    with pytest.raises(NPAError, match="seed must be"):
-        train("zero", heart(), Budget(particle_steps=10), -1)
+        train(method, heart(), Budget(particle_steps=10), seed, **options)
 
 
 def test_options_are_named_with_their_defaults():

@@ -354,32 +354,19 @@ def test_a_world_that_is_lost_stays_lost_and_leaves_the_others_as_they_are(devic
     assert torch.equal(found[:, 1], whole[:, 1])
 
 
-def update_prob(name: str) -> float:
-    path = shipped_rules()[name]
-    return trained_config(path, rule_metadata(path)).task.update_prob
-
-
 def test_plans_are_whole_chunks_and_hold_what_was_trained():
-    for name in rule_names():
+    for name, path in shipped_rules().items():
+        update_prob = trained_config(path, rule_metadata(path)).task.update_prob
         for plan in (PLANS[task_name(name)], quick_plan(task_name(name))):
             assert plan.heal_steps[0] == 0
             assert all(step % plan.chunk == 0 for step in (*plan.heal_steps, plan.grow_steps))
             assert set(plan.values) <= set(CONDITIONS)
             for condition, values in plan.values.items():
-                assert trained_value(condition, update_prob(name)) in values
+                assert trained_value(condition, update_prob) in values
                 assert condition == "shape" or list(values) == sorted(values)
 
 
 # Records and the command
-
-
-def test_a_record_comes_back_as_it_was_written(tmp_path: Path):
-    path = tmp_path / "robustness_heart.json"
-    course = Course("erase", (0, 16), ((2.0, 1.0), (math.nan, 3.0)), ((1.0, 1.0), (1.0, 1.0)))
-    written = record(course)
-    written.write(path)
-    assert json.loads(path.read_text())["courses"][0]["recovery_steps"] == [16, None]
-    assert repr(RuleRecord.read(path, {"a": 1})) == repr(written)
 
 
 def test_stored_records_give_the_stored_tables():
@@ -400,10 +387,15 @@ def test_tables_say_what_was_not_measured_and_what_is_not_finite():
     assert "| heart | 0.75 | 1 | 1.67 | nan |" in text
 
 
-def test_curves_are_drawn_by_task():
-    pytest.importorskip("matplotlib")
+def test_records_come_back_as_they_were_written_and_curves_are_drawn_by_task(tmp_path):
     course = Course("erase", (0, 16), ((2.0, 1.0), (2.0, math.nan)), ((1.0, 1.0), (1.0, 1.0)))
-    drawn = pictures([record(course), record(course, task="texture", rule="dots")])
+    records = [record(course), record(course, task="texture", rule="dots")]
+    path = tmp_path / "robustness_heart.json"
+    records[0].write(path)
+    assert json.loads(path.read_text())["courses"][0]["recovery_steps"] == [16, None]
+    assert repr(RuleRecord.read(path, {"a": 1})) == repr(records[0])
+    pytest.importorskip("matplotlib")
+    drawn = pictures(records)
     assert set(drawn) == {"morphogenesis2d", "texture"}
     assert all(picture.startswith(b"\x89PNG") for picture in drawn.values())
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 import time
 from dataclasses import replace
 from functools import partial
@@ -59,14 +60,6 @@ def session(**options) -> Session:
 
 def timing(median: float) -> Timing:
     return Timing(median, median, median)
-
-
-def tiny_suite(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Make the suite `quick` a tiny one of the same kind."""
-    monkeypatch.setitem(
-        suites.SUITES, "quick", lambda here: {"perception": perception_rows(here, TINY)}
-    )
-    monkeypatch.setattr(suites, "WORKLOAD", Workload(2, 1, 100, 1, hidden_dim=16))
 
 
 # Strategies and precisions
@@ -295,11 +288,8 @@ def test_each_skip_is_measured_with_and_without():
 def test_kernels_are_cudas(device):
     here = Session(device, repeats=1, small=True)
     rows = suites.SUITES["kernels"](here)["kernels"]
-    if device.type == "cuda":
-        assert any("perceive" in row.kernel for row in rows)
-    else:
-        assert rows == []
-        assert [entry.what for entry in here.left_out] == ["kernels"]
+    assert any("perceive" in row.kernel for row in rows) == (device.type == "cuda")
+    assert [entry.what for entry in here.left_out] == ([] if rows else ["kernels"])
 
 
 def test_the_suites_measure_all_their_tables():
@@ -335,24 +325,18 @@ def test_calls_are_compared_in_turn_and_each_pair_the_other_way_round(device):
 def test_one_species_is_compared_with_the_rollout_that_it_is():
     here = Session(torch.device("cpu"), repeats=3, small=True)
     rows = suites.SUITES["species"](here)["one_species"]
-    assert [(row.what, row.calls) for row in rows] == [
-        ("inference", "eager"),
-        ("training", "eager"),
+    assert [(row.workload, row.what, row.calls) for row in rows] == [
+        ("2D (1, 256, 2)", what, "eager") for what in ("inference", "training")
     ]
-    for row in rows:
-        assert row.workload == "2D (1, 256, 2)"
-        assert row.rollout_us.median > 0
-        # What it costs is measured; that it is not another rollout is known.
-        assert 1 / 3 < row.ratio < 3
-    workload = Workload(2, 2, 150, 2, hidden_dim=16, eps=0.2)
-    x, s = workload.worlds(here.device)
-    rule = workload.rule(here.device)
+    # What it costs is measured; that it is not another rollout is known.
+    assert all(row.rollout_us.median > 0 and 1 / 3 < row.ratio < 3 for row in rows)
+    x, s = TINY.worlds(here.device)
+    rule = TINY.rule(here.device)
     outcomes = [
         roll(rule, x, s, 2, update_prob=0.5, generator=torch.Generator().manual_seed(1))
         for roll in (rollout, roll_one_species)
     ]
-    for value, expected in zip(*outcomes, strict=True):
-        assert torch.equal(value, expected)
+    assert all(map(torch.equal, *outcomes))
 
 
 # Plots, report
@@ -394,13 +378,6 @@ def test_pictures_are_drawn_of_what_was_measured():
     drawn = pictures(tables)
     assert list(drawn) == ["pareto"]
     assert drawn["pareto"].startswith(b"\x89PNG")
-
-
-def test_plots_without_matplotlib_name_the_extra(tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(__import__("sys").modules, "matplotlib", None)
-    assert main([*FAST, "--quick", "--plots", "--output", str(tmp_path)]) == 2
-    assert "pip install 'npa-envs[bench]'" in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
 
 
 # Explanations
@@ -461,36 +438,36 @@ def test_the_library_is_faster_than_dense_torch_and_stored_ratios_are_those_meas
     assert sorted(json.loads(path.read_text())["cpu"]) == sorted(measured)
 
 
-def test_check_decides_the_exit_code(tmp_path, monkeypatch, capsys):
-    tiny_suite(monkeypatch)
+def test_the_command_prints_tables_writes_what_it_says_and_checks_ratios(
+    tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setitem(
+        suites.SUITES, "quick", lambda here: {"perception": perception_rows(here, TINY)}
+    )
+    monkeypatch.setattr(suites, "WORKLOAD", Workload(2, 1, 100, 1, hidden_dim=16))
     monkeypatch.chdir(tmp_path)
-    name = "perceive: dense torch over library"
-    words = [*FAST, "--strategies", "library", "--check"]
-    assert main([*words, str(stored(tmp_path, **{name: 1e-3}))]) == 0
-    assert "ratios are held" in capsys.readouterr().out
-    assert main([*words, str(stored(tmp_path, **{name: 1e9}))]) == 1
-    assert f"missed: {name}" in capsys.readouterr().out
-    # Nothing is written unless asked for.
-    assert [path.name for path in tmp_path.iterdir()] == ["ratios.json"]
-
-
-# The command
-
-
-def test_the_command_prints_tables_and_writes_what_it_says(tmp_path, monkeypatch, capsys):
-    tiny_suite(monkeypatch)
-    folder = tmp_path / "results"
-    assert main([*FAST, "--output", str(folder), "--commit", "abc"]) == 0
+    name, folder = "perceive: dense torch over library", tmp_path / "results"
+    held = [*FAST, "--check", str(stored(tmp_path, **{name: 1e-3}))]
+    assert main([*held, "--output", str(folder), "--commit", "abc"]) == 0
     text = capsys.readouterr().out
     for word in ("perception:", "neighbour_cap", "bf16_storage", "left out:", "times faster:"):
         assert word in text
     (path,) = folder.iterdir()
     assert f"wrote {path}" in text
+    assert text.endswith("ratios are held\n")
     loaded = json.loads(path.read_text())
     assert (path.name, loaded["commit"]) == ("quick_cpu.json", "abc")
     assert loaded["command"].startswith("npa-envs bench --no-progress")
     strategies = {row["strategy"] for row in loaded["tables"]["perception"]}
     assert strategies == set(STRATEGIES) - {"plain"}
+    missed = str(stored(tmp_path, **{name: 1e9}))
+    assert main([*FAST, "--strategies", "library", "--check", missed]) == 1
+    assert f"missed: {name}" in capsys.readouterr().out
+    # Nothing is written unless asked for.
+    assert {path.name for path in tmp_path.iterdir()} == {"ratios.json", "results"}
+
+
+# The command
 
 
 @pytest.mark.parametrize(
@@ -502,27 +479,28 @@ def test_the_command_prints_tables_and_writes_what_it_says(tmp_path, monkeypatch
         (["--device", "cuda:99"], "device must"),
         (["--repeats", "0"], "repeats must be at least 1"),
         (["--plots"], "give --output DIR"),
+        (["--plots", "--output", "."], "pip install 'npa-envs[bench]'"),
         (["--suite", "paper", "--check", "x.json"], "leave --suite out"),
+        (["--check", "{}"], "must hold ratios under 'cpu'"),
+        (["--check", "[]"], "must hold ratios under 'cpu'"),
+        (["--check", "no json"], "must hold ratios under 'cpu'"),
+        (["--check", '{"cpu": {"a": "fast"}}'], "must hold ratios under 'cpu'"),
     ],
 )
-def test_mistakes_are_refused_in_one_line(words, message, tmp_path, monkeypatch, capsys):
+def test_mistakes_are_refused_in_one_line_before_anything_is_measured(
+    words, message, tmp_path, tmp_path_factory, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    if words[0] == "--check":
+        path = tmp_path_factory.mktemp("stored") / "ratios.json"
+        path.write_text(words[1])
+        words = ["--check", str(path)]
     assert main(["bench", "--no-progress", *words]) == 2
     captured = capsys.readouterr()
     assert message in captured.err
     assert captured.err.count("\n") == 1
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("content", ["{}", "[]", "no json", '{"cpu": {"a": "fast"}}'])
-def test_a_file_without_ratios_is_refused_before_anything_is_measured(
-    content, tmp_path, monkeypatch, capsys
-):
-    path = tmp_path / "ratios.json"
-    path.write_text(content)
-    monkeypatch.setattr("npa_envs.cli.bench.measured_report", None)
-    assert main([*FAST, "--check", str(path)]) == 2
-    assert "must hold ratios under 'cpu'" in capsys.readouterr().err
+    assert (captured.out, list(tmp_path.iterdir())) == ("", [])
 
 
 def test_explain_prints_and_measures_nothing(capsys):

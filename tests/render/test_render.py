@@ -16,7 +16,8 @@ from npa_envs.errors import MissingDependencyError, NPAError
 from npa_envs.render import to_uint8, write_filmstrip, write_gif, write_mp4, write_png
 from npa_envs.render.film import encode_frame
 
-WRITERS = [write_gif, write_mp4, write_filmstrip]
+WRITERS = [(write_gif, "film.gif"), (write_mp4, "film.mp4"), (write_filmstrip, "film.png")]
+EVERY_WRITER = pytest.mark.parametrize(("writer", "name"), WRITERS, ids=["gif", "mp4", "strip"])
 
 
 def film(count: int = 6, height: int = 48, width: int = 64) -> list[np.ndarray]:
@@ -60,11 +61,9 @@ def test_overlapping_particles_average_and_thin_ones_let_the_background_through(
 def test_first_row_of_the_shown_picture_is_the_highest_y():
     picture = torch.zeros(2, 4, 4, 4)
     picture[1, 0, 2] = torch.tensor([1.0, 0.0, 0.0, 1.0])
-    shown = to_uint8(picture)
-    assert shown.shape == (2, 4, 4, 3)
-    assert (shown[1, 3, 2] == (255, 0, 0)).all()
-    assert (shown[0] == 255).all()
-    assert (np.delete(shown[1].reshape(16, 3), 14, axis=0) == 255).all()
+    expected = np.full((2, 4, 4, 3), 255)
+    expected[1, 3, 2] = (255, 0, 0)
+    np.testing.assert_array_equal(to_uint8(picture), expected)
 
 
 def test_colours_outside_their_range_are_clipped_and_nonfinite_ones_shown_as_background():
@@ -81,15 +80,18 @@ def test_picture_that_requires_grad_is_shown():
     assert (to_uint8(picture) == 255).all()
 
 
-def test_wrong_picture_or_background_is_a_clear_error():
-    with pytest.raises(NPAError, match=r"\[\.\.\., R, R, 4\].*\(8, 8, 3\)"):
-        to_uint8(torch.zeros(8, 8, 3))
-    with pytest.raises(NPAError, match=r"torch\.uint8"):
-        to_uint8(torch.zeros(8, 8, 4, dtype=torch.uint8))
-    with pytest.raises(NPAError, match="background must be a colour, got 'blurple'"):
-        to_uint8(torch.zeros(8, 8, 4), "blurple")
-    with pytest.raises(NPAError, match=r"red, green and blue in \[0, 1\]"):
-        to_uint8(torch.zeros(8, 8, 4), (255, 255, 255))
+@pytest.mark.parametrize(
+    ("picture", "background", "message"),
+    [
+        (torch.zeros(8, 8, 3), "white", r"\[\.\.\., R, R, 4\].*\(8, 8, 3\)"),
+        (torch.zeros(8, 8, 4, dtype=torch.uint8), "white", r"torch\.uint8"),
+        (torch.zeros(8, 8, 4), "blurple", "background must be a colour, got 'blurple'"),
+        (torch.zeros(8, 8, 4), (255, 255, 255), r"red, green and blue in \[0, 1\]"),
+    ],
+)
+def test_wrong_picture_or_background_is_a_clear_error(picture, background, message):
+    with pytest.raises(NPAError, match=message):
+        to_uint8(picture, background)
 
 
 def test_png_is_read_back_exactly(tmp_path):
@@ -181,6 +183,8 @@ def test_mp4_holds_every_frame_at_an_even_size(tmp_path, height, width):
 
 
 def test_filmstrip_holds_the_frames_exactly_in_rows(tmp_path):
+    write_filmstrip(tmp_path / "strip.png", film(1))
+    assert Image.open(tmp_path / "strip.png").size == (64 + 16, 48 + 16)
     frames = film(5)
     write_filmstrip(tmp_path / "strip.png", frames, columns=3)
     strip = np.asarray(Image.open(tmp_path / "strip.png"))
@@ -217,16 +221,8 @@ def test_filmstrip_of_small_frames_keeps_captions_apart(tmp_path):
     assert dark[0] == (pitch - 8 - 32) // 2
 
 
-def test_filmstrip_of_one_frame_needs_no_further_arguments(tmp_path):
-    write_filmstrip(tmp_path / "strip.png", film(1))
-    assert Image.open(tmp_path / "strip.png").size == (64 + 16, 48 + 16)
-
-
-@pytest.mark.parametrize("writer", WRITERS)
-def test_wrong_frames_are_clear_errors_and_leave_nothing(tmp_path, writer):
-    path = tmp_path / (
-        "film" + {"write_gif": ".gif", "write_mp4": ".mp4"}.get(writer.__name__, ".png")
-    )
+@EVERY_WRITER
+def test_wrong_frames_are_clear_errors_and_leave_nothing(tmp_path, writer, name):
     for frames, message in (
         ([], "at least one picture"),
         ([np.zeros((4, 4, 3))], "must be uint8"),
@@ -235,7 +231,7 @@ def test_wrong_frames_are_clear_errors_and_leave_nothing(tmp_path, writer):
         ([np.zeros((0, 4, 3), np.uint8)], "not zero"),
     ):
         with pytest.raises(NPAError, match=message):
-            writer(path, frames)
+            writer(tmp_path / name, frames)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -252,11 +248,10 @@ def test_wrong_rates_captions_and_columns_are_clear_errors(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("writer", WRITERS)
-def test_missing_folder_is_a_clear_error(tmp_path, writer):
-    suffix = {"write_gif": ".gif", "write_mp4": ".mp4"}.get(writer.__name__, ".png")
+@EVERY_WRITER
+def test_missing_folder_is_a_clear_error(tmp_path, writer, name):
     with pytest.raises(NPAError, match="nowhere"):
-        writer(tmp_path / "nowhere" / f"film{suffix}", film())
+        writer(tmp_path / "nowhere" / name, film())
 
 
 FILE_SIZE_LIMIT = """
@@ -274,10 +269,9 @@ except NPAError as error:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a limit on the size of files")
-@pytest.mark.parametrize("writer", WRITERS)
-def test_disk_that_fills_up_is_a_clear_error_and_keeps_the_old_file(tmp_path, writer):
-    suffix = {"write_gif": ".gif", "write_mp4": ".mp4"}.get(writer.__name__, ".png")
-    path = tmp_path / f"film{suffix}"
+@EVERY_WRITER
+def test_disk_that_fills_up_is_a_clear_error_and_keeps_the_old_file(tmp_path, writer, name):
+    path = tmp_path / name
     path.write_bytes(b"old")
     program = [sys.executable, "-c", FILE_SIZE_LIMIT, writer.__name__, str(path)]
     done = subprocess.run(program, capture_output=True, text=True, timeout=120, check=False)

@@ -29,19 +29,21 @@ def picture(height: int = 20, width: int = 30) -> np.ndarray:
     return frame
 
 
+def shown_on(window):
+    window.show(picture())
+    return pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
+
+
 def test_a_frame_appears_as_it_is(screen):
     with Window("a world", (30, 20)) as window:
-        window.show(picture())
-        shown = pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
+        np.testing.assert_array_equal(shown_on(window), picture())
         assert pygame.display.get_caption()[0] == "a world"
         assert window.visible
-    np.testing.assert_array_equal(shown, picture())
 
 
 def test_a_frame_of_another_size_fills_the_window(screen):
     with Window("a world", 60) as window:
-        window.show(picture())
-        shown = pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
+        shown = shown_on(window)
     assert shown.shape == (60, 60, 3)
     assert (shown[:25, 35:] == (200, 100, 50)).all()
     assert (shown[35:] == 0).all()
@@ -56,23 +58,26 @@ def test_frames_come_no_faster_than_the_rate(screen):
         assert time.perf_counter() - start > 0.8 * 8 / 40
 
 
-def test_a_click_on_the_cross_closes_the_window(screen):
+@pytest.mark.parametrize(
+    "shut",
+    [
+        lambda window: pygame.event.post(pygame.event.Event(pygame.QUIT)),
+        lambda window: pygame.display.quit(),
+        lambda window: window.close(),
+    ],
+    ids=["a click on the cross", "another library", "its owner"],
+)
+def test_a_window_that_was_shut_stays_closed(screen, shut):
     window = Window("a world", 32)
     window.show(picture())
     assert not window.closed
-    pygame.event.post(pygame.event.Event(pygame.QUIT))
+    shut(window)
     window.show(picture())
     assert window.closed
     assert not window.visible
-    window.show(picture())
-
-
-def test_closing_twice_is_fine(screen):
-    window = Window("a world", 32)
-    window.close()
-    window.close()
-    assert window.closed
     assert not pygame.display.get_init()
+    window.show(picture())
+    window.close()
 
 
 def test_a_new_window_takes_the_place_of_the_old_one(screen):
@@ -85,13 +90,6 @@ def test_a_new_window_takes_the_place_of_the_old_one(screen):
     assert new.visible
     assert pygame.display.get_surface().get_size() == (48, 48)
     new.close()
-
-
-def test_a_display_that_others_shut_down_closes_the_window(screen):
-    window = Window("a world", 32)
-    pygame.display.quit()
-    window.show(picture())
-    assert window.closed
 
 
 def test_the_environment_is_left_as_it_was(screen, monkeypatch):

@@ -9,6 +9,8 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -74,16 +76,16 @@ def _row(session: Session, name: str, call: Call, x: Tensor, exact: Fields) -> P
 
 
 def _reference_fields(x: Tensor, s: Tensor, eps: float) -> Fields:
-    fields = reference.fields(x[None], s[None], eps)
+    return _named(reference.fields(x[None], s[None], eps))
+
+
+def _named(fields: Any) -> Fields:
     return dict(zip(OPERATIONS, (fields.rho[0], fields.blur[0], fields.grad0[0]), strict=True))
 
 
 def _library(x: Tensor, s: Tensor, eps: float) -> list[Call]:
-    def run() -> Fields:
-        fields = perception_fields(x[None], s[None], eps)
-        return dict(zip(OPERATIONS, (fields.rho[0], fields.blur[0], fields.grad0[0]), strict=True))
-
-    return [Call("all", run, capturable=True)]
+    run = partial(perception_fields, x[None], s[None], eps)
+    return [Call("all", lambda: _named(run()), capturable=True)]
 
 
 def _hash_grid(x: Tensor, s: Tensor, eps: float) -> list[Call]:
