@@ -203,25 +203,14 @@ class EpisodeTask:
         self.problem = problem
         self.physics = problem.physics
         """The worlds' constants."""
+        self.eps, self.box = self.physics.eps, self.physics.box
+        """Perception radius ε and sides of the periodic box, None in open space [length units]."""
+        self.update_prob = self.physics.update_prob
+        """Probability of a particle's update in a step, dimensionless."""
         self._task = problem.make_task(device)
         counts = torch.tensor(problem.counts)
         self._species = torch.arange(len(counts)).repeat_interleave(counts).to(device)
         _check_rules_of_play(problem, self._task)
-
-    @property
-    def eps(self) -> float:
-        """Perception radius ε [length units]."""
-        return self.physics.eps
-
-    @property
-    def box(self) -> tuple[float, ...] | None:
-        """Sides of the periodic box [length units], or None in open space."""
-        return self.physics.box
-
-    @property
-    def update_prob(self) -> float:
-        """Probability of a particle's update in a step, dimensionless."""
-        return self.physics.update_prob
 
     @property
     def can_be_recorded(self) -> bool:

@@ -388,14 +388,6 @@ def test_read_outs_and_frozen_layers_stay_as_they_are(form):
     assert found.output.weight.grad is None
 
 
-@EVERY_FORM
-def test_fresh_rules_do_nothing_at_first_and_move_within_a_round(form):
-    trained = run(form, HEART, ROUND)
-    # A whole world is worth as much as before, to the last bit: nothing was done.
-    assert trained.log[0].mean_return == 0.0
-    assert trained.log[-1].mean_return != 0.0
-
-
 def test_a_gpu_is_kept_busy_where_neither_memory_nor_budget_forbids(monkeypatch):
     cuda, cpu, gib = torch.device("cuda", 0), torch.device("cpu"), 2**30
     free = {"bytes": 100 * gib}

@@ -19,8 +19,15 @@ from npa_envs.agents.learning import (
 from npa_envs.agents.learning.progress import annealed
 from npa_envs.errors import DivergedError, NPAError
 
+PROBLEM = heart(episode_steps=2)
+
 ITERATION = 480
 """Particle-steps of an iteration of the learner below."""
+
+
+@pytest.fixture
+def rules():
+    return PROBLEM.new_rules(0)
 
 
 def progress_of(problem, seeds=range(100, 103), **given):
@@ -54,23 +61,18 @@ def test_a_budget_that_means_nothing_is_refused(fields, message):
         Budget(**fields)
 
 
-def test_particle_steps_are_kept_up_to_one_iteration():
-    problem = heart(episode_steps=2)
-    rules = problem.new_rules(0)
-    log = learn_nothing(progress_of(problem, particle_steps=10_000, entries=5), rules)
+def test_particle_steps_are_kept_up_to_one_iteration(rules):
+    log = learn_nothing(progress_of(PROBLEM, particle_steps=10_000, entries=5), rules)
     assert 10_000 <= log[-1].particle_steps < 10_000 + ITERATION
     # At the start, and at the first iteration after each fifth.
     assert [entry.particle_steps for entry in log] == [0, 2400, 4320, 6240, 8160, 10080]
 
 
-def test_time_is_kept_and_evaluations_take_none_of_it():
-    problem = heart(episode_steps=2)
-    rules = problem.new_rules(0)
-
+def test_time_is_kept_and_evaluations_take_none_of_it(rules):
     def slow(entry):
         time.sleep(0.2)
 
-    progress = progress_of(problem, seconds=0.2, entries=4, on_entry=slow)
+    progress = progress_of(PROBLEM, seconds=0.2, entries=4, on_entry=slow)
     begun = time.perf_counter()
     log = learn_nothing(progress, rules, pause=0.01)
     assert time.perf_counter() - begun > 5 * 0.2 + 0.2
@@ -80,10 +82,9 @@ def test_time_is_kept_and_evaluations_take_none_of_it():
     assert [entry.seconds for entry in log] == sorted(entry.seconds for entry in log)
 
 
-def test_whichever_is_spent_first_ends_it():
-    problem = heart(episode_steps=2)
-    progress = progress_of(problem, seconds=1000.0, particle_steps=1000)
-    assert learn_nothing(progress, problem.new_rules(0))[-1].seconds < 10.0
+def test_whichever_is_spent_first_ends_it(rules):
+    progress = progress_of(PROBLEM, seconds=1000.0, particle_steps=1000)
+    assert learn_nothing(progress, rules)[-1].seconds < 10.0
 
 
 def test_entries_are_evaluations_from_the_seeds_given():
@@ -98,10 +99,8 @@ def test_entries_are_evaluations_from_the_seeds_given():
     assert len(log) == 2
 
 
-def test_a_forced_look_after_nothing_was_done_adds_no_entry():
-    problem = heart(episode_steps=2)
-    rules = problem.new_rules(0)
-    progress = progress_of(problem, particle_steps=1000, entries=2)
+def test_a_forced_look_after_nothing_was_done_adds_no_entry(rules):
+    progress = progress_of(PROBLEM, particle_steps=1000, entries=2)
     progress.start(rules)
     progress.look(rules, force=True)
     assert len(progress.log) == 1
@@ -112,10 +111,8 @@ def test_a_forced_look_after_nothing_was_done_adds_no_entry():
     assert len(progress.log) == 2
 
 
-def test_progress_has_to_start_first_and_once():
-    problem = heart(episode_steps=2)
-    rules = problem.new_rules(0)
-    progress = progress_of(problem, particle_steps=1000)
+def test_progress_has_to_start_first_and_once(rules):
+    progress = progress_of(PROBLEM, particle_steps=1000)
     with pytest.raises(NPAError, match="advance needs a start"):
         progress.advance(1)
     with pytest.raises(NPAError, match="look needs a start"):
@@ -131,10 +128,8 @@ def test_a_curve_without_points_is_refused(fields, word):
         progress_of(heart(), particle_steps=10, **fields)
 
 
-def test_rules_that_diverged_are_reported():
-    problem = heart(episode_steps=2)
-    rules = problem.new_rules(0)
-    progress = progress_of(problem, particle_steps=1000)
+def test_rules_that_diverged_are_reported(rules):
+    progress = progress_of(PROBLEM, particle_steps=1000)
     progress.start(rules)
     with torch.no_grad():
         rules.rules[0].output.weight[3, 5] = torch.nan
