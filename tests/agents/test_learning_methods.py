@@ -11,7 +11,7 @@ from learning_problems import digits, heart, species, wild_rules
 
 import npa_envs
 from npa_envs.agents import MendPolicy, PaintPolicy, RandomPolicy, SpreadPolicy, evaluate_policy
-from npa_envs.agents.learning import EVALUATION_SEEDS, Budget, Problem, RuleSet, train
+from npa_envs.agents.learning import EVALUATION_SEEDS, Budget, RuleSet, train
 from npa_envs.agents.learning.clone import Demonstrations, unexplained
 from npa_envs.agents.learning.gradient import ClampedRule, EpisodeTask, clamp_inward, episode_task
 from npa_envs.agents.learning.problem import FIRST_EVALUATION_SEED, world_seeds
@@ -30,6 +30,11 @@ def run(problem, method="gradient", iterations=30, seed=0, worlds=4, **options):
     budget = Budget(particle_steps=steps)
     seeds = range(500, 503)
     return train(method, problem, budget, seed, evaluation_seeds=seeds, entries=1, **options)
+
+
+def damaged(**keywords):
+    keywords = heart(**keywords).keywords | {"rule": "picture", "damage": "erase"}
+    return replace(heart(), env_id="npa/Regeneration2D-v0", keywords=keywords)
 
 
 def learned(problem, **options):
@@ -146,9 +151,7 @@ def test_the_gradient_tells_digits():
 
 
 def test_the_gradient_heals():
-    keywords = dict(heart().keywords, rule="picture", damage="erase")
-    problem = replace(heart(), env_id="npa/Regeneration2D-v0", keywords=keywords)
-    first, last = learned(problem, iterations=40)
+    first, last = learned(damaged(), iterations=40)
     assert last.mean_return > first.mean_return + 0.01
 
 
@@ -292,16 +295,21 @@ def test_methods_that_learn_nothing_evaluate_once():
 
 
 @pytest.mark.parametrize(
-    ("problem", "kind"),
+    ("problem", "gains", "kind"),
     [
-        (heart(episode_steps=16), PaintPolicy),
-        (species(episode_steps=16), SpreadPolicy),
-        (species("npa/Symbiosis-v0", episode_steps=16, resolution=16), PaintPolicy),
+        (heart(episode_steps=16), (0.03, -0.03), PaintPolicy),
+        (species(episode_steps=16), (0.03, -0.03), SpreadPolicy),
+        (
+            species("npa/Symbiosis-v0", episode_steps=16, resolution=16),
+            (0.03, -0.03),
+            PaintPolicy,
+        ),
+        (damaged(particle_count=200, eps=0.15), (0.001, -0.001), MendPolicy),
     ],
     ids=lambda p: getattr(p, "env_id", ""),
 )
-def test_the_scripted_policy_that_fits_is_found(problem, kind):
-    trained = run(problem, "scripted", gains=(0.03, -0.03))
+def test_the_scripted_policy_that_fits_is_found(problem, gains, kind):
+    trained = run(problem, "scripted", gains=gains)
     assert type(trained.policy) is kind
     nothing, best = trained.log
     assert nothing.mean_return == 0.0
@@ -322,12 +330,6 @@ def test_where_no_script_helps_there_is_none():
     pytest.importorskip("sklearn")
     with pytest.raises(NPAError, match="found no policy that does better than nothing"):
         run(digits(), "scripted", gains=(0.01,))
-
-
-def test_mending_is_known_where_pictures_are_damaged():
-    keywords = dict(heart().keywords, rule="picture", damage="erase", particle_count=200, eps=0.15)
-    problem = Problem(env_id="npa/Regeneration2D-v0", keywords=keywords, episode_steps=8)
-    assert type(run(problem, "scripted", gains=(0.001,)).policy) is MendPolicy
 
 
 # Seeds: every run learns in worlds of its own

@@ -72,14 +72,11 @@ def test_every_command_explains_itself(name, capsys):
     assert f"usage: npa-envs {name}" in capsys.readouterr().out
 
 
-def test_no_command_is_a_usage_error(capsys):
-    assert main([]) == 2
-    assert "usage: npa-envs COMMAND" in capsys.readouterr().out
-
-
-def test_version_is_that_of_the_package(capsys):
+def test_no_command_is_a_usage_error_and_the_version_is_that_of_the_package(capsys):
     import npa_envs
 
+    assert main([]) == 2
+    assert "usage: npa-envs COMMAND" in capsys.readouterr().out
     assert main(["--version"]) == 0
     assert capsys.readouterr().out == f"npa-envs {npa_envs.__version__}\n"
 

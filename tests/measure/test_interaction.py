@@ -136,20 +136,14 @@ def test_still_rules_leave_their_seeds_and_the_metric_is_the_tasks():
     assert 0.5 < rows[0].mixing < 0.99
 
 
-def test_the_same_settings_give_the_same_rows_and_count_their_steps():
+def test_pictures_are_taken_along_the_way_and_steps_are_counted():
     done = []
-    tables = []
-    for _ in range(2):
-        encounters = Encounters(settings(steps=40), device=CPU, progress=done.append)
-        tables.append(encounters.meet(organism(), organism("b", seed=1))[0])
-    assert tables[0] == tables[1]
-    assert sum(done) == 2 * (40 + 40)
-
-
-def test_pictures_are_taken_along_the_way():
-    encounters = Encounters(settings(steps=16, distances=(0.0, 1.0)), device=CPU)
+    given = settings(steps=40, distances=(0.0, 1.0))
+    encounters = Encounters(given, device=CPU, progress=done.append)
     _, scenes = encounters.meet(organism(), organism("b", seed=1))
-    steps = [round(16 * share) for share in FRAME_SHARES]
+    # What is grown alone is grown once.
+    assert sum(done) == 40 + 2 * 40
+    steps = [round(40 * share) for share in FRAME_SHARES]
     expected = [f"d {d}, r 0.5, step {step}" for d in (0, 1) for step in steps]
     assert scenes.captions == expected
     assert len(scenes.frames) == len(expected)

@@ -374,6 +374,8 @@ def test_stored_records_give_the_stored_tables():
     places = [folder / f"robustness_{name}.json" for name in rule_names()]
     held = {path: json.loads(path.read_text("utf-8")) for path in places if path.exists()}
     records = [RuleRecord.read(path, content["facts"]) for path, content in held.items()]
+    assert len(records) == len(list(folder.glob("*.json"))) == 15
+    assert all(record.done for record in records)
     assert tables(records) == (folder / "robustness.md").read_text("utf-8")
 
 
