@@ -1,5 +1,7 @@
 """Errors of a task's pictures: in one pass as by the differentiable path, alone as in a batch."""
 
+import functools
+
 import pytest
 import torch
 from worlds import assert_same, tensors
@@ -12,13 +14,18 @@ ERRORS = {torch.float32: 3e-6, torch.float64: 1e-13}
 """Largest relative difference between both paths (worst seen 3e-7 and 4e-16)."""
 
 
-@pytest.fixture(params=[(333, 33), (77, 101), (500, 64)], ids=("33px", "101px", "64px"))
-def worlds(request, dtype, device):
-    particle_count, resolution = request.param
+@functools.cache
+def task_of(particle_count, resolution, device):
+    """A task, drawn once for all tests: its target takes longer than they do."""
     config = Morphogenesis2DConfig(
         particle_count=particle_count, resolution=resolution, target_point_count=200
     )
-    task = Morphogenesis2D(config, device=device)
+    return Morphogenesis2D(config, device=device)
+
+
+@pytest.fixture(params=[(333, 33), (77, 101), (500, 64)], ids=("33px", "101px", "64px"))
+def worlds(request, dtype, device):
+    task = task_of(*request.param, device)
     random = WorldRandom(range(5), device=device)
     x, s = task.seed(5, generator=random, device=device)
     x = 3.0 * x + 0.2 * random.normal(*x.shape[1:])

@@ -124,11 +124,13 @@ def test_a_rollout_says_in_which_step_and_where_a_world_diverged(static, device)
     assert "world 0" not in text
 
 
-def test_what_was_not_finite_before_the_first_step_is_called_so(device):
+@moving_and_static
+@pytest.mark.parametrize("steps", [0, 5])
+def test_what_was_not_finite_before_the_first_step_is_called_so(steps, static, device):
     x, s = worlds(device)
-    s[0, 2, 1] = math.nan
-    with pytest.raises(DivergedError, match="channel 1 of particle 2 was nan before the first"):
-        npa_envs.rollout(make_rule(device), x, s, 0, on_divergence="raise")
+    s[0, 17, 2] = math.inf
+    with pytest.raises(DivergedError, match="channel 2 of particle 17 was inf before the first"):
+        npa_envs.rollout(make_rule(device, static=static), x, s, steps, on_divergence="raise")
 
 
 @moving_and_static
