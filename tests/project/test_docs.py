@@ -5,16 +5,21 @@ from __future__ import annotations
 import importlib.util
 import re
 import sys
+from dataclasses import fields
 from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from crowds import TASKS, still
+from crowds import small as small_crowd
 from gymnasium.utils.env_checker import check_env
 
 import npa_envs
 from npa_envs.agents.learning import METHODS, Budget, train
+from npa_envs.envs import multispecies_v0, particles_v0
+from npa_envs.envs.multi import TASKS as TABLE
 from npa_envs.ops.backend import Request, describe
 from npa_envs.registration import ENVIRONMENTS
 
@@ -360,3 +365,101 @@ def test_the_index_leads_to_every_page():
     linked = {(DOCS / name).resolve() for name in links}
     pages = {*DOCS.glob("*.md"), DOCS / "environments" / "README.md"}
     assert pages - {DOCS / "index.md"} <= linked
+
+
+# Pages of PettingZoo's environments.
+
+MODULES = {"MultiSpecies": multispecies_v0, "Particles": particles_v0}
+every_page = pytest.mark.parametrize("name", MODULES)
+
+
+def page_of(name: str) -> Path:
+    return DOCS / "environments" / f"{name}.md"
+
+
+@every_page
+def test_the_examples_of_a_page_run(name, capsys):
+    names = {}
+    for block in code_blocks(page_of(name)):
+        # Small and short worlds: what is tested is that the calls are right.
+        few = "particle_count=40, max_cycles=4)"
+        small_block = re.sub(r"species_count=2\)", f"species_count=2, {few}", block)
+        small_block = re.sub(r"max_cycles=200\)", few, small_block)
+        assert small_block.count(few) == 1
+        exec(small_block, names)
+    assert names["env"].agents == []
+    agent = names["env"].possible_agents[-1]
+    assert names["infos"][agent]["reason"] == "time limit"
+    if name == "MultiSpecies":
+        assert re.fullmatch(
+            r"\{'species_0': [\d.]+, 'species_1': [\d.]+\}\n", capsys.readouterr().out
+        )
+
+
+def test_the_page_lists_the_arguments_of_every_task_with_their_defaults():
+    shared, *own = section(page_of("MultiSpecies"), "Arguments").split("\nOf `")
+    tables = {part.split('"')[1]: part for part in own}
+    for task, task_type in TABLE.items():
+        listed = first_cells(shared) + first_cells(tables.get(task, ""))
+        config = task_type.config_type()
+        assert set(listed) == {field.name for field in fields(config)}
+        for field in fields(config):
+            row = f"| `{field.name}` |"
+            part = tables[task] if row in tables.get(task, "") else shared
+            (line,) = [line for line in part.splitlines() if line.startswith(row)]
+            value = getattr(config, field.name)
+            shown = f'"{value}"' if isinstance(value, str) else str(value)
+            assert line.split(" | ")[2] == f"`{shown}`"
+
+
+@every_page
+@pytest.mark.parametrize("task", TASKS)
+def test_a_page_names_the_keys_of_info_and_the_parts_of_the_loss(name, task):
+    env = MODULES[name].parallel_env(**small_crowd(task, particle_count=8, max_cycles=1))
+    _, at_reset = env.reset(seed=0)
+    *_, at_step = env.step(still(env))
+    agent = env.possible_agents[0]
+    (row,) = [
+        line for line in section(page_of(name), "Reward").splitlines() if f"| {task} |" in line
+    ]
+    parts = re.findall(r"`(\w+)`", row.split(" | ")[-1])
+    assert set(at_reset[agent]) == {"species", "loss", *(f"loss_{part}" for part in parts)}
+    gained = {f"reward_{part}" for part in parts}
+    assert set(at_step[agent]) == set(at_reset[agent]) | gained | {"reason"}
+    assert {"species", "loss", "reason"} <= set(first_cells(section(page_of(name), "Info")))
+
+
+@every_page
+def test_a_page_tells_spaces_and_agents_as_they_are(name):
+    env = MODULES[name].parallel_env()
+    head = page_of(name).read_text().split("```")[0]
+    for shown in (
+        f"`{env.possible_agents[0]}` to `{env.possible_agents[-1]}`",
+        f"`{env.observation_space(env.possible_agents[0])}`",
+        f"`{env.action_space(env.possible_agents[0])}`",
+        f"shape {env.state_space.shape}",
+        f"| {env.max_cycles} |",
+    ):
+        assert shown in head
+
+
+@every_page
+def test_the_page_lists_tasks_with_their_ids(name):
+    rows = re.findall(r'^\| `"(\w+)"` \| `([^`]+)` \|', page_of(name).read_text(), re.MULTILINE)
+    assert {id_: task for task, id_ in rows} == MODULES[name].ENVIRONMENTS
+
+
+def test_the_page_tells_how_episodes_end():
+    listed = re.findall(
+        r'`"([^`"]+)"` \|$', section(page_of("MultiSpecies"), "Episode end"), re.MULTILINE
+    )
+    reasons = set()
+    for task, keywords in (("invasion", {"deaths": ((1, 1),)}), ("mixing", {"max_cycles": 1})):
+        env = multispecies_v0.parallel_env(**small_crowd(task, **keywords))
+        env.reset(seed=0)
+        reasons |= {info["reason"] for info in env.step(still(env))[-1].values()}
+    env = multispecies_v0.parallel_env(**small_crowd("mixing", particle_counts=(1, 1)))
+    env.reset(seed=0)
+    env.place_particles(np.full((2, 2), 4.0), np.zeros((2, 16)))
+    reasons |= {info["reason"] for info in env.step(still(env))[-1].values()}
+    assert set(listed) == reasons

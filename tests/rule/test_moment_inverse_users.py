@@ -4,14 +4,15 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from circle_task import CircleTask, circle_config, plain_rollout
+from circle_task import CircleTask, circle_config
+from training_runs import train
 from worlds import random_world, relative_error
 
 import npa_envs
 from npa_envs import reference as oracle
 from npa_envs.agents import RulePolicy
 from npa_envs.envs import multispecies_v0
-from npa_envs.training import Trainer, load_config
+from npa_envs.training import load_config
 from npa_envs.training.trainer import initial_rule
 
 
@@ -84,8 +85,7 @@ def test_species_must_agree(device):
 
 def test_training_gives_its_rule_the_choice(tmp_path):
     config = circle_config(tmp_path / "run", iterations=2, moment_inverse="smooth")
-    trainer = Trainer(CircleTask(), config, task_name="circle", rollout=plain_rollout)
-    trainer.run(progress=False)
+    train(config)
     assert npa_envs.load_rule(tmp_path / "run" / "rule.safetensors").moment_inverse == "smooth"
     assert load_config(tmp_path / "run" / "config.json", circle_config(tmp_path)) == config
     with pytest.raises(npa_envs.NPAError, match="moment_inverse must be one of threshold, smooth"):

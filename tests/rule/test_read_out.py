@@ -23,15 +23,8 @@ class ReadOutTask(CircleTask):
     rule: NPARule | None = None
 
     def make_rule(self, generator):
-        return untrained_rule(
-            generator,
-            state_dim=STATE_DIM,
-            hidden_dim=16,
-            eps0=self.eps,
-            alpha=0.5,
-            readout_dim=2,
-            readout_hidden_dim=8,
-        )
+        shape = {"state_dim": STATE_DIM, "hidden_dim": 16, "eps0": self.eps}
+        return untrained_rule(generator, **shape, readout_dim=2, readout_hidden_dim=8)
 
     def for_rule(self, rule):
         bound = copy.copy(self)
@@ -47,16 +40,8 @@ class ReadOutTask(CircleTask):
 
 
 def test_read_out_is_two_layers_of_every_particles_own_state():
-    rule = untrained_rule(
-        torch.Generator().manual_seed(0),
-        state_dim=5,
-        hidden_dim=4,
-        eps0=0.1,
-        alpha=0.5,
-        static=True,
-        readout_dim=4,
-        readout_hidden_dim=7,
-    ).double()
+    shape = {"state_dim": 5, "hidden_dim": 4, "readout_dim": 4, "readout_hidden_dim": 7}
+    rule = untrained_rule(torch.Generator().manual_seed(0), static=True, **shape).double()
     assert rule.update_dim == 5
     states = torch.randn(2, 3, 5, dtype=torch.float64)
     first, last = rule.readout[0], rule.readout[2]
@@ -65,11 +50,6 @@ def test_read_out_is_two_layers_of_every_particles_own_state():
     # Worst error measured: 0, of outputs of about 0.3.
     torch.testing.assert_close(rule.read_out(states), expected, rtol=1e-12, atol=1e-14)
     torch.testing.assert_close(rule.colour(states), expected[..., 1:] + COLOUR_OFFSET)
-
-
-def test_a_task_without_read_out_is_the_same_for_all_rules():
-    task = CircleTask()
-    assert task_for_rule(task, task.make_rule(torch.Generator())) is task
 
 
 def train(tmp_path, task=None, **fields):

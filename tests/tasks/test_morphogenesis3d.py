@@ -24,22 +24,11 @@ from npa_envs.tasks.targets.meshes import AMBIENT, LIGHT, load_mesh
 from npa_envs.tasks.targets.views import ANGLE, DISTANCE, load_views, over, some_views
 
 needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-SMALL = Morphogenesis3DConfig(
-    target="doughnut",
-    particle_count=150,
-    hidden_dim=16,
-    readout_hidden_dim=8,
-    resolution=24,
-    training_views=6,
-    held_out_views=3,
-    views_per_iteration=2,
-    sigma=0.1,
-    opacity=0.5,
-    blur_sigma=2.0,
-    blur_iterations=10,
-    eps=0.3,
-    ssim_weight=0.0,
-)
+WORLD = {"target": "doughnut", "particle_count": 150, "eps": 0.3, "sigma": 0.1, "opacity": 0.5}
+RULE = {"hidden_dim": 16, "readout_hidden_dim": 8}
+VIEWS = {"training_views": 6, "held_out_views": 3, "views_per_iteration": 2, "resolution": 24}
+LOSS = {"blur_sigma": 2.0, "blur_iterations": 10, "ssim_weight": 0.0}
+SMALL = Morphogenesis3DConfig(**WORLD, **RULE, **VIEWS, **LOSS)
 
 
 @pytest.fixture(scope="module")

@@ -8,20 +8,14 @@ import torch
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.damage import FARTHEST, NEAREST, scatter, stray_motion
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
-from npa_envs.training import TrainConfig, train
+from npa_envs.tasks.train_config import tiny_run
+from npa_envs.training import train
 from npa_envs.world.randomness import WorldRandom
 from npa_envs.world.rollout import rollout
 
+TINY = {"state_dim": 6, "hidden_dim": 24, "eps": 0.3, "resolution": 24, "particle_count": 96}
 SMALL = Morphogenesis2DConfig(
-    target="ring",
-    particle_count=96,
-    target_point_count=96,
-    state_dim=6,
-    hidden_dim=24,
-    eps=0.3,
-    resolution=24,
-    stray_share=0.1,
-    stray_weight=1.0,
+    target="ring", target_point_count=96, stray_share=0.1, stray_weight=1.0, **TINY
 )
 
 
@@ -86,24 +80,14 @@ def lone_motion(rule: NPARule) -> float:
 
 
 def test_rules_that_saw_strays_let_lone_particles_rest(tmp_path):
-    config = TrainConfig(
-        task=replace(SMALL, stray_share=0.05, stray_weight=10.0),
-        iterations=40,
-        repeats=1,
-        world_count=2,
-        pool_size=6,
-        steps=(4, 8),
-        learning_rate=5e-3,
-        milestones=(),
-        seed_interval=2,
-        out=tmp_path / "strays",
-        tensorboard=False,
-    )
-    taught = train(config, "morphogenesis2d", progress=False)
-    plain = replace(config, task=replace(SMALL, stray_share=0.0, stray_weight=0.0))
-    untaught = train(replace(plain, out=tmp_path / "plain"), "morphogenesis2d", progress=False)
+    fields = {"iterations": 40, "pool_size": 6, "steps": (4, 8), "milestones": ()}
+    motions = []
+    for name, share, weight in (("strays", 0.05, 10.0), ("plain", 0.0, 0.0)):
+        task = replace(SMALL, stray_share=share, stray_weight=weight)
+        config = tiny_run(task, seed_interval=2, out=tmp_path / name, **fields)
+        motions.append(lone_motion(train(config, progress=False).rule))
     # Seen: 0.058 against 0.37 length units.
-    assert lone_motion(taught.rule) < 0.3 * lone_motion(untaught.rule)
+    assert motions[0] < 0.3 * motions[1]
 
 
 def test_the_distance_of_the_centroid_from_where_worlds_begin_is_paid_for():

@@ -162,17 +162,10 @@ def test_mesh_files_are_read_with_their_colours(tmp_path):
         load_mesh(tmp_path / "broken.ply")
 
 
-def test_a_missing_trimesh_is_named_with_its_cure(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "trimesh", None)
-    (tmp_path / "a.glb").write_bytes(b"")
-    with pytest.raises(MissingDependencyError, match=r"pip install 'npa-envs\[meshes\]'"):
-        load_mesh(tmp_path / "a.glb")
-
-
-def nerf_folder(folder, scale=1.5, side=40, fields=None):
+def nerf_folder(folder, side=40):
     """A scene as NeRF-synthetic ones are: z up, cameras at 4 units, of a coloured mesh."""
     mesh = load_mesh("rocket")
-    z_up = mesh.vertices[:, [0, 2, 1]] * (1.0, -1.0, 1.0) * scale
+    z_up = mesh.vertices[:, [0, 2, 1]] * (1.0, -1.0, 1.0) * 1.5
     turned = Mesh(z_up, mesh.faces, mesh.colours)
     for split, count in (("train", 5), ("test", 3)):
         # Poses in their world: ours turned.
@@ -196,9 +189,14 @@ def nerf_folder(folder, scale=1.5, side=40, fields=None):
                 folder / split / f"r_{k}.png"
             )
             frames.append({"file_path": f"./{split}/r_{k}", "transform_matrix": poses[k].tolist()})
-        content = {"camera_angle_x": math.radians(50.0), "frames": frames} | (fields or {})
+        content = {"camera_angle_x": math.radians(50.0), "frames": frames}
         (folder / f"transforms_{split}.json").write_text(json.dumps(content))
     return folder
+
+
+@pytest.fixture
+def nerf(tmp_path):
+    return nerf_folder(tmp_path / "scene", side=16)
 
 
 def test_nerf_folders_are_turned_upright_and_scaled_into_the_ball(tmp_path):
@@ -214,15 +212,12 @@ def test_nerf_folders_are_turned_upright_and_scaled_into_the_ball(tmp_path):
         assert float(error[..., 3].mean()) < 0.02
         assert float(error.mean()) < 0.02
         assert float(views.pictures[..., 3].mean()) > 0.05
-
-
-def test_nerf_folders_may_be_thinned_and_resized(tmp_path):
-    folder = nerf_folder(tmp_path / "scene")
-    target = load_views(folder, resolution=20, training_count=2, held_out_count=1)
-    whole = load_views(folder, resolution=20)
-    assert torch.equal(target.training.pictures, whole.training.pictures[[0, 2]])
-    assert target.training.pictures.shape == (2, 20, 20, 4)
-    assert target.held_out.cameras.intrinsics[2] == 10.0
+    # They may be thinned, and resized.
+    thin = load_views(tmp_path / "scene", resolution=20, training_count=2, held_out_count=1)
+    whole = load_views(tmp_path / "scene", resolution=20)
+    assert torch.equal(thin.training.pictures, whole.training.pictures[[0, 2]])
+    assert thin.training.pictures.shape == (2, 20, 20, 4)
+    assert thin.held_out.cameras.intrinsics[2] == 10.0
 
 
 @pytest.mark.parametrize(
@@ -237,36 +232,37 @@ def test_nerf_folders_may_be_thinned_and_resized(tmp_path):
         (lambda c: c["frames"][0].update(file_path="./train/none"), "does not exist"),
     ],
 )
-def test_damaged_nerf_folders_are_refused(tmp_path, change, message):
-    folder = nerf_folder(tmp_path / "scene", side=16)
-    path = folder / "transforms_train.json"
+def test_damaged_nerf_folders_are_refused(nerf, change, message):
+    path = nerf / "transforms_train.json"
     content = json.loads(path.read_text())
     change(content)
     path.write_text(json.dumps(content))
     with pytest.raises(NPAError, match=message):
-        load_views(folder)
+        load_views(nerf)
 
 
-def test_incomplete_nerf_folders_are_refused(tmp_path):
-    folder = nerf_folder(tmp_path / "scene", side=16)
-    (folder / "transforms_train.json").write_text("{")
-    with pytest.raises(NPAError, match="as JSON"):
-        load_views(folder)
-    (folder / "transforms_train.json").unlink()
-    with pytest.raises(NPAError, match=r"must hold transforms_train\.json"):
-        load_views(folder)
-    (folder / "transforms_test.json").unlink()
-    with pytest.raises(NPAError, match=r"transforms_test.json or transforms_val.json"):
-        load_views(folder)
-    empty = nerf_folder(tmp_path / "empty", side=16)
-    for path in empty.glob("*/*.png"):
+def emptied(folder):
+    for path in folder.glob("*/*.png"):
         Image.new("RGBA", (16, 16)).save(path)
-    with pytest.raises(NPAError, match="views must show something"):
-        load_views(empty)
-    oblong = nerf_folder(tmp_path / "oblong", side=16)
-    Image.new("RGBA", (16, 12)).save(oblong / "train" / "r_0.png")
-    with pytest.raises(NPAError, match="views must be square"):
-        load_views(oblong)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda f: (f / "transforms_train.json").write_text("{"), "as JSON"),
+        (lambda f: (f / "transforms_train.json").unlink(), r"must hold transforms_train\.json"),
+        (
+            lambda f: (f / "transforms_test.json").unlink(),
+            r"transforms_test.json or transforms_val",
+        ),
+        (emptied, "views must show something"),
+        (lambda f: Image.new("RGBA", (16, 12)).save(f / "train" / "r_0.png"), "must be square"),
+    ],
+)
+def test_incomplete_nerf_folders_are_refused(nerf, change, message):
+    change(nerf)
+    with pytest.raises(NPAError, match=message):
+        load_views(nerf)
 
 
 def test_similarity_is_the_library_s():
@@ -301,11 +297,18 @@ def test_similarity_has_finite_gradients_also_where_pictures_are_opposites(side)
     assert float((gradient * way).sum()) == pytest.approx(float(ahead - behind) / 2e-6, rel=2e-6)
 
 
-def test_a_missing_similarity_is_named_with_its_cure(monkeypatch):
-    monkeypatch.setitem(sys.modules, "pytorch_msssim", None)
-    monkeypatch.setitem(sys.modules, "pytorch_msssim.ssim", None)
-    with pytest.raises(MissingDependencyError, match=r"pip install 'npa-envs\[views\]'"):
-        MultiScaleSimilarity(64, 4)
+@pytest.mark.parametrize(
+    ("module", "extra", "call"),
+    [
+        ("trimesh", "meshes", lambda folder: load_mesh(folder / "a.glb")),
+        ("pytorch_msssim.ssim", "views", lambda folder: MultiScaleSimilarity(64, 4)),
+    ],
+)
+def test_a_missing_library_is_named_with_its_cure(tmp_path, monkeypatch, module, extra, call):
+    monkeypatch.setitem(sys.modules, module, None)
+    (tmp_path / "a.glb").write_bytes(b"")
+    with pytest.raises(MissingDependencyError, match=rf"pip install 'npa-envs\[{extra}\]'"):
+        call(tmp_path)
 
 
 def test_blur_is_a_gaussian_and_none_at_zero():
@@ -335,12 +338,7 @@ def test_schedules_follow_from_seed_and_iteration_alone():
         assert all(torch.equal(a, b) for a, b in zip(history[k], drawn(other, k), strict=True))
     # Graphs that were recorded read the same tensors.
     assert all(a is b for a, b in zip(kept, (one.index, one.backgrounds, one.sigma), strict=True))
-    assert [float(h[2]) for h in (history[0], history[25], history[50], history[59])] == [
-        10.0,
-        5.0,
-        0.0,
-        0.0,
-    ]
+    assert [float(history[k][2]) for k in (0, 25, 50, 59)] == [10.0, 5.0, 0.0, 0.0]
     chosen = torch.stack([h[0] for h in history])
     assert all(len(set(row.tolist())) == 4 for row in chosen)
     # 12 are expected of each; five standard deviations are 16.

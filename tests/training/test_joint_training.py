@@ -1,7 +1,5 @@
 """Rules that are trained together: the task of several species, and the run it makes."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 
@@ -10,7 +8,8 @@ from npa_envs.measure.quality import evaluate
 from npa_envs.rule.files import load_rule, rule_metadata
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2D, CoMorphogenesis2DConfig
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
-from npa_envs.training import TrainConfig, train_together
+from npa_envs.tasks.train_config import tiny_run
+from npa_envs.training import train_together
 from npa_envs.training.run_folder import load_checkpoint
 from npa_envs.world.species import rollout_species
 
@@ -31,23 +30,9 @@ def pair(**fields):
 
 
 def run_config(out, **fields):
-    base = TrainConfig(
-        task=pair(),
-        iterations=4,
-        repeats=1,
-        world_count=2,
-        pool_size=6,
-        steps=(4, 8),
-        learning_rate=5e-3,
-        milestones=(),
-        seed_interval=2,
-        out=out,
-        log_interval=1,
-        picture_interval=2,
-        checkpoint_interval=2,
-        tensorboard=False,
-    )
-    return replace(base, **fields)
+    usual = {"iterations": 4, "pool_size": 6, "steps": (4, 8), "milestones": (), "out": out}
+    usual |= {"seed_interval": 2, "picture_interval": 2, "checkpoint_interval": 2}
+    return tiny_run(pair(), **usual | fields)
 
 
 @pytest.fixture(scope="module")
@@ -172,23 +157,6 @@ class TestRun:
         assert parts.iteration == whole.iteration == 4
         for value, expected in zip(parts.rule.parameters(), whole.rule.parameters(), strict=True):
             assert torch.equal(value, expected)
-
-    def test_worlds_are_those_of_several_species_that_see_themselves_as_alone(
-        self, tmp_path, monkeypatch
-    ):
-        calls = []
-
-        def noted(rules, x, s, steps, **options):
-            calls.append((len(rules), options))
-            return rollout_species(rules, x, s, steps, **options)
-
-        monkeypatch.setattr("npa_envs.training.joint.rollout_species", noted)
-        train_together(run_config(tmp_path / "run", memory="minimal"), progress=False)
-        assert len(calls) == 4
-        for rule_count, options in calls:
-            assert rule_count == 2
-            assert options["counts"] == options["density_counts"] == (48, 32)
-            assert (options["eps"], options["memory"]) == (0.3, "minimal")
 
     def test_a_frozen_rule_stays_and_the_given_ones_are_copied(self, tmp_path):
         task = CoMorphogenesis2D(pair())

@@ -139,14 +139,8 @@ def test_log_has_terms_rate_steps_and_time(tmp_path):
     assert [record["learning_rate"] for record in records] == [0.01, 0.005, 0.005]
     assert all(4 <= record["steps"] < 9 for record in records)
     assert records[0]["seconds"] <= records[1]["seconds"] <= records[2]["seconds"]
-    terms = ["loss", "distance", "state", "motion"]
-    assert list(records[0]) == [
-        "iteration",
-        *terms,
-        "steps",
-        "replaced_worlds",
-        *list(records[0])[-2:],
-    ]
+    terms = ["loss", "distance", "state", "motion", "steps", "replaced_worlds"]
+    assert list(records[0]) == ["iteration", *terms, "learning_rate", "seconds"]
     for record in records:
         whole = record["distance"] + 0.01 * record["state"] + 0.001 * record["motion"]
         assert record["loss"] == pytest.approx(whole, rel=1e-5)
@@ -260,23 +254,6 @@ def explode_after(iterations):
     return rollout
 
 
-def test_loss_that_is_not_finite_stops_the_run_with_a_report(tmp_path):
-    config = circle_config(tmp_path, iterations=20, log_interval=2, checkpoint_interval=1)
-    trainer = trainer_of(config, rollout=explode_after(5))
-    with pytest.raises(DivergedError) as caught:
-        trainer.run(progress=False)
-    message = str(caught.value)
-    assert "distance was not in iteration 5 (" in message
-    assert "steps, world 2 of the batch)" in message
-    assert "diverged.pt" in message
-    assert [record["iteration"] for record in log_of(tmp_path)] == [2, 4]
-    assert load_checkpoint(tmp_path / "checkpoint.pt")["iteration"] == 4
-    diagnosis = load_checkpoint(tmp_path / "diverged.pt")
-    assert diagnosis["iteration"] == 5
-    assert torch.isfinite(diagnosis["x0"]).all()
-    assert torch.isfinite(diagnosis["x"]).flatten(1).all(1).tolist() == [True, True, False]
-
-
 def logging_late(config, **options):
     """A trainer that writes each record an iteration later, as it does on CUDA."""
     trainer = trainer_of(config, **options)
@@ -284,51 +261,41 @@ def logging_late(config, **options):
     return trainer
 
 
-def test_late_records_are_the_same_and_written_while_the_next_iteration_is_under_way(tmp_path):
-    fields = {"iterations": 7, "log_interval": 2, "checkpoint_interval": 3, "picture_interval": 4}
-    train(circle_config(tmp_path / "prompt", **fields))
-    trainer = logging_late(circle_config(tmp_path / "late", **fields))
-    events = []
-
-    def noted(name, function):
-        def call(*args):
-            function(*args)
-            events.append((name, trainer.iteration))
-
-        return call
-
-    trainer._log.append = noted("record", trainer._log.append)
-    trainer._write_picture = noted("picture", trainer._write_picture)
-    trainer.save = noted("checkpoint", trainer.save)
-    result = trainer.run(progress=False)
-    # Only the first record is late: the others must precede a picture or a checkpoint.
-    assert events == [
-        ("record", 3),
-        ("checkpoint", 3),
-        ("record", 4),
-        ("picture", 4),
-        ("record", 6),
-        ("checkpoint", 6),
-        ("record", 7),
-        ("checkpoint", 7),
-    ]
-    assert log_of(tmp_path / "late") == log_of(tmp_path / "prompt")
-    assert result.record["iteration"] == 7
-
-
-@pytest.mark.parametrize("checkpoint_interval", [1, 100])
-def test_late_records_find_a_loss_that_is_not_finite(tmp_path, checkpoint_interval):
+@pytest.mark.parametrize(
+    ("make", "checkpoint_interval", "found"),
+    # At the next line of the log or checkpoint, and an iteration later at most.
+    [(trainer_of, 1, 5), (trainer_of, 100, 6), (logging_late, 1, 5), (logging_late, 100, 7)],
+)
+def test_loss_that_is_not_finite_stops_the_run_with_a_report(
+    tmp_path, make, checkpoint_interval, found
+):
     fields = {"iterations": 20, "log_interval": 2, "checkpoint_interval": checkpoint_interval}
-    trainer = logging_late(circle_config(tmp_path, **fields), rollout=explode_after(5))
-    with pytest.raises(DivergedError, match="distance was not in iteration 5 "):
+    trainer = make(circle_config(tmp_path, **fields), rollout=explode_after(5))
+    told = r"distance was not in iteration 5 \(. steps, world 2 of the batch\).*diverged.pt"
+    with pytest.raises(DivergedError, match=told):
         trainer.run(progress=False)
-    # Found at the next line of the log or checkpoint, and an iteration later at most.
-    assert trainer.iteration == (5 if checkpoint_interval == 1 else 7)
+    assert trainer.iteration == found
     assert [record["iteration"] for record in log_of(tmp_path)] == [2, 4]
     saved = load_checkpoint(tmp_path / "checkpoint.pt")["iteration"]
     assert saved == (4 if checkpoint_interval == 1 else 0)
     with pytest.raises(DivergedError):
         trainer.save()
+    diagnosis = load_checkpoint(tmp_path / "diverged.pt")
+    assert diagnosis["iteration"] == 5
+    assert torch.isfinite(diagnosis["x0"]).all()
+    assert torch.isfinite(diagnosis["x"]).flatten(1).all(1).tolist() == [True, True, False]
+
+
+def test_late_records_are_the_same(tmp_path):
+    fields = {"iterations": 7, "log_interval": 2, "checkpoint_interval": 3, "picture_interval": 4}
+    train(circle_config(tmp_path / "prompt", **fields))
+    seen = []
+    task = KilledTask(iteration=3, end=lambda: seen.extend(log_of(tmp_path / "late")))
+    result = logging_late(circle_config(tmp_path / "late", **fields), task=task).run(progress=False)
+    # The first record is written while the third iteration is under way.
+    assert seen == []
+    assert log_of(tmp_path / "late") == log_of(tmp_path / "prompt")
+    assert result.record["iteration"] == 7
 
 
 @pytest.mark.parametrize("late", [False, True])
@@ -346,14 +313,10 @@ def test_signal_stops_after_the_iteration_saves_and_can_be_resumed(tmp_path, num
     assert log_of(tmp_path / "broken") == log_of(tmp_path / "whole")
 
 
-def test_bad_term_is_named_when_the_worlds_are_sound(tmp_path):
-    with pytest.raises(DivergedError, match="state was not in iteration 3"):
-        train(circle_config(tmp_path), BrokenTask(iteration=3))
-
-
-def test_diverged_run_can_be_resumed_from_its_last_good_checkpoint(tmp_path):
+def test_diverged_run_names_the_term_and_is_resumed_from_its_last_good_checkpoint(tmp_path):
     config = circle_config(tmp_path / "broken", checkpoint_interval=2)
-    with pytest.raises(DivergedError):
+    # The worlds are sound: the loss itself is not.
+    with pytest.raises(DivergedError, match="state was not in iteration 4"):
         train(config, BrokenTask(iteration=4))
     assert train(config, resume=True).finished
     train(circle_config(tmp_path / "whole", checkpoint_interval=2))
