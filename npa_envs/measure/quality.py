@@ -506,7 +506,7 @@ def _from_seeds(
 def _batches(task: PointClassification) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
     """Yield indices [B], classes [B] and blank states [B, N, C] of some clouds after the other."""
     x, label = task.clouds.x, task.clouds.label
-    for index in torch.arange(len(label), device=x.device).split(BATCH):
+    for index in torch.split(torch.arange(len(label), device=x.device), BATCH):
         yield index, label[index], x.new_zeros(len(index), x.shape[1], task.config.state_dim)
 
 
