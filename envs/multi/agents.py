@@ -15,7 +15,7 @@ from torch import Tensor
 from npa_envs.envs.core.screen import Screen
 from npa_envs.envs.core.spaces import action_tensor, to_output
 from npa_envs.envs.core.vector import world_keys
-from npa_envs.envs.multi.episodes import Episodes
+from npa_envs.envs.multi.worlds import Episodes
 from npa_envs.errors import DivergedError, NPAError
 from npa_envs.world.actions import Physics
 

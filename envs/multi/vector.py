@@ -16,7 +16,7 @@ from torch import Tensor
 
 from npa_envs.envs.core.vector import checked_count, checked_mode, worlds_to_reset
 from npa_envs.envs.multi.agents import AgentsEnv, joined_actions
-from npa_envs.envs.multi.episodes import Outcome
+from npa_envs.envs.multi.worlds import Outcome
 from npa_envs.errors import NPAError
 from npa_envs.world.cuda_graph import sent
 

@@ -16,7 +16,7 @@ from crowds import (
     targets_made_once,
 )
 
-from npa_envs.envs.multi.episodes import Account
+from npa_envs.envs.multi.worlds import Account
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.tasks.targets.points import load_target
 
