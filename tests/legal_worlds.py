@@ -85,16 +85,16 @@ class World:
 
 
 @st.composite
-def worlds(draw, device, *, space_dims=(2, 3), dtypes=tuple(UNIT), channels=6, boxes=True):
+def worlds(draw, device, *, dtypes=tuple(UNIT)):
     """Draw worlds: N from 1, states of sizes 0 to 1000, open or periodic down to sides of 2 ε."""
-    dim, dtype = draw(st.sampled_from(space_dims)), draw(st.sampled_from(dtypes))
+    dim, dtype = draw(st.sampled_from((2, 3))), draw(st.sampled_from(dtypes))
     world_count, particle_count = draw(st.integers(1, 3)), draw(st.integers(1, 24))
     eps_units = draw(st.sampled_from((1, 32, 96, 128, 200, 512)))
     eps = eps_units * GRID
     # A radius of a grid unit would put every particle of a wide world in a cell of its own.
     reach = draw(st.sampled_from((1, 4, 1000))) * eps_units
     box = None
-    if boxes and draw(st.booleans()):
+    if draw(st.booleans()):
         factors = draw(st.tuples(*[st.integers(0, 3)] * dim))
         box = tuple((2 * eps_units + f * eps_units // 2 * 2) * GRID for f in factors)
     seed = draw(st.integers(0, 2**31))
@@ -116,7 +116,7 @@ def worlds(draw, device, *, space_dims=(2, 3), dtypes=tuple(UNIT), channels=6, b
         half = torch.tensor([round(side / GRID) // 2 for side in box])
         units = units.sign() * half - integers(-1, 1, *units.shape)
     size = draw(st.sampled_from((0.0, 1e-3, 1.0, 1e3)))
-    shape = (world_count, particle_count, draw(st.integers(1, channels)))
+    shape = (world_count, particle_count, draw(st.integers(1, 6)))
     s = size * torch.randn(shape, generator=generator, dtype=torch.float64)
     eps0 = eps * draw(st.sampled_from((0.5, 1.0, 3.0)))
     return World((units * GRID).to(device, dtype), s.to(device, dtype), eps, eps0, box, seed)
