@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, TypedDict, Unpack
 
 import torch
 from torch import Tensor, nn
@@ -239,23 +239,22 @@ WARM_UP_STEPS = 2
 """Steps of the eager rollout that loads every kernel before the first capture."""
 
 
+class RolloutOptions(TypedDict):
+    """What the trainer tells a rollout by name."""
+
+    eps: float
+    box: tuple[float, ...] | None
+    update_prob: float
+    memory: Memory
+    generator: torch.Generator
+    return_path_length: Literal[True]
+
+
 class Rollout(Protocol):
     """`npa_envs.rollout` as the trainer calls it."""
 
     def __call__(
-        self,
-        rule: NPARule,
-        x: Tensor,
-        s: Tensor,
-        steps: int,
-        /,
-        *,
-        eps: float,
-        box: tuple[float, ...] | None,
-        update_prob: float,
-        memory: Memory,
-        generator: torch.Generator,
-        return_path_length: Literal[True],
+        self, rule: NPARule, x: Tensor, s: Tensor, steps: int, /, **options: Unpack[RolloutOptions]
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return positions, states and path lengths after `steps` steps."""
 

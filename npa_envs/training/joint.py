@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import json
 from collections.abc import Sequence
-from typing import Any, Literal, cast
+from typing import Any, Unpack, cast
 
 import torch
 from torch import Tensor, nn
@@ -17,8 +17,8 @@ from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import differing_fields
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2D, CoMorphogenesis2DConfig
 from npa_envs.tasks.train_config import JointTrainConfig, TrainConfig
+from npa_envs.training.iteration import RolloutOptions
 from npa_envs.training.trainer import Trainer, TrainResult
-from npa_envs.world.rollout import Memory
 from npa_envs.world.species import rollout_species
 
 TASK_NAME = "co_morphogenesis2d"
@@ -73,35 +73,11 @@ class _JointTrainer(Trainer):
         )
 
     def _rollout_together(
-        self,
-        rule: NPARule,
-        x: Tensor,
-        s: Tensor,
-        steps: int,
-        /,
-        *,
-        eps: float,
-        box: tuple[float, ...] | None,
-        update_prob: float,
-        memory: Memory,
-        generator: torch.Generator,
-        return_path_length: Literal[True],
+        self, rule: NPARule, x: Tensor, s: Tensor, steps: int, /, **options: Unpack[RolloutOptions]
     ) -> tuple[Tensor, Tensor, Tensor]:
         counts = self._species.config.counts
-        return rollout_species(
-            list(cast(JointRules, rule)),
-            x,
-            s,
-            steps,
-            counts=counts,
-            density_counts=counts,
-            eps=eps,
-            box=box,
-            update_prob=update_prob,
-            memory=memory,
-            generator=generator,
-            return_path_length=return_path_length,
-        )
+        rules = list(cast(JointRules, rule))
+        return rollout_species(rules, x, s, steps, counts=counts, density_counts=counts, **options)
 
     def _make_rule(self, generator: torch.Generator) -> NPARule:
         # The trainer asks of its rule what any module has, and for its hyper-parameters.
