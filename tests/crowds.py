@@ -71,12 +71,17 @@ def module_of(module: Any, **keywords: Any) -> SimpleNamespace:
     )
 
 
-def pair(task: str = "mixing", **keywords: Any) -> MultiSpeciesEnv:
-    """One particle of each of two species, half a radius apart; every action takes effect."""
-    env = make(task, particle_counts=(1, 1), update_prob=1.0, **keywords)
+def placed(points: Any, task: str = "mixing", **keywords: Any) -> MultiSpeciesEnv:
+    """A world with blank particles at some points, in which every action takes effect."""
+    env = make(task, **{"update_prob": 1.0, **keywords})
     env.reset(seed=0)
-    env.place_particles([[0.0, 0.0], [0.15, 0.0]], np.zeros((2, 16)))
+    env.place_particles(points, np.zeros((len(points), 16)))
     return env
+
+
+def pair(task: str = "mixing", **keywords: Any) -> MultiSpeciesEnv:
+    """One particle of each of two species, half a radius apart."""
+    return placed([[0.0, 0.0], [0.15, 0.0]], task, particle_counts=(1, 1), **keywords)
 
 
 def apart(env: MultiSpeciesEnv) -> dict[str, Any]:

@@ -35,11 +35,7 @@ Event = str | DamageEvent
 
 
 class Schedule:
-    """When worlds are damaged.
-
-    Args:
-        events: One or several.
-        every: Each event comes again after so many steps, and again; None: it comes once.
+    """When worlds are damaged; arguments are those of `DamageEvents`.
 
     Raises:
         NPAError: There is no event, one is wrong, or `every` is no whole number of at least 1.
@@ -69,11 +65,7 @@ class Schedule:
         """Steps after which each event comes again."""
 
     def due(self, elapsed: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return which events are due in which worlds, shape [E, B].
-
-        Args:
-            elapsed: Steps of each world's episode, shape [B].
-        """
+        """Return which events are due in which worlds, [E, B], by steps of their episodes, [B]."""
         late = elapsed - np.array([[event.step] for event in self.events])
         due = late == 0 if self.every is None else (late >= 0) & (late % self.every == 0)
         return np.asarray(due, dtype=bool)
@@ -102,14 +94,7 @@ class _DamagesWorlds(RecordConstructorArgs):
         RecordConstructorArgs.__init__(self, events=texts, every=every)
 
     def _particles(self, due: NDArray[np.bool_]) -> tuple[Tensor, Tensor]:
-        """Return the particles of all worlds, damaged where damage is due.
-
-        Args:
-            due: Which events are due in which worlds, shape [E, B].
-
-        Returns:
-            Positions [length units], [B, N, D], and states, [B, N, C].
-        """
+        """Return positions and states of all worlds, damaged where events are due, shape [E, B]."""
         worlds = self._base.worlds
         x, s = worlds.x.clone(), worlds.s.clone()
         for k, (event, mask) in enumerate(zip(self.schedule.events, due, strict=True), self._first):

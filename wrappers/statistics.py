@@ -87,9 +87,6 @@ class RunningMoments:
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Take over what `state_dict` returned.
 
-        Args:
-            state: Mean, variance and count.
-
         Raises:
             NPAError: A name is missing, unknown, or belongs to samples of another shape.
         """
@@ -138,11 +135,7 @@ class PerceptionStatistics:
         """Of the states, smoothed states, state gradients (C each) and the density gradient."""
 
     def update(self, observation: Any) -> None:
-        """Take in what particles perceive.
-
-        Args:
-            observation: Array or tensor of shape [..., P].
-        """
+        """Take in what particles perceive, an array or tensor of shape [..., P]."""
         z = as_tensor(observation).flatten(0, -2)
         var, mean = torch.var_mean(z, dim=0, correction=0)
         centred = 2 * self.state_dim
@@ -157,11 +150,7 @@ class PerceptionStatistics:
         )
 
     def normalize(self, observation: Any) -> Any:
-        """Return perception on one scale, clipped, as new float32 numbers.
-
-        Args:
-            observation: Array or tensor of shape [..., P].
-        """
+        """Return perception, shape [..., P], on one scale, clipped, as new float32 numbers."""
         z = as_tensor(observation)
         mean = self._spread(self.moments.mean).to(z)
         scale = self._spread((self.moments.var + self.epsilon).rsqrt()).to(z)
@@ -235,10 +224,7 @@ class _NormalizesPerception(RecordConstructorArgs):
         return self.statistics.moments.state_dict()
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Take over the statistics of another wrapper.
-
-        Args:
-            state: What its `state_dict` returned.
+        """Take over the statistics that another wrapper's `state_dict` returned.
 
         Raises:
             NPAError: It belongs to other observations.

@@ -81,13 +81,10 @@ class WorldTask(Generic[AnyConfig]):
     def draw_particles(
         self, x: Tensor, s: Tensor, style: str, azimuth: float = 0.0
     ) -> NDArray[np.uint8]:
-        """Return a picture of each world, shape [B, R, R, 3].
+        """Return a picture of each world in one of `STYLES`, shape [B, R, R, 3].
 
-        Args:
-            x: Positions [length units], shape [B, N, D].
-            s: States, dimensionless, shape [B, N, C].
-            style: "particles", "density" or "states".
-            azimuth: Where the camera of 3D worlds stands [degrees].
+        Positions are x [length units], [B, N, D], and states s, [B, N, C]. The camera of 3D worlds
+        stands at an azimuth [degrees].
         """
         return draw_worlds(
             x,
@@ -107,7 +104,8 @@ class EnvTask(WorldTask[Config]):
 
     `seed` and `losses` are all that a task must have. None of the methods may wait for the device
     (no `.item()`, no branch on a tensor's value), and the result for one world must not depend on
-    the others: take means over particles or pixels with `npa_envs.world_mean`.
+    the others: take means over particles or pixels with `npa_envs.world_mean`. Everywhere x are
+    positions [length units], shape [B, N, D], and s states, dimensionless, shape [B, N, C].
 
     Args:
         config: The environment's configuration.
@@ -156,20 +154,11 @@ class EnvTask(WorldTask[Config]):
         return self
 
     def losses(self, x: Tensor, s: Tensor) -> Mapping[str, Tensor]:
-        """Return the named parts of each world's loss, shape [B] each; their sum is the loss.
-
-        Args:
-            x: Positions [length units], shape [B, N, D].
-            s: States, dimensionless, shape [B, N, C].
-        """
+        """Return the named parts of each world's loss, shape [B] each; their sum is the loss."""
         raise NotImplementedError
 
     def particle_losses(self, x: Tensor, s: Tensor) -> Tensor:
         """Return each particle's share of its world's loss, shape [B, N]; their mean is the loss.
-
-        Args:
-            x: Positions [length units], shape [B, N, D].
-            s: States, dimensionless, shape [B, N, C].
 
         Raises:
             NPAError: The task has none.
@@ -211,12 +200,9 @@ class EnvTask(WorldTask[Config]):
         return self._pool
 
     def draw(self, x: Tensor, s: Tensor, steps: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Return a picture of each world, shape [B, R, R, 3]; a camera turns around 3D worlds.
+        """Return a picture of each world, shape [B, R, R, 3], so many steps after its start, [B].
 
-        Args:
-            x: Positions [length units], shape [B, N, D].
-            s: States, dimensionless, shape [B, N, C].
-            steps: Steps since each episode's start, shape [B].
+        A camera turns around 3D worlds.
         """
         style = self.config.render_style
         if self.space_dim == 2:

@@ -55,9 +55,6 @@ class CrowdEnv(AgentsEnv, pettingzoo.ParallelEnv):  # type: ignore[misc]
     def observation_space(self, agent: str) -> Box:
         """Return the space of an agent's observations, the same object each time.
 
-        Args:
-            agent: One of `possible_agents`.
-
         Raises:
             NPAError: There is no such agent.
         """
@@ -66,9 +63,6 @@ class CrowdEnv(AgentsEnv, pettingzoo.ParallelEnv):  # type: ignore[misc]
 
     def action_space(self, agent: str) -> Box:
         """Return the space of an agent's actions, the same object each time.
-
-        Args:
-            agent: One of `possible_agents`.
 
         Raises:
             NPAError: There is no such agent.

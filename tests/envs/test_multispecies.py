@@ -9,7 +9,7 @@ import sys
 import numpy as np
 import pytest
 import torch
-from crowds import TASKS, apart, drawn, make, pair, small, still, targets_made_once
+from crowds import TASKS, apart, drawn, make, pair, placed, small, still, targets_made_once
 from small_envs import assert_same
 
 import npa_envs
@@ -70,12 +70,14 @@ def test_turns_lead_to_the_same_world_as_acting_at_once():
 
 
 def test_turns_clip_actions_that_are_too_large(recwarn):
-    large, right = (multispecies_v0.env(**small("mixing", update_prob=1.0)) for _ in range(2))
-    for env, size in ((large, 3.0), (right, 1.0)):
+    states = []
+    for size in (3.0, 1.0):
+        env = multispecies_v0.env(**small("mixing", update_prob=1.0))
         env.reset(seed=0)
         for agent in env.agents:
             env.step(np.full(env.action_space(agent).shape, size, np.float32))
-    assert np.array_equal(large.state(), right.state())
+        states.append(env.state())
+    assert np.array_equal(*states)
 
 
 def test_particles_perceive_those_of_all_species():
@@ -183,9 +185,8 @@ def test_the_last_observation_of_a_species_is_of_the_world_with_it():
 
 
 def test_a_species_ends_when_all_of_its_particles_have_left():
-    env = make(particle_counts=(2, 2), position_limit=0.7, update_prob=1.0)
-    env.reset(seed=0)
-    env.place_particles([[0.65, 0], [0.0, 0.0], [0.65, 0.3], [0.6, 0.6]], np.zeros((4, 16)))
+    points = [[0.65, 0], [0.0, 0.0], [0.65, 0.3], [0.6, 0.6]]
+    env = placed(points, particle_counts=(2, 2), position_limit=0.7)
     actions = still(env)
     for action in actions.values():
         action[:, 0] = 1.0
@@ -230,9 +231,8 @@ def test_a_world_without_particles_can_be_drawn_and_described():
 
 
 def test_pictures_tell_species_apart():
-    env = make(particle_counts=(50, 50), render_mode="rgb_array", render_size=33)
-    env.reset(seed=0)
-    env.place_particles([[-0.5, 0.0]] * 50 + [[0.5, 0.0]] * 50, np.zeros((100, 16)))
+    keywords = {"particle_counts": (50, 50), "render_mode": "rgb_array", "render_size": 33}
+    env = placed([[-0.5, 0.0]] * 50 + [[0.5, 0.0]] * 50, **keywords)
     picture = env.render().astype(int)
     left, right = picture[16, 8], picture[16, 24]
     assert left[0] > left[1] + 50
@@ -245,10 +245,9 @@ def test_pictures_tell_species_apart():
 @pytest.mark.parametrize("task", TASKS)
 def test_pictures_of_a_periodic_box_show_the_box_and_nothing_more(task):
     keywords = {"boundary": "periodic", "box_size": 4.0, "seed_distance": 2.4}
-    env = make(task, particle_counts=(30, 30), render_mode="rgb_array", **keywords)
-    env.reset(seed=0)
+    keywords |= {"particle_counts": (30, 30), "render_mode": "rgb_array"}
     # On a corner, a quarter of a particle is seen in each of them.
-    env.place_particles(np.full((60, 2), -2.0), np.zeros((60, 16)))
+    env = placed(np.full((60, 2), -2.0), task, **keywords)
     picture = env.render().astype(int)
     assert picture[0, 0].max() < 200
     assert picture[12, 12].min() > 250

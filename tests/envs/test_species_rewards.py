@@ -12,6 +12,7 @@ from crowds import (
     make,
     pair,
     pair_entropy,
+    placed,
     still,
     targets_made_once,
 )
@@ -49,9 +50,8 @@ def test_parting_two_neighbours_costs_or_pays_their_entropy(task, sign):
 
 @pytest.mark.parametrize("reward", ["individual", "team"])
 def test_a_species_is_paid_for_the_mean_of_its_particles_and_a_team_for_that_of_species(reward):
-    env = make(particle_counts=(1, 2), update_prob=1.0, reward=reward)
-    env.reset(seed=0)
-    env.place_particles([[0.0, 0.0], [0.15, 0.0], [2.0, 2.0]], np.zeros((3, 16)))
+    points = [[0.0, 0.0], [0.15, 0.0], [2.0, 2.0]]
+    env = placed(points, particle_counts=(1, 2), reward=reward)
     _, _, _, _, infos = env.step(still(env))
     assert infos["species_0"]["loss"] == pytest.approx(1.0 - HALF_WAY, abs=1e-6)
     assert infos["species_1"]["loss"] == pytest.approx(1.0 - 0.5 * HALF_WAY, abs=1e-6)
@@ -74,9 +74,7 @@ def test_species_that_walk_through_each_other_mix_and_part_again():
 
 
 def test_entropy_weighs_neighbours_by_their_volumes():
-    env = make(particle_counts=(1, 2))
-    env.reset(seed=0)
-    env.place_particles([[0.0, 0.0], [0.15, 0.0], [0.3, 0.0]], np.zeros((3, 16)))
+    env = placed([[0.0, 0.0], [0.15, 0.0], [0.3, 0.0]], particle_counts=(1, 2))
     _, _, _, _, infos = env.step(still(env))
     # Volumes of the outer two and of the middle one, in units of the weight at no distance.
     weight = 0.75**3
@@ -88,9 +86,8 @@ def test_entropy_weighs_neighbours_by_their_volumes():
 
 
 def test_entropy_reaches_across_the_edge_of_a_periodic_box():
-    env = make(particle_counts=(1, 1), boundary="periodic", box_size=2.0)
-    env.reset(seed=0)
-    env.place_particles([[-0.95, 0.0], [0.9, 0.0]], np.zeros((2, 16)))
+    box = {"boundary": "periodic", "box_size": 2.0}
+    env = placed([[-0.95, 0.0], [0.9, 0.0]], particle_counts=(1, 1), **box)
     _, _, _, _, infos = env.step(still(env))
     assert infos["species_0"]["loss"] == pytest.approx(1.0 - HALF_WAY, abs=1e-5)
 
