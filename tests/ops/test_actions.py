@@ -233,7 +233,7 @@ def test_tensors_that_do_not_fit_are_clear_errors(change, message):
         apply_actions(**GIVEN | given | change)
 
 
-def repeated(x, s, **options):
+def prepared(x, s, **options):
     """Return the actions on copies of a world, with these copies, and what switches them off."""
     x, s = x.clone(), s.clone()
     enabled = torch.ones(1, dtype=torch.uint8, device=x.device)
@@ -248,9 +248,9 @@ def repeated(x, s, **options):
 
 
 @pytest.mark.parametrize("how", ["plain", "strided", "misaligned", "other dtype", "on the host"])
-def test_repeated_actions_are_the_same_wherever_they_lie(how, world, device):
+def test_prepared_actions_are_the_same_wherever_they_lie(how, world, device):
     action, x, s = world
-    act, (moved, changed), enabled = repeated(x, s)
+    act, (moved, changed), enabled = prepared(x, s)
     expected = world[1:]
     for sign in (1.0, -1.0, 0.5):
         given = {
@@ -268,7 +268,7 @@ def test_repeated_actions_are_the_same_wherever_they_lie(how, world, device):
 
 def test_one_number_that_is_not_finite_is_found_wherever_it_lies(world, device):
     action, x, s = (tensor[:1, :7] for tensor in world)
-    act, (moved, changed), enabled = repeated(x, s)
+    act, (moved, changed), enabled = prepared(x, s)
     for place in range(action.numel()):
         for wild in (math.nan, math.inf, -math.inf):
             bad = action.contiguous().clone()
@@ -284,9 +284,9 @@ def test_one_number_that_is_not_finite_is_found_wherever_it_lies(world, device):
     assert enabled.item() == 1
 
 
-def test_repeated_actions_can_be_pickled_after_use(world):
+def test_prepared_actions_can_be_pickled_after_use(world):
     action, x, s = (tensor.cpu() for tensor in world)
-    act, _, _ = repeated(x, s)
+    act, _, _ = prepared(x, s)
     act(action)
     again = pickle.loads(pickle.dumps(act))
     again(action)
@@ -294,9 +294,9 @@ def test_repeated_actions_can_be_pickled_after_use(world):
     assert torch.equal(again._worlds[0], twice[0])
 
 
-def test_repeated_actions_of_another_shape_are_clear_errors(world):
+def test_prepared_actions_of_another_shape_are_clear_errors(world):
     action, x, s = world
     with pytest.raises(NPAError, match="action must have shape"):
-        repeated(x, s)[0](action[:, :-1])
+        prepared(x, s)[0](action[:, :-1])
     with pytest.raises(NPAError, match=r"mask must be torch\.uint8"):
-        repeated(x, s, mask=torch.zeros(x.shape[:2], device=x.device))
+        prepared(x, s, mask=torch.zeros(x.shape[:2], device=x.device))

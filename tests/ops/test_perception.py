@@ -181,7 +181,7 @@ def test_observation_is_perception_in_the_callers_order_and_clipped(
     expected = oracle.perceive(*exact(x, s), 0.3, 0.2, box, moment_inverse=moment_inverse)
     surveyed = observed(x, s, eps=0.3, box=box, limit=1.5, moment_inverse=moment_inverse)
     assert (expected.abs() > 1.5).any()
-    # The second time, a recorded launch is repeated.
+    # The second time, a recorded launch runs.
     for _ in range(2):
         out = torch.full(expected.shape, float("nan"), dtype=dtype, device=device)
         assert surveyed.perceive(out) is out

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from npa_envs.world import cuda_graph as replay
+from npa_envs.world import cuda_graph
 from npa_envs.world.cuda_graph import Replayed, capture, no_garbage_collection
 
 CUDA = torch.device("cuda", 0)
@@ -65,7 +65,7 @@ def events(monkeypatch):
     monkeypatch.setattr(torch.cuda, "current_stream", lambda: stream("current"))
     monkeypatch.setattr(torch.cuda, "synchronize", note("synchronize"))
     monkeypatch.setattr(torch.cuda, "empty_cache", note("empty"))
-    monkeypatch.setattr(replay, "_capture_stream", lambda index: stream("side"))
+    monkeypatch.setattr(cuda_graph, "_capture_stream", lambda index: stream("side"))
     return seen
 
 
