@@ -569,7 +569,9 @@ def test_frames_come_as_a_list(name):
     env.reset(seed=0)
     for action in actions(env, 3):
         env.step(action)
-    assert len(env.render()) == 4
+    frames = env.render()
+    assert [(frame.shape, frame.dtype) for frame in frames] == [((24, 24, 3), np.uint8)] * 4
+    assert (frames[0] != frames[-1]).any()
 
 
 @every_id

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from small_envs import IDS, make, make_vec
+from small_envs import IDS, assert_same, make, make_vec
 
 from npa_envs.envs import multispecies_v0
 from npa_envs.errors import DivergedError
@@ -162,9 +162,8 @@ def test_torch_tensors_say_the_same_as_arrays(way, device):
     tensors.reset(seed=5)
     for _ in range(LAST):
         found = tensors.step(torch.from_numpy(pushed(tensors)).to(device))
-    for left, right in zip(found[:4], expected[:4], strict=True):
-        assert left.device == tensors.worlds.x.device
-        assert np.array_equal(left.cpu().numpy(), right)
+    assert all(left.device == tensors.worlds.x.device for left in found[:4])
+    assert_same(found[:4], expected[:4])
     told = found[4] if way != "terminate" else found[4]["final_info"]
     assert told["diverged"].tolist() == [False, True, False]
 

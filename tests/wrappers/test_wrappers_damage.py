@@ -4,6 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from small_envs import assert_same
 from wrapped_envs import ACTIONS, SMALL, STEPS, batched, policy, single
 
 import npa_envs  # noqa: F401 (registers the environments)
@@ -259,8 +260,7 @@ def test_reused_buffers_show_the_same():
             way += [observations.copy(), rewards.copy(), infos["particle_reward"].copy()]
         ways.append(way)
     assert all((reward != 0).all() for reward in ways[0][1::3])
-    for one, other in zip(*ways, strict=True):
-        np.testing.assert_array_equal(one, other)
+    assert_same(*ways)
 
 
 def test_the_spec_says_what_is_done():

@@ -57,27 +57,6 @@ def test_flatten_observation_and_normalize_reward():
     assert reward == pytest.approx(unscaled / scale, rel=1e-6)
 
 
-def test_autoreset_goes_on_with_the_sequence_of_episodes():
-    env, plain = wrappers.Autoreset(single()), single()
-    env.reset(seed=3)
-    plain.reset(seed=3)
-    for step in range(STEPS):
-        env.step(actions(step))
-    expected, _ = plain.reset()
-    np.testing.assert_array_equal(env.step(actions(0))[0], expected)
-
-
-def test_render_collection():
-    env = wrappers.RenderCollection(single(render_mode="rgb_array", render_size=32))
-    env.reset(seed=0)
-    for step in range(3):
-        env.step(actions(step))
-    frames = env.render()
-    assert len(frames) == 4
-    assert {frame.shape for frame in frames} == {(32, 32, 3)}
-    assert (frames[0] != frames[-1]).any()
-
-
 def test_record_video(tmp_path):
     pytest.importorskip("moviepy")
     env = wrappers.RecordVideo(single(render_mode="rgb_array", render_size=32), str(tmp_path))

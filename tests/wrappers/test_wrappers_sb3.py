@@ -336,8 +336,7 @@ def test_tensors_give_the_same_rows(device):
     assert np.array_equal(arrays.reset(), tensors.reset())
     for _ in range(6):
         actions = generator.uniform(-1, 1, (16, 18)).astype(np.float32)
-        mine, theirs = arrays.step(actions), tensors.step(actions)
-        assert all(np.array_equal(a, b) for a, b in zip(mine[:3], theirs[:3], strict=True))
+        assert_same(arrays.step(actions)[:3], tensors.step(actions)[:3])
 
 
 def rows_of(adapter, envs, **keywords):
