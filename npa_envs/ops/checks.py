@@ -93,11 +93,41 @@ def check_finite_positions(x: Tensor) -> None:
         return
     if x.is_cuda and torch.cuda.is_current_stream_capturing():
         return
-    finite = torch.isfinite(x.detach()).all(dim=-1)
-    if not bool(finite.all()):
+    FiniteCheck(x).wait()
+
+
+class FiniteCheck:
+    """The check that every position is finite: asked of the device now, answered by `wait`.
+
+    Args:
+        x: Positions [length units], shape [B, N, D].
+    """
+
+    def __init__(self, x: Tensor) -> None:
+        self._x = x.detach()
+        # A sum of zeros, but for numbers that are not finite: two short kernels.
+        self._answer = (self._x * 0.0).sum()
+        self._arrival: torch.cuda.Event | None = None
+        if x.is_cuda:
+            sent = torch.empty((), dtype=x.dtype, pin_memory=True)
+            self._answer = sent.copy_(self._answer, non_blocking=True)
+            self._arrival = torch.cuda.Event()  # type: ignore[no-untyped-call]
+            self._arrival.record(torch.cuda.current_stream(x.device))
+
+    def wait(self) -> None:
+        """Wait for the answer, and for nothing that was launched since the question.
+
+        Raises:
+            NPAError: A coordinate is NaN or infinite; the message names the first such particle.
+        """
+        if self._arrival is not None:
+            self._arrival.synchronize()
+        if float(self._answer) == 0.0:
+            return
+        finite = torch.isfinite(self._x).all(dim=-1)
         world, particle = (int(k) for k in (~finite).nonzero()[0])
         raise NPAError(
-            f"x must be finite, got {x[world, particle].tolist()} at world {world}, particle "
+            f"x must be finite, got {self._x[world, particle].tolist()} at world {world}, particle "
             f"{particle} ({int((~finite).sum())} such particles): reset those worlds"
         )
 

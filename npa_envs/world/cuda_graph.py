@@ -45,6 +45,22 @@ def _capture_stream(device_index: int) -> torch.cuda.Stream:
     return torch.cuda.Stream(device_index)  # type: ignore[no-untyped-call]
 
 
+def prepare_capture(function: Callable[[], object], device: torch.device) -> None:
+    """Run a function on the stream that is captured: loads kernels, allocates workspaces.
+
+    Args:
+        function: Launches kernels.
+        device: A CUDA device, where it works.
+    """
+    with torch.cuda.device(device):
+        stream = _capture_stream(torch.cuda.current_device())
+        stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(stream):
+            function()
+        torch.cuda.synchronize()
+        torch.cuda.empty_cache()
+
+
 def capture(
     function: Callable[[], object],
     device: torch.device,
@@ -77,11 +93,7 @@ def capture(
     with torch.cuda.device(device):
         stream = _capture_stream(torch.cuda.current_device())
         if warm_up is not None:
-            stream.wait_stream(torch.cuda.current_stream())
-            with torch.cuda.stream(stream):
-                warm_up()
-            torch.cuda.synchronize()
-            torch.cuda.empty_cache()
+            prepare_capture(warm_up, device)
         with contextlib.suppress(torch.OutOfMemoryError):
             return _recorded(function, stream, pool, generator)
         # Only here: the error that is gone by now held the memory of the first attempt.

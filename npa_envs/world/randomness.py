@@ -167,6 +167,16 @@ class WorldRandom:
         self.steps[worlds] = other.steps
         self._draw_count = max(self._draw_count, other._draw_count)
 
+    def follow(self, other: WorldRandom, steps: int) -> None:
+        """Go on where other streams stand that began where these do, in place.
+
+        Args:
+            other: Streams of as many worlds.
+            steps: How many steps those are ahead.
+        """
+        self.steps += steps
+        self._draw_count = other._draw_count
+
     def uniform(self, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
         """Return numbers uniform in [0, 1), shape [B, *shape].
 

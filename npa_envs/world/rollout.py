@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Literal, NamedTuple, Protocol, overload
 
 import torch
@@ -13,7 +13,6 @@ from torch.utils.checkpoint import checkpoint
 from npa_envs.errors import NPAError
 from npa_envs.ops.checks import (
     Box,
-    check_finite_positions,
     check_scale,
     check_world,
     checked_box,
@@ -28,6 +27,7 @@ from npa_envs.ops.update import update_particles
 from npa_envs.rule.rule import FoldedRule, NPARule, check_rule
 from npa_envs.world.divergence import DivergenceWatch, OnDivergence, make_watch
 from npa_envs.world.randomness import Randomness, WorldRandom, check_generator
+from npa_envs.world.recorded import CudaGraph, Worlds, check_cuda_graph, run_call
 
 Memory = Literal["store", "recompute", "minimal"]
 
@@ -124,7 +124,6 @@ def checked_options(
         raise NPAError(f"position_noise must be finite and not negative, got {position_noise}")
     detach_positions = checked_flag("detach_positions", detach_positions)
     sides = checked_box(box, rule.space_dim, radius)
-    check_finite_positions(x)
     return StepOptions(radius, sides, update_prob, dt, position_noise, detach_positions)
 
 
@@ -152,17 +151,6 @@ def rule_terms(rule: NPARule) -> Terms:
     """Return the groups of the perception vector that a rule reads."""
     inverse = rule.moment_inverse if rule.moment_correction else None
     return Terms(rule.state_gradient, inverse, rule.density_gradient)
-
-
-class Worlds(NamedTuple):
-    """Worlds between two steps of a rollout."""
-
-    x: Tensor
-    """Positions [length units], shape [B, N, D]."""
-    s: Tensor
-    """States, dimensionless, shape [B, N, C]."""
-    path_length: Tensor
-    """Length of each particle's path so far [length units], shape [B, N]."""
 
 
 class Draws(NamedTuple):
@@ -273,7 +261,8 @@ def run_steps(
     *,
     generator: Randomness | None,
     memory: Memory,
-    watch: DivergenceWatch | None,
+    keep_every: int | None = None,
+    watch: DivergenceWatch | None = None,
 ) -> Worlds:
     """Repeat a step on checked worlds; return them in the caller's order.
 
@@ -283,12 +272,15 @@ def run_steps(
         steps: Number of steps T.
         generator: Source of the draws.
         memory: What the backward pass reads is stored or recomputed.
+        keep_every: Return the worlds after each so many steps, one after the other in a first
+            dimension; None: the last ones.
         watch: What looks at the worlds after each step, or None.
 
     Raises:
         DivergedError: The watch has seen a world diverge.
     """
     interval = STORED_INTERVAL[memory] if torch.is_grad_enabled() else 1
+    kept: list[Worlds] = []
     # Worlds keep their dtype under autocast: the kernels read what the rules write.
     with torch.autocast(worlds.x.device.type, enabled=False):
         for number, draws in enumerate(step.draws(worlds.x, steps, generator)):
@@ -301,10 +293,48 @@ def run_steps(
             if watch is not None:
                 seen = step.ordered(Worlds(*(value.detach() for value in worlds)))
                 watch.look(seen.x, seen.s)
-        worlds = step.ordered(worlds)
+            if keep_every is not None and (number + 1) % keep_every == 0:
+                kept.append(step.ordered(worlds))
+        if keep_every is None:
+            worlds = step.ordered(worlds)
+        else:
+            worlds = Worlds(*map(torch.stack, zip(*kept, strict=True)))
     if watch is not None:
         watch.raise_diverged()
     return worlds
+
+
+class RolloutCall(NamedTuple):
+    """What a checked call of `rollout` asks for besides its tensors."""
+
+    steps: int
+    options: StepOptions
+    memory: Memory
+    keep_every: int | None
+
+    def run(
+        self,
+        rules: Sequence[NPARule],
+        worlds: Worlds,
+        generator: Randomness | None,
+        watch: DivergenceWatch | None = None,
+    ) -> Worlds:
+        """Launch the rollout of one rule."""
+        (rule,) = rules
+        # Any other rule runs as the module that it is.
+        folded = rule.folded() if rule.is_plain() else None
+        static = _prepare_static(rule, worlds.x, self.steps, self.options)
+        if static is not None:
+            worlds = Worlds(*map(static.sort, worlds))
+        return run_steps(
+            RuleStep(rule, folded, self.options, static),
+            worlds,
+            self.steps,
+            generator=generator,
+            memory=self.memory,
+            keep_every=self.keep_every,
+            watch=watch,
+        )
 
 
 def _prepare_static(
@@ -317,6 +347,23 @@ def _prepare_static(
     return prepare_static(
         x, rule.state_dim, eps=options.eps, box=options.box, terms=rule_terms(rule)
     )
+
+
+def checked_keep_every(keep_every: int | None, steps: int) -> int | None:
+    """Return after how many steps worlds are kept, each time.
+
+    Raises:
+        NPAError: It is no divisor of the number of steps.
+    """
+    if keep_every is None:
+        return None
+    kept = checked_count("keep_every", keep_every)
+    if kept == 0 or steps == 0 or steps % kept:
+        raise NPAError(
+            f"steps must be a multiple of keep_every, got {steps} and {kept}: the last world kept "
+            f"is the one at the end"
+        )
+    return kept
 
 
 def step(
@@ -332,6 +379,7 @@ def step(
     detach_positions: bool = True,
     generator: Randomness | None = None,
     on_divergence: OnDivergence = "ignore",
+    cuda_graph: CudaGraph = "auto",
 ) -> tuple[Tensor, Tensor]:
     """Advance worlds by one step: `rollout` with steps=1; its arguments and errors.
 
@@ -351,6 +399,7 @@ def step(
         detach_positions=detach_positions,
         generator=generator,
         on_divergence=on_divergence,
+        cuda_graph=cuda_graph,
     )
 
 
@@ -370,6 +419,8 @@ def rollout(
     memory: Memory = ...,
     generator: Randomness | None = ...,
     on_divergence: OnDivergence = ...,
+    keep_every: int | None = ...,
+    cuda_graph: CudaGraph = ...,
     return_path_length: Literal[False] = ...,
 ) -> tuple[Tensor, Tensor]: ...
 
@@ -390,6 +441,8 @@ def rollout(
     memory: Memory = ...,
     generator: Randomness | None = ...,
     on_divergence: OnDivergence = ...,
+    keep_every: int | None = ...,
+    cuda_graph: CudaGraph = ...,
     return_path_length: Literal[True],
 ) -> tuple[Tensor, Tensor, Tensor]: ...
 
@@ -409,6 +462,8 @@ def rollout(
     memory: Memory = "store",
     generator: Randomness | None = None,
     on_divergence: OnDivergence = "ignore",
+    keep_every: int | None = None,
+    cuda_graph: CudaGraph = "auto",
     return_path_length: bool = False,
 ) -> tuple[Tensor, Tensor] | tuple[Tensor, Tensor, Tensor]:
     """Run a rule for a number of steps; differentiable, and particle i stays particle i.
@@ -439,6 +494,12 @@ def rollout(
         on_divergence: What is done about worlds whose numbers become infinite or NaN: "ignore", at
             no cost (the next call refuses such positions), or "raise": look after each step, on the
             device, and wait for it once, at the end.
+        keep_every: Return the worlds after every so many steps, a divisor of `steps`: the
+            trajectory. Results have one more dimension at the front, of size steps / keep_every.
+        cuda_graph: On CUDA, replay calls that repeat instead of launching their kernels one by one:
+            a tenth of the host's time, the same numbers. "auto" records plain rules, from the third
+            call with the same shapes and options on; True also rules with a network of their own,
+            whose Python code then runs no more; False none. See docs/performance.md.
         return_path_length: Also return how far each particle travelled.
 
     Returns:
@@ -452,7 +513,9 @@ def rollout(
             which step, and which number of which particle.
     """
     steps = checked_count("steps", steps)
+    kept = checked_keep_every(keep_every, steps)
     check_memory(memory)
+    check_cuda_graph(cuda_graph)
     check_rule(rule)
     if rule.species_count:
         raise NPAError(
@@ -463,19 +526,12 @@ def rollout(
         rule, x, s, eps, box, update_prob, dt, position_noise, detach_positions
     )
     check_generator(generator, x.device, x.shape[0])
-    watch = make_watch(on_divergence, x, s)
-    # Any other rule runs as the module that it is.
-    folded = rule.folded() if rule.is_plain() else None
-    static = _prepare_static(rule, x, steps, options)
-    worlds = Worlds(x, s, x.new_zeros(x.shape[:2]))
-    if static is not None:
-        worlds = Worlds(*map(static.sort, worlds))
-    after = run_steps(
-        RuleStep(rule, folded, options, static),
-        worlds,
-        steps,
-        generator=generator,
-        memory=memory,
-        watch=watch,
+    after = run_call(
+        RolloutCall(steps, options, memory, kept),
+        (rule,),
+        Worlds(x, s, x.new_zeros(x.shape[:2])),
+        generator,
+        cuda_graph=cuda_graph,
+        watch=make_watch(on_divergence, x, s),
     )
     return (after.x, after.s, after.path_length) if return_path_length else (after.x, after.s)

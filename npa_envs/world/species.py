@@ -16,14 +16,15 @@ from npa_envs.ops.species import checked_counts, perceive_by_species
 from npa_envs.ops.static import StaticRows
 from npa_envs.ops.update import update_particles
 from npa_envs.rule.rule import FoldedRule, NPARule
-from npa_envs.world.divergence import OnDivergence, make_watch
+from npa_envs.world.divergence import DivergenceWatch, OnDivergence, make_watch
 from npa_envs.world.randomness import Randomness, WorldRandom, check_generator
+from npa_envs.world.recorded import CudaGraph, Worlds, check_cuda_graph, run_call
 from npa_envs.world.rollout import (
     Draws,
     Memory,
     StepOptions,
-    Worlds,
     check_memory,
+    checked_keep_every,
     checked_options,
     draw_step,
     rollout,
@@ -69,6 +70,8 @@ def rollout_species(
     density_counts: Sequence[float] | None = ...,
     memory: Memory = ...,
     on_divergence: OnDivergence = ...,
+    keep_every: int | None = ...,
+    cuda_graph: CudaGraph = ...,
     return_path_length: Literal[False] = ...,
 ) -> tuple[Tensor, Tensor]: ...
 
@@ -92,6 +95,8 @@ def rollout_species(
     density_counts: Sequence[float] | None = ...,
     memory: Memory = ...,
     on_divergence: OnDivergence = ...,
+    keep_every: int | None = ...,
+    cuda_graph: CudaGraph = ...,
     return_path_length: Literal[True],
 ) -> tuple[Tensor, Tensor, Tensor]: ...
 
@@ -114,6 +119,8 @@ def rollout_species(
     density_counts: Sequence[float] | None = None,
     memory: Memory = "store",
     on_divergence: OnDivergence = "ignore",
+    keep_every: int | None = None,
+    cuda_graph: CudaGraph = "auto",
     return_path_length: bool = False,
 ) -> tuple[Tensor, Tensor] | tuple[Tensor, Tensor, Tensor]:
     """Run several rules in one world; differentiable, and particle i stays particle i.
@@ -153,6 +160,8 @@ def rollout_species(
             default: N, the particles of the world, for all.
         memory: What the backward pass reads is stored or recomputed, as in `rollout`.
         on_divergence: "ignore" worlds that diverge, or "raise" at the end, as in `rollout`.
+        keep_every: Return the worlds after every so many steps, as in `rollout`.
+        cuda_graph: Whether calls that repeat are replayed on CUDA, as in `rollout`.
         return_path_length: Also return how far each particle travelled.
 
     Returns:
@@ -186,27 +195,68 @@ def rollout_species(
             memory=memory,
             generator=generator,
             on_divergence=on_divergence,
+            keep_every=keep_every,
+            cuda_graph=cuda_graph,
             return_path_length=True,
         )
         return (after[0], after[1], travelled) if return_path_length else (after[0], after[1])
-    options = [
+    kept = checked_keep_every(keep_every, steps)
+    check_cuda_graph(cuda_graph)
+    options = tuple(
         checked_options(rule, x, s, eps, box, chance, dt, position_noise, detach_positions)
         for rule, chance in zip(species_rules, probabilities, strict=True)
-    ]
+    )
     check_generator(generator, x.device, x.shape[0])
-    told_apart = perception == "per_species"
-    community = make_community(species_rules, sizes, options, divisors, x, told_apart=told_apart)
-    worlds = run_steps(
-        community,
+    worlds = run_call(
+        SpeciesCall(steps, options, memory, kept, sizes, divisors, perception == "per_species"),
+        species_rules,
         Worlds(x, s, x.new_zeros(x.shape[:2])),
-        steps,
-        generator=generator,
-        memory=memory,
+        generator,
+        cuda_graph=cuda_graph,
         watch=make_watch(on_divergence, x, s),
     )
     if return_path_length:
         return worlds.x, worlds.s, worlds.path_length
     return worlds.x, worlds.s
+
+
+class SpeciesCall(NamedTuple):
+    """What a checked call of `rollout_species` asks for besides its tensors."""
+
+    steps: int
+    options: tuple[StepOptions, ...]
+    """What each species' particles are told."""
+    memory: Memory
+    keep_every: int | None
+    counts: tuple[int, ...]
+    density_counts: tuple[float, ...]
+    told_apart: bool
+
+    def run(
+        self,
+        rules: Sequence[NPARule],
+        worlds: Worlds,
+        generator: Randomness | None,
+        watch: DivergenceWatch | None = None,
+    ) -> Worlds:
+        """Launch the rollout."""
+        community = make_community(
+            rules,
+            self.counts,
+            self.options,
+            self.density_counts,
+            worlds.x,
+            told_apart=self.told_apart,
+        )
+        return run_steps(
+            community,
+            worlds,
+            self.steps,
+            generator=generator,
+            memory=self.memory,
+            keep_every=self.keep_every,
+            watch=watch,
+        )
 
 
 def _checked_rules(rules: Any) -> list[NPARule]:
@@ -402,9 +452,9 @@ class Community(NamedTuple):
 
 
 def make_community(
-    rules: list[NPARule],
+    rules: Sequence[NPARule],
     counts: tuple[int, ...],
-    options: list[StepOptions],
+    options: Sequence[StepOptions],
     density_counts: tuple[float, ...],
     x: Tensor,
     *,

@@ -1,0 +1,589 @@
+"""Recorded rollouts: on CUDA, calls that repeat are replayed as graphs instead of launched.
+
+A rollout launches some ten short kernels a step, which takes the host many times longer than it
+takes the device. The third call of a kind (same shapes, options and form of the rule) is recorded:
+its forward pass, and where gradients are wanted its backward pass, as two CUDA graphs between
+tensors that stay where they are. Each call copies worlds and weights there, replays, and returns
+copies of what came out. So a recording serves any rule of that form, and later calls overwrite
+nothing that was returned.
+
+What a backward pass reads stays in the recording's memory. Until that pass has run, the recording
+is leased; another rollout meanwhile gets a recording of its own.
+"""
+
+from __future__ import annotations
+
+import collections
+import contextlib
+import copy
+import functools
+import logging
+import threading
+import weakref
+from collections.abc import Callable, Hashable, Sequence
+from typing import Any, Literal, NamedTuple, Protocol, Self
+
+import torch
+from torch import Tensor, nn
+
+from npa_envs.errors import NPAError
+from npa_envs.ops.checks import FiniteCheck, check_finite_positions
+from npa_envs.rule.rule import NPARule
+from npa_envs.world.cuda_graph import capture, prepare_capture
+from npa_envs.world.divergence import DivergenceWatch
+from npa_envs.world.randomness import Randomness, WorldRandom
+
+CudaGraph = bool | Literal["auto"]
+"""Whether rollouts record themselves on CUDA: "auto" records plain rules."""
+
+LAUNCHED_FIRST = 2
+"""Calls of a kind that are launched before one is recorded."""
+
+MEMORY_SHARE = 0.5
+"""Share of a device's memory that recordings take at most; the least recently used go first."""
+
+BLOCK_STEPS = 64
+"""Steps of a graph without gradients: longer rollouts replay it several times."""
+
+MOST_STEPS = 1024
+"""Steps of a graph with gradients, at most: longer rollouts are launched."""
+
+MOST_GRAPHS = 128
+"""Numbers of steps for which one recording holds graphs, at most."""
+
+MOST_KINDS = 256
+"""Kinds that are remembered, at most."""
+
+WARM_UP_STEPS = 4
+"""Steps that load all kernels of a kind: enough for static worlds and each form of `memory`."""
+
+logger = logging.getLogger(__name__)
+
+
+class Worlds(NamedTuple):
+    """Worlds between two steps of a rollout."""
+
+    x: Tensor
+    """Positions [length units], shape [B, N, D]."""
+    s: Tensor
+    """States, dimensionless, shape [B, N, C]."""
+    path_length: Tensor
+    """Length of each particle's path so far [length units], shape [B, N]."""
+
+
+class Call(Protocol):
+    """What a checked call asks for besides its tensors; hashable, a named tuple."""
+
+    @property
+    def steps(self) -> int:
+        """Number of steps T."""
+
+    @property
+    def keep_every(self) -> int | None:
+        """Worlds are kept after each so many steps; None: at the end alone."""
+
+    def run(
+        self,
+        rules: Sequence[NPARule],
+        worlds: Worlds,
+        generator: Randomness | None,
+        watch: DivergenceWatch | None = None,
+    ) -> Worlds:
+        """Launch the rollout."""
+
+    def _replace(self, **changes: Any) -> Self:
+        """Return the call with some fields changed."""
+
+
+def check_cuda_graph(cuda_graph: CudaGraph) -> None:
+    """Check whether rollouts shall be recorded.
+
+    Raises:
+        NPAError: It is neither "auto" nor True nor False.
+    """
+    if not isinstance(cuda_graph, bool) and cuda_graph != "auto":
+        raise NPAError(f"cuda_graph must be 'auto', True or False, got {cuda_graph!r}")
+
+
+def run_call(
+    call: Call,
+    rules: Sequence[NPARule],
+    worlds: Worlds,
+    generator: Randomness | None,
+    *,
+    cuda_graph: CudaGraph,
+    watch: DivergenceWatch | None,
+) -> Worlds:
+    """Run a checked rollout: recorded where that can be, launched otherwise; the same numbers.
+
+    Args:
+        call: What is asked for.
+        rules: The rule, or one of each species.
+        worlds: Where it begins.
+        generator: Source of the draws.
+        cuda_graph: Whether to record; True also records rules that are not plain.
+        watch: What looks at the worlds after each step, which then are launched.
+
+    Raises:
+        NPAError: A position is not finite.
+        DivergedError: The watch has seen a world diverge.
+    """
+    if watch is None and _can_record(call, rules, worlds.x, cuda_graph):
+        recorded = _run_recorded(call, rules, worlds, generator, cuda_graph)
+        if recorded is not None:
+            return recorded
+    check_finite_positions(worlds.x)
+    return call.run(rules, worlds, generator, watch)
+
+
+def recorded_memory(device: torch.device) -> int:
+    """Return how many bytes of a device the graphs of recorded rollouts take."""
+    with _lock:
+        recordings = [recording for kind in _kinds.values() for recording in kind.recordings]
+        return sum(recording.bytes for recording in recordings if recording.device == device)
+
+
+def release_recordings() -> None:
+    """Forget all recorded rollouts, and free their memory; later calls are recorded anew."""
+    with _lock:
+        for key in list(_kinds):
+            _forget(key)
+    torch.cuda.empty_cache()
+
+
+def _can_record(call: Call, rules: Sequence[NPARule], x: Tensor, cuda_graph: CudaGraph) -> bool:
+    # Asked in this order: a compiler cannot trace what a stream does.
+    if not x.is_cuda or cuda_graph is False or torch.compiler.is_compiling() or call.steps == 0:
+        return False
+    if torch.cuda.is_current_stream_capturing():
+        return False
+    return cuda_graph is True or all(rule.is_plain() for rule in rules)
+
+
+def _hooked() -> bool:
+    """Return whether somebody handles what is saved for backward passes, as checkpoints do."""
+    hooks = getattr(torch._C._autograd, "_top_saved_tensors_default_hooks", None)
+    return hooks is not None and hooks(True) is not None
+
+
+def _parameters(rules: Sequence[NPARule]) -> list[Tensor]:
+    """Return the tensors that a rollout reads of rules; read-outs of plain ones are not."""
+    tensors: list[Tensor] = []
+    for rule in rules:
+        if rule.is_plain():
+            tensors += (rule.hidden.weight, rule.hidden.bias, rule.output.weight)
+        else:
+            tensors += (*rule.parameters(), *rule.buffers())
+    return tensors
+
+
+def _form(rule: NPARule) -> Hashable:
+    """Return what a recording depends on of a rule besides its weights."""
+    if not rule.is_plain():
+        return weakref.ref(rule)
+    form: dict[str, Any] = {**rule.hyper_parameters()}
+    return tuple(value for name, value in form.items() if not name.startswith("readout"))
+
+
+def _twin(rule: NPARule, like: Tensor) -> NPARule:
+    """Return a rule of the same form with memory of its own for its weights."""
+    if not rule.is_plain():
+        return copy.deepcopy(rule)
+    form = rule.hyper_parameters() | {"readout_dim": 0, "readout_hidden_dim": 0}
+    # Without drawing first weights.
+    with torch.device("meta"):
+        twin = NPARule(**form)
+    return twin.to(like.dtype).to_empty(device=like.device)
+
+
+class _Kind:
+    """Calls that may share recordings."""
+
+    def __init__(self) -> None:
+        self.calls = 0
+        self.refused = False
+        """One of them could not be recorded."""
+        self.recordings: list[_Recording] = []
+        self.free: collections.deque[_Recording] = collections.deque()
+
+
+class _Lease:
+    """The right to a recording: given back when nobody can ask for a backward pass any more."""
+
+    def __init__(self, recording: _Recording, kind: _Kind) -> None:
+        self.recording = recording
+        self._free = kind.free
+
+    def __del__(self) -> None:
+        # Appending to a deque needs no lock: any thread may drop the last reference.
+        self._free.append(self.recording)
+
+
+class _Graphs(NamedTuple):
+    forward: torch.cuda.CUDAGraph
+    backward: torch.cuda.CUDAGraph | None
+
+
+class _Recording:
+    """Tensors that stay where they are, and graphs for some numbers of steps between them.
+
+    All graphs share the memory of what happens in between: only one rollout is under way.
+    """
+
+    def __init__(
+        self,
+        call: Call,
+        rules: Sequence[NPARule],
+        worlds: Worlds,
+        wanted: tuple[bool, ...],
+        by_world: bool,
+    ) -> None:
+        self.device = worlds.x.device
+        self.bytes = 0
+        """Memory of the graphs."""
+        self._call = call
+        self._rules = [_twin(rule, worlds.x) for rule in rules]
+        weights = _parameters(self._rules)
+        own = [torch.empty_like(value, memory_format=torch.contiguous_format) for value in worlds]
+        for tensor, flag in zip([*own, *weights], wanted, strict=False):
+            if isinstance(tensor, nn.Parameter) or flag:
+                tensor.requires_grad_(flag)
+        self._inputs = [*own, *weights]
+        self._wanted = wanted
+        self._generator = torch.Generator(self.device)
+        self._streams = None
+        if by_world:
+            keys = torch.zeros(len(worlds.x), dtype=torch.int64, device=self.device)
+            self._streams = WorldRandom.from_keys(keys)
+        self._outputs: dict[int | None, list[Tensor]] = {}
+        self._bars: dict[int | None, list[Tensor]] = {}
+        self._gradients = [
+            torch.empty_like(tensor) if flag else None
+            for tensor, flag in zip(self._inputs, wanted, strict=False)
+        ]
+        self._graphs: collections.OrderedDict[int, _Graphs] = collections.OrderedDict()
+        self._pool = torch.cuda.graph_pool_handle()
+        self._stream: torch.cuda.Stream | None = None
+        self.token = torch.empty(0, device=self.device)
+
+    def holds(self, steps: int) -> bool:
+        """Return whether a number of steps is recorded."""
+        return steps in self._graphs
+
+    def record(self, steps: int) -> None:
+        """Record rollouts of a number of steps.
+
+        Raises:
+            Exception: They cannot be recorded.
+        """
+        if not self._graphs:
+            first = self._call._replace(steps=min(steps, WARM_UP_STEPS), keep_every=None)
+            with torch.no_grad():
+                # Any worlds do; those of the memory's last owner might be no numbers.
+                for tensor in self._inputs:
+                    tensor.zero_()
+            prepare_capture(functools.partial(self._warm_up, first), self.device)
+        elif len(self._graphs) >= MOST_GRAPHS:
+            self._graphs.popitem(last=False)
+        call = self._call._replace(steps=steps)
+        before = _reserved(self.device)
+        results: list[Tensor] = []
+        kept: list[Tensor] = []
+        count = None if call.keep_every is None else steps // call.keep_every
+        outputs = self._outputs.setdefault(count, self._kept_worlds(count))
+
+        def forward() -> None:
+            kept.clear()
+            results[:] = self._run(call, kept)
+            for buffer, value in zip(outputs, results, strict=True):
+                buffer.copy_(value.detach())
+
+        draws = None if self._streams is not None else self._generator
+        forward_graph = capture(forward, self.device, pool=self._pool, generator=draws)
+        backward_graph = None
+        if any(self._wanted):
+            bars = self._bars.setdefault(count, [torch.zeros_like(out) for out in outputs])
+            backward_graph = capture(
+                functools.partial(self._pull_back, results, bars), self.device, pool=self._pool
+            )
+        self._graphs[steps] = _Graphs(forward_graph, backward_graph)
+        self.bytes += max(_reserved(self.device) - before, 0)
+
+    def _kept_worlds(self, count: int | None) -> list[Tensor]:
+        own = self._inputs[:3]
+        if count is None:
+            return [torch.empty_like(tensor) for tensor in own]
+        return [tensor.new_empty(count, *tensor.shape) for tensor in own]
+
+    def _warm_up(self, call: Call) -> None:
+        results = self._run(call, [])
+        if any(self._wanted):
+            self._pull_back(results, [torch.zeros_like(result) for result in results])
+
+    def _run(self, call: Call, kept: list[Tensor]) -> Worlds:
+        """Launch a rollout; what its backward pass reads is kept."""
+
+        def keep(tensor: Tensor) -> Tensor:
+            kept.append(tensor.detach())
+            return kept[-1]
+
+        generator = self._generator if self._streams is None else self._streams
+        hooks = torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor)
+        with torch.set_grad_enabled(any(self._wanted)), hooks:
+            return call.run(self._rules, Worlds(*self._inputs[:3]), generator)
+
+    def _pull_back(self, results: Sequence[Tensor], bars: list[Tensor]) -> None:
+        """Launch the backward pass."""
+        pairs = [
+            (result, bar) for result, bar in zip(results, bars, strict=True) if result.requires_grad
+        ]
+        sources = [tensor for tensor, flag in zip(self._inputs, self._wanted, strict=False) if flag]
+        buffers = [buffer for buffer in self._gradients if buffer is not None]
+        gradients = torch.autograd.grad(
+            [result for result, _ in pairs],
+            sources,
+            [bar for _, bar in pairs],
+            allow_unused=True,
+            materialize_grads=True,
+        )
+        for buffer, gradient in zip(buffers, gradients, strict=True):
+            buffer.copy_(gradient)
+
+    @torch.no_grad()
+    def forward(
+        self, steps: int, tensors: Sequence[Tensor], generator: Randomness | None
+    ) -> list[Tensor]:
+        """Replay a rollout, and return copies of the worlds that come out."""
+        with torch.cuda.device(self.device):
+            self._take_turns()
+            torch._foreach_copy_(self._inputs, list(tensors))
+            self._load_draws(generator)
+            graphs = self._graphs[steps]
+            self._graphs.move_to_end(steps)
+            graphs.forward.replay()
+            count = None if self._call.keep_every is None else steps // self._call.keep_every
+            return [value.clone() for value in self._outputs[count]]
+
+    @torch.no_grad()
+    def backward(
+        self, steps: int, bars: Sequence[Tensor | None], wanted: Sequence[bool]
+    ) -> list[Tensor | None]:
+        """Replay the backward pass of the rollout under way; return copies of the gradients."""
+        with torch.cuda.device(self.device):
+            self._take_turns()
+            count = None if self._call.keep_every is None else steps // self._call.keep_every
+            for buffer, bar in zip(self._bars[count], bars, strict=True):
+                buffer.zero_() if bar is None else buffer.copy_(bar)
+            graph = self._graphs[steps].backward
+            assert graph is not None, "it was recorded for gradients"
+            graph.replay()
+            return [
+                buffer.clone() if buffer is not None and flag else None
+                for buffer, flag in zip(self._gradients, wanted, strict=True)
+            ]
+
+    @property
+    def differentiable(self) -> bool:
+        """Whether there are backward passes."""
+        return any(self._wanted)
+
+    def finish(self) -> None:
+        """Wait until what was replayed is done."""
+        if self._stream is not None:
+            self._stream.synchronize()
+
+    def end_draws(self, generator: Randomness | None, steps: int) -> None:
+        """Let the caller's source of draws go on where the rollout's ended."""
+        if self._streams is not None:
+            assert isinstance(generator, WorldRandom)
+            generator.follow(self._streams, steps)
+        else:
+            _torch_generator(generator, self.device).set_offset(self._generator.get_offset())
+
+    def _load_draws(self, generator: Randomness | None) -> None:
+        if self._streams is not None:
+            assert isinstance(generator, WorldRandom)
+            self._streams.put(slice(None), generator)
+        else:
+            source = _torch_generator(generator, self.device)
+            self._generator.manual_seed(source.initial_seed())
+            self._generator.set_offset(source.get_offset())
+
+    def _take_turns(self) -> None:
+        """Let the current stream wait for the one on which this was used last."""
+        stream = torch.cuda.current_stream(self.device)
+        if self._stream is not None and self._stream != stream:
+            stream.wait_stream(self._stream)
+        self._stream = stream
+
+
+def _torch_generator(generator: Randomness | None, device: torch.device) -> torch.Generator:
+    if generator is None:
+        return torch.cuda.default_generators[device.index]
+    assert isinstance(generator, torch.Generator)
+    return generator
+
+
+def _reserved(device: torch.device) -> int:
+    return int(torch.cuda.memory_reserved(device))
+
+
+_kinds: collections.OrderedDict[Hashable, _Kind] = collections.OrderedDict()
+"""Kinds of calls so far, the least recently used first."""
+
+_lock = threading.RLock()
+"""Held while the above changes; graphs share one stream to be recorded on."""
+
+
+def _count(call: Call, rules: Sequence[NPARule], x: Tensor, s: Tensor, *rest: Hashable) -> _Kind:
+    """Return the kind of a call, which is counted."""
+    key = (
+        call._replace(steps=0),
+        tuple(_form(rule) for rule in rules),
+        (x.shape, s.shape, x.dtype, x.device),
+        torch.get_float32_matmul_precision(),
+        rest,
+    )
+    with _lock:
+        kind = _kinds.setdefault(key, _Kind())
+        _kinds.move_to_end(key)
+        if len(_kinds) > MOST_KINDS:
+            _forget(next(iter(_kinds)))
+        kind.calls += 1
+    return kind
+
+
+def _forget(key: Hashable) -> None:
+    """Forget a kind; recordings under way live until their backward pass has run."""
+    for recording in _kinds.pop(key).recordings:
+        recording.finish()
+
+
+def _run_recorded(
+    call: Call,
+    rules: Sequence[NPARule],
+    worlds: Worlds,
+    generator: Randomness | None,
+    cuda_graph: CudaGraph,
+) -> Worlds | None:
+    """Run a rollout by replaying it; None where it is to be launched."""
+    tensors = [*worlds, *_parameters(rules)]
+    wanted = (False,) * len(tensors)
+    if torch.is_grad_enabled():
+        wanted = tuple(tensor.requires_grad for tensor in tensors)
+    by_world = isinstance(generator, WorldRandom)
+    kind = _count(call, rules, worlds.x, worlds.s, wanted, by_world)
+    if kind.refused or kind.calls <= (1 if cuda_graph is True else LAUNCHED_FIRST):
+        return None
+    if any(wanted) and (_hooked() or call.steps > MOST_STEPS):
+        return None
+    check = FiniteCheck(worlds.x)
+    blocks = [call.steps] if any(wanted) else _blocks(call)
+    make = functools.partial(_Recording, call, rules, worlds, wanted, by_world)
+    lease = _lease(kind, set(blocks), make)
+    if lease is None:
+        return None
+    found: list[Worlds] = []
+    for steps in blocks:
+        after = _replay(lease, steps, tensors, generator)
+        if not found:
+            # Only now: the device is at work while the host waits for what it found before.
+            check.wait()
+        lease.recording.end_draws(generator, steps)
+        found.append(after)
+        last = after if call.keep_every is None else Worlds(*(value[-1] for value in after))
+        tensors[:3] = last
+    if len(found) == 1:
+        return found[0]
+    return last if call.keep_every is None else Worlds(*map(torch.cat, zip(*found, strict=True)))
+
+
+def _blocks(call: Call) -> list[int]:
+    """Return the steps of the graphs that are replayed one after the other, without gradients."""
+    kept = call.keep_every or 1
+    block = max(BLOCK_STEPS // kept, 1) * kept
+    rest = call.steps % block
+    return [block] * (call.steps // block) + [rest] * (rest > 0)
+
+
+def _lease(kind: _Kind, steps: set[int], make: Callable[[], _Recording]) -> _Lease | None:
+    """Return a recording that holds these numbers of steps; None where there can be none."""
+    with _lock:
+        lease = None
+        with contextlib.suppress(IndexError):
+            # The one used last: it more likely holds the steps.
+            lease = _Lease(kind.free.pop(), kind)
+        try:
+            if lease is None:
+                recording = make()
+                kind.recordings.append(recording)
+                lease = _Lease(recording, kind)
+            recording = lease.recording
+            for missing in [number for number in steps if not recording.holds(number)]:
+                if not _make_room(recording.device):
+                    logger.debug(
+                        "a rollout is launched: recordings have taken their share of memory"
+                    )
+                    return None
+                recording.record(missing)
+        except Exception as error:
+            # A launched rollout says what is wrong if that cannot run either.
+            logger.debug("rollouts of this kind are launched, not recorded: %s", error)
+            kind.refused = True
+            kind.recordings.clear()
+            kind.free.clear()
+            return None
+        return lease
+
+
+def _make_room(device: torch.device) -> bool:
+    """Return whether recordings take less than their share, forgetting those not in use."""
+    limit = MEMORY_SHARE * torch.cuda.get_device_properties(device).total_memory
+
+    for key in list(_kinds)[:-1]:
+        if recorded_memory(device) < limit:
+            break
+        if any(own.device == device for own in _kinds[key].recordings):
+            _forget(key)
+    return recorded_memory(device) < limit
+
+
+def _replay(
+    lease: _Lease, steps: int, tensors: Sequence[Tensor], generator: Randomness | None
+) -> Worlds:
+    """Replay a rollout from worlds, with weights; differentiable where that was recorded."""
+    recording = lease.recording
+    if not recording.differentiable:
+        return Worlds(*recording.forward(steps, tensors, generator))
+    # The lease stands for what is saved, so it ends when autograd drops that: after a backward
+    # pass, unless the graph is retained, or with the last result.
+    hooks = torch.autograd.graph.saved_tensors_hooks(
+        lambda _: lease, lambda saved: saved.recording.token
+    )
+    with hooks:
+        return Worlds(*_Replayed.apply(recording, steps, generator, *tensors))  # type: ignore[no-untyped-call]
+
+
+class _Replayed(torch.autograd.Function):
+    """A recorded rollout."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        recording: _Recording,
+        steps: int,
+        generator: Randomness | None,
+        *tensors: Tensor,
+    ) -> tuple[Tensor, ...]:
+        ctx.recording, ctx.steps = recording, steps
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(recording.token)
+        return tuple(recording.forward(steps, tensors, generator))
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *bars: Tensor | None) -> tuple[Tensor | None, ...]:
+        # Raises autograd's own error where what was saved is gone.
+        _ = ctx.saved_tensors
+        gradients = ctx.recording.backward(ctx.steps, bars, ctx.needs_input_grad[3:])
+        return (None, None, None, *gradients)

@@ -1,0 +1,402 @@
+"""Recorded rollouts: what they give is what launched ones give, bit for bit."""
+
+import functools
+import threading
+
+import pytest
+import torch
+from torch.utils.checkpoint import checkpoint
+from worlds import random_world
+
+import npa_envs
+from npa_envs.world import recorded
+
+pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+
+DEVICE = torch.device("cuda", 0)
+EPS = 0.3
+
+
+@pytest.fixture(autouse=True)
+def _nothing_recorded():
+    recorded.release_recordings()
+    yield
+    recorded.release_recordings()
+
+
+def worlds(count=3, particles=60, space_dim=2, seed=0, dtype=torch.float32):
+    return random_world(count, particles, space_dim, 8, dtype=dtype, device=DEVICE, seed=seed)
+
+
+def make_rule(space_dim=2, dtype=torch.float32, seed=0, **options):
+    torch.manual_seed(seed)
+    rule = npa_envs.NPARule(space_dim, 8, 32, eps0=EPS, **options)
+    for parameter in rule.parameters():
+        torch.nn.init.normal_(parameter, std=0.1)
+    return rule.to(DEVICE, dtype)
+
+
+def run(rule, x, s, steps=7, *, cuda_graph, seed=0, gradients=True, by_world=False, **options):
+    """Return what a rollout gives, its gradients, and what its generator draws next."""
+    generator = torch.Generator(DEVICE).manual_seed(seed)
+    if by_world:
+        generator = npa_envs.WorldRandom([seed + k for k in range(len(x))], device=DEVICE)
+    x, s = x.clone().requires_grad_(gradients), s.clone().requires_grad_(gradients)
+    with torch.set_grad_enabled(gradients):
+        results = npa_envs.rollout(
+            rule,
+            x,
+            s,
+            steps,
+            generator=generator,
+            return_path_length=True,
+            cuda_graph=cuda_graph,
+            **options,
+        )
+    found = list(results)
+    if gradients:
+        loss = sum(value.sin().sum() for value in results)
+        found += torch.autograd.grad(loss, [x, s, *rule.parameters()], allow_unused=True)
+    found.append(
+        generator.uniform(3) if by_world else torch.rand(3, device=DEVICE, generator=generator)
+    )
+    return found
+
+
+def same(first, second):
+    assert len(first) == len(second)
+    for one, other in zip(first, second, strict=True):
+        assert (one is None) == (other is None)
+        assert one is None or (torch.equal(one, other) and one.isfinite().all())
+
+
+def is_recorded():
+    return recorded.recorded_memory(DEVICE) > 0
+
+
+@pytest.mark.parametrize("gradients", [False, True])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"update_prob": 1.0, "box": (1.4, 1.8)},
+        {"position_noise": 0.01, "dt": 0.5},
+        {"detach_positions": False},
+        {"memory": "recompute"},
+        {"memory": "minimal"},
+        {"keep_every": 7},
+        {"keep_every": 1},
+        {"by_world": True, "position_noise": 0.01},
+        {"steps": 1},
+        {"steps": 150},
+    ],
+    ids=str,
+)
+def test_a_recorded_rollout_is_the_launched_one(options, gradients):
+    rule = make_rule()
+    for call in range(5):
+        x, s = worlds(seed=call)
+        expected = run(rule, x, s, seed=call, gradients=gradients, cuda_graph=False, **options)
+        found = run(rule, x, s, seed=call, gradients=gradients, cuda_graph="auto", **options)
+        same(found, expected)
+        assert is_recorded() == (call >= 2)
+
+
+@pytest.mark.parametrize(
+    ("dtype", "space_dim", "options"),
+    [
+        (torch.float64, 2, {}),
+        (torch.float32, 3, {}),
+        (torch.float32, 2, {"static": True}),
+        (torch.float32, 2, {"moment_inverse": "smooth"}),
+        (torch.float32, 2, {"readout_dim": 3, "readout_hidden_dim": 4}),
+    ],
+    ids=str,
+)
+def test_every_form_of_rule_is_recorded(dtype, space_dim, options):
+    rule = make_rule(space_dim, dtype, **options)
+    for call in range(4):
+        x, s = worlds(space_dim=space_dim, dtype=dtype, seed=call)
+        expected = run(rule, x, s, seed=call, cuda_graph=False)
+        same(run(rule, x, s, seed=call, cuda_graph="auto"), expected)
+    assert is_recorded()
+
+
+def test_numbers_of_steps_vary():
+    rule = make_rule()
+    x, s = worlds()
+    for call, steps in enumerate((5, 9, 5, 9, 12, 1, 9, 0, 5, 70)):
+        expected = run(rule, x, s, steps, seed=call, cuda_graph=False)
+        same(run(rule, x, s, steps, seed=call, cuda_graph="auto"), expected)
+
+
+def test_the_global_generator_goes_on_as_launched():
+    rule = make_rule()
+    x, s = worlds()
+    seen = []
+    for cuda_graph in (False, "auto"):
+        torch.manual_seed(3)
+        drawn = []
+        with torch.no_grad():
+            for _ in range(5):
+                drawn += npa_envs.rollout(rule, x, s, 6, cuda_graph=cuda_graph)
+                drawn.append(torch.rand(2, device=DEVICE))
+        seen.append(drawn)
+    same(*seen)
+    assert not torch.equal(seen[0][0], seen[0][3])
+
+
+def test_weights_are_read_anew_and_results_are_kept():
+    rule = make_rule()
+    x, s = worlds()
+    kept = []
+    for call in range(6):
+        expected = run(rule, x, s, seed=call, cuda_graph=False)
+        found = run(rule, x, s, seed=call, cuda_graph="auto")
+        kept.append((found, [None if value is None else value.clone() for value in found]))
+        same(found, expected)
+        with torch.no_grad():
+            for parameter in rule.parameters():
+                parameter.mul_(1.01)
+        if call == 3:
+            rule = make_rule(seed=5)
+        if call == 4:
+            rule = rule.cpu().to(DEVICE)
+            rule.load_state_dict(make_rule(seed=6).state_dict())
+    for found, copies in kept:
+        same(found, copies)
+
+
+def optimise(rule, x, s, cuda_graph, arrange):
+    generator = torch.Generator(DEVICE).manual_seed(0)
+    optimiser = torch.optim.SGD(rule.parameters(), lr=1e-3)
+    roll = functools.partial(npa_envs.rollout, rule, generator=generator, cuda_graph=cuda_graph)
+    for _ in range(6):
+        optimiser.zero_grad()
+        arrange(roll, x, s)
+        optimiser.step()
+    return [parameter.detach().clone() for parameter in rule.parameters()]
+
+
+def two_before_one_backward(roll, x, s):
+    first, second = roll(x, s, 5), roll(s=s * 2.0, x=x, steps=5)
+    (first[1] * second[1]).sum().backward()
+
+
+def one_after_the_other(roll, x, s):
+    middle = roll(x, s, 5)
+    roll(*middle, 5)[1].square().sum().backward()
+
+
+def retained(roll, x, s):
+    after = roll(x, s, 5)
+    after[1].sum().backward(retain_graph=True)
+    roll(x, s, 5)[1].square().sum().backward()
+    after[0].square().sum().backward()
+
+
+def abandoned(roll, x, s):
+    for _ in range(3):
+        roll(x, s, 5)
+    roll(x, s, 5)[1].sum().backward()
+
+
+def checkpointed(roll, x, s):
+    s = s.clone().requires_grad_()
+    middle = checkpoint(
+        lambda s: roll(x, s, 5)[1], s, use_reentrant=False, preserve_rng_state=False
+    )
+    middle.sum().backward()
+
+
+def with_autocast(roll, x, s):
+    with torch.autocast("cuda"):
+        roll(x, s, 5)[1].sum().backward()
+
+
+@pytest.mark.parametrize("memory", ["store", "recompute"])
+@pytest.mark.parametrize(
+    "arrange",
+    [two_before_one_backward, one_after_the_other, retained, abandoned, with_autocast],
+)
+def test_training_follows_the_same_path(arrange, memory):
+    x, s = worlds()
+    ways = []
+    for cuda_graph in (False, "auto"):
+        ways.append(
+            optimise(
+                make_rule(),
+                x,
+                s,
+                cuda_graph,
+                lambda roll, x, s: arrange(functools.partial(roll, memory=memory), x, s),
+            )
+        )
+    same(*ways)
+    assert is_recorded()
+
+
+def test_rollouts_within_a_checkpoint_are_launched():
+    """Their draws come from the generator twice, so that only the lack of an error is certain."""
+    optimise(make_rule(), *worlds(), "auto", checkpointed)
+    assert not is_recorded()
+
+
+def test_a_second_backward_pass_is_refused_as_ever():
+    rule = make_rule()
+    x, s = worlds()
+    for _ in range(4):
+        loss = npa_envs.rollout(rule, x, s, 5)[1].sum()
+        loss.backward()
+        with pytest.raises(RuntimeError, match="backward through the graph a second time"):
+            loss.backward()
+    assert is_recorded()
+
+
+def test_positions_that_are_not_finite_are_refused_and_nothing_is_drawn():
+    rule = make_rule()
+    x, s = worlds()
+    broken = x.clone()
+    broken[1, 7, 0] = torch.nan
+    generator = torch.Generator(DEVICE)
+    with torch.no_grad():
+        for _ in range(4):
+            generator.manual_seed(0)
+            npa_envs.rollout(rule, x, s, 5, generator=generator)
+        state = generator.get_state()
+        with pytest.raises(npa_envs.NPAError, match=r"x must be finite.*world 1, particle 7"):
+            npa_envs.rollout(rule, broken, s, 5, generator=generator)
+        assert torch.equal(generator.get_state(), state)
+        same(
+            run(rule, x, s, cuda_graph="auto", gradients=False),
+            run(rule, x, s, cuda_graph=False, gradients=False),
+        )
+
+
+class Doubled(npa_envs.NPARule):
+    runs = 0
+
+    def forward(self, perception):
+        Doubled.runs += 1
+        return 2.0 * super().forward(perception)
+
+
+def test_rules_with_a_network_of_their_own_are_recorded_where_asked():
+    torch.manual_seed(0)
+    rule = Doubled(2, 8, 32, eps0=EPS).to(DEVICE)
+    x, s = worlds()
+    for call in range(4):
+        expected = run(rule, x, s, seed=call, cuda_graph=False)
+        same(run(rule, x, s, seed=call, cuda_graph="auto"), expected)
+    assert not is_recorded()
+    for call in range(4):
+        expected = run(rule, x, s, seed=call, cuda_graph=False)
+        before = Doubled.runs
+        same(run(rule, x, s, seed=call, cuda_graph=True), expected)
+    assert is_recorded()
+    assert Doubled.runs == before
+
+
+def test_species_are_recorded():
+    rules = [make_rule(seed=k) for k in range(2)]
+    for call in range(4):
+        x, s = worlds(particles=50, seed=call)
+        found = []
+        for cuda_graph in (False, "auto"):
+            generator = torch.Generator(DEVICE).manual_seed(call)
+            after = npa_envs.rollout_species(
+                rules,
+                x,
+                s,
+                6,
+                counts=(20, 30),
+                update_prob=(0.5, 0.3),
+                generator=generator,
+                cuda_graph=cuda_graph,
+            )
+            loss = after[0].sum() + after[1].square().sum()
+            parameters = [own for rule in rules for own in rule.parameters()]
+            found.append([*after, *torch.autograd.grad(loss, parameters)])
+        same(*found)
+    assert is_recorded()
+
+
+def test_streams_and_threads():
+    rule = make_rule()
+    cases = [(worlds(seed=k), k) for k in range(4)]
+    expected = [run(rule, *given, seed=k, cuda_graph=False) for given, k in cases]
+    for _ in range(3):
+        for (given, k), right in zip(cases, expected, strict=True):
+            with torch.cuda.stream(torch.cuda.Stream()):
+                found = run(rule, *given, seed=k, cuda_graph="auto")
+                torch.cuda.current_stream().synchronize()
+            same(found, right)
+    wrong = []
+
+    def work(given, k, right):
+        for _ in range(10):
+            with torch.cuda.stream(torch.cuda.Stream()):
+                found = run(rule, *given, seed=k, cuda_graph="auto")
+                torch.cuda.current_stream().synchronize()
+            try:
+                same(found, right)
+            except AssertionError as error:
+                wrong.append(error)
+
+    threads = [
+        threading.Thread(target=work, args=(given, k, right))
+        for (given, k), right in zip(cases, expected, strict=True)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not wrong
+
+
+def test_inside_a_graph_of_the_caller():
+    rule = make_rule()
+    x, s = worlds()
+    with torch.no_grad():
+        for _ in range(4):
+            npa_envs.rollout(rule, x, s, 5, update_prob=1.0)
+        expected = npa_envs.rollout(rule, x, s, 5, update_prob=1.0, cuda_graph=False)
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            found = npa_envs.rollout(rule, x, s, 5, update_prob=1.0)
+        graph.replay()
+    same(found, expected)
+
+
+def test_memory_is_bounded(monkeypatch):
+    monkeypatch.setattr(recorded, "MEMORY_SHARE", 1e-12)
+    rule = make_rule()
+    x, s = worlds()
+    for call in range(5):
+        expected = run(rule, x, s, seed=call, cuda_graph=False)
+        same(run(rule, x, s, seed=call, cuda_graph="auto"), expected)
+
+
+@pytest.mark.slow
+def test_nothing_leaks_over_ten_thousand_calls_of_changing_shapes():
+    rule = make_rule()
+    random = torch.Generator().manual_seed(0)
+    taken = []
+    for call in range(10_000):
+        particles = int(torch.randint(20, 60, (), generator=random))
+        steps = int(torch.randint(1, 9, (), generator=random))
+        x, s = worlds(1, particles, seed=call % 7)
+        _, states = npa_envs.rollout(rule, x, s, steps)
+        if call % 2:
+            states.sum().backward()
+        if call in (4_999, 9_999):
+            torch.cuda.synchronize()
+            taken.append((torch.cuda.memory_allocated(), recorded.recorded_memory(DEVICE)))
+    assert taken[1][0] <= taken[0][0] * 1.01 + 2**20
+    assert taken[1][1] <= taken[0][1] + 2**24
+
+
+def test_wrong_words_are_refused():
+    x, s = worlds()
+    with pytest.raises(npa_envs.NPAError, match="cuda_graph must be 'auto', True or False"):
+        npa_envs.rollout(make_rule(), x, s, 1, cuda_graph="yes")
