@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import torch
 from torch import Tensor
 
 from npa_envs.kernels.access import WARP
 from npa_envs.kernels.cuda.adjoint import SHARE, TILE, listed_adjoint
 from npa_envs.kernels.portable.adjoint import adjoint_kernels
 from npa_envs.ops.launch import launch
+from npa_envs.ops.opaque import opaque
 from npa_envs.ops.sort import Plan, density_scale, make_plan
 
 
@@ -52,7 +52,7 @@ class RowCotangents(NamedTuple):
     """Of the density gradients before their scaling, shape [K, D]; empty without `states`."""
 
 
-@torch.library.custom_op("npa::perceive_rows_backward", mutates_args=())
+@opaque("npa::perceive_rows_backward")
 def perceive_rows_backward(
     perception_bar: Tensor,
     saved_tensors: list[Tensor],

@@ -15,6 +15,7 @@ from npa_envs.kernels.portable.draws import (
     draw_kernels,
 )
 from npa_envs.ops.launch import launch, scalar_type
+from npa_envs.ops.opaque import opaque
 
 WORD_COUNT = 2**32
 """Values of a word of the generator."""
@@ -29,7 +30,7 @@ def _launch_draw(
     return values
 
 
-@torch.library.custom_op("npa::draw_uniform", mutates_args=())
+@opaque("npa::draw_uniform")
 def uniform_draw(
     keys: Tensor, episodes: Tensor, steps: Tensor, draw: int, count: int, dtype: torch.dtype
 ) -> Tensor:
@@ -50,7 +51,7 @@ def uniform_draw(
     )
 
 
-@torch.library.custom_op("npa::draw_normal", mutates_args=())
+@opaque("npa::draw_normal")
 def normal_draw(
     keys: Tensor, episodes: Tensor, steps: Tensor, draw: int, count: int, dtype: torch.dtype
 ) -> Tensor:
@@ -70,7 +71,7 @@ def _(
     return keys.new_empty(keys.shape[0], count, dtype=dtype)
 
 
-@torch.library.custom_op("npa::draw_bernoulli", mutates_args=())
+@opaque("npa::draw_bernoulli")
 def bernoulli_draw(
     keys: Tensor, episodes: Tensor, steps: Tensor, draw: int, count: int, probability: float
 ) -> Tensor:
@@ -89,7 +90,7 @@ def _(
     return keys.new_empty(keys.shape[0], count, dtype=torch.uint8)
 
 
-@torch.library.custom_op("npa::draw_integers", mutates_args=())
+@opaque("npa::draw_integers")
 def integer_draw(
     keys: Tensor, episodes: Tensor, steps: Tensor, draw: int, count: int, high: int
 ) -> Tensor:

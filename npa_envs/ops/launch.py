@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
-import copy
+import ctypes
 import functools
+import threading
 from typing import Any
 
 import torch
@@ -39,83 +39,218 @@ def warp_device(device: torch.device) -> Any:
     return wp.device_from_torch(device)
 
 
-@functools.lru_cache(maxsize=1024)
-def _array_types(kernel: Any) -> tuple[Any, ...]:
-    return tuple(
-        argument.type if isinstance(argument.type, wp.array) else None
-        for argument in kernel.adj.args
-    )
-
-
-def _as_array(tensor: Tensor | None, array_type: Any) -> Any:
-    if tensor is None:
-        return None
-    return wp.from_torch(
-        tensor.detach(), dtype=array_type.dtype, requires_grad=False, return_ctype=True
-    )
-
-
 @functools.lru_cache(maxsize=64)
 def _warp_stream(device: torch.device, handle: int) -> Any:
     return wp.Stream(wp.device_from_torch(device), cuda_stream=handle)
 
 
-_launched: set[tuple[Any, torch.device]] = set()
-
-
-def _converted(kernel: Any, arguments: tuple[Any, ...]) -> list[Any]:
-    """Return a kernel's arguments as Warp takes them; one that is cut into ranges begins at 0."""
-    arguments = (*_range_start(kernel), *arguments)
-    return [
-        value if array_type is None else _as_array(value, array_type)
-        for value, array_type in zip(arguments, _array_types(kernel), strict=True)
-    ]
-
-
-def _range_start(kernel: Any) -> tuple[int, ...]:
-    return (0,) if kernel in SMALLEST_RANGES else ()
-
-
-def _ranges(kernel: Any, size: tuple[int, ...], device: torch.device) -> list[range]:
-    """Return what threads of the CPU run of a launch's first dimension; one range: no cut."""
-    smallest = SMALLEST_RANGES.get(kernel)
-    if device.type != "cpu" or smallest is None:
-        return [range(size[0])]
-    return even_ranges(size[0], smallest)
-
-
-def _launch_range(recorded: Any, size: tuple[int, ...], indices: range) -> None:
-    """Launch a part of a recorded launch, with which it shares all other arguments."""
-    part = copy.copy(recorded)
-    part.params = list(recorded.params)
-    part.set_dim((len(indices), *size[1:]))
-    part.set_param_at_index(0, indices.start)
-    part.launch()
-
-
-def _launch_ranges(recorded: Any, size: tuple[int, ...], ranges: list[range]) -> None:
-    run_together([functools.partial(_launch_range, recorded, size, part) for part in ranges])
-
-
 def _current_stream(device: torch.device) -> Any:
-    """Return torch's current stream of a CUDA device as Warp knows it, None for a CPU."""
-    if device.type != "cuda":
-        return None
+    """Return torch's current stream of a CUDA device as Warp knows it."""
     return _warp_stream(device, torch.cuda.current_stream(device).cuda_stream)
 
 
-def _placement(device: torch.device, block_dim: int = CUDA_BLOCK) -> dict[str, Any]:
-    """Return where `wp.launch` shall put a kernel."""
-    where = warp_device(device)
-    threads = block_dim if where.is_cuda else None
-    return {"device": where, "stream": _current_stream(device), "block_dim": threads}
+class _ArrayArgument:
+    """The description of a tensor within a kernel's arguments, changed in place.
+
+    Args:
+        place: The description, in the memory of the arguments.
+        array_type: What the kernel reads.
+    """
+
+    def __init__(self, place: Any, array_type: Any) -> None:
+        self._place = place
+        self._shape, self._strides = place.shape, place.strides
+        self._type = array_type
+        self._form: tuple[Any, ...] | None = None
+
+    def set(self, tensor: Tensor | None) -> None:
+        """Describe another tensor, or none."""
+        if tensor is None:
+            # Kernels ask an absent array for its size.
+            if self._form is not None:
+                self._write(self._type.__ctype__())
+                self._form = None
+            return
+        form = (tensor.shape, tensor.stride(), tensor.dtype)
+        if form != self._form:
+            self._describe(tensor, form)
+        self._place.data = tensor.data_ptr()
+
+    def _describe(self, tensor: Tensor, form: tuple[Any, ...]) -> None:
+        """Write shape and strides: by itself where only the first dimension has changed."""
+        last = self._form
+        if last is not None and last[0][1:] == form[0][1:] and last[1:] == form[1:]:
+            self._shape[0] = form[0][0]
+        else:
+            self._write(_description(tensor, self._type))
+        self._form = form
+
+    def _write(self, made: Any) -> None:
+        ctypes.memmove(ctypes.addressof(self._place), ctypes.addressof(made), ctypes.sizeof(made))
 
 
-def _quiet_at_first(kernel: Any, device: torch.device) -> contextlib.AbstractContextManager[Any]:
-    """Return a context for a launch: the first one of a kernel loads its module."""
-    first = (kernel, device) not in _launched
-    _launched.add((kernel, device))
-    return quiet_warp() if first else contextlib.nullcontext()
+def _description(tensor: Tensor, array_type: Any) -> Any:
+    """Return a tensor as Warp describes arrays to kernels."""
+    return wp.from_torch(
+        tensor.detach(), dtype=array_type.dtype, requires_grad=False, return_ctype=True
+    )
+
+
+class _StructArgument:
+    """A struct within a kernel's arguments, changed in place."""
+
+    def __init__(self, place: Any) -> None:
+        self._place = place
+        self._last: Any = None
+
+    def set(self, value: Any) -> None:
+        """Copy another struct, unless it is the one that is there."""
+        if value is not self._last:
+            made = value.__ctype__()
+            ctypes.memmove(
+                ctypes.addressof(self._place), ctypes.addressof(made), ctypes.sizeof(made)
+            )
+            self._last = value
+
+
+class _Arguments:
+    """A kernel on a device with memory for its arguments, in which each launch changes some.
+
+    Warp's own launch makes all of them anew, which takes the host ten times longer.
+
+    Args:
+        kernel: The kernel.
+        size: Number of threads along each dimension.
+        device: Device of every tensor among the arguments.
+        block_dim: Threads of a CUDA block.
+        arguments: Its arguments, with `range_start` where the kernel has it.
+    """
+
+    def __init__(
+        self,
+        kernel: Any,
+        size: tuple[int, ...],
+        device: torch.device,
+        block_dim: int,
+        arguments: tuple[Any, ...],
+    ) -> None:
+        where = warp_device(device)
+        launched.add((kernel, device))
+        types = [argument.type for argument in kernel.adj.args]
+        given = [
+            _description(value, kind) if isinstance(value, Tensor) else value
+            for value, kind in zip(arguments, types, strict=True)
+        ]
+        with quiet_warp():
+            self._launch = wp.launch(
+                kernel,
+                size,
+                inputs=given,
+                device=where,
+                block_dim=block_dim if where.is_cuda else None,
+                record_tape=False,
+                record_cmd=True,
+            )
+        self._device = device
+        self._bounds = {size: self._launch.bounds}
+        made = self._launch.params[1:]
+        fields = [(f"a{k}", type(value)) for k, value in enumerate(made)]
+        self._memory: Any = _struct(tuple(fields))(*made)
+        self._names = [name for name, _ in fields]
+        self._setters = [
+            self._setter(*argument) for argument in zip(self._names, types, arguments, strict=True)
+        ]
+        self._last: list[Any] = [None] * len(made)
+        self._addresses: Any = None
+        if where.is_cuda:
+            begin, layout = ctypes.addressof(self._memory), type(self._memory)
+            places = [begin + getattr(layout, name).offset for name in self._names]
+            self._addresses = (ctypes.c_void_p * (1 + len(made)))(0, *places)
+            self._launch.params_addr = self._addresses
+
+    def _setter(self, name: str, kind: Any, value: Any) -> Any:
+        """Return what changes an argument; None: a number or a vector, compared and assigned."""
+        if isinstance(kind, wp.array):
+            return _ArrayArgument(getattr(self._memory, name), kind).set
+        if hasattr(value, "__ctype__"):
+            return _StructArgument(getattr(self._memory, name)).set
+        return None
+
+    def set(self, arguments: tuple[Any, ...]) -> None:
+        """Change the arguments."""
+        last = self._last
+        for k, (setter, value) in enumerate(zip(self._setters, arguments, strict=True)):
+            if setter is not None:
+                setter(value)
+            elif value != last[k]:
+                last[k] = value
+                made = value
+                if isinstance(value, tuple):
+                    made = self._launch.kernel.adj.args[k].type(*value)
+                setattr(self._memory, self._names[k], made)
+
+    def set_address(self, index: int, tensor: Tensor) -> None:
+        """Let an array begin elsewhere."""
+        getattr(self._memory, self._names[index]).data = tensor.data_ptr()
+
+    def _bounds_of(self, size: tuple[int, ...]) -> Any:
+        bounds = self._bounds.get(size)
+        if bounds is None:
+            if len(self._bounds) > LARGEST_BOUNDS:
+                self._bounds.clear()
+            self._launch.set_dim(size)
+            bounds = self._bounds[size] = self._launch.bounds
+        return bounds
+
+    def run(self, size: tuple[int, ...]) -> None:
+        """Launch the kernel on torch's current stream, or on the CPU's threads."""
+        if self._addresses is not None:
+            self._launch.bounds = bounds = self._bounds_of(size)
+            self._addresses[0] = ctypes.addressof(bounds)
+            self._launch.launch(_current_stream(self._device))
+            return
+        ranges = _ranges(self._launch.kernel, size)
+        if len(ranges) == 1:
+            self._run_on_cpu(self._memory, size)
+        else:
+            run_together([functools.partial(self._run_range, size, part) for part in ranges])
+
+    def _run_range(self, size: tuple[int, ...], indices: range) -> None:
+        """Run a part of a launch, which shares all other arguments."""
+        memory = type(self._memory).from_buffer_copy(self._memory)
+        setattr(memory, self._names[0], indices.start)
+        self._run_on_cpu(memory, (len(indices), *size[1:]))
+
+    def _run_on_cpu(self, memory: Any, size: tuple[int, ...]) -> None:
+        self._launch.hooks.forward(ctypes.byref(self._bounds_of(size)), ctypes.byref(memory))
+
+
+launched: set[tuple[Any, torch.device]] = set()
+"""Kernels that have been launched, each with its device."""
+
+LARGEST_BOUNDS = 4096
+"""Sizes of launches that are remembered for a kernel."""
+
+
+@functools.lru_cache(maxsize=1024)
+def _struct(fields: tuple[tuple[str, type], ...]) -> Any:
+    return type("Arguments", (ctypes.Structure,), {"_fields_": list(fields)})
+
+
+def _ranges(kernel: Any, size: tuple[int, ...]) -> list[range]:
+    """Return what threads of the CPU run of a launch's first dimension; one range: no cut."""
+    smallest = SMALLEST_RANGES.get(kernel)
+    return [range(size[0])] if smallest is None else even_ranges(size[0], smallest)
+
+
+class _Ready(threading.local):
+    """A thread's kernels with memory for their arguments."""
+
+    def __init__(self) -> None:
+        self.by_kernel: dict[tuple[Any, torch.device, int], _Arguments] = {}
+
+
+_ready = _Ready()
 
 
 def launch(
@@ -136,20 +271,16 @@ def launch(
         block_dim: Threads of a CUDA block.
     """
     size = (size,) if isinstance(size, int) else size
-    converted = _converted(kernel, arguments)
-    placement = _placement(device, block_dim)
-    ranges = _ranges(kernel, size, device)
-    with _quiet_at_first(kernel, device):
-        recorded = wp.launch(
-            kernel,
-            size,
-            inputs=converted,
-            record_tape=False,
-            record_cmd=len(ranges) > 1,
-            **placement,
-        )
-    if len(ranges) > 1:
-        _launch_ranges(recorded, size, ranges)
+    if 0 in size:
+        return
+    if kernel in SMALLEST_RANGES:
+        arguments = (0, *arguments)
+    key = (kernel, device, block_dim)
+    ready = _ready.by_kernel.get(key)
+    if ready is None:
+        ready = _ready.by_kernel[key] = _Arguments(kernel, size, device, block_dim, arguments)
+    ready.set(arguments)
+    ready.run(size)
 
 
 def _form(tensor: Tensor) -> tuple[Any, ...]:
@@ -157,7 +288,7 @@ def _form(tensor: Tensor) -> tuple[Any, ...]:
 
 
 class PreparedLaunch:
-    """A launch that is made again and again with one tensor changed: a tenth of the host's time.
+    """A launch that is made again and again with one tensor changed.
 
     Args:
         kernel: As for `launch`.
@@ -175,22 +306,16 @@ class PreparedLaunch:
         *arguments: Any,
         changing: Tensor,
     ) -> None:
-        self._kernel = kernel
         self._size = (size,) if isinstance(size, int) else size
-        self._device = device
-        # The recorded launch knows addresses alone.
+        # Arguments hold addresses alone.
         self._kept = [value for value in arguments if value is not changing]
-        converted = _converted(kernel, arguments)
-        placement = _placement(device)
-        with _quiet_at_first(kernel, device):
-            self._recorded = wp.launch(
-                kernel, size, inputs=converted, record_tape=False, record_cmd=True, **placement
-            )
+        self._place = next(k for k, value in enumerate(arguments) if value is changing)
+        if kernel in SMALLEST_RANGES:
+            arguments = (0, *arguments)
+            self._place += 1
+        self._arguments = _Arguments(kernel, self._size, device, CUDA_BLOCK, arguments)
+        self._arguments.set(arguments)
         self._form = _form(changing)
-        place = next(k for k, value in enumerate(arguments) if value is changing)
-        place += len(_range_start(kernel))
-        self._argument = converted[place]
-        self._recorded.set_param_at_index_from_ctype(place, self._argument)
 
     def __call__(self, tensor: Tensor) -> None:
         """Launch on torch's current stream.
@@ -200,9 +325,5 @@ class PreparedLaunch:
                 device.
         """
         assert _form(tensor) == self._form, "only an address is replaced"
-        self._argument.data = tensor.data_ptr()
-        ranges = _ranges(self._kernel, self._size, self._device)
-        if len(ranges) > 1:
-            _launch_ranges(self._recorded, self._size, ranges)
-        else:
-            self._recorded.launch(_current_stream(self._device))
+        self._arguments.set_address(self._place, tensor)
+        self._arguments.run(self._size)

@@ -11,6 +11,7 @@ from npa_envs.errors import NPAError
 from npa_envs.kernels.portable.mean import CHUNK, MEAN_LANES, mean_kernels
 from npa_envs.ops.checks import DTYPES, check_dense
 from npa_envs.ops.launch import launch, scalar_type
+from npa_envs.ops.opaque import opaque
 
 
 def average_sums(partial_sums: Tensor, value_count: int, like: Tensor) -> Tensor:
@@ -43,7 +44,7 @@ def _lanes(device: torch.device) -> int:
     return MEAN_LANES if device.type == "cuda" else 1
 
 
-@torch.library.custom_op("npa::world_mean", mutates_args=())
+@opaque("npa::world_mean")
 def _world_mean(values: Tensor) -> Tensor:
     world_count, value_count, width = values.shape
     lanes = _lanes(values.device)

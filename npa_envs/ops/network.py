@@ -18,6 +18,7 @@ from npa_envs.kernels.cuda.network import (
 )
 from npa_envs.ops.backend import Request, choose
 from npa_envs.ops.launch import launch
+from npa_envs.ops.opaque import opaque
 
 
 class ArrangedWeights(NamedTuple):
@@ -90,7 +91,7 @@ def _arrange_left(weight: Tensor) -> Tensor:
     return fragments
 
 
-@torch.library.custom_op("npa::arrange_weights", mutates_args=())
+@opaque("npa::arrange_weights")
 def _arrange_weights(
     hidden_weight: Tensor, output_weight: Tensor, with_backward: bool
 ) -> list[Tensor]:
@@ -189,7 +190,7 @@ def _map_rows(
     return output
 
 
-@torch.library.custom_op("npa::run_network", mutates_args=())
+@opaque("npa::run_network")
 def _run_network(
     rows: Tensor, arranged: list[Tensor], out_width: int, unit_count: int, noting: bool
 ) -> tuple[Tensor, Tensor]:
@@ -213,7 +214,7 @@ def _sign_words(unit_count: int) -> int:
     return 4 * -(-unit_count // SIGN_UNITS)
 
 
-@torch.library.custom_op("npa::run_network_backward", mutates_args=())
+@opaque("npa::run_network_backward")
 def _run_network_backward(
     update_bar: Tensor, arranged: list[Tensor], signs: Tensor, width: int, unit_count: int
 ) -> Tensor:
@@ -227,7 +228,7 @@ def _(
     return update_bar.new_empty(update_bar.shape[0], width)
 
 
-@torch.library.custom_op("npa::network_weight_gradients", mutates_args=())
+@opaque("npa::network_weight_gradients")
 def _weight_gradients(
     rows: Tensor, update_bar: Tensor, signs: Tensor, arranged: list[Tensor], unit_count: int
 ) -> Tensor:

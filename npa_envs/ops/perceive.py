@@ -26,6 +26,7 @@ from npa_envs.ops.checks import (
     checked_moment_inverse,
 )
 from npa_envs.ops.launch import PreparedLaunch, launch
+from npa_envs.ops.opaque import opaque
 from npa_envs.ops.passes import (
     Terms,
     compute_densities,
@@ -196,7 +197,7 @@ class Rows(NamedTuple):
     row_base: int
 
 
-@torch.library.custom_op("npa::perceive_rows", mutates_args=())
+@opaque("npa::perceive_rows")
 def _perceive_rows(
     x: Tensor,
     s: Tensor,
@@ -273,7 +274,7 @@ def _(
     return [x.new_empty(row_capacity, dtype=integers), *saved.tensors()]
 
 
-@torch.library.custom_op("npa::perceive_static", mutates_args=())
+@opaque("npa::perceive_static")
 def _perceive_static(
     x: Tensor,
     s: Tensor,

@@ -22,6 +22,7 @@ from npa_envs.ops.checks import (
     entries,
 )
 from npa_envs.ops.launch import launch, scalar_type
+from npa_envs.ops.opaque import opaque
 from npa_envs.ops.perceive import perceive
 from npa_envs.ops.sort import density_scale, make_plan, sort_worlds
 
@@ -69,7 +70,7 @@ def checked_counts(counts: Sequence[int], particle_count: int) -> tuple[int, ...
     return checked
 
 
-@torch.library.custom_op("npa::gather_species", mutates_args=())
+@opaque("npa::gather_species")
 def _gather_species(
     x: Tensor,
     counts: list[int],

@@ -15,6 +15,7 @@ from npa_envs.kernels.portable.density import density_kernels
 from npa_envs.kernels.portable.sort import give_rows
 from npa_envs.ops.backend import rollout_listing
 from npa_envs.ops.launch import launch, scalar_type
+from npa_envs.ops.opaque import opaque
 from npa_envs.ops.passes import (
     Densities,
     ListedNeighbours,
@@ -89,7 +90,7 @@ class StaticWorlds(NamedTuple):
         return values.flatten(0, 1).index_select(0, index).view_as(values)
 
 
-@torch.library.custom_op("npa::prepare_static", mutates_args=())
+@opaque("npa::prepare_static")
 def _prepare_static(
     x: Tensor,
     state_dim: int,
@@ -215,7 +216,7 @@ class StaticRows(NamedTuple):
     """Positions of the rows [length units], shape [K, D]; undefined beyond the last active row."""
 
 
-@torch.library.custom_op("npa::static_rows", mutates_args=())
+@opaque("npa::static_rows")
 def _static_rows(
     x: Tensor, masks: Tensor, source: Tensor, cell_starts: Tensor, row_capacity: int
 ) -> list[Tensor]:

@@ -71,8 +71,10 @@ def thread_count() -> int:
 
 def even_ranges(count: int, smallest: int) -> list[range]:
     """Return ranges of [0, count) for all threads, of `smallest` indices or more; or one."""
+    if count < 2 * smallest:
+        return [range(count)]
     threads = thread_count()
-    parts = max(min(threads * SHARES, count // smallest), 1) if threads > 1 else 1
+    parts = min(threads * SHARES, count // smallest) if threads > 1 else 1
     ends = [count * k // parts for k in range(parts + 1)]
     return [range(begin, end) for begin, end in itertools.pairwise(ends)]
 

@@ -19,6 +19,7 @@ from npa_envs.kernels.portable.update import (
 )
 from npa_envs.ops.checks import check_world
 from npa_envs.ops.launch import PreparedLaunch, launch, scalar_type
+from npa_envs.ops.opaque import opaque
 from npa_envs.ops.perceive import Rows
 from npa_envs.ops.sort import LARGEST_INDEX
 
@@ -28,7 +29,7 @@ def _sharers(count: int) -> int:
     return -(-count // CHANNEL_SHARE)
 
 
-@torch.library.custom_op("npa::update_particles", mutates_args=())
+@opaque("npa::update_particles")
 def _update_particles(
     update: Tensor,
     x: Tensor,
@@ -86,7 +87,7 @@ def _(
     return torch.empty_like(x), torch.empty_like(s), torch.empty_like(path_length)
 
 
-@torch.library.custom_op("npa::update_particles_backward", mutates_args=())
+@opaque("npa::update_particles_backward")
 def _update_particles_backward(
     update: Tensor,
     new_x_bar: Tensor,

@@ -207,10 +207,10 @@ def test_warmup_leaves_nothing_to_compile(device):
     warmup(device)
     rule = npa_envs.NPARule(static=True).to(device)
     x, s = random_world(1, 40, 2, 16, dtype=torch.float32, device=device)
-    warm = set(launch._launched)
+    warm = set(launch.launched)
     for update_prob in (0.5, 1.0):
         outcome(rule, x, s, update_prob=update_prob)
-    assert not {(kernel.module.name, kernel.key) for kernel, _ in launch._launched - warm}
+    assert not {(kernel.module.name, kernel.key) for kernel, _ in launch.launched - warm}
 
 
 def test_other_streams_and_recorded_graphs_give_the_same(device):

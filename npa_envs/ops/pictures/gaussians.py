@@ -20,6 +20,7 @@ from npa_envs.kernels.pictures.gaussians import (
 )
 from npa_envs.ops.checks import DTYPES, check_dense, checked_count, checked_number
 from npa_envs.ops.launch import launch, scalar_type
+from npa_envs.ops.opaque import opaque
 from npa_envs.ops.pictures.cameras import Cameras
 from npa_envs.ops.sort import LARGEST_INDEX
 
@@ -281,7 +282,7 @@ def _scene(
     return shapes, colours.view(total, -1), [motions.view(-1, 4, 4), lenses.view(-1, 4)]
 
 
-@torch.library.custom_op("npa::gaussians", mutates_args=())
+@opaque("npa::gaussians")
 def _gaussians(
     means: Tensor,
     scales: Tensor,
@@ -357,7 +358,7 @@ def _(
     )
 
 
-@torch.library.custom_op("npa::gaussians_backward", mutates_args=())
+@opaque("npa::gaussians_backward")
 def _gaussians_backward(
     means: Tensor,
     scales: Tensor,

@@ -11,6 +11,7 @@ from npa_envs.errors import NPAError
 from npa_envs.kernels.pictures.splat import CHANNELS, group_count, make_lens
 from npa_envs.ops.launch import launch, scalar_type
 from npa_envs.ops.mean import average_sums, world_mean
+from npa_envs.ops.opaque import opaque
 from npa_envs.ops.pictures.splat import (
     Splats,
     aligned,
@@ -23,7 +24,7 @@ from npa_envs.ops.pictures.splat import (
 )
 
 
-@torch.library.custom_op("npa::picture_losses", mutates_args=())
+@opaque("npa::picture_losses")
 def _picture_losses(
     x: Tensor,
     states: Tensor,

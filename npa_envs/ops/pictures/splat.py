@@ -29,6 +29,7 @@ from npa_envs.ops.checks import (
     checked_side,
 )
 from npa_envs.ops.launch import launch, scalar_type
+from npa_envs.ops.opaque import opaque
 from npa_envs.ops.sort import LARGEST_INDEX
 
 LARGEST_SPOT = 1e6
@@ -141,7 +142,7 @@ def _draw(splats: Splats, lens: Any) -> tuple[Tensor, Tensor, Tensor]:
     return picture, footprints, source
 
 
-@torch.library.custom_op("npa::splat", mutates_args=())
+@opaque("npa::splat")
 def _splat(
     x: Tensor,
     colour: Tensor,
@@ -165,7 +166,7 @@ def _(x: Tensor, colour: Tensor, resolution: int, *lens: float) -> tuple[Tensor,
     )
 
 
-@torch.library.custom_op("npa::splat_backward", mutates_args=())
+@opaque("npa::splat_backward")
 def _splat_backward(
     picture_bar: Tensor,
     footprints: Tensor,

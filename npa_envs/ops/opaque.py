@@ -1,0 +1,50 @@
+"""Opaque torch operators: kernels that `torch.compile` calls and does not look into."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Generic, ParamSpec, TypeVar
+
+import torch
+from torch import Tensor, nn
+from torch.utils._python_dispatch import is_in_torch_dispatch_mode
+
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
+
+
+class Opaque(Generic[Arguments, Result]):
+    """A function as a torch operator; run as it is where nobody wants to see an operator.
+
+    A call of an operator takes the host as long as several launches do.
+
+    Args:
+        name: The operator's name, "npa::...".
+        function: What it does; results share no memory with each other or with arguments.
+    """
+
+    def __init__(self, name: str, function: Callable[Arguments, Result]) -> None:
+        self._function = function
+        self._operator = torch.library.custom_op(name, function, mutates_args=())
+        self.register_fake = self._operator.register_fake
+
+    def __call__(self, *args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+        """Run the function on plain tensors, and the operator on all others."""
+        # Asked in this order: a compiler cannot trace the other questions.
+        if torch.compiler.is_compiling() or not _is_plain(args[0]) or is_in_torch_dispatch_mode():
+            result: Result = self._operator(*args, **kwargs)
+            return result
+        return self._function(*args, **kwargs)
+
+
+def _is_plain(value: Any) -> bool:
+    return type(value) is Tensor or type(value) is nn.Parameter
+
+
+def opaque(name: str) -> Callable[[Callable[Arguments, Result]], Opaque[Arguments, Result]]:
+    """Return a decorator that makes a function an opaque operator; its first argument is a tensor.
+
+    Args:
+        name: The operator's name, "npa::...".
+    """
+    return lambda function: Opaque(name, function)
