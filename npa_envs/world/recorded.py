@@ -17,6 +17,7 @@ import collections
 import contextlib
 import copy
 import functools
+import itertools
 import logging
 import threading
 import weakref
@@ -24,7 +25,7 @@ from collections.abc import Callable, Hashable, Sequence
 from typing import Any, Literal, NamedTuple, Protocol, Self
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from npa_envs.errors import NPAError
 from npa_envs.ops.checks import FiniteCheck, check_finite_positions
@@ -128,8 +129,8 @@ def run_call(
         NPAError: A position is not finite.
         DivergedError: The watch has seen a world diverge.
     """
-    if watch is None and _can_record(call, rules, worlds.x, cuda_graph):
-        recorded = _run_recorded(call, rules, worlds, generator, cuda_graph)
+    if watch is None and cuda_graph is not False and _can_record(call, worlds.x):
+        recorded = _run_recorded(call, rules, worlds, generator, asked=cuda_graph is True)
         if recorded is not None:
             return recorded
     check_finite_positions(worlds.x)
@@ -151,13 +152,11 @@ def release_recordings() -> None:
     torch.cuda.empty_cache()
 
 
-def _can_record(call: Call, rules: Sequence[NPARule], x: Tensor, cuda_graph: CudaGraph) -> bool:
+def _can_record(call: Call, x: Tensor) -> bool:
     # Asked in this order: a compiler cannot trace what a stream does.
-    if not x.is_cuda or cuda_graph is False or torch.compiler.is_compiling() or call.steps == 0:
+    if not x.is_cuda or torch.compiler.is_compiling() or call.steps == 0:
         return False
-    if torch.cuda.is_current_stream_capturing():
-        return False
-    return cuda_graph is True or all(rule.is_plain() for rule in rules)
+    return not torch.cuda.is_current_stream_capturing()
 
 
 def _hooked() -> bool:
@@ -166,23 +165,14 @@ def _hooked() -> bool:
     return hooks is not None and hooks(True) is not None
 
 
-def _parameters(rules: Sequence[NPARule]) -> list[Tensor]:
-    """Return the tensors that a rollout reads of rules; read-outs of plain ones are not."""
-    tensors: list[Tensor] = []
-    for rule in rules:
-        if rule.is_plain():
-            tensors += (rule.hidden.weight, rule.hidden.bias, rule.output.weight)
-        else:
-            tensors += (*rule.parameters(), *rule.buffers())
-    return tensors
-
-
-def _form(rule: NPARule) -> Hashable:
-    """Return what a recording depends on of a rule besides its weights."""
-    if not rule.is_plain():
-        return weakref.ref(rule)
+def _form(rule: NPARule, plain: bool) -> tuple[Hashable, list[Tensor]]:
+    """Return what a recording depends on of a rule besides its weights, and what these are."""
+    if not plain:
+        return weakref.ref(rule), [*rule.parameters(), *rule.buffers()]
+    hidden = rule.hidden
     form: dict[str, Any] = {**rule.hyper_parameters()}
-    return tuple(value for name, value in form.items() if not name.startswith("readout"))
+    values = tuple(value for name, value in form.items() if not name.startswith("readout"))
+    return values, [hidden.weight, hidden.bias, rule.output.weight]
 
 
 def _twin(rule: NPARule, like: Tensor) -> NPARule:
@@ -243,13 +233,14 @@ class _Recording:
         """Memory of the graphs."""
         self._call = call
         self._rules = [_twin(rule, worlds.x) for rule in rules]
-        weights = _parameters(self._rules)
+        weights = [weight for rule in self._rules for weight in _form(rule, rule.is_plain())[1]]
         own = [torch.empty_like(value, memory_format=torch.contiguous_format) for value in worlds]
-        for tensor, flag in zip([*own, *weights], wanted, strict=False):
-            if isinstance(tensor, nn.Parameter) or flag:
-                tensor.requires_grad_(flag)
         self._inputs = [*own, *weights]
-        self._wanted = wanted
+        self._wanted = wanted or (False,) * len(self._inputs)
+        for tensor, flag in zip(self._inputs, self._wanted, strict=True):
+            # Buffers of rules may hold integers.
+            if tensor.requires_grad != flag:
+                tensor.requires_grad_(flag)
         self._generator = torch.Generator(self.device)
         self._streams = None
         if by_world:
@@ -259,7 +250,7 @@ class _Recording:
         self._bars: dict[int | None, list[Tensor]] = {}
         self._gradients = [
             torch.empty_like(tensor) if flag else None
-            for tensor, flag in zip(self._inputs, wanted, strict=False)
+            for tensor, flag in zip(self._inputs, self._wanted, strict=True)
         ]
         self._graphs: collections.OrderedDict[int, _Graphs] = collections.OrderedDict()
         self._pool = torch.cuda.graph_pool_handle()
@@ -435,20 +426,16 @@ _lock = threading.RLock()
 """Held while the above changes; graphs share one stream to be recorded on."""
 
 
-def _count(call: Call, rules: Sequence[NPARule], x: Tensor, s: Tensor, *rest: Hashable) -> _Kind:
+def _count(key: Hashable) -> _Kind:
     """Return the kind of a call, which is counted."""
-    key = (
-        call._replace(steps=0),
-        tuple(_form(rule) for rule in rules),
-        (x.shape, s.shape, x.dtype, x.device),
-        torch.get_float32_matmul_precision(),
-        rest,
-    )
     with _lock:
-        kind = _kinds.setdefault(key, _Kind())
-        _kinds.move_to_end(key)
-        if len(_kinds) > MOST_KINDS:
-            _forget(next(iter(_kinds)))
+        kind = _kinds.get(key)
+        if kind is None:
+            kind = _kinds[key] = _Kind()
+            if len(_kinds) > MOST_KINDS:
+                _forget(next(iter(_kinds)))
+        else:
+            _kinds.move_to_end(key)
         kind.calls += 1
     return kind
 
@@ -464,21 +451,38 @@ def _run_recorded(
     rules: Sequence[NPARule],
     worlds: Worlds,
     generator: Randomness | None,
-    cuda_graph: CudaGraph,
+    *,
+    asked: bool,
 ) -> Worlds | None:
-    """Run a rollout by replaying it; None where it is to be launched."""
-    tensors = [*worlds, *_parameters(rules)]
-    wanted = (False,) * len(tensors)
+    """Run a rollout by replaying it; None where it is to be launched.
+
+    Args:
+        call: What is asked for.
+        rules: The rule, or one of each species.
+        worlds: Where it begins.
+        generator: Source of the draws.
+        asked: The caller asks for a recording.
+    """
+    plain = [rule.is_plain() for rule in rules]
+    if not (asked or all(plain)):
+        return None
+    forms, weights = zip(*map(_form, rules, plain), strict=True)
+    tensors = [*worlds, *itertools.chain.from_iterable(weights)]
+    wanted: tuple[bool, ...] = ()
     if torch.is_grad_enabled():
         wanted = tuple(tensor.requires_grad for tensor in tensors)
+        wanted = wanted if any(wanted) else ()
     by_world = isinstance(generator, WorldRandom)
-    kind = _count(call, rules, worlds.x, worlds.s, wanted, by_world)
-    if kind.refused or kind.calls <= (1 if cuda_graph is True else LAUNCHED_FIRST):
+    x = worlds.x
+    precision = torch.get_float32_matmul_precision()
+    shape = (x.shape, worlds.s.shape[2], x.dtype, x.device)
+    kind = _count((call._replace(steps=0), forms, shape, wanted, by_world, precision))
+    if kind.refused or kind.calls <= (1 if asked else LAUNCHED_FIRST):
         return None
-    if any(wanted) and (_hooked() or call.steps > MOST_STEPS):
+    if wanted and (_hooked() or call.steps > MOST_STEPS):
         return None
     check = FiniteCheck(worlds.x)
-    blocks = [call.steps] if any(wanted) else _blocks(call)
+    blocks = [call.steps] if wanted else _blocks(call)
     make = functools.partial(_Recording, call, rules, worlds, wanted, by_world)
     lease = _lease(kind, set(blocks), make)
     if lease is None:
