@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import math
 import operator
 from collections.abc import Sequence
@@ -100,19 +101,26 @@ class FiniteCheck:
     """The check that every position is finite: asked of the device now, answered by `wait`.
 
     Args:
-        x: Positions [length units], shape [B, N, D].
+        x: Positions [length units], shape [B, N, D]; they stay as they are until `wait` returns.
+        ready: When they are there, on CUDA: they are looked at beside what the current stream does
+            after that. None: once it has done its work so far.
     """
 
-    def __init__(self, x: Tensor) -> None:
+    def __init__(self, x: Tensor, ready: torch.cuda.Event | None = None) -> None:
         self._x = x.detach()
-        # The largest size is NaN where one of the numbers is: one short kernel.
-        self._answer = torch.linalg.vector_norm(self._x, math.inf)
         self._arrival: torch.cuda.Event | None = None
-        if x.is_cuda:
+        if not x.is_cuda:
+            self._answer = _largest_size(self._x)
+            return
+        stream = torch.cuda.current_stream(x.device)
+        if ready is not None:
+            stream = _side_stream(x.device)
+            stream.wait_event(ready)
+        with torch.cuda.stream(stream):
             sent = torch.empty((), dtype=x.dtype, pin_memory=True)
-            self._answer = sent.copy_(self._answer, non_blocking=True)
+            self._answer = sent.copy_(_largest_size(self._x), non_blocking=True)
             self._arrival = torch.cuda.Event()  # type: ignore[no-untyped-call]
-            self._arrival.record(torch.cuda.current_stream(x.device))
+            self._arrival.record(stream)
 
     def wait(self) -> None:
         """Wait for the answer, and for nothing that was launched since the question.
@@ -130,6 +138,17 @@ class FiniteCheck:
             f"x must be finite, got {self._x[world, particle].tolist()} at world {world}, particle "
             f"{particle} ({int((~finite).sum())} such particles): reset those worlds"
         )
+
+
+def _largest_size(x: Tensor) -> Tensor:
+    """Return the size of the largest number, which is NaN where one is, in one short kernel."""
+    largest: Tensor = torch.linalg.vector_norm(x, math.inf)
+    return largest
+
+
+@functools.cache
+def _side_stream(device: torch.device) -> torch.cuda.Stream:
+    return torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
 
 
 def checked_flag(name: str, value: Any) -> bool:

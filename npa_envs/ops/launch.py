@@ -46,7 +46,9 @@ def _warp_stream(device: torch.device, handle: int) -> Any:
 
 def _current_stream(device: torch.device) -> Any:
     """Return torch's current stream of a CUDA device as Warp knows it."""
-    return _warp_stream(device, torch.cuda.current_stream(device).cuda_stream)
+    index = torch.cuda.current_device() if device.index is None else device.index
+    # What `torch.cuda.current_stream` makes an object of, in a tenth of its time.
+    return _warp_stream(device, torch._C._cuda_getCurrentRawStream(index))
 
 
 class _ArrayArgument:

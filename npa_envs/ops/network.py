@@ -286,12 +286,10 @@ class _Network(torch.autograd.Function):
         out_width: int,
         unit_count: int,
         arranged: ArrangedWeights,
-        noting: bool,
     ) -> Tensor:
         update: Tensor
-        update, signs = _run_network(rows, arranged.forward, out_width, unit_count, noting)
-        if noting:
-            ctx.save_for_backward(rows, signs, *arranged.backward)
+        update, signs = _run_network(rows, arranged.forward, out_width, unit_count, True)
+        ctx.save_for_backward(rows, signs, *arranged.backward)
         ctx.unit_count = unit_count
         return update
 
@@ -305,7 +303,7 @@ class _Network(torch.autograd.Function):
             rows_bar = _run_network_backward(update_bar, arranged, signs, width, unit_count)
         if ctx.needs_input_grad[1]:
             weights_bar = _weight_gradients(rows, update_bar, signs, arranged, unit_count)
-        return rows_bar, weights_bar, None, None, None, None
+        return rows_bar, weights_bar, None, None, None
 
 
 def run_network(
@@ -332,7 +330,9 @@ def run_network(
         hidden_weight = weights[:end].view(unit_count, -1)
         output_weight = weights[end:].view(out_width, unit_count)
         arranged = arrange(hidden_weight, output_weight, with_backward=True)
+    if not noting:
+        return _run_network(rows, arranged.forward, out_width, unit_count, False)[0]
     update: Tensor = _Network.apply(  # type: ignore[no-untyped-call]
-        rows, weights, out_width, unit_count, arranged, noting
+        rows, weights, out_width, unit_count, arranged
     )
     return update

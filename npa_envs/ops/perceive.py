@@ -350,20 +350,13 @@ class _PerceiveRows(torch.autograd.Function):
         options: PerceptionOptions,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         row_source, *tensors = _perceive_rows(
-            x, s, mask, *options[:-1], *options.terms, for_adjoint=any(ctx.needs_input_grad)
+            x, s, mask, *options[:-1], *options.terms, for_adjoint=True
         )
         saved = SavedPerception(*tensors)
         ctx.mark_non_differentiable(saved.row_of, row_source, saved.starts)
         ctx.set_materialize_grads(False)
-        if any(ctx.needs_input_grad):
-            _save(
-                ctx,
-                saved if ctx.needs_input_grad[0] else saved[:-1],
-                (),
-                s,
-                mask is not None,
-                options,
-            )
+        kept = saved if ctx.needs_input_grad[0] else saved[:-1]
+        _save(ctx, kept, (), s, mask is not None, options)
         return saved.perception, saved.row_of, row_source, saved.starts
 
     @staticmethod
@@ -500,6 +493,12 @@ def perceive_rows(
         row_base = x.shape[0] * x.shape[1] if masked else 0
         return perception, Rows(rows.row_of, rows.row_source, rows.starts, row_base)
     row_base = 0 if mask is None else x.shape[0] * x.shape[1]
+    if not (torch.is_grad_enabled() and (x.requires_grad or s.requires_grad)):
+        row_source, *tensors = _perceive_rows(
+            x, s, mask, *options[:-1], *options.terms, for_adjoint=False
+        )
+        saved = SavedPerception(*tensors)
+        return saved.perception, Rows(saved.row_of, row_source, saved.starts, row_base)
     perception, row_of, row_source, starts = _PerceiveRows.apply(  # type: ignore[no-untyped-call]
         x, s, mask, options
     )

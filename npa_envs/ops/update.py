@@ -187,17 +187,12 @@ def update_particles(
         moving: Updates begin with δ; otherwise there is none and positions stay.
         box: Sides of the periodic box, into which positions are wrapped, or None.
     """
-    outputs: tuple[Tensor, Tensor, Tensor] = _UpdateParticles.apply(  # type: ignore[no-untyped-call]
-        update,
-        x.contiguous(),
-        s.contiguous(),
-        path_length,
-        rows,
-        reach,
-        dt,
-        moving,
-        None if box is None else list(box),
-    )
+    x, s = x.contiguous(), s.contiguous()
+    options = (reach, dt, moving, None if box is None else list(box))
+    tensors = (update, x, s, path_length)
+    if not (torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)):
+        return _update_particles(*tensors, rows.row_of, *options)
+    outputs: tuple[Tensor, Tensor, Tensor] = _UpdateParticles.apply(*tensors, rows, *options)  # type: ignore[no-untyped-call]
     return outputs
 
 

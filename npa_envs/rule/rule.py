@@ -256,27 +256,26 @@ def check_rule(rule: Any) -> None:
         )
 
 
+def _blocked_product(hidden: Tensor, weight: Tensor) -> Tensor:
+    """Return hidden @ weight.T, summed in blocks."""
+    blocks = OUTPUT_BLOCKS if hidden.shape[1] % OUTPUT_BLOCKS == 0 else 1
+    left = hidden.view(hidden.shape[0], blocks, -1).transpose(0, 1)
+    right = weight.view(weight.shape[0], blocks, -1).permute(1, 2, 0)
+    return torch.bmm(left, right).sum(dim=0)
+
+
 class _BlockedProduct(torch.autograd.Function):
     """hidden @ weight.T, summed in blocks: less rounding, which rules amplify step by step."""
 
     @staticmethod
     def forward(ctx: Any, hidden: Tensor, weight: Tensor) -> Tensor:
         ctx.save_for_backward(hidden, weight)
-        blocks = OUTPUT_BLOCKS if hidden.shape[1] % OUTPUT_BLOCKS == 0 else 1
-        left = hidden.view(hidden.shape[0], blocks, -1).transpose(0, 1)
-        right = weight.view(weight.shape[0], blocks, -1).permute(1, 2, 0)
-        return torch.bmm(left, right).sum(dim=0)
+        return _blocked_product(hidden, weight)
 
     @staticmethod
     def backward(ctx: Any, update_bar: Tensor) -> tuple[Tensor, Tensor]:
         hidden, weight = ctx.saved_tensors
         return update_bar @ weight, update_bar.T @ hidden
-
-    @classmethod
-    def product(cls, hidden: Tensor, weight: Tensor) -> Tensor:
-        """Return the product of hidden units, [K, H], and weights, [A, H]: [K, A]."""
-        result: Tensor = cls.apply(hidden, weight)  # type: ignore[no-untyped-call]
-        return result
 
 
 class FoldedRule(NamedTuple):
@@ -305,7 +304,10 @@ class FoldedRule(NamedTuple):
         if self.arranged is not None and self.joined is not None:
             return run_network(rows, self.joined, self.output_weight.shape, self.arranged)
         hidden = torch.relu(rows @ self.hidden_weight.T)
-        return _BlockedProduct.product(hidden, self.output_weight)
+        if not torch.is_grad_enabled():
+            return _blocked_product(hidden, self.output_weight)
+        update: Tensor = _BlockedProduct.apply(hidden, self.output_weight)  # type: ignore[no-untyped-call]
+        return update
 
 
 def fold_weights(hidden_weight: Tensor, output_weight: Tensor) -> FoldedRule:

@@ -109,7 +109,8 @@ def check_cuda_graph(cuda_graph: CudaGraph) -> None:
 def run_call(
     call: Call,
     rules: Sequence[NPARule],
-    worlds: Worlds,
+    x: Tensor,
+    s: Tensor,
     generator: Randomness | None,
     *,
     cuda_graph: CudaGraph,
@@ -120,7 +121,8 @@ def run_call(
     Args:
         call: What is asked for.
         rules: The rule, or one of each species.
-        worlds: Where it begins.
+        x: Positions at the beginning [length units], shape [B, N, D].
+        s: States at the beginning, dimensionless, shape [B, N, C].
         generator: Source of the draws.
         cuda_graph: Whether to record; True also records rules that are not plain.
         watch: What looks at the worlds after each step, which then are launched.
@@ -129,12 +131,12 @@ def run_call(
         NPAError: A position is not finite.
         DivergedError: The watch has seen a world diverge.
     """
-    if watch is None and cuda_graph is not False and _can_record(call, worlds.x):
-        recorded = _run_recorded(call, rules, worlds, generator, asked=cuda_graph is True)
+    if watch is None and cuda_graph is not False and _can_record(call, x):
+        recorded = _run_recorded(call, rules, x, s, generator, asked=cuda_graph is True)
         if recorded is not None:
             return recorded
-    check_finite_positions(worlds.x)
-    return call.run(rules, worlds, generator, watch)
+    check_finite_positions(x)
+    return call.run(rules, Worlds(x, s, x.new_zeros(x.shape[:2])), generator, watch)
 
 
 def recorded_memory(device: torch.device) -> int:
@@ -224,17 +226,23 @@ class _Recording:
         self,
         call: Call,
         rules: Sequence[NPARule],
-        worlds: Worlds,
+        x: Tensor,
+        s: Tensor,
         wanted: tuple[bool, ...],
         by_world: bool,
     ) -> None:
-        self.device = worlds.x.device
+        self.device = x.device
+        self.no_path = x.new_zeros(x.shape[:2])
+        """Lengths of paths at the beginning."""
         self.bytes = 0
         """Memory of the graphs."""
         self._call = call
-        self._rules = [_twin(rule, worlds.x) for rule in rules]
+        self._rules = [_twin(rule, x) for rule in rules]
         weights = [weight for rule in self._rules for weight in _form(rule, rule.is_plain())[1]]
-        own = [torch.empty_like(value, memory_format=torch.contiguous_format) for value in worlds]
+        own = [
+            torch.empty(value.shape, dtype=value.dtype, device=value.device)
+            for value in (x, s, self.no_path)
+        ]
         self._inputs = [*own, *weights]
         self._wanted = wanted or (False,) * len(self._inputs)
         for tensor, flag in zip(self._inputs, self._wanted, strict=True):
@@ -244,7 +252,7 @@ class _Recording:
         self._generator = torch.Generator(self.device)
         self._streams = None
         if by_world:
-            keys = torch.zeros(len(worlds.x), dtype=torch.int64, device=self.device)
+            keys = torch.zeros(len(x), dtype=torch.int64, device=self.device)
             self._streams = WorldRandom.from_keys(keys)
         self._outputs: dict[int | None, list[Tensor]] = {}
         self._bars: dict[int | None, list[Tensor]] = {}
@@ -261,8 +269,12 @@ class _Recording:
         """Return whether a number of steps is recorded."""
         return steps in self._graphs
 
-    def record(self, steps: int) -> None:
+    def record(self, steps: int, tensors: Sequence[Tensor]) -> None:
         """Record rollouts of a number of steps.
+
+        Args:
+            steps: The number of steps.
+            tensors: Worlds and weights that kernels are warmed up with.
 
         Raises:
             Exception: They cannot be recorded.
@@ -270,9 +282,7 @@ class _Recording:
         if not self._graphs:
             first = self._call._replace(steps=min(steps, WARM_UP_STEPS), keep_every=None)
             with torch.no_grad():
-                # Any worlds do; those of the memory's last owner might be no numbers.
-                for tensor in self._inputs:
-                    tensor.zero_()
+                torch._foreach_copy_(self._inputs, list(tensors))
             prepare_capture(functools.partial(self._warm_up, first), self.device)
         elif len(self._graphs) >= MOST_GRAPHS:
             self._graphs.popitem(last=False)
@@ -449,7 +459,8 @@ def _forget(key: Hashable) -> None:
 def _run_recorded(
     call: Call,
     rules: Sequence[NPARule],
-    worlds: Worlds,
+    x: Tensor,
+    s: Tensor,
     generator: Randomness | None,
     *,
     asked: bool,
@@ -459,7 +470,8 @@ def _run_recorded(
     Args:
         call: What is asked for.
         rules: The rule, or one of each species.
-        worlds: Where it begins.
+        x: Positions at the beginning [length units], shape [B, N, D].
+        s: States at the beginning, dimensionless, shape [B, N, C].
         generator: Source of the draws.
         asked: The caller asks for a recording.
     """
@@ -467,32 +479,33 @@ def _run_recorded(
     if not (asked or all(plain)):
         return None
     forms, weights = zip(*map(_form, rules, plain), strict=True)
-    tensors = [*worlds, *itertools.chain.from_iterable(weights)]
+    tensors = [x, s, *itertools.chain.from_iterable(weights)]
     wanted: tuple[bool, ...] = ()
     if torch.is_grad_enabled():
         wanted = tuple(tensor.requires_grad for tensor in tensors)
-        wanted = wanted if any(wanted) else ()
+        wanted = (*wanted[:2], False, *wanted[2:]) if any(wanted) else ()
     by_world = isinstance(generator, WorldRandom)
-    x = worlds.x
     precision = torch.get_float32_matmul_precision()
-    shape = (x.shape, worlds.s.shape[2], x.dtype, x.device)
+    shape = (x.shape, s.shape[2], x.dtype, x.device)
     kind = _count((call._replace(steps=0), forms, shape, wanted, by_world, precision))
     if kind.refused or kind.calls <= (1 if asked else LAUNCHED_FIRST):
         return None
     if wanted and (_hooked() or call.steps > MOST_STEPS):
         return None
-    check = FiniteCheck(worlds.x)
     blocks = [call.steps] if wanted else _blocks(call)
-    make = functools.partial(_Recording, call, rules, worlds, wanted, by_world)
-    lease = _lease(kind, set(blocks), make)
+    make = functools.partial(_Recording, call, rules, x, s, wanted, by_world)
+    lease = _lease(kind, set(blocks), make, tensors)
     if lease is None:
         return None
+    tensors.insert(2, lease.recording.no_path)
+    ready = torch.cuda.Event()  # type: ignore[no-untyped-call]
+    ready.record(torch.cuda.current_stream(x.device))
     found: list[Worlds] = []
     for steps in blocks:
         after = _replay(lease, steps, tensors, generator)
         if not found:
-            # Only now: the device is at work while the host waits for what it found before.
-            check.wait()
+            # Only now, when the device has work: this takes the host as long as the rest.
+            FiniteCheck(x, ready).wait()
         lease.recording.end_draws(generator, steps)
         found.append(after)
         last = after if call.keep_every is None else Worlds(*(value[-1] for value in after))
@@ -510,8 +523,11 @@ def _blocks(call: Call) -> list[int]:
     return [block] * (call.steps // block) + [rest] * (rest > 0)
 
 
-def _lease(kind: _Kind, steps: set[int], make: Callable[[], _Recording]) -> _Lease | None:
+def _lease(
+    kind: _Kind, steps: set[int], make: Callable[[], _Recording], tensors: Sequence[Tensor]
+) -> _Lease | None:
     """Return a recording that holds these numbers of steps; None where there can be none."""
+    x, s, *weights = tensors
     with _lock:
         lease = None
         with contextlib.suppress(IndexError):
@@ -529,7 +545,7 @@ def _lease(kind: _Kind, steps: set[int], make: Callable[[], _Recording]) -> _Lea
                         "a rollout is launched: recordings have taken their share of memory"
                     )
                     return None
-                recording.record(missing)
+                recording.record(missing, [x, s, recording.no_path, *weights])
         except Exception as error:
             # A launched rollout says what is wrong if that cannot run either.
             logger.debug("rollouts of this kind are launched, not recorded: %s", error)

@@ -529,7 +529,8 @@ def rollout(
     after = run_call(
         RolloutCall(steps, options, memory, kept),
         (rule,),
-        Worlds(x, s, x.new_zeros(x.shape[:2])),
+        x,
+        s,
         generator,
         cuda_graph=cuda_graph,
         watch=make_watch(on_divergence, x, s),

@@ -210,7 +210,8 @@ def rollout_species(
     worlds = run_call(
         SpeciesCall(steps, options, memory, kept, sizes, divisors, perception == "per_species"),
         species_rules,
-        Worlds(x, s, x.new_zeros(x.shape[:2])),
+        x,
+        s,
         generator,
         cuda_graph=cuda_graph,
         watch=make_watch(on_divergence, x, s),

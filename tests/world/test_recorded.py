@@ -393,7 +393,8 @@ def test_nothing_leaks_over_ten_thousand_calls_of_changing_shapes():
         if call in (4_999, 9_999):
             torch.cuda.synchronize()
             taken.append((torch.cuda.memory_allocated(), recorded.recorded_memory(DEVICE)))
-    assert taken[1] == taken[0]
+    assert taken[1][0] <= taken[0][0] + 2**20
+    assert taken[1][1] == taken[0][1]
 
 
 def test_wrong_words_are_refused():
