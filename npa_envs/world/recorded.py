@@ -236,6 +236,8 @@ class _Recording:
         """Lengths of paths at the beginning."""
         self.bytes = 0
         """Memory of the graphs."""
+        self.ready = torch.cuda.Event()  # type: ignore[no-untyped-call]
+        """When the worlds to begin with are there."""
         self._call = call
         self._rules = [_twin(rule, x) for rule in rules]
         weights = [weight for rule in self._rules for weight in _form(rule, rule.is_plain())[1]]
@@ -350,12 +352,11 @@ class _Recording:
         for buffer, gradient in zip(buffers, gradients, strict=True):
             buffer.copy_(gradient)
 
-    @torch.no_grad()
     def forward(
         self, steps: int, tensors: Sequence[Tensor], generator: Randomness | None
     ) -> list[Tensor]:
-        """Replay a rollout, and return copies of the worlds that come out."""
-        with torch.cuda.device(self.device):
+        """Replay a rollout, and return copies of the worlds that come out; not differentiable."""
+        with self._placed():
             self._take_turns()
             torch._foreach_copy_(self._inputs, list(tensors))
             self._load_draws(generator)
@@ -365,12 +366,11 @@ class _Recording:
             count = None if self._call.keep_every is None else steps // self._call.keep_every
             return [value.clone() for value in self._outputs[count]]
 
-    @torch.no_grad()
     def backward(
         self, steps: int, bars: Sequence[Tensor | None], wanted: Sequence[bool]
     ) -> list[Tensor | None]:
         """Replay the backward pass of the rollout under way; return copies of the gradients."""
-        with torch.cuda.device(self.device):
+        with self._placed():
             self._take_turns()
             count = None if self._call.keep_every is None else steps // self._call.keep_every
             for buffer, bar in zip(self._bars[count], bars, strict=True):
@@ -409,6 +409,12 @@ class _Recording:
             source = _torch_generator(generator, self.device)
             self._generator.manual_seed(source.initial_seed())
             self._generator.set_offset(source.get_offset())
+
+    def _placed(self) -> contextlib.AbstractContextManager[object]:
+        """Return a context in which this device is the current one."""
+        if torch.cuda.current_device() == self.device.index:
+            return contextlib.nullcontext()
+        return torch.cuda.device(self.device)
 
     def _take_turns(self) -> None:
         """Let the current stream wait for the one on which this was used last."""
@@ -498,7 +504,7 @@ def _run_recorded(
     if lease is None:
         return None
     tensors.insert(2, lease.recording.no_path)
-    ready = torch.cuda.Event()  # type: ignore[no-untyped-call]
+    ready = lease.recording.ready
     ready.record(torch.cuda.current_stream(x.device))
     found: list[Worlds] = []
     for steps in blocks:
