@@ -15,9 +15,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from torch import Tensor
 
-from npa_envs.measure.speed.timing import Session, Timing, compare
+from npa_envs.measure.speed.timing import Session, Timing, compare, timed_calls
 from npa_envs.measure.speed.workloads import Workload, rollout_call
 from npa_envs.rule.rule import NPARule
+from npa_envs.world.recorded import release_recordings
 from npa_envs.world.rollout import Memory
 from npa_envs.world.species import rollout_species
 
@@ -131,6 +132,50 @@ def throughput_row(
         worlds_mib=(x.nbytes + s.nbytes) / 2**20,
         infer_mib=infer.peak_mib,
         train_mib=training.peak_mib if training else None,
+    )
+
+
+@dataclass(frozen=True)
+class PublicRow:
+    """What a step of a call of `rollout` costs a person who calls it in a plain loop [µs].
+
+    Each reading is one call, with loss and gradients for training, and ends with a
+    synchronisation. On CUDA the first numbers are of calls that replay what they have recorded,
+    the others of calls with `cuda_graph=False`.
+    """
+
+    workload: str
+    infer_us: Timing
+    train_us: Timing
+    launched_infer_us: Timing
+    launched_train_us: Timing
+
+
+def public_rows(session: Session, workloads: Sequence[Workload]) -> list[PublicRow]:
+    """Return a row for each workload: the public call, as it comes."""
+    return [
+        row
+        for workload in workloads
+        for row in session.attempt(workload.name, partial(_public_row, session, workload))
+    ]
+
+
+def _public_row(session: Session, workload: Workload) -> PublicRow:
+    x, s = workload.worlds(session.device)
+    found: dict[tuple[bool, bool], Timing] = {}
+    for recorded in (True, False):
+        for train in (False, True):
+            options = {} if recorded else {"cuda_graph": False}
+            run, _ = rollout_call(workload, x, s, train=train, **options)
+            timing = timed_calls(run, session.device, warm=3, repeats=session.repeats)
+            found[recorded, train] = timing.divided(workload.steps)
+    release_recordings()
+    return PublicRow(
+        workload=workload.name,
+        infer_us=found[True, False],
+        train_us=found[True, True],
+        launched_infer_us=found[False, False],
+        launched_train_us=found[False, True],
     )
 
 

@@ -95,6 +95,15 @@ def compare(
     return Comparison(_summary(readings[0]), _summary(readings[1]), ratio)
 
 
+def timed_calls(
+    run: Callable[[], object], device: torch.device, *, warm: int, repeats: int
+) -> Timing:
+    """Return what single calls take, each waited for, after some that are not timed."""
+    for _ in range(warm):
+        run()
+    return _summary([_reading(run, device, 1) * 1e6 for _ in range(repeats)])
+
+
 def _summary(readings: Sequence[float]) -> Timing:
     return Timing(statistics.median(readings), min(readings), max(readings))
 
