@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import functools
+import inspect
 import threading
-from typing import Any
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 import torch
 import warp as wp
@@ -245,6 +248,40 @@ def _ranges(kernel: Any, size: tuple[int, ...]) -> list[range]:
     return [range(size[0])] if smallest is None else even_ranges(size[0], smallest)
 
 
+class Launch(NamedTuple):
+    """One launch of a Warp kernel."""
+
+    kernel: str
+    """The kernel's name."""
+    module: str
+    """The Warp module of its variant, without the package's name."""
+    threads: str
+    """Threads along each dimension."""
+    purpose: str
+    """First line of its docstring."""
+
+
+@contextlib.contextmanager
+def noted_launches() -> Iterator[list[Launch]]:
+    """Yield a list to which every launch in the block is added, of all threads."""
+    noted: list[Launch] = []
+    _noting.append(noted)
+    try:
+        yield noted
+    finally:
+        _noting.remove(noted)
+
+
+_noting: list[list[Launch]] = []
+"""Lists to which launches are added."""
+
+
+def _described(kernel: Any, size: tuple[int, ...]) -> Launch:
+    purpose = (inspect.getdoc(kernel.func) or "").split("\n")[0]
+    module = kernel.module.name.removeprefix("npa_envs.").removeprefix("kernels.")
+    return Launch(kernel.func.__name__, module, " x ".join(map(str, size)), purpose)
+
+
 class _Ready(threading.local):
     """A thread's kernels with memory for their arguments."""
 
@@ -275,6 +312,8 @@ def launch(
     size = (size,) if isinstance(size, int) else size
     if 0 in size:
         return
+    for noted in _noting:
+        noted.append(_described(kernel, size))
     if kernel in SMALLEST_RANGES:
         arguments = (0, *arguments)
     key = (kernel, device, block_dim)

@@ -44,7 +44,7 @@ from npa_envs.measure.speed.throughput import (
 from npa_envs.measure.speed.timing import LeftOut, Session, Timing, compare
 from npa_envs.measure.speed.workloads import Workload, gecko
 from npa_envs.ops import perceive
-from npa_envs.runtime import recorded_launches
+from npa_envs.ops.launch import noted_launches
 from npa_envs.world.rollout import rollout
 
 TINY = Workload(2, 2, 150, 2, hidden_dim=16, eps=0.2)
@@ -401,9 +401,9 @@ def test_an_explanation_names_the_kernels_and_follows_what_is_asked_for():
     assert "f64" in explain(question(dtype=torch.float64))
 
 
-def test_recorded_launches_are_those_of_the_block():
+def test_noted_launches_are_those_of_the_block():
     x, s = TINY.worlds(torch.device("cpu"))
-    with recorded_launches() as launches:
+    with noted_launches() as launches:
         perceive(x, s, TINY.eps)
     names = [launch.kernel for launch in launches]
     perceive(x, s, TINY.eps)

@@ -13,9 +13,9 @@ from torch.profiler import ProfilerActivity, profile
 from npa_envs.measure.speed.timing import Session
 from npa_envs.measure.speed.workloads import Workload, rollout_call
 from npa_envs.ops.backend import Request, describe, rollout_listing
+from npa_envs.ops.launch import Launch, noted_launches
 from npa_envs.ops.sort import Plan, make_plan
 from npa_envs.rule.rule import NPARule
-from npa_envs.runtime import Launch, recorded_launches
 from npa_envs.world.rollout import row_capacity, step
 
 LEAST_SHARE = 0.005
@@ -114,7 +114,7 @@ def _launches(question: Question) -> tuple[list[Launch], list[Launch]]:
     needed = question.gradients != "none"
     x.requires_grad_(question.gradients == "positions")
     s.requires_grad_(needed)
-    with torch.set_grad_enabled(needed), recorded_launches() as forward:
+    with torch.set_grad_enabled(needed), noted_launches() as forward:
         new_x, new_s = step(
             rule,
             x,
@@ -125,7 +125,7 @@ def _launches(question: Question) -> tuple[list[Launch], list[Launch]]:
             detach_positions=question.gradients != "positions",
             generator=torch.Generator(question.device).manual_seed(0),
         )
-    with recorded_launches() as backward:
+    with noted_launches() as backward:
         if needed:
             torch.autograd.backward(new_x.sum() + new_s.sum())
     return forward, backward
