@@ -157,7 +157,8 @@ class _UpdateParticles(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *bars: Tensor) -> tuple[Tensor | None, ...]:
         update, row_source, starts = ctx.saved_tensors
-        update_bar = _update_particles_backward(update, *bars, row_source, starts, *ctx.options)
+        given: list[Any] = [update, *bars, row_source, starts, *ctx.options]
+        update_bar = _update_particles_backward(*given)
         return (update_bar, *bars, None, None, None, None, None)
 
 

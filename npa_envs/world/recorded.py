@@ -92,7 +92,7 @@ class Call(Protocol):
     ) -> Worlds:
         """Launch the rollout."""
 
-    def _replace(self, **changes: Any) -> Self:
+    def _replace(self, *, steps: int = ..., keep_every: int | None = ...) -> Self:
         """Return the call with some fields changed."""
 
 

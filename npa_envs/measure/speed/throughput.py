@@ -165,7 +165,7 @@ def _public_row(session: Session, workload: Workload) -> PublicRow:
     found: dict[tuple[bool, bool], Timing] = {}
     for recorded in (True, False):
         for train in (False, True):
-            options = {} if recorded else {"cuda_graph": False}
+            options: dict[str, Any] = {} if recorded else {"cuda_graph": False}
             run, _ = rollout_call(workload, x, s, train=train, **options)
             timing = timed_calls(run, session.device, warm=3, repeats=session.repeats)
             found[recorded, train] = timing.divided(workload.steps)

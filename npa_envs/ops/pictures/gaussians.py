@@ -439,8 +439,8 @@ class _Gaussians(torch.autograd.Function):
             picture_bar = passing.new_zeros(*passing.shape, colours.shape[-1])
         if passing_bar is None:
             passing_bar = torch.zeros_like(passing)
-        bars = _gaussians_backward(*ctx.saved_tensors, picture_bar, passing_bar, *ctx.numbers)
-        return (*bars, *(None,) * 7)
+        given: list[Any] = [*ctx.saved_tensors, picture_bar, passing_bar, *ctx.numbers]
+        return (*_gaussians_backward(*given), *(None,) * 7)
 
 
 def render_gaussians(
