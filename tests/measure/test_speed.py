@@ -18,17 +18,18 @@ from npa_envs import reference
 from npa_envs.cli import main
 from npa_envs.measure.speed import suites, throughput
 from npa_envs.measure.speed.errors import (
+    PEERS,
     RolloutRow,
     composed_step,
     drawn_mask,
     drift_rows,
     mask_source,
+    peer_rows,
     perception_rows,
     rollout_rows,
 )
 from npa_envs.measure.speed.explain import Question, explain
 from npa_envs.measure.speed.hash_grid import grid_fields
-from npa_envs.measure.speed.peers import PEERS, peer_rows
 from npa_envs.measure.speed.strategies import NEIGHBOUR_CAP, PRECISIONS, STRATEGIES, nearest
 from npa_envs.measure.speed.suites import Point, Report, front, pictures
 from npa_envs.measure.speed.throughput import (

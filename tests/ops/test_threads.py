@@ -11,11 +11,12 @@ from worlds import assert_same, random_mask, random_world, rows_of, with_gradien
 
 import npa_envs
 from npa_envs.ops import launch as bridge
-from npa_envs.ops import orbit, render_gaussians, threads
+from npa_envs.ops import launch as threads
+from npa_envs.ops import orbit, render_gaussians
+from npa_envs.ops.launch import even_ranges, run_together
 from npa_envs.ops.perceive import Terms, survey
 from npa_envs.ops.pictures.losses import picture_losses
 from npa_envs.ops.pictures.splat import splat
-from npa_envs.ops.threads import even_ranges, run_together
 from npa_envs.ops.update import ActionRules, PreparedActions, update_particles
 
 STATE_DIM = 5

@@ -13,8 +13,7 @@ from PIL import Image
 
 from npa_envs.errors import MissingDependencyError, NPAError
 from npa_envs.ops import Cameras, orbit
-from npa_envs.tasks.losses.ms_ssim import MultiScaleSimilarity
-from npa_envs.tasks.morphogenesis3d import ViewSchedule, blurred
+from npa_envs.tasks.morphogenesis3d import MultiScaleSimilarity, ViewSchedule, blurred
 from npa_envs.tasks.targets.meshes import (
     AMBIENT,
     MESHES,

@@ -20,11 +20,11 @@ from npa_envs.measure.speed.errors import (
     composed_step,
     drawn_mask,
     drift_rows,
+    peer_rows,
     perception_rows,
     rollout_rows,
 )
 from npa_envs.measure.speed.explain import kernel_rows
-from npa_envs.measure.speed.peers import peer_rows
 from npa_envs.measure.speed.strategies import PRECISIONS, STRATEGIES
 from npa_envs.measure.speed.throughput import (
     AXES,
