@@ -18,7 +18,7 @@ from npa_envs.kernels.cuda.network import (
 )
 from npa_envs.ops.backend import Request, choose
 from npa_envs.ops.launch import launch
-from npa_envs.ops.opaque import opaque
+from npa_envs.ops.opaque import once_differentiable, opaque
 
 
 class ArrangedWeights(NamedTuple):
@@ -294,7 +294,7 @@ class _Network(torch.autograd.Function):
         return update
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @once_differentiable
     def backward(ctx: Any, update_bar: Tensor) -> tuple[Tensor | None, ...]:
         rows, signs, *arranged = ctx.saved_tensors
         unit_count, width = ctx.unit_count, rows.shape[1]

@@ -1,13 +1,19 @@
-"""Opaque torch operators: kernels that `torch.compile` calls and does not look into."""
+"""Opaque torch operators: kernels that `torch.compile` calls and does not look into.
+
+Their derivatives are kernels as well, of which there are no derivatives.
+"""
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any, Generic, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor, nn
 from torch.utils._python_dispatch import is_in_torch_dispatch_mode
+
+from npa_envs.errors import NPAError
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
@@ -48,3 +54,31 @@ def opaque(name: str) -> Callable[[Callable[Arguments, Result]], Opaque[Argument
         name: The operator's name, "npa::...".
     """
     return lambda function: Opaque(name, function)
+
+
+def once_differentiable(
+    backward: Callable[Arguments, Result],
+) -> Callable[Arguments, Result]:
+    """Return the backward pass of an autograd function, made to refuse second derivatives.
+
+    Torch's own `once_differentiable` says nothing where the cotangent needs no gradient, as that of
+    a sum: second derivatives are then zero.
+
+    Args:
+        backward: The backward pass, of a context and cotangents.
+
+    Raises:
+        NPAError: When called with `create_graph=True`.
+    """
+
+    @functools.wraps(backward)
+    def guarded(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+        if torch.is_grad_enabled():
+            raise NPAError(
+                "create_graph must be False where particles are perceived, moved or drawn, got "
+                "True: these have no second derivatives; leave it out, or take small worlds with "
+                "the slow operators of npa_envs.reference, which have"
+            )
+        return backward(*args, **kwargs)
+
+    return guarded

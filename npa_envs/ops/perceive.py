@@ -26,7 +26,7 @@ from npa_envs.ops.checks import (
     checked_moment_inverse,
 )
 from npa_envs.ops.launch import PreparedLaunch, launch
-from npa_envs.ops.opaque import opaque
+from npa_envs.ops.opaque import once_differentiable, opaque
 from npa_envs.ops.passes import (
     Terms,
     compute_densities,
@@ -360,7 +360,7 @@ class _PerceiveRows(torch.autograd.Function):
         return saved.perception, saved.row_of, row_source, saved.starts
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @once_differentiable
     def backward(ctx: Any, *bars: Tensor | None) -> tuple[Tensor | None, ...]:
         if bars[0] is None:
             return None, None, None, None
@@ -409,7 +409,7 @@ class _PerceiveStatic(torch.autograd.Function):
         return perception
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @once_differentiable
     def backward(ctx: Any, bar: Tensor) -> tuple[Tensor | None, ...]:
         return _pull_back(ctx, bar)[0], None, None, None, None, None
 

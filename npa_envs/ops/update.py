@@ -19,7 +19,7 @@ from npa_envs.kernels.portable.update import (
 )
 from npa_envs.ops.checks import check_world
 from npa_envs.ops.launch import PreparedLaunch, launch, scalar_type
-from npa_envs.ops.opaque import opaque
+from npa_envs.ops.opaque import once_differentiable, opaque
 from npa_envs.ops.perceive import Rows
 from npa_envs.ops.sort import LARGEST_INDEX
 
@@ -154,7 +154,7 @@ class _UpdateParticles(torch.autograd.Function):
         return outputs
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @once_differentiable
     def backward(ctx: Any, *bars: Tensor) -> tuple[Tensor | None, ...]:
         update, row_source, starts = ctx.saved_tensors
         given: list[Any] = [update, *bars, row_source, starts, *ctx.options]

@@ -29,6 +29,7 @@ from torch import Tensor
 
 from npa_envs.errors import NPAError
 from npa_envs.ops.checks import FiniteCheck, check_finite_positions
+from npa_envs.ops.opaque import once_differentiable
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.cuda_graph import capture, prepare_capture
 from npa_envs.world.divergence import DivergenceWatch
@@ -607,7 +608,7 @@ class _Replayed(torch.autograd.Function):
         return tuple(recording.forward(steps, tensors, generator))
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @once_differentiable
     def backward(ctx: Any, *bars: Tensor | None) -> tuple[Tensor | None, ...]:
         # Raises autograd's own error where what was saved is gone.
         _ = ctx.saved_tensors

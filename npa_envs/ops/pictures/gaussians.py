@@ -20,7 +20,7 @@ from npa_envs.kernels.pictures.gaussians import (
 )
 from npa_envs.ops.checks import DTYPES, check_dense, checked_count, checked_number
 from npa_envs.ops.launch import launch, scalar_type
-from npa_envs.ops.opaque import opaque
+from npa_envs.ops.opaque import once_differentiable, opaque
 from npa_envs.ops.pictures.cameras import Cameras
 from npa_envs.ops.sort import LARGEST_INDEX
 
@@ -430,7 +430,7 @@ class _Gaussians(torch.autograd.Function):
         return picture, saved[0], overflow, saved[-1]
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @once_differentiable
     def backward(
         ctx: Any, picture_bar: Tensor | None, passing_bar: Tensor | None, *_: None
     ) -> tuple[Tensor | None, ...]:

@@ -29,7 +29,7 @@ from npa_envs.ops.checks import (
     checked_side,
 )
 from npa_envs.ops.launch import launch, scalar_type
-from npa_envs.ops.opaque import opaque
+from npa_envs.ops.opaque import once_differentiable, opaque
 from npa_envs.ops.sort import LARGEST_INDEX
 
 LARGEST_SPOT = 1e6
@@ -212,7 +212,7 @@ class _Splat(torch.autograd.Function):
         return picture
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @once_differentiable
     def backward(ctx: Any, picture_bar: Tensor) -> tuple[Tensor | None, ...]:
         positions_bar, colours_bar = _splat_backward(picture_bar, *ctx.saved_tensors, *ctx.lens)
         x_shape, colour_shape = ctx.shapes

@@ -1,0 +1,71 @@
+"""Second derivatives are right or refused; they never vanish."""
+
+import pytest
+import torch
+from worlds import lively_rule, random_world
+
+import npa_envs
+from npa_envs import reference
+from npa_envs.ops import render_gaussians, splat
+from npa_envs.ops.pictures.cameras import orbit
+
+
+def picture_of_gaussians(x, s):
+    scales, quaternions = torch.full_like(x, 0.1), torch.ones_like(s[..., :4])
+    opacities, cameras = torch.ones_like(x[..., 0]), orbit(1, width=16, height=16)
+    return render_gaussians(x, scales, quaternions, opacities, s[..., :3], cameras).image
+
+
+def states_of_rollout(x, s, memory="store", static=False):
+    rule = lively_rule(x.device, x.dtype, x.shape[2], s.shape[2], static=static)
+    generator = torch.Generator(x.device).manual_seed(0)
+    return npa_envs.rollout(rule, x, s, 3, generator=generator, memory=memory)[1]
+
+
+OPERATORS = {
+    "perception": lambda x, s: npa_envs.perceive(x, s, 0.3),
+    "perception, by positions": lambda x, s: npa_envs.perceive(x, s, 0.3, detach_positions=False),
+    "perception of species": lambda x, s: npa_envs.perceive_species(x, s, (20, 11), 0.3),
+    "a rollout": states_of_rollout,
+    "a rollout that recomputes": lambda x, s: states_of_rollout(x, s, memory="minimal"),
+    "a static rollout": lambda x, s: states_of_rollout(x, s, static=True),
+    "a picture": lambda x, s: splat(x[..., :2], s[..., :3], resolution=16, pixel_size=0.1),
+    "a picture of Gaussians": picture_of_gaussians,
+}
+
+
+@pytest.mark.parametrize("name", OPERATORS)
+def test_a_second_derivative_is_refused_however_the_first_is_asked_for(name, device):
+    x, s = random_world(1, 31, 3, 5, dtype=torch.float32, device=device)
+    s.requires_grad_()
+    for cotangent in (None, 1.0):
+        result = OPERATORS[name](x, s)
+        value = result.sum() if cotangent is None else (cotangent * result).square().sum()
+        with pytest.raises(npa_envs.NPAError, match=r"create_graph must be False .*reference"):
+            torch.autograd.grad(value, s, create_graph=True)
+        # The first alone is as ever.
+        (gradient,) = torch.autograd.grad(OPERATORS[name](x, s).sum(), s)
+        assert float(gradient.abs().max()) > 0.0
+
+
+def test_the_reference_that_the_error_names_has_second_derivatives():
+    x, s = random_world(1, 9, 2, 2, dtype=torch.float64, device="cpu")
+    s.requires_grad_()
+    (gradient,) = torch.autograd.grad(
+        reference.perceive(x, s, 0.8, 0.8).sum(), s, create_graph=True
+    )
+    (second,) = torch.autograd.grad(gradient.square().sum(), s)
+    assert float(second.abs().max()) > 0.0
+
+
+def test_a_compiled_function_refuses_second_derivatives_too(device):
+    x, s = random_world(1, 31, 2, 5, dtype=torch.float32, device=device)
+    s.requires_grad_()
+    compiled = torch.compile(lambda s: npa_envs.perceive(x, s, 0.3).sum(), backend="aot_eager")
+
+    def penalty():
+        (gradient,) = torch.autograd.grad(compiled(s), s, create_graph=True)
+        return torch.autograd.grad(gradient.square().sum(), s)
+
+    with pytest.raises(RuntimeError, match="double backward"):
+        penalty()
