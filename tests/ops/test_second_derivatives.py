@@ -56,16 +56,3 @@ def test_the_reference_that_the_error_names_has_second_derivatives():
     )
     (second,) = torch.autograd.grad(gradient.square().sum(), s)
     assert float(second.abs().max()) > 0.0
-
-
-def test_a_compiled_function_refuses_second_derivatives_too(device):
-    x, s = random_world(1, 31, 2, 5, dtype=torch.float32, device=device)
-    s.requires_grad_()
-    compiled = torch.compile(lambda s: npa_envs.perceive(x, s, 0.3).sum(), backend="aot_eager")
-
-    def penalty():
-        (gradient,) = torch.autograd.grad(compiled(s), s, create_graph=True)
-        return torch.autograd.grad(gradient.square().sum(), s)
-
-    with pytest.raises(RuntimeError, match="double backward"):
-        penalty()
