@@ -1,7 +1,8 @@
 """Files of rules: ours (safetensors), and the two formats of the paper's authors.
 
 Ours holds the weights under `NPARule`'s own names and, in the header's metadata, the format's name
-and version and every hyper-parameter, so that a file is all that is needed to run a rule.
+and version, every hyper-parameter and a checksum, so that a file is all that is needed to run a
+rule. The checksum is SHA-256 over all else that the file says; older files have none.
 
 State dict (`npa.pth`): `model.0.weight` [H, P], `model.0.bias` [H], `model.2.weight` [A, H] with
 rows [δ (D); Δs (C)], `eps0`, `alpha`, and for rules with a read-out `decoder.0.*`, `decoder.2.*`.
@@ -13,12 +14,14 @@ from __future__ import annotations
 
 import base64
 import binascii
+import hashlib
 import io
 import json
 import math
 import pickle
 import reprlib
 import struct
+import warnings
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -41,7 +44,7 @@ _FIELDS = {
     name: str if get_origin(kind) is Literal else kind
     for name, kind in get_type_hints(RuleHyperParameters).items()
 }
-_RESERVED = {"format", "version", *_FIELDS}
+_RESERVED = {"format", "version", "checksum", *_FIELDS}
 _SUFFIXES = (".safetensors", ".pth", ".pt", ".json")
 
 
@@ -51,6 +54,8 @@ class RuleParts:
 
     hyper_parameters: dict[str, Any]
     weights: dict[str, Tensor]
+    header: dict[str, str] | None = None
+    """Metadata of a file in our format."""
 
 
 def shipped_rules(task: str | None = None) -> dict[str, Path]:
@@ -82,12 +87,13 @@ def load_rule(source: str | Path, *, device: str | torch.device = "cpu") -> NPAR
 
     Returns:
         The rule, its weights in the precision of the file (float32 or float64). Torch's random
-        state is left alone.
+        state is left alone. A `.safetensors` file without a checksum, as older versions wrote them,
+        is loaded with a `UserWarning`: damage cannot be told there, nor in the authors' `.json`.
 
     Raises:
         NPAError: The name is unknown, the file is missing, garbage, truncated, of an unknown
-            version, does not hold a rule, or holds weights that are not finite; or there is no
-            such device.
+            version, does not hold a rule, holds weights that are not finite, or has changed since
+            it was written; or there is no such device.
     """
     target = check_device(device)
     path, name = _locate(source)
@@ -99,8 +105,16 @@ def load_rule(source: str | Path, *, device: str | torch.device = "cpu") -> NPAR
         else:
             parts = read_state_dict(_read_file(path))
         rule = _assemble(parts)
+        if parts.header is not None:
+            _verify(parts.header, parts.weights)
     except NPAError as error:
         raise NPAError(f"cannot load a rule from {str(source)!r}: {error}") from error
+    if parts.header is not None and "checksum" not in parts.header:
+        warnings.warn(
+            f"the rule's file {str(path)!r} has no checksum, so that damage cannot be told: if it "
+            "is known to be good, save it again with npa_envs.save_rule",
+            stacklevel=2,
+        )
     return rule.to(target)
 
 
@@ -144,6 +158,7 @@ def save_rule(
         header[name] = text
     weights = {k: v.detach().cpu().contiguous() for k, v in rule.state_dict().items()}
     _check_finite(weights)
+    header["checksum"] = _checksum(header, weights)
     write_bytes(path, _with_sorted_metadata(serialise(weights, metadata=header)))
 
 
@@ -253,7 +268,26 @@ def _read_ours(path: Path) -> RuleParts:
             weights = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
     except (OSError, SafetensorError) as error:
         raise NPAError(f"the weights cannot be read ({error})") from error
-    return RuleParts(hyper_parameters, weights)
+    return RuleParts(hyper_parameters, weights, header)
+
+
+def _checksum(header: Mapping[str, str], weights: Mapping[str, Tensor]) -> str:
+    """Return SHA-256 over the metadata, but for the checksum itself, and over all weights."""
+    told: list[Any] = sorted(item for item in header.items() if item[0] != "checksum")
+    told += [(name, str(tensor.dtype), *tensor.shape) for name, tensor in sorted(weights.items())]
+    found = hashlib.sha256(json.dumps(told).encode())
+    for _, tensor in sorted(weights.items()):
+        found.update(tensor.numpy().tobytes())
+    return found.hexdigest()
+
+
+def _verify(header: Mapping[str, str], weights: Mapping[str, Tensor]) -> None:
+    """Check that a file is as it was written, where it says what that was."""
+    if header.get("checksum", found := _checksum(header, weights)) != found:
+        raise NPAError(
+            "the checksum must be that of the weights and of the metadata, got another one: the "
+            "file is damaged, or another program has changed it; copy it again from where it came"
+        )
 
 
 def _parse(header: Mapping[str, str], name: str, kind: type) -> Any:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import math
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -95,6 +96,47 @@ def test_saving_refuses_what_could_not_be_loaded(
     with pytest.raises(NPAError, match=message):
         save_rule(rule, tmp_path / name, metadata=metadata)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_no_bit_flips_unnoticed(tmp_path: Path) -> None:
+    rule, path = NPARule(2, 3, 8, eps0=0.1), tmp_path / "rule.safetensors"
+    save_rule(rule, path, metadata={"trained": "10 000 iterations"})
+    data, told = path.read_bytes(), rule_metadata(path)
+    refused = 0
+    for place in np.random.default_rng(0).integers(8 * len(data), size=250).tolist():
+        flipped = bytearray(data)
+        flipped[place // 8] ^= 1 << place % 8
+        path.write_bytes(flipped)
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("error")
+                loaded = load_rule(path)
+        except (NPAError, UserWarning):
+            refused += 1
+        else:  # A space after the header.
+            assert rule_metadata(path) == told
+            assert_same_rule(loaded, rule)
+    assert refused >= 245
+
+
+def test_a_changed_weight_is_refused_with_the_cure(tmp_path: Path) -> None:
+    path = tmp_path / "rule.safetensors"
+    write_ours(path, lambda h, w: w["hidden.bias"].add_(1e-3))
+    with pytest.raises(NPAError, match=r"checksum must be .* damaged.*copy it again"):
+        load_rule(path)
+
+
+def test_a_file_without_a_checksum_is_loaded_with_a_warning(tmp_path: Path) -> None:
+    path = tmp_path / "rule.safetensors"
+    write_ours(path, lambda h, w: h.pop("checksum"))
+    with pytest.warns(UserWarning, match=r"rule\.safetensors' has no checksum.*save it again"):
+        loaded = load_rule(path)
+    save_rule(loaded, path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load_rule(path)
+        for name in shipped_rules():
+            load_rule(name)
 
 
 def write_ours(path: Path, change: Callable[[dict, dict], None]) -> None:
