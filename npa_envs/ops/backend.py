@@ -23,6 +23,9 @@ LARGEST_ROW, LARGEST_UPDATE, LARGEST_HIDDEN = 128, 32, 512
 UNIT_SHARE = 32
 """Hidden units that a warp of the fused network serves."""
 
+LARGEST_THREAD_WORLD = 4096
+"""Particles of the largest world that one thread of a CPU sorts."""
+
 LARGEST_BLOCK_WORLD = 4096
 """Particles of the largest world that a block of threads sorts."""
 
@@ -85,6 +88,10 @@ def _block(request: Request) -> bool:
     )
 
 
+def _world(request: Request) -> bool:
+    return request.device.type == "cpu" and request.particle_count <= LARGEST_THREAD_WORLD
+
+
 def _fused(request: Request) -> bool:
     widths = request.row_width, request.update_width
     return (
@@ -114,6 +121,13 @@ TABLE: tuple[Implementation, ...] = (
     ),
     Implementation(
         "sort", "cuda", "kernels/cuda/sort.py", f"{_MODERN}: a warp moves states together", _cuda
+    ),
+    Implementation(
+        "sort",
+        "world",
+        "kernels/portable/sort.py",
+        f"a CPU, worlds of at most {LARGEST_THREAD_WORLD} particles: a thread sorts a world",
+        _world,
     ),
     Implementation("sort", "portable", "kernels/portable/sort.py", "otherwise", _always),
     Implementation(

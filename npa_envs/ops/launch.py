@@ -68,31 +68,33 @@ class _ArrayArgument:
 
     def __init__(self, place: Any, array_type: Any) -> None:
         self._place = place
-        self._shape, self._strides = place.shape, place.strides
+        self._shape = place.shape
         self._type = array_type
-        self._form: tuple[Any, ...] | None = None
+        self._size: torch.Size | None = None
+        self._step: tuple[int, ...] = ()
+        self._dtype: torch.dtype | None = None
 
     def set(self, tensor: Tensor | None) -> None:
         """Describe another tensor, or none."""
         if tensor is None:
             # Kernels ask an absent array for its size.
-            if self._form is not None:
+            if self._size is not None:
                 self._write(self._type.__ctype__())
-                self._form = None
+                self._size = None
             return
-        form = (tensor.shape, tensor.stride(), tensor.dtype)
-        if form != self._form:
-            self._describe(tensor, form)
+        size, step = tensor.shape, tensor.stride()
+        if size != self._size or step != self._step or tensor.dtype is not self._dtype:
+            self._describe(tensor, size, step)
         self._place.data = tensor.data_ptr()
 
-    def _describe(self, tensor: Tensor, form: tuple[Any, ...]) -> None:
+    def _describe(self, tensor: Tensor, size: torch.Size, step: tuple[int, ...]) -> None:
         """Write shape and strides: by itself where only the first dimension has changed."""
-        last = self._form
-        if last is not None and last[0][1:] == form[0][1:] and last[1:] == form[1:]:
-            self._shape[0] = form[0][0]
+        known = self._size is not None and step == self._step and tensor.dtype is self._dtype
+        if known and self._size is not None and size[1:] == self._size[1:]:
+            self._shape[0] = size[0]
         else:
             self._write(_description(tensor, self._type))
-        self._form = form
+        self._size, self._step, self._dtype = size, step, tensor.dtype
 
     def _write(self, made: Any) -> None:
         ctypes.memmove(ctypes.addressof(self._place), ctypes.addressof(made), ctypes.sizeof(made))
@@ -166,9 +168,11 @@ class _Arguments:
         fields = [(f"a{k}", type(value)) for k, value in enumerate(made)]
         self._memory: Any = _struct(tuple(fields))(*made)
         self._names = [name for name, _ in fields]
-        self._setters = [
+        setters = [
             self._setter(*argument) for argument in zip(self._names, types, arguments, strict=True)
         ]
+        self._described = [(k, setter) for k, setter in enumerate(setters) if setter is not None]
+        self._numbers = [k for k, setter in enumerate(setters) if setter is None]
         self._last: list[Any] = [None] * len(made)
         self._addresses: Any = None
         if where.is_cuda:
@@ -187,15 +191,15 @@ class _Arguments:
 
     def set(self, arguments: tuple[Any, ...]) -> None:
         """Change the arguments."""
+        for k, setter in self._described:
+            setter(arguments[k])
         last = self._last
-        for k, (setter, value) in enumerate(zip(self._setters, arguments, strict=True)):
-            if setter is not None:
-                setter(value)
-            elif value != last[k]:
+        for k in self._numbers:
+            value = arguments[k]
+            if value != last[k]:
                 last[k] = value
-                made = value
-                if isinstance(value, tuple):
-                    made = self._launch.kernel.adj.args[k].type(*value)
+                kind = self._launch.kernel.adj.args[k].type
+                made = kind(*value) if isinstance(value, tuple) else value
                 setattr(self._memory, self._names[k], made)
 
     def set_address(self, index: int, tensor: Tensor) -> None:

@@ -22,6 +22,9 @@ LARGEST_INDEX = 2**31 - 1
 LARGEST_MASK = 2**28
 """Worlds times particles of masks that blocks sort: each block counts what is active before."""
 
+LARGEST_THREAD_MASK = 2**22
+"""The same of masks that threads of a CPU sort."""
+
 BUSY_BLOCKS = 128
 """Blocks that occupy a device: fewer worlds are cut into slices."""
 
@@ -175,6 +178,8 @@ def sort_worlds(
     capacity = _block_capacity(plan, x, s, mask)
     if capacity:
         return _sort_by_blocks(plan, capacity, x, s, mask, with_rows)
+    if plan.runs("sort") == "world" and _earlier(plan) <= LARGEST_THREAD_MASK:
+        return _sort_by_threads(plan, x, s, mask, with_rows)
     kernels = sort_kernels(plan.space_dim, plan.scalar, plan.width)
     device, total = x.device, plan.total
     cell, arrival = torch.empty(2, total, dtype=torch.int32, device=device).unbind()
@@ -253,10 +258,44 @@ def _empty_worlds(plan: Plan, x: Tensor, s: Tensor | None, with_rows: bool) -> l
 def _block_capacity(plan: Plan, *tensors: Tensor | None) -> int:
     """Return how many particles a block that sorts these worlds has room for, 0 if none does."""
     aligned = not any(tensor is not None and tensor.data_ptr() % 16 for tensor in tensors)
-    earlier = plan.world_count * plan.total if plan.masked else 0
-    if plan.runs("sort", aligned=aligned) != "block" or earlier > LARGEST_MASK:
+    if plan.runs("sort", aligned=aligned) != "block" or _earlier(plan) > LARGEST_MASK:
         return 0
     return next(size for size in sorted(BLOCKS) if size >= plan.particle_count)
+
+
+def _earlier(plan: Plan) -> int:
+    """Return how many entries of masks are read where each world counts the rows before it."""
+    return plan.world_count * plan.total if plan.masked else 0
+
+
+def _sort_by_threads(
+    plan: Plan, x: Tensor, s: Tensor | None, mask: Tensor | None, with_rows: bool
+) -> SortedWorlds:
+    """Sort small worlds on a CPU in one launch."""
+    ordered = _empty_worlds(plan, x, s, with_rows)
+    source = ordered[0]
+    starts = source.new_empty(plan.start_count)
+    launch(
+        sort_kernels(plan.space_dim, plan.scalar, plan.width).sort_worlds,
+        plan.world_count,
+        x.device,
+        plan.domain,
+        x.view(plan.total, plan.space_dim),
+        None if mask is None else mask.view(plan.total),
+        int(plan.masked),
+        plan.particle_count,
+        plan.state_dim,
+        plan.group_count,
+        int(s is not None and plan.state_dim % plan.width == 0 and s.data_ptr() % 16 == 0),
+        None if s is None else s.view(-1),
+        plan.active_offset,
+        plan.row_base,
+        plan.row_capacity,
+        torch.empty_like(source),
+        starts,
+        *ordered,
+    )
+    return SortedWorlds(starts, *ordered)
 
 
 def _sort_by_blocks(

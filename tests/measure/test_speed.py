@@ -390,10 +390,10 @@ def question(**options) -> Question:
 
 def test_an_explanation_names_the_kernels_and_follows_what_is_asked_for():
     forward, backward = explain(question()).split("backward:")
-    for kernel in ("count_cells", "compute_density", "perceive", "apply_update"):
+    for kernel in ("sort_worlds", "compute_density", "perceive", "apply_update"):
         assert f"  {kernel} " in forward
     assert "  gather_state_cotangents " in backward
-    assert "Count the particles" in forward
+    assert "Sort a world" in forward
     wide = Workload(2, 1, 900, 1)
     plain = explain(question(workload=wide, gradients="none", periodic=True))
     assert "backward:" not in plain

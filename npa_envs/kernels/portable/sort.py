@@ -18,7 +18,7 @@ from npa_envs.kernels.access import (
     make_wide_load,
     make_wide_store,
 )
-from npa_envs.kernels.cpu import PARTICLES, in_ranges
+from npa_envs.kernels.cpu import PARTICLES, WORLDS, in_ranges
 from npa_envs.kernels.domain import domain_types, kernel_module
 
 store_integer = make_wide_store(wp.int32, wp.int32)
@@ -141,10 +141,108 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
                 state = read_channels(states, state_dim, aligned, i, g * wp.static(width))
                 sorted_states[place * group_count + g] = state
 
+    @in_ranges(WORLDS)
+    @wp.kernel(enable_backward=False, module=module)
+    def sort_worlds(
+        range_start: wp.int32,
+        domain: Domain,
+        positions: wp.array(dtype=vector),
+        mask: wp.array(dtype=wp.uint8),
+        masked: wp.int32,
+        particle_count: wp.int32,
+        state_dim: wp.int32,
+        group_count: wp.int32,
+        aligned: wp.int32,
+        states: wp.array(dtype=scalar),
+        active_offset: wp.int32,
+        row_base: wp.int32,
+        row_capacity: wp.int32,
+        # outputs
+        cell: wp.array(dtype=wp.int32),
+        starts: wp.array(dtype=wp.int32),
+        source: wp.array(dtype=wp.int32),
+        sorted_cell: wp.array(dtype=wp.int32),
+        row_of: wp.array(dtype=wp.int32),
+        row_source: wp.array(dtype=wp.int32),
+        row_place: wp.array(dtype=wp.int32),
+        sorted_positions: wp.array(dtype=vector),
+        row_positions: wp.array(dtype=vector),
+        sorted_states: wp.array(dtype=group),
+    ):
+        """Sort a world in one thread: all of the three kernels above.
+
+        States and rows are left out where their arrays are empty.
+        """
+        world = range_start + wp.tid()
+        first = world * particle_count
+        end = first + particle_count
+        first_cell = world * domain.cell_count
+        end_cell = first_cell + domain.cell_count
+        first_row = row_base
+        if masked != 0:
+            for i in range(first):
+                first_row += wp.int32(mask[i])
+        for c in range(first_cell, end_cell):
+            starts[c] = 0
+            if masked != 0:
+                starts[active_offset + c] = 0
+        for i in range(first, end):
+            c = first_cell + cell_index(domain, cell_of(domain, positions[i]))
+            cell[i] = c
+            starts[c] = starts[c] + 1
+            if masked != 0:
+                starts[active_offset + c] = starts[active_offset + c] + wp.int32(mask[i])
+        place = first
+        row = first_row
+        for c in range(first_cell, end_cell):
+            count = starts[c]
+            starts[c] = place
+            place += count
+            if masked != 0:
+                count = starts[active_offset + c]
+                starts[active_offset + c] = row
+                row += count
+        if end == positions.shape[0]:
+            starts[starts.shape[0] - 1] = wp.where(masked != 0, row, place)
+
+        # Each start counts on as places are given, to the next cell's start.
+        for i in range(first, end):
+            c = cell[i]
+            place = starts[c]
+            starts[c] = place + 1
+            source[place] = i
+            sorted_cell[place] = c
+            sorted_positions[place] = positions[i]
+            row = place
+            if masked != 0:
+                row = starts[active_offset + c] - row_base
+                active = wp.int32(mask[i])
+                starts[active_offset + c] = row + row_base + active
+                row = wp.where(active != 0, row, row_capacity)
+            if row_of.shape[0] > 0:
+                row_of[i] = wp.where(row < row_capacity, row, wp.int32(-1))
+                if row < row_capacity:
+                    row_source[row] = i
+                    row_place[row] = place
+                    row_positions[row] = positions[i]
+            if sorted_states.shape[0] > 0:
+                for g in range(group_count):
+                    state = read_channels(states, state_dim, aligned, i, g * wp.static(width))
+                    sorted_states[place * group_count + g] = state
+        for back in range(end_cell - first_cell - 1):
+            c = end_cell - 1 - back
+            starts[c] = starts[c - 1]
+            if masked != 0:
+                starts[active_offset + c] = starts[active_offset + c - 1]
+        starts[first_cell] = first
+        if masked != 0:
+            starts[active_offset + first_cell] = first_row
+
     return SimpleNamespace(
         count_cells=count_cells,
         place_by_arrival=place_by_arrival,
         order_particles=order_particles,
+        sort_worlds=sort_worlds,
     )
 
 
