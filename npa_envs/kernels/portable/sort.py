@@ -169,7 +169,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
         row_positions: wp.array(dtype=vector),
         sorted_states: wp.array(dtype=group),
     ):
-        """Sort a world in one thread: all of the three kernels above.
+        """Sort a world by cell, then index, in one thread: all of the three kernels above.
 
         States and rows are left out where their arrays are empty.
         """
