@@ -23,6 +23,7 @@ from npa_envs.errors import NPAError
 _DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _NO_PERMISSION = {errno.EACCES, errno.EPERM, errno.EROFS}
 _NEARLY_FULL_BYTES = 64 * 1024
+_TOKEN_BYTES = 6
 
 
 def checked_path(path: str | Path) -> Path:
@@ -55,7 +56,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     given = checked_path(path)
     target = Path(os.path.realpath(given))
     _check_target(given, target)
-    temporary = target.with_name(f".{target.stem[:100]}.{secrets.token_hex(6)}.tmp{target.suffix}")
+    temporary = target.with_name(_temporary_name(target, secrets.token_hex(_TOKEN_BYTES)))
     try:
         # os.open keeps to the umask; the tempfile module would leave files only their owner reads.
         os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
@@ -78,6 +79,23 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def remove_unfinished(path: Path) -> None:
+    """Remove the temporary files that killed writes of a file have left beside it.
+
+    Args:
+        path: The file, which nobody may be writing now; its name may be a pattern of `Path.glob`.
+    """
+    pattern = _temporary_name(path, "[0-9a-f]" * 2 * _TOKEN_BYTES)
+    for left in path.parent.glob(pattern):
+        # One that cannot be removed takes up space, and nothing else.
+        with contextlib.suppress(OSError):
+            left.unlink()
+
+
+def _temporary_name(path: Path, token: str) -> str:
+    return f".{path.stem[:100]}.{token}.tmp{path.suffix}"
 
 
 def write_bytes(path: str | Path, data: bytes) -> None:

@@ -101,6 +101,11 @@ class TrainingCycle:
             "random_states": {name: g.get_state() for name, g in self.generators.items()},
         }
 
+    def state_like(self, iteration: int) -> dict[str, Any]:
+        """Return what `state_dict` has after so many iterations, with other numbers in it."""
+        optimiser = {"state": self.optimiser.moments_like()} if iteration > 0 else {"state": {}}
+        return self.state_dict() | {"optimiser": optimiser}
+
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from what `state_dict` returned; before the first iteration."""
         self.optimiser.load_state_dict(state["optimiser"])
@@ -435,9 +440,20 @@ class RuleOptimiser:
         """Return AdamW's moments and step counts, for a checkpoint."""
         return self._adamw.state_dict()
 
+    def moments_like(self) -> dict[int, dict[str, Tensor]]:
+        """Return moments and step counts as a first step makes them, by parameter; all are 0."""
+        twins = [nn.Parameter(torch.zeros_like(p)) for p in self._parameters]
+        for twin in twins:
+            twin.grad = torch.zeros_like(twin)
+        adamw = torch.optim.AdamW(twins)
+        adamw.step()
+        moments: dict[int, dict[str, Tensor]] = adamw.state_dict()["state"]
+        return moments
+
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from what `state_dict` returned."""
-        self._adamw.load_state_dict(state)
+        """Go on from the `state` of what `state_dict` returned; all else is the configuration's."""
+        groups = self._adamw.state_dict()["param_groups"]
+        self._adamw.load_state_dict({"state": state["state"], "param_groups": groups})
 
     def _fresh(self) -> torch.optim.AdamW:
         return torch.optim.AdamW(

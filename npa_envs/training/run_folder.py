@@ -6,17 +6,26 @@ import contextlib
 import json
 import os
 import shutil
+import socket
 import zipfile
+from collections.abc import Iterator, Mapping
 from io import FileIO
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from npa_envs.errors import MissingDependencyError, NPAError
-from npa_envs.files import atomic_path, write_bytes, write_text
+from npa_envs.files import atomic_path, remove_unfinished, write_text
+from npa_envs.tasks.checks import is_real, is_whole
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.overrides import config_to_dict
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 
 class RunFolder:
@@ -43,6 +52,9 @@ class RunFolder:
         """Pictures of a batch, named by iteration."""
         self.tensorboard = path / "tensorboard"
         """TensorBoard's events."""
+        self.lock = path / ".lock"
+        """Locked while a trainer writes to the folder; holds the trainer's process and computer."""
+        self._known: tuple[int, int] | None = None
 
     def prepare(self, byte_count: int) -> None:
         """Create the folder and see that a checkpoint can be written there.
@@ -69,14 +81,67 @@ class RunFolder:
                 f"of {str(self.path)!r} has {free / 2**20:.0f} MiB free: make room, choose another "
                 "folder, or lower pool_size"
             )
-        probe = self.path / ".probe"
-        write_bytes(probe, b"probe")
-        probe.unlink()
+
+    @contextlib.contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keep all other trainers from writing to the folder, within the block.
+
+        The system frees the lock of a process that ends in whatever way, so none is ever left
+        behind. Where the system or the file system has no such locks, nothing is locked.
+
+        Raises:
+            NPAError: Another trainer is writing to the folder, one has written to it since this one
+                read or wrote the checkpoint last, or the lock's file cannot be written.
+        """
+        try:
+            lock = self.lock.open("a+", encoding="utf-8", errors="replace")
+        except OSError as error:
+            raise NPAError(
+                f"out must be a folder that can be written to, got {str(self.path)!r} "
+                f"({error.strerror or error}): choose another one or mend its permissions"
+            ) from error
+        with lock:
+            if fcntl is not None:
+                try:
+                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    lock.seek(0)
+                    holder = lock.read(200).strip() or "another process"
+                    raise NPAError(
+                        f"out must be a folder that no other run writes to, but {holder} is "
+                        f"training in {str(self.path)!r}: let it end, stop it (it saves on "
+                        "SIGTERM), or choose another folder"
+                    ) from None
+                except OSError:
+                    pass  # The file system has no locks.
+            if self._known != _identity(self.checkpoint):
+                raise NPAError(
+                    f"out must be a folder that no other run writes to, but another one has "
+                    f"written {str(self.checkpoint)!r} meanwhile: resume it, or choose another "
+                    "folder"
+                )
+            with contextlib.suppress(OSError):  # A full disk; who reads it can do without.
+                lock.truncate(0)
+                lock.write(f"process {os.getpid()} on {socket.gethostname()}")
+                lock.flush()
+            yield
+
+    def note_checkpoint(self) -> None:
+        """Take down which checkpoint lies here now: that which was just read or written, or none.
+
+        The next `locked` refuses where it is another one.
+        """
+        self._known = _identity(self.checkpoint)
+
+    def tidy(self) -> None:
+        """Remove what killed writes of a run's files have left behind."""
+        own = [self.checkpoint, self.rule, self.log, self.config, self.diagnosis]
+        own += [self.rule_of("*"), self.pictures / "[0-9]*.png"]
+        for path in own:
+            remove_unfinished(path)
 
     def clear(self) -> None:
         """Remove an earlier run's files, and nothing else that may lie in the folder."""
-        for path in (self.checkpoint, self.rule, self.log, self.config, self.diagnosis):
-            path.unlink(missing_ok=True)
         patterns = (
             "rule-[0-9]*.safetensors",
             "pictures/[0-9]*.png",
@@ -85,14 +150,27 @@ class RunFolder:
         for pattern in patterns:
             for path in self.path.glob(pattern):
                 path.unlink()
+        # The checkpoint last but one: whenever this is killed, there is either a run that can be
+        # resumed or none at all.
+        for path in (self.log, self.rule, self.diagnosis, self.checkpoint, self.config):
+            path.unlink(missing_ok=True)
 
-    def rule_of(self, species: int) -> Path:
+    def rule_of(self, species: int | str) -> Path:
         """Return the path of the rule of a species, of a run that trains several together."""
         return self.path / f"rule-{species}.safetensors"
 
     def picture(self, iteration: int) -> Path:
         """Return the path of the picture of an iteration."""
         return self.pictures / f"{iteration:06d}.png"
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    """Return what tells a file from the one that replaces it, or None where there is none."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_ino, status.st_mtime_ns
 
 
 class JsonlLog:
@@ -141,7 +219,7 @@ class JsonlLog:
             iteration: The checkpoint's: lines up to it stay.
 
         Raises:
-            NPAError: The file cannot be read or written.
+            NPAError: The file cannot be read or written, or a line of it is damaged.
         """
         write_text(self.path, "".join(json.dumps(r) + "\n" for r in self.records(iteration)))
 
@@ -149,26 +227,44 @@ class JsonlLog:
         """Return the lines read back, up to an iteration if one is given.
 
         Raises:
-            NPAError: The file cannot be read.
+            NPAError: The file cannot be read; or a line of it is damaged, other than a last one
+                that has no end because a kill cut it short.
         """
         if not self.path.exists():
             return []
         try:
-            lines = self.path.read_text(encoding="utf-8", errors="replace").splitlines()
+            lines = self.path.read_text(encoding="utf-8", errors="replace").split("\n")
         except OSError as error:
             raise NPAError(f"cannot read the log {str(self.path)!r}: {error}") from error
+        # What stands behind the last end of a line was cut short; mostly nothing does.
+        if _parsed_record(lines[-1]) is None:
+            lines.pop()
         records: list[dict[str, Any]] = []
-        for line in lines:
-            try:
-                record = json.loads(line)
-            except json.JSONDecodeError:
-                break
-            if not isinstance(record, dict) or "iteration" not in record:
-                break
+        for number, line in enumerate(lines, start=1):
+            record = _parsed_record(line)
+            last = records[-1]["iteration"] if records else -1
+            if record is None or record["iteration"] <= last:
+                raise NPAError(
+                    f"the log {str(self.path)!r} must hold one JSON object of numbers a line, with "
+                    f"growing iterations, but line {number} is {line[:60]!r}: mend that line, or "
+                    "move the file away to go on without it"
+                )
             if iteration is not None and record["iteration"] > iteration:
                 break
             records.append(record)
         return records
+
+
+def _parsed_record(line: str) -> dict[str, Any] | None:
+    """Return a line of a log as `JsonlLog.append` was given it, or None where it is damaged."""
+    try:
+        record = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    if not isinstance(record, dict) or not is_whole(record.get("iteration")):
+        return None
+    sound = all(isinstance(value, str) or is_real(value) for value in record.values())
+    return record if sound else None
 
 
 def open_tensorboard(folder: RunFolder, iteration: int) -> Any:
@@ -217,25 +313,24 @@ MAY_DIFFER = frozenset(
 )
 """Fields that a resumed run may set anew: they do not change what is learned, only how long."""
 
-NEEDED: dict[str, tuple[type, ...]] = {
-    "task_name": (str,),
-    "config": (dict,),
-    "iteration": (int,),
-    "seconds": (int, float),
-    "rule": (dict,),
-    "optimiser": (dict,),
-    "pool": (dict,),
-    "meter": (dict,),
-    "random_states": (dict,),
+NEEDED: dict[str, type] = {
+    "task_name": str,
+    "config": dict,
+    "iteration": int,
+    "seconds": float,
+    "rule": dict,
+    "optimiser": dict,
+    "pool": dict,
+    "meter": dict,
+    "random_states": dict,
 }
 """What a run is resumed from, and of what types it is."""
 
-NEEDED_WITHIN = {
-    "config": {"task"},
-    "pool": {"x", "s"},
-    "random_states": {"schedule", "worlds", "masks"},
+NOT_NEGATIVE = {
+    *("iteration", "seconds", "replaced", "count", "step_sum", "goal"),
+    *("step", "exp_avg_sq"),  # AdamW's
 }
-"""What some of it must hold in turn."""
+"""Names of numbers and tensors in a checkpoint that are at least 0."""
 
 
 def save_checkpoint(path: Path, content: dict[str, Any]) -> None:
@@ -290,6 +385,9 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     try:
         # Torch does not look at the checksums.
         with zipfile.ZipFile(path) as archive:
+            # As torch writes them; others could be of any size once they are unpacked.
+            if any(part.compress_type != zipfile.ZIP_STORED for part in archive.infolist()):
+                raise zipfile.BadZipFile("compressed")
             bad = archive.testzip()
         if bad is not None:
             raise zipfile.BadZipFile(f"wrong checksum of {bad!r}")
@@ -347,19 +445,90 @@ def check_same_run(
         )
 
 
-def _check_complete(content: dict[str, Any], path: Path) -> None:
-    wrong = [name for name, kinds in NEEDED.items() if not isinstance(content.get(name), kinds)]
-    for outer, names in NEEDED_WITHIN.items():
-        if outer not in wrong:
-            wrong += [f"{outer}.{name}" for name in sorted(names - content[outer].keys())]
-    if not wrong and not isinstance(content["config"]["task"], dict):
-        wrong = ["config.task"]
+def check_content(content: dict[str, Any], expected: Mapping[str, Any], path: Path) -> None:
+    """Check that what a run goes on from is of the kind that the run itself has.
+
+    Args:
+        content: The checkpoint.
+        expected: The same of the run as it is, by the same names: dicts have the same keys, tensors
+            the same shapes and dtypes, others the same types.
+        path: The checkpoint's, for the error.
+
+    Raises:
+        NPAError: Something is of another type, shape or dtype, not finite, or negative where that
+            makes no sense.
+    """
+    wrong = [
+        what for name, like in expected.items() for what in _wrong(name, content.get(name), like)
+    ]
     if wrong:
-        raise NPAError(
-            f"the checkpoint {str(path)!r} must hold all that a run needs to go on, but lacks "
-            f"{', '.join(wrong)} or has it of a wrong type: start a new run with overwrite, or put "
-            "a copy of it in its place"
-        )
+        shown = "; ".join(wrong[:3]) + ("; ..." if len(wrong) > 3 else "")
+        raise unusable_checkpoint(path, shown)
+
+
+def unusable_checkpoint(path: Path, reason: str) -> NPAError:
+    """Return the error about a checkpoint that a run cannot go on from."""
+    return NPAError(
+        f"the checkpoint {str(path)!r} must hold all that a run needs to go on, but {reason}: "
+        "start a new run with overwrite, or put a copy of it in its place"
+    )
+
+
+def _wrong(name: str, value: Any, like: Any) -> Iterator[str]:
+    """Yield what is wrong with a value of a checkpoint, with its name."""
+    if isinstance(like, Mapping):
+        if not isinstance(value, Mapping) or value.keys() != like.keys():
+            names = ", ".join(map(str, like)) or "nothing"
+            yield f"{name} must be a dict of {names}"
+            return
+        for key in like:
+            yield from _wrong(f"{name}.{key}", value[key], like[key])
+    elif isinstance(like, Tensor):
+        if not isinstance(value, Tensor) or _kind(value) != _kind(like):
+            came = f"of {_kind(value)}" if isinstance(value, Tensor) else type(value).__name__
+            yield f"{name} must be a tensor of {_kind(like)}, got {came}"
+        elif not bool(torch.isfinite(value).all()):
+            yield f"{name} must be finite"
+        elif name.rpartition(".")[2] in NOT_NEGATIVE and bool((value < 0).any()):
+            yield f"{name} must not be negative"
+    elif isinstance(like, int | float):
+        right = is_whole(value) if isinstance(like, int) else is_real(value)
+        if not right or value < 0:
+            kind = "whole" if isinstance(like, int) else "finite"
+            yield f"{name} must be a {kind} number of at least 0, got {str(value)[:40]}"
+
+
+def _kind(tensor: Tensor) -> str:
+    usual = tensor.layout == torch.strided and not tensor.is_meta
+    return f"{'' if usual else 'odd '}{str(tensor.dtype)[6:]} {tuple(tensor.shape)}"
+
+
+def _check_complete(content: dict[str, Any], path: Path) -> None:
+    """Check what has to be known before the run itself is made."""
+    needed = [(name, content.get(name), kind) for name, kind in NEEDED.items()]
+    if isinstance(content.get("config"), dict):
+        needed.append(("config.task", content["config"].get("task"), dict))
+    # A whole number of seconds is a number too.
+    wrong = [
+        name
+        for name, value, kind in needed
+        if not isinstance(value, (int, float) if kind is float else kind)
+    ]
+    if not wrong and not _is_plain(content["config"]):
+        wrong = ["config"]
+    if wrong:
+        raise unusable_checkpoint(path, f"lacks {', '.join(wrong)} or has it of a wrong type")
+    numbers = {name: kind() for name, kind in NEEDED.items() if kind in (int, float)}
+    check_content(content, numbers, path)
+
+
+def _is_plain(value: Any) -> bool:
+    """Return whether a value is what JSON has, as configurations in checkpoints are."""
+    if isinstance(value, dict):
+        return all(isinstance(key, str) and _is_plain(inner) for key, inner in value.items())
+    if isinstance(value, list):
+        return all(map(_is_plain, value))
+    return value is None or isinstance(value, str | int | float)
 
 
 def _flat(config: dict[str, Any]) -> dict[str, Any]:

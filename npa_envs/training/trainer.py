@@ -36,10 +36,12 @@ from npa_envs.training.overrides import config_to_dict
 from npa_envs.training.run_folder import (
     JsonlLog,
     RunFolder,
+    check_content,
     check_same_run,
     load_checkpoint,
     open_tensorboard,
     save_checkpoint,
+    unusable_checkpoint,
 )
 
 
@@ -79,7 +81,8 @@ class Trainer:
 
     Raises:
         NPAError: There is no such device; the folder cannot be written to, holds a run already
-            (without `resume` or `overwrite`), or holds one of another task or configuration.
+            (without `resume` or `overwrite`), holds one of another task or configuration or a
+            damaged one, or another trainer is writing to it.
     """
 
     def __init__(
@@ -115,15 +118,18 @@ class Trainer:
         self.pool = self._cycle.pool
         rule_bytes = sum(p.nbytes for p in self.rule.parameters())
         self.folder.prepare(self.pool.x.nbytes + self.pool.s.nbytes + 16 * rule_bytes)
-        if content is not None:
-            self._restore(content)
-        else:
-            if overwrite:
+        with self.folder.locked():
+            self.folder.tidy()
+            if content is not None:
+                self._restore(content)
+            elif overwrite:
                 self.folder.clear()
-            # From the start, so that a run killed early can be resumed, and a disk that is too
-            # full is noticed now.
-            self.save()
-        write_text(self.folder.config, json.dumps(config_to_dict(config), indent=2) + "\n")
+            # Before the first checkpoint, which cannot be resumed without it.
+            write_text(self.folder.config, json.dumps(config_to_dict(config), indent=2) + "\n")
+            if content is None:
+                # From the start, so that a run killed early can be resumed, and a disk that is too
+                # full is noticed now.
+                self.save()
 
     def run(self, *, progress: bool = True, max_seconds: float | None = None) -> TrainResult:
         """Train until the end, or until Ctrl-C, SIGTERM or `max_seconds`; then save.
@@ -134,8 +140,13 @@ class Trainer:
 
         Raises:
             DivergedError: The loss is not finite.
-            NPAError: A file cannot be written; the last checkpoint is intact.
+            NPAError: A file cannot be written; the last checkpoint is intact. Or another trainer
+                writes to the folder, or has done so since this one was made.
         """
+        with self.folder.locked():
+            return self._run(progress, max_seconds)
+
+    def _run(self, progress: bool, max_seconds: float | None) -> TrainResult:
         config, total = self.config, self.config.total_iterations
         start = self._started = time.perf_counter()
         self._record = next(iter(self._log.records()[-1:]), {})
@@ -157,7 +168,7 @@ class Trainer:
                     if self._due(config.checkpoint_interval) and self.iteration < total:
                         self.save()
                     bar.update()
-                    if self._record:
+                    if "loss" in self._record:
                         bar.set_postfix(loss=f"{self._record['loss']:.4g}", refresh=False)
                 self.save()
         finally:
@@ -191,6 +202,7 @@ class Trainer:
         content: dict[str, Any] = {"iteration": self.iteration, "seconds": self._seconds()}
         content |= {"rule": self.rule.state_dict(), **self._cycle.state_dict()}
         save_checkpoint(self.folder.checkpoint, self._origin() | content)
+        self.folder.note_checkpoint()
         # A rule is passed on: where and on what it was trained is nobody's business.
         told = config_to_dict(self.config)
         told = {name: told[name] for name in told if name not in ("out", "device", "initial_rule")}
@@ -271,6 +283,11 @@ class Trainer:
 
     def _open_folder(self, *, resume: bool, overwrite: bool) -> dict[str, Any] | None:
         path = self.folder.checkpoint
+        self.folder.note_checkpoint()
+        if path.exists():
+            # A run that goes on is told of before anything is made.
+            with self.folder.locked():
+                pass
         if resume:
             content = load_checkpoint(path)
             check_same_run(content, self.task_name, self.config, path)
@@ -283,10 +300,19 @@ class Trainer:
         return None
 
     def _restore(self, content: dict[str, Any]) -> None:
+        path = self.folder.checkpoint
         self.iteration = content["iteration"]
+        expected = {"rule": self.rule.state_dict(), **self._cycle.state_like(self.iteration)}
+        # AdamW's groups are the configuration's, and not read.
+        read = content | {"optimiser": {"state": content["optimiser"].get("state")}}
+        check_content(read, expected, path)
         self._seconds_before = content["seconds"]
         self.rule.load_state_dict(content["rule"])
-        self._cycle.load_state_dict(content)
+        try:
+            self._cycle.load_state_dict(content)
+        except RuntimeError as error:
+            # Only a generator itself knows whether a state is one of its own.
+            raise unusable_checkpoint(path, f"random_states cannot be used ({error})") from error
         self._log.truncate(self.iteration)
 
 
