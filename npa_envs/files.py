@@ -1,8 +1,9 @@
-"""Files that are written whole or not at all.
+"""Files that are written whole or not at all, and guards for what is read.
 
 Whatever is written goes to a temporary file in the same folder first and is renamed over its
 destination once it is complete and on the disk: a killed program, a full disk, or an error
-half-way leaves the file that was there before.
+half-way leaves the file that was there before. Only regular files are read, of a limited size:
+a pipe or a device would block for ever, and a small file may ask for gigabytes.
 """
 
 from __future__ import annotations
@@ -14,27 +15,172 @@ import math
 import os
 import secrets
 import shutil
+import stat
+import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, shown
 
 _DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _NO_PERMISSION = {errno.EACCES, errno.EPERM, errno.EROFS}
 _NEARLY_FULL_BYTES = 64 * 1024
 _TOKEN_BYTES = 6
+_MIB = 2**20
 
 
 def checked_path(path: str | Path) -> Path:
     """Return a path as pathlib's own.
 
     Raises:
-        NPAError: It is neither text nor a path.
+        NPAError: It is neither text nor a path, or the system cannot write it, as it holds a zero
+            byte.
     """
     if not isinstance(path, str | os.PathLike):
-        raise NPAError(f"a path must be text or a pathlib.Path, got {path!r}")
+        raise NPAError(f"a path must be text or a pathlib.Path, got {shown(path)}")
+    try:
+        encoded = os.fsencode(path)
+    except UnicodeEncodeError:
+        encoded = b"\0"
+    if b"\0" in encoded:
+        raise NPAError(f"a path must hold no characters that none may, got {shown(str(path))}")
     return Path(path)
+
+
+def home_path(path: str | Path) -> Path:
+    """Return a path in which a `~` at the beginning is the user's home.
+
+    Raises:
+        NPAError: As for `checked_path`.
+    """
+    return Path(os.path.expanduser(checked_path(path)))
+
+
+def open_regular(path: str | Path, *, limit: int, what: str = "the file") -> IO[bytes]:
+    """Open a regular file to read its bytes; pipes, devices and folders are refused.
+
+    Args:
+        path: The file.
+        limit: Its largest size [bytes].
+        what: What errors call it.
+
+    Raises:
+        NPAError: There is no such file, it may not be read, is no regular one or larger than that.
+    """
+    path = checked_path(path)
+    try:
+        # Opening a pipe that nobody writes to would block without this flag.
+        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
+    except OSError as error:
+        raise NPAError(_unreadable(f"{what} {shown(str(path))}", error)) from error
+    found = os.fstat(descriptor)
+    rule = ""
+    if not stat.S_ISREG(found.st_mode):
+        kind = "folder" if stat.S_ISDIR(found.st_mode) else "pipe or a device"
+        rule = f"is a {kind}, not a regular file: give the path of a file"
+    elif found.st_size > limit:
+        rule = f"must have at most {limit / _MIB:.0f} MiB, got {found.st_size / _MIB:.0f} MiB"
+    if rule:
+        os.close(descriptor)
+        raise NPAError(f"{what} {shown(str(path))} {rule}")
+    return os.fdopen(descriptor, "rb")
+
+
+def check_regular(path: str | Path, *, limit: int, what: str = "the file") -> None:
+    """Check a file that a library reads by its path, as `open_regular` does.
+
+    Raises:
+        NPAError: As there.
+    """
+    open_regular(path, limit=limit, what=what).close()
+
+
+def read_bytes(path: str | Path, *, limit: int, what: str = "the file") -> bytes:
+    """Return the content of a regular file.
+
+    Args:
+        path: The file.
+        limit: Its largest size [bytes].
+        what: What errors call it.
+
+    Raises:
+        NPAError: As for `open_regular`.
+    """
+    with open_regular(path, limit=limit, what=what) as file:
+        try:
+            # Some files of the system have more in them than they say.
+            return file.read(limit)
+        except OSError as error:
+            raise NPAError(_unreadable(f"{what} {shown(str(path))}", error)) from error
+
+
+def parse_json(text: str | bytes) -> Any:
+    """Return the value of a JSON text.
+
+    Raises:
+        NPAError: It is none, is nested too deeply, or has numbers of thousands of digits.
+    """
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise NPAError(f"this is no JSON text, or a truncated one ({shown(error)})") from error
+
+
+def read_json(path: str | Path, *, limit: int = 16 * _MIB) -> Any:
+    """Return the value of a JSON file.
+
+    Args:
+        path: The file.
+        limit: Its largest size [bytes].
+
+    Raises:
+        NPAError: As for `open_regular` and `parse_json`.
+    """
+    return parse_json(read_bytes(path, limit=limit))
+
+
+def check_torch_archive(file: IO[bytes], *, checksums: bool = True) -> None:
+    """Check the archive that `torch.save` writes before anything of it is unpacked.
+
+    Torch neither compresses nor shares entries: an archive whose entries declare more than the file
+    holds would take more memory than it is worth.
+
+    Args:
+        file: It, open; where it stands afterwards is not said.
+        checksums: Whether to compare those too, which torch does not look at.
+
+    Raises:
+        NPAError: It is no archive, is damaged, or declares more than it holds.
+    """
+    try:
+        held = file.seek(0, os.SEEK_END)
+        with zipfile.ZipFile(file) as archive:
+            entries = archive.infolist()
+            plain = all(entry.compress_type == zipfile.ZIP_STORED for entry in entries)
+            declared = sum(entry.file_size for entry in entries)
+            bad = archive.testzip() if checksums and plain and declared <= held else None
+    except Exception as error:
+        # What zipfile raises depends on where the damage lies.
+        raise NPAError(
+            f"the file is damaged or truncated ({type(error).__name__}): fetch or save it again"
+        ) from error
+    if not plain or declared > held:
+        raise NPAError(
+            f"the file must not be compressed, but {declared} bytes are declared in a file of "
+            f"{held}: save it with torch.save"
+        )
+    if bad is not None:
+        raise NPAError(
+            f"the file is damaged (wrong checksum of {shown(bad)}): fetch or save it again"
+        )
+
+
+def _unreadable(what: str, error: OSError) -> str:
+    if error.errno == errno.ENOENT:
+        return f"{what} does not exist: check the path"
+    cure = "its permissions" if error.errno in _NO_PERMISSION else "the path"
+    return f"{what} cannot be read ({error.strerror or type(error).__name__}): check {cure}"
 
 
 @contextlib.contextmanager

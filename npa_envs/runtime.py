@@ -4,19 +4,42 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import json
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
 import warp as wp
 
+from npa_envs.errors import NPAError, shown
+
+_BROKEN_CACHE = ("Failed to load CPU", "Failed to load CUDA")
+"""How what Warp says about object files that it cannot load begins."""
+
 
 @contextlib.contextmanager
 def quiet_warp() -> Iterator[None]:
-    """Keep Warp's banner and its notes on loading modules out of the caller's output."""
+    """Keep Warp's banner and its notes on loading modules out of the caller's output.
+
+    Raises:
+        NPAError: The block started Warp or loaded kernels, and its cache of compiled kernels is
+            damaged or cannot be written to.
+    """
     level = wp.config.log_level
     wp.config.log_level = max(level, wp.LOG_WARNING)
     try:
         yield
+    except Exception as error:
+        # Its descriptions of object files are JSON.
+        of_cache = isinstance(error, OSError | json.JSONDecodeError)
+        if not of_cache and not str(error).startswith(_BROKEN_CACHE):
+            raise
+        folder = wp.config.kernel_cache_dir or os.environ.get("WARP_CACHE_PATH", "Warp's cache")
+        raise NPAError(
+            "Warp's cache of compiled kernels must be a folder that can be written to, and whole, "
+            f"but {shown(str(folder))} cannot be used ({shown(error)}): remove it, and kernels are "
+            "compiled anew, or set WARP_CACHE_PATH to another folder"
+        ) from error
     finally:
         wp.config.log_level = level
 

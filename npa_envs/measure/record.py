@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import argparse
 import importlib.metadata
-import json
 import math
+import os
 import platform
 import subprocess
 import sys
@@ -21,13 +21,16 @@ from typing import Any, TypeVar
 
 import torch
 
-from npa_envs.errors import NPAError
-from npa_envs.files import json_text, plain_numbers, write_text
+from npa_envs.errors import NPAError, shown
+from npa_envs.files import json_text, plain_numbers, read_json, write_text
 
 LIBRARIES = ("npa-envs", "torch", "warp-lang", "numpy", "scipy", "warpSPHCore")
 """Distributions whose versions are recorded."""
 
 Kept = TypeVar("Kept")
+
+LARGEST_RECORD = 64 * 2**20
+"""Bytes of a record, at most."""
 
 
 def write_record(path: Path, content: Any) -> None:
@@ -61,23 +64,24 @@ def read_record(
     Raises:
         NPAError: The file is no such record, or its figures follow from something else.
     """
-    if not path.exists():
+    if not os.path.exists(path):
         return None
     cure = f"remove it, or choose another folder with {option}"
     try:
-        held = json.loads(path.read_text("utf-8"))
+        held = read_json(path, limit=LARGEST_RECORD)
         before = dict(held[key])
         record = make(held)
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise NPAError(
             f"{str(path)!r} must hold a record of npa-envs {command}, but cannot be read "
-            f"({error}): {cure}"
+            f"({shown(error)}): {cure}"
         ) from error
     for name, value in plain_numbers(facts).items():
         if before.get(name) != value:
             raise NPAError(
-                f"{str(path)!r} holds figures of other settings: {name} was {before.get(name)!r}, "
-                f"now {value!r}: {cure}"
+                f"{str(path)!r} holds figures of other settings: {name} was "
+                f"{shown(before.get(name))}, "
+                f"now {shown(value)}: {cure}"
             )
     return record
 

@@ -18,11 +18,10 @@ import hashlib
 import io
 import json
 import math
+import os
 import pickle
-import reprlib
 import struct
 import warnings
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,8 +33,15 @@ from safetensors.torch import save as serialise
 from torch import Tensor
 
 from npa_envs.devices import check_device
-from npa_envs.errors import NPAError, suggest
-from npa_envs.files import checked_path, write_bytes
+from npa_envs.errors import NPAError, shown, suggest
+from npa_envs.files import (
+    check_regular,
+    check_torch_archive,
+    checked_path,
+    parse_json,
+    read_bytes,
+    write_bytes,
+)
 from npa_envs.rule.rule import NPARule, RuleHyperParameters, check_rule
 
 FORMAT_NAME = "npa-envs rule"
@@ -46,6 +52,8 @@ _FIELDS = {
 }
 _RESERVED = {"format", "version", "checksum", *_FIELDS}
 _SUFFIXES = (".safetensors", ".pth", ".pt", ".json")
+_LARGEST_FILE = 64 * 2**20
+"""Bytes that a rule's file has at most; the largest rule that is shipped has 0.1 MiB."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +78,7 @@ def shipped_rules(task: str | None = None) -> dict[str, Path]:
     folder = Path(__file__).resolve().parent / "shipped"
     rules = {path.stem: path for path in sorted(folder.glob("*.safetensors"))}
     if not isinstance(task, str | None):
-        raise NPAError(f"task must be the name of one, got {task!r}: for example 'texture'")
+        raise NPAError(f"task must be the name of one, got {shown(task)}: for example 'texture'")
     if task is None:
         return rules
     return {name: path for name, path in rules.items() if rule_metadata(path).get("task") == task}
@@ -101,17 +109,17 @@ def load_rule(source: str | Path, *, device: str | torch.device = "cpu") -> NPAR
         if path.suffix == ".safetensors":
             parts = _read_ours(path)
         elif path.suffix == ".json":
-            parts = read_demo_json(_read_file(path), name)
+            parts = read_demo_json(read_bytes(path, limit=_LARGEST_FILE), name)
         else:
-            parts = read_state_dict(_read_file(path))
+            parts = read_state_dict(read_bytes(path, limit=_LARGEST_FILE))
         rule = _assemble(parts)
         if parts.header is not None:
             _verify(parts.header, parts.weights)
     except NPAError as error:
-        raise NPAError(f"cannot load a rule from {str(source)!r}: {error}") from error
+        raise NPAError(f"cannot load a rule from {shown(str(source))}: {error}") from error
     if parts.header is not None and "checksum" not in parts.header:
         warnings.warn(
-            f"the rule's file {str(path)!r} has no checksum, so that damage cannot be told: if it "
+            f"the rule's file {shown(str(path))} has no checksum, so that damage cannot be told: if it "
             "is known to be good, save it again with npa_envs.save_rule",
             stacklevel=2,
         )
@@ -138,8 +146,8 @@ def save_rule(
     path = checked_path(path)
     if path.suffix != ".safetensors":
         raise NPAError(
-            f"a rule's file must end in .safetensors, got {str(path)!r}: "
-            f"use {str(path.with_suffix('.safetensors'))!r}"
+            f"a rule's file must end in .safetensors, got {shown(str(path))}: "
+            f"use {shown(str(path.with_suffix('.safetensors')))}"
         )
     header = {"format": FORMAT_NAME, "version": str(FORMAT_VERSION)}
     header |= {name: json.dumps(value) for name, value in rule.hyper_parameters().items()}
@@ -151,10 +159,12 @@ def save_rule(
     for name, text in (metadata or {}).items():
         if not isinstance(name, str) or not isinstance(text, str):
             raise NPAError(
-                f"metadata must map text to text, got {name!r}: {text!r}: use str({text!r})"
+                f"metadata must map text to text, got {shown(name)}: {shown(text)}: use str()"
             )
         if name in _RESERVED:
-            raise NPAError(f"metadata must not use the name {name!r}: the format holds it itself")
+            raise NPAError(
+                f"metadata must not use the name {shown(name)}: the format holds it itself"
+            )
         header[name] = text
     weights = {k: v.detach().cpu().contiguous() for k, v in rule.state_dict().items()}
     _check_finite(weights)
@@ -188,7 +198,7 @@ def rule_metadata(path: str | Path) -> dict[str, str]:
     try:
         return _read_header(checked_path(path))
     except NPAError as error:
-        raise NPAError(f"cannot read the header of {str(path)!r}: {error}") from error
+        raise NPAError(f"cannot read the header of {shown(str(path))}: {error}") from error
 
 
 def _locate(source: str | Path) -> tuple[Path, str | None]:
@@ -207,50 +217,31 @@ def _locate(source: str | Path) -> tuple[Path, str | None]:
     path, inner = (Path(base), name) if mark and base.endswith(".json") else (Path(text), None)
     if path.suffix in _SUFFIXES:
         return path, inner
-    try:
-        exists = path.exists()
-    except (OSError, ValueError) as error:
-        raise NPAError(
-            "source must be the name of a shipped rule or the path of a file that ends in "
-            f"{suffixes}, got {reprlib.repr(text)}, which cannot be a path "
-            f"({_reason(error)}): names: {', '.join(known)}"
-        ) from error
-    if exists:
-        raise NPAError(f"a rule's file must end in {suffixes}, got {text!r}: rename it")
+    if os.path.exists(path):
+        raise NPAError(f"a rule's file must end in {suffixes}, got {shown(text)}: rename it")
     raise NPAError(
-        f"unknown rule {text!r}: {suggest(text, known)}; or give the path of a file that ends in "
-        f"{suffixes}"
+        f"unknown rule {shown(text)}: {suggest(text, known)}; or give the path of a "
+        f"file that ends in {suffixes}"
     )
 
 
-def _read_file(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except (OSError, ValueError) as error:
-        raise NPAError(f"the file cannot be read ({_reason(error)}): check the path") from error
-
-
-def _reason(error: OSError | ValueError) -> str:
-    """Return the system's words without the path, or Python's for a path with a zero byte."""
-    return (isinstance(error, OSError) and error.strerror) or str(error)
-
-
 def _read_header(path: Path) -> dict[str, str]:
+    check_regular(path, limit=_LARGEST_FILE)
     try:
         with safe_open(path, framework="pt") as file:
             header: dict[str, str] = file.metadata() or {}
-    except (OSError, ValueError) as error:
-        raise NPAError(f"the file cannot be read ({_reason(error)}): check the path") from error
-    except SafetensorError as error:
-        raise NPAError(f"this is no safetensors file, or a truncated one ({error})") from error
+    except (OSError, ValueError, SafetensorError) as error:
+        raise NPAError(
+            f"this is no safetensors file, or a truncated one ({shown(error)})"
+        ) from error
     if header.get("format") != FORMAT_NAME:
         raise NPAError(
-            f"the metadata's format must be {FORMAT_NAME!r}, got {header.get('format')!r}: "
+            f"the metadata's format must be {FORMAT_NAME!r}, got {shown(header.get('format'))}: "
             "this safetensors file was not written by npa_envs.save_rule"
         )
     if header.get("version") != str(FORMAT_VERSION):
         raise NPAError(
-            f"the metadata's version must be {FORMAT_VERSION}, got {header.get('version')!r}: "
+            f"the metadata's version must be {FORMAT_VERSION}, got {shown(header.get('version'))}: "
             "upgrade with pip install -U npa-envs"
         )
     return header
@@ -267,7 +258,7 @@ def _read_ours(path: Path) -> RuleParts:
         with safe_open(path, framework="pt") as file:
             weights = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
     except (OSError, SafetensorError) as error:
-        raise NPAError(f"the weights cannot be read ({error})") from error
+        raise NPAError(f"the weights cannot be read ({shown(error)})") from error
     return RuleParts(hyper_parameters, weights, header)
 
 
@@ -294,14 +285,14 @@ def _parse(header: Mapping[str, str], name: str, kind: type) -> Any:
     if name not in header:
         raise NPAError(f"the metadata lacks {name!r}: save the rule again with npa_envs.save_rule")
     try:
-        value = json.loads(header[name])
+        value = parse_json(header[name])
         if kind is float and type(value) is int:
             value = float(value)
-    except (ValueError, OverflowError, RecursionError):
+    except (NPAError, OverflowError):
         value = None
     if type(value) is not kind:
         raise NPAError(
-            f"the metadata's {name!r} must be a JSON {kind.__name__}, got {header[name]!r}"
+            f"the metadata's {name!r} must be a JSON {kind.__name__}, got {shown(header[name])}"
         )
     return value
 
@@ -312,7 +303,9 @@ def _assemble(parts: RuleParts) -> NPARule:
         with torch.device("meta"):
             rule = NPARule(**parts.hyper_parameters)
     except (RuntimeError, TypeError, OverflowError) as error:
-        raise NPAError(f"no rule has the hyper-parameters {parts.hyper_parameters}") from error
+        raise NPAError(
+            f"no rule has the hyper-parameters {shown(parts.hyper_parameters)}"
+        ) from error
     expected = {name: tuple(tensor.shape) for name, tensor in rule.state_dict().items()}
     got = {name: tuple(tensor.shape) for name, tensor in parts.weights.items()}
     if got != expected:
@@ -321,7 +314,7 @@ def _assemble(parts: RuleParts) -> NPARule:
             for name in expected.keys() | got.keys()
             if expected.get(name) != got.get(name)
         )
-        raise NPAError(f"the weights must have the hyper-parameters' shapes, got {wrong}")
+        raise NPAError(f"the weights must have the hyper-parameters' shapes, got {shown(wrong)}")
     dtypes = {tensor.dtype for tensor in parts.weights.values()}
     if len(dtypes) != 1 or not dtypes <= {torch.float32, torch.float64}:
         raise NPAError(
@@ -338,8 +331,9 @@ def _check_finite(weights: Mapping[str, Tensor]) -> None:
         bad = int((~torch.isfinite(tensor)).sum())
         if bad:
             raise NPAError(
-                f"the weights must be finite, got {bad} of {tensor.numel()} numbers in {name!r} "
-                "NaN or infinite: take an earlier checkpoint, or train with a lower learning rate"
+                f"the weights must be finite, got {bad} of {tensor.numel()} numbers in "
+                f"{shown(name)} NaN or infinite: take an earlier checkpoint, or train with a lower "
+                "learning rate"
             )
 
 
@@ -383,7 +377,7 @@ def read_state_dict(data: bytes) -> RuleParts:
         raise NPAError(
             f"the state dict must hold {sorted(required)} and, with a read-out, "
             f"{sorted(_DECODER_NAMES)}; missing: {sorted(missing)}, unknown: "
-            f"{sorted(map(str, unknown))}"
+            f"{shown(sorted(map(str, unknown)))}"
         )
     weights = {}
     for theirs, ours in _WEIGHT_NAMES.items():
@@ -418,18 +412,17 @@ def read_demo_json(data: bytes, name: str | None) -> RuleParts:
     Raises:
         NPAError: This is not such a file, or it has no rule of that name.
     """
-    try:
-        collection = json.loads(data)
-    except (ValueError, RecursionError) as error:
-        raise NPAError(f"this is no JSON file, or a truncated one ({error})") from error
+    collection = parse_json(data)
     names = sorted(collection) if isinstance(collection, dict) else []
     if not names or not all(isinstance(collection[known], dict) for known in names):
         raise NPAError("the JSON file must map names to rules, as the authors' web demo has them")
     if name is None and len(names) > 1:
-        raise NPAError(f"the file holds several rules: add #name; names: {', '.join(names)}")
+        raise NPAError(
+            f"the file holds several rules: add #name; names: {shown(', '.join(names))[1:-1]}"
+        )
     name = names[0] if name is None else name
     if name not in collection:
-        raise NPAError(f"the file holds no rule {name!r}: {suggest(name, names)}")
+        raise NPAError(f"the file holds no rule {shown(name)}: {suggest(name, names)}")
     entry = collection[name]
     first = _decode(entry, "w1.weight", 2)
     bias = _decode(entry, "w1.bias", 1)
@@ -464,7 +457,7 @@ def read_demo_json(data: bytes, name: str | None) -> RuleParts:
 def _unpickle(data: bytes) -> Mapping[Any, Any]:
     is_zip = data.startswith(_ZIP_MARK)
     if is_zip:
-        _check_zip(data)
+        check_torch_archive(io.BytesIO(data))
     try:
         state = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
@@ -475,28 +468,13 @@ def _unpickle(data: bytes) -> Mapping[Any, Any]:
         ) from error
     except Exception as error:
         # What torch raises for garbage depends on where in its readers the garbage lands.
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise NPAError(
             "this is no state dict of tensors that torch reads without running code, or a "
-            f"truncated one ({reason[:200]})"
+            f"truncated one ({shown(error)})"
         ) from error
     if not isinstance(state, Mapping):
         raise NPAError(f"the file must hold a state dict, got a {type(state).__name__}")
     return state
-
-
-def _check_zip(data: bytes) -> None:
-    """Compare the checksums, which torch does not look at."""
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            bad = archive.testzip()
-    except Exception as error:
-        # What zipfile raises depends on where the damage lies.
-        raise NPAError(
-            f"the file is damaged or truncated ({type(error).__name__}): fetch or save it again"
-        ) from error
-    if bad is not None:
-        raise NPAError(f"the file is damaged (wrong checksum of {bad!r}): fetch or save it again")
 
 
 def _check_plain(name: str, tensor: Tensor) -> None:
@@ -504,6 +482,12 @@ def _check_plain(name: str, tensor: Tensor) -> None:
         raise NPAError(
             f"{name} must be a dense tensor with data, got a sparse, meta, nested or quantised "
             "one: export the state dict with plain tensors"
+        )
+    held = tensor.untyped_storage().nbytes()
+    if tensor.numel() * tensor.element_size() > held:
+        raise NPAError(
+            f"{name} must hold all its numbers, got shape {shown(tuple(tensor.shape))} of {held} "
+            "bytes: export the state dict with tensors that are not expanded"
         )
 
 
@@ -547,13 +531,13 @@ def _scalar(name: str, value: Any) -> float:
         _check_plain(name, value)
         value = value.item() if value.numel() == 1 else value
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise NPAError(f"{name} must be a finite number, got {reprlib.repr(value)}")
+        raise NPAError(f"{name} must be a finite number, got {shown(value)}")
     try:
         number = float(value)
     except OverflowError:
         number = math.inf
     if not math.isfinite(number):
-        raise NPAError(f"{name} must be a finite number, got {reprlib.repr(value)}")
+        raise NPAError(f"{name} must be a finite number, got {shown(value)}")
     for digits in range(1, 10):
         rounded = float(f"{number:.{digits}g}")
         if _as_float32(rounded) == number:
@@ -575,14 +559,16 @@ def _decode(entry: Mapping[str, Any], name: str, rank: int) -> Tensor:
     shape, dtype = packed["shape"], packed["dtype"]
     sizes_fit = isinstance(shape, list) and all(type(n) is int and n > 0 for n in shape)
     if dtype != "float32" or not sizes_fit or len(shape) != rank:
-        raise NPAError(f"{name} must be float32 with {rank} dimension(s), got {dtype!r} {shape!r}")
+        raise NPAError(
+            f"{name} must be float32 with {rank} dimension(s), got {shown(dtype)} {shown(shape)}"
+        )
     try:
         data = base64.b64decode(packed["data64"], validate=True)
     except (binascii.Error, TypeError, ValueError) as error:
-        raise NPAError(f"the data of {name} is no base64 text ({error})") from error
+        raise NPAError(f"the data of {name} is no base64 text ({shown(error)})") from error
     if len(data) != 4 * math.prod(shape):
         raise NPAError(
-            f"the data of {name} must be {4 * math.prod(shape)} bytes for shape {shape}, got "
-            f"{len(data)}: the file is damaged"
+            f"the data of {name} must be {4 * math.prod(shape)} bytes for shape "
+            f"{shown(shape)}, got {len(data)}: the file is damaged"
         )
     return torch.frombuffer(bytearray(data), dtype=torch.float32).reshape(shape)

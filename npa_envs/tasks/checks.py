@@ -5,10 +5,12 @@ from __future__ import annotations
 import sys
 from typing import Any, TypeGuard
 
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, shown
 
 
-def check_positive(config: object, kind: type, *names: str, at_least: int = 1) -> None:
+def check_positive(
+    config: object, kind: type, *names: str, at_least: int = 1, at_most: int = sys.maxsize
+) -> None:
     """Check that fields are whole numbers >= `at_least` (`kind` int) or finite and > 0 (float).
 
     Args:
@@ -16,6 +18,7 @@ def check_positive(config: object, kind: type, *names: str, at_least: int = 1) -
         kind: `int` or `float`.
         names: The fields to check.
         at_least: Smallest whole number allowed; ignored for floats.
+        at_most: Largest one.
 
     Raises:
         NPAError: A field breaks the rule.
@@ -25,6 +28,7 @@ def check_positive(config: object, kind: type, *names: str, at_least: int = 1) -
         if kind is int:
             ok = is_whole(value) and value >= at_least
             _require(ok, config, name, f"be a whole number of at least {at_least}", at_least)
+            _require(value <= at_most, config, name, f"be at most {at_most}", at_least)
         else:
             ok = is_real(value) and value > 0
             _require(ok, config, name, "be a finite number greater than 0", 1.0)
@@ -101,15 +105,18 @@ def _require(ok: bool, config: object, name: str, rule: str, otherwise: object) 
     if not ok:
         example = getattr(type(config), name, otherwise)
         raise NPAError(
-            f"{name} must {rule}, got {getattr(config, name)!r}: for example {name}={example!r}"
+            f"{name} must {rule}, got {shown(getattr(config, name))}: for example "
+            f"{name}={example!r}"
         )
 
 
-def check_count(name: str, value: object, cure: str = "") -> None:
-    """Check that an argument is a whole number of at least 1.
+def check_count(name: str, value: object, cure: str = "", *, at_most: int = sys.maxsize) -> None:
+    """Check that an argument is a whole number of at least 1, and at most `at_most`.
 
     Raises:
         NPAError: It is not.
     """
     if not is_whole(value) or value < 1:
-        raise NPAError(f"{name} must be an integer of at least 1, got {value!r}{cure}")
+        raise NPAError(f"{name} must be an integer of at least 1, got {shown(value)}{cure}")
+    if value > at_most:
+        raise NPAError(f"{name} must be at most {at_most}, got {shown(value)}{cure}")

@@ -14,6 +14,7 @@ from npa_envs.ops.pictures.losses import picture_losses
 from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.checks import check_non_negative, check_positive, check_text
 from npa_envs.tasks.growth import GrowthConfig, GrowthTask
+from npa_envs.tasks.targets.images import LARGEST_POINT_COUNT
 from npa_envs.tasks.targets.points import PointTarget, load_target
 from npa_envs.tasks.train_config import TrainConfig, fast_run, tiny_run
 
@@ -54,7 +55,7 @@ class Morphogenesis2DConfig(GrowthConfig):
         """Check every field; raise NPAError where one has a wrong type or lies out of its range."""
         super().__post_init__()
         check_text(self, "target", "a built-in name, an emoji or a path")
-        check_positive(self, int, "target_point_count")
+        check_positive(self, int, "target_point_count", at_most=LARGEST_POINT_COUNT)
         check_positive(self, float, "sigma")
         check_non_negative(self, "splat_weight", "colour_weight", "drift_weight")
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import tomllib
 import types
 import typing
@@ -11,10 +10,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-from npa_envs.errors import MissingDependencyError, NPAError, suggest
+from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
+from npa_envs.files import checked_path, parse_json, read_bytes
 from npa_envs.tasks.train_config import TrainConfig
 
 TaskConfigT = TypeVar("TaskConfigT")
+
+LARGEST_FILE = 2**20
+"""Bytes of a configuration file, at most."""
+
+MERGED = 10_000
+"""Fields that YAML's merge keys give a mapping, at most."""
 
 
 def override(config: TrainConfig[TaskConfigT], /, **fields: Any) -> TrainConfig[TaskConfigT]:
@@ -42,7 +48,7 @@ def override(config: TrainConfig[TaskConfigT], /, **fields: Any) -> TrainConfig[
             if type(value) is not type(task):
                 raise NPAError(
                     f"task must be a {type(task).__name__} or a mapping of its fields, "
-                    f"got {value!r}"
+                    f"got {shown(value)}"
                 )
             task = value
         elif name in own:
@@ -50,7 +56,7 @@ def override(config: TrainConfig[TaskConfigT], /, **fields: Any) -> TrainConfig[
         elif name in task_types:
             task_changes[name] = value
         else:
-            raise NPAError(f"unknown field {name!r}: {suggest(name, [*own, *task_types])}")
+            raise NPAError(f"unknown field {shown(name)}: {suggest(name, [*own, *task_types])}")
     return dataclasses.replace(config, task=_laid_over("task", task, task_changes), **changes)
 
 
@@ -69,21 +75,22 @@ def load_config(path: str | Path, base: TrainConfig[TaskConfigT]) -> TrainConfig
             value of the wrong type or outside its range.
         MissingDependencyError: The file is YAML and PyYAML is not installed.
     """
-    path = Path(path)
+    path = checked_path(path)
     try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise NPAError(f"cannot read the configuration file {str(path)!r}: {error}") from error
+        text = read_bytes(path, limit=LARGEST_FILE).decode("utf-8")
+    except (NPAError, UnicodeDecodeError) as error:
+        raise NPAError(f"cannot read the configuration file {shown(str(path))}: {error}") from error
     fields = _parse(path, text)
     if not isinstance(fields, Mapping) or not all(isinstance(key, str) for key in fields):
         raise NPAError(
-            f"the configuration file {str(path)!r} must hold field names and values at its top "
+            f"the configuration file {shown(str(path))} must hold field names and values at its "
+            "top "
             f"level, got {type(fields).__name__}: for example 'iterations: 500'"
         )
     try:
         return override(base, **fields)
     except NPAError as error:
-        raise NPAError(f"in the configuration file {str(path)!r}: {error}") from error
+        raise NPAError(f"in the configuration file {shown(str(path))}: {error}") from error
 
 
 def config_to_dict(config: TrainConfig[Any]) -> dict[str, Any]:
@@ -111,24 +118,39 @@ def _parse(path: Path, text: str) -> Any:
         if suffix == ".toml":
             return tomllib.loads(text)
         if suffix == ".json":
-            return json.loads(text)
+            return parse_json(text)
         if suffix in (".yaml", ".yml"):
-            try:
-                import yaml
-            except ImportError as error:
-                raise MissingDependencyError(
-                    "reading YAML needs PyYAML: pip install pyyaml, or write the file as TOML"
-                ) from error
-            try:
-                # An empty file sets nothing.
-                return yaml.safe_load(text) or {}
-            except yaml.YAMLError as error:
-                raise NPAError(f"{str(path)!r} is not valid YAML: {error}") from error
-    except (tomllib.TOMLDecodeError, json.JSONDecodeError) as error:
-        raise NPAError(f"{str(path)!r} is not valid {suffix[1:].upper()}: {error}") from error
+            # An empty file sets nothing.
+            return _parse_yaml(text) or {}
+    except MissingDependencyError:
+        raise
+    except Exception as error:
+        # What the parsers raise for garbage depends on where in them it lands.
+        raise NPAError(
+            f"{shown(str(path))} is not valid {suffix[1:].upper()}: {shown(error)}"
+        ) from error
     raise NPAError(
-        f"a configuration file must end in .yaml, .yml, .toml or .json, got {str(path)!r}"
+        f"a configuration file must end in .yaml, .yml, .toml or .json, got {shown(str(path))}"
     )
+
+
+def _parse_yaml(text: str) -> Any:
+    try:
+        import yaml
+    except ImportError as error:
+        raise MissingDependencyError(
+            "reading YAML needs PyYAML: pip install pyyaml, or write the file as TOML"
+        ) from error
+
+    class Loader(yaml.SafeLoader):
+        """YAML's safe loader, which merges no more than a few mappings into each other."""
+
+        def flatten_mapping(self, node: yaml.MappingNode) -> None:
+            super().flatten_mapping(node)
+            if len(node.value) > MERGED:
+                raise NPAError(f"a mapping must have at most {MERGED} fields with those merged in")
+
+    return yaml.load(text, Loader)
 
 
 def _field_types(config: Any) -> dict[str, Any]:
@@ -141,7 +163,9 @@ def _laid_over(name: str, present: Any, fields: Mapping[str, Any]) -> Any:
     kinds = _field_types(present)
     for field in fields:
         if field not in kinds:
-            raise NPAError(f"unknown field '{name}.{field}': {suggest(str(field), kinds)}")
+            raise NPAError(
+                f"unknown field '{name}.{shown(str(field))[1:-1]}': {suggest(str(field), kinds)}"
+            )
     changes = {k: _convert(k, v, kinds[k], getattr(present, k)) for k, v in fields.items()}
     return dataclasses.replace(present, **changes)
 
@@ -163,7 +187,7 @@ def _convert(name: str, value: Any, kind: Any, present: Any) -> Any:
         return None if value is None else _convert(name, value, inner[0], present)
     if origin is tuple:
         if not isinstance(value, list | tuple):
-            raise NPAError(f"{name} must be a list, got {value!r}: for example {name}: [1, 2]")
+            raise NPAError(f"{name} must be a list, got {shown(value)}: for example {name}: [1, 2]")
         item = typing.get_args(kind)[0]
         there = present if isinstance(present, tuple) and present else (None,)
         return tuple(
@@ -181,4 +205,4 @@ def _convert(name: str, value: Any, kind: Any, present: Any) -> Any:
             pass
     elif isinstance(value, kind) and (kind is bool or not isinstance(value, bool)):
         return value
-    raise NPAError(f"{name} must be of type {kind.__name__}, got {value!r}")
+    raise NPAError(f"{name} must be of type {kind.__name__}, got {shown(value)}")

@@ -7,7 +7,7 @@ import json
 import os
 import shutil
 import socket
-import zipfile
+import sys
 from collections.abc import Iterator, Mapping
 from io import FileIO
 from pathlib import Path
@@ -16,8 +16,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from npa_envs.errors import MissingDependencyError, NPAError
-from npa_envs.files import atomic_path, remove_unfinished, write_text
+from npa_envs.errors import MissingDependencyError, NPAError, shown
+from npa_envs.files import (
+    atomic_path,
+    check_torch_archive,
+    open_regular,
+    remove_unfinished,
+    write_text,
+)
 from npa_envs.tasks.checks import is_real, is_whole
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.overrides import config_to_dict
@@ -230,7 +236,7 @@ class JsonlLog:
             NPAError: The file cannot be read; or a line of it is damaged, other than a last one
                 that has no end because a kill cut it short.
         """
-        if not self.path.exists():
+        if not os.path.exists(self.path):
             return []
         try:
             lines = self.path.read_text(encoding="utf-8", errors="replace").split("\n")
@@ -377,27 +383,20 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     Raises:
         NPAError: There is no such file, it cannot be read, or it is no checkpoint of this version.
     """
-    if not path.is_file():
+    if not os.path.exists(path):
         raise NPAError(
             f"there is no checkpoint to resume from at {str(path)!r}: give the folder of an "
             "earlier run as `out`, or start a new run"
         )
     try:
-        # Torch does not look at the checksums.
-        with zipfile.ZipFile(path) as archive:
-            # As torch writes them; others could be of any size once they are unpacked.
-            if any(part.compress_type != zipfile.ZIP_STORED for part in archive.infolist()):
-                raise zipfile.BadZipFile("compressed")
-            bad = archive.testzip()
-        if bad is not None:
-            raise zipfile.BadZipFile(f"wrong checksum of {bad!r}")
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except OSError as error:
-        raise NPAError(f"cannot read the checkpoint {str(path)!r}: {error}") from error
+        with open_regular(path, limit=sys.maxsize, what="the checkpoint") as file:
+            check_torch_archive(file)
+            file.seek(0)
+            content = torch.load(file, map_location="cpu", weights_only=True)
     except Exception as error:
         # What is raised for garbage depends on where in the readers the garbage lands.
         raise NPAError(
-            f"{str(path)!r} is not a checkpoint or is damaged ({type(error).__name__}): "
+            f"{str(path)!r} is not a checkpoint or is damaged ({shown(error)}): "
             "start a new run with overwrite, or put a copy of it in its place"
         ) from error
     if not isinstance(content, dict) or content.get("format") != CHECKPOINT_FORMAT:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 import torch
 
 from npa_envs.errors import NPAError
+from npa_envs.files import parse_json
 from npa_envs.rule.files import rule_metadata, shipped_rules
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import PictureTask, task_for_rule
@@ -95,7 +95,7 @@ def trained_config(path: Path, metadata: Mapping[str, str]) -> Any:
         NPAError: What it says is damaged or of another version.
     """
     try:
-        fields = json.loads(metadata["config"])
+        fields = parse_json(metadata["config"])
         if not isinstance(fields, dict):
             raise NPAError(f"config must be an object, got {type(fields).__name__}")
         return preset("paper", metadata.get("task", "morphogenesis2d"), **fields)

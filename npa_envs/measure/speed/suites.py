@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -12,8 +11,8 @@ from typing import Any, NamedTuple
 
 import torch
 
-from npa_envs.errors import NPAError
-from npa_envs.files import json_text
+from npa_envs.errors import NPAError, shown
+from npa_envs.files import json_text, read_json
 from npa_envs.measure.plots import new_figure, number_plainly, png
 from npa_envs.measure.record import machine, versions
 from npa_envs.measure.speed.errors import (
@@ -366,13 +365,13 @@ def stored_ratios(path: Path, device: torch.device) -> dict[str, float]:
     """
     cure = "take `ratios` from the JSON of `npa-envs bench --quick --output DIR`"
     try:
-        loaded = json.loads(path.read_text(encoding="utf-8"))
+        loaded = read_json(path)
         return {str(name): float(value) for name, value in loaded[device.type].items()}
-    except OSError as error:
-        raise NPAError(f"cannot read {str(path)!r} ({error.strerror}): {cure}") from error
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except NPAError as error:
+        raise NPAError(f"{error}; {cure}") from error
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise NPAError(
-            f"{str(path)!r} must hold ratios under {device.type!r}, got {error!r}: {cure}"
+            f"{str(path)!r} must hold ratios under {device.type!r}, got {shown(error)}: {cure}"
         ) from error
 
 

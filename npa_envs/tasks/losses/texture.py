@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import pickle
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,7 +13,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from npa_envs.errors import NPAError, suggest
+from npa_envs.errors import NPAError, shown, suggest
+from npa_envs.files import check_torch_archive, home_path, open_regular
 from npa_envs.ops import world_mean
 
 DEFAULT_LOSS = "patch_swd"
@@ -597,8 +599,8 @@ def load_vgg_weights(path: str | Path = "") -> dict[str, Any]:
         NPAError: There is no such file, or it is damaged or holds something else.
     """
     folder = Path(torch.hub.get_dir()) / "checkpoints"
-    file = Path(path).expanduser() if str(path) else folder / WEIGHTS_FILE
-    if not file.is_file():
+    file = home_path(path) if str(path) else folder / WEIGHTS_FILE
+    if not os.path.exists(file):
         raise NPAError(
             f"vgg_ot needs VGG16's weights, and there is no file {str(file)!r}: "
             f"download {WEIGHTS_URL} (528 MiB) to {str(folder / WEIGHTS_FILE)!r}, for example with "
@@ -607,11 +609,13 @@ def load_vgg_weights(path: str | Path = "") -> dict[str, Any]:
             "'filter_swd', which need no weights"
         )
     try:
+        with open_regular(file, limit=2**30, what="the file") as opened:
+            check_torch_archive(opened, checksums=False)
         content = torch.load(file, map_location="cpu", weights_only=True, mmap=True)
     except (OSError, RuntimeError, ValueError, EOFError, pickle.UnpicklingError) as error:
         raise NPAError(
             f"VGG16's weights {str(file)!r} cannot be read, the file is damaged or no torch file "
-            f"({' '.join(str(error).split())[:120]}): download {WEIGHTS_URL} again"
+            f"({shown(error)}): download {WEIGHTS_URL} again"
         ) from error
     if not isinstance(content, dict):
         raise NPAError(

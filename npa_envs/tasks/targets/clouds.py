@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import gzip
 import math
+import os
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +16,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.errors import MissingDependencyError, NPAError, suggest
+from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
+from npa_envs.files import open_regular
 from npa_envs.world.randomness import Randomness, normal_draws, uniform_draws
 
 Split = Literal["train", "test"]
@@ -38,6 +40,9 @@ CHUNK = {"cpu": 256, "cuda": 1024}
 
 CHUNK_CELLS = 1 << 24
 """Cells of a grid, of all pictures that are sampled together, at most."""
+
+LARGEST_IDX = 600_000_000
+"""Bytes of data of an IDX file, at most; the largest of EMNIST's has 547 million."""
 
 CACHED = 4
 """Data sets that are kept in memory."""
@@ -277,15 +282,15 @@ def load_pictures(data: str, split: Split = "train", *, folder: str = "data") ->
         NPAError: There is no such data set or split, or a file is missing or damaged.
     """
     if split not in get_args(Split):
-        raise NPAError(f"split must be 'train' or 'test', got {split!r}")
+        raise NPAError(f"split must be 'train' or 'test', got {shown(split)}")
     if data == "digits":
         return _digits(split)
     if data == "mnist":
         return _mnist(split, folder)
     path = Path(data)
-    if not path.is_dir():
+    if not os.path.isdir(path):
         raise NPAError(
-            f"data must be a known data set or a folder of IDX files, got {data!r}: "
+            f"data must be a known data set or a folder of IDX files, got {shown(data)}: "
             f"{suggest(data, BUILT_IN)}"
         )
     return _idx_folder(path, split)
@@ -297,29 +302,36 @@ def read_idx(path: Path) -> NDArray[np.uint8]:
     Raises:
         NPAError: It cannot be read, or does not hold what its head says.
     """
-    try:
-        content = path.read_bytes()
-        if content[:2] == b"\x1f\x8b":
-            content = gzip.decompress(content)
-    except (OSError, EOFError, zlib.error) as error:
-        raise NPAError(f"cannot read the IDX file {str(path)!r}: {error}") from error
-    # Two zeros, 8 for unsigned bytes, the number of dimensions, then each as four bytes.
-    dimensions = content[3] if len(content) >= 4 else 0
-    head = 4 + 4 * dimensions
-    if content[:3] != b"\0\0\x08" or dimensions == 0 or len(content) < head:
-        raise NPAError(
-            f"{str(path)!r} must be an IDX file of unsigned bytes, but begins with "
-            f"{content[:4].hex(' ') or 'nothing'}: 00 00 08 and the number of dimensions"
-        )
-    shape = tuple(int(size) for size in np.frombuffer(content, ">u4", dimensions, offset=4))
-    values = np.frombuffer(content, np.uint8, offset=head)
-    expected = 1
-    for size in shape:
-        expected *= size
+    name = f"the IDX file {shown(str(path))}"
+    with open_regular(path, limit=LARGEST_IDX, what="the IDX file") as file:
+        try:
+            is_gzip = file.read(2) == b"\x1f\x8b"
+            file.seek(0)
+            unpacked = gzip.GzipFile(fileobj=file) if is_gzip else file
+            # Two zeros, 8 for unsigned bytes, the number of dimensions, then each as four bytes.
+            head = unpacked.read(4)
+            dimensions = head[3] if len(head) == 4 else 0
+            sizes = unpacked.read(4 * dimensions)
+            if head[:3] != b"\0\0\x08" or not 1 <= dimensions <= 4 or len(sizes) < 4 * dimensions:
+                raise NPAError(
+                    f"{shown(str(path))} must be an IDX file of unsigned bytes, but begins with "
+                    f"{head.hex(' ') or 'nothing'}: 00 00 08 and the number of dimensions, 1 to 4"
+                )
+            shape = tuple(int(size) for size in np.frombuffer(sizes, ">u4"))
+            expected = math.prod(shape)
+            if expected > LARGEST_IDX:
+                raise NPAError(
+                    f"{name} must have at most {LARGEST_IDX} bytes of data, but its head says "
+                    f"{' x '.join(map(str, shape))}: take a part of it"
+                )
+            values = np.frombuffer(unpacked.read(expected + 1), np.uint8)
+        except (OSError, EOFError, zlib.error) as error:
+            raise NPAError(f"cannot read {name}: {shown(error)}") from error
     if values.size != expected:
         raise NPAError(
-            f"the IDX file {str(path)!r} must hold {expected} bytes of data, as its head says "
-            f"({' x '.join(map(str, shape))}), but holds {values.size}: get it anew"
+            f"{name} must hold {expected} bytes of data, as its head says "
+            f"({' x '.join(map(str, shape))}), but holds {min(values.size, expected)}"
+            f"{' and more' if values.size > expected else ''}: get it anew"
         )
     return values.reshape(shape)
 
@@ -355,7 +367,7 @@ def _mnist(split: Split, folder: str) -> DigitPictures:
         mnist: Any = MNIST(folder, train=split == "train", download=False)
     except RuntimeError as error:
         raise NPAError(
-            f"MNIST is not in the folder {folder!r}, and nothing is downloaded unasked: "
+            f"MNIST is not in the folder {shown(folder)}, and nothing is downloaded unasked: "
             f'python -c "{MNIST_DOWNLOAD.format(folder=folder)}", or name its folder'
         ) from error
     ink = (mnist.data.numpy() / 255.0).astype(np.float32)
@@ -366,16 +378,20 @@ def _idx_folder(folder: Path, split: Split) -> DigitPictures:
     images, labels = (read_idx(_find(folder, name)) for name in IDX_NAMES[split])
     if images.ndim != 3 or labels.shape != images.shape[:1] or images.size == 0:
         raise NPAError(
-            f"the {split} files of {str(folder)!r} must hold pictures [M, H, W] and classes [M], "
+            f"the {split} files of {shown(str(folder))} must hold pictures [M, H, W] and classes "
+            "[M], "
             f"got {list(images.shape)} and {list(labels.shape)}: get them anew"
         )
-    return DigitPictures((images / 255.0).astype(np.float32), labels.astype(np.int64))
+    # By a table: the quotients themselves would take eight bytes a pixel.
+    ink = (np.arange(256) / 255.0).astype(np.float32)
+    return DigitPictures(ink[images], labels.astype(np.int64))
 
 
 def _find(folder: Path, name: str) -> Path:
     for candidate in (folder / name, folder / f"{name}.gz"):
-        if candidate.is_file():
+        if os.path.isfile(candidate):
             return candidate
     raise NPAError(
-        f"the folder {str(folder)!r} must hold {name} or {name}.gz: MNIST's files are called so"
+        f"the folder {shown(str(folder))} must hold {name} or {name}.gz: MNIST's files are called "
+        "so"
     )

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import math
+import os
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageOps, UnidentifiedImageError
+from PIL import EpsImagePlugin, Image, ImageOps, UnidentifiedImageError
 
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, shown
+from npa_envs.files import read_bytes
 
 OPAQUE = 128
 """Least alpha, of 255, at which a pixel belongs to the target."""
@@ -18,6 +23,20 @@ OPAQUE = 128
 _BACKGROUND_TOLERANCE = 28
 _UNIFORM_SHARE = 0.95
 _LARGEST_CUT_OUT = 2048
+_LARGEST_FILE = 256 * 2**20
+_LARGEST_PADDED = 9216
+
+LARGEST_AREA = 2**26
+"""Pixels that a picture has at most, 8192 x 8192."""
+
+FORMATS = ("PNG", "JPEG", "BMP", "GIF", "PPM", "TIFF", "WEBP")
+"""Pillow's names of the formats that are read. Others may start other programs, as EPS does."""
+
+LARGEST_GRID = 6144
+"""Pixels along each side of the grid that a picture is resampled to, at most."""
+
+LARGEST_POINT_COUNT = 2**24
+"""Points of a target, at most."""
 
 FloatImage = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -27,7 +46,7 @@ def read_image(path: Path) -> Image.Image:
     """Read a picture as RGBA; one without transparency is cut out of its plain background.
 
     Args:
-        path: A PNG, JPEG, WebP or other file that Pillow reads; of an animation, the first frame.
+        path: A file in one of `FORMATS`; of an animation, the first frame.
 
     Raises:
         NPAError: As for `open_image`, or the picture is fully transparent, or has neither
@@ -44,59 +63,69 @@ def open_image(path: Path) -> Image.Image:
     """Read a picture as RGBA, as it is.
 
     Args:
-        path: A PNG, JPEG, WebP or other file that Pillow reads; of an animation, the first frame.
+        path: A file in one of `FORMATS`; of an animation, the first frame.
 
     Raises:
         NPAError: The file is missing, not readable, empty, truncated, no picture, or too large.
     """
+    name = shown(str(path))
+    content = read_bytes(path, limit=_LARGEST_FILE, what="target")
+    if not content:
+        raise NPAError(f"target {name} is an empty file (0 bytes): save the picture anew")
     try:
-        if path.is_dir():
-            raise NPAError(f"target {str(path)!r} is a folder: give the path of a picture file")
-        if path.stat().st_size == 0:
-            raise NPAError(
-                f"target {str(path)!r} is an empty file (0 bytes): save the picture anew"
-            )
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            with Image.open(path) as opened:
+            warnings.simplefilter("ignore")
+            with Image.open(io.BytesIO(content), formats=FORMATS) as opened:
+                _check_area(opened.size, name)
                 opened.load()
+                # A format inside of another may have a size of its own.
+                _check_area(opened.size, name)
                 return _to_rgba(ImageOps.exif_transpose(opened))
-    except FileNotFoundError as error:
-        raise NPAError(f"target {str(path)!r} does not exist: check the path") from error
-    except PermissionError as error:
-        raise NPAError(f"target {str(path)!r} may not be read: check its permissions") from error
     except Image.DecompressionBombError as error:
-        raise NPAError(
-            f"target {str(path)!r} must have at most {2 * (Image.MAX_IMAGE_PIXELS or 0)} pixels, "
-            f"got more ({error}): scale the picture down first"
-        ) from error
+        raise NPAError(_too_large(name, "more")) from error
     except UnidentifiedImageError as error:
         raise NPAError(
-            f"target {str(path)!r} must be a picture (PNG, JPEG, WebP ...), "
-            "but its content is none that Pillow knows: save it as PNG"
+            f"target {name} must be a picture ({', '.join(FORMATS)}), "
+            "but its content is none of these: save it as PNG"
         ) from error
     except NPAError:
         raise
     except Exception as error:
         # Pillow's decoders report damaged data by exceptions of many kinds.
-        if isinstance(error, OSError) and error.errno is not None:
-            raise NPAError(
-                f"target {str(path)!r} cannot be read ({error}): check the path"
-            ) from error
         raise NPAError(
-            f"target {str(path)!r} cannot be decoded, it is truncated or damaged ({error}): "
+            f"target {name} cannot be decoded, it is truncated or damaged ({shown(error)}): "
             "save the picture anew, as PNG"
         ) from error
+
+
+@contextlib.contextmanager
+def no_foreign_programs() -> Iterator[None]:
+    """Keep Pillow from starting other programs where a library opens pictures by it."""
+    before = EpsImagePlugin.gs_binary
+    EpsImagePlugin.gs_binary = False
+    try:
+        yield
+    finally:
+        EpsImagePlugin.gs_binary = before
+
+
+def _check_area(size: tuple[int, int], name: str) -> None:
+    if size[0] * size[1] > LARGEST_AREA:
+        raise NPAError(_too_large(name, f"{size[0]} x {size[1]}"))
+
+
+def _too_large(name: str, got: str) -> str:
+    return (
+        f"target {name} must have at most {LARGEST_AREA} pixels, got {got}: "
+        "scale the picture down first"
+    )
 
 
 def looks_like_path(source: str) -> bool:
     """Return whether text is the path of a file: by a folder or suffix in it, or that it exists."""
     if "/" in source or "\\" in source or Path(source).suffix:
         return True
-    try:
-        return source != "" and Path(source).exists()
-    except (OSError, ValueError):
-        return False
+    return os.path.exists(source)
 
 
 def scaled_square(image: Image.Image, side: int) -> FloatImage:
@@ -117,7 +146,8 @@ def require_opaque_pixels(image: Image.Image, *, label: str) -> None:
     if alpha.size == 0 or alpha.max() < OPAQUE:
         highest = 0.0 if alpha.size == 0 else alpha.max() / 255
         raise NPAError(
-            f"target {label!r} must have pixels with alpha above 0.5, the highest is {highest:.2f} "
+            f"target {shown(label)} must have pixels with alpha above 0.5, the highest is "
+            f"{highest:.2f} "
             f"({image.width} x {image.height} pixels): give a picture that is not fully transparent"
         )
 
@@ -143,7 +173,8 @@ def cut_out_background(image: Image.Image, *, label: str) -> Image.Image:
     uniform = (np.abs(border - background).max(axis=-1) <= _BACKGROUND_TOLERANCE).mean()
     if uniform < _UNIFORM_SHARE:
         raise NPAError(
-            f"target {label!r} has no transparency, so at least {_UNIFORM_SHARE:.0%} of its border "
+            f"target {shown(label)} has no transparency, so at least {_UNIFORM_SHARE:.0%} of its "
+            "border "
             f"must have one colour (the background), but only {uniform:.0%} have: "
             "give a PNG or WebP with a transparent background"
         )
@@ -151,7 +182,7 @@ def cut_out_background(image: Image.Image, *, label: str) -> Image.Image:
     outside = _connected_to_border(similar)
     if outside.all():
         raise NPAError(
-            f"target {label!r} has no transparency and one colour all over, nothing to grow: "
+            f"target {shown(label)} has no transparency and one colour all over, nothing to grow: "
             "give a picture with an object, best a PNG with a transparent background"
         )
     colour, alpha = _unmix_edge(rgb, ~outside, background)
@@ -174,7 +205,8 @@ def resample(image: Image.Image, point_count: int, *, label: str = "picture") ->
         label: The name of the picture in error messages.
 
     Raises:
-        NPAError: Nothing opaque is left at the scale nearest to `point_count`.
+        NPAError: Nothing opaque is left at the scale nearest to `point_count`, or the opaque pixels
+            are so few and far apart that the grid would be larger than `LARGEST_GRID`.
     """
     image = image.crop(image.getchannel("A").getbbox())
     area = _opaque_count(image)
@@ -185,8 +217,12 @@ def resample(image: Image.Image, point_count: int, *, label: str = "picture") ->
         reduced = image.reduce(factor)
         if _opaque_count(reduced) * factor**2 > 0.9 * area:
             image, pitch = reduced, pitch / factor
-    span = max(image.size)
-    margin = 2 + math.ceil(0.5 * span + 4 * pitch)
+    span, margin = max(image.size), _margin(image, pitch)
+    if span + 2 * margin > _LARGEST_PADDED:
+        factor = math.ceil((span + 2 * margin) / _LARGEST_PADDED)
+        image = image.reduce(factor)
+        pitch = math.sqrt(max(_opaque_count(image), 1) / point_count)
+        span, margin = max(image.size), _margin(image, pitch)
     padded = Image.new("RGBA", (span + 2 * margin, span + 2 * margin), (0, 0, 0, 0))
     padded.paste(image, (margin + (span - image.width) // 2, margin + (span - image.height) // 2))
     alpha = padded.getchannel("A")
@@ -196,8 +232,14 @@ def resample(image: Image.Image, point_count: int, *, label: str = "picture") ->
         return int((np.asarray(sampled) >= OPAQUE).sum())
 
     fine, coarse = pitch / 1.5, min(pitch * 1.5, span)
-    while count(fine) < point_count:
+    while span / fine <= LARGEST_GRID and count(fine) < point_count:
         fine /= 1.5
+    if span / fine > LARGEST_GRID:
+        raise NPAError(
+            f"target {shown(label)} must give {point_count} points on a grid of at most "
+            f"{LARGEST_GRID} x {LARGEST_GRID} pixels, but its opaque pixels are few and far "
+            "apart: fill more of the picture, or lower target_point_count"
+        )
     best, best_miss = pitch, abs(count(pitch) - point_count)
     for _ in range(24):
         middle = 0.5 * (fine + coarse)
@@ -209,10 +251,15 @@ def resample(image: Image.Image, point_count: int, *, label: str = "picture") ->
         fine, coarse = (middle, coarse) if found > point_count else (fine, middle)
     if best_miss == point_count and count(best) == 0:
         raise NPAError(
-            f"target {label!r} is too thin to be resampled to {point_count} points, no opaque "
+            f"target {shown(label)} is too thin to be resampled to {point_count} points, no opaque "
             "pixel would be left: thicken it or raise target_point_count"
         )
     return _sample(padded, span, best)
+
+
+def _margin(image: Image.Image, pitch: float) -> int:
+    """Return how wide a border sampling needs: a grid reaches two of its pixels out."""
+    return 2 + math.ceil(min(0.5 * max(image.size) + 4 * pitch, 2.0 * max(image.size) + 2.0))
 
 
 def _sample(padded: Image.Image, span: int, pitch: float) -> Image.Image:

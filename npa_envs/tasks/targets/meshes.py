@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,13 +9,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from npa_envs.errors import MissingDependencyError, NPAError, suggest
+from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
+from npa_envs.files import check_regular, home_path
 from npa_envs.ops import Cameras
+from npa_envs.tasks.targets.images import no_foreign_programs
 
 FloatArray = NDArray[np.float64]
 
 RADIUS = 0.85
 """Every mesh is scaled to reach just so far from the origin [length units]."""
+
+_LARGEST_FILE = 256 * 2**20
+_SIZES = 1e-30, 1e30
+_LEAST_AREA = 1e-12
 
 MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
 """Files that are taken for meshes."""
@@ -219,19 +224,19 @@ def load_mesh(source: str | Path) -> Mesh:
         source: A built-in name, or the path of a mesh file that trimesh reads.
 
     Raises:
-        NPAError: The name is unknown, or the file is missing, damaged, or holds no triangles.
+        NPAError: The name is unknown, or the file is missing, damaged, holds no triangles, or some
+            without an area or of a size that numbers do not hold.
         MissingDependencyError: It is a file and trimesh is not installed.
     """
     if isinstance(source, str) and source in MESHES:
         return MESHES[source]().fitted()
-    path = Path(os.path.expanduser(source))
+    path = home_path(source)
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise NPAError(
             f"target must be a built-in mesh, the path of a mesh file ({', '.join(MESH_SUFFIXES)}) "
-            f"or a folder of views, got {str(source)!r}: {suggest(str(source), MESHES)}"
+            f"or a folder of views, got {shown(str(source))}: {suggest(str(source), MESHES)}"
         )
-    if not path.is_file():
-        raise NPAError(f"target {str(path)!r} does not exist or is no file: check the path")
+    check_regular(path, limit=_LARGEST_FILE, what="target")
     return _read_mesh(path).fitted()
 
 
@@ -240,27 +245,47 @@ def _read_mesh(path: Path) -> Mesh:
         import trimesh
     except ImportError as error:
         raise MissingDependencyError(
-            f"reading the mesh {str(path)!r} needs trimesh, which is not installed: "
+            f"reading the mesh {shown(str(path))} needs trimesh, which is not installed: "
             "pip install 'npa-envs[meshes]', or take a built-in mesh"
         ) from error
     try:
-        read = trimesh.load(path, force="mesh", process=False)
-        vertices = np.asarray(read.vertices, dtype=np.float64)
-        faces = np.asarray(read.faces, dtype=np.int64)
-        visual = read.visual.to_color() if hasattr(read.visual, "to_color") else read.visual
-        colours = np.asarray(visual.vertex_colors, dtype=np.float64)[:, :3] / 255.0
+        with no_foreign_programs(), np.errstate(all="ignore"):
+            read = trimesh.load(path, force="mesh", process=False)
+            vertices = np.asarray(read.vertices, dtype=np.float64)
+            faces = np.asarray(read.faces, dtype=np.int64)
+            visual = read.visual.to_color() if hasattr(read.visual, "to_color") else read.visual
+            colours = np.asarray(visual.vertex_colors, dtype=np.float64)[:, :3] / 255.0
     except Exception as error:
         # Its readers report damaged files by exceptions of many kinds.
         raise NPAError(
-            f"target {str(path)!r} cannot be read as a mesh ({type(error).__name__}: {error}): "
+            f"target {shown(str(path))} cannot be read as a mesh ({type(error).__name__}: "
+            f"{shown(error)}): "
             "save it anew, for example as .ply or .glb"
         ) from error
-    if len(faces) == 0 or not np.isfinite(vertices).all() or np.ptp(vertices, axis=0).max() == 0:
+    if faces.size == 0 or vertices.size == 0 or not np.isfinite(vertices).all():
         raise NPAError(
-            f"target {str(path)!r} must hold triangles with finite corners, got {len(faces)} "
+            f"target {shown(str(path))} must hold triangles with finite corners, got {len(faces)} "
             f"triangles and {len(vertices)} corners: give a surface, not a point cloud"
         )
-    if colours.shape != vertices.shape:
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise NPAError(
+            f"the triangles of target {shown(str(path))} must have corners from 0 to "
+            f"{len(vertices) - 1}, got {faces.min()} to {faces.max()}: save it anew"
+        )
+    used = vertices[np.unique(faces)]
+    extent = float((used.max(axis=0) / 2 - used.min(axis=0) / 2).max()) * 2
+    if not _SIZES[0] <= extent <= _SIZES[1] or np.abs(used).max() > _SIZES[1]:
+        raise NPAError(
+            f"target {shown(str(path))} must lie within {_SIZES[1]:g} of the origin and be of a "
+            f"size of at least {_SIZES[0]:g}, got a size of {extent:.3g}: scale it"
+        )
+    a, b, c = ((vertices[faces[:, k]] - used.min(axis=0)) / extent for k in range(3))
+    if np.linalg.norm(np.cross(b - a, c - a), axis=1).max() < _LEAST_AREA:
+        raise NPAError(
+            f"target {shown(str(path))} must have a surface, but the corners of every triangle "
+            "lie on a line: give triangles with an area"
+        )
+    if colours.shape != vertices.shape or not np.isfinite(colours).all():
         colours = np.full(vertices.shape, 0.6)
     return Mesh(vertices, faces, colours)
 

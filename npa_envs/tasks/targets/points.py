@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import colorsys
 import math
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,10 +15,12 @@ from numpy.typing import NDArray
 from PIL import Image, ImageChops, ImageColor, ImageDraw
 from torch import Tensor
 
-from npa_envs.errors import NPAError, suggest
-from npa_envs.tasks.checks import check_count
+from npa_envs.errors import NPAError, shown, suggest
+from npa_envs.files import home_path
+from npa_envs.tasks.checks import check_count, is_real
 from npa_envs.tasks.targets.emoji import is_emoji, render_emoji
 from npa_envs.tasks.targets.images import (
+    LARGEST_POINT_COUNT,
     OPAQUE,
     looks_like_path,
     read_image,
@@ -93,9 +94,11 @@ def load_target(
             few points, or a number is out of range.
         MissingDependencyError: An emoji is asked for, and no colour-emoji font is installed.
     """
-    check_count("point_count", point_count, ": try 4096")
-    if not (math.isfinite(extent) and extent > 0):
-        raise NPAError(f"extent must be finite and above 0 length units, got {extent!r}: try 1.8")
+    check_count("point_count", point_count, ": try 4096", at_most=LARGEST_POINT_COUNT)
+    if not is_real(extent) or extent <= 0:
+        raise NPAError(
+            f"extent must be finite and above 0 length units, got {shown(extent)}: try 1.8"
+        )
     name, image = load_target_image(source)
     return target_from_image(
         image, name=name, point_count=point_count, extent=extent, device=device
@@ -120,12 +123,13 @@ def load_target_image(source: str | Path) -> tuple[str, Image.Image]:
     if isinstance(source, str) and source in DRAWINGS:
         return source, DRAWINGS[source]()
     if isinstance(source, Path) or looks_like_path(source):
-        path = Path(os.path.expanduser(source))
+        path = home_path(source)
         return path.stem, read_image(path)
     if is_emoji(source):
         return source, render_emoji(source)
     raise NPAError(
-        f"target must be a built-in name, the path of a picture file or one emoji, got {source!r}: "
+        "target must be a built-in name, the path of a picture file or one emoji, got "
+        f"{shown(source)}: "
         f"{suggest(source, DRAWINGS)}"
     )
 

@@ -7,7 +7,6 @@ A pattern is a function of places on the unit torus. It returns red, green, blue
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +18,8 @@ from numpy.typing import NDArray
 from PIL import ImageColor
 from torch import Tensor
 
-from npa_envs.errors import NPAError, suggest
+from npa_envs.errors import NPAError, shown, suggest
+from npa_envs.files import home_path
 from npa_envs.tasks.checks import check_count
 from npa_envs.tasks.targets.images import (
     looks_like_path,
@@ -88,25 +88,25 @@ def load_texture(
     """
     if not isinstance(source, str | Path) or not str(source):
         raise NPAError(
-            f"target must be a built-in texture or the path of a picture, got {source!r}: "
+            f"target must be a built-in texture or the path of a picture, got {shown(source)}: "
             "for example 'cells'"
         )
-    check_count("resolution", resolution, ": try 128")
+    check_count("resolution", resolution, ": try 128", at_most=LARGEST_RESOLUTION)
     if isinstance(source, str) and source in PATTERNS:
         drawn = draw_pattern(source, resolution)
         return _target(source, drawn, True, device)
-    path = Path(os.path.expanduser(source))
+    path = home_path(source)
     if isinstance(source, str) and not looks_like_path(str(path)):
         raise NPAError(
             "target must be a built-in texture or the path of a picture file, "
-            f"got {source!r}: {suggest(source, PATTERNS)}"
+            f"got {shown(source)}: {suggest(source, PATTERNS)}"
         )
     image = open_image(path)
     require_opaque_pixels(image, label=str(path))
     side = min(image.size)
     if side < 2:
         raise NPAError(
-            f"target {str(path)!r} must have at least 2 x 2 pixels, got {image.width} x "
+            f"target {shown(str(path))} must have at least 2 x 2 pixels, got {image.width} x "
             f"{image.height}: give a larger picture"
         )
     left, top = (image.width - side) // 2, (image.height - side) // 2
@@ -118,6 +118,12 @@ def _target(name: str, picture: Array, tiles: bool, device: str | torch.device) 
     tensor = torch.tensor(np.ascontiguousarray(picture), dtype=torch.float32, device=device)
     return TextureTarget(name, tensor, tiles)
 
+
+LARGEST_RESOLUTION = 2048
+"""Pixels along each side of a target, at most."""
+
+STRIP_SAMPLES = 2**20
+"""Samples that are drawn at once, about."""
 
 OVERSAMPLING = 4
 """Samples along each side of a pixel."""
@@ -139,16 +145,21 @@ def draw_pattern(name: str, resolution: int, *, seed: int = 0) -> Array:
         NPAError: There is no such texture, or the resolution is not positive.
     """
     if name not in PATTERNS:
-        raise NPAError(f"unknown texture {name!r}: {suggest(name, PATTERNS)}")
+        raise NPAError(f"unknown texture {shown(name)}: {suggest(name, PATTERNS)}")
     if resolution < 1:
         raise NPAError(f"resolution must be at least 1 pixel, got {resolution}: try 128")
     samples = resolution * OVERSAMPLING
     axis = (np.arange(samples) + 0.5) / samples
-    rgba = PATTERNS[name](*np.meshgrid(axis, axis), np.random.default_rng(seed))
-    rgba[..., :3] *= rgba[..., 3:]
-    blocks = rgba.reshape(resolution, OVERSAMPLING, resolution, OVERSAMPLING, 4)
-    averaged: Array = blocks.mean(axis=(1, 3))
-    return averaged
+    strips = []
+    rows = max(1, STRIP_SAMPLES // samples // OVERSAMPLING) * OVERSAMPLING
+    for first in range(0, samples, rows):
+        places = np.meshgrid(axis, axis[first : first + rows])
+        # Each strip draws the same numbers: what is scattered has one place in all of them.
+        rgba = PATTERNS[name](*places, np.random.default_rng(seed))
+        rgba[..., :3] *= rgba[..., 3:]
+        blocks = rgba.reshape(-1, OVERSAMPLING, resolution, OVERSAMPLING, 4)
+        strips.append(blocks.mean(axis=(1, 3)))
+    return np.concatenate(strips)
 
 
 def stripes(u: Array, v: Array, _: np.random.Generator) -> Array:

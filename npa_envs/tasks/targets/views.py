@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from dataclasses import dataclass, replace
@@ -12,7 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, shown
+from npa_envs.files import home_path, read_json
 from npa_envs.ops import Cameras, cameras_of_poses, look_at, orbit
 from npa_envs.tasks.checks import check_count, is_real
 from npa_envs.tasks.targets.images import open_image, scaled_square
@@ -20,6 +20,9 @@ from npa_envs.tasks.targets.meshes import RADIUS, draw_mesh, load_mesh
 
 DISTANCE = 3.2
 """How far cameras are from the origin [length units]."""
+
+LARGEST_VIEWS = 2**27
+"""Pixels of all views of a target together, at most; they take 16 bytes each."""
 
 ANGLE = 40.0
 """Their angle of view [degrees]: the unit ball fits into the picture."""
@@ -87,14 +90,21 @@ def load_views(
     """
     if not isinstance(source, str | Path) or not str(source):
         raise NPAError(
-            f"target must be a built-in mesh, a mesh file or a folder of views, got {source!r}: "
+            "target must be a built-in mesh, a mesh file or a folder of views, got "
+            f"{shown(source)}: "
             "for example 'mushroom'"
         )
     counts = {"training_count": training_count, "held_out_count": held_out_count}
     for name, value in {"resolution": resolution, **counts}.items():
         check_count(name, value)
-    folder = Path(os.path.expanduser(source))
-    if folder.is_dir():
+    pixels = (training_count + held_out_count) * resolution**2
+    if pixels > LARGEST_VIEWS:
+        raise NPAError(
+            f"all views together must have at most {LARGEST_VIEWS} pixels, got {shown(pixels)} of "
+            f"resolution={shown(resolution)}: lower it, or take fewer views"
+        )
+    folder = home_path(source)
+    if os.path.isdir(folder):
         return read_nerf(folder, resolution, training_count, held_out_count).to(device)
     mesh = load_mesh(source)
     views = []
@@ -208,7 +218,7 @@ def read_nerf(
     held_out = next((folder / name for name in HELD_OUT if (folder / name).is_file()), None)
     if held_out is None:
         raise NPAError(
-            f"a folder of views must hold {' or '.join(HELD_OUT)}, {str(folder)!r} does not: "
+            f"a folder of views must hold {' or '.join(HELD_OUT)}, {shown(str(folder))} does not: "
             "views to measure by must be others than those trained with"
         )
     training = _views(_read_split(folder / TRAINING), resolution, training_count)
@@ -216,7 +226,8 @@ def read_nerf(
     reach = max(scene_reach(training), scene_reach(measured))
     if reach == 0.0:
         raise NPAError(
-            f"views must show something, but no picture of {str(folder)!r} has a pixel of alpha "
+            f"views must show something, but no picture of {shown(str(folder))} has a pixel of "
+            "alpha "
             f"above {SEEN}: give pictures with a transparent background"
         )
     scale = RADIUS / reach
@@ -263,7 +274,7 @@ def _views(split: _Split, resolution: int, count: int) -> Views:
             turned.float(), split.angle, width=resolution, height=resolution
         )
     except NPAError as error:
-        raise NPAError(f"in {str(split.path)!r}: {error}") from error
+        raise NPAError(f"in {shown(str(split.path))}: {error}") from error
     pictures = [_read_picture(split.files[k], resolution) for k in chosen]
     return Views(cameras, torch.stack(pictures))
 
@@ -276,31 +287,31 @@ def _read_picture(path: Path, resolution: int) -> Tensor:
     image = open_image(path)
     if image.width != image.height:
         raise NPAError(
-            f"views must be square, {str(path)!r} has {image.width} x {image.height} pixels: "
+            f"views must be square, {shown(str(path))} has {image.width} x {image.height} pixels: "
             "cut them to squares around the middle, and mend camera_angle_x"
         )
     return torch.from_numpy(scaled_square(image, resolution))
 
 
 def _read_split(path: Path) -> _Split:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
+    if not os.path.exists(path):
         raise NPAError(
-            f"a folder of views must hold {path.name}, {str(path.parent)!r} does not: give a "
+            f"a folder of views must hold {path.name}, {shown(str(path.parent))} does not: give a "
             "folder as NeRF-synthetic scenes are"
-        ) from error
-    except (OSError, ValueError) as error:
-        raise NPAError(f"cannot read {str(path)!r} as JSON: {error}") from error
+        )
+    try:
+        content = read_json(path)
+    except NPAError as error:
+        raise NPAError(f"cannot read {shown(str(path))} as JSON: {error}") from error
     angle = content.get("camera_angle_x") if isinstance(content, dict) else None
     frames = content.get("frames") if isinstance(content, dict) else None
     if not is_real(angle) or not 0.0 < float(angle or 0.0) < math.pi:
         raise NPAError(
-            f"camera_angle_x in {str(path)!r} must be an angle between 0 and pi radians, "
-            f"got {angle!r}"
+            f"camera_angle_x in {shown(str(path))} must be an angle between 0 and pi radians, "
+            f"got {shown(angle)}"
         )
     if not isinstance(frames, list) or not frames:
-        raise NPAError(f"frames in {str(path)!r} must be a list with at least one view")
+        raise NPAError(f"frames in {shown(str(path))} must be a list with at least one view")
     files, poses = zip(
         *(_read_frame(path, k, frame) for k, frame in enumerate(frames)), strict=True
     )
@@ -310,17 +321,25 @@ def _read_split(path: Path) -> _Split:
 def _read_frame(path: Path, number: int, frame: Any) -> tuple[Path, Tensor]:
     name = frame.get("file_path") if isinstance(frame, dict) else None
     if not isinstance(name, str) or not name:
-        raise NPAError(f"frame {number} in {str(path)!r} must have a file_path, got {name!r}")
+        raise NPAError(
+            f"frame {number} in {shown(str(path))} must have a file_path, got {shown(name)}"
+        )
     fault = ""
     try:
         pose = torch.tensor(frame.get("transform_matrix"), dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError) as error:
-        pose, fault = torch.empty(0), f" ({error})"
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        pose, fault = torch.empty(0), f" ({shown(error)})"
     if pose.shape != (4, 4):
         raise NPAError(
-            f"transform_matrix of frame {number} in {str(path)!r} must be 4 x 4 numbers, "
+            f"transform_matrix of frame {number} in {shown(str(path))} must be 4 x 4 numbers, "
             f"got shape {tuple(pose.shape)}{fault}"
         )
-    file = path.parent / name
+    inside = os.path.normpath(name)
+    if os.path.isabs(name) or inside == os.curdir or inside.split(os.sep)[0] == os.pardir:
+        raise NPAError(
+            f"file_path of frame {number} in {shown(str(path))} must name a file in that folder, "
+            f"got {shown(name)}: put the pictures beside it"
+        )
+    file = path.parent / inside
     # Their file_path has no suffix.
     return (file if file.suffix else file.with_name(file.name + ".png")), pose
