@@ -119,7 +119,8 @@ def load_rule(source: str | Path, *, device: str | torch.device = "cpu") -> NPAR
         raise NPAError(f"cannot load a rule from {shown(str(source))}: {error}") from error
     if parts.header is not None and "checksum" not in parts.header:
         warnings.warn(
-            f"the rule's file {shown(str(path))} has no checksum, so that damage cannot be told: if it "
+            f"the rule's file {shown(str(path))} has no checksum, so that damage cannot be told: "
+            "if it "
             "is known to be good, save it again with npa_envs.save_rule",
             stacklevel=2,
         )

@@ -21,6 +21,7 @@ from npa_envs.files import (
     atomic_path,
     check_torch_archive,
     open_regular,
+    read_bytes,
     remove_unfinished,
     write_text,
 )
@@ -32,6 +33,8 @@ try:
     import fcntl
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
+
+_LARGEST_LOG = 2**29
 
 
 class RunFolder:
@@ -238,10 +241,8 @@ class JsonlLog:
         """
         if not os.path.exists(self.path):
             return []
-        try:
-            lines = self.path.read_text(encoding="utf-8", errors="replace").split("\n")
-        except OSError as error:
-            raise NPAError(f"cannot read the log {str(self.path)!r}: {error}") from error
+        content = read_bytes(self.path, limit=_LARGEST_LOG, what="the log")
+        lines = content.decode("utf-8", errors="replace").split("\n")
         # What stands behind the last end of a line was cut short; mostly nothing does.
         if _parsed_record(lines[-1]) is None:
             lines.pop()
@@ -422,12 +423,12 @@ def check_same_run(
     _check_complete(content, path)
     if content["task_name"] != task_name:
         raise NPAError(
-            f"the checkpoint {str(path)!r} is of task {content['task_name']!r}, "
+            f"the checkpoint {str(path)!r} is of task {shown(content['task_name'])}, "
             f"not of {task_name!r}: resume it with that task, or choose another folder"
         )
     theirs, ours = _flat(content["config"]), _flat(config_to_dict(config))
     differences = [
-        f"{name}: {theirs.get(name, 'absent')!r} there, {ours.get(name, 'absent')!r} here"
+        f"{name}: {shown(theirs.get(name, 'absent'))} there, {shown(ours.get(name, 'absent'))} here"
         for name in sorted(theirs.keys() | ours.keys())
         if name not in MAY_DIFFER and theirs.get(name) != ours.get(name)
     ]
