@@ -286,6 +286,9 @@ class _Recording:
             first = self._call._replace(steps=min(steps, WARM_UP_STEPS), keep_every=None)
             with torch.no_grad():
                 torch._foreach_copy_(self._inputs, list(tensors))
+            # What earlier, launched calls have left in the allocator's cache makes room.
+            torch.cuda.synchronize(self.device)
+            torch.cuda.empty_cache()
             prepare_capture(functools.partial(self._warm_up, first), self.device)
         elif len(self._graphs) >= MOST_GRAPHS:
             self._graphs.popitem(last=False)

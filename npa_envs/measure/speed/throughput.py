@@ -46,6 +46,9 @@ PAPER = (EIGHT_WORLDS, ONE_WORLD, LARGE_WORLDS, CUBES, MILLION, SIXTEEN_MILLION)
 PROFILED = PAPER[:4]
 """Those of the authors' own table."""
 
+PUBLIC = (*PROFILED, Workload(2, 64, 256, 32))
+"""Workloads of the public call, with many small worlds."""
+
 CPU = (Workload(2, 1, 4096, 16), Workload(2, 4, 1024, 16))
 """Workloads on a CPU."""
 
