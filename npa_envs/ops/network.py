@@ -152,7 +152,10 @@ LAYER_BLOCK = 64
 """Threads of a block that maps rows: small, so that few rows still fill the device."""
 
 SHARES_PER_PROCESSOR = 2
-"""Blocks of a multiprocessor that sum weight gradients side by side."""
+"""Blocks of a multiprocessor that sum weight gradients side by side, where there are many rows."""
+
+FEW_ROWS = 160
+"""Rows of a multiprocessor up to which one block sums them: adding up the shares takes longer."""
 
 SIGN_UNITS = 128
 """Hidden units whose signs are one word for each of the four lanes that share a row."""
@@ -240,7 +243,8 @@ def _weight_gradients(
         -(-width // 16), -(-width // 8), -(-out_width // 8), warps, unit_blocks, signs.shape[1]
     )
     processors = torch.cuda.get_device_properties(rows.device).multi_processor_count
-    most = max(SHARES_PER_PROCESSOR * processors // unit_blocks, 1)
+    each = 1 if count <= FEW_ROWS * processors else SHARES_PER_PROCESSOR
+    most = max(each * processors // unit_blocks, 1)
     share_rows = max(-(-count // (most * ROW_GROUP)), 1) * ROW_GROUP
     shares = -(-count // share_rows)
     partial_sums = rows.new_empty(shares, unit_count * (width + out_width))
