@@ -271,8 +271,7 @@ class EnvConfig(WorldConfig):
     "particle": as dense, with each particle's own share in `info["particle_reward"]`."""
 
     episode_steps: int = 256
-    """Length of an episode where reward is "sparse", which a single environment cannot know from
-    `max_episode_steps`: change both together. Vector environments know it."""
+    """Length of an episode where reward is "sparse" and there is no `max_episode_steps`."""
 
     success_loss: float | None = None
     """The episode ends in success once the loss is at most this; None: the task's own choice."""

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
 import torch
+from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -20,8 +22,8 @@ from npa_envs.envs.core.spaces import (
     to_output,
 )
 from npa_envs.envs.core.task import EnvTask
-from npa_envs.envs.core.vector import world_keys
-from npa_envs.envs.core.worlds import DIVERGED, SUCCESS, Worlds, reason
+from npa_envs.envs.core.vector import check_options, plain_seed, world_keys
+from npa_envs.envs.core.worlds import DIVERGED, SUCCESS, TIME_LIMIT, Worlds, reason
 from npa_envs.errors import NPAError
 
 
@@ -37,7 +39,7 @@ class NPAEnv(gymnasium.Env[Any, Any]):
     | `reward` | Reward of step t |
     |---|---|
     | `"dense"` | L before the step minus L after it |
-    | `"sparse"` | 0, and minus L in the last step |
+    | `"sparse"` | 0, and minus L in the last step, also where that is a time limit |
     | `"particle"` | as dense; besides, `info["particle_reward"]` has each particle's own |
 
     Dense rewards telescope: their sum over an episode is L at its start minus L at its end. So the
@@ -59,9 +61,8 @@ class NPAEnv(gymnasium.Env[Any, Any]):
     | `max_episode_steps` steps are done | truncated | `"time limit"` |
 
     A particle has left where a coordinate is beyond ±`position_limit`, and its state has run away
-    beyond ±`observation_limit`. The steps of a single environment are counted by Gymnasium, which
-    truncates without a reason; with `reward="sparse"` such an environment has to be told the number
-    of steps twice, as `max_episode_steps` and as `episode_steps`.
+    beyond ±`observation_limit`. With a step limit of your own instead of `max_episode_steps`, such
+    as another library's, tell `reward="sparse"` the number of steps as `episode_steps`.
 
     ## Info
 
@@ -69,7 +70,7 @@ class NPAEnv(gymnasium.Env[Any, Any]):
     |---|---|---|
     | `loss` | reset, step | L as it is now |
     | `success`, `diverged` | step | whether it did so in this step, bool |
-    | `reason` | last step | why the episode ended, see above |
+    | `reason` | last step | why the episode ended, see above; None for worlds that go on |
     | `particle_reward` | step, where `reward="particle"` | each particle's own reward, shape [N] |
 
     ## Rendering
@@ -144,16 +145,20 @@ class NPAEnv(gymnasium.Env[Any, Any]):
         Args:
             seed: Begin the sequence of episodes that belongs to this number; without it the
                 sequence goes on.
-            options: Not used.
+            options: None or empty: a single environment has none.
 
         Raises:
             gymnasium.error.Error: The seed is no integer of at least 0.
+            NPAError: There is an option.
 
         Returns:
             The observation, shape [N, P], and the loss with its parts.
         """
+        seed = plain_seed(seed)
+        check_options(options, ())
         super().reset(seed=seed)
         self._warn_of_unpaid_rewards()
+        self.worlds.limit_steps(_step_limit(self))
         # A generator that is not the one of the last episode means a new sequence, be it by `seed`
         # or because the caller put another one into `np_random`.
         keys = None
@@ -174,8 +179,8 @@ class NPAEnv(gymnasium.Env[Any, Any]):
             action: Shape [N, A], in [-1, 1].
 
         Returns:
-            Observation, reward, whether the episode ended by itself, False (the step limit is
-            Gymnasium's own), and what the docstring of the environment lists.
+            Observation, reward, whether the episode ended by itself, whether the step limit of
+            `gymnasium.make` ended it, and what the docstring of the environment lists.
 
         Raises:
             NPAError: The action has another shape; the world is then as it was.
@@ -191,20 +196,20 @@ class NPAEnv(gymnasium.Env[Any, Any]):
             endings, observation = worlds.step(checked[None])
             diverged = bool(endings[0] & DIVERGED)
             ending = int(worlds.guarded(endings, observation)[0])
-        ended = ending & (SUCCESS | DIVERGED) != 0
+        ended, late = ending & (SUCCESS | DIVERGED) != 0, ending & TIME_LIMIT != 0
         names, numbers = worlds.part_names, worlds.report.numbers[:, 0].tolist()
         info = self._losses(numbers)
         info |= {f"reward_{name}": numbers[2 + len(names) + k] for k, name in enumerate(names)}
         info |= {"success": bool(ending & SUCCESS), "diverged": diverged}
-        if ended:
+        if ended or late:
             info["reason"] = reason(ending)
         if worlds.particle_reward is not None:
             info["particle_reward"] = self._out(worlds.particle_reward[0].clone())
         if config.reward == "sparse":
-            paid = ended or int(worlds.elapsed[0]) == config.episode_steps
+            paid = ended or late or int(worlds.elapsed[0]) == config.episode_steps
             self._unpaid_steps = 0 if paid else self._unpaid_steps + 1
         self._show()
-        return self._out(observation[0]), numbers[0], ended, False, info
+        return self._out(observation[0]), numbers[0], ended, late, info
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return the world's picture, shape [R, R, 3], in the mode "rgb_array"."""
@@ -255,8 +260,29 @@ class NPAEnv(gymnasium.Env[Any, Any]):
             self._warned = True
             warnings.warn(
                 f"an episode ended {self._unpaid_steps} steps after the last sparse reward, which "
-                f"comes at step episode_steps={self.config.episode_steps}: where Gymnasium's "
-                "max_episode_steps is another number, give it as episode_steps as well",
+                f"comes at step episode_steps={self.config.episode_steps}: give the number of "
+                "steps as max_episode_steps to gymnasium.make, or as episode_steps as well",
                 stacklevel=3,
             )
         self._unpaid_steps = 0
+
+
+def _step_limit(env: NPAEnv) -> int | None:
+    """Return the step limit that Gymnasium put around an environment, None where there is none.
+
+    An environment is told neither the limit nor what is wrapped around it; but whoever counts its
+    steps is reset together with it, and so stands among its callers. Limits around a wrapper that
+    may take several steps at once are left out: they do not count these.
+    """
+    limits, frame = [], sys._getframe(1).f_back
+    inner: gymnasium.Env[Any, Any] = env
+    while frame is not None:
+        caller = frame.f_locals.get("self")
+        if isinstance(caller, gymnasium.Wrapper) and caller.env is inner:
+            inner = caller
+            if isinstance(caller, TimeLimit):
+                limits.append(caller._max_episode_steps)
+            elif not isinstance(caller, OrderEnforcing | PassiveEnvChecker):
+                break
+        frame = frame.f_back
+    return min(limits, default=None)

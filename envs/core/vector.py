@@ -23,7 +23,7 @@ from npa_envs.envs.core.spaces import (
     to_output,
 )
 from npa_envs.envs.core.task import EnvTask
-from npa_envs.envs.core.worlds import FLAGS, TIME_LIMIT, Worlds, reason
+from npa_envs.envs.core.worlds import FLAGS, TIME_LIMIT, Report, Worlds, reason
 from npa_envs.errors import NPAError, suggest
 from npa_envs.tasks.checks import is_whole
 from npa_envs.world.cuda_graph import sent
@@ -96,6 +96,7 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
         """Whether what is handed out stays as it is after the next step."""
         self._started = False
         self._buffer: Tensor | None = None
+        self._shared: NDArray[np.float64] | None = None
         self._ended = np.zeros(num_envs, dtype=bool)
         self._screen = Screen(self.worlds, self.config, self.metadata["render_fps"])
 
@@ -129,10 +130,8 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
         Raises:
             NPAError: The mask or the seeds have a wrong shape.
         """
-        first: Any = seed
-        if isinstance(first, np.integer):
-            seed = first = int(first)
-        super().reset(seed=first if isinstance(first, int) else None)
+        seed = plain_seed(seed)
+        super().reset(seed=seed if isinstance(seed, int) else None)
         chosen = worlds_to_reset(options, self.num_envs)
         if not self._started and len(chosen) < self.num_envs:
             raise NPAError("reset_mask needs worlds to leave alone: reset all of them first")
@@ -150,7 +149,7 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
         self._show()
         which = np.zeros(self.num_envs, dtype=bool)
         which[chosen] = True
-        numbers = list(self._out(self.worlds.report.copy().numbers))
+        numbers = self._numbers(self.worlds.report.copy())
         return self._out(observation), self._losses(numbers, self._mask(which))
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
@@ -210,6 +209,8 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
             infos |= {"final_info": final_infos, "_final_info": self._mask(ended)}
         else:
             self._ended = ended
+            if ended.any():
+                infos |= {"reason": REASONS[endings], "_reason": self._mask(ended)}
         self._show()
         return self._out(observation), numbers[0], flags[0], flags[1], infos
 
@@ -267,7 +268,7 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
         worlds = self.worlds
         report = worlds.report.copy() if copy else worlds.report
         # One view for each quantity, made at once.
-        numbers, flags = list(self._out(report.numbers)), list(self._out(report.endings))
+        numbers, flags = self._numbers(report), list(self._out(report.endings))
         everyone = self._out(report.everyone if copy else report.everyone.clone())
         which = everyone if stepped is None else self._mask(stepped)
         infos = self._losses(numbers, everyone)
@@ -293,6 +294,18 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
         """Return the last infos of the worlds whose episodes are over, with the reasons."""
         final = {name: which if name.startswith("_") else value for name, value in infos.items()}
         return final | {"reason": REASONS[endings], "_reason": which}
+
+    def _numbers(self, report: Report) -> list[Any]:
+        """Return a report's numbers as handed out: arrays are float64, as Gymnasium's own are."""
+        numbers = self._out(report.numbers)
+        if isinstance(numbers, Tensor):
+            return list(numbers)
+        if report is not self.worlds.report:
+            return list(numbers.astype(np.float64))
+        if self._shared is None:
+            self._shared = np.empty(numbers.shape)
+        self._shared[:] = numbers
+        return list(self._shared)
 
     def _out(self, tensor: Tensor) -> Any:
         return to_output(tensor, self.config.output)
@@ -344,22 +357,36 @@ def checked_mode(given: str | AutoresetMode) -> AutoresetMode:
     return by_name[given]
 
 
+def plain_seed(seed: Any) -> Any:
+    """Return a seed as Gymnasium takes it: NumPy's whole number as Python's, all else as it is."""
+    return int(seed) if isinstance(seed, np.integer) else seed
+
+
+def check_options(options: Any, known: tuple[str, ...]) -> None:
+    """Check what `reset` is told, by names of options.
+
+    Raises:
+        NPAError: It is no mapping, or holds another name than the known ones.
+    """
+    if not isinstance(options, Mapping | None):
+        raise NPAError(
+            f"options must be a dict or None, got {type(options).__name__}: "
+            "for example options={'reset_mask': mask}"
+        )
+    for name in options or ():
+        if name not in known:
+            cure = suggest(str(name), known) if known else "a single environment has none"
+            raise NPAError(f"unknown reset option {str(name)[:80]!r}: {cure}")
+
+
 def worlds_to_reset(options: dict[str, Any] | None, world_count: int) -> NDArray[np.int64]:
     """Return which of B worlds the options of `reset` ask for: those of the mask, or all.
 
     Raises:
         NPAError: The mask is no bool array of shape [B], or chooses no world.
     """
-    options = {} if options is None else options
-    if not isinstance(options, Mapping):
-        raise NPAError(
-            f"options must be a dict or None, got {type(options).__name__}: "
-            "for example options={'reset_mask': mask}"
-        )
-    for name in options:
-        if name != "reset_mask":
-            raise NPAError(f"unknown reset option {name!r}: {suggest(str(name), ['reset_mask'])}")
-    mask = options.get("reset_mask")
+    check_options(options, ("reset_mask",))
+    mask = (options or {}).get("reset_mask")
     if mask is None:
         return np.arange(world_count)
     given = mask.cpu().numpy() if isinstance(mask, Tensor) else np.asarray(mask)

@@ -204,6 +204,12 @@ class Worlds(Batch):
         if self._beside is not None:
             self._host_endings = self._host_endings.pin_memory()
 
+    def limit_steps(self, episode_steps: int | None) -> None:
+        """Cut episodes off after so many steps from now on, or never."""
+        if episode_steps != self.episode_steps:
+            self.episode_steps = episode_steps
+            self._judge_and_survey = Replayed(self._look, self.device)
+
     @property
     def reward(self) -> Tensor:
         """Rewards of the last step, shape [B]."""

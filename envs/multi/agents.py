@@ -14,7 +14,7 @@ from torch import Tensor
 
 from npa_envs.envs.core.screen import Screen
 from npa_envs.envs.core.spaces import action_tensor, to_output
-from npa_envs.envs.core.vector import world_keys
+from npa_envs.envs.core.vector import plain_seed, world_keys
 from npa_envs.envs.multi.worlds import Episodes
 from npa_envs.errors import DivergedError, NPAError
 from npa_envs.world.actions import Physics
@@ -80,7 +80,7 @@ class AgentsEnv:
         """
         if seed is None and self.np_random is not None:
             return None
-        self.np_random, _ = seeding.np_random(first)
+        self.np_random, _ = seeding.np_random(plain_seed(first))
         return world_keys(seed, self.worlds.world_count, self.np_random)
 
     def _state(self) -> Tensor:

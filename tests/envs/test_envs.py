@@ -17,6 +17,7 @@ from gymnasium.wrappers import FlattenObservation
 from small_envs import IDS, assert_same, make, make_vec, small
 
 import npa_envs
+from npa_envs.envs import multispecies_v0
 from npa_envs.errors import DivergedError, NPAError
 from npa_envs.world.randomness import Purpose
 
@@ -166,17 +167,91 @@ def test_dense_rewards_add_up_to_the_total_improvement(name):
 
 @every_id
 def test_sparse_reward_is_the_loss_at_the_end_paid_once(name):
-    env = make(name, reward="sparse", max_episode_steps=8, episode_steps=5, success_loss=0.0)
+    """Shorter and longer than `episode_steps`, which is for environments without a limit."""
+    for given in ({"max_episode_steps": 8}, {"max_episode_steps": 8, "episode_steps": 5}):
+        env = make(name, reward="sparse", success_loss=0.0, **given)
+        env.reset(seed=0)
+        steps = [env.step(action) for action in actions(env, 8, scale=0.2)]
+        expected = [0.0] * 7 + [-steps[7][4]["loss"]]
+        assert [reward for _, reward, *_ in steps] == expected
+        assert [truncated for *_, truncated, _ in steps] == [False] * 7 + [True]
+        assert [info.get("reason") for *_, info in steps] == [None] * 7 + ["time limit"]
+
+
+@pytest.mark.filterwarnings("ignore:an episode ended")
+def test_sparse_reward_is_paid_at_whatever_limit_stands_around_the_environment():
+    inner = make(IDS[0], reward="sparse", max_episode_steps=-1, episode_steps=2)
+    limited = gymnasium.wrappers.TimeLimit(inner, 3)
+    for env, last in ((inner, 2), (limited, 3), (inner, 2)):
+        env.reset(seed=0)
+        paid = [env.step(action)[1] != 0.0 for action in actions(env, 4, scale=0.2)]
+        assert paid == [step + 1 == last for step in range(4)]
+
+
+class Repeated(gymnasium.Wrapper):
+    """Takes each action twice, as wrappers for video games do."""
+
+    def step(self, action):
+        self.env.step(action)
+        return self.env.step(action)
+
+
+def test_a_limit_that_counts_other_steps_ends_nothing_early():
+    env = gymnasium.wrappers.TimeLimit(Repeated(make(IDS[0], max_episode_steps=-1)), 3)
     env.reset(seed=0)
-    steps = [env.step(action) for action in actions(env, 8, scale=0.2)]
-    expected = [0.0] * 8
-    expected[4] = -steps[4][4]["loss"]
-    assert [reward for _, reward, *_ in steps] == expected
-    assert [truncated for *_, truncated, _ in steps] == [False] * 7 + [True]
+    ends = [env.step(action)[3] for action in actions(env, 3, scale=0.2)]
+    assert ends == [False, False, True]
+
+
+@pytest.mark.parametrize("mode", ["disabled", "next-step"])
+def test_infos_say_why_episodes_ended_where_nothing_is_reset_in_the_same_step(mode):
+    envs = make_vec(IDS[0], 3, max_episode_steps=2, autoreset_mode=mode, observation_limit=3.5)
+    envs.reset(seed=0)
+    still = np.zeros((3, *envs.single_action_space.shape), np.float32)
+    assert "reason" not in envs.step(still)[4]
+    x, s = envs.particles()
+    envs.place_particles(x[1:2], torch.full_like(s[1:2], 3.4), worlds=[1])
+    still[1] = 1.0
+    _, _, terminated, _, infos = envs.step(still)
+    assert terminated.tolist() == [False, True, False]
+    assert infos["reason"].tolist() == ["time limit", "diverged", "time limit"]
+    assert infos["_reason"].all()
+
+
+def test_reset_takes_the_same_of_one_world_and_of_many():
+    single, vector, sync = make(IDS[0]), make_vec(IDS[0], 2), sync_envs(2)
+    for env in (single, vector, sync):
+        with pytest.raises(NPAError, match="unknown reset option 'damage'"):
+            env.reset(options={"damage": "cut"})
+        env.reset(options={})
+    with pytest.raises(NPAError, match="options must be a dict or None, got int"):
+        single.unwrapped.reset(options=3)
+    observation, _ = single.reset(seed=3)
+    assert np.array_equal(single.reset(seed=np.int64(3))[0], observation)
+    assert np.array_equal(vector.reset(seed=np.int64(3))[0][0], observation)
+    species = multispecies_v0.parallel_env("mixing", particle_counts=[24, 17], eps=0.3)
+    first, again = (species.reset(seed=kind(3))[0] for kind in (int, np.int64))
+    assert all(np.array_equal(first[agent], again[agent]) for agent in first)
+
+
+def sync_envs(count):
+    return gymnasium.vector.SyncVectorEnv([lambda: make(IDS[0])] * count)
+
+
+def test_rewards_and_losses_have_the_same_type_natively_and_through_gymnasium():
+    native, sync = make_vec(IDS[0], 2, max_episode_steps=3), sync_envs(2)
+    native.reset(seed=0)
+    sync.reset(seed=0)
+    for action in actions(native, 2, scale=0.2):
+        left, right = native.step(action), sync.step(action)
+        assert left[1].dtype == right[1].dtype == np.float64
+        for name in ("loss", "reward_colour", "diverged"):
+            assert left[4][name].dtype == right[4][name].dtype
+        assert np.array_equal(left[1], right[1])
 
 
 def test_sparse_reward_that_was_cut_off_is_told():
-    env = make(IDS[0], reward="sparse", max_episode_steps=3)
+    env = make(IDS[0], reward="sparse", max_episode_steps=-1)
     env.reset(seed=0)
     for action in actions(env, 3, scale=0.2):
         env.step(action)
