@@ -143,7 +143,16 @@ class EnvTask(WorldTask[Config]):
         Args:
             random: As for `seed`.
         """
-        return Start(*self.seed(random))
+        return self._as_start("seed", self.seed(random))
+
+    def _as_start(self, method: str, made: Any) -> Start:
+        """Return what one of the task's methods made, positions and states first, as a `Start`."""
+        if not isinstance(made, tuple | list) or not 2 <= len(made) <= len(Start._fields):
+            raise NPAError(
+                f"{type(self).__name__}.{method} must return positions and states, got a "
+                f"{type(made).__name__}: return x, s"
+            )
+        return Start(*made)
 
     def toward(self, goal: Tensor) -> Self:
         """Return the task with losses for worlds of these goals; by default there are none.
@@ -180,7 +189,7 @@ class EnvTask(WorldTask[Config]):
             random: Where they come from, one stream a world.
         """
         if self.config.seed_pool == 0:
-            start = self.fresh(random)
+            start = self._as_start("fresh", self.fresh(random))
         else:
             pool = self.pool()
             chosen = random.integers(self.config.seed_pool, 1)[:, 0]
@@ -196,7 +205,8 @@ class EnvTask(WorldTask[Config]):
         if self._pool is None:
             # Not the streams that episodes with these seeds go on with.
             random = WorldRandom(range(self.config.seed_pool), device=self.device)
-            self._pool = self.fresh(random.beside(Purpose.GROWTH))
+            made = self.fresh(random.beside(Purpose.GROWTH))
+            self._pool = self._as_start("fresh", made)
         return self._pool
 
     def draw(self, x: Tensor, s: Tensor, steps: NDArray[np.int64]) -> NDArray[np.uint8]:

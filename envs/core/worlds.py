@@ -16,6 +16,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from npa_envs.envs.core.answers import (
+    GlobalDraws,
+    check_finite,
+    check_start,
+    checked_losses,
+    checked_shares,
+    starter,
+)
 from npa_envs.envs.core.config import EnvConfig, WorldConfig
 from npa_envs.envs.core.memory import check_memory
 from npa_envs.envs.core.spaces import number_tensor
@@ -28,6 +36,9 @@ from npa_envs.world.randomness import WorldRandom
 
 SUCCESS, DIVERGED, TIME_LIMIT = 1, 2, 4
 """Bits of an ending: why an episode is over; none is set while it runs."""
+
+NOT_FINITE = 8
+"""Bit of a world whose reward is not finite: its step is an error."""
 
 FLAGS = ("success", "diverged")
 """Names of the first two endings in `info`."""
@@ -227,10 +238,22 @@ class Worlds(Batch):
         Keys are those of `next_streams`.
         """
         random = self.next_streams(worlds, keys)
-        start = self.task.start(random)
+        # The first start is not recorded: the host may look.
+        task, first = self.task, not self.part_names
+        draws = GlobalDraws(task) if first else None
+        start = task.start(random)
+        check_start(task, start, len(worlds), (self.x.shape, self.s.shape))
+        if draws is not None:
+            draws.check(starter(task))
+        if first or not self.x.is_cuda:
+            check_finite(task, starter(task), {"positions": start.x, "states": start.s})
         self.random.put(worlds, random)
         self.elapsed.index_fill_(0, worlds, 0)
         self.place(worlds, start)
+        if draws is not None:
+            draws.check("losses")
+        if first or not self.x.is_cuda:
+            self._check_losses(worlds)
         self._start_loss[worlds] = self.loss[worlds]
         if start.success_loss is None:
             self._success_loss.index_fill_(0, worlds, -torch.inf)
@@ -252,17 +275,18 @@ class Worlds(Batch):
             self._goal.index_copy_(0, worlds, goal)
             task = task.toward(goal)
         parts = task.losses(x, s)
+        values = torch.stack(checked_losses(task, parts, len(x), self.part_names))
         if not self.part_names:
             self.part_names = tuple(parts)
             self.report = Report.empty(self.world_count, len(parts), x.device)
         self.x.index_copy_(0, worlds, x)
         self.s.index_copy_(0, worlds, s)
-        values = torch.stack(list(parts.values()))
         still = torch.zeros_like(values)
         numbers = torch.cat((still[:1], total(values)[None], values, still))
         self.report.numbers.index_copy_(1, worlds, numbers)
         if self.particle_loss is not None and self.particle_reward is not None:
-            self.particle_loss[worlds] = task.particle_losses(x, s)
+            shares = checked_shares(task, task.particle_losses(x, s), (len(x), x.shape[1]))
+            self.particle_loss[worlds] = shares
             self.particle_reward.index_fill_(0, worlds, 0.0)
         self.report.endings.index_fill_(1, worlds, False)
 
@@ -304,6 +328,7 @@ class Worlds(Batch):
         Raises:
             DivergedError: An action is not finite; the worlds, and what is reported of them, are
                 then as they were.
+            NPAError: The task's losses are not finite.
         """
         observation = self.queue(action, out)
         if self._beside is not None:
@@ -312,7 +337,15 @@ class Worlds(Batch):
             self.random.steps -= 1
             self.elapsed -= 1
             raise self._not_finite(action)
-        return self._host_endings[:-1].numpy().copy(), observation
+        endings = self._host_endings[:-1].numpy().copy()
+        if (endings & NOT_FINITE).any():
+            everyone = torch.arange(self.world_count, device=self.device)
+            self._check_losses(everyone)
+            raise NPAError(
+                f"losses of {type(self.task).__name__} must be finite before a step as well as "
+                "after it: mend them, then reset"
+            )
+        return endings, observation
 
     @torch.no_grad()
     def queue(self, action: Tensor, out: Tensor | None = None) -> Tensor:
@@ -342,7 +375,8 @@ class Worlds(Batch):
         # Worlds that have to go on as they are pay and are paid for what they are.
         lost = torch.zeros_like(diverged) if config.on_divergence == "ignore" else diverged
         ended = diverged if config.on_divergence == "terminate" else torch.zeros_like(diverged)
-        parts = torch.stack(list(task.losses(self.x, self.s).values()))
+        losses = task.losses(self.x, self.s)
+        parts = torch.stack(checked_losses(task, losses, self.world_count, self.part_names))
         loss = total(parts)
         # Leaving the world must not pay, even where an empty picture is better than the start.
         loss = torch.where(lost, torch.maximum(loss, self._start_loss), loss)
@@ -354,11 +388,14 @@ class Worlds(Batch):
         endings = torch.stack((success | ended, late, success, diverged))
         self.report.endings.copy_(torch.where(enabled, endings, self.report.endings))
         improvement = self.loss - loss
+        broken = ~torch.isfinite(improvement)
         if self.particle_loss is not None and self.particle_reward is not None:
             shares = task.particle_losses(self.x, self.s)
+            shares = checked_shares(task, shares, (self.world_count, self.particle_count))
             own = torch.where(lost[:, None], improvement[:, None], self.particle_loss - shares)
             self.particle_reward.copy_(torch.where(enabled, own, self.particle_reward))
             self.particle_loss.copy_(shares)
+            broken |= ~torch.isfinite(own).all(dim=1)
         reward = improvement
         if config.reward == "sparse":
             limit = self.episode_steps or config.episode_steps
@@ -369,6 +406,7 @@ class Worlds(Batch):
         now = torch.cat((reward[None], loss[None], parts, before - parts))
         numbers.copy_(torch.where(enabled, now, numbers))
         ending = SUCCESS * success.byte() + DIVERGED * diverged.byte() + TIME_LIMIT * late.byte()
+        ending += NOT_FINITE * broken.byte()
         self._host_endings.copy_(torch.cat((ending, self._enabled)), non_blocking=True)
         self._enabled.fill_(1)
 
@@ -400,6 +438,16 @@ class Worlds(Batch):
             if len(going_on):
                 self.reseed(going_on, observation)
         return endings & ~np.uint8(DIVERGED)
+
+    def _check_losses(self, worlds: Tensor) -> None:
+        """Check that the losses of some worlds, int64, shape [M], are finite."""
+        numbers = self.report.numbers[2 : 2 + len(self.part_names), worlds]
+        parts = {
+            f"part {name!r}": part for name, part in zip(self.part_names, numbers, strict=True)
+        }
+        check_finite(self.task, "losses", parts)
+        if self.particle_loss is not None:
+            check_finite(self.task, "particle_losses", {"shares": self.particle_loss[worlds]})
 
     def pictures(self, count: int) -> NDArray[np.uint8]:
         """Return pictures of the first worlds, uint8, shape [count, R, R, 3]."""
