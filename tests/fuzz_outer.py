@@ -5,8 +5,13 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import gzip
+import io
+import json
 import random
+import re
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +19,18 @@ import gymnasium
 import small_envs
 import torch
 from fuzz_values import Target, wrong
+from PIL import Image
 
 import npa_envs
 from npa_envs import agents, wrappers
 from npa_envs.cli import COMMANDS, main
 from npa_envs.envs import multispecies_v0, particles_v0
+from npa_envs.tasks.targets.clouds import read_idx
+from npa_envs.tasks.targets.points import load_target
+from npa_envs.tasks.targets.textures import load_texture
+from npa_envs.tasks.targets.views import load_views
 from npa_envs.training import TASKS, load_config, override, preset
+from npa_envs.training.overrides import config_to_dict
 
 
 def configured(draw: random.Random) -> dict[str, Any]:
@@ -47,6 +58,92 @@ def read_config(text: Any, suffix: Any) -> None:
         path = Path(folder) / f"config{suffix}"
         path.write_text(str(text))
         load_config(path, preset("tiny"))
+
+
+FILES: dict[str, tuple[str, Callable[[Path], Any]]] = {
+    ".png": ("picture", lambda path: load_target(path, point_count=50)),
+    ".jpg": ("picture", lambda path: load_texture(path, resolution=8)),
+    ".webp": ("picture", lambda path: load_texture(path, resolution=8)),
+    ".gif": ("picture", lambda path: load_texture(path, resolution=8)),
+    ".bmp": ("picture", lambda path: load_texture(path, resolution=8)),
+    ".tiff": ("picture", lambda path: load_texture(path, resolution=8)),
+    ".ppm": ("picture", lambda path: load_texture(path, resolution=8)),
+    ".safetensors": ("rule", npa_envs.load_rule),
+    ".pth": ("state dict", npa_envs.load_rule),
+    ".json": ("configuration", lambda path: load_config(path, preset("tiny"))),
+    ".yaml": ("configuration", lambda path: load_config(path, preset("tiny"))),
+    ".toml": ("TOML", lambda path: load_config(path, preset("tiny"))),
+    ".idx": ("IDX", read_idx),
+    ".gz": ("IDX", read_idx),
+    ".obj": ("mesh", lambda path: load_views(path, resolution=8, training_count=1)),
+}
+"""What is written to a file of each suffix, and what reads it."""
+
+
+@functools.cache
+def whole_file(suffix: str) -> bytes:
+    """Return a file of a format as it should be."""
+    kind, _ = FILES[suffix]
+    buffer = io.BytesIO()
+    if kind == "picture":
+        picture = Image.new("RGB", (12, 12), "white")
+        picture.paste("red", (3, 3, 9, 9))
+        picture.save(buffer, {".jpg": "JPEG", ".tiff": "TIFF"}.get(suffix, suffix[1:].upper()))
+    elif kind == "rule":
+        return npa_envs.rule.files.shipped_rules()["heart"].read_bytes()
+    elif kind == "state dict":
+        shapes = {"model.0.weight": (8, 22), "model.0.bias": (8,), "model.2.weight": (7, 8)}
+        weights = {name: torch.zeros(shape) for name, shape in shapes.items()}
+        torch.save(weights | {"eps0": 0.1, "alpha": 0.2}, buffer)
+    elif kind == "IDX":
+        sizes = b"".join(size.to_bytes(4, "big") for size in (2, 3, 3))
+        content = b"\0\0\x08\x03" + sizes + bytes(18)
+        return gzip.compress(content) if suffix == ".gz" else content
+    elif kind == "mesh":
+        return b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 2 3 4\n"
+    elif kind == "TOML":
+        return b'iterations = 5\nsteps = [3, 6]\n[task]\ntarget = "heart"\neps = 0.1\n'
+    else:
+        return json.dumps(config_to_dict(preset("tiny"))).encode()
+    return buffer.getvalue()
+
+
+WORDS = (b"0", b"-1", b"1e400", 5000 * b"9", b"nan", b"null", b"[]", b"{}", b"true", b"[", b"\0")
+SIZES = (b"\xff\xff\xff\xff", b"\x7f\xff\xff\xff", b"\xff\xff\xff\x7f", bytes(4), b"\0\0\x40\0")
+
+
+def damaged_files(draw: random.Random) -> dict[str, Any]:
+    """Make a file of which one to eight places are wrong."""
+    suffix = draw.choice(tuple(FILES))
+    content = bytearray(whole_file(suffix))
+    for _ in range(draw.choice((1, 1, 2, 8))):
+        place = draw.randrange(len(content))
+        if draw.random() < 0.5:
+            place = min(place, draw.randrange(200))
+        change = draw.choice(("bit", "cut", "drop", "size", "word", "repeat"))
+        if change == "bit":
+            content[place] ^= 1 << draw.randrange(8)
+        elif change == "cut" and place:
+            del content[place:]
+        elif change == "drop" and place:
+            del content[place : place + draw.randrange(32)]
+        elif change == "size":
+            content[place : place + 4] = draw.choice(SIZES)
+        elif change == "repeat":
+            content[place:place] = content[: draw.randrange(64)]
+        else:
+            found = list(re.finditer(rb"[-\w.]+", content))
+            if found:
+                begin, end = draw.choice(found).span()
+                content[begin:end] = draw.choice(WORDS)
+    return {"kind": suffix, "content": bytes(content)}
+
+
+def read_damaged(kind: str, content: Any) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"file{kind}"
+        path.write_bytes(content if isinstance(content, bytes) else str(content).encode())
+        FILES[kind][1](path)
 
 
 def config_files(draw: random.Random) -> dict[str, Any]:
@@ -232,6 +329,7 @@ OUTER: dict[str, Target] = {
     "preset": Target(configure, configured, 4),
     "TrainConfig": Target(reconfigure, configured, 4),
     "load_config": Target(read_config, config_files),
+    "damaged files": Target(read_damaged, damaged_files, 6),
     "gymnasium.make": Target(run_env, env_fields, 5, (gymnasium.error.Error,)),
     "reset, place_particles and step": Target(act, acted, 5, (gymnasium.error.Error,)),
     "multispecies_v0": Target(run_species, crowd_fields, 5),

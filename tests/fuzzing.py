@@ -27,7 +27,7 @@ def call(seed: int) -> tuple[str, dict[str, Any]]:
     own = {"name"} if name in ("wrappers", "agents", "TrainConfig") else set()
     own |= {"task"} if name == "TrainConfig" else set()
     free = [a for a in arguments if a not in FIXED and a not in own and a != "words"]
-    if name in ("load_rule of a file", "load_config", "npa-envs"):
+    if name in ("load_rule of a file", "load_config", "damaged files", "npa-envs"):
         free = []
     for argument in draw.sample(free, min(len(free), draw.choice((0, 1, 1, 1, 2, 3)))):
         arguments[argument] = wrong(draw, argument, arguments[argument])

@@ -270,6 +270,16 @@ BAD_MESHES = {
 }
 
 
+def test_a_mesh_that_covers_no_pixel_gives_empty_views(tmp_path):
+    pytest.importorskip("trimesh")
+    far = [*TRIANGLE, [0.0, 1e-2, 0.0], [1e-2, 0.0, 0.0], [10.0, 10.0, 10.0]]
+    (tmp_path / "mesh.obj").write_text(
+        "".join(f"v {x} {y} {z}\n" for x, y, z in far) + "f 1 4 5\nf 6 6 6\n"
+    )
+    views = load_views(tmp_path / "mesh.obj", resolution=2, training_count=1, held_out_count=1)
+    assert (views.training.pictures == 0.0).all()
+
+
 @pytest.mark.parametrize("case", BAD_MESHES)
 def test_meshes_that_cannot_be_drawn_are_refused(tmp_path, case):
     pytest.importorskip("trimesh")

@@ -262,7 +262,8 @@ def _read_mesh(path: Path) -> Mesh:
             f"{shown(error)}): "
             "save it anew, for example as .ply or .glb"
         ) from error
-    if faces.size == 0 or vertices.size == 0 or not np.isfinite(vertices).all():
+    in_space = vertices.shape[1:] == (3,) and faces.shape[1:] == (3,)
+    if not in_space or faces.size == 0 or vertices.size == 0 or not np.isfinite(vertices).all():
         raise NPAError(
             f"target {shown(str(path))} must hold triangles with finite corners, got {len(faces)} "
             f"triangles and {len(vertices)} corners: give a surface, not a point cloud"
@@ -384,12 +385,12 @@ def _draw(
     low = np.maximum(np.floor(corners.min(axis=1) - 0.5).astype(np.int64), 0)
     high = np.minimum(np.ceil(corners.max(axis=1) - 0.5).astype(np.int64), (width - 1, height - 1))
     spans = (high - low + 1).max(axis=1)
-    shown = (high >= low).all(axis=1)
+    touched = (high >= low).all(axis=1)
     found: list[tuple[NDArray[np.int64], FloatArray, FloatArray]] = []
     # Triangles of about one size together, each on a square of pixels that holds it.
     side = 1
     while side < 2 * max(height, width):
-        chosen = np.flatnonzero(shown & (spans > side // 2) & (spans <= side))
+        chosen = np.flatnonzero(touched & (spans > side // 2) & (spans <= side))
         for part in np.array_split(chosen, max(1, len(chosen) * side * side // 2**21)):
             if len(part):
                 found.append(
@@ -401,7 +402,8 @@ def _draw(
         pixel, near, colour = (np.concatenate(parts) for parts in zip(*found, strict=True))
         order = np.lexsort((-near, pixel))
         pixel, colour = pixel[order], colour[order]
-        first = np.concatenate(([True], pixel[1:] != pixel[:-1]))
+        first = np.ones(len(pixel), dtype=np.bool_)
+        first[1:] = pixel[1:] != pixel[:-1]
         picture[pixel[first], :3] = colour[first]
         picture[pixel[first], 3] = 1.0
     return picture.reshape(height, width, 4)
