@@ -20,6 +20,7 @@ from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
 from npa_envs.tasks.checks import check_positive
 from npa_envs.tasks.point_classification import (
+    PICTURE_MARGIN,
     PointClassification,
     PointClassificationConfig,
     class_colours,
@@ -113,14 +114,20 @@ class PointClassificationTask(GoalTask[PointClassificationEnvConfig]):
         return self.goal.errors(s) + self.config.overflow_weight * self.goal.overflows(s)
 
     def draw(self, x: Tensor, s: Tensor, steps: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Return pictures of the unit square; particles have the colours of what they say."""
+        """Return pictures of the unit square, with a margin, in colours of what particles say."""
         colours = class_colours(self.goal.outputs(s)) - COLOUR_OFFSET
-        return super().draw(2.0 * x - 1.0, torch.cat((s[..., :-3], colours), dim=-1), steps)
+        return super().draw(
+            MAGNIFICATION * (x - 0.5), torch.cat((s[..., :-3], colours), dim=-1), steps
+        )
 
     @property
     def pixel_size(self) -> float:
-        """Size of a particle in pictures, which show the unit square at twice its size."""
-        return 2.0 * self.goal.pixel_size
+        """Size of a particle in pictures, which show the unit square magnified."""
+        return MAGNIFICATION * self.goal.pixel_size
+
+
+MAGNIFICATION = 2.0 / (1.0 + 2.0 * PICTURE_MARGIN)
+"""Of pictures, which span two length units."""
 
 
 def _read_out_rule(config: PointClassificationEnvConfig, device: torch.device) -> NPARule:
@@ -199,7 +206,7 @@ class PointClassificationEnv(NPAEnv):
     ## Rendering
 
     A particle has the colour of the class that it says, greyer the less sure it is, and [0, 1] ×
-    [0, 1] is shown in place of the square named below.
+    [0, 1] with a little room around it is shown in place of the square named below.
     """
 
     task_type = PointClassificationTask

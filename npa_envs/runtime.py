@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import functools
 import json
 import os
+import sys
+import weakref
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -49,6 +52,16 @@ def start_warp() -> None:
     """Start Warp, quietly; does nothing from the second call on."""
     with quiet_warp():
         wp.init()  # type: ignore[no-untyped-call]
+    # Handlers go in the reverse order: the one that warns has to be there before this one.
+    weakref.finalize(wp, int).detach()
+    atexit.register(_remove_header_folders)
+
+
+def _remove_header_folders() -> None:
+    """Remove Warp's folders of precompiled headers: left to the interpreter, that warns of them."""
+    runtime = getattr(sys.modules.get("warp._src.context"), "runtime", None)
+    for folder in getattr(runtime, "_pch_dirs", {}).values():
+        folder.cleanup()
 
 
 def warp_devices() -> list[str]:

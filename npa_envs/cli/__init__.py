@@ -37,6 +37,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         The exit code: 0, 2 for a mistake in what was asked for, 130 after Ctrl-C.
     """
+    # Read once, when torch is loaded: where other programs want the cores, threads that wait in
+    # busy loops make every operation several times as slow.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         return _dispatch(words)

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-import tyro
-
 from npa_envs.cli.output import (
     MeasureOptions,
+    OptionalOutFolder,
     StepBar,
     check_numbers,
     chosen_names,
+    parse_options,
     torch_threads,
     writable_folder,
 )
@@ -50,7 +50,7 @@ class BenchOptions(MeasureOptions):
     repeats: int = 7
     """Readings of every time; tables show their median and range."""
 
-    output: Path | None = None
+    out: OptionalOutFolder = None
     """Folder for SUITE_DEVICE.json and plots; default: nothing is written."""
 
     plots: bool = False
@@ -89,14 +89,14 @@ class BenchOptions(MeasureOptions):
 
 def main(arguments: Sequence[str]) -> int:
     """Measure, print, write and check; return 1 where `--check` found a ratio that was missed."""
-    options = tyro.cli(BenchOptions, prog="npa-envs bench", args=arguments)
+    options = parse_options(BenchOptions, "bench", arguments)
     from npa_envs.devices import check_device
     from npa_envs.measure.plots import check_matplotlib
     from npa_envs.measure.speed.suites import SUITES, missed_ratios, stored_ratios
 
     check_numbers(options, repeats=1, threads=1, world_count=1, particle_count=1, state_dim=1)
-    if options.plots and options.output is None:
-        raise NPAError("plots need a folder to be written to: give --output DIR as well")
+    if options.plots and options.out is None:
+        raise NPAError("plots need a folder to be written to: give --out DIR as well")
     if options.check is not None and options.suite not in (None, QUICK):
         raise NPAError(
             f"check compares ratios of the suite quick, got suite {options.suite!r}: "
@@ -107,15 +107,15 @@ def main(arguments: Sequence[str]) -> int:
     if options.explain:
         print(_explanation(options, device))
         return 0
-    if options.output is not None:
-        writable_folder(options.output)
+    if options.out is not None:
+        writable_folder(options.out)
     if options.plots:
         check_matplotlib()
     stored = {} if options.check is None else stored_ratios(options.check, device)
     report = measured_report(options, device, shlex.join(["npa-envs", "bench", *arguments]))
     print(report.text())
-    if options.output is not None:
-        _write(report, options.output, plots=options.plots)
+    if options.out is not None:
+        _write(report, options.out, plots=options.plots)
     if options.check is None:
         return 0
     missed = missed_ratios(report.ratios, stored)

@@ -14,9 +14,11 @@ import tyro
 
 from npa_envs.cli.output import (
     MeasureOptions,
+    OutFolder,
     StepBar,
     check_numbers,
     chosen_names,
+    parse_options,
     writable_folder,
 )
 from npa_envs.errors import NPAError, suggest
@@ -43,7 +45,7 @@ class CompareOptions(MeasureOptions):
     code 1 where a run failed.
     """
 
-    output: Path = Path("comparison")
+    out: OutFolder = Path("comparison")
     """Folder for AXIS/TASK/METHOD/seed-K/, comparison.md, .json and .csv, and pictures
     (curves need the extra `bench`)."""
 
@@ -85,15 +87,15 @@ class CompareOptions(MeasureOptions):
 
 def main(arguments: Sequence[str]) -> int:
     """Run what is missing, print and write; return 1 where a run failed."""
-    options = tyro.cli(CompareOptions, prog="npa-envs compare", args=arguments)
+    options = parse_options(CompareOptions, "compare", arguments)
     from npa_envs.agents.comparison.report import write_pictures, write_table
     from npa_envs.agents.comparison.run import Places, held_records, run_jobs
 
     # Records are not to tell where on which machine they were written.
-    words = ["OUT" if word == str(options.output) else word for word in arguments]
+    words = ["OUT" if word == str(options.out) else word for word in arguments]
     command = shlex.join(["npa-envs", "compare", *words])
     plan = make_plan(options)
-    folder = writable_folder(options.output)
+    folder = writable_folder(options.out)
     # All are read first: a record of other settings is refused before any work is done.
     records = held_records(plan, folder)
     jobs = plan.jobs()

@@ -8,8 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import tyro
-
+from npa_envs.cli.output import (
+    OutFolder,
+    StepBar,
+    parse_options,
+    rule_of,
+    torch_threads,
+    writable_folder,
+)
 from npa_envs.errors import NPAError
 
 GROW_STEPS = 512
@@ -42,11 +48,11 @@ class DemoOptions:
     """Grow a shipped rule from its seed, cut it, erase a part and let it heal each time; then train
     a small rule from a picture."""
 
-    out: Path = Path("demo")
+    out: OutFolder = Path("demo")
     """Folder to write to; created where missing."""
 
     rule: str = "gecko"
-    """The rule to grow: a shipped one or a file."""
+    """The rule to grow: a shipped one, a file, or the folder of a run."""
 
     target: str = "heart"
     """The picture to train on: a built-in name, an emoji or a path."""
@@ -66,8 +72,7 @@ class DemoOptions:
 
 def main(arguments: Sequence[str]) -> int:
     """Show what the words after `npa-envs demo` ask for; return 0."""
-    options = tyro.cli(DemoOptions, prog="npa-envs demo", args=arguments)
-    from npa_envs.cli.output import torch_threads, writable_folder
+    options = parse_options(DemoOptions, "demo", arguments)
     from npa_envs.files import write_text
 
     if not 1.0 <= options.train_seconds <= 3600.0:
@@ -114,7 +119,6 @@ def grow_and_heal(options: DemoOptions, report: Report) -> None:
     import torch
 
     from npa_envs.cli.film import Film, film_world, write_film
-    from npa_envs.cli.output import StepBar
     from npa_envs.measure.quality import measure
     from npa_envs.rule.files import load_rule
     from npa_envs.tasks.damage import DamageEvent, damage_worlds
@@ -122,8 +126,9 @@ def grow_and_heal(options: DemoOptions, report: Report) -> None:
     from npa_envs.training.trained_tasks import task_of_rule
 
     device = check_device(options.device)
-    rule = load_rule(options.rule, device=device).float()
-    trained = task_of_rule(options.rule, rule, device)
+    source = rule_of(options.rule)
+    rule = load_rule(source, device=device).float()
+    trained = task_of_rule(source, rule, device)
     task = trained.task
     generator = torch.Generator(device).manual_seed(options.seed)
     x, s = task.seed(1, generator=generator, device=device)
@@ -165,7 +170,6 @@ def train_small(options: DemoOptions, report: Report) -> None:
     import torch
 
     from npa_envs.cli.film import film_world, write_film
-    from npa_envs.cli.output import StepBar
     from npa_envs.measure.quality import measure
     from npa_envs.render import to_uint8, write_filmstrip
     from npa_envs.training import (

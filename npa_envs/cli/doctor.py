@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import tyro
+from npa_envs.cli.output import parse_options
 
 PACKAGES = (
     "npa-envs",
@@ -36,7 +36,7 @@ class DoctorOptions:
 
 def main(arguments: Sequence[str]) -> int:
     """Print the report; return 1 where something has to be mended."""
-    tyro.cli(DoctorOptions, prog="npa-envs doctor", args=arguments)
+    parse_options(DoctorOptions, "doctor", arguments)
     findings = examine()
     width = max(len(finding.subject) for finding in findings)
     for finding in findings:

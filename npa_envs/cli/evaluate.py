@@ -7,9 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import tyro
-
-from npa_envs.cli.output import RuleOptions, StepBar, check_numbers
+from npa_envs.cli.output import RuleOptions, StepBar, check_numbers, parse_options, rule_of
 from npa_envs.errors import NPAError
 
 if TYPE_CHECKING:
@@ -48,7 +46,7 @@ class EvaluateOptions(RuleOptions):
 
 def main(arguments: Sequence[str]) -> int:
     """Measure and print."""
-    options = tyro.cli(EvaluateOptions, prog="npa-envs evaluate", args=arguments)
+    options = parse_options(EvaluateOptions, "evaluate", arguments)
     from npa_envs.devices import check_device
     from npa_envs.measure.quality import CHECKPOINTS, check_steps, evaluate, healing
     from npa_envs.measure.tables import table_text
@@ -60,9 +58,10 @@ def main(arguments: Sequence[str]) -> int:
     check_steps("checkpoints", checkpoints)
     check_numbers(options, seed_count=1)
     device = check_device(options.device)
-    rule = load_rule(options.rule, device=device).float()
+    source = rule_of(options.rule)
+    rule = load_rule(source, device=device).float()
     world = options.world() | {"data_folder": options.data_folder}
-    trained = task_of_rule(options.rule, rule, device, **world)
+    trained = task_of_rule(source, rule, device, **world)
     if trained.doubt is not None:
         raise NPAError(
             f"cannot measure {options.rule!r}: {trained.doubt}: "

@@ -5,13 +5,21 @@ from __future__ import annotations
 import functools
 import hashlib
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from npa_envs.cli.output import RunOptions, StepBar, check_numbers, writable_folder
+from npa_envs.cli.output import (
+    OutFolder,
+    RunOptions,
+    StepBar,
+    check_numbers,
+    parse_options,
+    rule_of,
+    writable_folder,
+)
 from npa_envs.errors import NPAError
 
 if TYPE_CHECKING:
@@ -25,6 +33,14 @@ RESULTS = "interactions.json"
 
 TASK = "morphogenesis2d"
 """The task of the rules that are brought together."""
+
+QUICK: dict[str, Any] = {
+    "seed_count": 2,
+    "distances": (0.0, 0.5),
+    "steps": 32,
+    "particle_count": 512,
+}
+"""What `--quick` puts in place of the defaults."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,13 +82,17 @@ class InteractOptions(RunOptions):
     margin: float = 0.2
     """Share by which a loss must change to count as changed."""
 
-    out: Path = Path("runs/interact")
+    quick: bool = False
+    """Two rules, worlds and distances, few particles and steps, unless said otherwise: figures that
+    say nothing but that it runs."""
+
+    out: OutFolder = Path("runs/interact")
     """Folder to write to; created where missing."""
 
 
 def main(arguments: Sequence[str]) -> int:
     """Bring together, measure, write."""
-    options = tyro.cli(InteractOptions, prog="npa-envs interact", args=arguments)
+    options = parse_options(InteractOptions, "interact", arguments)
     from npa_envs.devices import check_device
     from npa_envs.measure.interaction import Encounters, heat_map, read_rows, write_rows
     from npa_envs.measure.plots import write_plots
@@ -80,6 +100,11 @@ def main(arguments: Sequence[str]) -> int:
     from npa_envs.render import write_filmstrip
 
     check_numbers(options, seed_count=1)
+    if options.quick:
+        unsaid = [
+            name for name in QUICK if getattr(options, name) == getattr(InteractOptions, name)
+        ]
+        options = replace(options, **{name: QUICK[name] for name in unsaid})
     device = check_device(options.device)
     organisms, settings = _organisms(options, device)
     folder = writable_folder(options.out)
@@ -119,7 +144,8 @@ def _organisms(
     from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
     from npa_envs.training.trained_tasks import task_of_rule
 
-    sources = list(dict.fromkeys(options.rules)) or list(shipped_rules(TASK))
+    sources = list(dict.fromkeys(map(rule_of, options.rules)))
+    sources = sources or list(shipped_rules(TASK))[: 2 if options.quick else None]
     organisms: list[Organism] = []
     counts = []
     for source in sources:

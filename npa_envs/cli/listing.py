@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import tyro
+from npa_envs.cli.output import duration, parse_options
 
 
 @dataclass(frozen=True)
@@ -15,7 +15,7 @@ class ListOptions:
 
 def main(arguments: Sequence[str]) -> int:
     """Print everything that has a name."""
-    tyro.cli(ListOptions, prog="npa-envs list", args=arguments)
+    parse_options(ListOptions, "list", arguments)
     from npa_envs.measure.quality import score_line, scores
     from npa_envs.registration import ENVIRONMENTS
     from npa_envs.rule.files import load_rule, shipped_rules
@@ -27,8 +27,11 @@ def main(arguments: Sequence[str]) -> int:
     for name, entry in TASKS.items():
         print(f"  {name}: {entry.summary}")
         for preset, config in entry.presets.items():
+            seconds = entry.expected_seconds(config) or 0.0
+            repeats = "" if config.repeats == 1 else f" ({config.repeats} x {config.iterations})"
             print(
-                f"    {preset}: {config.total_iterations} iterations of {config.world_count} worlds"
+                f"    {preset}: {config.total_iterations} iterations{repeats} of "
+                f"{config.world_count} worlds, about {duration(seconds)} on a CPU"
             )
     print("environments (import npa_envs; gymnasium.make(NAME) or make_vec(NAME, num_envs=64))")
     for environment in ENVIRONMENTS:

@@ -3,17 +3,99 @@
 from __future__ import annotations
 
 import contextlib
+import inspect
+import sys
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import tyro
 from tqdm import tqdm
 
 from npa_envs.errors import NPAError, suggest
+
+OptionsT = TypeVar("OptionsT")
+
+_OLD_NAME = tyro.conf.arg(aliases=("--output",))
+
+OutFolder = Annotated[Path, _OLD_NAME]
+"""A folder to write to: one name in all commands, and the old one of some."""
+
+OptionalOutFolder = Annotated[Path | None, _OLD_NAME]
+"""The same, where nothing is written unless it is given."""
+
+EXAMPLES: dict[str, tuple[str, ...]] = {
+    "bench": ("bench --quick", "bench --suite accuracy --out results --plots"),
+    "compare": (
+        "compare --quick --out quick",
+        "compare --seconds 60 --methods gradient ppo --tasks morphogenesis2d",
+    ),
+    "demo": ("demo", "demo --target star --train-seconds 60 --out star"),
+    "doctor": ("doctor",),
+    "evaluate": ("evaluate gecko --healing", "evaluate runs/heart --seed-count 2"),
+    "interact": ("interact gecko heart", "interact --quick"),
+    "list": ("list",),
+    "robustness": ("robustness heart --quick", "robustness --device cuda --out results"),
+    "rollout": ("rollout gecko --damage 300:cut 500:erase --steps 700", "rollout runs/heart"),
+    "stress": ("stress --quick", "stress --only geometry --out results"),
+    "warmup": ("warmup", "warmup --device cuda --space-dims 2 3"),
+    "train morphogenesis2d": (
+        "train morphogenesis2d --target heart --out runs/heart",
+        "train morphogenesis2d --preset paper --target lizard.png --device cuda",
+    ),
+    "train co_morphogenesis2d": (
+        "train co_morphogenesis2d --targets ring heart",
+        "train co_morphogenesis2d --preset paper --targets gecko heart --device cuda",
+    ),
+    "train morphogenesis3d": (
+        "train morphogenesis3d --target duck --out runs/duck",
+        "train morphogenesis3d --preset paper --target statue.obj --device cuda",
+    ),
+    "train texture": (
+        "train texture --target dots --out runs/dots",
+        "train texture --target wall.png --loss filter_swd",
+    ),
+    "train point_classification": (
+        "train point_classification --out runs/digits",
+        "train point_classification --preset paper --data mnist --device cuda",
+    ),
+}
+"""What the help of each command shows."""
+
+
+def parse_options(
+    kind: type[OptionsT],
+    command: str,
+    arguments: Sequence[str],
+    *,
+    description: str | None = None,
+    default: OptionsT | None = None,
+) -> OptionsT:
+    """Return the options of a command as the words after it say.
+
+    Ends the process, as parsers do, after `--help` and with code 2 for a word that is wrong.
+
+    Args:
+        kind: Dataclass of the options; its docstring is what the help begins with.
+        command: Name of the command, a row of `EXAMPLES`.
+        arguments: The words after it.
+        description: What the help begins with instead.
+        default: What the options are where nothing is said; None: as the dataclass has them.
+    """
+    if any(word.partition("=")[0] == "--output" for word in arguments):
+        print("npa-envs: --output is now --out", file=sys.stderr)
+    shown = "\n".join(f"  npa-envs {example}" for example in EXAMPLES[command])
+    return tyro.cli(
+        kind,
+        prog=f"npa-envs {command}",
+        description=f"{description or inspect.getdoc(kind)}\n\nExamples:\n{shown}",
+        args=arguments,
+        config=(tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone, tyro.conf.SuppressFixed),
+        **({} if default is None else {"default": default}),
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,8 +114,8 @@ class RuleOptions(RunOptions):
     """Options of commands that run one rule: which one, in which world, and where."""
 
     rule: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RULE")]
-    """A shipped rule (`npa-envs list`), a file of ours or the authors' (.safetensors, .pth), or a
-    rule of their web demo (models.json#name)."""
+    """A shipped rule (`npa-envs list`), the folder of a run, a file of ours or the authors'
+    (.safetensors, .pth), or a rule of their web demo (models.json#name)."""
 
     target: str | None = None
     """The target to measure against; default: the one that the rule was trained on."""
@@ -57,6 +139,33 @@ class RuleOptions(RunOptions):
         """Return what was said of the rule's world, as `task_of_rule` takes it."""
         names = ("target", "loss", "data", "particle_count", "eps", "update_prob")
         return {name: getattr(self, name) for name in names}
+
+
+def rule_of(source: str) -> str:
+    """Return what `load_rule` takes: the rule of a run where `source` is its folder.
+
+    Raises:
+        NPAError: The folder holds no rule, or those of several species.
+    """
+    from npa_envs.rule.files import shipped_rules
+
+    folder = Path(source)
+    rule = folder / "rule.safetensors"
+    if not folder.is_dir() or source in shipped_rules():
+        return source
+    if rule.is_file():
+        return str(rule)
+    others = sorted(folder.glob("rule-*.safetensors"))
+    cure = f"name one of its rules, such as {str(others[0])!r}" if others else "name another one"
+    raise NPAError(f"a folder must hold the {rule.name} of a run, {source!r} does not: {cure}")
+
+
+def duration(seconds: float) -> str:
+    """Return a time [s] in words, in seconds, minutes or hours."""
+    for unit, size in (("hours", 3600.0), ("minutes", 60.0)):
+        if seconds >= 1.5 * size:
+            return f"{seconds / size:.0f} {unit}"
+    return f"{max(seconds, 1.0):.0f} s"
 
 
 def writable_folder(path: Path) -> Path:

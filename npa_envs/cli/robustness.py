@@ -12,9 +12,11 @@ import tyro
 
 from npa_envs.cli.output import (
     MeasureOptions,
+    OptionalOutFolder,
     StepBar,
     check_numbers,
     chosen_names,
+    parse_options,
     torch_threads,
     writable_folder,
 )
@@ -34,7 +36,7 @@ class RobustnessOptions(MeasureOptions):
     """Measure how rules grow under other conditions, and how they recover from damage.
 
     Unlike `npa-envs stress` this expects nothing and gives no verdicts: it is a table of figures
-    over seeds. With --output a rule's JSON file is written after each value, and a run that was
+    over seeds. With --out a rule's JSON file is written after each value, and a run that was
     stopped goes on there.
     """
 
@@ -54,7 +56,7 @@ class RobustnessOptions(MeasureOptions):
     quick: bool = False
     """Small worlds, few steps and values: figures that say nothing but that it runs."""
 
-    output: Path | None = None
+    out: OptionalOutFolder = None
     """Folder for robustness_RULE.json, robustness.md, and curves (extra `bench`); default: nothing
     is written."""
 
@@ -64,7 +66,7 @@ class RobustnessOptions(MeasureOptions):
 
 def main(arguments: Sequence[str]) -> int:
     """Measure, print and write."""
-    options = tyro.cli(RobustnessOptions, prog="npa-envs robustness", args=arguments)
+    options = parse_options(RobustnessOptions, "robustness", arguments)
     from npa_envs.devices import check_device
     from npa_envs.measure.accuracy.habitats import rule_names
     from npa_envs.measure.record import measured_facts, time_limit
@@ -79,7 +81,7 @@ def main(arguments: Sequence[str]) -> int:
     facts = measured_facts(
         device, options.commit, quick=options.quick, seeds=list(seeds), most_particles=most
     )
-    folder = options.output
+    folder = options.out
     if folder is not None:
         writable_folder(folder)
     paths = {name: folder / f"robustness_{name}.json" for name in names} if folder else {}

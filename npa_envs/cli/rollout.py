@@ -10,7 +10,14 @@ from typing import Annotated
 
 import tyro
 
-from npa_envs.cli.output import RuleOptions, StepBar, writable_folder
+from npa_envs.cli.output import (
+    OutFolder,
+    RuleOptions,
+    StepBar,
+    parse_options,
+    rule_of,
+    writable_folder,
+)
 from npa_envs.errors import NPAError
 
 SCREEN = 256
@@ -35,7 +42,7 @@ class RolloutOptions(RuleOptions):
     """Damage on the way, STEP:KIND or STEP:KIND:SIZE: 200:cut (gap 0.1), 300:erase (radius 0.2),
     400:clump (radius 0.2); sizes in length units."""
 
-    out: Path = Path("runs/rollout")
+    out: OutFolder = Path("runs/rollout")
     """Folder to write to; created where missing."""
 
     resolution: int | None = None
@@ -65,7 +72,7 @@ class RolloutOptions(RuleOptions):
 
 def main(arguments: Sequence[str]) -> int:
     """Grow, film and write what the words after `npa-envs rollout` ask for; return 0."""
-    options = tyro.cli(RolloutOptions, prog="npa-envs rollout", args=arguments)
+    options = parse_options(RolloutOptions, "rollout", arguments)
     import torch
 
     from npa_envs.cli.film import film_world, write_film, write_solid
@@ -86,13 +93,14 @@ def main(arguments: Sequence[str]) -> int:
             f"damage must come before the last of {options.steps} steps, got step {late[0].step}: "
             f"raise --steps above {late[0].step}"
         )
-    rule = load_rule(options.rule, device=device).float()
+    source = rule_of(options.rule)
+    rule = load_rule(source, device=device).float()
     world = options.world()
-    trained = task_of_rule(options.rule, rule, device, **world, resolution=options.resolution)
+    trained = task_of_rule(source, rule, device, **world, resolution=options.resolution)
     # Drawn large enough to be seen; measured as trained, so that the figures can be compared.
     task = shown = trained.task
     if options.resolution is None and len(task.target_picture) < SCREEN:
-        shown = task_of_rule(options.rule, rule, device, **world, resolution=SCREEN).task
+        shown = task_of_rule(source, rule, device, **world, resolution=SCREEN).task
     folder = writable_folder(options.out)
     generator = torch.Generator(device).manual_seed(options.seed)
     x, s, goal = seed_worlds(task, 1, generator=generator, device=device)

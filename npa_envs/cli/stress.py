@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
-
-import tyro
 
 from npa_envs.cli.output import (
     MeasureOptions,
+    OptionalOutFolder,
     StepBar,
     check_numbers,
+    parse_options,
     torch_threads,
     writable_folder,
 )
@@ -28,7 +27,7 @@ class StressOptions(MeasureOptions):
     """Check hard geometry, hard values, long runs of rules, gradients, precision.
 
     Every check has an expectation, figures and a verdict: pass, fail, a range (where something
-    holds), or skipped. With --output a JSON file is written after each check, and a run that was
+    holds), or skipped. With --out a JSON file is written after each check, and a run that was
     stopped goes on where it was: what passed is not repeated.
     """
 
@@ -45,7 +44,7 @@ class StressOptions(MeasureOptions):
     seed: int = 0
     """What random worlds are drawn from."""
 
-    output: Path | None = None
+    out: OptionalOutFolder = None
     """Folder for stress_DEVICE.json and heat maps (extra `bench`); default: nothing is written."""
 
     list: bool = False
@@ -54,7 +53,7 @@ class StressOptions(MeasureOptions):
 
 def main(arguments: Sequence[str]) -> int:
     """Check, print and write; return 1 where a check failed."""
-    options = tyro.cli(StressOptions, prog="npa-envs stress", args=arguments)
+    options = parse_options(StressOptions, "stress", arguments)
     from npa_envs.devices import check_device
     from npa_envs.measure.accuracy import suite
     from npa_envs.measure.accuracy.checks import Session
@@ -71,9 +70,9 @@ def main(arguments: Sequence[str]) -> int:
     device = check_device(options.device)
     facts = measured_facts(device, options.commit, quick=options.quick, seed=options.seed)
     record, path = suite.Record(facts), None
-    if options.output is not None:
+    if options.out is not None:
         name = f"stress_{device.type}{'_quick' * options.quick}.json"
-        path = writable_folder(options.output) / name
+        path = writable_folder(options.out) / name
         record = suite.Record.read(path, facts)
     before = sum(record.done(check.name) for check in chosen)
     if before:

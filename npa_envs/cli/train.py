@@ -5,15 +5,15 @@ from __future__ import annotations
 import argparse
 import math
 import shlex
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, make_dataclass, replace
-from functools import partial
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, fields, make_dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import tyro
 
 from npa_envs.cli import INTERRUPTED
+from npa_envs.cli.output import OutFolder, duration, parse_options
 from npa_envs.errors import NPAError
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
@@ -24,21 +24,39 @@ from npa_envs.training import (
     TrainConfig,
     TrainResult,
     load_config,
+    override,
     preset,
     task_entry,
     train,
 )
 
+COMMON = ("target", "iterations", "device", "out")
+"""Fields of configurations that stand among the most common options, where a task has them."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class TrainOptions:
-    """How to run; what to run are the options of the configuration."""
+    """What most runs are told; the paper's schedule, pool and world follow below."""
 
     preset: str = "fast"
-    """Configuration to start from: `npa-envs list` names them."""
+    """Configuration to start from: `paper`, `fast` (minutes on a CPU) or `tiny` (seconds);
+    `npa-envs list` has their sizes and times."""
+
+    target: str = ""
+    """What is to be learned: a built-in name (`npa-envs list`), a file, or for morphogenesis2d an
+    emoji."""
+
+    iterations: int = 0
+    """Optimiser steps in one repeat."""
+
+    device: str = "cpu"
+    """Where to train: cpu, cuda, cuda:1."""
+
+    out: OutFolder = Path()
+    """Folder that log, pictures, checkpoint and rule are written to; created where missing."""
 
     config: Path | None = None
-    """YAML, TOML or JSON file with field names and values; goes over the preset."""
+    """YAML, TOML or JSON file with field names and values, also `preset`; goes over the preset."""
 
     resume: bool = False
     """Go on from the checkpoint in the folder `out`, with the configuration that lies there."""
@@ -84,15 +102,15 @@ def starting_configuration(task_name: str, arguments: Sequence[str]) -> TrainCon
     """
     # These options decide what the others' defaults are, so they are looked at first.
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-    parser.add_argument("--preset", default=TrainOptions.preset)
+    parser.add_argument("--preset")
     parser.add_argument("--config", type=Path)
     parser.add_argument("--resume", action="store_true")
-    parser.add_argument("--out", type=Path)
+    parser.add_argument("--out", "--output", type=Path)
     try:
         first, _ = parser.parse_known_args(arguments)
     except argparse.ArgumentError as error:
         raise NPAError(f"{error.argument_name}: {error.message}") from error
-    base = preset(first.preset, task_name)
+    base = preset(first.preset or TrainOptions.preset, task_name)
     if first.resume and not {"-h", "--help"} & set(arguments):
         folder = RunFolder(first.out or base.out)
         if not folder.checkpoint.is_file():
@@ -102,7 +120,11 @@ def starting_configuration(task_name: str, arguments: Sequence[str]) -> TrainCon
             )
         base = load_config(folder.config, base)
     if first.config is not None:
-        base = load_config(first.config, base)
+        presets = task_entry(task_name).presets
+        if first.preset or first.resume:
+            # What is said on the command line, or was of the run resumed, goes over the file.
+            presets = dict.fromkeys(presets, base)
+        base = load_config(first.config, base, presets=presets)
     return base
 
 
@@ -111,23 +133,44 @@ def parse(
 ) -> tuple[TrainOptions, TrainConfig[Any]]:
     """Lay the command line's options over a configuration."""
 
-    def read(kind: Any, defaults: Any) -> tuple[TrainOptions, Any]:
-        fields = [("launch", TrainOptions), ("run", kind)]
-        command = make_dataclass("Command", fields, frozen=True)
-        parsed: Any = tyro.cli(
+    def read(defaults: Any) -> tuple[TrainOptions, Any]:
+        # These stand first, as options of their own, and not once more below.
+        told = {
+            name: getattr(holder, name)
+            for name in COMMON
+            for holder in (defaults, defaults.task)
+            if hasattr(holder, name) and not (name == "target" and hasattr(holder, "targets"))
+        }
+        common = _without(TrainOptions(**told), set(COMMON) - told.keys())
+        training = _without(replace(defaults, task=_without(defaults.task, told)), told)
+        kinds = [("common", type(common)), ("training", type(training))]
+        command = make_dataclass("Command", kinds, frozen=True)
+        parsed: Any = parse_options(
             command,
-            prog=f"npa-envs train {task_name}",
+            f"train {task_name}",
+            arguments,
             description=f"Train on {task_name}. Defaults shown are those of the preset.",
-            args=arguments,
-            default=command(TrainOptions(), defaults),
-            config=(tyro.conf.OmitArgPrefixes,),
+            default=command(common, training),
         )
-        return parsed.launch, parsed.run
+        task = _of_type(type(defaults.task), parsed.training.task)
+        config = _of_type(type(defaults), parsed.training, task=task)
+        return parsed.common, override(
+            config, **{name: getattr(parsed.common, name) for name in told}
+        )
 
-    if isinstance(base, JointTrainConfig):
-        return parse_joint(base, partial(read, JointOptions))
-    generic: Any = TrainConfig
-    return read(generic[type(base.task)], base)
+    return parse_joint(base, read) if isinstance(base, JointTrainConfig) else read(base)
+
+
+def _without(source: Any, names: Iterable[str]) -> Any:
+    """Return a dataclass of which some fields, where it has them, are no options."""
+    kind, hints = type(source), get_type_hints(type(source))
+    changed = {name: tyro.conf.Fixed[hints[name]] for name in names if name in hints}
+    if "task" in hints:
+        changed["task"] = type(source.task)
+    options = [(name, own, field(default=getattr(source, name))) for name, own in changed.items()]
+    base = kind[changed["task"]] if getattr(kind, "__parameters__", ()) else kind
+    narrow = make_dataclass(kind.__name__, options, bases=(base,), frozen=True, kw_only=True)
+    return _of_type(narrow, source)
 
 
 def run(task_name: str, options: TrainOptions, config: TrainConfig[Any]) -> int:
@@ -136,8 +179,14 @@ def run(task_name: str, options: TrainOptions, config: TrainConfig[Any]) -> int:
         raise NPAError(f"max_seconds must be positive and finite, got {options.max_seconds}")
     folder = RunFolder(config.out)
     resume_command = f"npa-envs train {task_name} --out {shlex.quote(str(config.out))} --resume"
-    print(f"{task_name}: {config.total_iterations} iterations on {config.device}")
-    print(f"writing to {config.out}/ (Ctrl-C stops in order; {resume_command} goes on)")
+
+    def begun() -> None:
+        print("\n".join(announcement(task_name, options, config)))
+        print(
+            f"writing to {config.out}/ (Ctrl-C stops in order; {resume_command} goes on)",
+            flush=True,
+        )
+
     try:
         result = train(
             config,
@@ -146,6 +195,7 @@ def run(task_name: str, options: TrainOptions, config: TrainConfig[Any]) -> int:
             overwrite=options.overwrite,
             progress=options.progress,
             max_seconds=options.max_seconds,
+            begun=begun,
         )
     except KeyboardInterrupt:
         print(f"interrupted; the last checkpoint is {folder.checkpoint}\ngo on: {resume_command}")
@@ -159,6 +209,35 @@ def run(task_name: str, options: TrainOptions, config: TrainConfig[Any]) -> int:
         look += f" --particle-count {sum(config.task.counts[:2])}"
     _report(result, rules, look, resume_command)
     return INTERRUPTED if result.interrupted else 0
+
+
+def announcement(
+    task_name: str, options: TrainOptions, config: TrainConfig[Any]
+) -> tuple[str, str]:
+    """Return what a run is about to do, in two lines: what it learns, and how large and long it is.
+
+    Args:
+        task_name: The task.
+        options: How it runs.
+        config: What it runs.
+    """
+    task = config.task
+    species = getattr(task, "species", (task,))
+    goals = [getattr(own, "target", None) or f"the data {own.data}" for own in species]
+    particles = " and ".join(str(own.particle_count) for own in species)
+    source = f"preset {options.preset}" if options.config is None else str(options.config)
+    expected = task_entry(task_name).expected_seconds(config)
+    if expected is None:
+        time = f"how long that takes on {config.device} the progress bar tells"
+    else:
+        time = f"about {duration(expected)} on a CPU that has little else to do"
+    if options.max_seconds is not None:
+        time += f", at most {duration(options.max_seconds)}"
+    return (
+        f"{task_name}: learns {' and '.join(goals)} ({'goes on' if options.resume else source})",
+        f"{config.total_iterations} iterations on {config.device}, each of {config.world_count} "
+        f"worlds of {particles} particles: {time}",
+    )
 
 
 def _report(result: TrainResult, rules: Sequence[Path], look: str, resume_command: str) -> None:

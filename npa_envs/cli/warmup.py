@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-import tyro
-
+from npa_envs.cli.output import parse_options
 from npa_envs.errors import NPAError
 
 
@@ -28,7 +27,7 @@ class WarmupOptions:
 
 def main(arguments: Sequence[str]) -> int:
     """Compile what the words after `npa-envs warmup` ask for; return 0."""
-    options = tyro.cli(WarmupOptions, prog="npa-envs warmup", args=arguments)
+    options = parse_options(WarmupOptions, "warmup", arguments)
     import torch
 
     from npa_envs.ops import warmup

@@ -353,7 +353,7 @@ def read_rows(path: Path, settings: Mapping[str, Any]) -> list[InteractionRow]:
         ]
         return [InteractionRow(**row) for row in rows]
 
-    found = read_record(path, settings, made, command="interact", key="settings", option="--out")
+    found = read_record(path, settings, made, command="interact", key="settings")
     return found or []
 
 

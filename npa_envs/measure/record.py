@@ -49,7 +49,6 @@ def read_record(
     *,
     command: str,
     key: str = "facts",
-    option: str = "--output",
 ) -> Kept | None:
     """Return the record that a stopped run left; None where there is none.
 
@@ -59,14 +58,13 @@ def read_record(
         make: Makes the record of the JSON object.
         command: Name of the command that writes such records, for the errors.
         key: Where the object says what its figures follow from.
-        option: The command's option for another folder.
 
     Raises:
         NPAError: The file is no such record, or its figures follow from something else.
     """
     if not os.path.exists(path):
         return None
-    cure = f"remove it, or choose another folder with {option}"
+    cure = "remove it, or choose another folder with --out"
     try:
         held = read_json(path, limit=LARGEST_RECORD)
         before = dict(held[key])

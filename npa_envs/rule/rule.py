@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from typing import Any, NamedTuple, TypedDict
 
 import torch
@@ -220,6 +221,15 @@ class NPARule(nn.Module):
             states: Particle states, dimensionless, shape [..., C], C at least 3 without read-out.
         """
         return self.read_out(states)[..., -3:] + COLOUR_OFFSET
+
+    def __getattr__(self, name: str) -> Any:
+        try:
+            return super().__getattr__(name)
+        except AttributeError as error:
+            # As Python's own errors do, which torch's modules replace.
+            nearest = difflib.get_close_matches(name, [n for n in dir(self) if n[0] != "_"], n=1)
+            hint = f": did you mean {nearest[0]!r}?" if nearest and name[0] != "_" else ""
+            raise AttributeError(f"{error}{hint}", name=name, obj=self) from None
 
     def hyper_parameters(self) -> RuleHyperParameters:
         """Return all that `NPARule` takes: `NPARule(**rule.hyper_parameters())` has this shape."""

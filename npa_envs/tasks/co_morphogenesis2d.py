@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.rule.rule import NPARule
+from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
 from npa_envs.tasks.checks import check_non_negative
 from npa_envs.tasks.morphogenesis2d import (
     MORPHOGENESIS2D_PRESETS,
@@ -159,6 +159,17 @@ class CoMorphogenesis2D:
         It spans [-1, 1] x [-1, 1]; its resolution is the first species' own.
         """
         return self.tasks[0].picture(x, s, centred=False)
+
+    @property
+    def target_picture(self) -> Tensor:
+        """What all species together are to look like, each around its seed; shape [R, R, 4]."""
+        places, states = [], []
+        for task, centre in zip(self.tasks, self.config.centres, strict=True):
+            points, colours = task.target.points, task.target.colours
+            places.append(points + points.new_tensor((centre, 0.0)))
+            states.append(colours.new_zeros(len(colours), task.config.state_dim))
+            states[-1][:, -3:] = colours - COLOUR_OFFSET
+        return self.picture(torch.cat(places)[None], torch.cat(states)[None])[0]
 
     def metrics(self, x: Tensor, s: Tensor) -> Tensor:
         """Return each species' splat loss in each world, shape [B, K]."""

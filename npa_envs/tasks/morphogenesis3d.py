@@ -26,7 +26,7 @@ from npa_envs.tasks.checks import (
     check_text,
 )
 from npa_envs.tasks.growth import GrowthConfig, GrowthTask
-from npa_envs.tasks.targets.views import ViewTarget, load_views, nearest_elevation, over, some_views
+from npa_envs.tasks.targets.views import ViewTarget, load_views, nearest_camera, over, some_views
 from npa_envs.tasks.train_config import TrainConfig, fast_run, tiny_run
 from npa_envs.world.cuda_graph import sent
 
@@ -123,7 +123,7 @@ class Morphogenesis3DConfig(GrowthConfig):
 
 
 SHOWN_FROM = 20.0
-"""Pictures show the held-out view whose elevation is nearest to this [degrees]."""
+"""Pictures show the held-out view nearest to the front at this elevation [degrees]."""
 
 GREY = 0.5
 """Background of the views that `metric` compares."""
@@ -176,7 +176,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
                     f"views must have {side} x {side} pixels as config.resolution says, "
                     f"got {tuple(views.pictures.shape[1:])}: load them at that size"
                 )
-        shown = nearest_elevation(target.held_out.cameras, SHOWN_FROM)
+        shown = nearest_camera(target.held_out.cameras, SHOWN_FROM)
         self.target = target.to(device)
         """What worlds are to look like."""
         self._shown = some_views(self.target.held_out, torch.tensor([shown], device=device))

@@ -296,8 +296,8 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
             resolution=self.config.resolution,
             pixel_size=self.pixel_size,
             sigma=SIGMA,
-            lo=0.0,
-            hi=1.0,
+            lo=-PICTURE_MARGIN,
+            hi=1.0 + PICTURE_MARGIN,
         )
 
     def __getstate__(self) -> dict[str, object]:
@@ -310,6 +310,9 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         vars(bound).update(fields)
         return bound
 
+
+PICTURE_MARGIN = 0.0625
+"""Room around the square of the points in pictures [length units]: ink reaches its sides."""
 
 PALETTE = (
     (0.90, 0.10, 0.29),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from npa_envs.devices import check_device
@@ -48,6 +49,7 @@ def train(
     overwrite: bool = False,
     progress: bool = True,
     max_seconds: float | None = None,
+    begun: Callable[[], None] = lambda: None,
 ) -> TrainResult:
     """Train a rule on a task of the table `TASKS`, or a rule for each species of a joint task.
 
@@ -58,6 +60,7 @@ def train(
         overwrite: Start anew although `config.out` holds a run; its files are removed.
         progress: Show a progress bar.
         max_seconds: Stop after this time [s]; the run can be resumed.
+        begun: Called once when nothing is left to be refused, before the first iteration.
 
     Raises:
         NPAError: The task is unknown, its target cannot be loaded, or as for `Trainer`.
@@ -66,8 +69,14 @@ def train(
     entry = task_entry(task_name)
     if entry.joint:
         return train_together(
-            config, resume=resume, overwrite=overwrite, progress=progress, max_seconds=max_seconds
+            config,
+            resume=resume,
+            overwrite=overwrite,
+            progress=progress,
+            max_seconds=max_seconds,
+            begun=begun,
         )
     task = entry.make(config.task, check_device(config.device))
     trainer = Trainer(task, config, task_name=task_name, resume=resume, overwrite=overwrite)
+    begun()
     return trainer.run(progress=progress, max_seconds=max_seconds)

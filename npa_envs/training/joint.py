@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Unpack, cast
 
 import torch
@@ -130,6 +130,7 @@ def train_together(
     overwrite: bool = False,
     progress: bool = True,
     max_seconds: float | None = None,
+    begun: Callable[[], None] = lambda: None,
 ) -> TrainResult:
     """Train one rule for each species of a world that all of them share.
 
@@ -145,6 +146,7 @@ def train_together(
         overwrite: Start anew although `config.out` holds a run; its files are removed.
         progress: Show a progress bar.
         max_seconds: Stop after this time [s]; the run can be resumed.
+        begun: Called once when nothing is left to be refused, before the first iteration.
 
     Returns:
         What the run came to; its `rule` holds the rules, in the order of the species. Their files
@@ -161,4 +163,5 @@ def train_together(
         )
     task = CoMorphogenesis2D(config.task, device=check_device(config.device))
     trainer = _JointTrainer(task, config, rules, resume=resume, overwrite=overwrite)
+    begun()
     return trainer.run(progress=progress, max_seconds=max_seconds)

@@ -60,7 +60,12 @@ def override(config: TrainConfig[TaskConfigT], /, **fields: Any) -> TrainConfig[
     return dataclasses.replace(config, task=_laid_over("task", task, task_changes), **changes)
 
 
-def load_config(path: str | Path, base: TrainConfig[TaskConfigT]) -> TrainConfig[TaskConfigT]:
+def load_config(
+    path: str | Path,
+    base: TrainConfig[TaskConfigT],
+    *,
+    presets: Mapping[str, TrainConfig[TaskConfigT]] | None = None,
+) -> TrainConfig[TaskConfigT]:
     """Return `base` with the fields that a YAML, TOML or JSON file sets.
 
     The file holds field names and values at its top level; fields of the task may also lie in a
@@ -69,6 +74,7 @@ def load_config(path: str | Path, base: TrainConfig[TaskConfigT]) -> TrainConfig
     Args:
         path: A file that ends in .yaml, .yml, .toml or .json.
         base: The configuration that gives every field the file does not, for example a preset.
+        presets: Those that a `preset` of the file may name to stand for `base`; None: none.
 
     Raises:
         NPAError: The file cannot be read, is no such file, names an unknown field, or gives a
@@ -87,8 +93,13 @@ def load_config(path: str | Path, base: TrainConfig[TaskConfigT]) -> TrainConfig
             "top "
             f"level, got {type(fields).__name__}: for example 'iterations: 500'"
         )
+    own = dict(fields)
     try:
-        return override(base, **fields)
+        if presets is not None and (name := own.pop("preset", None)) is not None:
+            if not isinstance(name, str) or name not in presets:
+                raise NPAError(f"unknown preset {name!r}: {suggest(name, presets)}")
+            base = presets[name]
+        return override(base, **own)
     except NPAError as error:
         raise NPAError(f"in the configuration file {shown(str(path))}: {error}") from error
 

@@ -38,11 +38,29 @@ class TaskEntry:
     targets: Callable[[], tuple[str, ...]]
     """Returns the names of its built-in targets; none where `--target` is no field of its."""
 
+    fast_seconds: float
+    """How long the preset `fast` takes on one thread of a CPU [s]."""
+
     space_dim: int = 2
     """Space dimension D of its worlds."""
 
     joint: bool = False
     """Whether several rules are trained, one for each species, by `train_together`."""
+
+    def expected_seconds(self, config: TrainConfig[Any]) -> float | None:
+        """Return about how long a run takes on a CPU [s]: as its particle-steps to those of `fast`.
+
+        None on other devices, where particle-steps do not tell.
+        """
+        if config.device != "cpu":
+            return None
+        return self.fast_seconds * _particle_steps(config) / _particle_steps(self.presets["fast"])
+
+
+def _particle_steps(config: TrainConfig[Any]) -> float:
+    species = getattr(config.task, "species", (config.task,))
+    particles = sum(own.particle_count for own in species)
+    return config.total_iterations * config.world_count * particles * sum(config.steps)
 
 
 TASKS: Mapping[str, TaskEntry] = {
@@ -51,6 +69,7 @@ TASKS: Mapping[str, TaskEntry] = {
         presets=MORPHOGENESIS2D_PRESETS,
         make=lambda config, device: Morphogenesis2D(config, device=device),
         targets=builtin_targets,
+        fast_seconds=210.0,
     ),
     "co_morphogenesis2d": TaskEntry(
         summary="grow pictures in one world, each by a rule of its own",
@@ -58,6 +77,7 @@ TASKS: Mapping[str, TaskEntry] = {
         # Films and the evaluation take its rules one by one, as rules of their own task.
         make=lambda config, device: cast(PictureTask, CoMorphogenesis2D(config, device=device)),
         targets=tuple,
+        fast_seconds=500.0,
         joint=True,
     ),
     "morphogenesis3d": TaskEntry(
@@ -65,6 +85,7 @@ TASKS: Mapping[str, TaskEntry] = {
         presets=MORPHOGENESIS3D_PRESETS,
         make=lambda config, device: Morphogenesis3D(config, device=device),
         targets=builtin_meshes,
+        fast_seconds=250.0,
         space_dim=3,
     ),
     "texture": TaskEntry(
@@ -72,12 +93,14 @@ TASKS: Mapping[str, TaskEntry] = {
         presets=TEXTURE_PRESETS,
         make=lambda config, device: Texture(config, device=device),
         targets=builtin_textures,
+        fast_seconds=265.0,
     ),
     "point_classification": TaskEntry(
         summary="particles that stay where they are agree on which digit they form",
         presets=POINT_CLASSIFICATION_PRESETS,
         make=lambda config, device: PointClassification(config, device=device),
         targets=tuple,
+        fast_seconds=200.0,
     ),
 }
 """Every task that can be trained, by its name on the command line and in checkpoints."""

@@ -29,7 +29,7 @@ from npa_envs.render.colours import to_uint8
 from npa_envs.render.film import encode_frame
 from npa_envs.rule.files import load_rule, save_rule
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.base import Task, differing_fields, task_for_rule, task_toward
+from npa_envs.tasks.base import GoalTask, Task, differing_fields, task_for_rule, task_toward
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.iteration import Rollout, TrainingCycle
 from npa_envs.training.overrides import config_to_dict
@@ -43,6 +43,15 @@ from npa_envs.training.run_folder import (
     save_checkpoint,
     unusable_checkpoint,
 )
+
+FIRST_PICTURE = 10
+"""Iteration after which the first picture is written, where the interval is longer."""
+
+PICTURE_HEIGHT = 256
+"""Least height of the pictures [pixels]; the pixels of smaller worlds are repeated."""
+
+PICTURE_GAP = 8
+"""Pixels between the worlds of a picture."""
 
 
 @dataclass(frozen=True)
@@ -163,7 +172,7 @@ class Trainer:
                     self._finish_record()
                     if self._due(config.log_interval) or self.iteration == total:
                         self._begin_record()
-                    if self._due(config.picture_interval):
+                    if self._picture_due():
                         self._write_picture()
                     if self._due(config.checkpoint_interval) and self.iteration < total:
                         self.save()
@@ -227,6 +236,10 @@ class Trainer:
     def _due(self, interval: int) -> bool:
         return interval > 0 and self.iteration % interval == 0
 
+    def _picture_due(self) -> bool:
+        interval = self.config.picture_interval
+        return self._due(interval) or (self.iteration == FIRST_PICTURE < interval)
+
     def _seconds(self) -> float:
         running = 0.0 if self._started is None else time.perf_counter() - self._started
         return self._seconds_before + running
@@ -270,6 +283,12 @@ class Trainer:
         self._finish_record()
         with torch.no_grad():
             picture = self._cycle.task.picture(self._cycle.batch.x, self._cycle.batch.s)
+        # Worlds that have goals of their own have no picture in common.
+        target = (
+            None if isinstance(self.task, GoalTask) else getattr(self.task, "target_picture", None)
+        )
+        if target is not None:
+            picture = torch.cat((target[None].to(picture), picture))
         path = self.folder.picture(self.iteration)
         write_batch_picture(path, picture, self._board, self.iteration)
 
@@ -295,7 +314,7 @@ class Trainer:
         if path.exists() and not overwrite:
             raise NPAError(
                 f"out must be a folder without a run, but {str(self.folder.path)!r} holds one: "
-                "resume it, choose another folder, or overwrite it"
+                "resume it (--resume), choose another folder (--out), or overwrite it (--overwrite)"
             )
         return None
 
@@ -372,18 +391,22 @@ def stop_flag() -> Iterator[threading.Event]:
 
 
 def write_batch_picture(path: Path, picture: Tensor, board: Any, iteration: int) -> None:
-    """Write the worlds of a batch side by side as a PNG, and as a JPEG to TensorBoard.
+    """Write target and worlds of a batch side by side as a PNG, and as a JPEG to TensorBoard.
 
     Args:
-        path: The file to write.
-        picture: rgb sums and density of each world, shape [B, R, R, 4].
+        path: The file to write, at least `PICTURE_HEIGHT` pixels high.
+        picture: rgb sums and density of the target, if there is one, and of each world, shape
+            [B, R, R, 4].
         board: TensorBoard's writer (`open_tensorboard`), or None.
         iteration: Iterations done so far.
 
     Raises:
         NPAError: The file cannot be written.
     """
-    frame = np.concatenate(list(to_uint8(picture)), axis=1)
+    repeats = math.ceil(PICTURE_HEIGHT / picture.shape[1])
+    frames = to_uint8(picture).repeat(repeats, axis=1).repeat(repeats, axis=2)
+    frames = np.pad(frames, ((0, 0), (0, 0), (0, PICTURE_GAP), (0, 0)), constant_values=255)
+    frame = np.concatenate(list(frames), axis=1)[:, :-PICTURE_GAP]
     write_bytes(path, encode_frame(frame, "PNG"))
     if board is not None:
         _add_picture(board, frame, iteration)

@@ -501,7 +501,7 @@ def test_a_quick_comparison_stops_goes_on_and_refuses_other_settings(tmp_path, c
     words = (
         "compare --quick --tasks morphogenesis2d --methods zero evolution --seeds 1 "
         "--particle-steps 20000 --no-progress --commit test "
-        f"--options evolution.population=4 --output {tmp_path}"
+        f"--options evolution.population=4 --out {tmp_path}"
     ).split()
     assert main([*words, "--max-seconds", "1e-3"]) == 0
     assert "1 runs are left: call again" in capsys.readouterr().out
@@ -518,7 +518,7 @@ def test_a_quick_comparison_stops_goes_on_and_refuses_other_settings(tmp_path, c
     assert (held["status"], len(held["returns"])) == ("done", 4)
     assert held["curve"][-1]["particle_steps"] >= 20000
     assert str(tmp_path) not in json.dumps(held)
-    assert "--output OUT" in held["command"]
+    assert "--out OUT" in held["command"]
     problem = make_problem("morphogenesis2d", quick=True)
     assert len(list(RuleSet.load(folder / "evolution" / "seed-0", problem))) == 1
     assert f"| evolution | 1 | {np.mean(held['returns']):.3f}" in told
@@ -539,7 +539,7 @@ def test_a_method_that_raises_is_in_the_table_and_the_command_says_so(tmp_path, 
     words = (
         "compare --quick --tasks morphogenesis2d --methods evolution --seeds 1 "
         "--particle-steps 1000 --no-progress "
-        f"--options evolution.population=1 --output {tmp_path}"
+        f"--options evolution.population=1 --out {tmp_path}"
     ).split()
     assert main(words) == 1
     told = capsys.readouterr().out

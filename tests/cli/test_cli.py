@@ -19,6 +19,7 @@ from PIL import Image
 
 from npa_envs.cli import COMMANDS, main
 from npa_envs.cli.film import Film
+from npa_envs.cli.output import EXAMPLES
 from npa_envs.cli.rollout import RolloutOptions
 from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule, save_rule
@@ -70,6 +71,59 @@ def test_every_command_explains_itself(name, capsys):
         code = end.code
     assert code == 0
     assert f"usage: npa-envs {name}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_the_help_of_a_command_shows_examples_of_options_that_it_has(name, capsys):
+    with pytest.raises(SystemExit):
+        main([*name.split(), "--help"])
+    text = capsys.readouterr().out
+    assert "{None}" not in text
+    for example in EXAMPLES[name]:
+        assert f"  npa-envs {example}\n" in text
+        assert example.startswith(name)
+        for option in re.findall("--[a-z-]+", example):
+            # Once more, among the options.
+            assert len(re.findall(rf"{option}[ ,\n]", text.split(EXAMPLES[name][-1])[1])) > 0
+
+
+def test_the_help_of_train_begins_with_the_most_common_options(capsys):
+    with pytest.raises(SystemExit):
+        main(["train", "texture", "--help"])
+    common, _, others = capsys.readouterr().out.partition("training options")
+    for option in ("preset", "target", "iterations", "device", "out", "config", "resume"):
+        assert f"--{option}" in common
+        assert f" --{option} " not in others
+    assert "default: dots" in common
+
+
+@pytest.mark.parametrize(
+    "words", ["bench --explain", "stress --list", "rollout RULE --steps 1", "evaluate RULE"]
+)
+def test_output_is_the_old_name_of_out(words, rule, tmp_path, capsys):
+    given = [str({"RULE": rule}.get(word, word)) for word in words.split()]
+    given += ["--checkpoints", "1", "--json"] if words.startswith("evaluate") else ["--output"]
+    assert main([*given, str(tmp_path / "here")]) == 0
+    told = "--output is now --out\n" in capsys.readouterr().err
+    assert told == ("--output" in given)
+    assert (tmp_path / "here" / "growth.gif").exists() == words.startswith("rollout")
+
+
+@pytest.mark.parametrize(
+    ("before", "after"), [({}, "passive"), ({"OMP_WAIT_POLICY": "active"}, "active")]
+)
+def test_threads_of_torch_wait_without_a_busy_loop_unless_told_otherwise(
+    before, after, monkeypatch
+):
+    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
+    for name, value in before.items():
+        monkeypatch.setenv(name, value)
+    program = (
+        "import os, sys\nfrom npa_envs.cli import main\nmain(['--version'])\n"
+        "print(os.environ['OMP_WAIT_POLICY'], 'torch' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.stdout.endswith(f"\n{after} False\n"), done.stdout + done.stderr
 
 
 def test_no_command_is_a_usage_error_and_the_version_is_that_of_the_package(capsys):
@@ -139,6 +193,64 @@ def test_a_configuration_file_goes_over_the_preset_and_options_over_the_file(tmp
     assert config.iterations == 40
 
 
+def test_a_configuration_file_may_name_its_preset_and_the_command_line_another(tmp_path, capsys):
+    from npa_envs.cli.train import starting_configuration
+
+    path = tmp_path / "run.yaml"
+    path.write_text("preset: tiny\nseed: 5\n")
+    words = ["--config", str(path)]
+    config = starting_configuration("morphogenesis2d", words)
+    assert (config.iterations, config.seed) == (40, 5)
+    config = starting_configuration("morphogenesis2d", [*words, "--preset", "fast"])
+    assert (config.iterations, config.seed) == (2400, 5)
+    path.write_text("preset: tinny\n")
+    assert "did you mean 'tiny'" in error_of(capsys, ["train", "morphogenesis2d", *words])
+
+
+def test_train_says_what_it_learns_how_long_that_takes_and_where_it_writes(tmp_path, capsys):
+    folder = tmp_path / "run"
+    words = ["train", *TINY[:-3], "--iterations", "10", "--milestones", "--no-progress"]
+    assert main([*words, "--target", "heart", "--out", str(folder)]) == 0
+    learns, size, where = capsys.readouterr().out.splitlines()[:3]
+    assert learns == "morphogenesis2d: learns heart (preset tiny)"
+    assert size.startswith("10 iterations on cpu, each of 2 worlds of 128 particles: about 1 s")
+    assert where.startswith(f"writing to {folder}/")
+    # The tiny preset has its first picture after 20 iterations.
+    with Image.open(folder / "pictures" / "000010.png") as picture:
+        assert picture.size == (3 * 256 + 2 * 8, 256)
+        target = np.asarray(picture)[:, :256].astype(int)
+    assert (target[..., 0] > target[..., 2] + 50).mean() > 0.1
+
+
+def test_train_refuses_before_it_says_where_it_writes(trained, tmp_path, capsys):
+    words = ["train", *TINY, "--milestones", "--out"]
+    for given in ([str(trained)], [str(tmp_path / "out"), "--target", "/nowhere.png"]):
+        assert main([*words, *given]) == 2
+        assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize("command", ["rollout", "evaluate"])
+def test_the_folder_of_a_run_stands_for_its_rule(command, trained, tmp_path, capsys):
+    words = [command, str(trained), "--no-progress"]
+    own = {"rollout": ["--steps", "1", "--out", str(tmp_path)], "evaluate": ["--checkpoints", "1"]}
+    assert main([*words, *own[command]]) == 0
+    (tmp_path / "rule-0.safetensors").touch()
+    message = error_of(capsys, [command, str(tmp_path)])
+    assert "must hold the rule.safetensors of a run" in message
+    assert "rule-0.safetensors" in message
+
+
+def test_a_quick_encounter_is_of_two_rules(tmp_path, capsys, monkeypatch):
+    from npa_envs.cli import interact
+
+    for name, value in {"steps": 2, "seed_count": 1, "particle_count": 64}.items():
+        monkeypatch.setitem(interact.QUICK, name, value)
+    assert main(["interact", "--quick", "--no-progress", "--out", str(tmp_path)]) == 0
+    held = json.loads((tmp_path / "interactions.json").read_text())
+    assert (len(held["settings"]["seeds"]), held["settings"]["particle_count"]) == (1, 64)
+    assert len(held["rows"]) == 2 * 2 * 2
+
+
 def test_a_run_stopped_by_time_resumes_to_the_same_rule(tmp_path, trained, capsys):
     folder = tmp_path / "run"
     words = ["train", *TINY, "--milestones", "--out", str(folder)]
@@ -156,7 +268,8 @@ def test_a_run_stopped_by_time_resumes_to_the_same_rule(tmp_path, trained, capsy
 def test_a_folder_with_a_run_is_not_overwritten_unasked(trained, capsys):
     before = (trained / "rule.safetensors").read_bytes()
     message = error_of(capsys, ["train", *TINY, "--milestones", "--out", str(trained)])
-    assert "holds one" in message
+    assert "holds one: resume it (--resume)" in message
+    assert "overwrite it (--overwrite)" in message
     assert (trained / "rule.safetensors").read_bytes() == before
 
 
@@ -174,6 +287,7 @@ def test_a_folder_with_a_run_is_not_overwritten_unasked(trained, capsys):
         ("train morphogenesis2d --resume --out /nowhere", "no checkpoint to resume from"),
         ("train morphogenesis2d --config /nowhere.yaml", "cannot read the configuration file"),
         ("train TINY --out OUT --max-seconds -1", "max_seconds must be positive"),
+        ("train TINY --out OUT --iterations 0", "iterations must be a whole number"),
         ("train TINY --out OUT --target /nowhere.png", "nowhere.png"),
         ("rollout nosuchrule --out OUT", "unknown rule 'nosuchrule'"),
         ("rollout RULE --out OUT --damage 5:burn", "unknown damage 'burn'"),
@@ -207,7 +321,7 @@ def test_a_mistake_is_refused_in_one_line_and_nothing_is_written(
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["train", *TINY, "--iterations", "0"], "iterations must be a whole number"),
+        (["train", *TINY, "--repeats", "0"], "repeats must be a whole number"),
         (["train", *TINY, "--iters", "3"], "--iters"),
         (["rollout", "gecko", "--fps", "51"], "fps must be in"),
         (["rollout", "gecko", "--seed", "-1"], "seed must be in"),

@@ -279,7 +279,7 @@ def test_what_grew_at_another_radius_is_measured_at_its_trained_size(device):
 
 
 def test_the_command_writes_a_record_draws_it_and_goes_on(tmp_path, capsys, monkeypatch):
-    words = ["stress", "--quick", "--no-progress", "--output", str(tmp_path), "--commit", "x"]
+    words = ["stress", "--quick", "--no-progress", "--out", str(tmp_path), "--commit", "x"]
     assert main([*words, "--only", "geometry/one", "values/nan_position"]) == 0
     record = json.loads((tmp_path / "stress_cpu_quick.json").read_text())
     assert record["counts"] == {"pass": 5, "range": 0, "fail": 0, "skipped": 0}

@@ -404,7 +404,7 @@ def test_records_come_back_as_they_were_written_and_curves_are_drawn_by_task(tmp
 
 def test_the_command_measures_writes_and_goes_on(tmp_path, capsys, monkeypatch):
     words = ["robustness", "heart", "--quick", "--no-progress", "--commit", "0"]
-    words += ["--output", str(tmp_path)]
+    words += ["--out", str(tmp_path)]
     path = tmp_path / "robustness_heart.json"
     # No time is left after the damages and three values.
     asked = iter([False] * 4)

@@ -448,7 +448,7 @@ def test_the_command_prints_tables_writes_what_it_says_and_checks_ratios(
     monkeypatch.chdir(tmp_path)
     name, folder = "perceive: dense torch over library", tmp_path / "results"
     held = [*FAST, "--check", str(stored(tmp_path, **{name: 1e-3}))]
-    assert main([*held, "--output", str(folder), "--commit", "abc"]) == 0
+    assert main([*held, "--out", str(folder), "--commit", "abc"]) == 0
     text = capsys.readouterr().out
     for word in ("perception:", "neighbour_cap", "bf16_storage", "left out:", "times faster:"):
         assert word in text
@@ -473,13 +473,13 @@ def test_the_command_prints_tables_writes_what_it_says_and_checks_ratios(
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--suite", "papper", "--output", "results"], "did you mean 'paper'?"),
+        (["--suite", "papper", "--out", "results"], "did you mean 'paper'?"),
         (["--strategies", "libraries"], "did you mean 'library'?"),
         (["--precisions", "float16"], "unknown precision 'float16'"),
         (["--device", "cuda:99"], "device must"),
         (["--repeats", "0"], "repeats must be at least 1"),
-        (["--plots"], "give --output DIR"),
-        (["--plots", "--output", "."], "pip install 'npa-envs[bench]'"),
+        (["--plots"], "give --out DIR"),
+        (["--plots", "--out", "."], "pip install 'npa-envs[bench]'"),
         (["--suite", "paper", "--check", "x.json"], "leave --suite out"),
         (["--check", "{}"], "must hold ratios under 'cpu'"),
         (["--check", "[]"], "must hold ratios under 'cpu'"),

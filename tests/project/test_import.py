@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 UNWANTED = ("stable_baselines3", "matplotlib", "imageio", "tensorboard", "tyro", "yaml")
 
@@ -52,3 +53,24 @@ def test_old_names_are_the_new_modules_and_nothing_within_them_runs_a_second_tim
     )
     refused = "no module npa_envs.sph.perceive: npa_envs.sph is now npa_envs.ops"
     assert run(program) == f"True True\n{refused}\n"
+
+
+def test_the_package_shows_its_public_names_alone() -> None:
+    program = (
+        "import npa_envs\n"
+        "print(sorted(dir(npa_envs)) == sorted([*npa_envs.__all__, '__version__']))"
+    )
+    assert run(program) == "True\n"
+
+
+def test_folders_that_kernels_are_compiled_in_are_removed_without_a_warning() -> None:
+    program = (
+        "import sys, warnings\nfrom npa_envs.runtime import start_warp\nstart_warp()\n"
+        "warnings.simplefilter('error')\n"
+        "runtime = sys.modules['warp._src.context'].runtime\n"
+        "folder = runtime.get_clang_pch_dir()\n"
+        "print(folder)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert "ResourceWarning" not in done.stderr
+    assert not Path(done.stdout.splitlines()[-1]).exists()

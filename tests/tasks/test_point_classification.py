@@ -62,6 +62,16 @@ def random(seed=0, device="cpu"):
     return torch.Generator(device).manual_seed(seed)
 
 
+def test_pictures_have_room_around_the_ink():
+    config = PointClassificationConfig(particle_count=64, resolution=32)
+    task = PointClassification(config)
+    x, s, _ = task.seed_with_goals(32, generator=random())
+    assert float(x.amax()) > 0.99
+    density = task.picture(x, s)[..., 3]
+    edges = torch.cat((density[:, 0], density[:, -1], density[:, :, 0], density[:, :, -1]), dim=1)
+    assert float(edges.amax()) < 0.4 < float(density.amax())
+
+
 def test_worlds_are_clouds_of_their_class_with_blank_states(task, device):
     x, s, goal = task.seed_with_goals(50, generator=random(1, device), device=device)
     assert s.shape == (50, 24, 6)

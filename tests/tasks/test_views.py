@@ -24,7 +24,13 @@ from npa_envs.tasks.targets.meshes import (
     ellipsoid,
     load_mesh,
 )
-from npa_envs.tasks.targets.views import ANGLE, DISTANCE, load_views, surrounding_cameras
+from npa_envs.tasks.targets.views import (
+    ANGLE,
+    DISTANCE,
+    load_views,
+    nearest_camera,
+    surrounding_cameras,
+)
 
 
 def ball(radius=0.5, colour=(0.2, 0.6, 1.0)):
@@ -124,6 +130,12 @@ def test_targets_have_views_to_train_with_and_others_to_measure_by():
         assert bool((colours <= alpha + 1e-6).all())
         assert bool((alpha.amax((1, 2, 3)) == 1.0).all())
         assert float(alpha[:, 0].max()) == float(alpha[:, :, 0].max()) == 0.0
+
+
+def test_pictures_show_the_front():
+    cameras = orbit(8, elevation=10.0, radius=3.0, width=8, height=8, azimuth=100.0)
+    # Cameras stand at 100, 145, ... degrees; the seventh at 370.
+    assert nearest_camera(cameras, 20.0) == 6
 
 
 @pytest.mark.parametrize(

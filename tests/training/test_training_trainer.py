@@ -205,8 +205,12 @@ def test_run_leaves_rule_configuration_and_pictures(tmp_path):
     assert load_config(tmp_path / "config.json", circle_config("x")) == config
     assert sorted(p.name for p in tmp_path.glob("pictures/*")) == ["000003.png", "000006.png"]
     pixels = np.asarray(Image.open(tmp_path / "pictures" / "000006.png"))
-    assert pixels.shape == (8, 3 * 8, 3)
-    assert pixels.min() < pixels.max()
+    # The target and three worlds of 8 x 8 pixels, each pixel repeated, with gaps.
+    assert pixels.shape == (256, 4 * 256 + 3 * 8, 3)
+    worlds = pixels[:, 256:]
+    assert (pixels[:, :256] == 255).all()
+    assert (worlds[::32] == worlds[31::32]).all()
+    assert worlds.min() < worlds.max()
 
 
 def test_tensorboard_gets_the_same_numbers_as_the_log(tmp_path):
@@ -219,7 +223,7 @@ def test_tensorboard_gets_the_same_numbers_as_the_log(tmp_path):
     expected = [(record["iteration"], record["loss"]) for record in log_of(tmp_path)]
     assert losses == [(k, pytest.approx(loss, rel=1e-6)) for k, loss in expected]
     (picture,) = events.Images("batch")
-    assert (picture.step, picture.width, picture.height) == (6, 24, 8)
+    assert (picture.step, picture.width, picture.height) == (6, 4 * 256 + 3 * 8, 256)
     written = np.asarray(Image.open(tmp_path / "pictures" / "000006.png")).astype(float)
     shown = np.asarray(Image.open(io.BytesIO(picture.encoded_image_string)))
     # A JPEG of few pixels: seen 5.6 of 255.
@@ -338,7 +342,9 @@ def test_second_run_in_a_folder_is_refused_unless_it_overwrites(tmp_path):
     config = circle_config(tmp_path, picture_interval=1)
     train(config)
     (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(NPAError, match="holds one: resume it, choose another folder, or overwrite"):
+    with pytest.raises(
+        NPAError, match=r"holds one: resume it .*, choose another folder .*, or overwrite"
+    ):
         trainer_of(config)
     result = train(override(config, iterations=2), overwrite=True)
     assert result.iteration == 2

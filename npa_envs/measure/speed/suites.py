@@ -364,7 +364,7 @@ def stored_ratios(path: Path, device: torch.device) -> dict[str, float]:
     Raises:
         NPAError: The file cannot be read or holds nothing for this kind of device.
     """
-    cure = "take `ratios` from the JSON of `npa-envs bench --quick --output DIR`"
+    cure = "take `ratios` from the JSON of `npa-envs bench --quick --out DIR`"
     try:
         loaded = read_json(path)
         return {str(name): float(value) for name, value in loaded[device.type].items()}

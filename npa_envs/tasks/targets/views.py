@@ -166,17 +166,18 @@ def some_views(views: Views, index: Tensor) -> Views:
     return Views(chosen, views.pictures.index_select(0, index))
 
 
-def nearest_elevation(cameras: Cameras, elevation: float) -> int:
-    """Return which camera looks at the origin from nearest to an elevation.
+def nearest_camera(cameras: Cameras, elevation: float) -> int:
+    """Return which camera looks at the origin from nearest to the front, at an elevation.
 
     Args:
         cameras: V cameras.
-        elevation: Above the horizon [degrees].
+        elevation: Above the horizon [degrees]; the front is where z points to.
     """
     motions = cameras.world_to_camera.double().cpu()
     places = -(motions[:, :3, :3].mT @ motions[:, :3, 3:])[..., 0]
-    heights = places[:, 1] / places.norm(dim=1)
-    return int((heights - math.sin(math.radians(elevation))).abs().argmin())
+    tilt = math.radians(elevation)
+    front = places.new_tensor((0.0, math.sin(tilt), math.cos(tilt)))
+    return int((places @ front / places.norm(dim=1)).argmax())
 
 
 # Folders of pictures and cameras as the NeRF-synthetic scenes are (Mildenhall et al. 2020).
