@@ -88,14 +88,16 @@ def parse_options(
     if any(word.partition("=")[0] == "--output" for word in arguments):
         print("npa-envs: --output is now --out", file=sys.stderr)
     shown = "\n".join(f"  npa-envs {example}" for example in EXAMPLES[command])
-    return tyro.cli(
+    told: dict[str, Any] = {} if default is None else {"default": default}
+    options: OptionsT = tyro.cli(
         kind,
         prog=f"npa-envs {command}",
         description=f"{description or inspect.getdoc(kind)}\n\nExamples:\n{shown}",
         args=arguments,
         config=(tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone, tyro.conf.SuppressFixed),
-        **({} if default is None else {"default": default}),
+        **told,
     )
+    return options
 
 
 @dataclass(frozen=True, kw_only=True)

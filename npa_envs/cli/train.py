@@ -163,8 +163,10 @@ def parse(
 
 def _without(source: Any, names: Iterable[str]) -> Any:
     """Return a dataclass of which some fields, where it has them, are no options."""
-    kind, hints = type(source), get_type_hints(type(source))
-    changed = {name: tyro.conf.Fixed[hints[name]] for name in names if name in hints}
+    kind: Any = type(source)
+    fixed: Any = tyro.conf.Fixed
+    hints = get_type_hints(kind)
+    changed = {name: fixed[hints[name]] for name in names if name in hints}
     if "task" in hints:
         changed["task"] = type(source.task)
     options = [(name, own, field(default=getattr(source, name))) for name, own in changed.items()]

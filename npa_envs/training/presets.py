@@ -57,9 +57,9 @@ class TaskEntry:
         return self.fast_seconds * _particle_steps(config) / _particle_steps(self.presets["fast"])
 
 
-def _particle_steps(config: TrainConfig[Any]) -> float:
+def _particle_steps(config: TrainConfig[Any]) -> int:
     species = getattr(config.task, "species", (config.task,))
-    particles = sum(own.particle_count for own in species)
+    particles: int = sum(own.particle_count for own in species)
     return config.total_iterations * config.world_count * particles * sum(config.steps)
 
 
