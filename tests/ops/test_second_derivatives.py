@@ -13,6 +13,7 @@ from npa_envs.ops.pictures.cameras import orbit
 def picture_of_gaussians(x, s):
     scales, quaternions = torch.full_like(x, 0.1), torch.ones_like(s[..., :4])
     opacities, cameras = torch.ones_like(x[..., 0]), orbit(1, width=16, height=16)
+    cameras = cameras.to(x.device)
     return render_gaussians(x, scales, quaternions, opacities, s[..., :3], cameras).image
 
 
