@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
+import gymnasium
 import numpy as np
 import torch
-from gymnasium.vector import AutoresetMode
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from numpy.typing import NDArray
 
 from npa_envs.agents.policies import unwrapped
 from npa_envs.errors import NPAError
 from npa_envs.world.randomness import WorldRandom
+
+TIME_LIMIT = "time limit"
+"""Why an episode ended that Gymnasium cut off."""
+
+_TOLD = {"reason", "diverged", "success"}
 
 
 class Episodes(NamedTuple):
@@ -54,22 +60,21 @@ def evaluate_policy(env: Any, policy: Callable[[Any], Any], seeds: Iterable[int]
     long ones, and the environment's draws do not depend on the number of worlds.
 
     Args:
-        env: A vector environment of `npa_envs`, wrapped or not, in the autoreset mode "same-step"
-            and with `max_episode_steps`.
-        policy: Maps observations, [B, N, P], to actions, [B, N, A].
+        env: A single or a vector environment of `npa_envs`, or Gymnasium's `SyncVectorEnv` of
+            single ones; wrapped or not, in any autoreset mode, with `max_episode_steps`.
+        policy: Maps observations, [B, N, P], to actions, [B, N, A]; B is 1 where `env` is single.
         seeds: One for each episode, integers of at least 0.
 
     Raises:
         NPAError: There are no seeds or wrong ones, or the environment is another one.
     """
     worlds = unwrapped(env).worlds
-    if env.metadata.get("autoreset_mode") is not AutoresetMode.SAME_STEP:
+    if not (hasattr(env, "num_envs") or isinstance(env, gymnasium.Env)):
         raise NPAError(
-            f"env must be a vector environment that resets in the same step, got "
-            f"{type(env).__name__}: make it with gymnasium.make_vec(..., "
-            "vectorization_mode='vector_entry_point', autoreset_mode='same-step')"
+            f"env must be a single or a vector environment, got {type(env).__name__}: of several "
+            "species take Problem(...).make_envs() of npa_envs.agents.learning"
         )
-    if worlds.episode_steps is None:
+    if worlds.episode_steps is None and _step_limit(env) is None:
         raise NPAError("env must end its episodes: make it with max_episode_steps=256")
     if not isinstance(seeds, Iterable):
         raise NPAError(f"seeds must be one for each episode, got {seeds!r}: give seeds=range(8)")
@@ -78,9 +83,11 @@ def evaluate_policy(env: Any, policy: Callable[[Any], Any], seeds: Iterable[int]
         raise NPAError("seeds must hold at least one seed, got none: give seeds=range(8)")
     # Before the first episode, not in the midst of them.
     WorldRandom(given)
-    count = env.num_envs
+    single = isinstance(env, gymnasium.Env)
+    count = 1 if single else env.num_envs
+    run = _run_single if single else _run
     batches = [given[k : k + count] for k in range(0, len(given), count)]
-    ran = [_run(env, policy, [*batch, *batch[-1:] * (count - len(batch))]) for batch in batches]
+    ran = [run(env, policy, [*batch, *batch[-1:] * (count - len(batch))]) for batch in batches]
     joined = [np.concatenate(column)[: len(given)] for column in zip(*ran, strict=True)]
     returns, start_losses, final_losses, steps, endings = joined
     return Episodes(returns, start_losses, final_losses, steps, tuple(endings.tolist()))
@@ -94,17 +101,50 @@ def _run(env: Any, policy: Callable[[Any], Any], seeds: list[int]) -> tuple[NDAr
     steps = np.zeros(len(seeds), dtype=np.int64)
     endings = np.full(len(seeds), None, dtype=object)
     running = np.ones(len(seeds), dtype=bool)
+    resets_itself = env.metadata.get("autoreset_mode") is not AutoresetMode.DISABLED
     while running.any():
         observation, reward, terminated, truncated, infos = env.step(policy(observation))
         returns[running] += _host(reward)[running]
         steps[running] += 1
-        over = running & (_host(terminated) | _host(truncated)).astype(bool)
+        ended = (_host(terminated) | _host(truncated)).astype(bool)
+        over = running & ended
         if over.any():
-            final = infos["final_info"]
+            final = infos.get("final_info", infos)
             final_losses[over] = _host(final["loss"])[over]
-            endings[over] = final["reason"][over]
+            for k in np.flatnonzero(over):
+                endings[k] = _ending({name: final[name][k] for name in _TOLD & final.keys()})
             running &= ~over
+        if not resets_itself and ended.any() and running.any():
+            observation, _ = env.reset(options={"reset_mask": ended})
     return returns, start_losses, final_losses, steps, endings
+
+
+def _run_single(
+    env: Any, policy: Callable[[Any], Any], seeds: list[int]
+) -> tuple[NDArray[Any], ...]:
+    """As `_run`, of one world."""
+    observation, info = env.reset(seed=seeds[0])
+    start_loss, total, steps, over = info["loss"], 0.0, 0, False
+    while not over:
+        observation, reward, terminated, truncated, info = env.step(policy(observation[None])[0])
+        total, steps, over = total + float(reward), steps + 1, terminated or truncated
+    ending = np.array([_ending(info)], dtype=object)
+    return *(np.array([n]) for n in (total, start_loss, info["loss"], steps)), ending
+
+
+def _ending(info: Mapping[str, Any]) -> str:
+    """Return why an episode ended, from what its last step told of that world."""
+    flags = [name for name in ("diverged", "success") if info.get(name)]
+    return str(info.get("reason") or next(iter(flags), TIME_LIMIT))
+
+
+def _step_limit(env: Any) -> int | None:
+    """Return the steps after which Gymnasium cuts off episodes of single environments, or None."""
+    inner = env.unwrapped
+    if isinstance(inner, SyncVectorEnv):
+        env = inner.envs[0]
+    limit = getattr(env.spec, "max_episode_steps", None) if isinstance(env, gymnasium.Env) else None
+    return limit if limit is not None and limit > 0 else None
 
 
 def _host(value: Any) -> NDArray[Any]:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any, NamedTuple, TypeVar
+from collections.abc import Mapping, Sequence
+from itertools import accumulate
+from typing import Any, NamedTuple, TypeVar, overload
 
 import numpy as np
 import torch
-from gymnasium.vector import VectorEnv
+from gymnasium.vector import SyncVectorEnv, VectorEnv
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -86,10 +87,14 @@ class Interface(NamedTuple):
 def unwrapped(env: Any) -> Any:
     """Return the NPA environment, single or vector, within wrappers.
 
+    Of Gymnasium's `SyncVectorEnv` it is the first of the environments that it holds.
+
     Raises:
         NPAError: It is none.
     """
     inner = getattr(env, "unwrapped", None)
+    if isinstance(inner, SyncVectorEnv):
+        inner = inner.envs[0].unwrapped
     if not hasattr(inner, "worlds"):
         cure = "gymnasium.make('npa/Morphogenesis2D-v0')"
         if isinstance(env, VectorEnv):
@@ -130,7 +135,8 @@ class Policy:
 
     Called with observations of one world, [N, P], or of several, [B, N, P], it returns actions
     [N, A] or [B, N, A], float32, within the action space: a NumPy array for an array, and a tensor
-    on the same device for a tensor. No gradient is recorded.
+    on the same device for a tensor. Called with a dict of agents' observations, as PettingZoo's
+    parallel environments return it, it returns a dict of their actions. No gradient is recorded.
 
     Args:
         interface: What observations and actions mean: `interface_of(env)`.
@@ -151,18 +157,60 @@ class Policy:
         """
         raise NotImplementedError
 
+    @overload
+    def __call__(self, observation: Array) -> Array: ...
+
+    @overload
+    def __call__(self, observation: Mapping[str, Array]) -> dict[str, Array]: ...
+
     @torch.no_grad()
-    def __call__(self, observation: Array) -> Array:
-        """Return the actions for observations, shape [N, P] or [B, N, P].
+    def __call__(self, observation: Any) -> Any:
+        """Return the actions for observations, shape [N, P] or [B, N, P], or for agents' own.
 
         Raises:
             NPAError: The shape is another one.
         """
+        if isinstance(observation, Mapping):
+            return self._act_by_agent(observation)
         if isinstance(observation, Tensor):
             return self._act_on(observation).to(observation.device)
         # Torch refuses to share memory that may not be written to.
         writable = np.require(observation, np.float32, ("C", "W"))
         return self._act_on(torch.from_numpy(writable)).cpu().numpy()
+
+    def _act_by_agent(self, observations: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the actions of agents, by [P] or [N_k, P] or [B, N_k, P] that each perceives."""
+        if not observations:
+            return {}
+        rows = {agent: torch.as_tensor(seen) for agent, seen in observations.items()}
+        rows = {agent: seen if seen.ndim > 1 else seen[None] for agent, seen in rows.items()}
+        places = self._places({agent: seen.shape[-2] for agent, seen in rows.items()})
+        first = next(iter(rows.values()))
+        count = max(place.stop for place in places.values())
+        together = first.new_zeros(*first.shape[:-2], count, first.shape[-1])
+        for agent, place in places.items():
+            if rows[agent].shape != together[..., place, :].shape:
+                raise NPAError(
+                    f"observation[{agent!r}] must have shape "
+                    f"{tuple(together[..., place, :].shape)}, got {tuple(rows[agent].shape)}: "
+                    "use the policy with the environment that it was made for"
+                )
+            together[..., place, :] = rows[agent]
+        actions = self._act_on(together).to(together.device)
+        result: dict[str, Any] = {}
+        for agent, seen in observations.items():
+            own = actions[..., places[agent], :]
+            own = own if np.ndim(seen) > 1 else own[0]
+            result[agent] = own if isinstance(seen, Tensor) else own.cpu().numpy()
+        return result
+
+    def _places(self, counts: Mapping[str, int]) -> dict[str, slice]:
+        """Return where the particles of agents stand, of whom each has so many."""
+        ends = accumulate(counts.values())
+        return {
+            agent: slice(end - count, end)
+            for (agent, count), end in zip(counts.items(), ends, strict=True)
+        }
 
     def _act_on(self, observation: Tensor) -> Tensor:
         shape, columns = tuple(observation.shape), self.interface.perception_dim

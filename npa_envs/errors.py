@@ -24,6 +24,13 @@ class DivergedError(NPAError):
     """Numbers became infinite or NaN; the message says when, which, and in which worlds."""
 
 
+class UnknownKeywordError(NPAError, TypeError):
+    """A keyword that an environment does not have, worded as Python's own error.
+
+    By that type and those words libraries know that they may leave a keyword out.
+    """
+
+
 class MissingDependencyError(NPAError, ImportError):
     """An optional dependency is not installed; the message holds the command that installs it."""
 

@@ -70,7 +70,8 @@ class Trained(NamedTuple):
     """The learning curve."""
 
     policy: Callable[[Any], Any]
-    """Maps observations, [B, N, P], to actions, [B, N, A]: the rules' where there are some."""
+    """Maps observations, [B, N, P], to actions, [B, N, A], and a dict of agents' observations, of
+    PettingZoo's parallel environments, to one of their actions: the rules' where there are some."""
 
 
 def train(

@@ -27,7 +27,9 @@ class Budget:
     """
 
     seconds: float | None = None
-    """Wall-clock time of learning, without set-up and evaluations [s]."""
+    """Wall-clock time of learning [s]. Set-up and evaluations come on top, and may take longer:
+    there are at most `entries` + 2 evaluations, of an episode for each of `evaluation_seeds`. By
+    default these are 22 of 16 episodes; `entries=1` makes at most 3."""
 
     particle_steps: int | None = None
     """Steps of an environment or a rollout, times the particles that took them."""

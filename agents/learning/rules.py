@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import accumulate
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
@@ -208,6 +208,21 @@ class RuleSetPolicy(Policy):
         """Return the rules' bounded updates of every particle."""
         parts = [self.interface.action(*update) for update in self.rules.updates(observation)]
         return torch.cat(parts, dim=1).float()
+
+    def _places(self, counts: Mapping[str, int]) -> dict[str, slice]:
+        # Agents that are dead are missing, so that names say which species, or particle, it is.
+        spans = self.rules.spans
+        particles = [slice(k, k + 1) for k in range(spans[-1].stop)]
+        known = {f"species_{k}": span for k, span in enumerate(spans)}
+        known |= {f"particle_{k}": place for k, place in enumerate(particles)}
+        for agent in counts:
+            if agent not in known:
+                raise NPAError(
+                    f"observation must be of agents of {len(spans)} species and {len(particles)} "
+                    f"particles, got one of {agent!r}: use the policy with the environment that it "
+                    "was made for"
+                )
+        return {agent: known[agent] for agent in counts}
 
 
 def starting_rules(

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.devices import check_device
-from npa_envs.errors import NPAError, suggest
+from npa_envs.errors import NPAError, UnknownKeywordError, suggest
 from npa_envs.render import STYLES
 from npa_envs.tasks.checks import (
     check_fraction,
@@ -209,13 +209,14 @@ class WorldConfig:
             keywords: Fields by name; numbers of NumPy are taken for Python's, lists for tuples.
 
         Raises:
-            NPAError: There is no field of that name, or a field is wrong.
+            UnknownKeywordError: There is no field of that name.
+            NPAError: A field is wrong.
         """
         known = [field.name for field in fields(cls)]
         for name in keywords:
             if name not in known:
                 hint = cls.elsewhere.get(name) or suggest(name, [*known, *cls.taken_by_make])
-                raise NPAError(f"unknown keyword {name!r}: {hint}")
+                raise UnknownKeywordError(f"got an unexpected keyword argument {name!r}: {hint}")
         return cls(**{name: plain(value) for name, value in keywords.items()})
 
     def task_config(self, config_type: type[TaskConfig], **changes: Any) -> TaskConfig:

@@ -99,19 +99,23 @@ class CrowdEnv(AgentsEnv, pettingzoo.ParallelEnv):  # type: ignore[misc]
         """Apply the actions of all live agents, take those that ended out of the world, perceive.
 
         Args:
-            actions: One for each live agent, as its action space says.
+            actions: One for each live agent, as its action space says; none where none is live.
 
         Returns:
             Observations, rewards, whether an agent's episode ended by itself, whether it was cut
             off, and infos: of all agents that acted.
 
         Raises:
-            NPAError: The episode is over, or an action is missing, not wanted, or of another
+            NPAError: There is no world yet, or an action is missing, not wanted, or of another
                 shape; the world is then as it was.
             DivergedError: An action is not finite, and the world is as it was; or an agent is out
                 of bounds, and `on_divergence` is "raise".
         """
-        if not self.agents:
+        if not self._started:
+            raise NPAError("step needs a world: call reset first")
+        if not self.agents and isinstance(actions, Mapping):
+            if not actions:
+                return {}, {}, {}, {}, {}
             raise NPAError("step needs a live agent, and there is none: call reset first")
         worlds, acted, live = self.worlds, self.agents, self._live
         shapes = [self.action_spaces[agent].shape for agent in acted]

@@ -59,7 +59,8 @@ class CompareOptions(MeasureOptions):
     """Seeds for each method and task: 0, 1, ..."""
 
     seconds: float | None = None
-    """Compare for equal wall time: seconds that each run may learn."""
+    """Compare for equal wall time: seconds that each run may learn. Its start and evaluations come
+    on top."""
 
     particle_steps: float | None = None
     """Compare for equal particle-steps: as many as each run may learn from, for example 1e8."""

@@ -19,6 +19,7 @@ from npa_envs.agents import (
     evaluate_policy,
     interface_of,
 )
+from npa_envs.envs import multispecies_v0, particles_v0
 from npa_envs.errors import NPAError
 from npa_envs.rule.rule import COLOUR_OFFSET
 
@@ -341,6 +342,30 @@ def test_episodes_do_not_depend_on_how_many_run_at_once(output):
     assert len(set(episodes.returns.tolist())) == 4
 
 
+@pytest.mark.parametrize("form", ["single", "tensors", "next-step", "disabled", "sync"])
+@pytest.mark.parametrize("ending", [{}, {"success_loss": 0.9}])
+def test_episodes_are_the_same_in_every_form_of_an_environment(form, ending):
+    keywords = {"particle_count": 32, "max_episode_steps": 40} | ending
+    usual = make_vector(world_count=2, **keywords)
+    expected = evaluate_policy(usual, PaintPolicy(usual), range(3))
+    if form == "single":
+        env = make(**keywords)
+    elif form == "tensors":
+        env = make(**keywords, output="torch", disable_env_checker=True)
+    elif form == "sync":
+        name, mode = "npa/Morphogenesis2D-v0", {"vectorization_mode": "sync"}
+        env = gymnasium.make_vec(name, num_envs=2, **mode, **keywords)
+    else:
+        env = make_vector(world_count=2, autoreset_mode=form, **keywords)
+    found = evaluate_policy(env, PaintPolicy(env), range(3))
+    assert found.endings == expected.endings
+    assert ("success" in found.endings) == bool(ending)
+    assert found.steps.tolist() == expected.steps.tolist()
+    assert not ending or len(set(found.steps.tolist())) > 1
+    for name in ("returns", "start_losses", "final_losses"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-6)
+
+
 def test_episodes_that_end_early_keep_their_own_length_and_ending():
     envs = make_vector(world_count=4, particle_count=64, max_episode_steps=50, success_loss=1.5)
     episodes = evaluate_policy(envs, PaintPolicy(envs), range(4))
@@ -353,11 +378,12 @@ def test_episodes_that_end_early_keep_their_own_length_and_ending():
 
 
 def test_environments_whose_episodes_cannot_be_told_apart_are_refused():
-    with pytest.raises(NPAError, match="same step"):
-        evaluate_policy(make(particle_count=64), lambda z: z, [0])
-    disabled = make_vector(particle_count=64, autoreset_mode="disabled")
-    with pytest.raises(NPAError, match="same step"):
-        evaluate_policy(disabled, lambda z: z, [0])
+    agents = multispecies_v0.parallel_env(particle_count=8)
+    with pytest.raises(NPAError, match=r"single or a vector .*make_envs"):
+        evaluate_policy(agents, never, [0])
+    unlimited = make(particle_count=64, max_episode_steps=-1)
+    with pytest.raises(NPAError, match="max_episode_steps=256"):
+        evaluate_policy(unlimited, never, [0])
     envs = make_vector(particle_count=64)
     with pytest.raises(NPAError, match="max_episode_steps=256"):
         evaluate_policy(make_vector(particle_count=64, max_episode_steps=None), lambda z: z, [0])
@@ -388,9 +414,30 @@ def test_seeds_may_be_anything_that_gives_one_after_the_other(make_seeds):
     assert len(set(episodes.start_losses.tolist())) == 3
 
 
+@pytest.mark.parametrize("module", [multispecies_v0, particles_v0])
+@pytest.mark.parametrize("output", ["numpy", "torch"])
+def test_policies_act_for_the_agents_of_a_parallel_environment(module, output):
+    env = module.parallel_env(particle_counts=(5, 7), output=output, deaths=((0, 1),))
+    policy = SpreadPolicy(env)
+    observations, _ = env.reset(seed=0)
+    actions = policy(observations)
+    assert list(actions) == env.agents
+    for agent, seen in observations.items():
+        rows = seen if seen.ndim > 1 else seen[None]
+        np.testing.assert_array_equal(np.atleast_2d(actions[agent]), policy(rows))
+        assert actions[agent].shape == env.action_space(agent).shape
+        assert type(actions[agent]) is type(seen)
+    observations, *_ = env.step(actions)
+    left = {agent: observations[agent] for agent in env.agents}
+    assert len(policy(left)) == (1 if module is multispecies_v0 else 7)
+    assert policy({}) == {}
+    with pytest.raises(NPAError, match="observation must have shape"):
+        policy({"species_0": np.zeros((3, 4), np.float32)})
+
+
 def test_the_error_about_foreign_vector_environments_says_how_to_make_ours():
-    single = functools.partial(make, particle_count=64)
-    foreign = gymnasium.vector.SyncVectorEnv([single, single], autoreset_mode="SameStep")
+    single = functools.partial(gymnasium.make, "CartPole-v1")
+    foreign = gymnasium.vector.SyncVectorEnv([single, single])
     for use in (interface_of, ZeroPolicy, lambda env: evaluate_policy(env, never, [0])):
         with pytest.raises(NPAError, match="got SyncVectorEnv: make it with gymnasium") as caught:
             use(foreign)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import numpy as np
 import pytest
 import torch
 from learning_problems import digits, heart, species, wild_rules
@@ -17,7 +18,7 @@ from npa_envs.agents import (
     interface_of,
 )
 from npa_envs.agents.learning import Budget, Problem, RuleSet, train
-from npa_envs.envs import multispecies_v0
+from npa_envs.envs import multispecies_v0, particles_v0
 from npa_envs.errors import NPAError
 from npa_envs.registration import ENVIRONMENTS
 from npa_envs.rule.rule import NPARule
@@ -54,7 +55,7 @@ def test_json_keeps_a_problem(problem):
     [
         ({"env_id": "npa/Mixng-v0"}, "did you mean 'npa/Mixing-v0'"),
         ({"env_id": "CartPole-v1"}, "env_id must be of an environment of many worlds"),
-        ({"keywords": {"epsilon": 0.1}}, "unknown keyword 'epsilon'"),
+        ({"keywords": {"epsilon": 0.1}}, "unexpected keyword argument 'epsilon'"),
         ({"keywords": {"eps": -0.1}}, "eps must be"),
         ({"keywords": {"device": "cuda"}}, "given to train and make_envs"),
         ({"keywords": {"max_cycles": 3}}, "field episode_steps"),
@@ -120,6 +121,32 @@ def test_the_policy_of_one_rule_is_rule_policy_bit_for_bit(problem):
         assert torch.equal(action, theirs(observation))
         observation, *_ = envs.step(action)
     assert action.abs().mean() > 0.01
+
+
+@pytest.mark.parametrize("module", [multispecies_v0, particles_v0])
+def test_the_policy_of_rules_acts_for_agents_whoever_is_left(module):
+    problem = species(particle_counts=(5, 7))
+    env = module.parallel_env(task="mixing", **problem.keywords, deaths=((0, 2),))
+    policy = wild_rules(problem).policy()
+    observations, _ = env.reset(seed=0)
+    for _ in range(3):
+        together = np.zeros((12, problem.interface.perception_dim), np.float32)
+        places = {"species_0": slice(0, 5), "species_1": slice(5, 12)}
+        places |= {f"particle_{k}": slice(k, k + 1) for k in range(12)}
+        for agent, seen in observations.items():
+            together[places[agent]] = seen
+        everyone, actions = policy(together), policy(observations)
+        assert list(actions) == env.agents
+        for agent, action in actions.items():
+            np.testing.assert_array_equal(np.atleast_2d(action), everyone[places[agent]])
+        observations, *_ = env.step(actions)
+        # The dead have a last observation.
+        observations = {agent: observations[agent] for agent in env.agents}
+    assert len(env.agents) == (1 if module is multispecies_v0 else 7)
+    with pytest.raises(NPAError, match="must be of agents of 2 species and 12 particles, got one"):
+        policy({"agent_0": np.zeros((5, 4), np.float32)})
+    with pytest.raises(NPAError, match=r"observation\['species_1'\] must have shape \(7, "):
+        policy({"species_1": np.zeros((5, 4), np.float32)})
 
 
 @pytest.mark.parametrize("problem", [heart(state_scale=0.1), digits(), species()])

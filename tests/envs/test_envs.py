@@ -488,6 +488,13 @@ def test_action_of_another_shape_is_an_error(name, shape):
 
 
 @every_id
+def test_an_unknown_keyword_is_a_type_error_in_pythons_words(name):
+    for many in (False, True):
+        with pytest.raises(TypeError, match=r"got an unexpected keyword argument 'frameskip': "):
+            make_vec(name, 2, frameskip=1) if many else make(name, frameskip=1)
+
+
+@every_id
 def test_step_before_reset_is_an_error(name):
     env = make(name).unwrapped
     with pytest.raises(NPAError, match="call reset first"):
@@ -498,8 +505,11 @@ def test_step_before_reset_is_an_error(name):
 @pytest.mark.parametrize(
     ("keywords", "message"),
     [
-        ({"particle_coumt": 5}, "unknown keyword 'particle_coumt': did you mean 'particle_count'"),
-        ({"seed": 3}, "unknown keyword 'seed': give it to reset"),
+        (
+            {"particle_coumt": 5},
+            "unexpected keyword argument 'particle_coumt': did you mean 'particle_count'",
+        ),
+        ({"seed": 3}, "unexpected keyword argument 'seed': give it to reset"),
         ({"max_episode_step": 3}, "did you mean 'max_episode_steps'"),
         ({"episode_steps": 5}, "for longer or shorter episodes give max_episode_steps"),
         ({"target": "geko"}, "target must be a built-in "),

@@ -226,7 +226,14 @@ def test_a_world_without_particles_can_be_drawn_and_described():
     assert env.agents == []
     assert env.render().min() == 255
     assert not env.state().any()
+    # PettingZoo's loops may call this once more.
+    assert env.step({}) == ({}, {}, {}, {}, {})
     with pytest.raises(NPAError, match="there is none: call reset first"):
+        env.step({"species_0": np.zeros(1)})
+    with pytest.raises(NPAError, match="actions must be a dict"):
+        env.step(None)
+    env.reset()
+    with pytest.raises(NPAError, match="got none for species_0, species_1"):
         env.step({})
 
 
@@ -335,8 +342,8 @@ def test_the_package_is_imported_without_pettingzoo_which_is_asked_for_by_name()
         ({"task": "symbiosis", "sigma": 1e20}, r"sigma must be at most 1e\+09, got 1e\+20"),
         ({"task": "invasion", "colour_weight": 1e38}, "colour_weight must be at most"),
         ({"max_cycles": 0}, "max_cycles must be a whole number of at least 1"),
-        ({"epsilon": 0.2}, "unknown keyword 'epsilon': did you mean 'eps'"),
-        ({"seed": 1}, r"unknown keyword 'seed': give it to reset\(seed=...\)"),
+        ({"epsilon": 0.2}, "unexpected keyword argument 'epsilon': did you mean 'eps'"),
+        ({"seed": 1}, r"unexpected keyword argument 'seed': give it to reset\(seed=...\)"),
         ({"eps": -0.1}, "eps must be a finite number greater than 0"),
         ({"perception": "own"}, r"perception must be a known word, got 'own'"),
         ({"on_divergence": "reset"}, "on_divergence must be a known word, got 'reset'"),

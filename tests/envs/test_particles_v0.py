@@ -106,7 +106,7 @@ def test_particles_of_a_removed_species_end_together():
         ({"particle_counts": (500, 20)}, "particle_count must be at most 512 .* got 520"),
         ({"species_count": 0}, "species_count must be a whole number of at least 1"),
         ({"task": "mixin"}, "did you mean 'mixing'"),
-        ({"particles": 4}, "unknown keyword 'particles': did you mean"),
+        ({"particles": 4}, "unexpected keyword argument 'particles': did you mean"),
     ],
 )
 def test_a_wrong_configuration_is_refused(keywords, message):

@@ -263,7 +263,7 @@ def test_spaces_hold_what_comes_out():
         ({"autoreset_mode": "next-step"}, "autoreset_mode must be 'same-step' or 'disabled'"),
         ({"autoreset_mode": "never"}, "autoreset_mode must be a known word, got 'never'"),
         ({"eps": -1.0}, "eps must be a finite number greater than 0"),
-        ({"num_envs": 3}, "unknown keyword 'num_envs'"),
+        ({"num_envs": 3}, "unexpected keyword argument 'num_envs'"),
         ({"world_count": 10**7, "particle_count": 10**4}, "particle_count is too large"),
     ],
 )

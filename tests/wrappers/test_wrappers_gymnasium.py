@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from gymnasium import wrappers
+import torch
+from gymnasium import spaces, wrappers
 from gymnasium.vector import AsyncVectorEnv
 from gymnasium.wrappers import vector
 from wrapped_envs import ACTIONS, STEPS, batched, single
@@ -55,6 +56,41 @@ def test_flatten_observation_and_normalize_reward():
         np.testing.assert_array_equal(observation, expected.reshape(-1))
     scale = np.sqrt(env.return_rms.var + env.epsilon)
     assert reward == pytest.approx(unscaled / scale, rel=1e-6)
+
+
+def test_actions_as_numbers_of_bins():
+    env, plain = wrappers.DiscretizeAction(single(), bins=5, multidiscrete=True), single()
+    env.reset(seed=0)
+    plain.reset(seed=0)
+    chosen = np.arange(64 * ACTIONS) % 5
+    # The middles of five bins of [-1, 1].
+    expected, *_ = plain.step((0.4 * chosen - 0.8).astype(np.float32).reshape(64, ACTIONS))
+    np.testing.assert_allclose(env.step(chosen)[0], expected, atol=1e-5)
+
+
+def test_actions_in_one_row_as_rllib_takes_them():
+    plain = single()
+    shape = plain.action_space.shape
+    flat = spaces.Box(-1.0, 1.0, (np.prod(shape),))
+    env = wrappers.TransformAction(single(), lambda action: action.reshape(shape), flat)
+    env.reset(seed=0)
+    plain.reset(seed=0)
+    expected, *_ = plain.step(actions(0))
+    np.testing.assert_array_equal(env.step(actions(0).ravel())[0], expected)
+
+
+@pytest.mark.parametrize("output", ["numpy", "torch"])
+def test_arrays_as_tensors(output):
+    pytest.importorskip("array_api_compat")
+    options = {"output": output, "disable_env_checker": output == "torch"}
+    env, plain = wrappers.NumpyToTorch(single(**options)), single()
+    observation, _ = env.reset(seed=0)
+    np.testing.assert_array_equal(observation.numpy(), plain.reset(seed=0)[0])
+    for step in range(STEPS):
+        observation, reward, terminated, truncated, _ = env.step(torch.from_numpy(actions(step)))
+        expected = plain.step(actions(step))
+        np.testing.assert_array_equal(observation.numpy(), expected[0])
+        assert (reward, terminated, truncated) == expected[1:4]
 
 
 def test_record_video(tmp_path):
