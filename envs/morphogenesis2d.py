@@ -13,7 +13,9 @@ from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import GoalTask
 from npa_envs.envs.core.vector import NPAVectorEnv
+from npa_envs.tasks.checks import check_positive
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
+from npa_envs.tasks.targets.images import LARGEST_POINT_COUNT
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,6 +33,8 @@ class Morphogenesis2DEnvConfig(EnvConfig):
     def __post_init__(self) -> None:
         """Check every field."""
         super().__post_init__()
+        # By its own name: the target has as many points.
+        check_positive(self, int, "particle_count", at_most=LARGEST_POINT_COUNT)
         _ = self.goal
         self.check_start_radius(self.seed_radius)
 
