@@ -6,7 +6,7 @@ import json
 import math
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -35,6 +35,13 @@ NEED_MORE = ("clone",)
 QUICK_EPISODES, QUICK_STEPS = 4, 200_000
 """Held-out episodes and particle-steps of a quick comparison."""
 
+QUICK: dict[str, Any] = {
+    "tasks": ("morphogenesis2d",),
+    "methods": ("gradient", "evolution", "zero"),
+    "seeds": 1,
+}
+"""What a quick comparison compares unless it is told."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class CompareOptions(MeasureOptions):
@@ -50,13 +57,14 @@ class CompareOptions(MeasureOptions):
     (curves need the extra `bench`)."""
 
     tasks: tuple[str, ...] = ()
-    """morphogenesis2d, regeneration2d, point_classification, mixing; default: all."""
+    """morphogenesis2d, regeneration2d, point_classification, mixing; default: all, or the
+    first when quick."""
 
     methods: tuple[str, ...] = ()
     """Methods of npa_envs.agents.learning; default: all but `clone`, which needs a teacher."""
 
-    seeds: int = 3
-    """Seeds for each method and task: 0, 1, ..."""
+    seeds: int | None = None
+    """Seeds for each method and task: 0, 1, ...; default: 3, or 1 when quick."""
 
     seconds: float | None = None
     """Compare for equal wall time: seconds that each run may learn. Its start and evaluations come
@@ -72,8 +80,8 @@ class CompareOptions(MeasureOptions):
     """Options of methods, values as JSON or plain text: evolution.population=64."""
 
     quick: bool = False
-    """Tiny worlds and, unless said otherwise, few steps: figures that say nothing but that it
-    runs."""
+    """Tiny worlds and, unless said otherwise, few steps, methods, tasks and one seed, a minute at
+    most on two CPU cores: figures that say nothing but that it runs."""
 
     devices: tuple[str, ...] = ()
     """Several devices that runs are dealt out to, for example cuda:0 cuda:1; default: --device."""
@@ -140,6 +148,9 @@ def make_plan(options: CompareOptions) -> Plan:
     from npa_envs.agents.learning import METHODS, REMOVED
 
     check_numbers(options, seeds=1, episodes=1, jobs=1, threads=1)
+    if options.quick:
+        told = {name: getattr(options, name) or few for name, few in QUICK.items()}
+        options = replace(options, **told)
     tasks = chosen_names("task", options.tasks, PROBLEMS)
     for name in REMOVED.keys() & set(options.methods):
         raise NPAError(f"method {name!r} is no more: {REMOVED[name]}")
@@ -150,7 +161,7 @@ def make_plan(options: CompareOptions) -> Plan:
     return Plan(
         tasks={name: json.loads(problem.to_json()) for name, problem in problems.items()},
         methods=methods,
-        seeds=tuple(range(options.seeds)),
+        seeds=tuple(range(3 if options.seeds is None else options.seeds)),
         budgets=_budgets(options),
         options=_method_options(options.options, methods),
         left_out=() if options.methods else LEFT_OUT,

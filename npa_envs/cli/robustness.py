@@ -41,7 +41,7 @@ class RobustnessOptions(MeasureOptions):
     """
 
     rules: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RULES")] = ()
-    """Shipped rules (`npa-envs list`); default: all."""
+    """Shipped rules (`npa-envs list`); default: all, or one of each task when quick."""
 
     seed_count: int | None = None
     """Seeds for each figure; default: 8, or 2 when quick."""
@@ -54,7 +54,8 @@ class RobustnessOptions(MeasureOptions):
     131072 on a CPU, 2097152 on CUDA."""
 
     quick: bool = False
-    """Small worlds, few steps and values: figures that say nothing but that it runs."""
+    """Small worlds, few steps and values, a minute at most on two CPU cores: figures that say
+    nothing but that it runs."""
 
     out: OptionalOutFolder = None
     """Folder for robustness_RULE.json, robustness.md, and curves (extra `bench`); default: nothing
@@ -68,13 +69,16 @@ def main(arguments: Sequence[str]) -> int:
     """Measure, print and write."""
     options = parse_options(RobustnessOptions, "robustness", arguments)
     from npa_envs.devices import check_device
-    from npa_envs.measure.accuracy.habitats import rule_names
+    from npa_envs.measure.accuracy.habitats import rule_names, task_name
     from npa_envs.measure.record import measured_facts, time_limit
     from npa_envs.measure.robustness.study import MOST_PARTICLES, RuleRecord, measure_rule, tables
 
     check_numbers(options, seed_count=1, first_seed=0, most_particles=1, threads=1)
     enough = time_limit(options.max_seconds)
     names = chosen_names("rule", options.rules, rule_names())
+    if options.quick and not options.rules:
+        # One of each task.
+        names = list({task_name(name): name for name in reversed(names)}.values())[::-1]
     device = check_device(options.device)
     most = options.most_particles or MOST_PARTICLES[device.type]
     seeds = _seeds(options)

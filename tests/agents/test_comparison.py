@@ -496,6 +496,14 @@ def test_a_strip_has_a_column_for_each_method_and_room_for_what_failed(tmp_path)
 # The whole command
 
 
+def test_a_quick_comparison_is_of_one_task_and_seed_unless_told_otherwise():
+    plan = make_plan(CompareOptions(quick=True))
+    assert (list(plan.tasks), plan.seeds) == (["morphogenesis2d"], (0,))
+    assert set(plan.methods) == {"gradient", "evolution", "zero"}
+    plan = make_plan(CompareOptions(quick=True, tasks=("mixing",), seeds=2))
+    assert (list(plan.tasks), plan.seeds) == (["mixing"], (0, 1))
+
+
 def test_a_quick_comparison_stops_goes_on_and_refuses_other_settings(tmp_path, capsys):
     pytest.importorskip("cma")
     words = (
