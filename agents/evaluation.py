@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from numpy.typing import NDArray
 
 from npa_envs.agents.policies import unwrapped
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, shown
 from npa_envs.world.randomness import WorldRandom
 
 TIME_LIMIT = "time limit"
@@ -77,7 +77,9 @@ def evaluate_policy(env: Any, policy: Callable[[Any], Any], seeds: Iterable[int]
     if worlds.episode_steps is None and _step_limit(env) is None:
         raise NPAError("env must end its episodes: make it with max_episode_steps=256")
     if not isinstance(seeds, Iterable):
-        raise NPAError(f"seeds must be one for each episode, got {seeds!r}: give seeds=range(8)")
+        raise NPAError(
+            f"seeds must be one for each episode, got {shown(seeds)}: give seeds=range(8)"
+        )
     given = list(seeds)
     if not given:
         raise NPAError("seeds must hold at least one seed, got none: give seeds=range(8)")

@@ -13,7 +13,7 @@ from gymnasium.vector import SyncVectorEnv, VectorEnv
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, shown
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
 from npa_envs.tasks.checks import is_real, is_whole
 from npa_envs.world.randomness import Purpose, WorldRandom
@@ -246,7 +246,7 @@ class RulePolicy(Policy):
             )
         if not (is_real(state_scale) and state_scale > 0.0):
             raise NPAError(
-                f"state_scale must be positive and finite, got {state_scale!r}: give the "
+                f"state_scale must be positive and finite, got {shown(state_scale)}: give the "
                 "environment's, or env"
             )
         if env is None:
@@ -294,7 +294,7 @@ class RandomPolicy(Policy):
         super().__init__(interface_of(env))
         given: Any = seed
         if not (is_whole(given) or isinstance(given, np.integer)) or given < 0:
-            raise NPAError(f"a seed must be an integer of at least 0, got {given!r}")
+            raise NPAError(f"a seed must be an integer of at least 0, got {shown(given)}")
         self._seed = int(given)
         self._random: WorldRandom | None = None
 
@@ -325,7 +325,7 @@ class SpreadPolicy(Policy):
     def __init__(self, env: Any, gain: float = 0.03) -> None:
         super().__init__(interface_of(env))
         if not is_real(gain):
-            raise NPAError(f"gain must be a finite number, got {gain!r}: try 0.03")
+            raise NPAError(f"gain must be a finite number, got {shown(gain)}: try 0.03")
         self._gain = gain
 
     def act(self, observation: Tensor) -> Tensor:
@@ -363,7 +363,8 @@ class PaintPolicy(SpreadPolicy):
             self._colour = torch.as_tensor(colour, dtype=torch.float32)
         except (TypeError, ValueError, RuntimeError, OverflowError) as error:
             raise NPAError(
-                f"colour must have three numbers, got {colour!r}: for example colour=(0, 0.5, 0)"
+                f"colour must have three numbers, got {shown(colour)}: for example colour=(0, 0.5, "
+                "0)"
             ) from error
         if self._colour.shape != (3,):
             raise NPAError(

@@ -16,7 +16,7 @@ from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import TURN, GoalTask
 from npa_envs.envs.core.vector import NPAVectorEnv
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, shown
 from npa_envs.render import turntable_frames
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
@@ -59,7 +59,7 @@ class Morphogenesis3DEnvConfig(EnvConfig):
         super().__post_init__()
         if not isinstance(self.readout, str):
             raise NPAError(
-                f"readout must be a name or a path, got {self.readout!r}: "
+                f"readout must be a name or a path, got {shown(self.readout)}: "
                 "for example readout='mushroom'"
             )
         check_positive(self, int, "view_count")

@@ -15,7 +15,7 @@ from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import GoalTask, Start
 from npa_envs.envs.core.vector import NPAVectorEnv
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, shown
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
 from npa_envs.tasks.checks import check_positive
@@ -55,12 +55,13 @@ class PointClassificationEnvConfig(EnvConfig):
         super().__post_init__()
         if self.boundary != "open":
             raise NPAError(
-                f"boundary must be 'open' for point clouds, got {self.boundary!r}: leave it out"
+                f"boundary must be 'open' for point clouds, got {shown(self.boundary)}: leave it "
+                "out"
             )
         if self.split not in get_args(Split):
-            raise NPAError(f"split must be 'train' or 'test', got {self.split!r}")
+            raise NPAError(f"split must be 'train' or 'test', got {shown(self.split)}")
         if not isinstance(self.rule, str):
-            raise NPAError(f"rule must be the path of a rule as a string, got {self.rule!r}")
+            raise NPAError(f"rule must be the path of a rule as a string, got {shown(self.rule)}")
         _ = self.goal
         check_positive(self, int, "state_dim", at_least=3 if self.rule else self.class_count)
 
@@ -135,7 +136,7 @@ def _read_out_rule(config: PointClassificationEnvConfig, device: torch.device) -
     if given.readout is None or given.state_dim != config.state_dim:
         raise NPAError(
             f"rule must have a read-out of state_dim = {config.state_dim} channels, but "
-            f"{config.rule!r} has {given.state_dim} channels and {given.readout_dim} outputs: "
+            f"{shown(config.rule)} has {given.state_dim} channels and {given.readout_dim} outputs: "
             "choose one that was trained on point_classification"
         )
     rule = _WorldByWorld(**given.hyper_parameters()).to(device)

@@ -12,7 +12,7 @@ from npa_envs.envs.core.task import Start
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.envs.core.worlds import total
 from npa_envs.envs.morphogenesis2d import Morphogenesis2DEnvConfig, PictureTask
-from npa_envs.errors import NPAError, suggest
+from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.rule.files import load_rule, shipped_rules
 from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
 from npa_envs.tasks.checks import check_fraction, check_positive
@@ -71,8 +71,8 @@ class Regeneration2DEnvConfig(Morphogenesis2DEnvConfig):
         super().__post_init__()
         kinds = (*SIZES, RANDOM_DAMAGE)
         if self.damage not in kinds:
-            hint = suggest(str(self.damage), kinds)
-            raise NPAError(f"damage must be a known kind, got {self.damage!r}: {hint}")
+            hint = suggest(self.damage, kinds)
+            raise NPAError(f"damage must be a known kind, got {shown(self.damage)}: {hint}")
         check_positive(self, int, "grow_steps")
         check_fraction(self, "healed_share")
         if self.damage_size is not None:
@@ -151,8 +151,9 @@ class RegenerationTask(PictureTask[Regeneration2DEnvConfig]):
         config = self.config
         if config.rule is None and config.target not in (known := shipped_rules("morphogenesis2d")):
             raise NPAError(
-                f"rule must say what grows the worlds, as no shipped rule grows {config.target!r} "
-                f"({', '.join(known)}): give rule='PATH', or rule={PICTURE!r} to start "
+                "rule must say what grows the worlds, as no shipped rule grows "
+                f"{shown(config.target)} "
+                f"({', '.join(known)}): give rule='PATH', or rule={shown(PICTURE)} to start "
                 "from the target's own points"
             )
         rule = load_rule(config.rule or config.target, device=self.device)

@@ -13,7 +13,7 @@ from npa_envs.envs.core.config import Boundary, EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import GoalTask
 from npa_envs.envs.core.vector import NPAVectorEnv
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, shown
 from npa_envs.tasks.texture import Texture, TextureConfig
 
 LOSS_BYTES = 4000
@@ -45,7 +45,8 @@ class TextureEnvConfig(EnvConfig):
         super().__post_init__()
         if self.boundary != "periodic":
             raise NPAError(
-                f"boundary must be 'periodic' for textures, got {self.boundary!r}: leave it out"
+                f"boundary must be 'periodic' for textures, got {shown(self.boundary)}: leave it "
+                "out"
             )
         _ = self.goal
 

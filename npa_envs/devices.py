@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, shown
 
 
 def parse_device(name: str) -> torch.device:
@@ -18,18 +18,20 @@ def parse_device(name: str) -> torch.device:
     """
     cure = "use 'cpu', 'cuda' or 'cuda:1'"
     if not isinstance(name, str):
-        raise NPAError(f"device must be text, got {name!r}: {cure}")
+        raise NPAError(f"device must be text, got {shown(name)}: {cure}")
     try:
         device = torch.device(name)
     except (RuntimeError, TypeError) as error:
-        raise NPAError(f"device must name a device, got {name!r}: {cure}") from error
+        raise NPAError(f"device must name a device, got {shown(name)}: {cure}") from error
     if device.type not in ("cpu", "cuda"):
-        raise NPAError(f"device must be 'cpu' or 'cuda', got {name!r}: {cure}")
+        raise NPAError(f"device must be 'cpu' or 'cuda', got {shown(name)}: {cure}")
     if device.type == "cpu" and name not in ("cpu", "cpu:0"):
-        raise NPAError(f"device must be 'cpu' without a number, got {name!r}: {cure}")
+        raise NPAError(f"device must be 'cpu' without a number, got {shown(name)}: {cure}")
     # Torch keeps the number in eight bits: "cuda:256" would be the first device.
     if str(device) != name:
-        raise NPAError(f"device must have a number that torch can count to, got {name!r}: {cure}")
+        raise NPAError(
+            f"device must have a number that torch can count to, got {shown(name)}: {cure}"
+        )
     return device
 
 
@@ -49,7 +51,7 @@ def check_device(name: str | torch.device) -> torch.device:
     index = 0 if device.index is None else device.index
     if index >= count:
         raise NPAError(
-            f"device must be one that torch sees, got {str(name)!r}, but it sees {count} CUDA "
+            f"device must be one that torch sees, got {shown(str(name))}, but it sees {count} CUDA "
             "devices: use device='cpu', or see `npa-envs doctor`"
         )
     return torch.device("cuda", index)

@@ -54,7 +54,7 @@ def shown(value: object) -> str:
     return brief if len(brief) <= SHOWN_LENGTH else f"{brief[:half]} ... {brief[-half:]}"
 
 
-def suggest(name: str, known: Iterable[str]) -> str:
+def suggest(name: object, known: Iterable[str]) -> str:
     """Return the tail of an error about an unknown name: the nearest known one, then all of them.
 
     Args:

@@ -275,16 +275,19 @@ def _check_target(given: Path, target: Path) -> None:
     try:
         if target.is_dir():
             raise NPAError(
-                f"cannot write {str(given)!r}: that is a folder: give the path of a file inside it"
+                f"cannot write {shown(str(given))}: that is a folder: give the path of a file "
+                "inside it"
             )
         if not target.parent.exists():
             raise NPAError(
-                f"cannot write {str(given)!r}: the folder {str(target.parent)!r} does not exist: "
-                f"create it first (mkdir -p {str(target.parent)!r})"
+                f"cannot write {shown(str(given))}: the folder {shown(str(target.parent))} does "
+                "not exist: "
+                f"create it first (mkdir -p {shown(str(target.parent))})"
             )
         if not target.parent.is_dir():
             raise NPAError(
-                f"cannot write {str(given)!r}: {str(target.parent)!r} is a file, not a folder: "
+                f"cannot write {shown(str(given))}: {shown(str(target.parent))} is a file, not a "
+                "folder: "
                 "give a path in a folder"
             )
     except OSError as error:
@@ -317,10 +320,10 @@ def _explain(given: Path, error: OSError) -> str:
     if error.errno in _DISK_FULL:
         rule, cure = "the disk is full", "free some space or choose another disk"
     elif error.errno in _NO_PERMISSION:
-        rule, cure = "no write permission", f"choose another path, or check: ls -ld {folder!r}"
+        rule, cure = "no write permission", f"choose another path, or check: ls -ld {shown(folder)}"
     else:
         rule, cure = (error.strerror or type(error).__name__), "choose another path"
-    return f"cannot write {str(given)!r}: {rule} ({error}): {cure}; nothing was changed"
+    return f"cannot write {shown(str(given))}: {rule} ({error}): {cure}; nothing was changed"
 
 
 def plain_numbers(value: Any) -> Any:

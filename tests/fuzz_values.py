@@ -26,6 +26,7 @@ EXTREME: tuple[Any, ...] = (
     math.nan, math.inf, -math.inf, 5e-324, 1e-38, 1e-12, 1e12, 1e30, 1e38, 1e300, -1e300, 2**31 - 1,
     2**31, 2**63 - 1, 2**64, 10**400, -(10**400), np.nan, np.array(math.inf), [math.nan, 1.0],
     (math.inf, 1e300), torch.tensor(math.nan), torch.tensor([math.inf, 1.0]), [10**400], "1e400",
+    10**5000, 10_000 * "x",
 )  # fmt: skip
 """Numbers that are none, or at the end of a range."""
 

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.vector import AUTORESET_MODES, NPAVectorEnv
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, shown
 
 if TYPE_CHECKING:
     AnyWrapper = gymnasium.Wrapper[Any, Any, Any, Any]
@@ -77,7 +77,7 @@ def torch_env(env: Any, adapter: str) -> NPAVectorEnv:
     base = vector_env(env, adapter)
     if base.config.output != "torch":
         raise NPAError(
-            f"{adapter} needs torch tensors, got output={base.config.output!r}: "
+            f"{adapter} needs torch tensors, got output={shown(base.config.output)}: "
             "make the environment with output='torch'"
         )
     if not base.copies:
@@ -115,7 +115,7 @@ def autoreset_mode(env: AnyVectorEnv) -> AutoresetMode:
 def check_autoreset(mode: AutoresetMode, word: str, rule: str) -> None:
     """Check that an environment restarts worlds as an adapter needs it: by a mode, in words."""
     if mode is not AUTORESET_MODES[word]:
-        raise NPAError(f"env must {rule}, got {mode}: make it with autoreset_mode={word!r}")
+        raise NPAError(f"env must {rule}, got {mode}: make it with autoreset_mode={shown(word)}")
 
 
 def check_same_step(mode: AutoresetMode) -> None:

@@ -15,7 +15,7 @@ from torch import Tensor
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.spaces import to_output
 from npa_envs.envs.core.vector import NPAVectorEnv
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, shown
 from npa_envs.tasks.checks import is_whole
 from npa_envs.tasks.damage import DamageEvent, damage_worlds, parse_damage
 from npa_envs.world.randomness import Purpose
@@ -51,7 +51,7 @@ class Schedule:
             raise NPAError("events must hold at least one event, got none: for example '100:cut'")
         if every is not None and not (is_whole(every) and 1 <= every < 2**63):
             raise NPAError(
-                f"every must be a whole number of at least 1 and below 2^63, got {every!r}"
+                f"every must be a whole number of at least 1 and below 2^63, got {shown(every)}"
             )
         for event in given:
             if not isinstance(event, str | DamageEvent):

@@ -8,7 +8,7 @@ import gymnasium
 
 from npa_envs.envs import multispecies_v0, particles_v0
 from npa_envs.envs.core.vector import checked_count
-from npa_envs.errors import MissingDependencyError, NPAError, suggest
+from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
 from npa_envs.registration import ENVIRONMENTS, register_environments
 from npa_envs.wrappers.particle_rows import ParticleRows
 
@@ -90,7 +90,7 @@ def rllib_config(name: str, *, shared: bool = False, **keywords: Any) -> PPOConf
         NPAError: There is no such id, or a keyword is wrong.
     """
     if name not in MAKERS:
-        raise NPAError(f"name must be a known id, got {name!r}: {suggest(str(name), MAKERS)}")
+        raise NPAError(f"name must be a known id, got {shown(name)}: {suggest(name, MAKERS)}")
     make, task = MAKERS[name]
     env = make(task, **keywords)
     _, infos = env.reset(seed=0)
@@ -128,7 +128,7 @@ def rllib_rows_config(
     """
     ids = [environment.id for environment in ENVIRONMENTS]
     if name not in ids:
-        raise NPAError(f"name must be a known id, got {name!r}: {suggest(str(name), ids)}")
+        raise NPAError(f"name must be a known id, got {shown(name)}: {suggest(name, ids)}")
     rows = checked_count("world_count", world_count) * checked_count(
         "particle_count", particle_count
     )

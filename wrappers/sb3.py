@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.envs.multi.vector import MultiSpeciesVectorEnv
-from npa_envs.errors import MissingDependencyError, NPAError, suggest
+from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
 from npa_envs.wrappers.base import (
     AnyVectorEnv,
     as_tensor,
@@ -453,12 +453,12 @@ class SpeciesVecEnv(RowVecEnv):
             if not callable(policy):
                 raise NPAError(
                     f"others must hold functions of observations, got {type(policy).__name__} for "
-                    f"{name!r}: RowPolicy(model) makes one of a model"
+                    f"{shown(name)}: RowPolicy(model) makes one of a model"
                 )
             if name not in env.possible_agents:
                 raise NPAError(
-                    f"others must name species, got {name!r}: "
-                    f"{suggest(str(name), env.possible_agents)}"
+                    f"others must name species, got {shown(name)}: "
+                    f"{suggest(name, env.possible_agents)}"
                 )
         self.rows_of = [name for name in env.possible_agents if name not in self.others]
         """Species whose particles are rows, in order."""
@@ -532,8 +532,8 @@ class SpeciesVecEnv(RowVecEnv):
         """
         if species not in self.rows_of:
             raise NPAError(
-                f"species must be one whose particles are rows, got {species!r}: "
-                f"{suggest(str(species), self.rows_of)}"
+                f"species must be one whose particles are rows, got {shown(species)}: "
+                f"{suggest(species, self.rows_of)}"
             )
         tag = None
         if self._tags is not None:

@@ -15,7 +15,7 @@ from torch import Tensor
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.spaces import to_output
 from npa_envs.envs.core.vector import NPAVectorEnv
-from npa_envs.errors import NPAError, suggest
+from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.tasks.checks import is_real, is_whole
 from npa_envs.world.randomness import Purpose, WorldRandom
 from npa_envs.wrappers.base import (
@@ -43,11 +43,11 @@ class SpeciesPlan:
     ) -> None:
         if not is_whole(species_count) or species_count < 1:
             raise NPAError(
-                f"species_count must be a whole number of at least 1, got {species_count!r}"
+                f"species_count must be a whole number of at least 1, got {shown(species_count)}"
             )
         if not isinstance(assignment, str) or assignment not in ASSIGNMENTS:
-            hint = suggest(str(assignment), ASSIGNMENTS)
-            raise NPAError(f"assignment must be a known word, got {assignment!r}: {hint}")
+            hint = suggest(assignment, ASSIGNMENTS)
+            raise NPAError(f"assignment must be a known word, got {shown(assignment)}: {hint}")
         if species_count > particle_count:
             raise NPAError(
                 f"species_count must be at most the {particle_count} particles, got {species_count}"

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.vector import NPAVectorEnv
-from npa_envs.errors import NPAError, suggest
+from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.tasks.checks import is_real, is_whole
 from npa_envs.world.actions import Physics
 from npa_envs.wrappers.base import (
@@ -93,7 +93,7 @@ class RunningMoments:
         wanted = {"mean": self.mean.shape, "var": self.var.shape, "count": torch.Size()}
         for name in state.keys() ^ wanted.keys():
             fault = "unknown" if name in state else "missing"
-            raise NPAError(f"{fault} statistic {name!r}: {suggest(name, wanted)}")
+            raise NPAError(f"{fault} statistic {shown(name)}: {suggest(name, wanted)}")
         given = {name: torch.as_tensor(state[name], dtype=torch.float64) for name in wanted}
         for name, shape in wanted.items():
             if given[name].shape != shape:
@@ -210,10 +210,10 @@ class _NormalizesPerception(RecordConstructorArgs):
             name, value = next(iter(given.items()))
             raise NPAError(
                 f"{name} belongs to statistics, which has {getattr(statistics, name):g}, got "
-                f"{value!r} as well: leave {name} out"
+                f"{shown(value)} as well: leave {name} out"
             )
         if not isinstance(training, bool | np.bool_):
-            raise NPAError(f"training must be True or False, got {training!r}")
+            raise NPAError(f"training must be True or False, got {shown(training)}")
         self.statistics, self.training = statistics, bool(training)
         RecordConstructorArgs.__init__(
             self, clip=statistics.clip, epsilon=statistics.epsilon, training=training
@@ -326,7 +326,7 @@ class TorchRecordEpisodeStatistics(EpisodeWrapper):
         if not is_whole(buffer_length) or not 1 <= buffer_length < 2**31:
             raise NPAError(
                 "buffer_length must be a whole number of at least 1 and below 2^31, got "
-                f"{buffer_length!r}"
+                f"{shown(buffer_length)}"
             )
         self._key = stats_key
         self.episode_count = 0
@@ -449,7 +449,7 @@ class TorchNormalizeReward(EpisodeWrapper):
         check_vector_env(env, type(self).__name__)
         super().__init__(env)
         if not is_real(gamma) or not 0.0 <= gamma <= 1.0:
-            raise NPAError(f"gamma must lie in [0, 1], got {gamma!r}: try 0.99")
+            raise NPAError(f"gamma must lie in [0, 1], got {shown(gamma)}: try 0.99")
         self.gamma, self.epsilon = gamma, above_zero("epsilon", epsilon)
         self.return_rms = RunningMoments()
         """Running mean and variance of the discounted return."""
@@ -502,5 +502,5 @@ def check_tensor(values: Any, wrapper: str) -> None:
 def above_zero(name: str, value: float) -> float:
     """Return a number that must be finite and greater than 0, by its name."""
     if not is_real(value) or value <= 0:
-        raise NPAError(f"{name} must be a finite number greater than 0, got {value!r}")
+        raise NPAError(f"{name} must be a finite number greater than 0, got {shown(value)}")
     return float(value)

@@ -93,7 +93,7 @@ def make_problem(name: str, *, quick: bool = False) -> Problem:
         NPAError: There is no such task.
     """
     if name not in PROBLEMS:
-        raise NPAError(f"unknown task {name!r}: {suggest(str(name), PROBLEMS)}")
+        raise NPAError(f"unknown task {name!r}: {suggest(name, PROBLEMS)}")
     sizes = PROBLEMS[name]
     return Problem(
         env_id=sizes.env_id,

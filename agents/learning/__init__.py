@@ -19,7 +19,7 @@ from npa_envs.agents.learning.problem import EVALUATION_SEEDS, Problem
 from npa_envs.agents.learning.progress import Budget, Entry, Progress, check_finite
 from npa_envs.agents.learning.rules import RuleSet, RuleSetPolicy, starting_rules
 from npa_envs.devices import check_device
-from npa_envs.errors import NPAError, suggest
+from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.tasks.checks import is_whole
 
 __all__ = [
@@ -112,9 +112,11 @@ def train(
     known = method_options(method)
     for name in options:
         if name not in known:
-            raise NPAError(f"method {method!r} has no option {name!r}: {suggest(name, known)}")
+            raise NPAError(
+                f"method {shown(method)} has no option {shown(name)}: {suggest(name, known)}"
+            )
     if not is_whole(seed) or seed < 0:
-        raise NPAError(f"seed must be a whole number of at least 0, got {seed!r}: give seed=0")
+        raise NPAError(f"seed must be a whole number of at least 0, got {shown(seed)}: give seed=0")
     place = check_device(device)
     if start is not None:
         start = starting_rules(problem, seed, place, start)
@@ -164,10 +166,10 @@ def _declared(function: Callable[..., Any]) -> Any:
 
 def _function(method: str) -> Callable[..., Any]:
     if method in REMOVED:
-        raise NPAError(f"method {method!r} is no more: {REMOVED[method]}")
+        raise NPAError(f"method {shown(method)} is no more: {REMOVED[method]}")
     if not isinstance(method, str) or method not in METHODS:
         raise NPAError(
-            f"method must be a known word, got {method!r}: {suggest(str(method), METHODS)}"
+            f"method must be a known word, got {shown(method)}: {suggest(method, METHODS)}"
         )
     function: Callable[..., Any] = pkgutil.resolve_name(METHODS[method])
     return function

@@ -11,7 +11,7 @@ from torch import Tensor
 from npa_envs.agents.learning.problem import Problem, world_seeds
 from npa_envs.agents.learning.progress import Progress, annealed
 from npa_envs.agents.learning.rules import RuleSet, Source, starting_rules
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, shown
 from npa_envs.tasks.checks import check_positive, is_real
 
 VARIANCE_FLOOR = 1e-8
@@ -50,7 +50,9 @@ class CloneOptions:
     def __post_init__(self) -> None:
         """Check every field but the teacher; raises NPAError."""
         if not (is_real(self.student_share) and 0.0 <= self.student_share <= 1.0):
-            raise NPAError(f"student_share must lie in [0, 1], got {self.student_share!r}: try 0.5")
+            raise NPAError(
+                f"student_share must lie in [0, 1], got {shown(self.student_share)}: try 0.5"
+            )
         check_positive(self, int, "collect_steps", "kept_steps", "updates", "batch_worlds")
         check_positive(self, float, "learning_rate")
         if self.kept_steps < self.collect_steps:
@@ -91,14 +93,14 @@ def train(
         rules.parameters(), lr=options.learning_rate, fused=device.type == "cuda"
     )
     observation, _ = envs.reset(seed=world_seeds(seed, problem.num_envs))
-    shown = Demonstrations(options.kept_steps * problem.num_envs, observation, teacher(observation))
+    some = Demonstrations(options.kept_steps * problem.num_envs, observation, teacher(observation))
     taught = problem.num_envs - round(options.student_share * problem.num_envs)
 
     def iteration() -> int:
         nonlocal observation
         for _ in range(options.collect_steps):
             action = teacher(observation)
-            shown.add(observation, action)
+            some.add(observation, action)
             if taught < problem.num_envs:
                 action[taught:] = student(observation[taught:])
             observation, *_ = envs.step(action)
@@ -106,7 +108,7 @@ def train(
         for group in optimiser.param_groups:
             group["lr"] = rate
         for _ in range(options.updates):
-            loss = unexplained(rules, *shown.draw(options.batch_worlds, generator))
+            loss = unexplained(rules, *some.draw(options.batch_worlds, generator))
             optimiser.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
             optimiser.step()

@@ -16,7 +16,7 @@ from npa_envs.agents.learning.progress import Progress, annealed
 from npa_envs.agents.learning.rules import RuleSet, starting_rules
 from npa_envs.envs.core.task import EnvTask
 from npa_envs.envs.multi.task import Population, SpeciesConfig, SpeciesTask
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, shown
 from npa_envs.rule.rule import FoldedRule, NPARule
 from npa_envs.tasks.base import Task
 from npa_envs.tasks.train_config import TrainConfig
@@ -188,7 +188,8 @@ def _check_rules_of_play(problem: Problem, task: EnvTask[Any] | SpeciesTask) -> 
         )
     if problem.keywords.get("deaths"):
         raise NPAError(
-            f"method='gradient' must keep all particles, got deaths={problem.keywords['deaths']!r}:"
+            "method='gradient' must keep all particles, got "
+            f"deaths={shown(problem.keywords['deaths'])}:"
             " leave deaths out, or learn by 'ppo' or 'evolution'"
         )
 

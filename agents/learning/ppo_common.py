@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.rules import RuleSet
-from npa_envs.errors import NPAError, suggest
+from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.tasks.checks import check_fraction, check_non_negative, check_positive
 
 
@@ -131,7 +131,7 @@ def check_word(name: str, word: object, words: Sequence[str]) -> None:
         NPAError: It is none of them.
     """
     if word not in words:
-        raise NPAError(f"{name} must be a known word, got {word!r}: {suggest(str(word), words)}")
+        raise NPAError(f"{name} must be a known word, got {shown(word)}: {suggest(word, words)}")
 
 
 def first_rules(problem: Problem, seed: int, start: RuleSet | None) -> RuleSet:

@@ -29,7 +29,7 @@ from npa_envs.envs.multi.task import SpeciesConfig, SpeciesTask
 from npa_envs.envs.multi.tasks import ENVIRONMENTS as SPECIES
 from npa_envs.envs.multi.tasks import task_type as species_task_type
 from npa_envs.envs.multi.vector import MultiSpeciesVectorEnv
-from npa_envs.errors import NPAError, suggest
+from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.registration import ENVIRONMENTS
 from npa_envs.tasks.checks import check_positive
 from npa_envs.world.actions import Physics
@@ -96,7 +96,7 @@ class Problem:
             )
         for name in self.keywords:
             if name in ELSEWHERE:
-                raise NPAError(f"keywords must not have {name!r}: {ELSEWHERE[name]}")
+                raise NPAError(f"keywords must not have {shown(name)}: {ELSEWHERE[name]}")
         if self.keywords.get("reward") == "particle":
             raise NPAError(
                 "keywords must not have reward='particle': ask make_envs for row_rewards=True"
@@ -105,7 +105,8 @@ class Problem:
             plain = json.loads(json.dumps(dict(self.keywords)))
         except (TypeError, ValueError) as error:
             raise NPAError(
-                f"keywords must have values of JSON's types, got {dict(self.keywords)!r}: give "
+                f"keywords must have values of JSON's types, got {shown(dict(self.keywords))}: "
+                "give "
                 f"numbers, text and lists ({error})"
             ) from error
         object.__setattr__(self, "keywords", plain)
@@ -131,8 +132,8 @@ class Problem:
         if not (isinstance(entry, type) and issubclass(entry, NPAVectorEnv)):
             known = [environment.id for environment in ENVIRONMENTS]
             raise NPAError(
-                f"env_id must be of an environment of many worlds, got {self.env_id!r}: "
-                f"{suggest(str(self.env_id), [*known, *SPECIES])}"
+                f"env_id must be of an environment of many worlds, got {shown(self.env_id)}: "
+                f"{suggest(self.env_id, [*known, *SPECIES])}"
             )
         return entry
 
@@ -231,7 +232,7 @@ class Problem:
             if given.get("reward", "dense") != "dense":
                 raise NPAError(
                     "row_rewards needs the problem's reward to be 'dense', got "
-                    f"{given['reward']!r}: leave it out of keywords"
+                    f"{shown(given['reward'])}: leave it out of keywords"
                 )
             given["reward"] = "particle"
         envs: Any = gymnasium.make_vec(
@@ -277,9 +278,11 @@ class Problem:
             fields = json.loads(text)
             return cls(**fields)
         except TypeError as error:
-            raise NPAError(f"text must be a problem in JSON, got {text!r} ({error})") from error
+            raise NPAError(
+                f"text must be a problem in JSON, got {shown(text)} ({error})"
+            ) from error
         except json.JSONDecodeError as error:
-            raise NPAError(f"text must be JSON, got {text!r} ({error})") from error
+            raise NPAError(f"text must be JSON, got {shown(text)} ({error})") from error
 
 
 def world_seeds(seed: int, count: int) -> range:

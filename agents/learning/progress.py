@@ -14,7 +14,7 @@ from npa_envs.agents.evaluation import evaluate_policy
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.devices import check_device
-from npa_envs.errors import DivergedError, NPAError
+from npa_envs.errors import DivergedError, NPAError, shown
 from npa_envs.tasks.checks import is_real, is_whole
 
 
@@ -41,10 +41,14 @@ class Budget:
                 "a budget must say something: Budget(seconds=60) or particle_steps=10**7"
             )
         if self.seconds is not None and not (is_real(self.seconds) and self.seconds > 0.0):
-            raise NPAError(f"seconds must be positive and finite, got {self.seconds!r}: try 60")
+            raise NPAError(
+                f"seconds must be positive and finite, got {shown(self.seconds)}: try 60"
+            )
         steps = self.particle_steps
         if steps is not None and not (is_whole(steps) and steps > 0):
-            raise NPAError(f"particle_steps must be a positive integer, got {steps!r}: try 10**7")
+            raise NPAError(
+                f"particle_steps must be a positive integer, got {shown(steps)}: try 10**7"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,7 +124,9 @@ class Progress:
                 "evaluation_seeds must hold at least one seed, got none: range(100, 132)"
             )
         if not is_whole(entries) or entries < 1:
-            raise NPAError(f"entries must be a whole number of at least 1, got {entries!r}: try 20")
+            raise NPAError(
+                f"entries must be a whole number of at least 1, got {shown(entries)}: try 20"
+            )
         self._entries = entries
         self._on_entry = on_entry
         self._device = check_device(device)
@@ -263,6 +269,7 @@ def check_finite(rules: RuleSet, particle_steps: int) -> None:
             bad = int((~torch.isfinite(weight)).sum())
             if bad:
                 raise DivergedError(
-                    f"weights must stay finite, but {bad} of {weight.numel()} in {name!r} of rule "
+                    f"weights must stay finite, but {bad} of {weight.numel()} in {shown(name)} of "
+                    "rule "
                     f"{number} were not after {particle_steps} particle-steps: learn more slowly"
                 )

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from npa_envs.agents.policies import Interface, Policy, bounded_update, check_rule_fits
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, shown
 from npa_envs.rule.files import load_rule, save_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.checks import is_whole
@@ -67,7 +67,9 @@ class RuleSet(nn.Module):
             NPAError: The seed is no such integer.
         """
         if not is_whole(seed) or seed < 0:
-            raise NPAError(f"seed must be a whole number of at least 0, got {seed!r}: give seed=0")
+            raise NPAError(
+                f"seed must be a whole number of at least 0, got {shown(seed)}: give seed=0"
+            )
         interface, config = problem.interface, problem.config
         with torch.random.fork_rng(devices=()):
             torch.manual_seed(seed)
@@ -137,7 +139,8 @@ class RuleSet(nn.Module):
             Path(folder).mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise NPAError(
-                f"folder must be one that can be made, got {str(folder)!r} ({error.strerror}): "
+                f"folder must be one that can be made, got {shown(str(folder))} "
+                f"({error.strerror}): "
                 "choose another place"
             ) from error
         for rule, path in zip(self, paths, strict=True):

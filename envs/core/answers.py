@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.envs.core.task import EnvTask, Start
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, shown
 
 
 def starter(task: EnvTask[Any]) -> str:
@@ -77,7 +77,7 @@ def checked_losses(
             f"{list(losses)} after {list(names)}: return zeros for a part that does not count"
         )
     for part, value in losses.items():
-        _check_tensor(task, "losses", f"part {part!r}", value, (world_count,), torch.float32)
+        _check_tensor(task, "losses", f"part {shown(part)}", value, (world_count,), torch.float32)
     return list(losses.values())
 
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.devices import check_device
-from npa_envs.errors import NPAError, UnknownKeywordError, suggest
+from npa_envs.errors import NPAError, UnknownKeywordError, shown, suggest
 from npa_envs.render import STYLES
 from npa_envs.tasks.checks import (
     check_fraction,
@@ -137,7 +137,7 @@ class WorldConfig:
             if value not in words:
                 known = [word for word in words if word is not None]
                 raise NPAError(
-                    f"{name} must be a known word, got {value!r}: {suggest(str(value), known)}"
+                    f"{name} must be a known word, got {shown(value)}: {suggest(value, known)}"
                 )
         if self.boundary == "periodic" and self.box_size < 2.0 * self.eps:
             raise NPAError(
@@ -152,7 +152,7 @@ class WorldConfig:
         for field in fields(self):
             value = getattr(self, field.name)
             if is_real(value) and value > LARGEST:
-                raise NPAError(f"{field.name} must be at most {LARGEST:g}, got {value}")
+                raise NPAError(f"{field.name} must be at most {LARGEST:g}, got {shown(value)}")
         for name in ("eps", "eps0"):
             if getattr(self, name) < 1.0 / LARGEST:
                 raise NPAError(
@@ -288,7 +288,7 @@ class EnvConfig(WorldConfig):
             check_non_negative(self, "success_loss")
         if not is_whole(self.seed_pool) or self.seed_pool < 0:
             raise NPAError(
-                f"seed_pool must be a whole number of at least 0, got {self.seed_pool!r}: "
+                f"seed_pool must be a whole number of at least 0, got {shown(self.seed_pool)}: "
                 "0 makes a fresh start for each episode"
             )
 

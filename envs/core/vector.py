@@ -24,7 +24,7 @@ from npa_envs.envs.core.spaces import (
 )
 from npa_envs.envs.core.task import EnvTask
 from npa_envs.envs.core.worlds import FLAGS, TIME_LIMIT, Report, Worlds, reason
-from npa_envs.errors import NPAError, suggest
+from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.tasks.checks import is_whole
 from npa_envs.world.cuda_graph import sent
 from npa_envs.world.randomness import WorldRandom
@@ -332,7 +332,7 @@ def checked_count(name: str, value: Any) -> int:
         value = int(value)
     if not is_whole(value) or value < 1:
         raise NPAError(
-            f"{name} must be a whole number of at least 1, got {value!r}: for example {name}=8"
+            f"{name} must be a whole number of at least 1, got {shown(value)}: for example {name}=8"
         )
     return int(value)
 
@@ -351,8 +351,8 @@ def checked_mode(given: str | AutoresetMode) -> AutoresetMode:
     by_name = AUTORESET_MODES | {mode.value: mode for mode in AutoresetMode}
     if not isinstance(given, str) or given not in by_name:
         raise NPAError(
-            f"autoreset_mode must be a known word, got {given!r}: "
-            f"{suggest(str(given), AUTORESET_MODES)}"
+            f"autoreset_mode must be a known word, got {shown(given)}: "
+            f"{suggest(given, AUTORESET_MODES)}"
         )
     return by_name[given]
 
@@ -375,8 +375,8 @@ def check_options(options: Any, known: tuple[str, ...]) -> None:
         )
     for name in options or ():
         if name not in known:
-            cure = suggest(str(name), known) if known else "a single environment has none"
-            raise NPAError(f"unknown reset option {str(name)[:80]!r}: {cure}")
+            cure = suggest(name, known) if known else "a single environment has none"
+            raise NPAError(f"unknown reset option {shown(str(name)[:80])}: {cure}")
 
 
 def worlds_to_reset(options: dict[str, Any] | None, world_count: int) -> NDArray[np.int64]:
@@ -420,7 +420,7 @@ def world_keys(
     try:
         seeds = [operator.index(number) for number in seed]
     except TypeError as error:
-        raise NPAError(f"seed must be {cure}, got {seed!r}") from error
+        raise NPAError(f"seed must be {cure}, got {shown(seed)}") from error
     if len(seeds) != world_count:
         raise NPAError(f"seed must be {cure}, got {len(seeds)}")
     return WorldRandom(seeds).keys

@@ -28,7 +28,7 @@ from npa_envs.envs.core.config import EnvConfig, WorldConfig
 from npa_envs.envs.core.memory import check_memory
 from npa_envs.envs.core.spaces import number_tensor
 from npa_envs.envs.core.task import EnvTask, Start, WorldTask
-from npa_envs.errors import DivergedError, NPAError
+from npa_envs.errors import DivergedError, NPAError, shown
 from npa_envs.world.actions import Actions, SurveyedWorlds, survey_worlds
 from npa_envs.world.cuda_graph import Beside, Replayed, WeakFunction, sent
 from npa_envs.world.divergence import LARGEST_REPORT, term_name
@@ -443,7 +443,7 @@ class Worlds(Batch):
         """Check that the losses of some worlds, int64, shape [M], are finite."""
         numbers = self.report.numbers[2 : 2 + len(self.part_names), worlds]
         parts = {
-            f"part {name!r}": part for name, part in zip(self.part_names, numbers, strict=True)
+            f"part {shown(name)}": part for name, part in zip(self.part_names, numbers, strict=True)
         }
         check_finite(self.task, "losses", parts)
         if self.particle_loss is not None:

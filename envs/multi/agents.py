@@ -16,7 +16,7 @@ from npa_envs.envs.core.screen import Screen
 from npa_envs.envs.core.spaces import action_tensor, to_output
 from npa_envs.envs.core.vector import plain_seed, world_keys
 from npa_envs.envs.multi.worlds import Episodes
-from npa_envs.errors import DivergedError, NPAError
+from npa_envs.errors import DivergedError, NPAError, shown
 from npa_envs.world.actions import Physics
 
 
@@ -144,7 +144,9 @@ def joined_actions(
             "get no more actions until reset; see env.agents"
         )
     rows = [
-        action_tensor(f"actions[{agent!r}]", actions[agent], shape, f"env.action_space({agent!r})")
+        action_tensor(
+            f"actions[{shown(agent)}]", actions[agent], shape, f"env.action_space({shown(agent)})"
+        )
         for agent, shape in zip(agents, shapes, strict=True)
     ]
     # What has one row only has no dimension for it.
@@ -154,12 +156,13 @@ def joined_actions(
         bad = next(k for k, row in enumerate(rows) if not bool(torch.isfinite(row).all()))
         wrong = rows[bad][~torch.isfinite(rows[bad])]
         raise DivergedError(
-            f"actions[{agents[bad]!r}] must be finite, got {wrong[0].item()} ({wrong.numel()} such "
+            f"actions[{shown(agents[bad])}] must be finite, got {wrong[0].item()} ({wrong.numel()} "
+            "such "
             "numbers): check the policy; the world is as it was"
         )
     return joined
 
 
 def _names(agents: Sequence[str]) -> str:
-    shown = ", ".join(agents[:3])
-    return shown if len(agents) <= 3 else f"{shown} and {len(agents) - 3} more"
+    some = ", ".join(agents[:3])
+    return some if len(agents) <= 3 else f"{some} and {len(agents) - 3} more"

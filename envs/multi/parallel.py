@@ -13,7 +13,7 @@ from torch import Tensor
 
 from npa_envs.envs.core.spaces import number_tensor
 from npa_envs.envs.multi.agents import AgentsEnv, joined_actions
-from npa_envs.errors import MissingDependencyError, NPAError, suggest
+from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
 
 try:
     import pettingzoo
@@ -210,8 +210,8 @@ class CrowdEnv(AgentsEnv, pettingzoo.ParallelEnv):  # type: ignore[misc]
 
     def _check_agent(self, agent: str) -> None:
         if agent not in self.observation_spaces:
-            hint = suggest(str(agent), self.possible_agents[:8])
-            raise NPAError(f"agent must be one that exists, got {agent!r}: {hint}")
+            hint = suggest(agent, self.possible_agents[:8])
+            raise NPAError(f"agent must be one that exists, got {shown(agent)}: {hint}")
 
 
 def in_turns(parallel: Any, *, clips: bool = False) -> Any:

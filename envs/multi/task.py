@@ -16,7 +16,7 @@ from torch import Tensor
 
 from npa_envs.envs.core.config import WorldConfig, plain
 from npa_envs.envs.core.task import WorldTask
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, shown
 from npa_envs.render import STYLES
 from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.checks import check_non_negative, check_positive, is_whole
@@ -130,7 +130,8 @@ class SpeciesConfig(WorldConfig):
         if given and (not whole or len(given) != self.species_count or min(given) < 1):
             raise NPAError(
                 f"particle_counts must be {self.species_count} whole numbers of at least 1, one "
-                f"for each of species_count = {self.species_count}, got {given!r}: for example "
+                f"for each of species_count = {self.species_count}, got {shown(given)}: for "
+                "example "
                 f"particle_counts={(64,) * self.species_count}"
             )
         if not given and self.particle_count < self.species_count:
@@ -151,7 +152,7 @@ class SpeciesConfig(WorldConfig):
         )
         fits = pairs and all(0 <= k < self.species_count and step > 0 for k, step in given)
         if not fits or len({k for k, _ in given}) < len(given):
-            raise NPAError(f"{rule}, got {given!r}: for example deaths=((1, 50),)")
+            raise NPAError(f"{rule}, got {shown(given)}: for example deaths=((1, 50),)")
 
 
 class Population(NamedTuple):

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.devices import check_device
-from npa_envs.errors import NPAError, suggest
+from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.measure.tables import table_text, tables_json
 from npa_envs.rule.files import shipped_rules
 from npa_envs.rule.rule import NPARule
@@ -559,7 +559,7 @@ def scores(name: str) -> dict[str, Any]:
     """
     rules = shipped_rules()
     if not isinstance(name, str) or name not in rules:
-        raise NPAError(f"unknown rule {name!r}: {suggest(str(name), rules)}")
+        raise NPAError(f"unknown rule {shown(name)}: {suggest(name, rules)}")
     found: dict[str, Any] = json.loads(rules[name].with_suffix(".json").read_text("utf-8"))
     return found
 

@@ -12,7 +12,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, shown
 
 DTYPES = (torch.float32, torch.float64)
 
@@ -159,7 +159,7 @@ def checked_flag(name: str, value: Any) -> bool:
     """
     with contextlib.suppress(TypeError, ValueError, RuntimeError):
         return bool(value)
-    raise NPAError(f"{name} must be True or False, got {value!r}")
+    raise NPAError(f"{name} must be True or False, got {shown(value)}")
 
 
 def checked_moment_inverse(value: Any) -> MomentInverse:
@@ -173,7 +173,8 @@ def checked_moment_inverse(value: Any) -> MomentInverse:
     if isinstance(value, str) and value == "smooth":
         return "smooth"
     raise NPAError(
-        f"moment_inverse must be 'threshold' or 'smooth', got {value!r}: 'threshold' is the paper's"
+        f"moment_inverse must be 'threshold' or 'smooth', got {shown(value)}: 'threshold' is the "
+        "paper's"
     )
 
 
@@ -186,7 +187,7 @@ def checked_number(name: str, value: Any) -> float:
     if not isinstance(value, str | bytes | bool):
         with contextlib.suppress(TypeError, ValueError, RuntimeError, OverflowError):
             return float(value)
-    raise NPAError(f"{name} must be a number, got {value!r}")
+    raise NPAError(f"{name} must be a number, got {shown(value)}")
 
 
 def checked_count(name: str, value: Any) -> int:
@@ -200,7 +201,7 @@ def checked_count(name: str, value: Any) -> int:
             count = operator.index(value)
             if count >= 0:
                 return count
-    raise NPAError(f"{name} must be an integer of at least 0, got {value!r}")
+    raise NPAError(f"{name} must be an integer of at least 0, got {shown(value)}")
 
 
 def checked_positive(name: str, value: Any, unit: str = "") -> float:
@@ -236,7 +237,7 @@ def checked_side(name: str, value: Any) -> int:
     """
     side = checked_count(name, value)
     if not 1 <= side <= LARGEST_SIDE:
-        raise NPAError(f"{name} must lie in [1, {LARGEST_SIDE}] pixels, got {side}")
+        raise NPAError(f"{name} must lie in [1, {LARGEST_SIDE}] pixels, got {shown(side)}")
     return side
 
 
@@ -258,9 +259,9 @@ def number_tensor(name: str, value: Any) -> Tensor:
     try:
         made = torch.as_tensor(value)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise NPAError(f"{name} must be numbers, got {value!r}") from error
+        raise NPAError(f"{name} must be numbers, got {shown(value)}") from error
     if made.dtype.is_complex:
-        raise NPAError(f"{name} must be real numbers, got {value!r}")
+        raise NPAError(f"{name} must be real numbers, got {shown(value)}")
     check_dense(name, made)
     return made
 
@@ -278,11 +279,11 @@ def checked_eps(name: str, eps: float, dtype: torch.dtype) -> float:
     """
     value = checked_number(name, eps)
     if not (math.isfinite(value) and value > 0.0):
-        raise NPAError(f"{name} must be positive and finite [length units], got {eps}")
+        raise NPAError(f"{name} must be positive and finite [length units], got {shown(eps)}")
     low, high = LENGTH_RANGE[dtype]
     if not low <= value <= high:
         raise NPAError(
-            f"{name} must lie in [{low:g}, {high:g}] length units for {dtype}, got {eps}: "
+            f"{name} must lie in [{low:g}, {high:g}] length units for {dtype}, got {shown(eps)}: "
             f"choose another unit of length"
         )
     return value
@@ -318,11 +319,11 @@ def checked_box(box: Box, space_dim: int, eps: float) -> tuple[float, ...] | Non
     else:
         sides = tuple(checked_number("a side of box", side) for side in given)
     if len(sides) != space_dim:
-        raise NPAError(f"box must have {space_dim} sides, got {len(sides)}: {sides}")
+        raise NPAError(f"box must have {space_dim} sides, got {len(sides)}: {shown(sides)}")
     # Ten digits of grace: a box of exactly 2 eps must pass however both were rounded.
     if not all(math.isfinite(side) and side >= 2.0 * eps * (1.0 - 1e-10) for side in sides):
         raise NPAError(
-            f"box sides must be finite and at least 2 eps = {2.0 * eps:g}, got {sides}: "
+            f"box sides must be finite and at least 2 eps = {2.0 * eps:g}, got {shown(sides)}: "
             f"enlarge the box or perceive at a smaller eps"
         )
     return sides

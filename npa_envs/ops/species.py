@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, shown
 from npa_envs.kernels.portable.species import species_kernel
 from npa_envs.ops.checks import (
     Box,
@@ -52,7 +52,7 @@ def checked_counts(counts: Sequence[int], particle_count: int) -> tuple[int, ...
     given = entries(counts)
     if given is None:
         raise NPAError(
-            f"counts must hold one number of particles for each species, got {counts!r}: "
+            f"counts must hold one number of particles for each species, got {shown(counts)}: "
             f"for example counts=({particle_count},)"
         )
     checked = tuple(checked_count("an entry of counts", count) for count in given)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from PIL import ImageColor
 from torch import Tensor
 
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, shown
 from npa_envs.ops.checks import check_dense, checked_number, entries
 
 Background = str | tuple[float, float, float]
@@ -50,10 +50,12 @@ def to_uint8(picture: Tensor, background: Background = "white") -> NDArray[np.ui
     fields = torch.where(valid, fields, torch.zeros_like(fields))
     sums, density = fields[..., :3], fields[..., 3:]
     # Added channel by channel: a tensor of the colour would be a copy to the device for each frame.
-    shown = sums / density.clamp(min=1)
+    visible = sums / density.clamp(min=1)
     uncovered = 1 - density.clamp(0, 1)
-    shown = torch.stack([shown[..., k] + uncovered[..., 0] * behind[k] for k in range(3)], dim=-1)
-    pixels = (shown.clamp(0, 1) * 255).round().to(torch.uint8).flip(-3)
+    visible = torch.stack(
+        [visible[..., k] + uncovered[..., 0] * behind[k] for k in range(3)], dim=-1
+    )
+    pixels = (visible.clamp(0, 1) * 255).round().to(torch.uint8).flip(-3)
     return pixels.cpu().numpy()
 
 
@@ -68,7 +70,7 @@ def background_colour(background: Background) -> tuple[float, float, float]:
             red, green, blue = ImageColor.getrgb(background)[:3]
         except ValueError as error:
             raise NPAError(
-                f"background must be a colour, got {background!r}: "
+                f"background must be a colour, got {shown(background)}: "
                 "give 'white', 'black', another name of CSS, or '#rrggbb'"
             ) from error
         return red / 255, green / 255, blue / 255
@@ -76,7 +78,7 @@ def background_colour(background: Background) -> tuple[float, float, float]:
     channels = [checked_number("a channel of background", part) for part in given or ()]
     if len(channels) != 3 or not all(0 <= channel <= 1 for channel in channels):
         raise NPAError(
-            f"background must be red, green and blue in [0, 1], got {background!r}: "
+            f"background must be red, green and blue in [0, 1], got {shown(background)}: "
             "for white give (1, 1, 1)"
         )
     return channels[0], channels[1], channels[2]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from npa_envs.errors import MissingDependencyError, NPAError
+from npa_envs.errors import MissingDependencyError, NPAError, shown
 from npa_envs.files import atomic_path
 from npa_envs.ops import Cameras, orbit
 from npa_envs.ops.checks import checked_count, checked_finite
@@ -151,7 +151,7 @@ def write_filmstrip(
         )
     across = min(count, 8) if columns is None else columns
     if isinstance(across, bool) or not isinstance(across, int) or across < 1:
-        raise NPAError(f"columns must be an integer of at least 1, got {columns!r}: try 4")
+        raise NPAError(f"columns must be an integer of at least 1, got {shown(columns)}: try 4")
     across = min(across, count)
     height, width, _ = pictures[0].shape
     font = _caption_font(captions or [], width)
@@ -179,7 +179,7 @@ def check_rate(fps: float, *, highest: float = 1000) -> None:
         NPAError: It is not in [0.1, highest].
     """
     if not (is_real(fps) and 0.1 <= fps <= highest):
-        raise NPAError(f"fps must be in [0.1, {highest}], got {fps}: try 25")
+        raise NPAError(f"fps must be in [0.1, {highest}], got {shown(fps)}: try 25")
 
 
 def _check_frames(frames: Iterable[Frame]) -> list[Frame]:

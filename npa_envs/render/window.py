@@ -12,7 +12,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from npa_envs.errors import MissingDependencyError, NPAError
+from npa_envs.errors import MissingDependencyError, NPAError, shown
 from npa_envs.render.film import Frame, check_rate
 
 _SETTINGS = {
@@ -51,7 +51,7 @@ class Window:
         global _shown
         width, height = (size, size) if isinstance(size, int) else size
         if min(width, height) < 1:
-            raise NPAError(f"size must be at least 1 pixel each way, got {size}: try 512")
+            raise NPAError(f"size must be at least 1 pixel each way, got {shown(size)}: try 512")
         if fps is not None:
             check_rate(fps)
         self.size = (width, height)
@@ -136,7 +136,7 @@ class Window:
                 self._surface = display.set_mode(self.size)
                 display.set_caption(title)
                 return None
-            reason = f"SDL found only its driver {driver!r}"
+            reason = f"SDL found only its driver {shown(driver)}"
         except self._pygame.error as error:
             reason = str(error)
         display.quit()

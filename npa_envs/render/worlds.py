@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from npa_envs.errors import NPAError, suggest
+from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.ops import periodic_splat, splat
 from npa_envs.ops.checks import (
     check_world,
@@ -102,13 +102,15 @@ def draw_worlds(
     """
     check_world(x, s)
     if not isinstance(style, str) or style not in STYLES:
-        raise NPAError(f"style must be one that exists, got {style!r}: {suggest(style, STYLES)}")
+        raise NPAError(
+            f"style must be one that exists, got {shown(style)}: {suggest(style, STYLES)}"
+        )
     half_width = checked_positive("half_width", half_width)
     periodic = checked_flag("periodic", periodic)
     azimuth, elevation = checked_number("azimuth", azimuth), checked_number("elevation", elevation)
     for name, value in (("azimuth", azimuth), ("elevation", elevation)):
         if not math.isfinite(value):
-            raise NPAError(f"{name} must be a finite angle in degrees, got {value}")
+            raise NPAError(f"{name} must be a finite angle in degrees, got {shown(value)}")
     resolution, pixel_size, sigma, *_ = checked_window(
         resolution, pixel_size, sigma, -half_width, half_width
     )
@@ -122,12 +124,12 @@ def draw_worlds(
         if x.shape[2] == 3:
             places, depth = _seen_from(places, azimuth, elevation)
         limit = 1e3 * (half_width + sigma * pixel_size)
-        shown = (places.abs() <= limit).all(-1, keepdim=True)
+        visible = (places.abs() <= limit).all(-1, keepdim=True)
         if style != "density":
-            shown = shown & s.isfinite().all(-1, keepdim=True)
+            visible = visible & s.isfinite().all(-1, keepdim=True)
         # Nobody sees a place that is no number, but the images of all others in a periodic box.
         nowhere = math.nan if periodic else limit
-        places, colour = places.where(shown, nowhere), colour.where(shown, 0.0)
+        places, colour = places.where(visible, nowhere), colour.where(visible, 0.0)
         draw = partial(
             periodic_splat if periodic else splat,
             resolution=resolution,
@@ -142,7 +144,7 @@ def draw_worlds(
             return density_colours(density.flip(-2), behind)
         if depth is None:
             return to_uint8(draw(places, colour, sigma=sigma), behind)
-        depth = depth.where(shown, 0.0)
+        depth = depth.where(visible, 0.0)
         light = 1.0 - SHADE * (0.5 - 0.5 * depth / half_width).clamp(0.0, 1.0)
         beads = partial(draw, sigma=BEAD * sigma)
         return to_uint8(_stack_layers(beads, places, depth, colour * light), behind)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, TypedDict
 import torch
 from torch import Tensor, nn
 
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, shown
 from npa_envs.ops.checks import (
     MomentInverse,
     checked_flag,
@@ -106,21 +106,23 @@ class NPARule(nn.Module):
         super().__init__()
         sizes = (space_dim, state_dim, hidden_dim, readout_dim, readout_hidden_dim, species_count)
         if any(isinstance(size, bool) or not isinstance(size, int) for size in sizes):
-            raise NPAError(f"dimensions of a rule must be integers, got {sizes}")
+            raise NPAError(f"dimensions of a rule must be integers, got {shown(sizes)}")
         if space_dim not in (2, 3):
-            raise NPAError(f"space_dim must be 2 or 3, got {space_dim}")
+            raise NPAError(f"space_dim must be 2 or 3, got {shown(space_dim)}")
         if max(sizes) > LARGEST_DIM:
-            raise NPAError(f"dimensions of a rule must be at most {LARGEST_DIM}, got {sizes}")
+            raise NPAError(
+                f"dimensions of a rule must be at most {LARGEST_DIM}, got {shown(sizes)}"
+            )
         for name, value in (("state_dim", state_dim), ("hidden_dim", hidden_dim)):
             if value < 1:
-                raise NPAError(f"{name} must be at least 1, got {value}")
+                raise NPAError(f"{name} must be at least 1, got {shown(value)}")
         if readout_dim < 0 or (readout_dim > 0 and readout_hidden_dim < 1):
             raise NPAError(
                 f"readout_dim must be 0, or positive with readout_hidden_dim at least 1, "
-                f"got {readout_dim} and {readout_hidden_dim}"
+                f"got {shown(readout_dim)} and {shown(readout_hidden_dim)}"
             )
         if species_count < 0:
-            raise NPAError(f"species_count must be at least 0, got {species_count}")
+            raise NPAError(f"species_count must be at least 0, got {shown(species_count)}")
         self.space_dim = space_dim
         self.state_dim = state_dim
         self.hidden_dim = hidden_dim

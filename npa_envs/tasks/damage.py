@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from npa_envs.errors import NPAError, suggest
+from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.ops import world_mean
 from npa_envs.ops.checks import check_world, checked_number
 from npa_envs.tasks.checks import check_non_negative, is_real, is_whole
@@ -46,9 +46,9 @@ class DamageEvent:
             NPAError: The kind is unknown, the step negative, or the size not positive and finite.
         """
         if not isinstance(self.kind, str) or self.kind not in DAMAGE_SIZES:
-            raise NPAError(f"unknown damage {self.kind!r}: {suggest(str(self.kind), DAMAGE_SIZES)}")
+            raise NPAError(f"unknown damage {shown(self.kind)}: {suggest(self.kind, DAMAGE_SIZES)}")
         if not is_whole(self.step) or self.step < 0:
-            raise NPAError(f"step must be a whole number of at least 0, got {self.step!r}")
+            raise NPAError(f"step must be a whole number of at least 0, got {shown(self.step)}")
         if not is_real(self.extent) or self.extent <= 0:
             raise NPAError(f"size must be positive and finite, got {self.size}: try 0.1")
 
@@ -77,17 +77,19 @@ def parse_damage(text: str) -> DamageEvent:
         NPAError: It is written in another way, or the kind is unknown.
     """
     if not isinstance(text, str):
-        raise NPAError(f"damage must be text, got {text!r}: for example '300:cut'")
+        raise NPAError(f"damage must be text, got {shown(text)}: for example '300:cut'")
     parts = text.split(":")
     kind = parts[1] if len(parts) > 1 else ""
     if kind and kind not in DAMAGE_SIZES:
-        raise NPAError(f"unknown damage {kind!r} in {text!r}: {suggest(kind, DAMAGE_SIZES)}")
+        raise NPAError(
+            f"unknown damage {shown(kind)} in {shown(text)}: {suggest(kind, DAMAGE_SIZES)}"
+        )
     if len(parts) in (2, 3):
         with suppress(ValueError):
             size = float(parts[2]) if len(parts) == 3 else None
             return DamageEvent(int(parts[0]), kind, size)
     raise NPAError(
-        f"damage must be STEP:KIND or STEP:KIND:SIZE with a positive size, got {text!r}: "
+        f"damage must be STEP:KIND or STEP:KIND:SIZE with a positive size, got {shown(text)}: "
         "for example 300:cut or 500:erase:0.3"
     )
 
@@ -116,7 +118,7 @@ def damage_worlds(
         NPAError: An unknown kind, a wrong shape or dtype, or a size that is negative or not finite.
     """
     if not isinstance(kind, str) or kind not in DAMAGE_SIZES:
-        raise NPAError(f"unknown damage {kind!r}: {suggest(str(kind), DAMAGE_SIZES)}")
+        raise NPAError(f"unknown damage {shown(kind)}: {suggest(kind, DAMAGE_SIZES)}")
     check_world(x, s)
     check_generator(generator, x.device, x.shape[0])
     extent = DAMAGE_SIZES[kind] if size is None else checked_number("size", size)
@@ -255,7 +257,7 @@ def _per_world(name: str, value: float | Tensor, x: Tensor, *, highest: float = 
     value = checked_number(name, value)
     if not 0 <= value <= min(highest, torch.finfo(x.dtype).max):
         rule = "finite and at least 0" if highest == math.inf else f"in [0, {highest:g}]"
-        raise NPAError(f"{name} must be {rule}, got {value}: try 0.1")
+        raise NPAError(f"{name} must be {rule}, got {shown(value)}: try 0.1")
     return x.new_full((1, 1, 1), value)
 
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
-from npa_envs.errors import MissingDependencyError, NPAError
+from npa_envs.errors import MissingDependencyError, NPAError, shown
 from npa_envs.ops import Cameras, world_mean
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.appearance import OUTPUTS, RENDERERS, Appearance, Gaussians
@@ -119,7 +119,7 @@ class Morphogenesis3DConfig(GrowthConfig):
             raise NPAError("opacity must lie below 1, got 1: for example opacity=0.99")
         check_seed(self, "view_seed", bits=31)
         if self.renderer not in RENDERERS:
-            raise NPAError(f"renderer must be 'own' or 'gsplat', got {self.renderer!r}")
+            raise NPAError(f"renderer must be 'own' or 'gsplat', got {shown(self.renderer)}")
 
 
 SHOWN_FROM = 20.0
@@ -176,10 +176,10 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
                     f"views must have {side} x {side} pixels as config.resolution says, "
                     f"got {tuple(views.pictures.shape[1:])}: load them at that size"
                 )
-        shown = nearest_camera(target.held_out.cameras, SHOWN_FROM)
+        visible = nearest_camera(target.held_out.cameras, SHOWN_FROM)
         self.target = target.to(device)
         """What worlds are to look like."""
-        self._shown = some_views(self.target.held_out, torch.tensor([shown], device=device))
+        self._shown = some_views(self.target.held_out, torch.tensor([visible], device=device))
         self.target_picture = self._shown.pictures[0].flip(0)
         """The view that pictures show: red, green and blue times alpha, and alpha, dimensionless,
         shape [R, R, 4]; rows point up."""

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.devices import check_device
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, shown
 from npa_envs.ops.checks import DTYPES, checked_count, checked_finite, entries
 from npa_envs.ops.sort import LARGEST_INDEX
 from npa_envs.world.randomness import Randomness, WorldRandom, check_generator
@@ -49,7 +49,7 @@ def uniform_ball(
         )
     )
     if space_dim < 1:
-        raise NPAError(f"space_dim must be at least 1, got {space_dim}: give 2 or 3")
+        raise NPAError(f"space_dim must be at least 1, got {shown(space_dim)}: give 2 or 3")
     radius = checked_finite("radius", radius, " [length units]")
     if radius < 0.0:
         raise NPAError(f"radius must not be negative [length units], got {radius:g}")
@@ -92,7 +92,9 @@ def uniform_box(
     particle_count = checked_count("particle_count", particle_count)
     given = entries(box)
     if not given:
-        raise NPAError(f"box must hold a side for each dimension, got {box!r}: give (2.0, 2.0)")
+        raise NPAError(
+            f"box must hold a side for each dimension, got {shown(box)}: give (2.0, 2.0)"
+        )
     sides = [checked_finite("a side of box", side, " [length units]") for side in given]
     _check_points(world_count * particle_count * len(sides), dtype)
     check_generator(generator, device, world_count)

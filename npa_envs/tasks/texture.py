@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, shown
 from npa_envs.ops import periodic_splat
 from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.base import ParticleTask, TaskConfig, shares_of_loss
@@ -84,7 +84,7 @@ class TextureConfig(TaskConfig):
         check_loss_name(self.loss)
         check_seed(self, "loss_seed")
         if not isinstance(self.vgg_weights, str):
-            raise NPAError(f"vgg_weights must be a path as a string, got {self.vgg_weights!r}")
+            raise NPAError(f"vgg_weights must be a path as a string, got {shown(self.vgg_weights)}")
         check_positive(self, int, "state_dim", at_least=3)
         check_positive(self, int, "resolution", at_least=12)
         check_positive(self, float, "alpha", "box_size", "sigma")

@@ -10,7 +10,7 @@ from typing import Any, Generic, Literal, TypeVar, get_args
 import torch
 
 from npa_envs.devices import parse_device
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, shown
 from npa_envs.ops.checks import MomentInverse
 from npa_envs.tasks.checks import (
     check_fraction,
@@ -125,13 +125,13 @@ class TrainConfig(Generic[TaskConfigT]):
         interval = self.picture_interval
         if not is_whole(interval) or interval < 0:
             raise NPAError(
-                f"picture_interval must be a whole number of at least 0, got {interval!r}"
+                f"picture_interval must be a whole number of at least 0, got {shown(interval)}"
             )
         check_seed(self, "seed")
         if not isinstance(self.initial_rule, str):
             raise NPAError(
                 f"initial_rule must be the name of a rule or of a file, or '' for none, got "
-                f"{self.initial_rule!r}"
+                f"{shown(self.initial_rule)}"
             )
         self._check_schedule()
         if self.world_count > self.pool_size:
@@ -145,7 +145,9 @@ class TrainConfig(Generic[TaskConfigT]):
         self._check_choice("moment_inverse", get_args(MomentInverse))
         parse_device(self.device)
         if not isinstance(self.out, Path):
-            raise NPAError(f"out must be a pathlib.Path, got {self.out!r}: Path({self.out!r})")
+            raise NPAError(
+                f"out must be a pathlib.Path, got {shown(self.out)}: Path({shown(self.out)})"
+            )
 
     def _check_schedule(self) -> None:
         steps = self.steps
@@ -156,15 +158,15 @@ class TrainConfig(Generic[TaskConfigT]):
             or not 1 <= steps[0] < steps[1]
         ):
             raise NPAError(
-                f"steps must be two whole numbers (lo, hi) with 1 <= lo < hi, got {steps!r}: "
+                f"steps must be two whole numbers (lo, hi) with 1 <= lo < hi, got {shown(steps)}: "
                 "hi is exclusive, so exactly 32 steps are steps=(32, 33)"
             )
         milestones = self.milestones
         if not isinstance(milestones, tuple) or not all(is_whole(m) for m in milestones):
-            raise NPAError(f"milestones must be a tuple of whole numbers, got {milestones!r}")
+            raise NPAError(f"milestones must be a tuple of whole numbers, got {shown(milestones)}")
         if any(m < 1 for m in milestones) or list(milestones) != sorted(set(milestones)):
             raise NPAError(
-                f"milestones must be positive and increasing, got {milestones!r}: "
+                f"milestones must be positive and increasing, got {shown(milestones)}: "
                 "for example milestones=(2000, 4000)"
             )
 
@@ -172,7 +174,7 @@ class TrainConfig(Generic[TaskConfigT]):
         value = getattr(self, name)
         if not isinstance(value, str) or value not in choices:
             raise NPAError(
-                f"{name} must be one of {', '.join(choices)}, got {getattr(self, name)!r}"
+                f"{name} must be one of {', '.join(choices)}, got {shown(getattr(self, name))}"
             )
 
     @property
@@ -226,18 +228,21 @@ class JointTrainConfig(TrainConfig[TaskConfigT]):
         super().__post_init__()
         if self.initial_rule:
             raise NPAError(
-                f"initial_rule is for one rule, got {self.initial_rule!r}: give initial_rules, one "
+                f"initial_rule is for one rule, got {shown(self.initial_rule)}: give "
+                "initial_rules, one "
                 "for each species"
             )
         rules = self.initial_rules
         if not isinstance(rules, tuple) or not all(isinstance(r, str) and r for r in rules):
             raise NPAError(
-                f"initial_rules must be a tuple of names or files, got {rules!r}: "
+                f"initial_rules must be a tuple of names or files, got {shown(rules)}: "
                 "for example initial_rules=('gecko', 'heart')"
             )
         frozen = self.frozen
         if not isinstance(frozen, tuple) or not all(is_whole(n) and n >= 0 for n in frozen):
-            raise NPAError(f"frozen must be a tuple of species' numbers from 0, got {frozen!r}")
+            raise NPAError(
+                f"frozen must be a tuple of species' numbers from 0, got {shown(frozen)}"
+            )
 
 
 SMALL: Mapping[str, Any] = {"repeats": 1, "world_count": 2, "tensorboard": False}

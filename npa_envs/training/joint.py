@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from npa_envs.devices import check_device
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, shown
 from npa_envs.rule.files import load_rule, save_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import differing_fields
@@ -107,7 +107,9 @@ class _JointTrainer(Trainer):
             rule.moment_inverse = self.config.moment_inverse
         for number in self._frozen:
             if number >= len(rules):
-                raise NPAError(f"frozen must name species from 0 to {len(rules) - 1}, got {number}")
+                raise NPAError(
+                    f"frozen must name species from 0 to {len(rules) - 1}, got {shown(number)}"
+                )
             rules[number].requires_grad_(False)
         if not any(p.requires_grad for rule in rules for p in rule.parameters()):
             raise NPAError("frozen must leave a rule that learns, got all of them: leave one out")
@@ -158,7 +160,8 @@ def train_together(
     """
     if config.initial_rule:
         raise NPAError(
-            f"initial_rule is for one rule, got {config.initial_rule!r}: give one for each species "
+            f"initial_rule is for one rule, got {shown(config.initial_rule)}: give one for each "
+            "species "
             "as rules"
         )
     task = CoMorphogenesis2D(config.task, device=check_device(config.device))

@@ -175,7 +175,7 @@ def _laid_over(name: str, present: Any, fields: Mapping[str, Any]) -> Any:
     for field in fields:
         if field not in kinds:
             raise NPAError(
-                f"unknown field '{name}.{shown(str(field))[1:-1]}': {suggest(str(field), kinds)}"
+                f"unknown field '{name}.{shown(str(field))[1:-1]}': {suggest(field, kinds)}"
             )
     changes = {k: _convert(k, v, kinds[k], getattr(present, k)) for k, v in fields.items()}
     return dataclasses.replace(present, **changes)

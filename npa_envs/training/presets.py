@@ -8,7 +8,7 @@ from typing import Any, cast
 
 import torch
 
-from npa_envs.errors import NPAError, suggest
+from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.tasks.base import PictureTask
 from npa_envs.tasks.co_morphogenesis2d import CO_MORPHOGENESIS2D_PRESETS, CoMorphogenesis2D
 from npa_envs.tasks.morphogenesis2d import MORPHOGENESIS2D_PRESETS, Morphogenesis2D
@@ -116,7 +116,7 @@ def task_entry(task_name: str) -> TaskEntry:
         NPAError: There is no such task.
     """
     if not isinstance(task_name, str) or task_name not in TASKS:
-        raise NPAError(f"unknown task {task_name!r}: {suggest(task_name, TASKS)}")
+        raise NPAError(f"unknown task {shown(task_name)}: {suggest(task_name, TASKS)}")
     return TASKS[task_name]
 
 
@@ -133,5 +133,5 @@ def preset(name: str, task_name: str = "morphogenesis2d", /, **fields: Any) -> T
     """
     presets = task_entry(task_name).presets
     if not isinstance(name, str) or name not in presets:
-        raise NPAError(f"unknown preset {name!r} of {task_name}: {suggest(name, presets)}")
+        raise NPAError(f"unknown preset {shown(name)} of {task_name}: {suggest(name, presets)}")
     return override(presets[name], **fields)

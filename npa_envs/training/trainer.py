@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from npa_envs.devices import check_device
-from npa_envs.errors import DivergedError, NPAError
+from npa_envs.errors import DivergedError, NPAError, shown
 from npa_envs.files import write_bytes, write_text
 from npa_envs.render.colours import to_uint8
 from npa_envs.render.film import encode_frame
@@ -313,8 +313,9 @@ class Trainer:
             return content
         if path.exists() and not overwrite:
             raise NPAError(
-                f"out must be a folder without a run, but {str(self.folder.path)!r} holds one: "
-                "resume it (--resume), choose another folder (--out), or overwrite it (--overwrite)"
+                f"out must be a folder without a run, but {shown(str(self.folder.path))} holds "
+                "one: resume it (--resume), choose another folder (--out), or overwrite it "
+                "(--overwrite)"
             )
         return None
 
@@ -354,7 +355,7 @@ def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
     wrong = differing_fields(rule, untrained)
     if wrong:
         raise NPAError(
-            f"initial_rule must be a rule of the task's shape, but {source!r} differs in "
+            f"initial_rule must be a rule of the task's shape, but {shown(source)} differs in "
             f"{', '.join(wrong)}: change those fields, or start from another rule"
         )
     rule.moment_inverse = config.moment_inverse
@@ -441,13 +442,14 @@ def divergence_error(
         diagnosis: Where the snapshot was written.
     """
     terms = [name for name, value in snapshot["terms"].items() if not math.isfinite(value)]
-    shown = [name for name in terms if name != "loss"] or terms
+    visible = [name for name in terms if name != "loss"] or terms
     worlds = bad_worlds(task, rule, snapshot)
     where = f"world{'s' * (len(worlds) > 1)} {', '.join(map(str, worlds))}" if worlds else "no one"
     return DivergedError(
-        f"the loss must stay finite, but {' and '.join(shown)} was not in iteration "
+        f"the loss must stay finite, but {' and '.join(visible)} was not in iteration "
         f"{snapshot['iteration']} ({snapshot['steps']} steps, {where} of the batch): lower "
-        f"learning_rate, or use fewer steps; the worlds and the rule are in {str(diagnosis)!r}, "
+        "learning_rate, or use fewer steps; the worlds and the rule are in "
+        f"{shown(str(diagnosis))}, "
         "the last good checkpoint is untouched"
     )
 

@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from npa_envs.errors import DivergedError, NPAError
+from npa_envs.errors import DivergedError, NPAError, shown
 from npa_envs.ops.checks import check_world, checked_number
 
 OnDivergence = Literal["ignore", "raise"]
@@ -168,7 +168,7 @@ def make_watch(on_divergence: str, x: Tensor, s: Tensor) -> DivergenceWatch | No
         NPAError: The word is unknown, or the rollout is being captured, which cannot wait.
     """
     if on_divergence not in ("ignore", "raise"):
-        raise NPAError(f"on_divergence must be 'ignore' or 'raise', got {on_divergence!r}")
+        raise NPAError(f"on_divergence must be 'ignore' or 'raise', got {shown(on_divergence)}")
     if on_divergence == "ignore":
         return None
     if x.is_cuda and torch.cuda.is_current_stream_capturing():

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.devices import check_device
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, shown
 from npa_envs.ops.checks import DTYPES, check_dense, checked_count, checked_number
 from npa_envs.ops.draws import bernoulli_draw, integer_draw, normal_draw, uniform_draw
 from npa_envs.ops.sort import LARGEST_INDEX
@@ -268,16 +268,16 @@ def check_generator(generator: Randomness | None, device: torch.device, world_co
         raise NPAError(
             f"generator must be a torch.Generator or a WorldRandom, "
             f"got {type(generator).__name__}: "
-            f"make it with torch.Generator({device.type!r}).manual_seed(0)"
+            f"make it with torch.Generator({shown(device.type)}).manual_seed(0)"
         )
     by_world = isinstance(generator, WorldRandom)
-    made = f"WorldRandom(seeds, device={str(device)!r})" if by_world else ""
+    made = f"WorldRandom(seeds, device={shown(str(device))})" if by_world else ""
     here = generator.device
     elsewhere = by_world and None not in (here.index, device.index) and here.index != device.index
     if here.type != device.type or elsewhere:
         raise NPAError(
             f"generator must be on the worlds' device, {device}, got {here}: "
-            f"make it with {made or f'torch.Generator({device.type!r})'}"
+            f"make it with {made or f'torch.Generator({shown(device.type)})'}"
         )
     if isinstance(generator, WorldRandom) and generator.world_count != world_count:
         raise NPAError(

@@ -27,7 +27,7 @@ from typing import Any, Literal, NamedTuple, Protocol, Self
 import torch
 from torch import Tensor
 
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, shown
 from npa_envs.ops.checks import FiniteCheck, check_finite_positions
 from npa_envs.ops.opaque import once_differentiable
 from npa_envs.rule.rule import NPARule
@@ -104,7 +104,7 @@ def check_cuda_graph(cuda_graph: CudaGraph) -> None:
         NPAError: It is neither "auto" nor True nor False.
     """
     if not isinstance(cuda_graph, bool) and cuda_graph != "auto":
-        raise NPAError(f"cuda_graph must be 'auto', True or False, got {cuda_graph!r}")
+        raise NPAError(f"cuda_graph must be 'auto', True or False, got {shown(cuda_graph)}")
 
 
 def run_call(

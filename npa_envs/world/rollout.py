@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, shown
 from npa_envs.ops.checks import (
     Box,
     check_scale,
@@ -84,7 +84,7 @@ def row_count(mask: Tensor | None, x: Tensor, options: StepOptions) -> int:
 def check_memory(memory: Memory) -> None:
     """Check what the backward pass shall read."""
     if not isinstance(memory, str) or memory not in STORED_INTERVAL:
-        raise NPAError(f"memory must be 'store', 'recompute' or 'minimal', got {memory!r}")
+        raise NPAError(f"memory must be 'store', 'recompute' or 'minimal', got {shown(memory)}")
 
 
 def checked_options(

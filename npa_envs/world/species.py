@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple, overload
 import torch
 from torch import Tensor
 
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, shown
 from npa_envs.ops.checks import Box, check_world, checked_count, checked_number, entries
 from npa_envs.ops.perceive import perceive_rows
 from npa_envs.ops.species import checked_counts, perceive_by_species
@@ -279,7 +279,7 @@ def _checked_rules(rules: Any) -> list[NPARule]:
 def _check_agreement(rules: list[NPARule], species_count: int, perception: str) -> None:
     """Check that rules fit each other, the number of species and the mode of perception."""
     if not isinstance(perception, str) or perception not in MODES:
-        raise NPAError(f"perception must be 'shared' or 'per_species', got {perception!r}")
+        raise NPAError(f"perception must be 'shared' or 'per_species', got {shown(perception)}")
     if len(rules) != species_count:
         raise NPAError(
             f"rules and counts must be one for each species, got {len(rules)} rules and "
@@ -296,7 +296,7 @@ def _check_agreement(rules: list[NPARule], species_count: int, perception: str) 
                 )
         if rule.species_count != expected:
             raise NPAError(
-                f"perception {perception!r} of {species_count} species needs rules with "
+                f"perception {shown(perception)} of {species_count} species needs rules with "
                 f"species_count={expected}, got {rule.species_count} for rule {number}"
             )
 
@@ -325,7 +325,7 @@ def _checked_divisors(density_counts: Any, counts: tuple[int, ...]) -> tuple[flo
     if len(checked) != len(counts) or not all(0.0 < number < math.inf for number in checked):
         raise NPAError(
             f"density_counts must hold one positive number for each of {len(counts)} species, "
-            f"got {density_counts!r}: for example density_counts={counts}"
+            f"got {shown(density_counts)}: for example density_counts={counts}"
         )
     return checked
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from npa_envs.envs.multi.task import SpeciesTask
 from npa_envs.envs.multi.tasks.mixing import MixingTask, SegregationTask
 from npa_envs.envs.multi.tasks.pictures import CoMorphogenesisTask, InvasionTask, SymbiosisTask
-from npa_envs.errors import NPAError, suggest
+from npa_envs.errors import NPAError, shown, suggest
 
 TASKS: dict[str, type[SpeciesTask]] = {
     "mixing": MixingTask,
@@ -37,5 +37,5 @@ def task_type(name: str) -> type[SpeciesTask]:
         NPAError: There is no such task.
     """
     if not isinstance(name, str) or name not in TASKS:
-        raise NPAError(f"task must be a known word, got {name!r}: {suggest(str(name), TASKS)}")
+        raise NPAError(f"task must be a known word, got {shown(name)}: {suggest(name, TASKS)}")
     return TASKS[name]

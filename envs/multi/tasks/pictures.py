@@ -11,7 +11,7 @@ from torch import Tensor
 
 from npa_envs import world_mean
 from npa_envs.envs.multi.task import Population, SpeciesConfig, SpeciesTask, by_species
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, shown
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 
 USUAL = ("gecko", "heart", "butterfly", "flower", "octopus", "ring")
@@ -116,7 +116,7 @@ class CoMorphogenesisConfig(PictureLossConfig):
         if names and (not named or len(names) != self.species_count):
             raise NPAError(
                 f"targets must be {self.species_count} names, emoji or paths, one for each of "
-                f"species_count = {self.species_count}, got {names!r}: for example "
+                f"species_count = {self.species_count}, got {shown(names)}: for example "
                 f"targets={self._usual}"
             )
 
@@ -159,7 +159,8 @@ class InvasionConfig(OnePictureConfig):
         super().__post_init__()
         if self.reward != "individual":
             raise NPAError(
-                f"reward must be 'individual' in invasion, got {self.reward!r}: the sum of all "
+                f"reward must be 'individual' in invasion, got {shown(self.reward)}: the sum of "
+                "all "
                 "rewards is zero, so there is nothing to share"
             )
 

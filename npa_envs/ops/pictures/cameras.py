@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, shown
 from npa_envs.ops.checks import (
     DTYPES,
     LARGEST_SIDE,
@@ -71,7 +71,8 @@ class Cameras:
         near = checked_number("near", self.near)
         if not (math.isfinite(near) and near > 0.0):
             raise NPAError(
-                f"near must be positive and finite [length units], got {near}: what is nearer has "
+                f"near must be positive and finite [length units], got {shown(near)}: what is "
+                "nearer has "
                 f"no place on the picture"
             )
         if self.world_to_camera.device.type == "cpu":
@@ -107,7 +108,7 @@ class Cameras:
             if not isinstance(tensor, Tensor) or tensor.dtype not in DTYPES:
                 got = tensor.dtype if isinstance(tensor, Tensor) else type(tensor).__name__
                 raise NPAError(
-                    f"{name} must be a float32 or float64 tensor, got {got}: "
+                    f"{name} must be a float32 or float64 tensor, got {shown(got)}: "
                     f"convert it with torch.as_tensor(..., dtype=torch.float32)"
                 )
             check_dense(name, tensor)
@@ -176,7 +177,7 @@ def look_at(
     """
     if not isinstance(eyes, Tensor) or eyes.dtype not in DTYPES or eyes.shape[-1:] != (3,):
         got = tuple(eyes.shape) if isinstance(eyes, Tensor) else type(eyes).__name__
-        raise NPAError(f"eyes must be a floating tensor of shape [..., 3], got {got}")
+        raise NPAError(f"eyes must be a floating tensor of shape [..., 3], got {shown(got)}")
     check_dense("eyes", eyes)
     goal = number_tensor("targets", targets).to(eyes)
     if goal.shape not in ((3,), eyes.shape):
@@ -186,7 +187,7 @@ def look_at(
         )
     high = number_tensor("up", up).to(eyes)
     if high.shape != (3,):
-        raise NPAError(f"up must be 3 numbers, got {up}")
+        raise NPAError(f"up must be 3 numbers, got {shown(up)}")
     ahead = goal - eyes
     right = torch.linalg.cross(ahead, high.expand_as(ahead))
     lengths = (ahead.norm(dim=-1), right.norm(dim=-1))
@@ -249,9 +250,9 @@ def orbit(
         NPAError: A number is out of its range.
     """
     if checked_count("count", count) < 1:
-        raise NPAError(f"count must be at least 1 camera, got {count}")
+        raise NPAError(f"count must be at least 1 camera, got {shown(count)}")
     if count > LARGEST_SIDE:
-        raise NPAError(f"count must be at most {LARGEST_SIDE} cameras, got {count}")
+        raise NPAError(f"count must be at most {LARGEST_SIDE} cameras, got {shown(count)}")
     elevation, azimuth = checked_finite("elevation", elevation), checked_finite("azimuth", azimuth)
     radius, angle = checked_finite("radius", radius), checked_number("fov", fov)
     if not abs(elevation) < 90.0:
@@ -268,7 +269,7 @@ def orbit(
     outward = torch.stack((flat * turn.sin(), heights, flat * turn.cos()), dim=-1)
     middle = number_tensor("centre", centre).double()
     if middle.shape != (3,):
-        raise NPAError(f"centre must be 3 numbers [length units], got {centre}")
+        raise NPAError(f"centre must be 3 numbers [length units], got {shown(centre)}")
     return Cameras(
         world_to_camera=look_at(middle + radius * outward, middle).float(),
         intrinsics=_intrinsics(math.radians(angle), width, height),
@@ -298,7 +299,9 @@ def cameras_of_poses(
     """
     if not isinstance(camera_to_world, Tensor) or camera_to_world.shape[-2:] != (4, 4):
         got = getattr(camera_to_world, "shape", type(camera_to_world).__name__)
-        raise NPAError(f"camera_to_world must have shape [V, 4, 4] or [B, V, 4, 4], got {got}")
+        raise NPAError(
+            f"camera_to_world must have shape [V, 4, 4] or [B, V, 4, 4], got {shown(got)}"
+        )
     if camera_to_world.dtype not in DTYPES:
         raise NPAError(
             f"camera_to_world must be float32 or float64, got {camera_to_world.dtype}: "

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, shown
 from npa_envs.kernels.pictures.splat import (
     CHANNELS,
     FOOTPRINT,
@@ -349,7 +349,7 @@ def periodic_splat(
     if side > LARGEST_SIDE:
         raise NPAError(
             f"spots must reach across so few boxes that picture and margins stay within "
-            f"{LARGEST_SIDE} pixels, got {side}: choose a smaller sigma or pixel_size"
+            f"{LARGEST_SIDE} pixels, got {shown(side)}: choose a smaller sigma or pixel_size"
         )
     # Whole boxes are taken off without gradient: what is left moves as the particle does.
     boxes = ((x.detach() - lo) / (hi - lo)).floor()

@@ -95,9 +95,9 @@ def check_loss_name(name: str) -> None:
     Raises:
         NPAError: There is none.
     """
-    if name not in TEXTURE_LOSSES:
-        hint = suggest(str(name), TEXTURE_LOSSES)
-        raise NPAError(f"loss must be a texture loss that exists, got {name!r}: {hint}")
+    if not isinstance(name, str) or name not in TEXTURE_LOSSES:
+        hint = suggest(name, TEXTURE_LOSSES)
+        raise NPAError(f"loss must be a texture loss that exists, got {shown(name)}: {hint}")
 
 
 def make_texture_loss(
@@ -602,8 +602,9 @@ def load_vgg_weights(path: str | Path = "") -> dict[str, Any]:
     file = home_path(path) if str(path) else folder / WEIGHTS_FILE
     if not os.path.exists(file):
         raise NPAError(
-            f"vgg_ot needs VGG16's weights, and there is no file {str(file)!r}: "
-            f"download {WEIGHTS_URL} (528 MiB) to {str(folder / WEIGHTS_FILE)!r}, for example with "
+            f"vgg_ot needs VGG16's weights, and there is no file {shown(str(file))}: "
+            f"download {WEIGHTS_URL} (528 MiB) to {shown(str(folder / WEIGHTS_FILE))}, for example "
+            "with "
             f"python -c \"import torch; torch.hub.load_state_dict_from_url('{WEIGHTS_URL}')\", "
             "or give the path of such a file as vgg_weights, or choose loss='patch_swd' or "
             "'filter_swd', which need no weights"
@@ -614,12 +615,14 @@ def load_vgg_weights(path: str | Path = "") -> dict[str, Any]:
         content = torch.load(file, map_location="cpu", weights_only=True, mmap=True)
     except (OSError, RuntimeError, ValueError, EOFError, pickle.UnpicklingError) as error:
         raise NPAError(
-            f"VGG16's weights {str(file)!r} cannot be read, the file is damaged or no torch file "
+            f"VGG16's weights {shown(str(file))} cannot be read, the file is damaged or no torch "
+            "file "
             f"({shown(error)}): download {WEIGHTS_URL} again"
         ) from error
     if not isinstance(content, dict):
         raise NPAError(
-            f"VGG16's weights {str(file)!r} must be a state dict, got {type(content).__name__}: "
+            f"VGG16's weights {shown(str(file))} must be a state dict, got "
+            f"{type(content).__name__}: "
             f"download {WEIGHTS_URL}"
         )
     return content

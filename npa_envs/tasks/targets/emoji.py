@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from npa_envs.errors import MissingDependencyError, NPAError
+from npa_envs.errors import MissingDependencyError, NPAError, shown
 
 # Bitmap fonts open only at the sizes that they hold: 109 is Noto's, 160, 96 ... are Apple's.
 _SIZES = (109, 160, 136, 128, 96, 72, 64, 48, 32)
@@ -51,7 +51,8 @@ def render_emoji(text: str) -> Image.Image:
     fonts = find_emoji_fonts()
     if not fonts:
         raise MissingDependencyError(
-            f"target {text!r} is an emoji and needs an installed colour-emoji font, found none: "
+            f"target {shown(text)} is an emoji and needs an installed colour-emoji font, found "
+            "none: "
             "install one, on Debian and Ubuntu with 'apt install fonts-noto-color-emoji', "
             "or give a picture file or a built-in target"
         )
@@ -69,10 +70,11 @@ def render_emoji(text: str) -> Image.Image:
     names = ", ".join(path.name for path in fonts)
     if several:
         raise NPAError(
-            f"target {text!r} must be one emoji, but {names} draws several: give one of them"
+            f"target {shown(text)} must be one emoji, but {names} draws several: give one of them"
         )
     raise NPAError(
-        f"target {text!r} must be an emoji that an installed font draws in colour, but none of "
+        f"target {shown(text)} must be an emoji that an installed font draws in colour, but none "
+        "of "
         f"{names} does: give another emoji, a picture file, or install 'fonts-noto-color-emoji'"
     )
 

@@ -234,7 +234,7 @@ def load_mesh(source: str | Path) -> Mesh:
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise NPAError(
             f"target must be a built-in mesh, the path of a mesh file ({', '.join(MESH_SUFFIXES)}) "
-            f"or a folder of views, got {shown(str(source))}: {suggest(str(source), MESHES)}"
+            f"or a folder of views, got {shown(str(source))}: {suggest(source, MESHES)}"
         )
     check_regular(path, limit=_LARGEST_FILE, what="target")
     return _read_mesh(path).fitted()
