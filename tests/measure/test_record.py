@@ -54,7 +54,7 @@ def test_other_settings_and_other_files_are_refused(content, facts, message, tmp
     path = tmp_path / "record.json"
     path.write_text(content)
     with pytest.raises(NPAError, match=message) as error:
-        read(path, facts, option="--out")
+        read(path, facts)
     assert str(error.value).endswith("remove it, or choose another folder with --out")
 
 

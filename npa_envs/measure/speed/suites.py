@@ -368,9 +368,7 @@ def stored_ratios(path: Path, device: torch.device) -> dict[str, float]:
     try:
         loaded = read_json(path)
         return {str(name): float(value) for name, value in loaded[device.type].items()}
-    except NPAError as error:
-        raise NPAError(f"{error}; {cure}") from error
-    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
+    except (NPAError, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise NPAError(
             f"{str(path)!r} must hold ratios under {device.type!r}, got {shown(error)}: {cure}"
         ) from error

@@ -108,7 +108,7 @@ class Cameras:
             if not isinstance(tensor, Tensor) or tensor.dtype not in DTYPES:
                 got = tensor.dtype if isinstance(tensor, Tensor) else type(tensor).__name__
                 raise NPAError(
-                    f"{name} must be a float32 or float64 tensor, got {shown(got)}: "
+                    f"{name} must be a float32 or float64 tensor, got {got}: "
                     f"convert it with torch.as_tensor(..., dtype=torch.float32)"
                 )
             check_dense(name, tensor)
@@ -177,7 +177,7 @@ def look_at(
     """
     if not isinstance(eyes, Tensor) or eyes.dtype not in DTYPES or eyes.shape[-1:] != (3,):
         got = tuple(eyes.shape) if isinstance(eyes, Tensor) else type(eyes).__name__
-        raise NPAError(f"eyes must be a floating tensor of shape [..., 3], got {shown(got)}")
+        raise NPAError(f"eyes must be a floating tensor of shape [..., 3], got {got}")
     check_dense("eyes", eyes)
     goal = number_tensor("targets", targets).to(eyes)
     if goal.shape not in ((3,), eyes.shape):
@@ -299,9 +299,7 @@ def cameras_of_poses(
     """
     if not isinstance(camera_to_world, Tensor) or camera_to_world.shape[-2:] != (4, 4):
         got = getattr(camera_to_world, "shape", type(camera_to_world).__name__)
-        raise NPAError(
-            f"camera_to_world must have shape [V, 4, 4] or [B, V, 4, 4], got {shown(got)}"
-        )
+        raise NPAError(f"camera_to_world must have shape [V, 4, 4] or [B, V, 4, 4], got {got}")
     if camera_to_world.dtype not in DTYPES:
         raise NPAError(
             f"camera_to_world must be float32 or float64, got {camera_to_world.dtype}: "
