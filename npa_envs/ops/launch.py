@@ -79,7 +79,7 @@ class _ArrayArgument:
         if tensor is None:
             # Kernels ask an absent array for its size.
             if self._size is not None:
-                self._write(self._type.__ctype__())
+                _overwrite(self._place, self._type.__ctype__())
                 self._size = None
             return
         size, step = tensor.shape, tensor.stride()
@@ -93,11 +93,13 @@ class _ArrayArgument:
         if known and self._size is not None and size[1:] == self._size[1:]:
             self._shape[0] = size[0]
         else:
-            self._write(_description(tensor, self._type))
+            _overwrite(self._place, _description(tensor, self._type))
         self._size, self._step, self._dtype = size, step, tensor.dtype
 
-    def _write(self, made: Any) -> None:
-        ctypes.memmove(ctypes.addressof(self._place), ctypes.addressof(made), ctypes.sizeof(made))
+
+def _overwrite(place: Any, made: Any) -> None:
+    """Copy a description or a struct into the memory of the arguments."""
+    ctypes.memmove(ctypes.addressof(place), ctypes.addressof(made), ctypes.sizeof(made))
 
 
 def _description(tensor: Tensor, array_type: Any) -> Any:
@@ -117,10 +119,7 @@ class _StructArgument:
     def set(self, value: Any) -> None:
         """Copy another struct, unless it is the one that is there."""
         if value is not self._last:
-            made = value.__ctype__()
-            ctypes.memmove(
-                ctypes.addressof(self._place), ctypes.addressof(made), ctypes.sizeof(made)
-            )
+            _overwrite(self._place, value.__ctype__())
             self._last = value
 
 
