@@ -1,7 +1,5 @@
 """A toy task for the trainer's tests: particles learn to walk to a circle, without any kernels."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 import torch

@@ -1,7 +1,5 @@
 """Small worlds of several species, and how to act in them."""
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Iterator

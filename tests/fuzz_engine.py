@@ -1,7 +1,5 @@
 """Calls of operators, rules, pictures and cameras, with arguments that are right."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import random

@@ -1,7 +1,5 @@
 """Calls of configurations, environments, wrappers, policies and the command line."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import functools

@@ -1,7 +1,5 @@
 """Arguments that are mostly wrong, and what they are given to."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import random

@@ -1,7 +1,5 @@
 """Calls of the public API with arguments that are mostly wrong, each made from one number."""
 
-from __future__ import annotations
-
 import random
 from typing import Any
 

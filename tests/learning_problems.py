@@ -1,7 +1,5 @@
 """Problems that are small enough to learn from in a second, and rules that do a lot."""
 
-from __future__ import annotations
-
 import torch
 
 from npa_envs.agents.learning import Problem, RuleSet

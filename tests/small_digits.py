@@ -1,7 +1,5 @@
 """A data set in MNIST's format that any rule can learn: a disk, a bar and a ring."""
 
-from __future__ import annotations
-
 import gzip
 import struct
 from pathlib import Path

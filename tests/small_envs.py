@@ -1,7 +1,5 @@
 """Every registered environment, made small."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import gymnasium

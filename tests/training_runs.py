@@ -1,7 +1,5 @@
 """Small runs of training for tests: their logs, their ends, their operations recorded."""
 
-from __future__ import annotations
-
 import torch
 from circle_task import CircleTask, plain_rollout
 from torch.utils._python_dispatch import TorchDispatchMode

@@ -1,7 +1,5 @@
 """The small environments that wrappers are tested over, and what acts in them."""
 
-from __future__ import annotations
-
 import gymnasium as gym
 import numpy as np
 import torch

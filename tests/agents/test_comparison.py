@@ -1,7 +1,5 @@
 """Comparisons: runs are processes that may fail or stop, and tables say what they reached."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

@@ -1,7 +1,5 @@
 """Evolution: many candidates at once are each candidate by itself, and their mean gets better."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import replace
 

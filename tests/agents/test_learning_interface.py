@@ -1,7 +1,5 @@
 """Problems, sets of rules and species in one array: what all learners share."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The gradient, cloning, and the methods that learn nothing: each learns what it should."""
 
-from __future__ import annotations
-
 import copy
 from dataclasses import replace
 

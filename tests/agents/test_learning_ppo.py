@@ -1,7 +1,5 @@
 """PPO in its forms: on the device, and Stable-Baselines3's."""
 
-from __future__ import annotations
-
 import inspect
 import math
 import weakref

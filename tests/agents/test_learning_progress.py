@@ -1,7 +1,5 @@
 """Budgets, learning curves, and the table of methods."""
 
-from __future__ import annotations
-
 import time
 
 import pytest

@@ -1,7 +1,5 @@
 """The command line does what it says, says what it did, and refuses mistakes in one line."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """Every registered environment: Gymnasium's rules, seeds, rewards, endings, bad input."""
 
-from __future__ import annotations
-
 import json
 import pickle
 import subprocess

@@ -1,7 +1,5 @@
 """What environments do about a world whose numbers run away, and that no other world notices."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Batched environments: world k is the single environment, whatever else the batch does."""
 
-from __future__ import annotations
-
 import gymnasium
 import numpy as np
 import pytest
@@ -309,7 +307,6 @@ def test_each_world_has_its_picture(name):
 
 
 @pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 @every_id
 def test_cpu_and_cuda_agree(name):
     cpu, cuda = make_vec(name, 3), make_vec(name, 3, device="cuda")

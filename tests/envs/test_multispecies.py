@@ -1,7 +1,5 @@
 """Species as agents: seeds, turns, deaths, pictures, errors."""
 
-from __future__ import annotations
-
 import pickle
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Particles as agents: rewards that add up, ends of single particles."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from crowds import HALF_WAY, TASKS, drawn, few, still, targets_made_once

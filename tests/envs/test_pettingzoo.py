@@ -1,7 +1,5 @@
 """Species and particles as agents: PettingZoo's own tests, seeds, and ids."""
 
-from __future__ import annotations
-
 import numpy as np
 import pettingzoo
 import pytest

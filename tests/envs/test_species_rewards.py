@@ -1,7 +1,5 @@
 """What species are paid, by numbers computed by hand or by the tasks of single worlds."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

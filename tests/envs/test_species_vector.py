@@ -1,7 +1,5 @@
 """Batches of worlds of several species: world k is the single environment, whoever dies."""
 
-from __future__ import annotations
-
 import pickle
 
 import numpy as np

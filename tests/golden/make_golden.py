@@ -3,8 +3,6 @@
 Run by hand with the library importable: `OMP_NUM_THREADS=1 python tests/golden/make_golden.py`.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

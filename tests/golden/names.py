@@ -1,7 +1,5 @@
 """What is public besides numbers: names, ids, commands with their options, documented imports."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import inspect

@@ -1,7 +1,5 @@
 """Runs of training that were killed, kept as files."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -4,8 +4,6 @@ A scene returns arrays by name. Its numbers come from stored worlds or from seed
 short, because the dynamics amplify rounding.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from functools import partial

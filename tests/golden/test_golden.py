@@ -1,7 +1,5 @@
 """Results are those of the commit that wrote the golden files; NPA_GOLDEN=exact: bit for bit."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """CUDA C++ of the kernels: it compiles on machines without a CUDA device, too."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The stress command finds what breaks, says where, and goes on where it was stopped."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

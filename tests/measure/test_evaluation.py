@@ -1,7 +1,5 @@
 """The numbers by which a rule is judged."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import astuple

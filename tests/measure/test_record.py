@@ -1,7 +1,5 @@
 """Records, tables and plots: what every measuring command shares."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import dataclass

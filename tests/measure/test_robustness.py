@@ -1,7 +1,5 @@
 """Rules are tried under other conditions and damaged beside twins; recovery is what it is said."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

@@ -1,7 +1,5 @@
 """The benchmark measures what it says: real strategies, true errors, and a guard that bites."""
 
-from __future__ import annotations
-
 import json
 import math
 import sys

@@ -192,7 +192,6 @@ def test_a_world_moves_in_any_batch_as_it_moves_alone(world, device):
 
 
 @pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_both_devices_agree_and_a_graph_can_be_captured():
     g = torch.Generator().manual_seed(1)
     action, x, s = (torch.randn(B, N, k, generator=g) for k in (2 + C, 2, C))

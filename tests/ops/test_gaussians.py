@@ -529,8 +529,6 @@ def test_a_compiled_function_equals_the_eager_one(pairs, device):
 
 @pytest.mark.gpu
 def test_a_recorded_graph_draws_what_it_is_given():
-    if not torch.cuda.is_available():
-        pytest.skip("needs a CUDA device")
     gaussians, cameras = SCENES["batch"].of(torch.float32, torch.device("cuda"))
     with torch.no_grad():
         bars = cotangents(render_gaussians(*gaussians, cameras)[:2])

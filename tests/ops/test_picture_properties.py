@@ -3,8 +3,6 @@
 Likewise of every rule's file. The runs are those of test_properties.py.
 """
 
-from __future__ import annotations
-
 import math
 import tempfile
 from dataclasses import dataclass, replace

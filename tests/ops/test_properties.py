@@ -4,8 +4,6 @@ The quick run draws the same few examples each time; the thorough one (marked sl
 and prints what reproduces a failure.
 """
 
-from __future__ import annotations
-
 import torch
 from legal_worlds import (
     allowances,

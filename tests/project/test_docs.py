@@ -1,7 +1,5 @@
 """The documentation is true: pages are current, tables name what is there, code runs."""
 
-from __future__ import annotations
-
 import importlib.util
 import re
 import sys

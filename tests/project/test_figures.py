@@ -1,7 +1,5 @@
 """The measured numbers of the README are those of the files that they come from, rounded."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Whatever the public API is given, it works or says what is wrong: an `NPAError`, nothing else."""
 
-from __future__ import annotations
-
 import os
 import reprlib
 import time

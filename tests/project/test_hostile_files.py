@@ -1,7 +1,5 @@
 """Small files that would cost gigabytes, block for ever or start programs: refused, and cheaply."""
 
-from __future__ import annotations
-
 import gzip
 import json
 import os

@@ -1,7 +1,5 @@
 """Importing the package is cheap: it starts no device and pulls in no heavy extra."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

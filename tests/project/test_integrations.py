@@ -1,7 +1,5 @@
 """The programs of docs/integrations.md: each runs as it stands there, and learns."""
 
-from __future__ import annotations
-
 import re
 import sys
 from pathlib import Path

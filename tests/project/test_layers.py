@@ -4,8 +4,6 @@ The table below is the whole rule. A new module needs a row (or lies in a folder
 libraries named are the only ones outside Python's own that its files may import, at any depth.
 """
 
-from __future__ import annotations
-
 import ast
 import sys
 from dataclasses import dataclass

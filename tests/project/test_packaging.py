@@ -1,7 +1,5 @@
 """The layout of the repository and the layout of the installed package agree."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

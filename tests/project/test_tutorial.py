@@ -1,7 +1,5 @@
 """The program of docs/tutorial.md: it runs as it stands there, and learns what the page says."""
 
-from __future__ import annotations
-
 import math
 import re
 import time

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -250,7 +248,6 @@ def test_worlds_without_colour_are_refused_by_the_style_that_shows_it():
 
 
 @pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 @pytest.mark.parametrize("style", STYLES)
 @pytest.mark.parametrize("space_dim", [2, 3])
 def test_pictures_of_a_gpu_are_repeatable_and_those_of_the_cpu(style, space_dim):

@@ -1,7 +1,5 @@
 """Rules with a read-out network, and tasks whose losses compare what it says."""
 
-from __future__ import annotations
-
 import copy
 
 import pytest

@@ -1,7 +1,5 @@
 """Rules survive their files, the authors' formats mean what ours do, and bad files are refused."""
 
-from __future__ import annotations
-
 import base64
 import json
 import math

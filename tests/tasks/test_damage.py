@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -148,7 +146,6 @@ def test_wrong_arguments_are_clear_errors():
 
 
 @pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_damage_can_be_captured_in_a_cuda_graph():
     x, s = torch.randn(2, 64, 2, device="cuda"), torch.randn(2, 64, 3, device="cuda")
     generator = torch.Generator("cuda").manual_seed(0)
@@ -172,7 +169,6 @@ def test_damage_can_be_captured_in_a_cuda_graph():
 
 
 @pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_generator_of_another_device_is_a_clear_error():
     with pytest.raises(NPAError, match=r"generator must be on the worlds' device"):
         random_particle(torch.zeros(1, 4, 2, device="cuda"), torch.Generator())

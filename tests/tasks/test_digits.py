@@ -1,7 +1,5 @@
 """Pictures of digits, and the clouds of points that are made of them."""
 
-from __future__ import annotations
-
 import sys
 import types
 

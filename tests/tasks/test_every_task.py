@@ -1,7 +1,5 @@
 """What holds for every task: seeds, metric, loss, checks, training by its tiny preset, commands."""
 
-from __future__ import annotations
-
 import json
 
 import pytest
@@ -17,7 +15,6 @@ from npa_envs.tasks.base import seed_worlds, task_for_rule, task_toward
 from npa_envs.training import TASKS, Trainer, preset, task_entry, train
 from npa_envs.world.randomness import WorldRandom
 
-needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 NAMES = [name for name, entry in TASKS.items() if not entry.joint]
 VARIANTS = [
     ("morphogenesis2d", {}),
@@ -190,7 +187,7 @@ RESUMED = [
     pytest.param(
         "morphogenesis2d",
         {"device": "cuda", "steps": (8, 11), "iterations": 8},
-        marks=[pytest.mark.gpu, needs_cuda],
+        marks=pytest.mark.gpu,
     ),
 ]
 
@@ -286,7 +283,6 @@ def test_commands_take_the_rule_of_a_task(tmp_path, capsys, name):
 
 
 @pytest.mark.gpu
-@needs_cuda
 @pytest.mark.parametrize(("name", "fields"), VARIANTS)
 def test_graphs_train_the_same_rule_as_eager_launches(tiny, name, fields):
     logs = []
@@ -300,7 +296,6 @@ def test_graphs_train_the_same_rule_as_eager_launches(tiny, name, fields):
 
 
 @pytest.mark.gpu
-@needs_cuda
 @pytest.mark.parametrize(("name", "fields"), VARIANTS)
 def test_iterations_never_wait_for_the_device(tiny, name, fields):
     config = tiny(name, device="cuda", steps=(8, 9), **fields)
@@ -318,7 +313,6 @@ def test_iterations_never_wait_for_the_device(tiny, name, fields):
 
 
 @pytest.mark.gpu
-@needs_cuda
 @pytest.mark.parametrize(("name", "fields"), VARIANTS)
 def test_losses_and_gradients_on_cuda_are_those_on_the_cpu(tiny, name, fields):
     if name == "texture":

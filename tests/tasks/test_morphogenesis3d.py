@@ -1,7 +1,5 @@
 """3D morphogenesis: worlds, how particles look, the loss, training, commands, exported clouds."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import sys
@@ -23,7 +21,6 @@ from npa_envs.tasks.morphogenesis3d import Morphogenesis3D, Morphogenesis3DConfi
 from npa_envs.tasks.targets.meshes import AMBIENT, LIGHT, load_mesh
 from npa_envs.tasks.targets.views import ANGLE, DISTANCE, load_views, over, some_views
 
-needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 WORLD = {"target": "doughnut", "particle_count": 150, "eps": 0.3, "sigma": 0.1, "opacity": 0.5}
 RULE = {"hidden_dim": 16, "readout_hidden_dim": 8}
 VIEWS = {"training_views": 6, "held_out_views": 3, "views_per_iteration": 2, "resolution": 24}

@@ -1,7 +1,5 @@
 """Self-classifying point clouds: task, goals that stay with their worlds, training, measures."""
 
-from __future__ import annotations
-
 import json
 
 import gymnasium

@@ -1,7 +1,5 @@
 """Targets of points: built-in drawings, and pictures cut out, scaled and read from files."""
 
-from __future__ import annotations
-
 import io
 import os
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Targets of 3D worlds: meshes, their pictures, folders of views, and how views are compared."""
 
-from __future__ import annotations
-
 import json
 import math
 import sys

@@ -1,7 +1,5 @@
 """A run's folder: killed while it is made, used by two, with damaged files in it."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """Configurations: checks, overrides, files, presets."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from pathlib import Path

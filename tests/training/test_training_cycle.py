@@ -1,7 +1,5 @@
 """What a training iteration does before and after the rollout, recorded and replayed."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from circle_task import CircleTask, circle_config, plain_rollout
@@ -12,8 +10,6 @@ from worlds import assert_same
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
 from npa_envs.tasks.point_classification import PointClassification
 from npa_envs.training import preset
-
-needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 
 
 def circle_cycle(tmp_path, **fields):
@@ -70,7 +66,6 @@ def test_replayed_operations_train_the_same_rule_as_called_ones(tmp_path, make, 
 
 
 @pytest.mark.gpu
-@needs_cuda
 def test_graphs_draw_the_worlds_that_launches_draw(tmp_path):
     drawn = []
     for graphed in (True, False):

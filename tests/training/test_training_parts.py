@@ -1,7 +1,5 @@
 """Pool, optimiser, iteration and meter, each by itself."""
 
-from __future__ import annotations
-
 import math
 import zipfile
 
@@ -202,7 +200,6 @@ def test_meter_keeps_the_first_bad_iteration_and_not_a_later_one(tmp_path, devic
 
 
 @pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_replayed_graphs_give_what_eager_launches_give(tmp_path):
     config = circle_config(tmp_path, dtype="float64")
     _, _, eager = make_iteration(config, EagerIteration, "cuda")

@@ -1,7 +1,5 @@
 """The trainer as a whole: it learns, it leaves files behind, it can be killed and resumed."""
 
-from __future__ import annotations
-
 import io
 import math
 import os

@@ -1,7 +1,5 @@
 """Recorded CUDA work: when it is recorded, what that may not do, and that it is what it was."""
 
-from __future__ import annotations
-
 import contextlib
 import copy
 import gc
@@ -181,12 +179,7 @@ def test_a_copied_object_replays_its_own_method():
         assert (counter.count, other.count) == (1, 2)
 
 
-def needs_cuda(test):
-    skip = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-    return pytest.mark.gpu(skip(test))
-
-
-@needs_cuda
+@pytest.mark.gpu
 def test_replays_draw_what_launches_would_have_drawn():
     drawn = []
     for replayed in (True, False):
@@ -206,7 +199,7 @@ def test_replays_draw_what_launches_would_have_drawn():
     assert torch.equal(drawn[0][1], drawn[1][1])
 
 
-@needs_cuda
+@pytest.mark.gpu
 def test_a_capture_in_between_leaves_the_numbers_of_busy_graphs_alone():
     drawn = []
     for busy in (True, False):
@@ -233,7 +226,7 @@ def test_a_capture_in_between_leaves_the_numbers_of_busy_graphs_alone():
     assert len(drawn[0].unique(dim=0)) == len(drawn[0])
 
 
-@needs_cuda
+@pytest.mark.gpu
 def test_after_a_failed_capture_the_device_captures_and_replays_as_before():
     numbers = torch.zeros(10, device=CUDA)
 
@@ -249,7 +242,7 @@ def test_after_a_failed_capture_the_device_captures_and_replays_as_before():
     assert numbers.tolist() == [2.0] * 10
 
 
-@needs_cuda
+@pytest.mark.gpu
 def test_a_capture_with_a_backward_pass_does_not_wait_for_the_device():
     x = torch.ones(10, device=CUDA, requires_grad=True)
     gradient = torch.zeros(10, device=CUDA)

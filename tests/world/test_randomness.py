@@ -29,8 +29,6 @@ SAME_ON_EVERY_DEVICE = ("uniform", "uniform_float64", "bernoulli", "integers")
 SIGMAS = 5.0
 """Statistics may be this many standard errors off: one test in a million by chance."""
 
-needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-
 
 @pytest.fixture(params=DRAWS.values(), ids=DRAWS.keys())
 def draw(request):
@@ -364,7 +362,6 @@ def test_neighbouring_worlds_steps_draws_and_particles_are_uncorrelated(kind, de
 
 
 @pytest.mark.gpu
-@needs_cuda
 @pytest.mark.parametrize("name", SAME_ON_EVERY_DEVICE)
 def test_both_devices_draw_the_same(name):
     here, there = WorldRandom(range(9)), WorldRandom(range(9), device="cuda")
@@ -376,7 +373,6 @@ def test_both_devices_draw_the_same(name):
 
 
 @pytest.mark.gpu
-@needs_cuda
 def test_both_devices_draw_the_same_normal_numbers_up_to_rounding():
     here, there = (WorldRandom(range(9), device=d).normal(10_000) for d in ("cpu", "cuda"))
     torch.testing.assert_close(there.cpu(), here, rtol=2e-7, atol=1e-9)
@@ -384,7 +380,6 @@ def test_both_devices_draw_the_same_normal_numbers_up_to_rounding():
 
 
 @pytest.mark.gpu
-@needs_cuda
 def test_a_captured_step_draws_anew_at_each_replay():
     random, eager = (WorldRandom([3, 4], device="cuda") for _ in range(2))
     random.advance()

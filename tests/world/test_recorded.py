@@ -11,7 +11,7 @@ from worlds import random_world
 import npa_envs
 from npa_envs.world import recorded
 
-pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+pytestmark = pytest.mark.gpu
 
 DEVICE = torch.device("cuda", 0)
 EPS = 0.3

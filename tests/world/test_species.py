@@ -307,7 +307,6 @@ def test_a_rule_that_tells_species_apart_perceives_more_and_says_so():
 
 
 @pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 @pytest.mark.parametrize("perception", ["shared", "per_species"])
 def test_devices_agree_and_a_rollout_can_be_captured(perception):
     told = 0 if perception == "shared" else 2

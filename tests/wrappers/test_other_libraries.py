@@ -1,7 +1,5 @@
 """PettingZoo's and RLlib's ways to train on environments; skipped where libraries are missing."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from crowds import small, still

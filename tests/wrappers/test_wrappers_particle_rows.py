@@ -1,7 +1,5 @@
 """Particles as rows of a vector environment of Gymnasium's."""
 
-from __future__ import annotations
-
 import gc
 
 import gymnasium as gym

@@ -1,7 +1,5 @@
 """Particles as rows of RSL-RL; skipped where it is missing."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 import wrapped_envs

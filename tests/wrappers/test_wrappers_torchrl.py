@@ -1,7 +1,5 @@
 """Batches of worlds in TorchRL; skipped where it is missing."""
 
-from __future__ import annotations
-
 import gymnasium
 import numpy as np
 import pytest
