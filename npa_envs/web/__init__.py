@@ -1,0 +1,1 @@
+"""Worlds to watch and to touch in a browser."""

@@ -1,0 +1,475 @@
+// Particles on a canvas: cameras, and painters with WebGL2 or, where there is none, without it.
+
+// Where one looks from. 2D worlds are seen from straight above, and the camera moves and zooms; 3D
+// worlds are seen in perspective, and the camera goes round: y is up, angles are in degrees.
+export class Camera {
+  constructor(dimension, halfWidth) {
+    this.dimension = dimension;
+    this.halfWidth = halfWidth;
+    this.centre = [0, 0, 0];
+    this.zoom = 1;
+    this.azimuth = 0;
+    this.elevation = dimension === 3 ? 15 : 0;
+  }
+
+  // The unit vectors to the right, up and towards the viewer.
+  get axes() {
+    if (this.dimension === 2) return [[1, 0, 0], [0, 1, 0], [0, 0, 1]];
+    const turn = (this.azimuth * Math.PI) / 180, tilt = (this.elevation * Math.PI) / 180;
+    const outward = [Math.sin(turn), 0, Math.cos(turn)];
+    return [
+      [Math.cos(turn), 0, -Math.sin(turn)],
+      [-Math.sin(tilt) * outward[0], Math.cos(tilt), -Math.sin(tilt) * outward[2]],
+      [Math.cos(tilt) * outward[0], Math.sin(tilt), Math.cos(tilt) * outward[2]],
+    ];
+  }
+
+  // From the camera to the centre [length units]; 0 stands for far away, without perspective.
+  get distance() {
+    return this.dimension === 2 ? 0 : 5 * this.halfWidth;
+  }
+
+  // From the middle of a canvas to the middle of its nearer edge [length units].
+  get extent() {
+    return this.halfWidth / this.zoom;
+  }
+
+  // Length units of a pixel on the canvas, at the depth of the centre.
+  unit(width, height) {
+    return (2 * this.extent) / Math.min(width, height);
+  }
+
+  // Place on the canvas [pixels from its upper left corner], nearness and scale of a position.
+  project(position, width, height) {
+    const offset = this.centre.map((middle, k) => (position[k] ?? 0) - middle);
+    const [across, up, near] = this.axes.map((axis) => dot(axis, offset));
+    const scale = this.distance ? this.distance / (this.distance - near) : 1;
+    const unit = this.unit(width, height);
+    return [width / 2 + (across * scale) / unit, height / 2 - (up * scale) / unit, near, scale];
+  }
+
+  // The position under a place on the canvas, at a nearness; and how far a movement leads there.
+  position(column, row, width, height, near = 0) {
+    const move = this.movement(column - width / 2, row - height / 2, width, height, near);
+    return this.centre.map((middle, k) => middle + move[k] + near * this.axes[2][k]);
+  }
+
+  movement(columns, rows, width, height, near = 0) {
+    const unit = this.unit(width, height);
+    const share = this.distance ? 1 - near / this.distance : 1;
+    const [right, up] = this.axes;
+    return [0, 1, 2].map((k) => share * unit * (columns * right[k] - rows * up[k]));
+  }
+
+  // Follow a pointer that drags the world [pixels].
+  drag(columns, rows, width, height) {
+    if (this.dimension === 2) {
+      const move = this.movement(columns, rows, width, height);
+      this.centre = this.centre.map((middle, k) => middle - move[k]);
+    } else {
+      this.azimuth -= columns * 0.4;
+      this.elevation = Math.min(89, Math.max(-89, this.elevation + rows * 0.4));
+    }
+  }
+
+  magnify(factor) {
+    this.zoom = Math.min(20, Math.max(0.3, this.zoom * factor));
+  }
+}
+
+function dot(a, b) {
+  return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+}
+
+// What a painter draws:
+//   {positions, colours, dimension, box, spot, camera, background: [r, g, b] in [0, 1],
+//    look: "soft" | "points", trails: {positions: Float32Array of pairs of points [x, y, z],
+//    fades: Float32Array} or null, ink: [r, g, b] of trails}
+export function makePainter(canvas, kind = "auto") {
+  const gl = kind === "plain" ? null : canvas.getContext("webgl2", { antialias: false, alpha: false });
+  return gl ? new GlPainter(gl) : new PlainPainter(canvas.getContext("2d", { alpha: false }));
+}
+
+// Offsets of the images of a periodic world that a camera sees [length units].
+function tiles(scene, width, height) {
+  const { box, camera, dimension } = scene;
+  if (!box || dimension !== 2) return [[0, 0, 0]];
+  const unit = camera.unit(width, height);
+  const found = [];
+  const range = (size, side, middle) => {
+    const half = (size * unit) / 2;
+    const first = Math.round((middle - half) / side), last = Math.round((middle + half) / side);
+    return Array.from({ length: Math.min(last - first + 1, 8) }, (_, k) => (first + k) * side);
+  };
+  for (const x of range(width, box[0], camera.centre[0]))
+    for (const y of range(height, box[1], camera.centre[1])) found.push([x, y, 0]);
+  return found;
+}
+
+const PLACE = `
+uniform vec3 right, up, toward, centre, offset;
+uniform vec2 unit;        // device units a length unit
+uniform float distance_;  // of the camera; 0: no perspective
+uniform float nearest;    // nearness that counts as the front
+vec4 place(vec3 position, out float scale, out float near) {
+  vec3 p = position + offset - centre;
+  near = dot(p, toward);
+  scale = distance_ > 0.0 ? distance_ / max(distance_ - near, 1e-3) : 1.0;
+  return vec4(dot(p, right) * scale * unit.x, dot(p, up) * scale * unit.y, -near / nearest, 1.0);
+}`;
+
+const SPOT_VERTEX = `#version 300 es
+layout(location=0) in vec3 position;
+layout(location=1) in vec3 colour;
+uniform float size;       // pixels at the depth of the centre
+out vec3 tint; out float light;
+${PLACE}
+void main() {
+  float scale, near;
+  gl_Position = place(position, scale, near);
+  gl_PointSize = size * scale;
+  tint = colour;
+  light = distance_ > 0.0 ? clamp(0.78 + 0.4 * near / nearest, 0.35, 1.1) : 1.0;
+}`;
+
+// Sums of colours and of densities: soft spots, which the second pass shows over the background.
+const SOFT_FRAGMENT = `#version 300 es
+precision mediump float;
+in vec3 tint; in float light; out vec4 sum;
+void main() {
+  vec2 r = 2.0 * gl_PointCoord - 1.0;
+  float weight = exp(-3.9 * dot(r, r)) - 0.02;
+  sum = weight > 0.0 ? vec4(tint, 1.0) * weight : vec4(0.0);
+}`;
+
+const SHOW_VERTEX = `#version 300 es
+out vec2 at;
+void main() {
+  at = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.0;
+  gl_Position = vec4(2.0 * at - 1.0, 0.0, 1.0);
+}`;
+
+const SHOW_FRAGMENT = `#version 300 es
+precision mediump float;
+in vec2 at; uniform sampler2D sums; uniform vec3 background; out vec4 shown;
+void main() {
+  vec4 sum = texture(sums, at);
+  float cover = 1.0 - exp(-2.4 * sum.a);
+  shown = vec4(mix(background, sum.rgb / max(sum.a, 1e-3), cover), 1.0);
+}`;
+
+// Crisp spots: discs in 2D, and in 3D balls that hide what lies behind them.
+const BALL_FRAGMENT = `#version 300 es
+precision mediump float;
+in vec3 tint; in float light; uniform bool ball; uniform float edge; out vec4 shown;
+void main() {
+  vec2 r = 2.0 * gl_PointCoord - 1.0;
+  float square = dot(r, r);
+  if (square > 1.0) discard;
+  if (ball) {
+    vec3 normal = vec3(r.x, -r.y, sqrt(1.0 - square));
+    float shade = 0.62 + 0.38 * dot(normal, vec3(-0.35, 0.6, 0.72));
+    shown = vec4(tint * shade * light, 1.0);
+  } else {
+    float cover = clamp((1.0 - sqrt(square)) * edge, 0.0, 1.0);
+    shown = vec4(tint * cover, cover);
+  }
+}`;
+
+const TRAIL_VERTEX = `#version 300 es
+layout(location=0) in vec3 position;
+layout(location=1) in float fade;
+out float cover;
+${PLACE}
+void main() {
+  float scale, near;
+  gl_Position = place(position, scale, near);
+  cover = fade;
+}`;
+
+const TRAIL_FRAGMENT = `#version 300 es
+precision mediump float;
+in float cover; uniform vec3 ink; out vec4 shown;
+void main() { shown = vec4(ink * cover, cover); }`;
+
+const SOFT_REACH = 2.8; // standard deviations of a soft spot that are drawn
+const BUFFER_SPOT = 2.2; // standard deviation of a soft spot in the buffer of sums [pixels], at most
+
+class GlPainter {
+  constructor(gl) {
+    this.gl = gl;
+    this.kind = "webgl2";
+    this.sums = gl.getExtension("EXT_color_buffer_float") ? this.makeSums() : null;
+    this.programs = {
+      soft: linked(gl, SPOT_VERTEX, SOFT_FRAGMENT),
+      ball: linked(gl, SPOT_VERTEX, BALL_FRAGMENT),
+      show: linked(gl, SHOW_VERTEX, SHOW_FRAGMENT),
+      trail: linked(gl, TRAIL_VERTEX, TRAIL_FRAGMENT),
+    };
+    this.places = gl.createBuffer();
+    this.tints = gl.createBuffer();
+    this.lines = gl.createBuffer();
+    this.fades = gl.createBuffer();
+  }
+
+  makeSums() {
+    const gl = this.gl, texture = gl.createTexture(), frame = gl.createFramebuffer();
+    return { texture, frame, width: 0, height: 0 };
+  }
+
+  draw(scene) {
+    const gl = this.gl, width = gl.drawingBufferWidth, height = gl.drawingBufferHeight;
+    const { dimension, colours, background, camera } = scene;
+    const positions = dimension === 3 ? scene.positions : flat(scene.positions);
+    const count = positions.length / 3;
+    const pixels = scene.spot / camera.unit(width, height);
+    const soft = this.sums && dimension === 2 && scene.look === "soft";
+    const shrink = soft ? Math.min(1, BUFFER_SPOT / pixels) : 1;
+    fill(gl, this.places, positions);
+    fill(gl, this.tints, colours);
+    gl.disable(gl.DEPTH_TEST);
+    gl.enable(gl.BLEND);
+    if (soft) this.sizeSums(Math.ceil(width * shrink), Math.ceil(height * shrink));
+    gl.bindFramebuffer(gl.FRAMEBUFFER, soft ? this.sums.frame : null);
+    const [across, down] = soft ? [this.sums.width, this.sums.height] : [width, height];
+    gl.viewport(0, 0, across, down);
+    gl.clearColor(...(soft ? [0, 0, 0, 0] : [...background, 1]));
+    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    const program = soft ? this.programs.soft : this.programs.ball;
+    gl.useProgram(program.program);
+    this.look(program, scene, width, height);
+    attribute(gl, 0, this.places, 3, gl.FLOAT, false);
+    attribute(gl, 1, this.tints, 3, gl.UNSIGNED_BYTE, true);
+    if (soft) {
+      gl.blendFunc(gl.ONE, gl.ONE);
+      gl.uniform1f(program.size, Math.max(2 * SOFT_REACH * pixels * shrink, 2));
+    } else {
+      const size = Math.max((dimension === 3 ? 3.2 : 1.7) * pixels, 2);
+      gl.uniform1f(program.size, size);
+      gl.uniform1i(program.ball, dimension === 3);
+      gl.uniform1f(program.edge, size / 2);
+      if (dimension === 3) {
+        gl.enable(gl.DEPTH_TEST);
+        gl.disable(gl.BLEND);
+      } else gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    }
+    for (const offset of tiles(scene, width, height)) {
+      gl.uniform3fv(program.offset, offset);
+      gl.drawArrays(gl.POINTS, 0, count);
+    }
+    if (soft) {
+      const show = this.programs.show;
+      gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+      gl.viewport(0, 0, width, height);
+      gl.useProgram(show.program);
+      gl.disable(gl.BLEND);
+      gl.bindTexture(gl.TEXTURE_2D, this.sums.texture);
+      gl.uniform3fv(show.background, background);
+      gl.drawArrays(gl.TRIANGLES, 0, 3);
+    }
+    if (scene.trails) this.drawTrails(scene, width, height);
+  }
+
+  look(program, { camera }, width, height) {
+    const gl = this.gl, unit = camera.unit(width, height);
+    const [right, up, toward] = camera.axes;
+    gl.uniform3fv(program.right, right);
+    gl.uniform3fv(program.up, up);
+    gl.uniform3fv(program.toward, toward);
+    gl.uniform3fv(program.centre, camera.centre);
+    gl.uniform3fv(program.offset, [0, 0, 0]);
+    gl.uniform2f(program.unit, 2 / (unit * width), 2 / (unit * height));
+    gl.uniform1f(program.distance_, camera.distance);
+    gl.uniform1f(program.nearest, 2 * camera.halfWidth);
+  }
+
+  drawTrails(scene, width, height) {
+    const gl = this.gl, program = this.programs.trail;
+    gl.useProgram(program.program);
+    this.look(program, scene, width, height);
+    gl.disable(gl.DEPTH_TEST);
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    gl.uniform3fv(program.ink, scene.ink);
+    fill(gl, this.lines, scene.trails.positions);
+    fill(gl, this.fades, scene.trails.fades);
+    attribute(gl, 0, this.lines, 3, gl.FLOAT, false);
+    attribute(gl, 1, this.fades, 1, gl.FLOAT, false);
+    gl.drawArrays(gl.LINES, 0, scene.trails.fades.length);
+  }
+
+  sizeSums(width, height) {
+    const gl = this.gl, sums = this.sums;
+    if (sums.width === width && sums.height === height) return;
+    Object.assign(sums, { width, height });
+    gl.bindTexture(gl.TEXTURE_2D, sums.texture);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA16F, width, height, 0, gl.RGBA, gl.HALF_FLOAT, null);
+    for (const [name, value] of [
+      [gl.TEXTURE_MIN_FILTER, gl.LINEAR], [gl.TEXTURE_MAG_FILTER, gl.LINEAR],
+      [gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE], [gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE],
+    ]) gl.texParameteri(gl.TEXTURE_2D, name, value);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, sums.frame);
+    gl.framebufferTexture2D(
+      gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, sums.texture, 0);
+  }
+}
+
+function flat(positions) {
+  const count = positions.length / 2, solid = new Float32Array(3 * count);
+  for (let k = 0; k < count; k++) {
+    solid[3 * k] = positions[2 * k];
+    solid[3 * k + 1] = positions[2 * k + 1];
+  }
+  return solid;
+}
+
+function fill(gl, buffer, data) {
+  gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
+  gl.bufferData(gl.ARRAY_BUFFER, data, gl.DYNAMIC_DRAW);
+}
+
+function attribute(gl, place, buffer, size, type, normalised) {
+  gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
+  gl.enableVertexAttribArray(place);
+  gl.vertexAttribPointer(place, size, type, normalised, 0, 0);
+}
+
+// A program with the places of its uniforms by their names.
+function linked(gl, vertex, fragment) {
+  const program = gl.createProgram();
+  for (const [type, source] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
+    const shader = gl.createShader(type);
+    gl.shaderSource(shader, source);
+    gl.compileShader(shader);
+    if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw Error(gl.getShaderInfoLog(shader));
+    gl.attachShader(program, shader);
+  }
+  gl.linkProgram(program);
+  const found = { program };
+  for (let k = 0; k < gl.getProgramParameter(program, gl.ACTIVE_UNIFORMS); k++) {
+    const { name } = gl.getActiveUniform(program, k);
+    found[name] = gl.getUniformLocation(program, name);
+  }
+  return found;
+}
+
+const PLAIN_PIXELS = 400; // on the longer side: what a processor alone fills in a few milliseconds
+
+// Without WebGL: spots written into a small picture, which the canvas then stretches.
+class PlainPainter {
+  constructor(context) {
+    this.context = context;
+    this.kind = "canvas";
+    this.small = document.createElement("canvas");
+  }
+
+  draw(scene) {
+    const { context, small } = this;
+    const { width, height } = context.canvas;
+    const shrink = Math.min(1, PLAIN_PIXELS / Math.max(width, height));
+    const across = Math.ceil(width * shrink), down = Math.ceil(height * shrink);
+    if (small.width !== across || small.height !== down) Object.assign(small, { width: across, height: down });
+    const brush = small.getContext("2d");
+    const picture = brush.createImageData(across, down);
+    const sums = new Float32Array(4 * across * down);
+    const { positions, colours, dimension, camera } = scene;
+    const spot = Math.max(scene.spot / camera.unit(across, down), 0.5);
+    const order = Array.from({ length: positions.length / dimension }, (_, k) => k);
+    const point = (k, offset) => [0, 1, 2].map((d) =>
+      (d < dimension ? positions[dimension * k + d] : 0) + offset[d]);
+    for (const offset of tiles(scene, across, down)) {
+      for (const k of order) {
+        const [column, row, near, scale] = camera.project(point(k, offset), across, down);
+        // Nearer particles weigh more, which hides what lies behind them well enough.
+        const weight = dimension === 3 ? Math.exp((4 * near) / camera.halfWidth) : 1;
+        add(sums, across, down, column, row, spot * scale, weight, colours, 3 * k);
+      }
+    }
+    for (let p = 0; p < across * down; p++) {
+      const weight = sums[4 * p + 3];
+      const cover = 1 - Math.exp(-2.4 * weight);
+      for (let c = 0; c < 3; c++) {
+        const behind = 255 * scene.background[c];
+        const front = weight > 0 ? sums[4 * p + c] / weight : behind;
+        picture.data[4 * p + c] = behind + cover * (front - behind);
+      }
+      picture.data[4 * p + 3] = 255;
+    }
+    brush.putImageData(picture, 0, 0);
+    context.imageSmoothingEnabled = true;
+    context.drawImage(small, 0, 0, width, height);
+    if (scene.trails) this.drawTrails(scene, width, height);
+  }
+
+  drawTrails({ trails, ink, camera }, width, height) {
+    const { context } = this;
+    context.strokeStyle = `rgba(${ink.map((v) => Math.round(255 * v)).join(",")},0.5)`;
+    context.beginPath();
+    for (let k = 0; k < trails.positions.length; k += 6) {
+      const [from, to] = [k, k + 3].map((at) =>
+        camera.project(trails.positions.subarray(at, at + 3), width, height));
+      context.moveTo(from[0], from[1]);
+      context.lineTo(to[0], to[1]);
+    }
+    context.stroke();
+  }
+}
+
+function add(sums, width, height, column, row, spot, weight, colours, at) {
+  const reach = 2.2 * spot, fall = -0.5 / (spot * spot);
+  const left = Math.max(0, Math.ceil(column - reach)), last = Math.min(width - 1, column + reach);
+  const top = Math.max(0, Math.ceil(row - reach)), bottom = Math.min(height - 1, row + reach);
+  for (let y = top; y <= bottom; y++) {
+    for (let x = left; x <= last; x++) {
+      const part = weight * Math.exp(fall * ((x - column) ** 2 + (y - row) ** 2));
+      const p = 4 * (y * width + x);
+      sums[p] += part * colours[at];
+      sums[p + 1] += part * colours[at + 1];
+      sums[p + 2] += part * colours[at + 2];
+      sums[p + 3] += part;
+    }
+  }
+}
+
+const TRACED = 160; // particles with a trail
+const TRAIL_LENGTH = 48; // frames that a trail goes back
+
+// Where some particles have been in the last frames.
+export class Tracers {
+  constructor() {
+    this.clear();
+  }
+
+  clear() {
+    this.frames = [];
+    this.count = 0;
+  }
+
+  add(positions, dimension) {
+    const count = positions.length / dimension;
+    if (count !== this.count) this.clear();
+    this.count = count;
+    const traced = Math.min(TRACED, count), kept = new Float32Array(3 * traced);
+    for (let k = 0; k < traced; k++) {
+      const particle = Math.floor(((k + 0.5) * count) / traced);
+      for (let d = 0; d < dimension; d++) kept[3 * k + d] = positions[dimension * particle + d];
+    }
+    this.frames.push(kept);
+    if (this.frames.length > TRAIL_LENGTH) this.frames.shift();
+  }
+
+  // Lines from frame to frame, older ones fainter; none where a particle crossed a box's edge.
+  lines(box) {
+    const places = [], fades = [], longest = box ? Math.min(...box) / 2 : Infinity;
+    for (let f = 1; f < this.frames.length; f++) {
+      const from = this.frames[f - 1], to = this.frames[f];
+      const fade = 0.75 * (f / this.frames.length) ** 1.5;
+      for (let k = 0; k < to.length; k += 3) {
+        if (Math.hypot(to[k] - from[k], to[k + 1] - from[k + 1]) > longest) continue;
+        places.push(from[k], from[k + 1], from[k + 2], to[k], to[k + 1], to[k + 2]);
+        fades.push(fade, fade);
+      }
+    }
+    return { positions: new Float32Array(places), fades: new Float32Array(fades) };
+  }
+}

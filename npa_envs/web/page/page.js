@@ -1,0 +1,598 @@
+// The page: one canvas, brushes, controls and plots over an engine that moves the particles.
+//
+// An engine is a module with one function, `connect`. `engine_socket.js` speaks to a server that runs
+// the Python engine, `engine_browser.js` computes in the page. Nothing else knows which one runs.
+//
+//   const engine = await connect(settings, listener);   // settings: what index.html hands to `start`
+//   engine.send(message);                               // page -> engine, a JSON object
+//   listener(event);                                    // engine -> page, an object
+//
+// Messages:
+//   {type: "play", on}                 run or pause
+//   {type: "step"}                     one step, while paused
+//   {type: "reset", seed}              a fresh world; without seed the next one
+//   {type: "set", name, value}         name: a key of the world's `settings`, or "rule", "show",
+//                                      "loss" (true while its plot is seen: else it is not computed)
+//   {type: "brush", tool, at, move, radius, strength, rule?, view?}
+//                                      tool: erase | push | clump | cut | graft | add
+//                                      at, move: [x, y] or [x, y, z] [length units]; push and clump
+//                                      come again and again while the pointer is down, cut once, at
+//                                      its end: the line from `at` to `at + move`, of half-width
+//                                      `radius`; strength in [0, 1]; rule: of graft and add, a name
+//                                      of `rules`; view: in 3D the unit vector towards the viewer
+//   {type: "damage", name}             one of the world's `damages`, at a random place
+//   {type: "drawn"}                    the page has drawn a frame and is ready for another. An engine
+//                                      has at most two frames on the way: a page that is slow or
+//                                      hidden holds the world, it does not lag behind it.
+//   {type: "film", action}             where capabilities hold "film": "start", "stop"; between them
+//                                      the page sends pictures as Blob objects by engine.send(blob)
+//
+// Events:
+//   {type: "world", title, note, dimension, box, half_width, spot, rules, rule, species, shows, show,
+//    tools, damages, settings, capabilities, playing, seed}        once, and after changes
+//       note: a sentence for the reader, or ""; box: sides [length units] or null; half_width: from
+//       the middle of the canvas to its edge; spot: standard deviation of a particle's spot [length
+//       units]; rules: names that `rule`, graft and add may take; species: names of the rules that
+//       live in the world now; settings: {name: {value, low, high, scale?: "log", whole?: true}}
+//       with names among eps, update_prob, noise, count, speed (steps a frame);
+//       capabilities: some of "step", "reset", "film", "loss".
+//       A key that an engine leaves out is as in `BLANK` below.
+//   {type: "frame", step, positions, colours, milliseconds, loss?}
+//       positions: Float32Array, count * dimension; colours: Uint8Array, count * 3 (red, green, blue);
+//       milliseconds: one step took so long; loss: where it was computed
+//   {type: "curve", name, points: [[x, y], ...], append?}          a plot of a training run
+//   {type: "file", name, url}                                      a film is ready
+//   {type: "error", message}
+//
+// Modules are joined into one file for the exported page, in this order: drawing.js, plots.js, page.js,
+// then the engine. For that, imports are single lines of names in braces, exports stand before
+// `function`, `class` or `const`, and top-level names differ between modules.
+//
+// `show`: "colours", "density", "species", "speed", "mask", "components" (the first three principal
+// components of the state as red, green and blue), "state 0", "state 1", ...
+
+import { Camera, Tracers, makePainter } from "./drawing.js";
+import { Plot, short } from "./plots.js";
+
+const BLANK = {
+  title: "npa-envs", note: "", dimension: 2, box: null, half_width: 1.1, spot: 0.015, rules: [], rule: null,
+  species: [], shows: ["colours"], show: "colours", tools: [], damages: [], settings: {},
+  capabilities: [], playing: true, seed: 0,
+};
+
+const TOOLS = {
+  look: ["Look: drag to move, wheel or pinch to zoom", "M12 5v14M5 12h14M12 5l-2 2M12 5l2 2M12 19l-2-2M12 19l2-2M5 12l2-2M5 12l2 2M19 12l-2-2M19 12l-2 2"],
+  erase: ["Erase", "M4 15l8-9 7 6-7 8H8zM9 20h11"],
+  push: ["Pull with the pointer", "M12 20c-4 0-6-3-7-7 2-1 3 0 4 2V6a1.4 1.4 0 0 1 3 0v5a1.4 1.4 0 0 1 3 0v1a1.4 1.4 0 0 1 3 0v3c0 3-2 5-6 5z"],
+  clump: ["Clump", "M4 4l5 5M20 4l-5 5M4 20l5-5M20 20l-5-5M9 6v3H6M15 6v3h3M9 18v-3H6M15 18v-3h3"],
+  cut: ["Cut along a line", "M5 19L19 5M6 8a2 2 0 1 0 0-.1M16 18a2 2 0 1 0 0-.1M8 9l8 8"],
+  graft: ["Graft: particles take another rule", "M12 21v-9M12 12c0-5 3-7 8-7 0 5-3 7-8 7zM12 15c0-4-3-6-8-6 0 4 3 6 8 6z"],
+  add: ["Add a seed of another rule", "M12 4a8 8 0 1 0 .1 0M12 8v8M8 12h8"],
+};
+
+const ICONS = {
+  play: "M8 5l11 7-11 7z", pause: "M8 5v14M16 5v14", one: "M6 5l9 7-9 7zM19 5v14",
+  reset: "M5 12a7 7 0 1 0 2-5L5 9M5 4v5h5", fold: "M4 7h10M18 7h2M4 17h2M10 17h10M16 5v4M8 15v4",
+};
+
+const SETTINGS = {
+  eps: "Perception radius ε", update_prob: "Update probability p", noise: "Position noise",
+  count: "Particles N",
+};
+
+const FILM_SIZE = 640; // pixels on each side of a film's pictures, and of the middle of the canvas
+const FILM_PAUSE = 40; // milliseconds between two pictures of a film, at least
+const QUALITY = 0.92;
+
+const $ = (name) => document.getElementById(name);
+
+function icon(path) {
+  return `<svg viewBox="0 0 24 24" aria-hidden="true"><path d="${path}"/></svg>`;
+}
+
+// Starts the page over an engine.
+export async function start(connect, settings) {
+  const page = new Page();
+  try {
+    page.engine = await connect(settings, (event) => page.listen(event));
+    for (const message of page.waiting.splice(0)) page.engine.send(message);
+  } catch (error) {
+    page.complain(error.message);
+  }
+  return page;
+}
+
+class Page {
+  constructor() {
+    this.engine = null;
+    this.waiting = [];
+    this.world = { ...BLANK };
+    this.frame = null;
+    this.camera = new Camera(2, BLANK.half_width);
+    this.canvas = $("world");
+    const wanted = new URLSearchParams(location.search).get("painter");
+    this.painter = makePainter(this.canvas, wanted ?? "auto");
+    this.tracers = new Tracers();
+    this.tool = "look";
+    this.pointers = new Map();
+    this.recording = null;
+    this.frameTimes = [];
+    this.plots = {
+      loss: new Plot($("plots"), "Loss", "", { log: true }),
+      milliseconds: new Plot($("plots"), "Time of a step", "ms"),
+    };
+    this.curves = {};
+    this.dirty = true;
+    this.build();
+    this.watch();
+    requestAnimationFrame(() => this.tick());
+  }
+
+  send(message) {
+    if (this.engine) this.engine.send(message);
+    else this.waiting.push(message);
+  }
+
+  // Events of the engine.
+
+  listen(event) {
+    if (event.type === "frame") {
+      this.frame = event;
+      this.fresh = true;
+    } else if (event.type === "world") this.meet(event);
+    else if (event.type === "curve") this.curve(event);
+    else if (event.type === "file") this.offer(event.name, event.url);
+    else if (event.type === "error") this.complain(event.message);
+  }
+
+  meet(event) {
+    const before = this.world, world = { ...BLANK, ...event };
+    this.world = world;
+    if (!this.met || before.dimension !== world.dimension || before.half_width !== world.half_width) {
+      this.camera = new Camera(world.dimension, world.half_width);
+      this.frame = null;
+      const first = world.tools.includes("erase") && world.dimension === 2 ? "erase" : "look";
+      this.choose(world.tools.includes(this.tool) ? this.tool : first);
+    }
+    if (before.rule !== world.rule || before.seed !== world.seed) {
+      this.tracers.clear();
+      Object.values(this.plots).forEach((plot) => plot.clear());
+    }
+    this.met = true;
+    document.title = `${world.title} · npa-envs`;
+    $("title").textContent = world.title;
+    $("note").textContent = world.note;
+    this.showPlaying();
+    options($("rule"), world.rules, world.rule);
+    options($("other"), world.rules, $("other").value || world.rules.find((name) => name !== world.rule));
+    options($("show"), world.shows, world.show);
+    $("rule-field").hidden = world.rules.length < 2;
+    $("other-field").hidden = !world.tools.some((tool) => tool === "graft" || tool === "add");
+    $("brush").hidden = !world.tools.length;
+    $("one").disabled = !world.capabilities.includes("step");
+    $("reset").disabled = !world.capabilities.includes("reset");
+    this.plots.loss.figure.hidden = !world.capabilities.includes("loss");
+    this.showTools();
+    this.showDamages();
+    this.showSettings();
+    this.dirty = true;
+  }
+
+  curve({ name, points, append }) {
+    const plot = (this.curves[name] ??= new Plot($("plots"), name, "", { log: true }));
+    if (!append) plot.clear();
+    for (const [x, y] of points) plot.add(x, y);
+    plot.draw();
+  }
+
+  offer(name, url) {
+    const item = document.createElement("li"), link = document.createElement("a");
+    Object.assign(link, { href: url, download: name, textContent: name });
+    item.append(link);
+    $("files").prepend(item);
+    $("film").open = true;
+    return link;
+  }
+
+  complain(message) {
+    $("message").textContent = message;
+    $("message").hidden = false;
+    clearTimeout(this.quiet);
+    this.quiet = setTimeout(() => ($("message").hidden = true), 9000);
+  }
+
+  // Controls.
+
+  build() {
+    $("one").innerHTML = icon(ICONS.one);
+    $("reset").innerHTML = icon(ICONS.reset);
+    $("fold").innerHTML = icon(ICONS.fold);
+    $("play").onclick = () => this.play(!this.world.playing);
+    $("one").onclick = () => { this.play(false); this.send({ type: "step" }); };
+    $("reset").onclick = () => this.send({ type: "reset" });
+    $("fold").onclick = () => this.fold(!$("panel").hidden);
+    $("rule").onchange = () => this.send({ type: "set", name: "rule", value: $("rule").value });
+    $("show").onchange = () => this.send({ type: "set", name: "show", value: $("show").value });
+    $("message").onclick = () => ($("message").hidden = true);
+    $("snapshot").onclick = () => this.snapshot();
+    $("record").onclick = () => this.record(!this.recording);
+    $("plots").ontoggle = () => this.send({ type: "set", name: "loss", value: $("plots").open });
+    $("tracers").onchange = () => { this.tracers.clear(); this.dirty = true; };
+    $("style").onchange = () => (this.dirty = true);
+    $("theme").value = kept("theme") ?? "";
+    $("theme").onchange = () => { keep("theme", $("theme").value); this.showTheme(); };
+    matchMedia("(prefers-color-scheme: dark)").onchange = () => this.showTheme();
+    this.showTheme();
+    for (const name of ["radius", "strength", "size"]) {
+      const input = $(name), told = input.parentElement.querySelector("output");
+      input.oninput = () => { told.textContent = short(+input.value); this.dirty = true; };
+      input.oninput();
+    }
+    this.fold(innerWidth <= 760);
+    this.showPlaying();
+    addEventListener("keydown", (event) => this.key(event));
+  }
+
+  fold(away) {
+    $("panel").hidden = away;
+    $("fold").setAttribute("aria-expanded", String(!away));
+  }
+
+  play(on) {
+    this.world.playing = on;
+    this.showPlaying();
+    this.send({ type: "play", on });
+  }
+
+  showPlaying() {
+    $("play").innerHTML = icon(this.world.playing ? ICONS.pause : ICONS.play);
+    $("play").setAttribute("aria-pressed", String(this.world.playing));
+  }
+
+  showTheme() {
+    document.documentElement.dataset.theme = $("theme").value;
+    const style = getComputedStyle(document.documentElement);
+    this.background = numbers(style.getPropertyValue("--ground"));
+    this.ink = numbers(style.getPropertyValue("--text"));
+    this.dirty = true;
+  }
+
+  showTools() {
+    const names = ["look", ...this.world.tools.filter((name) => name in TOOLS)];
+    if ($("tools").dataset.names === names.join()) return;
+    $("tools").dataset.names = names.join();
+    $("tools").replaceChildren(...names.map((name, k) => {
+      const button = document.createElement("button");
+      button.innerHTML = icon(TOOLS[name][1]);
+      button.title = `${TOOLS[name][0]} (${k + 1})`;
+      button.dataset.tool = name;
+      button.setAttribute("role", "radio");
+      button.setAttribute("aria-label", name);
+      button.onclick = () => this.choose(name);
+      return button;
+    }));
+    this.choose(this.tool);
+  }
+
+  choose(name) {
+    this.tool = name;
+    for (const button of $("tools").children)
+      button.setAttribute("aria-checked", String(button.dataset.tool === name));
+    if (name === "look") $("cursor").hidden = true;
+    this.canvas.style.cursor = name === "look" ? "grab" : "crosshair";
+  }
+
+  showDamages() {
+    $("damages").hidden = !this.world.damages.length;
+    $("damages").replaceChildren(...this.world.damages.map((name) => {
+      const button = document.createElement("button");
+      button.textContent = name;
+      button.title = `Damage: ${name}`;
+      button.onclick = () => this.send({ type: "damage", name });
+      return button;
+    }));
+  }
+
+  // Sliders are made once and kept, so that one that is being dragged stays under the finger.
+  showSettings() {
+    const { settings } = this.world;
+    $("speed-field").hidden = !settings.speed;
+    if (settings.speed) this.slider($("speed"), "speed", settings.speed);
+    $("physics").hidden = !Object.keys(SETTINGS).some((name) => name in settings);
+    for (const [name, label] of Object.entries(SETTINGS)) {
+      let input = $(name);
+      if (!settings[name]) {
+        input?.parentElement.remove();
+        continue;
+      }
+      if (!input) {
+        const field = document.createElement("label"), text = document.createElement("span");
+        field.className = "slider";
+        text.textContent = label;
+        input = Object.assign(document.createElement("input"), { type: "range", id: name });
+        field.append(text, document.createElement("output"), input);
+        $("physics").append(field);
+      }
+      this.slider(input, name, settings[name]);
+    }
+  }
+
+  slider(input, name, { value, low, high, scale, whole }) {
+    const bend = scale === "log" ? Math.log : (v) => v, unbend = scale === "log" ? Math.exp : (v) => v;
+    const told = input.parentElement.querySelector("output");
+    const read = () => (whole ? Math.round : (v) => +v.toPrecision(3))(unbend(+input.value));
+    input.min = bend(low);
+    input.max = bend(high);
+    input.step = whole && scale !== "log" ? 1 : (bend(high) - bend(low)) / 200;
+    if (document.activeElement !== input || !this.pressing) input.value = bend(value);
+    told.textContent = short(value);
+    input.onpointerdown = () => (this.pressing = true);
+    input.onpointerup = () => (this.pressing = false);
+    input.oninput = () => {
+      told.textContent = short(read());
+      clearTimeout(this.settling);
+      // A world is made anew for another number of particles: only once the slider rests.
+      const send = () => this.send({ type: "set", name, value: read() });
+      if (name === "count") this.settling = setTimeout(send, 150);
+      else send();
+    };
+  }
+
+  key(event) {
+    if (event.target.matches("select, input[type=text]") || event.ctrlKey || event.metaKey) return;
+    const tools = [...$("tools").children];
+    const acts = {
+      " ": () => this.play(!this.world.playing), s: () => $("one").click(), r: () => $("reset").click(),
+      p: () => $("fold").click(),
+    };
+    const act = acts[event.key] ?? tools[+event.key - 1]?.onclick;
+    if (!act || (event.key === " " && event.target.matches("button, summary"))) return;
+    event.preventDefault();
+    act();
+  }
+
+  // Pointers: one works, two look.
+
+  watch() {
+    const { canvas } = this;
+    canvas.onpointerdown = (event) => this.press(event);
+    canvas.onpointermove = (event) => this.move(event);
+    canvas.onpointerup = canvas.onpointercancel = (event) => this.release(event);
+    canvas.onpointerleave = () => { if (!this.pointers.size) $("cursor").hidden = true; };
+    canvas.oncontextmenu = (event) => event.preventDefault();
+    canvas.addEventListener("wheel", (event) => {
+      event.preventDefault();
+      this.camera.magnify(Math.exp(-event.deltaY * 0.0015));
+      this.dirty = true;
+    }, { passive: false });
+    new ResizeObserver(() => (this.dirty = true)).observe(canvas);
+  }
+
+  place(event) {
+    const { left, top } = this.canvas.getBoundingClientRect();
+    return [event.clientX - left, event.clientY - top];
+  }
+
+  press(event) {
+    this.canvas.setPointerCapture(event.pointerId);
+    const place = this.place(event);
+    this.pointers.set(event.pointerId, place);
+    this.looking = this.tool === "look" || event.button === 2 || event.shiftKey || this.pointers.size > 1;
+    if (this.looking) {
+      this.stroke = null;
+      return;
+    }
+    const near = this.nearness(place);
+    this.stroke = { near, from: place, at: place, sent: place };
+    if (this.tool !== "cut") this.brush(place, [0, 0]);
+    this.showCursor(place);
+  }
+
+  move(event) {
+    const place = this.place(event), before = this.pointers.get(event.pointerId);
+    if (!before) {
+      if (event.pointerType === "mouse") this.showCursor(place);
+      return;
+    }
+    const columns = place[0] - before[0], rows = place[1] - before[1];
+    const others = [...this.pointers].filter(([id]) => id !== event.pointerId).map(([, at]) => at);
+    this.pointers.set(event.pointerId, place);
+    const { clientWidth: width, clientHeight: height } = this.canvas;
+    if (this.looking) {
+      this.camera.drag(columns / this.pointers.size, rows / this.pointers.size, width, height);
+      if (others.length) this.camera.magnify(
+        Math.hypot(place[0] - others[0][0], place[1] - others[0][1]) /
+        Math.max(Math.hypot(before[0] - others[0][0], before[1] - others[0][1]), 1));
+      this.dirty = true;
+    } else if (this.stroke) {
+      this.stroke.at = place;
+      this.showCursor(place);
+    }
+  }
+
+  release(event) {
+    const { stroke } = this;
+    this.pointers.delete(event.pointerId);
+    if (stroke && this.tool === "cut" && event.type === "pointerup") {
+      const move = [stroke.at[0] - stroke.from[0], stroke.at[1] - stroke.from[1]];
+      if (Math.hypot(...move) > 4) this.brush(stroke.from, move);
+    }
+    this.stroke = null;
+    $("knife").hidden = true;
+    $("cursor").classList.remove("pressed");
+    if (event.pointerType !== "mouse") $("cursor").hidden = true;
+  }
+
+  // How near the surface under the pointer is: brushes of 3D worlds work there.
+  nearness([column, row]) {
+    const { frame, camera, canvas } = this;
+    if (!frame || this.world.dimension !== 3) return 0;
+    const width = canvas.clientWidth, height = canvas.clientHeight;
+    const reach = Math.max(8, (0.3 * $("radius").value) / camera.unit(width, height));
+    let nearest = -Infinity;
+    for (let k = 0; k < frame.positions.length; k += 3) {
+      const [x, y, near] = camera.project(frame.positions.subarray(k, k + 3), width, height);
+      if (near > nearest && Math.hypot(x - column, y - row) < reach) nearest = near;
+    }
+    return Number.isFinite(nearest) ? nearest : 0;
+  }
+
+  // The brush at a place on the canvas, moved so many pixels.
+  brush(place, pixels) {
+    const { camera, canvas, world, stroke } = this;
+    const width = canvas.clientWidth, height = canvas.clientHeight, { dimension, box } = world;
+    const near = stroke?.near ?? 0;
+    const at = camera.position(...place, width, height, near).slice(0, dimension);
+    const move = camera.movement(...pixels, width, height, near).slice(0, dimension);
+    const wrapped = box ? at.map((v, k) => v - box[k] * Math.round(v / box[k])) : at;
+    const message = {
+      type: "brush", tool: this.tool, at: wrapped, move,
+      radius: this.radius(), strength: +$("strength").value,
+    };
+    if (this.tool === "graft" || this.tool === "add") message.rule = $("other").value;
+    if (dimension === 3) message.view = camera.axes[2];
+    this.send(message);
+  }
+
+  // A cut is a line: of its radius only a part is the gap.
+  radius() {
+    return +$("radius").value * (this.tool === "cut" ? 0.4 : 1);
+  }
+
+  showCursor([column, row]) {
+    const { canvas, stroke } = this, knife = $("knife"), cursor = $("cursor");
+    const unit = this.camera.unit(canvas.clientWidth, canvas.clientHeight);
+    cursor.hidden = this.tool === "look";
+    const size = (2 * this.radius()) / unit;
+    cursor.style.width = cursor.style.height = `${size}px`;
+    cursor.style.transform = `translate(${column - size / 2}px, ${row - size / 2}px)`;
+    cursor.classList.toggle("pressed", Boolean(stroke));
+    knife.hidden = !(stroke && this.tool === "cut");
+    if (!knife.hidden) {
+      const across = column - stroke.from[0], down = row - stroke.from[1];
+      knife.style.width = `${Math.hypot(across, down)}px`;
+      knife.style.transform =
+        `translate(${stroke.from[0]}px, ${stroke.from[1]}px) rotate(${Math.atan2(down, across)}rad)`;
+    }
+  }
+
+  // Each frame of the screen: what the brush does, and what is new to see.
+
+  tick() {
+    requestAnimationFrame(() => this.tick());
+    const { stroke } = this;
+    if (stroke && !["cut", "graft", "add"].includes(this.tool)) {
+      const move = [stroke.at[0] - stroke.sent[0], stroke.at[1] - stroke.sent[1]];
+      if (this.tool !== "push" || Math.hypot(...move) > 0) this.brush(stroke.sent, move);
+      stroke.sent = stroke.at;
+    } else if (stroke && this.tool === "graft" && stroke.at !== stroke.sent) {
+      stroke.sent = stroke.at;
+      this.brush(stroke.at, [0, 0]);
+    }
+    if (!this.fresh && !this.dirty) return;
+    if (this.fresh) this.take();
+    this.draw();
+    if (this.fresh) this.send({ type: "drawn" });
+    this.fresh = this.dirty = false;
+  }
+
+  take() {
+    const { frame, world } = this, now = performance.now();
+    if ($("tracers").checked) this.tracers.add(frame.positions, world.dimension);
+    this.frameTimes.push(now);
+    while (this.frameTimes[0] < now - 2000) this.frameTimes.shift();
+    this.plots.milliseconds.add(frame.step, frame.milliseconds);
+    if (frame.loss !== undefined) this.plots.loss.add(frame.step, frame.loss);
+    if (now - (this.told ?? 0) > 250) {
+      this.told = now;
+      const { length } = this.frameTimes;
+      const rate = length > 1 ? (1000 * (length - 1)) / (now - this.frameTimes[0]) : 0;
+      const count = frame.positions.length / world.dimension;
+      $("step").textContent = `step ${frame.step} · ${count} particles`;
+      $("rate").textContent = world.playing && rate ? `${Math.round(rate)} frames a second` : "";
+      if ($("plots").open) Object.values(this.plots).forEach((plot) => plot.draw());
+    }
+  }
+
+  draw() {
+    const { canvas, frame, world, camera } = this;
+    // More pixels than this are not seen, and cost where the processor draws.
+    const ratio = Math.min(devicePixelRatio || 1, 1600 / Math.max(canvas.clientWidth, canvas.clientHeight, 1), 2);
+    const width = Math.round(canvas.clientWidth * ratio), height = Math.round(canvas.clientHeight * ratio);
+    if (!width || !height) return;
+    if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
+    this.painter.draw({
+      positions: frame?.positions ?? new Float32Array(), colours: frame?.colours ?? new Uint8Array(),
+      dimension: world.dimension, box: world.box, spot: world.spot * $("size").value, camera,
+      background: this.background, look: $("style").value, ink: this.ink,
+      trails: $("tracers").checked ? this.tracers.lines(world.box) : null,
+    });
+    this.film();
+  }
+
+  // Pictures and films.
+
+  snapshot() {
+    this.draw();
+    this.canvas.toBlob((blob) => {
+      const name = `${this.world.title}-${this.frame?.step ?? 0}.png`.replace(/[^\w.-]+/g, "-");
+      this.offer(name, URL.createObjectURL(blob)).click();
+    }, "image/png");
+  }
+
+  // An engine that makes films gets pictures; else the browser records the canvas.
+  record(on) {
+    $("record").setAttribute("aria-pressed", String(on));
+    $("record").textContent = on ? "Stop" : "Record";
+    if (!on) {
+      this.recording.stop();
+      this.recording = null;
+    } else if (this.world.capabilities.includes("film")) {
+      const picture = Object.assign(document.createElement("canvas"), { width: FILM_SIZE, height: FILM_SIZE });
+      this.recording = { picture, last: 0, stop: () => this.send({ type: "film", action: "stop" }) };
+      this.send({ type: "film", action: "start" });
+      this.dirty = true;
+    } else this.recording = recorder(this.canvas, (name, url) => this.offer(name, url));
+  }
+
+  film() {
+    const { recording, canvas } = this, now = performance.now();
+    if (!recording?.picture || now - recording.last < FILM_PAUSE) return;
+    recording.last = now;
+    const { picture } = recording, side = Math.min(canvas.width, canvas.height);
+    picture.getContext("2d").drawImage(
+      canvas, (canvas.width - side) / 2, (canvas.height - side) / 2, side, side, 0, 0, FILM_SIZE, FILM_SIZE);
+    picture.toBlob((blob) => { if (blob) this.send(blob); }, "image/jpeg", QUALITY);
+  }
+}
+
+function recorder(canvas, done) {
+  const kind = ["video/mp4", "video/webm"].find((type) => MediaRecorder.isTypeSupported(type));
+  const parts = [], media = new MediaRecorder(canvas.captureStream(30), { mimeType: kind });
+  media.ondataavailable = ({ data }) => parts.push(data);
+  media.onstop = () =>
+    done(`film.${kind.slice(6)}`, URL.createObjectURL(new Blob(parts, { type: kind })));
+  media.start(500);
+  return { stop: () => media.stop() };
+}
+
+function options(select, names, chosen) {
+  if (select.dataset.names !== names.join("\n")) {
+    select.dataset.names = names.join("\n");
+    select.replaceChildren(...names.map((name) => new Option(name, name)));
+  }
+  if (chosen) select.value = chosen;
+}
+
+function numbers(hex) {
+  return [1, 3, 5].map((k) => parseInt(hex.trim().slice(k, k + 2), 16) / 255);
+}
+
+// What the reader chose is kept where the browser allows it.
+function keep(name, value) {
+  try { localStorage.setItem(`npa-envs ${name}`, value); } catch { /* private windows */ }
+}
+
+function kept(name) {
+  try { return localStorage.getItem(`npa-envs ${name}`); } catch { return null; }
+}

@@ -1,0 +1,72 @@
+// Small plots of numbers that come one after the other.
+
+const KEPT = 2000; // points of a plot; older ones are thinned out
+
+export class Plot {
+  // A canvas with a title in `parent`; `unit` follows the last number.
+  constructor(parent, title, unit = "", { log = false } = {}) {
+    this.unit = unit;
+    this.log = log;
+    this.points = [];
+    this.figure = document.createElement("figure");
+    this.figure.className = "plot";
+    const caption = document.createElement("figcaption");
+    const name = document.createElement("span");
+    this.value = document.createElement("output");
+    name.textContent = title;
+    caption.append(name, this.value);
+    this.canvas = document.createElement("canvas");
+    this.canvas.setAttribute("role", "img");
+    this.canvas.setAttribute("aria-label", title);
+    this.figure.append(caption, this.canvas);
+    parent.append(this.figure);
+  }
+
+  add(x, y) {
+    if (!Number.isFinite(y)) return;
+    const last = this.points.at(-1);
+    if (last && x < last[0]) this.points = [];
+    this.points.push([x, y]);
+    if (this.points.length > KEPT) this.points = this.points.filter((_, k) => k % 2 || k > KEPT / 2);
+  }
+
+  clear() {
+    this.points = [];
+    this.draw();
+  }
+
+  remove() {
+    this.figure.remove();
+  }
+
+  draw() {
+    const { canvas, points } = this;
+    this.value.textContent = points.length ? `${short(points.at(-1)[1])} ${this.unit}` : "–";
+    const ratio = window.devicePixelRatio || 1;
+    const width = Math.round(canvas.clientWidth * ratio), height = Math.round(canvas.clientHeight * ratio);
+    if (!width || !height) return;
+    if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
+    const context = canvas.getContext("2d"), style = getComputedStyle(canvas);
+    context.clearRect(0, 0, width, height);
+    if (points.length < 2) return;
+    const level = (y) => (this.log ? Math.log10(Math.max(y, 1e-12)) : y);
+    const levels = points.map(([, y]) => level(y));
+    const low = this.log ? Math.min(...levels) : Math.min(0, ...levels);
+    const high = Math.max(...levels), span = high - low || 1;
+    const first = points[0][0], range = points.at(-1)[0] - first || 1;
+    context.beginPath();
+    points.forEach(([x], k) => context.lineTo(
+      ((x - first) / range) * (width - 2) + 1,
+      height - 2 - ((levels[k] - low) / span) * (height - 4)));
+    context.lineJoin = "round";
+    context.lineWidth = 1.5 * ratio;
+    context.strokeStyle = style.getPropertyValue("--accent") || "#888";
+    context.stroke();
+  }
+}
+
+export function short(number) {
+  const size = Math.abs(number);
+  if (size >= 1000 || (size > 0 && size < 0.001)) return number.toExponential(1);
+  return String(+number.toPrecision(3));
+}
