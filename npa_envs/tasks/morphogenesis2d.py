@@ -7,8 +7,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
+from npa_envs.errors import NPAError
 from npa_envs.ops import splat, world_mean
 from npa_envs.ops.pictures.losses import picture_losses
 from npa_envs.rule.rule import COLOUR_OFFSET
@@ -17,6 +19,9 @@ from npa_envs.tasks.growth import GrowthConfig, GrowthTask
 from npa_envs.tasks.targets.images import LARGEST_POINT_COUNT
 from npa_envs.tasks.targets.points import PointTarget, load_target
 from npa_envs.tasks.train_config import TrainConfig, fast_run, tiny_run
+
+SMALLEST_PICTURE = 4
+"""Pixels a side of a picture that is blurred and halved, at least."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,6 +53,10 @@ class Morphogenesis2DConfig(GrowthConfig):
     colour_weight: float = 5.0
     """Weight of the colour term against the density term inside the splat loss (dimensionless)."""
 
+    blur_levels: int = 0
+    """How often pictures are blurred and halved to be compared once more: particles far from where
+    they are missing are drawn there by the coarse ones. The loss is the mean of all."""
+
     drift_weight: float = 0.0
     """Weight of the centroids' distance from the origin, where worlds begin (per length unit)."""
 
@@ -56,6 +65,12 @@ class Morphogenesis2DConfig(GrowthConfig):
         super().__post_init__()
         check_text(self, "target", "a built-in name, an emoji or a path")
         check_positive(self, int, "target_point_count", at_most=LARGEST_POINT_COUNT)
+        check_positive(self, int, "blur_levels", at_least=0)
+        if self.resolution >> self.blur_levels < SMALLEST_PICTURE:
+            raise NPAError(
+                f"blur_levels must leave pictures of at least {SMALLEST_PICTURE} pixels a side, "
+                f"got {self.blur_levels} for a resolution of {self.resolution}: lower it"
+            )
         check_positive(self, float, "sigma")
         check_non_negative(self, "splat_weight", "colour_weight", "drift_weight")
 
@@ -120,12 +135,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         colours count where there is something to colour. World k's errors are the same, bit for
         bit, in every batch.
         """
-        difference = self.picture(x, s) - self.target_picture.to(x)
-        density = _growth(difference[..., 3])
-        # Added one by one: the order of torch's own sums is not promised.
-        red, green, blue = _growth(difference[..., :3]).unbind(dim=-1)
-        colour = (red + green + blue) / 3.0
-        return density, colour * torch.exp(-density.detach())
+        return _errors(self.picture(x, s) - self.target_picture.to(x))
 
     def splat_losses(self, x: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return each world's density loss and colour loss, dimensionless, shape [B] each.
@@ -153,7 +163,17 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
 
     def compare(self, x: Tensor, s: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the batch's splat loss, weighted, and its density and colour terms."""
-        density, colour = (term.mean() for term in self.splat_losses(x, s))
+        levels = self.config.blur_levels
+        if levels == 0:
+            density, colour = (term.mean() for term in self.splat_losses(x, s))
+        else:
+            difference = self.picture(x, s) - self.target_picture.to(x)
+            density, colour = x.new_zeros(()), x.new_zeros(())
+            for level in range(levels + 1):
+                errors = _errors(difference)
+                density = density + errors[0].mean() / (levels + 1)
+                colour = colour + errors[1].mean() / (levels + 1)
+                difference = _halved(difference) if level < levels else difference
         total = self.config.splat_weight * (density + self.config.colour_weight * colour)
         return total, {"density": density, "colour": colour}
 
@@ -198,6 +218,21 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
             pixel_size=self.target.pixel_size,
             sigma=self.config.sigma,
         )
+
+
+def _errors(difference: Tensor) -> tuple[Tensor, Tensor]:
+    """Return density errors and colour errors of pictures' differences, shape [B, R, R] each."""
+    density = _growth(difference[..., 3])
+    # Added one by one: the order of torch's own sums is not promised.
+    red, green, blue = _growth(difference[..., :3]).unbind(dim=-1)
+    colour = (red + green + blue) / 3.0
+    return density, colour * torch.exp(-density.detach())
+
+
+def _halved(picture: Tensor) -> Tensor:
+    """Return pictures [B, R, R, 4] blurred and half as large: means of 4 x 4 pixels, every 2."""
+    channels_first = picture.permute(0, 3, 1, 2)
+    return F.avg_pool2d(channels_first, 4, stride=2, padding=1).permute(0, 2, 3, 1)
 
 
 def _growth(difference: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,15 @@ from npa_envs.tasks.checks import (
 from npa_envs.world.rollout import Memory
 
 TaskConfigT = TypeVar("TaskConfigT")
+
+Schedule = Literal["milestones", "cosine"]
+"""How a learning rate falls."""
+
+RISE = 0.01
+"""Share of a repeat in which the learning rate of the schedule "cosine" rises."""
+
+LOWEST = 0.01
+"""What is left of the learning rate at the end of the schedule "cosine"."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,6 +69,10 @@ class TrainConfig(Generic[TaskConfigT]):
     learning_rate: float = 5e-4
     """AdamW's learning rate at the start of each repeat."""
 
+    schedule: Schedule = "milestones"
+    """How the learning rate falls in a repeat: at `milestones`, or along half a "cosine" to a
+    hundredth, whatever the length of the repeat."""
+
     milestones: tuple[int, ...] = (2_000, 4_000, 6_000, 8_000)
     """Iterations of a repeat after which the learning rate is multiplied by `decay`."""
 
@@ -68,6 +82,10 @@ class TrainConfig(Generic[TaskConfigT]):
     weight_decay: float = 0.0
     """AdamW's weight decay."""
 
+    average: float = 0.0
+    """The rule that is kept is a running mean of the weights, which keeps this share of itself in
+    an iteration, less in the first ones; 0: the weights as they are."""
+
     normalise_gradients: bool = True
     """Every parameter's gradient is divided by its own norm before the optimiser's step."""
 
@@ -76,6 +94,12 @@ class TrainConfig(Generic[TaskConfigT]):
 
     fresh_share: float = 0.0
     """Share of the worlds of such a batch that are fresh seeds, at least one of them."""
+
+    lifetimes: tuple[int, int] = (0, 0)
+    """Steps that worlds of the pool live until a fresh seed takes their place: from the least, in
+    the pool's first place, to the most, in its last, evenly in their logarithm. A batch has a world
+    of each of B equal sections, so that there are young and old ones in it. (0, 0): fresh seeds
+    come by `seed_interval` instead."""
 
     damage: bool = True
     """Worlds from the pool are damaged before the rollout, so that the rule learns to heal."""
@@ -119,7 +143,9 @@ class TrainConfig(Generic[TaskConfigT]):
         check_positive(self, int, "seed_interval", "log_interval", "checkpoint_interval")
         check_positive(self, float, "learning_rate", "runaway_limit")
         check_fraction(self, "decay")
-        check_non_negative(self, "weight_decay", "fresh_share")
+        check_non_negative(self, "weight_decay", "fresh_share", "average")
+        if self.average >= 1.0:
+            raise NPAError(f"average must be below 1, got {self.average}: try 0.999")
         if self.fresh_share > 1.0:
             raise NPAError(f"fresh_share must be at most 1, got {self.fresh_share}: try 0.5")
         interval = self.picture_interval
@@ -140,6 +166,8 @@ class TrainConfig(Generic[TaskConfigT]):
                 f"got world_count={self.world_count} and pool_size={self.pool_size}: "
                 f"set pool_size={self.world_count} or more"
             )
+        self._check_lifetimes()
+        self._check_choice("schedule", get_args(Schedule))
         self._check_choice("dtype", ("float32", "float64"))
         self._check_choice("memory", get_args(Memory))
         self._check_choice("moment_inverse", get_args(MomentInverse))
@@ -170,12 +198,36 @@ class TrainConfig(Generic[TaskConfigT]):
                 "for example milestones=(2000, 4000)"
             )
 
+    def _check_lifetimes(self) -> None:
+        times = self.lifetimes
+        if (
+            not isinstance(times, tuple)
+            or len(times) != 2
+            or not all(is_whole(steps) for steps in times)
+            or not (1 <= times[0] <= times[1] or times == (0, 0))
+        ):
+            raise NPAError(
+                "lifetimes must be two whole numbers (lo, hi) with 1 <= lo <= hi, or (0, 0), got "
+                f"{shown(times)}: for example lifetimes=(64, 16384)"
+            )
+        if self.ages and self.pool_size % self.world_count:
+            raise NPAError(
+                f"pool_size must be a multiple of world_count where lifetimes are set, got "
+                f"{self.pool_size} and {self.world_count}: set "
+                f"pool_size={self.pool_size // self.world_count * self.world_count}"
+            )
+
     def _check_choice(self, name: str, choices: tuple[str, ...]) -> None:
         value = getattr(self, name)
         if not isinstance(value, str) or value not in choices:
             raise NPAError(
                 f"{name} must be one of {', '.join(choices)}, got {shown(getattr(self, name))}"
             )
+
+    @property
+    def ages(self) -> bool:
+        """Whether worlds of the pool have lifetimes."""
+        return self.lifetimes[1] > 0
 
     @property
     def fresh_count(self) -> int:
@@ -195,13 +247,18 @@ class TrainConfig(Generic[TaskConfigT]):
     def learning_rate_at(self, iteration: int) -> float:
         """Return the learning rate of an iteration, counted from 0 over all repeats.
 
-        It is a function of the iteration alone (MultiStepLR, restarted with each repeat), so
-        that a resumed run needs no scheduler state.
+        It is a function of the iteration alone, restarted with each repeat, so that a resumed run
+        needs no scheduler state: MultiStepLR, or a cosine with a short linear rise before it
+        (Loshchilov and Hutter, arXiv 1608.03983).
 
         Args:
             iteration: Iterations done so far in the run.
         """
         within = iteration % self.iterations
+        if self.schedule == "cosine":
+            rise = min(1.0, (within + 1) / (RISE * self.iterations))
+            fall = 0.5 + 0.5 * math.cos(math.pi * within / self.iterations)
+            return self.learning_rate * rise * (LOWEST + (1.0 - LOWEST) * fall)
         passed = sum(milestone <= within for milestone in self.milestones)
         return float(self.learning_rate * self.decay**passed)
 

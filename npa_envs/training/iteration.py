@@ -6,6 +6,7 @@ steps; what happened is kept on the device until a line of the log asks for it.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -58,7 +59,8 @@ class TrainingCycle:
         self.generators = {"schedule": schedule, "worlds": worlds, "masks": masks}
         """Randomness of the steps' numbers, of the worlds, and of the update masks."""
         x, s, goal = self._seeds(config.pool_size)
-        self.pool = WorldPool(x, s, goal, runaway_limit=config.runaway_limit)
+        lifetimes = config.lifetimes if config.ages else None
+        self.pool = WorldPool(x, s, goal, runaway_limit=config.runaway_limit, lifetimes=lifetimes)
         """Worlds that live on between batches."""
         batch = x[: config.world_count], s[: config.world_count]
         goals = None if goal is None else goal[: config.world_count]
@@ -68,9 +70,13 @@ class TrainingCycle:
         """Worlds before and after the last rollout, the loss and its gradients."""
         self.optimiser = RuleOptimiser(self.batch.parameters, config)
         """Changes the rule."""
+        self.average = WeightAverage(self.batch.parameters, config.average)
+        """The running mean of the weights, where the configuration asks for one."""
         self.meter = LossMeter(self.batch)
         """What happened since the last line of the log."""
         self._index = torch.zeros(config.world_count, dtype=torch.int64, device=device)
+        self._age = torch.zeros_like(self._index)
+        self._steps = torch.zeros_like(self._index[0])
         self._fresh_x, self._fresh_s = (torch.empty_like(t) for t in batch)
         self._fresh_goal = None if goals is None else torch.empty_like(goals)
         self._draw = Replayed(self._draw_worlds, device, worlds) if graphed else self._draw_worlds
@@ -84,12 +90,14 @@ class TrainingCycle:
         if isinstance(self.task, ScheduledTask):
             self.task.begin(iteration)
         self._draw()
-        if iteration % config.seed_interval == 0:
+        if not config.ages and iteration % config.seed_interval == 0:
             self._begin_anew(config.fresh_count)
         batch.run(steps)
         self.meter.begin(iteration + 1, steps)
+        self._steps.fill_(steps)
         self._keep()
         self.optimiser.step(iteration)
+        self.average.update(iteration)
         return steps
 
     def state_dict(self) -> dict[str, Any]:
@@ -99,6 +107,7 @@ class TrainingCycle:
             "pool": {name: tensor for name, tensor in self._pooled() if tensor is not None},
             "meter": self.meter.state_dict(),
             "random_states": {name: g.get_state() for name, g in self.generators.items()},
+            **self.average.state_dict(),
         }
 
     def state_like(self, iteration: int) -> dict[str, Any]:
@@ -113,6 +122,7 @@ class TrainingCycle:
             if tensor is not None:
                 tensor.copy_(state["pool"][name])
         self.meter.load_state_dict(state["meter"])
+        self.average.load_state_dict(state)
         for name, generator in self.generators.items():
             generator.set_state(state["random_states"][name])
 
@@ -125,17 +135,27 @@ class TrainingCycle:
         if isinstance(self.task, GoalTask) and goal is not None:
             if config.damage:
                 x0, s0, goal = self.task.damage_with_goals(x0, s0, goal, worlds)
-            self.batch.aim(goal)
         elif config.damage:
             x0, s0 = self.task.damage(x0, s0, worlds)
-        self.batch.x0.copy_(x0)
-        self.batch.s0.copy_(s0)
         # Drawn in every iteration, needed or not: nobody on the host knows which worlds run away.
         fresh_x, fresh_s, fresh_goal = self._seeds(config.world_count)
         self._fresh_x.copy_(fresh_x)
         self._fresh_s.copy_(fresh_s)
         if self._fresh_goal is not None and fresh_goal is not None:
             self._fresh_goal.copy_(fresh_goal)
+        if config.ages:
+            age, over = self.pool.ages_of(self._index)
+            x0, s0 = (
+                torch.where(over[:, None, None], fresh, old)
+                for fresh, old in ((fresh_x, x0), (fresh_s, s0))
+            )
+            if goal is not None and fresh_goal is not None:
+                goal = torch.where(over, fresh_goal, goal)
+            self._age.copy_(age.masked_fill(over, 0))
+        self.batch.x0.copy_(x0)
+        self.batch.s0.copy_(s0)
+        if goal is not None:
+            self.batch.aim(goal)
 
     def _begin_anew(self, count: int) -> None:
         """Let the first worlds of the batch be fresh seeds."""
@@ -152,7 +172,8 @@ class TrainingCycle:
         if batch.goal is not None and self._fresh_goal is not None:
             goals = batch.goal, self._fresh_goal
         fresh = self._fresh_x, self._fresh_s
-        replaced = self.pool.write(self._index, batch.x, batch.s, *fresh, goals)
+        age = self._age + self._steps if self._config.ages else None
+        replaced = self.pool.write(self._index, batch.x, batch.s, *fresh, goals, age)
         self.meter.observe(replaced)
         self.optimiser.prepare_gradients()
 
@@ -162,7 +183,8 @@ class TrainingCycle:
         return x.to(dtype), s.to(dtype), goal
 
     def _pooled(self) -> list[tuple[str, Tensor | None]]:
-        return [("x", self.pool.x), ("s", self.pool.s), ("goal", self.pool.goal)]
+        pool = self.pool
+        return [("x", pool.x), ("s", pool.s), ("goal", pool.goal), ("age", pool.age)]
 
 
 class WorldPool:
@@ -173,10 +195,18 @@ class WorldPool:
         s: States, shape [W, N, C].
         goal: The goal of every world, shape [W], where the task has such.
         runaway_limit: A world with a larger |x| or |s|, or one that is not finite, is not kept.
+        lifetimes: Steps that the world in the first place lives, and that in the last, all others
+            between; None: for ever.
     """
 
     def __init__(
-        self, x: Tensor, s: Tensor, goal: Tensor | None = None, *, runaway_limit: float
+        self,
+        x: Tensor,
+        s: Tensor,
+        goal: Tensor | None = None,
+        *,
+        runaway_limit: float,
+        lifetimes: tuple[int, int] | None = None,
     ) -> None:
         self.x = x
         """Positions [length units], shape [W, N, D]."""
@@ -184,17 +214,35 @@ class WorldPool:
         """States (dimensionless), shape [W, N, C]."""
         self.goal = goal
         """Goals, int64, shape [W], or None."""
+        self.age = None if lifetimes is None else torch.zeros_like(x[:, 0, 0], dtype=torch.int64)
+        """Steps since the seed, int64, shape [W], or None."""
+        self.lifetime: Tensor | None = None
+        """Age at which the world of each place has lived, int64, shape [W], or None."""
+        if lifetimes is not None:
+            logarithms = torch.linspace(*map(math.log, lifetimes), len(x), dtype=torch.float64)
+            self.lifetime = logarithms.exp().round().to(x.device, torch.int64)
         self._runaway_limit = runaway_limit
 
     def sample(self, world_count: int, generator: torch.Generator) -> Tensor:
-        """Draw different worlds.
+        """Draw different worlds; where they have lifetimes, one of each of B equal sections.
 
         Returns:
             Their indices, shape [B].
         """
         # The largest of random numbers: unlike randperm, one short kernel and no host copy.
         keys = torch.rand(len(self.x), generator=generator, device=self.x.device)
-        return keys.topk(world_count).indices
+        if self.age is None:
+            return keys.topk(world_count).indices
+        size = len(self.x) // world_count
+        first = torch.arange(0, size * world_count, size, device=self.x.device)
+        return first + keys.view(world_count, size).argmax(dim=1)
+
+    def ages_of(self, index: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the ages of worlds that have lifetimes, and which have lived, shape [B] each."""
+        assert self.age is not None, "made with lifetimes"
+        assert self.lifetime is not None, "made with lifetimes"
+        age = self.age.index_select(0, index)
+        return age, age >= self.lifetime.index_select(0, index)
 
     def read(self, index: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
         """Return copies of the worlds at `index` [B]: x [B, N, D], s [B, N, C] and goals [B]."""
@@ -209,6 +257,7 @@ class WorldPool:
         fresh_x: Tensor,
         fresh_s: Tensor,
         goals: tuple[Tensor, Tensor] | None = None,
+        age: Tensor | None = None,
     ) -> Tensor:
         """Put worlds back; those that are not finite or run away are replaced by fresh ones.
 
@@ -219,6 +268,7 @@ class WorldPool:
             fresh_x: Positions of seeds, shape [B, N, D].
             fresh_s: States of seeds, shape [B, N, C].
             goals: Goals of the worlds and of the seeds, shape [B], where the pool has such.
+            age: Steps of the worlds since their seeds, int64, shape [B], where they have lifetimes.
 
         Returns:
             Which worlds were replaced, shape [B], bool.
@@ -231,6 +281,8 @@ class WorldPool:
         self.s.index_copy_(0, index, torch.where(mask, s, fresh_s))
         if self.goal is not None and goals is not None:
             self.goal.index_copy_(0, index, torch.where(keep, *goals))
+        if self.age is not None and age is not None:
+            self.age.index_copy_(0, index, age.masked_fill(~keep, 0))
         return ~keep
 
 
@@ -463,6 +515,48 @@ class RuleOptimiser:
             # One kernel for all parameters; the CPU's own loop is as fast there.
             fused=self._parameters[0].is_cuda,
         )
+
+
+class WeightAverage:
+    """A running mean of parameters: recent ones weigh more, exponentially.
+
+    Args:
+        parameters: What is averaged.
+        decay: Share of itself that the mean keeps in an iteration, in [0, 1); 0: there is none.
+    """
+
+    def __init__(self, parameters: Sequence[nn.Parameter], decay: float) -> None:
+        self._parameters = list(parameters)
+        self._decay = decay
+        self._means = [p.detach().clone() for p in parameters] if decay > 0.0 else []
+
+    @torch.no_grad()
+    def update(self, iteration: int) -> None:
+        """Take the parameters after an iteration, counted from 0, into the mean."""
+        if self._means:
+            # What untrained weights have to say is soon forgotten.
+            keep = min(self._decay, (1 + iteration) / (10 + iteration))
+            torch._foreach_lerp_(self._means, self._parameters, 1.0 - keep)
+
+    @torch.no_grad()
+    def rule(self, rule: NPARule) -> NPARule:
+        """Return a copy of the rule that has the parameters with their means; itself without."""
+        if not self._means:
+            return rule
+        averaged = copy.deepcopy(rule)
+        trained = [parameter for parameter in averaged.parameters() if parameter.requires_grad]
+        torch._foreach_copy_(trained, self._means)
+        return averaged
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the means as the entry `average` of a checkpoint, or nothing."""
+        means = {str(number): mean for number, mean in enumerate(self._means)}
+        return {"average": means} if means else {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from a checkpoint with the entries of `state_dict`."""
+        for number, mean in enumerate(self._means):
+            mean.copy_(state["average"][str(number)])
 
 
 NONE_YET = -1

@@ -115,13 +115,13 @@ class _JointTrainer(Trainer):
             raise NPAError("frozen must leave a rule that learns, got all of them: leave one out")
         return cast(NPARule, JointRules(rules))
 
-    def _save_rule(self, told: dict[str, Any]) -> None:
-        for number, rule in enumerate(cast(JointRules, self.rule)):
+    def _save_rule(self, rule: NPARule, told: dict[str, Any]) -> None:
+        for number, one in enumerate(cast(JointRules, rule)):
             own = {name: told[name] for name in told if name not in ("initial_rules", "frozen")}
             own["task"] = told["task"]["species"][number]
             metadata = {"task": "morphogenesis2d", "config": json.dumps(own)}
             metadata |= {"iteration": str(self.iteration), "trained_in": TASK_NAME}
-            save_rule(rule, self.folder.rule_of(number), metadata=metadata)
+            save_rule(one, self.folder.rule_of(number), metadata=metadata)
 
 
 def train_together(

@@ -334,7 +334,7 @@ NEEDED: dict[str, type] = {
 """What a run is resumed from, and of what types it is."""
 
 NOT_NEGATIVE = {
-    *("iteration", "seconds", "replaced", "count", "step_sum", "goal"),
+    *("iteration", "seconds", "replaced", "count", "step_sum", "goal", "age"),
     *("step", "exp_avg_sq"),  # AdamW's
 }
 """Names of numbers and tensors in a checkpoint that are at least 0."""

@@ -59,7 +59,7 @@ class TrainResult:
     """What a run came to."""
 
     rule: NPARule
-    """The rule as it stands."""
+    """The rule as it stands: the mean of its weights, where that is kept."""
 
     iteration: int
     """Iterations done."""
@@ -186,7 +186,7 @@ class Trainer:
                 self._board.close()
                 self._board = None
         return TrainResult(
-            rule=self.rule,
+            rule=self._cycle.average.rule(self.rule),
             iteration=self.iteration,
             finished=self.iteration >= total,
             interrupted=stop.is_set(),
@@ -215,12 +215,12 @@ class Trainer:
         # A rule is passed on: where and on what it was trained is nobody's business.
         told = config_to_dict(self.config)
         told = {name: told[name] for name in told if name not in ("out", "device", "initial_rule")}
-        self._save_rule(told)
+        self._save_rule(self._cycle.average.rule(self.rule), told)
 
-    def _save_rule(self, told: dict[str, Any]) -> None:
+    def _save_rule(self, rule: NPARule, told: dict[str, Any]) -> None:
         metadata = {"task": self.task_name, "config": json.dumps(told)}
         metadata["iteration"] = str(self.iteration)
-        save_rule(self.rule, self.folder.rule, metadata=metadata)
+        save_rule(rule, self.folder.rule, metadata=metadata)
 
     def _origin(self) -> dict[str, Any]:
         """Return what checkpoint and diagnosis say of where they come from."""

@@ -1,0 +1,505 @@
+"""Recipes of training compared: choices switched on and off, on pictures that nobody tuned for.
+
+An arm is a recipe with one choice changed. `run` trains every arm on every picture of a folder and
+measures the rules as `npa-envs evaluate --healing` does, with seeds that training never saw; on a
+GPU several runs share the device, each on a stream of its own. Every finished run is a line of
+JSON, so that a stopped call goes on where it was. `warm-up` compiles all kernels and tests that
+runs side by side learn bit for bit what they learn alone; `merge` makes one record, one sheet of
+pictures and one archive of rules of what several processes left; `report` prints the tables.
+
+    python benchmarks/recipes.py warm-up --device cuda --out OUT
+    CUDA_VISIBLE_DEVICES=0 python benchmarks/recipes.py run --pictures DIR --device cuda --out OUT
+    python benchmarks/recipes.py merge --out OUT
+    python benchmarks/recipes.py report OUT/recipes.json
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import statistics
+import sys
+import tarfile
+import tempfile
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+
+from npa_envs.measure.quality import Runner, evaluate, healing
+from npa_envs.measure.record import machine, write_record
+from npa_envs.render.colours import to_uint8
+from npa_envs.rule.files import save_rule
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DTrainConfig
+from npa_envs.training import Trainer, preset
+from npa_envs.world.recorded import release_recordings
+
+SEEDS = tuple(range(1000, 1008))
+"""Seeds of the worlds that rules are measured on."""
+
+STEPS = (64, 128, 256, 512, 1024, 2048, 4096)
+"""Steps at which they are measured; worlds of full size also at `LAST`."""
+
+LAST = 20_000
+"""The last step at which worlds of full size are measured."""
+
+QUARTERS = (0.2, 0.4, 0.6, 0.8)
+"""Milestones of the paper's schedule, as shares of its length."""
+
+SIDE_BY_SIDE = 6
+"""Runs of which the first is compared with one that has the device for itself."""
+
+Fields = Mapping[str, Any]
+
+SIZES: Mapping[str, Fields] = {
+    "full": {"particle_count": 4096, "target_point_count": 4096, "iterations": 10_000},
+    "small": {
+        "particle_count": 1024,
+        "target_point_count": 1024,
+        "resolution": 128,
+        "eps": 0.14,
+        "seed_radius": 0.28,
+        "iterations": 3000,
+    },
+    "fast": {},
+    "tiny": {
+        "particle_count": 128,
+        "target_point_count": 128,
+        "resolution": 32,
+        "hidden_dim": 16,
+        "eps": 0.3,
+        "iterations": 6,
+        "steps": (4, 6),
+        "lifetimes": (4, 64),
+        "pool_size": 16,
+    },
+}
+"""Worlds: as in the preset `paper`; a quarter of its particles, which see as many others and
+begin in a disk as large, as they see; as in `fast`; and a test of the script."""
+
+STRAYS: Fields = {
+    "stray_share": 2e-4,
+    "stray_weight": 10.0,
+    "bound_weight": 10.0,
+    "drift_weight": 1.0,
+    "clump_radius": 0.2,
+    "cut_gap": 0.1,
+}
+"""What keeps worlds together for 100 000 steps, and heals clumps and cuts."""
+
+AGES: Fields = {"lifetimes": (64, 16_384), "pool_size": 64}
+"""Worlds of all ages in every batch."""
+
+RECIPE: Fields = {
+    **AGES,
+    **STRAYS,
+    "schedule": "cosine",
+    "learning_rate": 1e-3,
+    "average": 0.999,
+    "blur_levels": 3,
+    "steps": (48, 80),
+}
+"""The candidate that the arms change one thing of each."""
+
+NO_STRAYS: Fields = dict.fromkeys(
+    ("stray_share", "stray_weight", "drift_weight", "clump_radius", "cut_gap"), 0.0
+) | {"bound_weight": 100.0}
+
+ARMS: Mapping[str, Fields] = {
+    "recipe": {},
+    "no ages, seeds every 3rd": {"lifetimes": (0, 0), "pool_size": 512, "seed_interval": 3},
+    "no average": {"average": 0.0},
+    "no blur": {"blur_levels": 0},
+    "no strays": NO_STRAYS,
+    "milestones": {"schedule": "milestones"},
+    "rate 2e-3": {"learning_rate": 2e-3},
+    "rate 5e-4": {"learning_rate": 5e-4},
+    "lifetimes to 4096": {"lifetimes": (64, 4096)},
+    "lifetimes from 256": {"lifetimes": (256, 16_384)},
+    "lifetimes from 16": {"lifetimes": (16, 16_384)},
+    "seed radius 0.56": {"seed_radius": 0.56},
+    "hidden 256": {"hidden_dim": 256},
+    "lifetimes to 65536": {"lifetimes": (64, 65_536)},
+    "pool 256": {"pool_size": 256},
+    "blur 5": {"blur_levels": 5},
+    "steps 32 to 96": {"steps": (32, 96)},
+    "steps 32 to 48": {"steps": (32, 48), "iterations": 4800},
+    "4 worlds": {"world_count": 4, "iterations": 6000},
+    "16 worlds": {"world_count": 16, "iterations": 1500},
+}
+"""Arms of `full` and `small`: what each changes of the recipe."""
+
+PAPER: Mapping[str, Fields] = {
+    "paper": {},
+    "paper, seeds every 3rd": {"seed_interval": 3},
+}
+"""The paper's schedule in one repeat, from which the recipe starts."""
+
+FAST_RECIPE: Fields = {
+    "lifetimes": (24, 2048),
+    "pool_size": 16,
+    "schedule": "cosine",
+    "average": 0.99,
+    "blur_levels": 2,
+}
+
+FAST_ARMS: Mapping[str, Fields] = {
+    "recipe": {},
+    "no ages": {"lifetimes": (0, 0), "pool_size": 32},
+    "no average": {"average": 0.0},
+    "no blur": {"blur_levels": 0},
+    "milestones": {"schedule": "milestones"},
+    "strays": {**STRAYS, "drift_weight": 1.0},
+    "rate 1e-3": {"learning_rate": 1e-3},
+    "rate 4e-3": {"learning_rate": 4e-3},
+    "lifetimes to 8192": {"lifetimes": (24, 8192)},
+    "lifetimes from 96": {"lifetimes": (96, 2048)},
+    "4 worlds": {"world_count": 4, "iterations": 1200},
+    "damage 0.2": {"damage_radius": 0.2},
+}
+"""Arms of `fast`."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training run."""
+
+    size: str
+    """A name of `SIZES`."""
+    arm: str
+    """A name of `ARMS`, `FAST_ARMS` or `PAPER`."""
+    picture: str
+    """Stem of the picture's file."""
+    seed: int
+    """Seed of the run."""
+
+    @property
+    def name(self) -> str:
+        """What its files are called."""
+        return (
+            f"{self.size}-{self.arm.replace(' ', '_').replace(',', '')}-{self.picture}-{self.seed}"
+        )
+
+
+def configuration(
+    run: Run, picture: Path, out: Path, device: str, changes: Fields
+) -> Morphogenesis2DTrainConfig:
+    """Return what a run is told."""
+    fields: dict[str, Any] = {"repeats": 1, "tensorboard": False, "picture_interval": 0}
+    if run.size == "fast":
+        base = "fast"
+        if run.arm != "fast":
+            fields |= FAST_RECIPE | FAST_ARMS[run.arm]
+    else:
+        base = "paper"
+        if run.arm in PAPER:
+            fields |= PAPER[run.arm] | SIZES[run.size]
+        else:
+            fields |= RECIPE | SIZES[run.size] | ARMS[run.arm]
+    fields |= changes
+    if run.size != "fast" and fields.get("schedule") != "cosine":
+        fields["milestones"] = tuple(round(share * fields["iterations"]) for share in QUARTERS)
+    fields |= {"out": out, "device": device, "seed": run.seed, "target": str(picture)}
+    fields["checkpoint_interval"] = 10**9
+    return preset(base, **fields)
+
+
+@contextlib.contextmanager
+def stream_of(device: torch.device) -> Iterator[Any]:
+    """Yield a stream of one's own, and nothing on a CPU."""
+    yield torch.cuda.Stream(device) if device.type == "cuda" else contextlib.nullcontext()
+
+
+def on(stream: Any) -> Any:
+    """Return a context in which work goes to a stream."""
+    return torch.cuda.stream(stream) if isinstance(stream, torch.cuda.Stream) else stream
+
+
+def train_side_by_side(
+    configs: Sequence[Morphogenesis2DTrainConfig], iterations: int | None = None
+) -> tuple[list[Trainer], float]:
+    """Train several rules, an iteration of each in turn; return the trainers and the seconds."""
+    device = torch.device(configs[0].device)
+    streams, trainers = [], []
+    for config in configs:
+        with stream_of(device) as stream, on(stream):
+            task = Morphogenesis2D(config.task, device=device)
+            trainers.append(Trainer(task, config, task_name="morphogenesis2d"))
+            streams.append(stream)
+    begun = time.perf_counter()
+    most = max(config.total_iterations for config in configs) if iterations is None else iterations
+    for _ in range(most):
+        for trainer, stream in zip(trainers, streams, strict=True):
+            if trainer.iteration < trainer.config.total_iterations:
+                with on(stream):
+                    trainer.iterate()
+    if device.type == "cuda":
+        torch.cuda.synchronize()
+    return trainers, time.perf_counter() - begun
+
+
+def measured(trainer: Trainer, size: str) -> dict[str, Any]:
+    """Return growth and healing of a trained rule, by the means of all worlds."""
+    task: Any = trainer.task
+    rule = trainer._cycle.average.rule(trainer.rule)
+    device = trainer.config.device
+    steps = {"full": (*STEPS, LAST), "tiny": (4, 8)}.get(size, STEPS)
+    rows = evaluate(rule, task, checkpoints=steps, seeds=SEEDS, device=device)
+    grow, heal = (8, 8) if size == "tiny" else (1024, 500)
+    healed = healing(rule, task, grow_steps=grow, heal_steps=heal, seeds=SEEDS, device=device)
+    if trainer.config.device.startswith("cuda"):
+        release_recordings()
+    return {"growth": [asdict(row) for row in rows], "healing": [asdict(row) for row in healed]}
+
+
+@torch.no_grad()
+def strip(trainer: Trainer, steps: Sequence[int]) -> np.ndarray[Any, Any]:
+    """Return pictures of the target and of one world as it grows, side by side."""
+    task: Any = trainer.task
+    rule = trainer._cycle.average.rule(trainer.rule)
+    device = torch.device(trainer.config.device)
+    runner = Runner(rule, task, device, SEEDS[0], None)
+    x, s = task.seed(1, generator=torch.Generator(device).manual_seed(SEEDS[0]), device=device)
+    frames, before = [task.target_picture[None]], 0
+    for step in steps:
+        x, s = runner.run(x, s, step - before)
+        frames.append(task.picture(x, s))
+        before = step
+    picture = to_uint8(torch.cat([frame.cpu() for frame in frames]))
+    side = max(1, picture.shape[1] // 128)
+    return np.concatenate(list(picture[:, ::side, ::side]), axis=1)
+
+
+def read_lines(folder: Path) -> list[dict[str, Any]]:
+    """Return the finished runs that lie in a folder."""
+    merged = folder / "recipes.json"
+    lines: list[dict[str, Any]] = []
+    if merged.exists():
+        lines = json.loads(merged.read_text("utf-8"))["runs"]
+    for path in sorted(folder.glob("runs-*.jsonl")):
+        for line in path.read_text("utf-8").splitlines():
+            with contextlib.suppress(ValueError):
+                lines.append(json.loads(line))
+    return lines
+
+
+def key_of(line: Mapping[str, Any]) -> Run:
+    """Return which run a line is of."""
+    return Run(*(line[name] for name in ("size", "arm", "picture", "seed")))
+
+
+def groups_of(runs: Iterable[Run], together: int) -> Iterator[list[Run]]:
+    """Yield runs of one size, a few at a time."""
+    group: list[Run] = []
+    for run in runs:
+        if group and (len(group) == together or group[0].size != run.size):
+            yield group
+            group = []
+        group.append(run)
+    if group:
+        yield group
+
+
+def run_all(arguments: argparse.Namespace) -> None:
+    """Train and measure all runs of this process, a group at a time, until time is up."""
+    out: Path = arguments.out
+    out.mkdir(parents=True, exist_ok=True)
+    deadline = time.perf_counter() + arguments.seconds
+    pictures = {path.stem: path for path in sorted(arguments.pictures.glob("*.png"))}
+    chosen = arguments.names or list(pictures)
+    changes = json.loads(arguments.fields)
+    changes = {k: tuple(v) if isinstance(v, list) else v for k, v in changes.items()}
+    done = {key_of(line) for line in read_lines(out)}
+    arms = arguments.arms or ["fast", *FAST_ARMS]
+    if arguments.size != "fast":
+        arms = arguments.arms or [*PAPER, *ARMS]
+    runs = [
+        Run(arguments.size, arm, picture, seed)
+        for seed in arguments.seeds
+        for arm in arms
+        for picture in chosen
+    ]
+    together = arguments.together
+    if (out / "check.json").exists() and not json.loads((out / "check.json").read_text())["same"]:
+        together = 1
+    longest = 0.0
+    for group in groups_of((run for run in runs if run not in done), together):
+        begun = time.perf_counter()
+        if begun + longest > deadline:
+            print(f"out of time before {group[0].name}", flush=True)
+            return
+        with tempfile.TemporaryDirectory() as folder:
+            configs = [
+                configuration(
+                    run, pictures[run.picture], Path(folder) / run.name, arguments.device, changes
+                )
+                for run in group
+            ]
+            trainers, seconds = train_side_by_side(configs)
+            for run, trainer in zip(group, trainers, strict=True):
+                line = asdict(run) | {"iterations": trainer.iteration, "seconds": seconds}
+                line |= {"together": len(group), "fields": changes} | measured(trainer, run.size)
+                rule = trainer._cycle.average.rule(trainer.rule)
+                save_rule(rule, out / f"rule-{run.name}.safetensors")
+                if arguments.strips:
+                    steps = (4, 8) if run.size == "tiny" else (32, 64, 128, 512, 4096)
+                    Image.fromarray(strip(trainer, steps)).save(out / f"strip-{run.name}.png")
+                    if arguments.device.startswith("cuda"):
+                        release_recordings()
+                with (out / f"runs-{arguments.process}.jsonl").open("a") as file:
+                    file.write(json.dumps(line) + "\n")
+                losses = " ".join(f"{r['step']}:{r['loss']:.3f}" for r in line["growth"])
+                print(f"{run.name} {seconds:.0f} s  {losses}", flush=True)
+            del trainers
+        longest = max(longest, time.perf_counter() - begun)
+
+
+def warm_up(arguments: argparse.Namespace) -> None:
+    """Compile kernels, and see whether runs side by side learn what they learn alone."""
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    sizes = ["tiny"] if arguments.tiny else ["small", "full", "fast"]
+    target = Path("gecko")
+    weights = []
+    with tempfile.TemporaryDirectory() as folder:
+
+        def config(size: str, name: str, **fields: Any) -> Morphogenesis2DTrainConfig:
+            run = Run(size, "recipe", name, fields.pop("seed", 0))
+            # Few numbers of steps, each of which is a capture.
+            few = fields if arguments.tiny else {"steps": (48, 50)} | fields
+            return configuration(run, target, Path(folder) / name, arguments.device, few)
+
+        for size in sizes:
+            (trainer,), _ = train_side_by_side([config(size, f"{size}-first", iterations=8)])
+            measured(trainer, "tiny")
+        size = sizes[0]
+        wide = config(size, "wide", iterations=3, hidden_dim=256)
+        measured(train_side_by_side([wide])[0][0], "tiny")
+        wide = config(size, "paper", iterations=3, lifetimes=(0, 0), average=0.0, blur_levels=0)
+        measured(train_side_by_side([wide])[0][0], "tiny")
+        for name in ("alone", "again"):
+            (trainer,), _ = train_side_by_side([config(size, name, iterations=40)])
+            weights.append(torch.nn.utils.parameters_to_vector(trainer.rule.parameters()))
+        side = [config(size, f"side{k}", iterations=40, seed=k) for k in range(SIDE_BY_SIDE)]
+        trainers, _ = train_side_by_side(side)
+        weights.append(torch.nn.utils.parameters_to_vector(trainers[0].rule.parameters()))
+        # The pace that both have once all is recorded.
+        paces = {}
+        if not arguments.tiny:
+            for size, counts in {"small": (1, 4, 8), "full": (1, 2, 3), "fast": (1, 8)}.items():
+                for count in counts:
+                    name = f"{size}-{count}"
+                    many = [config(size, f"{name}-{k}", iterations=100) for k in range(count)]
+                    paces[f"{name}: seconds"] = train_side_by_side(many)[1]
+    repeatable = torch.equal(weights[0], weights[1])
+    same = torch.equal(weights[0], weights[2]) or not repeatable
+    same = same and bool(torch.isfinite(weights[2]).all())
+    write_record(
+        arguments.out / "check.json", {"same": same, "repeatable": repeatable, "paces": paces}
+    )
+    print((arguments.out / "check.json").read_text(), flush=True)
+
+
+def merge(arguments: argparse.Namespace) -> None:
+    """Make one record, one sheet and one archive of what several processes left in a folder."""
+    out: Path = arguments.out
+    record = {"machine": machine(torch.device(arguments.device)), "runs": read_lines(out)}
+    write_record(out / "recipes.json", record)
+    for path in out.glob("runs-*.jsonl"):
+        path.unlink()
+    with tarfile.open(out / "rules.tar", "w") as archive:
+        for path in sorted(out.glob("rule-*.safetensors")):
+            archive.add(path, path.name)
+            path.unlink()
+    strips = sorted(out.glob("strip-*.png"))
+    if strips:
+        rows = [np.asarray(Image.open(path)) for path in strips]
+        width = max(row.shape[1] for row in rows)
+        rows = [np.pad(r, ((0, 4), (0, width - r.shape[1]), (0, 0))) for r in rows]
+        Image.fromarray(np.concatenate(rows)).save(out / "strips.png")
+        (out / "strips.txt").write_text("\n".join(path.stem for path in strips) + "\n")
+    for path in strips:
+        path.unlink()
+
+
+REPORTED = (64, 128, 512, 4096, LAST)
+"""Steps of the tables."""
+
+
+def table(runs: Sequence[Mapping[str, Any]], size: str) -> str:
+    """Return the arms of a size as a Markdown table: means over pictures and seeds, the worst."""
+    arms: dict[str, list[Mapping[str, Any]]] = {}
+    for run in runs:
+        if run["size"] == size:
+            arms.setdefault(run["arm"], []).append(run)
+    steps = [n for n in REPORTED if any(_loss(r, n) is not None for a in arms.values() for r in a)]
+    head = ["arm", "runs", *map(str, steps), "worst from 128", "healed"]
+    lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
+    for arm, own in arms.items():
+        cells = [arm, str(len(own))]
+        for step in steps:
+            losses = [loss for run in own if (loss := _loss(run, step)) is not None]
+            cells.append(f"{statistics.fmean(losses):.3f}" if losses else "")
+        worst = max((_loss(r, n) or 0.0 for r in own for n in steps if n >= 128), default=0.0)
+        rows = [row for run in own for row in run["healing"]]
+        share = sum(r["worlds_healed"] for r in rows) / sum(r["world_count"] for r in rows)
+        lines.append(f"| {' | '.join([*cells, f'{worst:.3f}', f'{share:.0%}'])} |")
+    return "\n".join(lines)
+
+
+def _loss(run: Mapping[str, Any], step: int) -> float | None:
+    return next((row["loss"] for row in run["growth"] if row["step"] == step), None)
+
+
+def report(arguments: argparse.Namespace) -> None:
+    """Print the tables of a record."""
+    runs = json.loads(arguments.record.read_text("utf-8"))["runs"]
+    for size in SIZES:
+        if any(run["size"] == size for run in runs):
+            print(f"\n{size}\n\n{table(runs, size)}")
+
+
+def main() -> None:
+    """Do what the command line says."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    commands = parser.add_subparsers(required=True)
+    own = commands.add_parser("warm-up")
+    own.set_defaults(main=warm_up)
+    own.add_argument("--out", type=Path, required=True)
+    own.add_argument("--device", default="cpu")
+    own.add_argument("--tiny", action="store_true", help="worlds of a test")
+    own = commands.add_parser("run")
+    own.set_defaults(main=run_all)
+    own.add_argument("--out", type=Path, required=True)
+    own.add_argument("--pictures", type=Path, required=True, help="folder of PNG files")
+    own.add_argument("--names", nargs="+", help="stems of the pictures; all")
+    own.add_argument("--device", default="cpu")
+    own.add_argument("--size", choices=SIZES, default="small")
+    own.add_argument("--arms", nargs="+", help="all of the size")
+    own.add_argument("--seeds", type=int, nargs="+", default=[0])
+    own.add_argument("--together", type=int, default=1, help="runs that share the device")
+    own.add_argument("--seconds", type=float, default=1e9, help="begin no run that would end later")
+    own.add_argument("--process", default="0", help="part of the name of the file of results")
+    own.add_argument("--fields", default="{}", help="JSON object of fields for all arms")
+    own.add_argument("--strips", action="store_true", help="pictures of what grows")
+    own = commands.add_parser("merge")
+    own.set_defaults(main=merge)
+    own.add_argument("--out", type=Path, required=True)
+    own.add_argument("--device", default="cpu")
+    own = commands.add_parser("report")
+    own.set_defaults(main=report)
+    own.add_argument("record", type=Path)
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    arguments.main(arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
