@@ -1,7 +1,9 @@
 """Configurations: checks, overrides, files, presets."""
 
 import dataclasses
+import itertools
 import json
+import math
 from pathlib import Path
 
 import pytest
@@ -41,6 +43,20 @@ def test_learning_rate_falls_at_milestones_and_starts_afresh_with_each_repeat():
     assert rates == [1, 1, 0.5, 0.5, 0.5, 0.25, 0.25, 0.25, 0.25, 0.25, 1, 1]
 
 
+@pytest.mark.parametrize("iterations", [10, 1000])
+def test_learning_rate_rises_shortly_and_falls_along_a_cosine_whatever_the_length(iterations):
+    config = override(PAPER, iterations=iterations, learning_rate=1.0, schedule="cosine")
+    rates = [config.learning_rate_at(k) for k in range(2 * iterations)]
+    assert rates[:iterations] == rates[iterations:]
+    assert rates[0] == pytest.approx(min(1.0, 100 / iterations))
+    assert rates[iterations // 2] == pytest.approx(0.505)
+    last = math.pi * (iterations - 1) / iterations
+    assert rates[-1] == pytest.approx(0.01 + 0.99 * (0.5 + 0.5 * math.cos(last)))
+    top = rates.index(max(rates))
+    assert top <= iterations // 100
+    assert all(a > b for a, b in itertools.pairwise(rates[top:iterations]))
+
+
 def test_override_reaches_fields_of_the_run_and_of_the_task():
     config = override(PAPER, iterations=7, target="heart", eps=1, out="elsewhere")
     assert (config.iterations, config.task.target, config.out) == (7, "heart", Path("elsewhere"))
@@ -66,6 +82,12 @@ def test_no_field_of_the_run_hides_one_of_the_task():
         ("weight_decay", -1, "weight_decay must be a finite number of at least 0, got -1.0"),
         ("steps", [5, 5], "steps must be two whole numbers"),
         ("steps", 5, "steps must be a list, got 5"),
+        ("lifetimes", [5, 2], "lifetimes must be two whole numbers"),
+        ("lifetimes", [0, 2], "lifetimes must be two whole numbers"),
+        ("average", 1.0, "average must be below 1, got 1.0"),
+        ("schedule", "linear", "schedule must be one of milestones, cosine, got 'linear'"),
+        ("blur_levels", 7, "blur_levels must leave pictures of at least 4 pixels a side, got 7"),
+        ("blur_levels", -1, "blur_levels must be a whole number of at least 0, got -1"),
         ("milestones", [5, 2], "milestones must be positive and increasing"),
         ("world_count", 1000, "world_count must be at most pool_size"),
         ("seed", -1, r"seed must be a whole number of at least 0 and below 2\*\*63, got -1"),
@@ -85,6 +107,13 @@ def test_no_field_of_the_run_hides_one_of_the_task():
 def test_each_wrong_value_is_named(field, value, rule):
     with pytest.raises(NPAError, match=rule):
         override(PAPER, **{field: value})
+
+
+def test_sections_of_a_pool_with_lifetimes_are_equal():
+    with pytest.raises(NPAError, match="pool_size must be a multiple of world_count where"):
+        override(PAPER, lifetimes=[64, 128], pool_size=36)
+    assert override(PAPER, lifetimes=[64, 128], pool_size=32).ages
+    assert not override(PAPER, pool_size=36).ages
 
 
 def test_the_largest_seed_and_a_device_that_is_not_here_are_accepted():

@@ -1,5 +1,6 @@
 """Pool, optimiser, iteration and meter, each by itself."""
 
+import itertools
 import math
 import zipfile
 
@@ -16,6 +17,7 @@ from npa_envs.training.iteration import (
     Interval,
     LossMeter,
     RuleOptimiser,
+    WeightAverage,
     WorldPool,
     clear_non_finite,
     normalise_gradients,
@@ -46,6 +48,31 @@ def test_pool_draws_different_worlds_and_all_of_them_in_the_long_run():
     x.zero_()
     s.zero_()
     assert (pool.x[4, 0, 0], pool.s[2, 0, 0]) == (4, 2)
+
+
+def test_a_pool_with_lifetimes_draws_one_world_of_each_section():
+    x = torch.zeros(12, 2, 2)
+    pool = WorldPool(x, x.clone(), runaway_limit=1.0, lifetimes=(10, 1000))
+    lifetimes = pool.lifetime.tolist()
+    assert (lifetimes[0], lifetimes[-1]) == (10, 1000)
+    ratios = [b / a for a, b in itertools.pairwise(lifetimes)]
+    assert ratios == pytest.approx([100 ** (1 / 11)] * 11, rel=0.03)
+    generator = torch.Generator().manual_seed(0)
+    drawn = torch.stack([pool.sample(4, generator) for _ in range(60)])
+    assert (drawn // 3 == torch.arange(4)).all()
+    assert set(drawn.flatten().tolist()) == set(range(12))
+
+
+def test_worlds_age_and_are_new_when_they_run_away():
+    x = torch.zeros(4, 2, 2)
+    pool = WorldPool(x, x.clone(), runaway_limit=1.0, lifetimes=(5, 40))
+    index = torch.tensor([0, 2, 3])
+    after = torch.tensor([0.0, 0.0, 3.0])[:, None, None].expand(3, 2, 2)
+    pool.write(index, after, after, x[:3], x[:3], age=torch.tensor([7, 8, 9]))
+    assert pool.age.tolist() == [7, 0, 8, 0]
+    age, over = pool.ages_of(index)
+    assert age.tolist() == [7, 8, 0]
+    assert over.tolist() == [True, False, False]
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 11.0, -11.0])
@@ -100,6 +127,39 @@ def test_first_step_of_each_repeat_has_the_full_learning_rate_and_fresh_moments(
     parameter.grad = torch.zeros(1)
     RuleOptimiser([parameter], config).step(0)
     assert parameter.item() == pytest.approx(1 - 0.01 * 0.5)
+
+
+def test_average_of_weights_forgets_the_first_ones_soon():
+    parameter = nn.Parameter(torch.tensor([8.0]))
+    average = WeightAverage([parameter], 0.75)
+    mean, share = 8.0, []
+    for iteration, value in enumerate([1.0, 5.0, 2.0] + 40 * [3.0]):
+        with torch.no_grad():
+            parameter.fill_(value)
+        average.update(iteration)
+        keep = min(0.75, (1 + iteration) / (10 + iteration))
+        mean = keep * mean + (1 - keep) * value
+        share.append(keep)
+        assert average.state_dict()["average"]["0"].item() == pytest.approx(mean, rel=1e-5)
+    assert (share[0], share[-1]) == (0.1, 0.75)
+    assert WeightAverage([parameter], 0.0).state_dict() == {}
+
+
+def test_the_rule_of_an_average_is_a_copy_and_leaves_frozen_weights():
+    rule = CircleTask().make_rule(torch.Generator().manual_seed(1))
+    frozen, *trained = rule.parameters()
+    frozen.requires_grad_(False)
+    average = WeightAverage(trained, 0.5)
+    before = [p.detach().clone() for p in rule.parameters()]
+    with torch.no_grad():
+        for parameter in rule.parameters():
+            parameter += 10.0
+    average.update(0)
+    first, *others = average.rule(rule).parameters()
+    assert torch.equal(first, before[0] + 10.0)
+    for own, old in zip(others, before[1:], strict=True):
+        torch.testing.assert_close(own, old + 9.0)
+    assert WeightAverage(trained, 0.0).rule(rule) is rule
 
 
 def make_iteration(config, kind=EagerIteration, device="cpu"):

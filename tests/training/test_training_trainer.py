@@ -57,6 +57,7 @@ def test_training_starts_from_an_initial_rule_of_its_shape(tmp_path):
         (5, {}),
         (5, {"repeats": 2, "iterations": 3, "milestones": [1]}),
         (5, {"log_interval": 2, "checkpoint_interval": 3}),
+        (5, {"lifetimes": (3, 40), "pool_size": 9, "average": 0.9, "schedule": "cosine"}),
         (5, {"dtype": "float64", "damage": False, "normalise_gradients": False}),
     ],
 )
@@ -175,6 +176,26 @@ def test_every_fourth_batch_starts_with_a_fresh_seed(tmp_path):
     trainer_of(config, task, rollout=task.make_rollout()).run(progress=False)
     assert [first for first, _ in task.fresh[4:]] == [k % 4 == 0 for k in range(4, 40)]
     assert not any(second for _, second in task.fresh[4:])
+
+
+def test_worlds_that_have_lived_are_replaced_by_seeds_and_all_others_grow_older(tmp_path):
+    task, steps = WatchedTask(), []
+
+    def rollout(rule, x, s, count, **options):
+        steps.append(count)
+        return task.make_rollout()(rule, x, s, count, **options)
+
+    fields = {"iterations": 60, "world_count": 2, "pool_size": 2, "milestones": []}
+    fields |= {"lifetimes": (1, 40), "steps": (4, 8), "damage": False}
+    config = circle_config(tmp_path, **fields)
+    trainer_of(config, task, rollout=rollout).run(progress=False)
+    ages = [0, 0]
+    for count, (first, second) in zip(steps, task.fresh, strict=True):
+        # The first world never lives longer than a rollout.
+        assert first
+        assert second == (ages[1] == 0 or ages[1] >= 40)
+        ages[1] = (0 if second else ages[1]) + count
+    assert 5 < sum(second for _, second in task.fresh) < 12
 
 
 @pytest.mark.parametrize("damage", [True, False])
