@@ -219,7 +219,8 @@ class WorldPool:
         self.lifetime: Tensor | None = None
         """Age at which the world of each place has lived, int64, shape [W], or None."""
         if lifetimes is not None:
-            logarithms = torch.linspace(*map(math.log, lifetimes), len(x), dtype=torch.float64)
+            lo, hi = map(math.log, lifetimes)
+            logarithms = torch.linspace(lo, hi, len(x), dtype=torch.float64)
             self.lifetime = logarithms.exp().round().to(x.device, torch.int64)
         self._runaway_limit = runaway_limit
 
@@ -526,7 +527,7 @@ class WeightAverage:
     """
 
     def __init__(self, parameters: Sequence[nn.Parameter], decay: float) -> None:
-        self._parameters = list(parameters)
+        self._parameters: list[Tensor] = list(parameters)
         self._decay = decay
         self._means = [p.detach().clone() for p in parameters] if decay > 0.0 else []
 
@@ -545,7 +546,8 @@ class WeightAverage:
             return rule
         averaged = copy.deepcopy(rule)
         trained = [parameter for parameter in averaged.parameters() if parameter.requires_grad]
-        torch._foreach_copy_(trained, self._means)
+        for parameter, mean in zip(trained, self._means, strict=True):
+            parameter.copy_(mean)
         return averaged
 
     def state_dict(self) -> dict[str, Any]:

@@ -110,17 +110,37 @@ def config_to_dict(config: TrainConfig[Any]) -> dict[str, Any]:
     Args:
         config: The configuration; `override(base, **config_to_dict(config))` gives it back.
     """
-
-    def plain(value: Any) -> Any:
-        if isinstance(value, tuple):
-            return [plain(item) for item in value]
-        if isinstance(value, dict):
-            return {key: plain(item) for key, item in value.items()}
-        return str(value) if isinstance(value, Path) else value
-
-    result = plain(dataclasses.asdict(config))
+    result = _plain(dataclasses.asdict(config))
     assert isinstance(result, dict)
     return result
+
+
+def completed(held: Any, config: Any) -> Any:
+    """Return a configuration that was kept, with the defaults of fields that are younger than it.
+
+    Args:
+        held: What `config_to_dict` once returned.
+        config: A configuration of the same kind as it is made now.
+    """
+    if dataclasses.is_dataclass(config) and isinstance(held, dict):
+        younger = {
+            field.name: _plain(field.default)
+            for field in dataclasses.fields(config)
+            if field.name not in held and field.default is not dataclasses.MISSING
+        }
+        now = {name: getattr(config, name, None) for name in held}
+        return younger | {name: completed(value, now[name]) for name, value in held.items()}
+    if isinstance(config, tuple) and isinstance(held, list) and len(config) == len(held):
+        return [completed(one, own) for one, own in zip(held, config, strict=True)]
+    return held
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, tuple | list):
+        return [_plain(item) for item in value]
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    return str(value) if isinstance(value, Path) else value
 
 
 def _parse(path: Path, text: str) -> Any:

@@ -27,7 +27,7 @@ from npa_envs.files import (
 )
 from npa_envs.tasks.checks import is_real, is_whole
 from npa_envs.tasks.train_config import TrainConfig
-from npa_envs.training.overrides import config_to_dict
+from npa_envs.training.overrides import completed, config_to_dict
 
 try:
     import fcntl
@@ -426,7 +426,8 @@ def check_same_run(
             f"the checkpoint {str(path)!r} is of task {shown(content['task_name'])}, "
             f"not of {task_name!r}: resume it with that task, or choose another folder"
         )
-    theirs, ours = _flat(content["config"]), _flat(config_to_dict(config))
+    theirs = _flat(completed(content["config"], config))
+    ours = _flat(config_to_dict(config))
     differences = [
         f"{name}: {shown(theirs.get(name, 'absent'))} there, {shown(ours.get(name, 'absent'))} here"
         for name in sorted(theirs.keys() | ours.keys())

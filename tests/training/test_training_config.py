@@ -20,6 +20,7 @@ from npa_envs.training import (
     preset,
     task_entry,
 )
+from npa_envs.training.overrides import completed
 
 PAPER = preset("paper")
 
@@ -63,6 +64,15 @@ def test_override_reaches_fields_of_the_run_and_of_the_task():
     assert config.task.eps == 1.0
     assert isinstance(config.task.eps, float)
     assert (PAPER.iterations, PAPER.task.target) == (10_000, "gecko")
+
+
+def test_configurations_that_were_kept_get_the_defaults_of_younger_fields():
+    config = preset("fast", "co_morphogenesis2d", average=0.5)
+    held = config_to_dict(config)
+    whole = json.loads(json.dumps(held))
+    del held["lifetimes"], held["average"], held["task"]["species"][1]["blur_levels"]
+    assert completed(held, config) == whole | {"average": 0.0}
+    assert completed(whole, config) == whole
 
 
 def test_no_field_of_the_run_hides_one_of_the_task():
