@@ -41,6 +41,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "robustness": ("robustness heart --quick", "robustness --device cuda --out results"),
     "rollout": ("rollout gecko --damage 300:cut 500:erase --steps 700", "rollout runs/heart"),
     "stress": ("stress --quick", "stress --only geometry --out results"),
+    "view": ("view gecko", "view runs/heart", "view npa/Texture-v0 --policy dots"),
     "warmup": ("warmup", "warmup --device cuda --space-dims 2 3"),
     "train morphogenesis2d": (
         "train morphogenesis2d --target heart --out runs/heart",

@@ -5,7 +5,6 @@ Nothing here reads a value back from the device, so all of it may be captured in
 
 from __future__ import annotations
 
-import math
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -17,7 +16,25 @@ from npa_envs.ops import world_mean
 from npa_envs.ops.checks import check_world, checked_number
 from npa_envs.tasks.checks import check_non_negative, is_real, is_whole
 from npa_envs.tasks.seeds import drawn_indices, uniform_ball
+from npa_envs.world.brushes import clump, cut, erase_state
 from npa_envs.world.randomness import Randomness, check_generator, normal_draws, uniform_draws
+
+__all__ = [
+    "CLUMP_FACTOR",
+    "DAMAGE_SIZES",
+    "DamageEvent",
+    "PoolDamage",
+    "clump",
+    "cut",
+    "damage_worlds",
+    "erase_state",
+    "hurt",
+    "parse_damage",
+    "random_particle",
+    "scatter",
+    "stray_motion",
+    "tear",
+]
 
 DAMAGE_SIZES = {"erase": 0.2, "cut": 0.1, "clump": 0.2, "noise": 0.05}
 """Kinds of damage with their usual size: radius, gap, radius, standard deviation [length units]."""
@@ -154,125 +171,6 @@ def random_particle(x: Tensor, generator: Randomness | None = None) -> Tensor:
     check_generator(generator, x.device, x.shape[0])
     chosen = drawn_indices(x.shape[1], x.shape[0], generator, x.device)
     return x.take_along_dim(chosen[:, None, None], dim=1).squeeze(1)
-
-
-def erase_state(x: Tensor, s: Tensor, *, centre: Tensor, radius: float | Tensor) -> Tensor:
-    """Return the states with those of the particles inside a ball set to zero.
-
-    Args:
-        x: Particle positions [length units], shape [B, N, D].
-        s: Particle states (dimensionless), shape [B, N, C].
-        centre: Centre of the ball in each world [length units], shape [B, D].
-        radius: Radius of the ball [length units], a number or a tensor of shape [B].
-
-    Returns:
-        The new states, shape [B, N, C]; `s` itself is left as it is.
-
-    Raises:
-        NPAError: A wrong shape or dtype, or a radius that is negative or not finite.
-    """
-    check_world(x, s)
-    inside = _inside_ball(x, centre, radius)
-    return s.masked_fill(inside[..., None], 0.0)
-
-
-def cut(
-    x: Tensor, s: Tensor, *, centre: Tensor, normal: Tensor, gap: float | Tensor
-) -> tuple[Tensor, Tensor]:
-    """Open a slit along a line (a plane in 3D), as a knife would.
-
-    Particles within `gap` of the line move away from it, those on the line by half the gap and
-    those at the distance `gap` not at all: none is left within half the gap, the bands beside the
-    slit are twice as dense, and everything further away stays where it is.
-
-    Args:
-        x: Particle positions [length units], shape [B, N, D].
-        s: Particle states (dimensionless), shape [B, N, C].
-        centre: A point on the line in each world [length units], shape [B, D].
-        normal: Direction across the line, of any length, shape [B, D]; a zero vector cuts nothing.
-        gap: Width of the slit [length units], a number or a tensor of shape [B].
-
-    Returns:
-        The new positions, shape [B, N, D], and the states as they came.
-
-    Raises:
-        NPAError: A wrong shape or dtype, or a gap that is negative or not finite.
-    """
-    check_world(x, s)
-    _check_vector("centre", centre, x)
-    _check_vector("normal", normal, x)
-    width = _per_world("gap", gap, x)
-    length = torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
-    # Masked before the division: a zero normal must give a shift of zero, not NaN.
-    direction = normal / torch.where(length > 0, length, torch.ones_like(length))
-    height = ((x - centre[:, None]) * direction[:, None]).sum(dim=-1, keepdim=True)
-    side = (height >= 0).to(x.dtype) - 0.5
-    push = side * (width - height.abs()).clamp_min(0.0)
-    return x + push * direction[:, None], s
-
-
-def clump(
-    x: Tensor, s: Tensor, *, centre: Tensor, radius: float | Tensor, factor: float | Tensor
-) -> tuple[Tensor, Tensor]:
-    """Draw the particles inside a ball together.
-
-    Args:
-        x: Particle positions [length units], shape [B, N, D].
-        s: Particle states (dimensionless), shape [B, N, C].
-        centre: Centre of the ball in each world [length units], shape [B, D].
-        radius: Radius of the ball [length units], a number or a tensor of shape [B].
-        factor: The share of its distance from the centre that a particle loses (dimensionless),
-            from 0, nothing moves, to 1, all meet in the centre; a number or a tensor of shape [B].
-
-    Returns:
-        The new positions, shape [B, N, D], and the states as they came.
-
-    Raises:
-        NPAError: A wrong shape or dtype, a radius that is negative or not finite, or a factor
-            outside [0, 1].
-    """
-    check_world(x, s)
-    inside = _inside_ball(x, centre, radius)
-    share = _per_world("factor", factor, x, highest=1.0)
-    pulled = x + share * (centre[:, None] - x)
-    return torch.where(inside[..., None], pulled, x), s
-
-
-def _inside_ball(x: Tensor, centre: Tensor, radius: float | Tensor) -> Tensor:
-    _check_vector("centre", centre, x)
-    distance = torch.linalg.vector_norm(x - centre[:, None], dim=-1)
-    return torch.le(distance, _per_world("radius", radius, x).squeeze(-1))
-
-
-def _per_world(name: str, value: float | Tensor, x: Tensor, *, highest: float = math.inf) -> Tensor:
-    """Return the number of each world in a shape [B, 1, 1] or [1, 1, 1]."""
-    if isinstance(value, Tensor):
-        if value.shape not in ((), (x.shape[0],)):
-            raise NPAError(
-                f"{name} must be a number or a tensor of shape [B] = [{x.shape[0]}], "
-                f"got {list(value.shape)}: give one number for each world"
-            )
-        # The values stay unread: looking at them would wait for the device.
-        return value.to(x).reshape(-1, 1, 1)
-    value = checked_number(name, value)
-    if not 0 <= value <= min(highest, torch.finfo(x.dtype).max):
-        rule = "finite and at least 0" if highest == math.inf else f"in [0, {highest:g}]"
-        raise NPAError(f"{name} must be {rule}, got {shown(value)}: try 0.1")
-    return x.new_full((1, 1, 1), value)
-
-
-def _check_vector(name: str, vector: Tensor, x: Tensor) -> None:
-    wanted = (x.shape[0], x.shape[2])
-    if vector.shape != wanted:
-        raise NPAError(
-            f"{name} must have shape [B, D] = {wanted}, got {tuple(vector.shape)}: "
-            f"give one vector for each world, for example {name}.expand{wanted}"
-        )
-    if vector.device != x.device or vector.dtype != x.dtype:
-        raise NPAError(
-            f"{name} must be {x.dtype} on {x.device} like x, got {vector.dtype} on "
-            f"{vector.device}: convert it with {name}.to(x)"
-        )
 
 
 # Strays see nobody, so nothing says where to stay: a rule that was trained in whole worlds alone

@@ -3,11 +3,12 @@
 // Where one looks from. 2D worlds are seen from straight above, and the camera moves and zooms; 3D
 // worlds are seen in perspective, and the camera goes round: y is up, angles are in degrees.
 export class Camera {
-  constructor(dimension, halfWidth) {
+  constructor(dimension, halfWidth, centre = [0, 0, 0]) {
     this.dimension = dimension;
     this.halfWidth = halfWidth;
-    this.centre = [0, 0, 0];
+    this.centre = [0, 1, 2].map((k) => centre[k] ?? 0);
     this.zoom = 1;
+    this.covered = 0; // share of the canvas's height that controls cover, at its lower edge
     this.azimuth = 0;
     this.elevation = dimension === 3 ? 15 : 0;
   }
@@ -29,14 +30,14 @@ export class Camera {
     return this.dimension === 2 ? 0 : 5 * this.halfWidth;
   }
 
-  // From the middle of a canvas to the middle of its nearer edge [length units].
-  get extent() {
-    return this.halfWidth / this.zoom;
-  }
-
   // Length units of a pixel on the canvas, at the depth of the centre.
   unit(width, height) {
-    return (2 * this.extent) / Math.min(width, height);
+    return (2 * this.halfWidth) / (this.zoom * Math.min(width, this.open(height)));
+  }
+
+  // Rows of the canvas that no controls cover; the centre is seen in their middle.
+  open(height) {
+    return height * (1 - this.covered);
   }
 
   // Place on the canvas [pixels from its upper left corner], nearness and scale of a position.
@@ -45,12 +46,12 @@ export class Camera {
     const [across, up, near] = this.axes.map((axis) => dot(axis, offset));
     const scale = this.distance ? this.distance / (this.distance - near) : 1;
     const unit = this.unit(width, height);
-    return [width / 2 + (across * scale) / unit, height / 2 - (up * scale) / unit, near, scale];
+    return [width / 2 + (across * scale) / unit, this.open(height) / 2 - (up * scale) / unit, near, scale];
   }
 
   // The position under a place on the canvas, at a nearness; and how far a movement leads there.
   position(column, row, width, height, near = 0) {
-    const move = this.movement(column - width / 2, row - height / 2, width, height, near);
+    const move = this.movement(column - width / 2, row - this.open(height) / 2, width, height, near);
     return this.centre.map((middle, k) => middle + move[k] + near * this.axes[2][k]);
   }
 
@@ -85,9 +86,21 @@ function dot(a, b) {
 //   {positions, colours, dimension, box, spot, camera, background: [r, g, b] in [0, 1],
 //    look: "soft" | "points", trails: {positions: Float32Array of pairs of points [x, y, z],
 //    fades: Float32Array} or null, ink: [r, g, b] of trails}
+// `kind`: "webgl2", "canvas", or "auto": WebGL2 unless it would be a processor that draws, which is
+// faster without it.
 export function makePainter(canvas, kind = "auto") {
-  const gl = kind === "plain" ? null : canvas.getContext("webgl2", { antialias: false, alpha: false });
+  const chosen = kind === "auto" ? quickest() : kind;
+  const gl = chosen === "canvas" ? null : canvas.getContext("webgl2", { antialias: false, alpha: false });
   return gl ? new GlPainter(gl) : new PlainPainter(canvas.getContext("2d", { alpha: false }));
+}
+
+function quickest() {
+  // Asked of a canvas of its own: one that has given a context gives no other.
+  const gl = document.createElement("canvas").getContext("webgl2", { failIfMajorPerformanceCaveat: true });
+  const told = gl?.getExtension("WEBGL_debug_renderer_info");
+  const name = told ? gl.getParameter(told.UNMASKED_RENDERER_WEBGL) : "";
+  gl?.getExtension("WEBGL_lose_context")?.loseContext();
+  return gl && !/swiftshader|llvmpipe|software|basic render/i.test(name) ? "webgl2" : "canvas";
 }
 
 // Offsets of the images of a periodic world that a camera sees [length units].
@@ -111,11 +124,12 @@ uniform vec3 right, up, toward, centre, offset;
 uniform vec2 unit;        // device units a length unit
 uniform float distance_;  // of the camera; 0: no perspective
 uniform float nearest;    // nearness that counts as the front
+uniform float covered;    // share of the height that controls cover
 vec4 place(vec3 position, out float scale, out float near) {
   vec3 p = position + offset - centre;
   near = dot(p, toward);
   scale = distance_ > 0.0 ? distance_ / max(distance_ - near, 1e-3) : 1.0;
-  return vec4(dot(p, right) * scale * unit.x, dot(p, up) * scale * unit.y, -near / nearest, 1.0);
+  return vec4(dot(p, right) * scale * unit.x, dot(p, up) * scale * unit.y + covered, -near / nearest, 1.0);
 }`;
 
 const SPOT_VERTEX = `#version 300 es
@@ -281,6 +295,7 @@ class GlPainter {
     gl.uniform2f(program.unit, 2 / (unit * width), 2 / (unit * height));
     gl.uniform1f(program.distance_, camera.distance);
     gl.uniform1f(program.nearest, 2 * camera.halfWidth);
+    gl.uniform1f(program.covered, camera.covered);
   }
 
   drawTrails(scene, width, height) {
@@ -353,56 +368,53 @@ function linked(gl, vertex, fragment) {
   return found;
 }
 
-const PLAIN_PIXELS = 400; // on the longer side: what a processor alone fills in a few milliseconds
+const PLAIN_PIXELS = [320, 1000]; // on the longer side of the small picture, least and most
+const PLAIN_TIME = 10; // milliseconds that a picture may take
+const COVERS = Float32Array.from({ length: 1024 }, (_, k) => 1 - Math.exp(-2.4 * (k / 256)));
 
-// Without WebGL: spots written into a small picture, which the canvas then stretches.
+// Without WebGL: spots written into a small picture, as large as there is time for, which the canvas
+// then stretches.
 class PlainPainter {
   constructor(context) {
     this.context = context;
     this.kind = "canvas";
     this.small = document.createElement("canvas");
+    this.pixels = 480;
   }
 
   draw(scene) {
-    const { context, small } = this;
+    const started = performance.now(), { context, small } = this;
     const { width, height } = context.canvas;
-    const shrink = Math.min(1, PLAIN_PIXELS / Math.max(width, height));
+    const shrink = Math.min(1, this.pixels / Math.max(width, height));
     const across = Math.ceil(width * shrink), down = Math.ceil(height * shrink);
-    if (small.width !== across || small.height !== down) Object.assign(small, { width: across, height: down });
-    const brush = small.getContext("2d");
-    const picture = brush.createImageData(across, down);
-    const sums = new Float32Array(4 * across * down);
-    const { positions, colours, dimension, camera } = scene;
-    const spot = Math.max(scene.spot / camera.unit(across, down), 0.5);
-    const order = Array.from({ length: positions.length / dimension }, (_, k) => k);
-    const point = (k, offset) => [0, 1, 2].map((d) =>
-      (d < dimension ? positions[dimension * k + d] : 0) + offset[d]);
+    if (small.width !== across || small.height !== down) {
+      Object.assign(small, { width: across, height: down });
+      this.sums = new Float32Array(4 * across * down);
+      this.picture = small.getContext("2d").createImageData(across, down);
+    }
+    this.sums.fill(0);
+    const soft = scene.dimension === 2 && scene.look === "soft";
+    const spot = scene.spot / scene.camera.unit(across, down);
     for (const offset of tiles(scene, across, down)) {
-      for (const k of order) {
-        const [column, row, near, scale] = camera.project(point(k, offset), across, down);
-        // Nearer particles weigh more, which hides what lies behind them well enough.
-        const weight = dimension === 3 ? Math.exp((4 * near) / camera.halfWidth) : 1;
-        add(sums, across, down, column, row, spot * scale, weight, colours, 3 * k);
-      }
+      const places = projected(scene, offset, across, down);
+      if (soft) addSpots(this.sums, across, down, places, scene.colours, Math.max(spot, 0.6));
+      else addBalls(this.sums, across, down, places, scene, Math.max(spot, 0.5));
     }
-    for (let p = 0; p < across * down; p++) {
-      const weight = sums[4 * p + 3];
-      const cover = 1 - Math.exp(-2.4 * weight);
-      for (let c = 0; c < 3; c++) {
-        const behind = 255 * scene.background[c];
-        const front = weight > 0 ? sums[4 * p + c] / weight : behind;
-        picture.data[4 * p + c] = behind + cover * (front - behind);
-      }
-      picture.data[4 * p + 3] = 255;
-    }
-    brush.putImageData(picture, 0, 0);
+    show(this.picture.data, this.sums, scene.background, soft);
+    small.getContext("2d").putImageData(this.picture, 0, 0);
     context.imageSmoothingEnabled = true;
+    context.imageSmoothingQuality = "high";
     context.drawImage(small, 0, 0, width, height);
     if (scene.trails) this.drawTrails(scene, width, height);
+    const taken = performance.now() - started, [least, most] = PLAIN_PIXELS;
+    // In steps, so that the picture is not laid out anew in every frame.
+    if (taken > 1.5 * PLAIN_TIME) this.pixels = Math.max(least, this.pixels - 80);
+    else if (taken < 0.4 * PLAIN_TIME) this.pixels = Math.min(most, this.pixels + 80);
   }
 
   drawTrails({ trails, ink, camera }, width, height) {
     const { context } = this;
+    context.lineWidth = 1.5;
     context.strokeStyle = `rgba(${ink.map((v) => Math.round(255 * v)).join(",")},0.5)`;
     context.beginPath();
     for (let k = 0; k < trails.positions.length; k += 6) {
@@ -415,23 +427,88 @@ class PlainPainter {
   }
 }
 
-function add(sums, width, height, column, row, spot, weight, colours, at) {
-  const reach = 2.2 * spot, fall = -0.5 / (spot * spot);
-  const left = Math.max(0, Math.ceil(column - reach)), last = Math.min(width - 1, column + reach);
-  const top = Math.max(0, Math.ceil(row - reach)), bottom = Math.min(height - 1, row + reach);
-  for (let y = top; y <= bottom; y++) {
-    for (let x = left; x <= last; x++) {
-      const part = weight * Math.exp(fall * ((x - column) ** 2 + (y - row) ** 2));
-      const p = 4 * (y * width + x);
-      sums[p] += part * colours[at];
-      sums[p + 1] += part * colours[at + 1];
-      sums[p + 2] += part * colours[at + 2];
-      sums[p + 3] += part;
+// Column, row, nearness and scale of each particle, as `Camera.project` gives them one by one.
+function projected({ positions, dimension, camera }, offset, width, height) {
+  const count = positions.length / dimension, places = new Float32Array(4 * count);
+  const [right, up, toward] = camera.axes, unit = camera.unit(width, height), { distance, centre } = camera;
+  const middle = camera.open(height) / 2;
+  for (let k = 0; k < count; k++) {
+    const x = positions[dimension * k] + offset[0] - centre[0];
+    const y = positions[dimension * k + 1] + offset[1] - centre[1];
+    const z = (dimension === 3 ? positions[3 * k + 2] : 0) + offset[2] - centre[2];
+    const near = x * toward[0] + y * toward[1] + z * toward[2];
+    const scale = distance ? distance / Math.max(distance - near, 1e-3) : 1;
+    places[4 * k] = width / 2 + ((x * right[0] + y * right[1] + z * right[2]) * scale) / unit;
+    places[4 * k + 1] = middle - ((x * up[0] + y * up[1] + z * up[2]) * scale) / unit;
+    places[4 * k + 2] = near / unit;
+    places[4 * k + 3] = scale;
+  }
+  return places;
+}
+
+// Adds soft spots: sums of colours and of weights.
+function addSpots(sums, width, height, places, colours, spot) {
+  const reach = 2.4 * spot, fall = -0.5 / (spot * spot);
+  const weights = new Float32Array(2 * Math.ceil(reach) + 2);
+  for (let k = 0; k < places.length / 4; k++) {
+    const column = places[4 * k], row = places[4 * k + 1];
+    const left = Math.max(0, Math.ceil(column - reach)), last = Math.min(width - 1, Math.floor(column + reach));
+    const top = Math.max(0, Math.ceil(row - reach)), end = Math.min(height - 1, Math.floor(row + reach));
+    for (let x = left; x <= last; x++) weights[x - left] = Math.exp(fall * (x - column) ** 2);
+    const red = colours[3 * k], green = colours[3 * k + 1], blue = colours[3 * k + 2];
+    for (let y = top; y <= end; y++) {
+      const share = Math.exp(fall * (y - row) ** 2);
+      for (let x = left, p = 4 * (y * width + left); x <= last; x++, p += 4) {
+        const weight = share * weights[x - left];
+        sums[p] += weight * red;
+        sums[p + 1] += weight * green;
+        sums[p + 2] += weight * blue;
+        sums[p + 3] += weight;
+      }
     }
   }
 }
 
-const TRACED = 160; // particles with a trail
+// Writes balls that hide what lies behind them, or flat discs; the fourth sum holds how near they are.
+function addBalls(sums, width, height, places, { colours, dimension, camera }, spot) {
+  const solid = dimension === 3, span = 2 * camera.halfWidth;
+  for (let k = 0; k < places.length / 4; k++) {
+    const column = places[4 * k], row = places[4 * k + 1], near = places[4 * k + 2];
+    const radius = (solid ? 1.6 : 0.9) * spot * places[4 * k + 3];
+    const depth = near * camera.unit(width, height);
+    const light = solid ? Math.min(1.1, Math.max(0.35, 0.78 + (0.4 * depth) / span)) : 1;
+    const left = Math.max(0, Math.ceil(column - radius)), last = Math.min(width - 1, column + radius);
+    const top = Math.max(0, Math.ceil(row - radius)), end = Math.min(height - 1, row + radius);
+    for (let y = top; y <= end; y++) {
+      for (let x = left; x <= last; x++) {
+        const across = (x - column) / radius, down = (y - row) / radius;
+        const square = across * across + down * down, p = 4 * (y * width + x);
+        if (square > 1) continue;
+        const front = Math.sqrt(1 - square), nearness = 1e6 + near + (solid ? front * radius : k * 1e-3);
+        if (nearness < sums[p + 3]) continue;
+        const shade = solid ? light * (0.62 + 0.38 * (0.72 * front - 0.35 * across - 0.6 * down)) : 1;
+        sums[p] = shade * colours[3 * k];
+        sums[p + 1] = shade * colours[3 * k + 1];
+        sums[p + 2] = shade * colours[3 * k + 2];
+        sums[p + 3] = nearness;
+      }
+    }
+  }
+}
+
+function show(data, sums, background, soft) {
+  const [red, green, blue] = background.map((v) => 255 * v), full = COVERS.length - 1;
+  for (let p = 0; p < sums.length; p += 4) {
+    const weight = sums[p + 3], shareOf = soft ? 1 / Math.max(weight, 1e-3) : 1;
+    const cover = soft ? COVERS[Math.min(full, (weight * 256) | 0)] : weight > 0 ? 1 : 0;
+    data[p] = red + cover * (sums[p] * shareOf - red);
+    data[p + 1] = green + cover * (sums[p + 1] * shareOf - green);
+    data[p + 2] = blue + cover * (sums[p + 2] * shareOf - blue);
+    data[p + 3] = 255;
+  }
+}
+
+const TRACED = 300; // particles with a trail
 const TRAIL_LENGTH = 48; // frames that a trail goes back
 
 // Where some particles have been in the last frames.

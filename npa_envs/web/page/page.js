@@ -28,12 +28,12 @@
 //                                      the page sends pictures as Blob objects by engine.send(blob)
 //
 // Events:
-//   {type: "world", title, note, dimension, box, half_width, spot, rules, rule, species, shows, show,
-//    tools, damages, settings, capabilities, playing, seed}        once, and after changes
-//       note: a sentence for the reader, or ""; box: sides [length units] or null; half_width: from
-//       the middle of the canvas to its edge; spot: standard deviation of a particle's spot [length
-//       units]; rules: names that `rule`, graft and add may take; species: names of the rules that
-//       live in the world now; settings: {name: {value, low, high, scale?: "log", whole?: true}}
+//   {type: "world", title, note, dimension, box, centre, half_width, spot, rules, rule, others,
+//    species, shows, show, tools, damages, settings, capabilities, playing, seed}
+//       once, and after changes. note: a sentence for the reader, or ""; box: sides [length units] or
+//       null; centre, half_width: what the canvas shows at first; spot: standard deviation of a
+//       particle's spot [length units]; rules: names that `rule` may take; others: names that graft
+//       and add may take; species: names of the rules that live in the world now; settings: {name: {value, low, high, scale?: "log", whole?: true}}
 //       with names among eps, update_prob, noise, count, speed (steps a frame);
 //       capabilities: some of "step", "reset", "film", "loss".
 //       A key that an engine leaves out is as in `BLANK` below.
@@ -44,8 +44,8 @@
 //   {type: "file", name, url}                                      a film is ready
 //   {type: "error", message}
 //
-// Modules are joined into one file for the exported page, in this order: drawing.js, plots.js, page.js,
-// then the engine. For that, imports are single lines of names in braces, exports stand before
+// index.html loads viewer.js, which starts the page over the socket. For the exported page modules are
+// joined into one file instead, in this order: drawing.js, plots.js, page.js, then the engine. For that, imports are single lines of names in braces, exports stand before
 // `function`, `class` or `const`, and top-level names differ between modules.
 //
 // `show`: "colours", "density", "species", "speed", "mask", "components" (the first three principal
@@ -56,7 +56,7 @@ import { Plot, short } from "./plots.js";
 
 const BLANK = {
   title: "npa-envs", note: "", dimension: 2, box: null, half_width: 1.1, spot: 0.015, rules: [], rule: null,
-  species: [], shows: ["colours"], show: "colours", tools: [], damages: [], settings: {},
+  centre: [0, 0, 0], others: [], species: [], shows: ["colours"], show: "colours", tools: [], damages: [], settings: {},
   capabilities: [], playing: true, seed: 0,
 };
 
@@ -90,9 +90,9 @@ function icon(path) {
   return `<svg viewBox="0 0 24 24" aria-hidden="true"><path d="${path}"/></svg>`;
 }
 
-// Starts the page over an engine.
+// Starts the page over an engine; the page is also `document.page`, for the console.
 export async function start(connect, settings) {
-  const page = new Page();
+  const page = (document.page = new Page());
   try {
     page.engine = await connect(settings, (event) => page.listen(event));
     for (const message of page.waiting.splice(0)) page.engine.send(message);
@@ -149,7 +149,7 @@ class Page {
     const before = this.world, world = { ...BLANK, ...event };
     this.world = world;
     if (!this.met || before.dimension !== world.dimension || before.half_width !== world.half_width) {
-      this.camera = new Camera(world.dimension, world.half_width);
+      this.camera = new Camera(world.dimension, world.half_width, world.centre);
       this.frame = null;
       const first = world.tools.includes("erase") && world.dimension === 2 ? "erase" : "look";
       this.choose(world.tools.includes(this.tool) ? this.tool : first);
@@ -164,7 +164,9 @@ class Page {
     $("note").textContent = world.note;
     this.showPlaying();
     options($("rule"), world.rules, world.rule);
-    options($("other"), world.rules, $("other").value || world.rules.find((name) => name !== world.rule));
+    const other = world.others.includes($("other").value) && before.rule === world.rule
+      ? $("other").value : world.others.find((name) => name !== world.rule);
+    options($("other"), world.others, other);
     options($("show"), world.shows, world.show);
     $("rule-field").hidden = world.rules.length < 2;
     $("other-field").hidden = !world.tools.some((tool) => tool === "graft" || tool === "add");
@@ -521,6 +523,8 @@ class Page {
     const width = Math.round(canvas.clientWidth * ratio), height = Math.round(canvas.clientHeight * ratio);
     if (!width || !height) return;
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
+    // What fills the canvas may lie under the bar as well.
+    camera.covered = world.box ? 0 : (canvas.clientHeight - $("bar").offsetTop) / canvas.clientHeight;
     this.painter.draw({
       positions: frame?.positions ?? new Float32Array(), colours: frame?.colours ?? new Uint8Array(),
       dimension: world.dimension, box: world.box, spot: world.spot * $("size").value, camera,
@@ -559,9 +563,10 @@ class Page {
     const { recording, canvas } = this, now = performance.now();
     if (!recording?.picture || now - recording.last < FILM_PAUSE) return;
     recording.last = now;
-    const { picture } = recording, side = Math.min(canvas.width, canvas.height);
+    const { picture } = recording, height = this.camera.open(canvas.height);
+    const side = Math.min(canvas.width, height);
     picture.getContext("2d").drawImage(
-      canvas, (canvas.width - side) / 2, (canvas.height - side) / 2, side, side, 0, 0, FILM_SIZE, FILM_SIZE);
+      canvas, (canvas.width - side) / 2, (height - side) / 2, side, side, 0, 0, FILM_SIZE, FILM_SIZE);
     picture.toBlob((blob) => { if (blob) this.send(blob); }, "image/jpeg", QUALITY);
   }
 }

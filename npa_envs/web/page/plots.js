@@ -67,6 +67,7 @@ export class Plot {
 
 export function short(number) {
   const size = Math.abs(number);
+  if (Number.isInteger(number) && size < 1e6) return String(number);
   if (size >= 1000 || (size > 0 && size < 0.001)) return number.toExponential(1);
   return String(+number.toPrecision(3));
 }

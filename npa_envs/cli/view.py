@@ -1,0 +1,121 @@
+"""`npa-envs view`: a world to watch and to touch, in the browser."""
+
+from __future__ import annotations
+
+import contextlib
+import webbrowser
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from npa_envs.cli.output import OutFolder, parse_options, rule_of, torch_threads, writable_folder
+from npa_envs.errors import NPAError
+
+if TYPE_CHECKING:
+    import torch
+
+    from npa_envs.web.live import LiveWorld
+
+RUN_FILES = ("config.json", "log.jsonl", "checkpoint.pt")
+"""What tells the folder of a run from others."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewOptions:
+    """Watch and touch a live world in the browser: a rule, a training run or an environment.
+
+    The page has brushes, sliders, damage and films. A run's world follows its newest checkpoint.
+    The server answers this computer alone; with another --host it prints a link with a token.
+    """
+
+    what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RULE|RUN|ENV")] = "gecko"
+    """A shipped rule (`npa-envs list`), a rule's file, the folder of a run, or the id of an
+    environment such as npa/Texture-v0."""
+
+    policy: str = "zero"
+    """What acts in an environment: "zero", "random", or a rule that fits it."""
+
+    particle_count: int | None = None
+    """Particles N; default: as trained."""
+
+    seed: int = 0
+    """The first world's number."""
+
+    device: str = "cpu"
+    """Where the world lives: cpu, cuda, cuda:1."""
+
+    threads: int = 1
+    """CPU threads of torch and of the kernels; the browser needs a core as well."""
+
+    host: str = "127.0.0.1"
+    """The address to bind; 0.0.0.0 lets other computers in, who need the token."""
+
+    port: int | None = None
+    """The port; default: the first free one from 8765 on."""
+
+    browser: bool = True
+    """Open the page in a browser."""
+
+    out: OutFolder = Path("runs/view")
+    """Folder of recorded films; created where missing."""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Serve what the words after `npa-envs view` ask for until Ctrl-C; return 0."""
+    options = parse_options(ViewOptions, "view", arguments)
+    if not 1 <= options.threads <= 256:
+        raise NPAError(f"threads must be in [1, 256], got {options.threads}")
+    from npa_envs.devices import check_device
+    from npa_envs.web.server import address_of, make_site, open_port, serve
+
+    make_world = world_maker(options, check_device(options.device))
+    # Made once before the server starts: what is wrong with it is said here.
+    make_world().close()
+    site = make_site(make_world, films=writable_folder(options.out), host=options.host)
+    with (
+        contextlib.closing(open_port(options.host, options.port)) as listener,
+        torch_threads(options.threads),
+    ):
+        address = address_of(site, listener)
+        print(f"{options.what}: {address}  (Ctrl-C ends it)", flush=True)
+        if options.browser and not webbrowser.open(address):
+            print("no browser was found: open the link above", flush=True)
+        serve(site, listener)
+    return 0
+
+
+def world_maker(options: ViewOptions, device: torch.device) -> Callable[[], LiveWorld]:
+    """Return what makes a world of the rule, the run or the environment that was asked for.
+
+    Raises:
+        NPAError: An option does not fit it.
+    """
+    from npa_envs.web.environment_world import EnvironmentWorld, make_environment
+    from npa_envs.web.rule_world import RuleWorld, RunWorld
+
+    if options.what.startswith("npa/"):
+        policy = options.policy
+        policy = policy if policy in ("zero", "random") else rule_of(policy)
+
+        def make_world() -> LiveWorld:
+            env, acting = make_environment(
+                options.what, policy, device=str(device), particle_count=options.particle_count
+            )
+            return EnvironmentWorld(env, acting, seed=options.seed)
+
+        return make_world
+    if options.policy != "zero":
+        raise NPAError(
+            f"policy is for environments, got --policy {options.policy} with a rule or a run: "
+            "leave it out"
+        )
+    told: dict[str, Any] = {"device": device, "seed": options.seed}
+    told["particle_count"] = options.particle_count
+    folder = Path(options.what)
+    if folder.is_dir() and any((folder / name).exists() for name in RUN_FILES):
+        return lambda: RunWorld(folder, **told)
+    source = rule_of(options.what)
+    return lambda: RuleWorld(source, **told)

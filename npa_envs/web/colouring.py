@@ -1,0 +1,169 @@
+"""Colours of single particles: what each tells of its state, its surroundings, its movement."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from npa_envs.errors import NPAError, shown, suggest
+from npa_envs.ops import species_fields
+from npa_envs.render.colours import GOLDEN_ANGLE, STATE_CHROMA, STATE_GAIN, ramp, srgb
+
+SHOWS = ("colours", "density", "components", "species", "speed", "mask")
+"""What can be shown besides single state channels: "state 0", "state 1", ..."""
+
+DARK = (0.05, 0.06, 0.09)
+"""What the ramp of densities and speeds begins at; it is seen on light backgrounds as well."""
+
+BALANCE = 0.9
+"""How much of its memory of covariances the basis of components keeps from frame to frame."""
+
+
+class Seen(NamedTuple):
+    """A world of which particles are coloured."""
+
+    x: Tensor
+    """Positions [length units], shape [1, N, D]."""
+    s: Tensor
+    """States (dimensionless), shape [1, N, C]."""
+    colours: Callable[[Tensor], Tensor]
+    """Own colours of particles of states [1, N, C], in [0, 1] if clipped, shape [1, N, 3]."""
+    eps: float
+    """Perception radius [length units]."""
+    box: tuple[float, ...] | None
+    """Sides of the periodic box [length units], or None."""
+    counts: Sequence[int]
+    """Particles of each species, species after species."""
+    full: int
+    """Particles that the world had when it was fresh."""
+    travelled: Tensor | None
+    """How far each particle went in the last step, as a share of the farthest way, [1, N]."""
+    updated: Tensor | None
+    """Which particles the last step updated, bool, shape [1, N]."""
+
+
+class Colouring:
+    """Colours of the particles of one world, frame after frame."""
+
+    def __init__(self) -> None:
+        self._covariance: Tensor | None = None
+        self._basis: Tensor | None = None
+
+    def __call__(self, show: str, seen: Seen) -> NDArray[np.uint8]:
+        """Return red, green and blue of each particle, uint8, shape [N, 3].
+
+        Args:
+            show: One of `shows_of`.
+            seen: The world.
+
+        Raises:
+            NPAError: `show` is another word.
+        """
+        if seen.x.shape[1] == 0:
+            return np.zeros((0, 3), dtype=np.uint8)
+        match show.split():
+            case ["colours"]:
+                return _bytes(seen.colours(seen.s)[0])
+            case ["density"]:
+                # 1 is a world whose particles fill [-1, 1]^D, or its box, evenly.
+                rho = species_fields(seen.x, [seen.x.shape[1]], eps=seen.eps, box=seen.box).rho
+                volume = float(np.prod(seen.box or (2.0,) * seen.x.shape[2]))
+                crowding = rho[0].sum(dim=-1) * (volume / seen.full)
+                # In open space worlds fill a part only, and so are denser.
+                return _ramp(1.0 - torch.exp2(-crowding / (1.0 if seen.box else 4.0)))
+            case ["components"]:
+                return _bytes(self._components(seen.s[0]))
+            case ["species"]:
+                return species_colours(len(seen.counts)).repeat(seen.counts, axis=0)
+            case ["speed"]:
+                share = _known(seen.travelled, seen)
+                return _ramp(share.clamp(0.0, 1.0).sqrt())
+            case ["mask"]:
+                return _bytes(_mask_colours(_known(seen.updated, seen)))
+            case ["state", number] if number.isdecimal() and int(number) < seen.s.shape[2]:
+                return _bytes(signed_colours(seen.s[0, :, int(number)]))
+        raise NPAError(
+            f"show must be what the world has, got {shown(show)}: "
+            f"{suggest(show, shows_of(seen.s.shape[2]))}"
+        )
+
+    def _components(self, s: Tensor) -> Tensor:
+        """Return the first three principal components as colours; the basis moves slowly."""
+        centred = (s - s.mean(dim=0)).double()
+        covariance = centred.T @ centred / len(s)
+        if self._covariance is None or self._covariance.shape != covariance.shape:
+            self._covariance, self._basis = covariance, None
+        self._covariance = BALANCE * self._covariance + (1.0 - BALANCE) * covariance
+        values, vectors = torch.linalg.eigh(self._covariance.cpu())
+        count = min(3, len(values))
+        basis = vectors[:, -count:].flip(-1).to(s.device)
+        if self._basis is not None:
+            # An eigenvector may come with either sign: colours must not flip between frames.
+            sign = (basis * self._basis).sum(dim=0, keepdim=True).sign()
+            basis = basis * torch.where(sign == 0, 1.0, sign)
+        self._basis = basis
+        width = values[-count:].flip(0).clamp_min(1e-12).sqrt().to(s.device)
+        parts = 0.5 + 0.22 * (centred @ basis) / width
+        return torch.nn.functional.pad(parts, (0, 3 - count), value=0.5)
+
+
+def shows_of(state_dim: int, *, species: bool = True) -> list[str]:
+    """Return what can be shown of particles with so many state channels, of rules or not."""
+    own = SHOWS if species else ("colours", "density", "components", "speed")
+    return [*own, *(f"state {k}" for k in range(state_dim))]
+
+
+def signed_colours(values: Tensor) -> Tensor:
+    """Return colours of numbers [...]: blue below 0, grey at 0, orange above; [..., 3]."""
+    pull = torch.tanh(0.5 * STATE_GAIN * values)
+    return srgb(
+        torch.stack(
+            (
+                0.62 + 0.18 * pull.abs(),
+                0.5 * STATE_CHROMA * pull,
+                STATE_CHROMA * pull,
+            ),
+            dim=-1,
+        )
+    )
+
+
+def species_colours(count: int) -> NDArray[np.uint8]:
+    """Return colours that tell species apart, whatever their number, uint8, shape [count, 3]."""
+    hue = 0.9 + GOLDEN_ANGLE * torch.arange(count, dtype=torch.float64)
+    lab = (torch.full_like(hue, 0.72), 0.13 * hue.cos(), 0.13 * hue.sin())
+    return _bytes(srgb(torch.stack(lab, dim=-1)))
+
+
+def _mask_colours(updated: Tensor) -> Tensor:
+    on, off = (0.98, 0.78, 0.36), (0.29, 0.33, 0.42)
+    return torch.stack(
+        [torch.where(updated, bright, dim) for bright, dim in zip(on, off, strict=True)], dim=-1
+    )
+
+
+def _known(values: Tensor | None, seen: Seen) -> Tensor:
+    """Return numbers of a last step [N], or zeros where there was none."""
+    if values is None or values.shape[1] != seen.x.shape[1]:
+        return torch.zeros(seen.x.shape[1], device=seen.x.device)
+    return values[0]
+
+
+def _ramp(share: Tensor) -> NDArray[np.uint8]:
+    table = ramp(DARK)
+    # The darkest colours would not be seen on a dark background.
+    first = len(table) // 6
+    entry = first + (share.nan_to_num(0.0) * (len(table) - 1 - first)).round()
+    colours: NDArray[np.uint8] = table[entry.to(torch.int32).cpu().numpy()]
+    return colours
+
+
+def _bytes(colours: Tensor) -> NDArray[np.uint8]:
+    scaled = (colours.detach().nan_to_num(0.0).clamp(0.0, 1.0) * 255.0).round()
+    pixels: NDArray[np.uint8] = scaled.to(torch.uint8).cpu().numpy()
+    return pixels

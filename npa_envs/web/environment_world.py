@@ -1,0 +1,187 @@
+"""Live worlds of environments: what a policy does in one, episode after episode."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import gymnasium
+from torch import Tensor
+
+from npa_envs.agents.policies import RandomPolicy, RulePolicy, ZeroPolicy
+from npa_envs.errors import NPAError, suggest
+from npa_envs.registration import ENVIRONMENTS
+from npa_envs.rule.files import load_rule
+from npa_envs.rule.rule import COLOUR_OFFSET
+from npa_envs.tasks.damage import DAMAGE_SIZES, damage_worlds
+from npa_envs.tasks.point_classification import PointClassification, class_colours
+from npa_envs.web.colouring import Colouring, Seen, shows_of
+from npa_envs.web.live import Frame, Live, Touch, brushed, checked_seed
+
+
+def make_environment(
+    id: str, policy: str = "zero", *, device: str = "cpu", **keywords: Any
+) -> tuple[Any, Callable[[Any], Any]]:
+    """Return an environment of this package, and what acts in it.
+
+    Args:
+        id: Its id, such as "npa/Texture-v0".
+        policy: "zero", "random", or the source of a rule that fits it.
+        device: Where its world lives.
+        keywords: More of its keywords; None leaves one as it is.
+
+    Raises:
+        NPAError: There is no such environment or rule, or the rule does not fit.
+    """
+    known = [environment.id for environment in ENVIRONMENTS]
+    if id not in known:
+        raise NPAError(f"unknown environment {id!r}: {suggest(id, known)}")
+    simple = {"zero": ZeroPolicy, "random": RandomPolicy}
+    rule = None if policy in simple else load_rule(policy, device=device).float()
+    told = {name: value for name, value in keywords.items() if value is not None}
+    env = gymnasium.make(id, disable_env_checker=True, device=device, output="torch", **told)
+    return env, simple[policy](env) if rule is None else RulePolicy(rule, env)
+
+
+class EnvironmentWorld(Live):
+    """An environment of this package with a policy in it.
+
+    Args:
+        env: The environment, single, wrapped or not; it is closed with the world.
+        policy: What acts: maps an observation [N, P] to an action [N, A].
+        seed: The seed of the first episode.
+        title: What the page calls it.
+
+    Raises:
+        NPAError: The environment is none of this package.
+    """
+
+    def __init__(
+        self,
+        env: Any,
+        policy: Callable[[Any], Any],
+        *,
+        seed: int = 0,
+        title: str | None = None,
+    ) -> None:
+        super().__init__()
+        self._env, self._inner, self._policy = env, env.unwrapped, policy
+        if not hasattr(self._inner, "place_particles"):
+            raise NPAError(
+                f"env must be an environment of npa_envs, got {type(env).__name__}: make it with "
+                "gymnasium.make('npa/Texture-v0')"
+            )
+        self._title = title or (env.spec.id if env.spec is not None else type(env).__name__)
+        self._colouring = Colouring()
+        self.seed = checked_seed(seed)
+        self._episode, self._ended = 0, ""
+        self.reset(self.seed)
+
+    def reset(self, seed: int | None) -> None:
+        """Begin an episode."""
+        self.seed = self.seed + 1 if seed is None else seed
+        self._begin(self.seed)
+
+    def _begin(self, seed: int | None) -> None:
+        self._observation, info = self._env.reset(seed=seed)
+        self._episode += 1
+        self._info: dict[str, Any] = info
+        self._return, self.step, self._milliseconds = 0.0, 0, 0.0
+        self._travelled: Tensor | None = None
+
+    def describe(self) -> dict[str, Any]:
+        """Return the event "world"."""
+        physics, task = self._inner.worlds.physics, self._inner.task
+        box, dimension = physics.box, physics.space_dim
+        moving = ["push", "clump", "cut"] if physics.moving else []
+        return {
+            "type": "world",
+            "title": self._title,
+            "note": f"episode {self._episode}{self._ended}",
+            "dimension": dimension,
+            "box": None if box is None else list(box),
+            "half_width": task.half_width if box is None else 0.5 * min(box),
+            "centre": [0.0] * dimension,
+            "spot": 0.7 * float(task.pixel_size),
+            "rules": [],
+            "rule": None,
+            "others": [],
+            "species": [],
+            "shows": self._shows(),
+            "show": self.show,
+            "tools": moving,
+            "damages": list(DAMAGE_SIZES) if physics.moving else ["erase"],
+            "settings": self._settings(),
+            "capabilities": ["step", "reset", "film", "loss"],
+            "playing": self.playing,
+            "seed": self.seed,
+        }
+
+    def _shows(self) -> list[str]:
+        return shows_of(self._inner.worlds.physics.state_dim, species=False)
+
+    def _run(self, steps: int) -> None:
+        for _ in range(steps):
+            before = self._inner.particles()[0] if self.show == "speed" else None
+            action = self._policy(self._observation)
+            self._observation, reward, ended, late, self._info = self._env.step(action)
+            self.step += 1
+            self._return += float(reward)
+            if before is not None:
+                physics = self._inner.worlds.physics
+                way = (self._inner.particles()[0] - before).norm(dim=-1)
+                self._travelled = way[None] / max(physics.reach, 1e-12)
+            if ended or late:
+                self._ended = (
+                    f"; the last one ended after {self.step} steps: "
+                    f"{self._info.get('reason')}, return {self._return:.3g}"
+                )
+                self._news.append(
+                    {
+                        "type": "curve", "name": "Return", "append": self._episode > 1,
+                        "points": [[self._episode, self._return]],
+                    }
+                )  # fmt: skip
+                self._begin(None)
+                self._news.append(self.describe())
+                return
+
+    def frame(self) -> Frame:
+        """Return what is seen now."""
+        x, s = (part[None] for part in self._inner.particles())
+        physics = self._inner.worlds.physics
+        count = x.shape[1]
+        seen = Seen(
+            x, s, self._own_colours, physics.eps, physics.box, [count], count, self._travelled, None
+        )
+        loss = self._info.get("loss") if self._loss_wanted else None
+        return Frame(
+            self.step,
+            x[0].cpu().numpy(),
+            self._colouring(self.show, seen),
+            self._milliseconds,
+            None if loss is None else float(loss),
+        )
+
+    def _own_colours(self, s: Tensor) -> Tensor:
+        goal = getattr(self._inner.task, "goal", None)
+        if isinstance(goal, PointClassification):
+            return class_colours(goal.outputs(s))
+        return s[..., -3:] + COLOUR_OFFSET
+
+    def _damage(self, name: str) -> None:
+        x, s = (part[None] for part in self._inner.particles())
+        self._place(*damage_worlds(x, s, kind=name))
+
+    def _brush(self, message: Mapping[str, Any]) -> bool:
+        x, s = (part[None] for part in self._inner.particles())
+        touch = Touch.read(message, x)
+        self._place(*brushed(x, s, touch, self._inner.worlds.physics.box))
+        return False
+
+    def _place(self, x: Tensor, s: Tensor) -> None:
+        self._observation = self._inner.place_particles(x[0], s[0])
+
+    def close(self) -> None:
+        """Close the environment."""
+        self._env.close()

@@ -1,0 +1,322 @@
+"""What live worlds have in common: messages, frames, hands.
+
+A live world goes on while one watches and touches it: it takes messages, moves on and shows frames,
+and knows nothing of how these travel. The messages and what `describe` returns are listed at the
+head of `npa_envs/web/page/page.js`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from npa_envs.errors import NPAError, shown, suggest
+from npa_envs.tasks.checks import is_real, is_whole
+from npa_envs.tasks.damage import DAMAGE_SIZES
+from npa_envs.world.brushes import clump, cut, push
+
+MOST_STEPS = 64
+"""Steps from frame to frame, at most."""
+
+LOSS_SHARE = 0.1
+"""Share of the time that losses take at most, while they are looked at."""
+
+CLUMP_RATE = 0.25
+"""Share of its distance that a particle loses to the brush `clump` of strength 1 in one message."""
+
+FARTHEST = 1e4
+"""Largest coordinate that a message may name [length units]."""
+
+LARGEST_RADIUS = 10.0
+"""Largest radius of a brush [length units]."""
+
+
+class Frame(NamedTuple):
+    """What is seen of a world at a time."""
+
+    step: int
+    """Steps from the seed."""
+    positions: NDArray[np.float32]
+    """Positions [length units], shape [N, D]."""
+    colours: NDArray[np.uint8]
+    """Red, green and blue, shape [N, 3]."""
+    milliseconds: float
+    """Time of one step, lately [ms]."""
+    loss: float | None
+    """How far the world is from its target, where that was computed."""
+
+
+class LiveWorld(Protocol):
+    """A world that goes on while one watches and touches it."""
+
+    playing: bool
+    """Whether it goes on by itself."""
+
+    def describe(self) -> dict[str, Any]:
+        """Return the event "world"."""
+
+    def handle(self, message: Mapping[str, Any]) -> bool:
+        """Do what a message says; return whether `describe` has changed.
+
+        Raises:
+            NPAError: The message says nothing that can be done; the world is as it was.
+        """
+
+    def advance(self) -> None:
+        """Go on to the next frame."""
+
+    def frame(self) -> Frame:
+        """Return what is seen now."""
+
+    def news(self) -> list[dict[str, Any]]:
+        """Return other events since the last call: curves, errors, descriptions that changed."""
+
+    def close(self) -> None:
+        """Give back what the world holds."""
+
+
+class Range(NamedTuple):
+    """What a number may be."""
+
+    low: float
+    high: float
+    scale: str | None = None
+    whole: bool = False
+
+    def checked(self, name: str, value: Any) -> float:
+        """Return a number that lies in the range.
+
+        Raises:
+            NPAError: It does not, or is none.
+        """
+        if (
+            not (is_whole(value) if self.whole else is_real(value))
+            or not self.low <= value <= self.high
+        ):
+            kind = "a whole number" if self.whole else "a number"
+            raise NPAError(
+                f"{name} must be {kind} in [{self.low:g}, {self.high:g}], got {shown(value)}"
+            )
+        return int(value) if self.whole else float(value)
+
+    def told(self, value: float) -> dict[str, Any]:
+        """Return the range and the present value as the page reads them."""
+        told: dict[str, Any] = {"value": value, "low": self.low, "high": self.high}
+        if self.scale is not None:
+            told["scale"] = self.scale
+        return told | ({"whole": True} if self.whole else {})
+
+
+SPEED = Range(1, MOST_STEPS, "log", whole=True)
+"""Steps from frame to frame."""
+
+
+class Live:
+    """What live worlds have in common: playing, time, colours, and the way of a message."""
+
+    def __init__(self) -> None:
+        self.playing = True
+        self.speed = 1
+        self.show = "colours"
+        self.step = 0
+        self._milliseconds = 0.0
+        self._loss_wanted = False
+        self._loss_due = 0.0
+        self._news: list[dict[str, Any]] = []
+
+    def handle(self, message: Mapping[str, Any]) -> bool:
+        """Do what a message says; return whether `describe` has changed."""
+        kind = message.get("type") if isinstance(message, Mapping) else None
+        match kind:
+            case "play":
+                self.playing = checked_flag("on", message.get("on"))
+            case "step":
+                self.playing = False
+                self._timed(1)
+            case "reset":
+                seed = message.get("seed")
+                self.reset(None if seed is None else checked_seed(seed))
+                return True
+            case "set":
+                return self._set(message.get("name"), message.get("value"))
+            case "brush":
+                return self._brush(message)
+            case "damage":
+                name = message.get("name")
+                if name not in DAMAGE_SIZES:
+                    raise NPAError(f"unknown damage {shown(name)}: {suggest(name, DAMAGE_SIZES)}")
+                self._damage(str(name))
+            case _:
+                known = ("play", "step", "reset", "set", "brush", "damage")
+                raise NPAError(f"unknown message {shown(kind)}: {suggest(kind, known)}")
+        return False
+
+    def advance(self) -> None:
+        """Go on to the next frame."""
+        self._timed(self.speed)
+
+    def news(self) -> list[dict[str, Any]]:
+        """Return other events since the last call."""
+        told, self._news = self._news, []
+        return told
+
+    def close(self) -> None:
+        """Give back what the world holds: nothing."""
+
+    def reset(self, seed: int | None) -> None:
+        """Begin a fresh world, of the next seed where none is given."""
+        raise NotImplementedError
+
+    def _run(self, steps: int) -> None:
+        raise NotImplementedError
+
+    def _damage(self, name: str) -> None:
+        raise NotImplementedError
+
+    def _brush(self, message: Mapping[str, Any]) -> bool:
+        raise NotImplementedError
+
+    def _set(self, name: Any, value: Any) -> bool:
+        match name:
+            case "speed":
+                self.speed = int(SPEED.checked("speed", value))
+            case "show":
+                if value not in self._shows():
+                    raise NPAError(f"unknown show {shown(value)}: {suggest(value, self._shows())}")
+                self.show = str(value)
+            case "loss":
+                self._loss_wanted = checked_flag("loss", value)
+            case _:
+                raise NPAError(f"unknown setting {shown(name)}: {suggest(name, self._settings())}")
+        return bool(name != "loss")
+
+    def _settings(self) -> dict[str, Any]:
+        return {"speed": SPEED.told(self.speed)}
+
+    def _shows(self) -> list[str]:
+        raise NotImplementedError
+
+    def _timed(self, steps: int) -> None:
+        start = time.perf_counter()
+        self._run(steps)
+        each = 1000.0 * (time.perf_counter() - start) / steps
+        # The mean of the last few: single steps are compiled, recorded, interrupted.
+        self._milliseconds += (0.2 if self._milliseconds else 1.0) * (each - self._milliseconds)
+
+    def _loss(self, compute: Callable[[], float]) -> float | None:
+        """Return a loss where it is wanted and may take the time again."""
+        start = time.perf_counter()
+        if not self._loss_wanted or start < self._loss_due:
+            return None
+        loss = compute()
+        taken = time.perf_counter() - start
+        self._loss_due = start + taken / LOSS_SHARE
+        return loss
+
+
+class Touch(NamedTuple):
+    """What a hand does at a place."""
+
+    tool: str
+    at: Tensor
+    """Where [length units], shape [1, D]."""
+    move: Tensor
+    """How it moves [length units], shape [1, D]."""
+    radius: float
+    """Radius of the brush [length units]."""
+    strength: float
+    """From 0 to 1, dimensionless."""
+    view: Tensor | None
+    """In 3D the unit vector towards the viewer, shape [1, D], where it is known."""
+
+    @classmethod
+    def read(cls, message: Mapping[str, Any], x: Tensor) -> Touch:
+        """Return what a message says, for a world at x [1, N, D].
+
+        Raises:
+            NPAError: A tool or a number is missing or wrong.
+        """
+        tool = message.get("tool")
+        tools = ("erase", "push", "clump", "cut", "graft", "add")
+        if tool not in tools:
+            raise NPAError(f"unknown tool {shown(tool)}: {suggest(tool, tools)}")
+        at = _checked_vector("at", message.get("at"), x)
+        move = _checked_vector("move", message.get("move", [0.0] * x.shape[2]), x)
+        radius = Range(1e-4, LARGEST_RADIUS).checked("radius", message.get("radius"))
+        strength = Range(0.0, 1.0).checked("strength", message.get("strength", 1.0))
+        view = message.get("view")
+        toward = None if view is None else _checked_vector("view", view, x)
+        return cls(str(tool), at, move, radius, strength, toward)
+
+
+def brushed(
+    x: Tensor, s: Tensor, touch: Touch, box: tuple[float, ...] | None
+) -> tuple[Tensor, Tensor]:
+    """Return worlds after a brush that keeps all particles: push, clump or cut.
+
+    Raises:
+        NPAError: It is another brush.
+    """
+    match touch.tool:
+        case "push":
+            moved = push(
+                x, centre=touch.at, move=touch.move, radius=touch.radius, box=box,
+                strength=min(1.0, 0.5 + touch.strength),
+            )  # fmt: skip
+            return moved, s
+        case "clump":
+            factor = CLUMP_RATE * touch.strength
+            return clump(x, s, centre=touch.at, radius=touch.radius, factor=factor, box=box)
+        case "cut":
+            half = 0.5 * touch.move
+            return cut(
+                x, s, centre=touch.at + half, normal=across(touch.move, touch.view), along=half,
+                gap=touch.radius, box=box,
+            )  # fmt: skip
+    raise NPAError(
+        f"this world keeps its particles, so that the brush {shown(touch.tool)} does nothing: take "
+        "push, clump or cut"
+    )
+
+
+def across(move: Tensor, view: Tensor | None) -> Tensor:
+    """Return the direction across a cut along `move` [1, D], seen from `view` in 3D, [1, D]."""
+    if move.shape[1] == 2:
+        return torch.stack((-move[:, 1], move[:, 0]), dim=1)
+    toward = move.new_tensor([[0.0, 0.0, 1.0]]) if view is None else view
+    normal: Tensor = torch.linalg.cross(toward, move)
+    return normal
+
+
+def checked_flag(name: str, value: Any) -> bool:
+    """Return a flag of a message.
+
+    Raises:
+        NPAError: It is none.
+    """
+    if not isinstance(value, bool):
+        raise NPAError(f"{name} must be true or false, got {shown(value)}")
+    return value
+
+
+def checked_seed(value: Any) -> int:
+    """Return a world's number.
+
+    Raises:
+        NPAError: It is none.
+    """
+    return int(Range(0, 2**53, whole=True).checked("seed", value))
+
+
+def _checked_vector(name: str, value: Any, x: Tensor) -> Tensor:
+    space_dim = x.shape[2]
+    fits = isinstance(value, list) and len(value) == space_dim and all(map(is_real, value))
+    if not fits or max(map(abs, value)) > FARTHEST:
+        raise NPAError(f"{name} must be {space_dim} finite numbers, got {shown(value)}")
+    return x.new_tensor([value])

@@ -1,0 +1,500 @@
+"""Live worlds of rules: a rule with whatever grafts and seeds bring in, and the rule of a run."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from npa_envs.errors import NPAError, shown, suggest
+from npa_envs.rule.files import load_rule, shipped_rules
+from npa_envs.rule.rule import NPARule
+from npa_envs.tasks.base import PictureTask, seed_worlds, task_toward
+from npa_envs.tasks.checks import is_real
+from npa_envs.tasks.damage import DAMAGE_SIZES, damage_worlds
+from npa_envs.tasks.point_classification import PointClassification, class_colours
+from npa_envs.tasks.seeds import uniform_ball
+from npa_envs.training.run_folder import JsonlLog, RunFolder
+from npa_envs.training.trained_tasks import TrainedTask, task_of_rule
+from npa_envs.web.colouring import Colouring, Seen, shows_of
+from npa_envs.web.live import Frame, Live, Range, Touch, brushed, checked_seed
+from npa_envs.world.brushes import inside_ball, removed
+from npa_envs.world.rollout import rollout
+from npa_envs.world.species import AGREEMENTS, rollout_species
+
+MOST_PARTICLES = {"cpu": 16384, "cuda": 131072}
+"""Largest number of particles that the slider offers, on each kind of device."""
+
+SEED_SHARE = 0.5
+"""Particles that the brush `add` of strength 1 adds, as a share of those of a fresh world."""
+
+SMALL_VIEWS = {"resolution": 64, "training_views": 1, "held_out_views": 6}
+"""What the loss of a 3D world looks at: as trained, drawing the target alone takes many seconds."""
+
+POLL_SECONDS = 1.0
+"""Time between two looks into the folder of a run [s]."""
+
+
+class Organism(NamedTuple):
+    """A rule by its name."""
+
+    name: str
+    """What the page calls it."""
+    rule: NPARule
+    """The rule, float32, on the world's device."""
+
+
+class RuleWorld(Live):
+    """A world of one rule, or of several that grafts and seeds have brought into it.
+
+    Args:
+        source: The rule: a shipped one or a file.
+        device: Where the world lives.
+        seed: The first world's number.
+        particle_count: Particles N; None: as trained.
+        choices: Other rules that may be chosen, by their names; None: the shipped ones.
+
+    Raises:
+        NPAError: The rule cannot be loaded, or a number is out of its range.
+    """
+
+    def __init__(
+        self,
+        source: str = "gecko",
+        *,
+        device: torch.device,
+        seed: int = 0,
+        particle_count: int | None = None,
+        choices: Mapping[str, str] | None = None,
+    ) -> None:
+        super().__init__()
+        self._device = device
+        self._rules: dict[str, NPARule] = {}
+        self._trained: dict[tuple[str, int | None], TrainedTask] = {}
+        self.seed = checked_seed(seed)
+        others = {name: name for name in shipped_rules()} if choices is None else dict(choices)
+        name = name_of(source)
+        self._choices = others | {name: source}
+        self._plant(name, particle_count)
+
+    # Which rule, and a fresh world of it.
+
+    def _organism(self, name: Any) -> Organism:
+        if not isinstance(name, str) or name not in self._choices:
+            raise NPAError(f"unknown rule {shown(name)}: {suggest(name, self._choices)}")
+        if name not in self._rules:
+            rule = load_rule(self._choices[name], device=self._device).float()
+            self._rules[name] = rule.requires_grad_(False)
+        return Organism(name, self._rules[name])
+
+    def _task_of(self, organism: Organism, particle_count: int | None) -> TrainedTask:
+        key = (organism.name, particle_count)
+        if key not in self._trained:
+            self._trained[key] = task_of_rule(
+                self._choices[organism.name],
+                organism.rule,
+                self._device,
+                particle_count=particle_count,
+                **(SMALL_VIEWS if organism.rule.space_dim == 3 else {}),
+            )
+        return self._trained[key]
+
+    def _plant(self, name: Any, particle_count: int | None = None) -> None:
+        """Begin a fresh world of a rule, in the world that it was trained in."""
+        organism = self._organism(name)
+        self.trained = self._task_of(organism, particle_count)
+        self.main = organism
+        self.eps, self.update_prob, self.noise = self.task.eps, self.task.update_prob, 0.0
+        self.speed = 1
+        if self.show not in self._shows():
+            self.show = "colours"
+        self.reset(self.seed)
+
+    @torch.no_grad()
+    def reset(self, seed: int | None) -> None:
+        """Begin a fresh world of the chosen rule alone."""
+        self.seed = self.seed + 1 if seed is None else seed
+        self._generator = torch.Generator(self._device).manual_seed(self.seed)
+        self.x, self.s, self._goal = seed_worlds(
+            self.task, 1, generator=self._generator, device=self._device
+        )
+        self.full = self.x.shape[1]
+        self.organisms, self.counts = [self.main], [self.full]
+        self._divisors = [float(self.full)]
+        self._colouring = Colouring()
+        self._travelled: Tensor | None = None
+        self._updated: Tensor | None = None
+        self.step, self._milliseconds, self._loss_due = 0, 0.0, 0.0
+
+    @property
+    def task(self) -> PictureTask:
+        """The task of the chosen rule."""
+        return self.trained.task
+
+    @property
+    def dimension(self) -> int:
+        """Space dimension D."""
+        return self.main.rule.space_dim
+
+    def describe(self) -> dict[str, Any]:
+        """Return the event "world"."""
+        task, box = self.task, self.task.box
+        half_width, centre = 1.1, [0.0] * self.dimension
+        if box is not None:
+            half_width = 0.5 * min(box)
+        elif isinstance(task, PointClassification):
+            half_width, centre = 0.6, [0.5] * self.dimension
+        alike = [name for name in self._choices if self._may_join(name)]
+        tools = ["erase", "push", "clump", "cut", "graft", "add"]
+        if self.main.rule.static:
+            tools.remove("add")
+        return {
+            "type": "world",
+            "title": self.main.name,
+            "note": self._note(),
+            "dimension": self.dimension,
+            "box": None if box is None else list(box),
+            "half_width": half_width,
+            "centre": centre,
+            "spot": self._spot(),
+            "rules": sorted(self._choices),
+            "rule": self.main.name,
+            "others": alike,
+            "species": [organism.name for organism in self.organisms],
+            "shows": self._shows(),
+            "show": self.show,
+            "tools": tools,
+            "damages": list(DAMAGE_SIZES),
+            "settings": self._settings(),
+            "capabilities": ["step", "reset", "film", *self._loss_offered()],
+            "playing": self.playing,
+            "seed": self.seed,
+        }
+
+    def _note(self) -> str:
+        return ""
+
+    def _loss_offered(self) -> list[str]:
+        return ["loss"] if self.trained.doubt is None else []
+
+    def _may_join(self, name: str) -> bool:
+        """Return whether particles of another rule can live in this world."""
+        try:
+            other = self._organism(name).rule
+        except NPAError:
+            return False
+        return all(getattr(other, what) == getattr(self.main.rule, what) for what in AGREEMENTS)
+
+    def _spot(self) -> float:
+        """Return the standard deviation of a particle's spot [length units]."""
+        target = getattr(self.task, "target", None)
+        size = getattr(self.task, "pixel_size", None) or getattr(target, "pixel_size", None)
+        spacing = (0.1 / self.full) ** (1.0 / 3.0) if size is None else float(size)
+        return 0.7 * spacing
+
+    # Settings.
+
+    def _ranges(self) -> dict[str, Range]:
+        eps0, box = self.main.rule.eps0, self.task.box
+        # Cells of a periodic box are as wide as the radius, and two of them must fit.
+        most = 2.5 * eps0 if box is None else min(2.5 * eps0, 0.499 * min(box))
+        return {
+            "eps": Range(0.4 * eps0, most, "log"),
+            "update_prob": Range(0.05, 1.0),
+            "noise": Range(0.0, 0.2 * eps0),
+            "count": Range(64, MOST_PARTICLES[self._device.type], "log", whole=True),
+        }
+
+    def _settings(self) -> dict[str, Any]:
+        ranges = self._ranges()
+        values = {
+            "eps": self.eps, "update_prob": self.update_prob, "noise": self.noise,
+            "count": self.full,
+        }  # fmt: skip
+        if isinstance(self.task, PointClassification):
+            del values["count"]
+        told = {name: ranges[name].told(value) for name, value in values.items()}
+        return super()._settings() | told
+
+    def _shows(self) -> list[str]:
+        return shows_of(self.main.rule.state_dim)
+
+    def _set(self, name: Any, value: Any) -> bool:
+        if name == "rule":
+            self._plant(value)
+            return True
+        if name not in self._settings() or name == "speed":
+            return super()._set(name, value)
+        number = self._ranges()[name].checked(name, value)
+        if name == "count":
+            if number != self.full:
+                self.trained = self._task_of(self.main, int(number))
+                self.reset(self.seed)
+        else:
+            setattr(self, name, number)
+        return True
+
+    # Time.
+
+    @torch.no_grad()
+    def _run(self, steps: int) -> None:
+        self.step += steps
+        if self.x.shape[1] == 0:
+            return
+        told: dict[str, Any] = {
+            "eps": self.eps, "box": self.task.box, "update_prob": self.update_prob,
+            "position_noise": self.noise, "generator": self._generator,
+        }  # fmt: skip
+        watched = self.show in ("mask", "speed")
+        if watched and steps > 1:
+            # Shown is the last step alone.
+            self._go(steps - 1, told)
+        before = self.s
+        travelled = self._go(1 if watched else steps, told, path=watched)
+        if travelled is not None:
+            reach = max(organism.rule.alpha for organism in self.organisms) * self.eps
+            self._travelled, self._updated = travelled / reach, (self.s != before).any(dim=-1)
+        if self._device.type == "cuda":
+            torch.cuda.synchronize(self._device)
+
+    def _go(self, steps: int, told: Mapping[str, Any], *, path: bool = False) -> Tensor | None:
+        rules = [organism.rule for organism in self.organisms]
+        alone = self.counts == [self.full]
+        if alone:
+            self.x, self.s, travelled = rollout(
+                rules[0], self.x, self.s, steps, return_path_length=True, **told
+            )
+        else:
+            # Densities are divided by the particles of a fresh world: what a hand takes away or
+            # adds is then felt nearby, and nowhere else.
+            self.x, self.s, travelled = rollout_species(
+                rules, self.x, self.s, steps, counts=self.counts, return_path_length=True,
+                density_counts=self._divisors, **told,
+            )  # fmt: skip
+        return travelled if path else None
+
+    def frame(self) -> Frame:
+        """Return what is seen now."""
+        seen = Seen(
+            self.x, self.s, self._own_colours, self.eps, self.task.box, self.counts, self.full,
+            self._travelled, self._updated,
+        )  # fmt: skip
+        with torch.no_grad():
+            colours = self._colouring(self.show, seen)
+        positions: NDArray[np.float32] = self.x[0].cpu().numpy()
+        alone = len(self.organisms) == 1 and positions.size and self._loss_offered()
+        loss = self._loss(self._metric) if alone else None
+        return Frame(self.step, positions, colours, self._milliseconds, loss)
+
+    def _own_colours(self, s: Tensor) -> Tensor:
+        if isinstance(self.task, PointClassification):
+            return class_colours(self.task.outputs(s))
+        parts = zip(self.organisms, s.split_with_sizes(self.counts, dim=1), strict=True)
+        return torch.cat([organism.rule.colour(part) for organism, part in parts], dim=1)
+
+    @torch.no_grad()
+    def _metric(self) -> float:
+        return float(task_toward(self.task, self._goal).metric(self.x, self.s))
+
+    # Hands.
+
+    @torch.no_grad()
+    def _damage(self, name: str) -> None:
+        if self.x.shape[1]:
+            self.x, self.s = damage_worlds(self.x, self.s, kind=name, generator=self._generator)
+
+    @torch.no_grad()
+    def _brush(self, message: Mapping[str, Any]) -> bool:
+        touch = Touch.read(message, self.x)
+        before = [organism.name for organism in self.organisms]
+        match touch.tool:
+            case "erase":
+                gone = inside_ball(self.x, centre=touch.at, radius=touch.radius, box=self.task.box)
+                self._arrange(*removed(self.x, self.s, gone=gone), self._species()[~gone[0]])
+            case "graft":
+                self._graft(touch, self._joining(message.get("rule")))
+            case "add" if not self.main.rule.static:
+                self._add(touch, self._joining(message.get("rule")))
+            case _:
+                self.x, self.s = brushed(self.x, self.s, touch, self.task.box)
+        return before != [organism.name for organism in self.organisms]
+
+    def _graft(self, touch: Touch, organism: Organism) -> None:
+        inside = inside_ball(self.x, centre=touch.at, radius=touch.radius, box=self.task.box)
+        # Among its hosts it sees densities as they do.
+        number = self._number(organism, float(self.full))
+        self._arrange(self.x, self.s, torch.where(inside[0], number, self._species()))
+
+    def _add(self, touch: Touch, organism: Organism) -> None:
+        count = max(16, round(touch.strength * SEED_SHARE * self.full))
+        room = MOST_PARTICLES[self._device.type] - self.x.shape[1]
+        if count > room:
+            raise NPAError(f"the world has room for {max(room, 0)} particles more, got {count}")
+        ball = uniform_ball(
+            1, count, self.dimension, touch.radius, generator=self._generator,
+            device=self._device, dtype=self.x.dtype,
+        )  # fmt: skip
+        # As if it grew alone: what is new divides densities by its own number.
+        number = self._number(organism, float(count))
+        x = torch.cat((self.x, ball + touch.at[:, None]), dim=1)
+        s = torch.nn.functional.pad(self.s, (0, 0, 0, count))
+        self._arrange(x, s, torch.nn.functional.pad(self._species(), (0, count), value=number))
+
+    def _joining(self, name: Any) -> Organism:
+        organism = self._organism(name)
+        if not self._may_join(organism.name):
+            raise NPAError(
+                f"{organism.name} cannot live in a world of {self.main.name}: rules of one world "
+                f"must agree in {', '.join(AGREEMENTS)}"
+            )
+        return organism
+
+    def _number(self, organism: Organism, divisor: float) -> int:
+        """Return the number of a species, after giving a rule that is new here the next one."""
+        names = [own.name for own in self.organisms]
+        if organism.name not in names:
+            names.append(organism.name)
+            self.organisms.append(organism)
+            self.counts.append(0)
+            self._divisors.append(divisor)
+        return names.index(organism.name)
+
+    def _species(self) -> Tensor:
+        """Return the species of each particle, int64, shape [N]."""
+        numbers = torch.arange(len(self.counts))
+        return numbers.repeat_interleave(torch.tensor(self.counts)).to(self._device)
+
+    def _arrange(self, x: Tensor, s: Tensor, species: Tensor) -> None:
+        """Take particles in any order, and put them species after species."""
+        order = species.argsort(stable=True)
+        counts = torch.bincount(species, minlength=len(self.organisms)).tolist()
+        living = [k for k, count in enumerate(counts) if count] or [0]
+        self.x, self.s = x[:, order], s[:, order]
+        self.organisms = [self.organisms[k] for k in living]
+        self._divisors = [self._divisors[k] for k in living]
+        self.counts = [counts[k] for k in living]
+
+
+def name_of(source: str) -> str:
+    """Return what the page calls a rule: its file's name, or that of the run it belongs to."""
+    if "#" in source:
+        return source.rpartition("#")[2]
+    path = Path(source)
+    return path.resolve().parent.name if path.name == "rule.safetensors" else path.stem
+
+
+class RunWorld(RuleWorld):
+    """The rule of a training run, as of its last checkpoint, in a world that lives on.
+
+    Args:
+        folder: The run's folder.
+        device: Where the world lives.
+        seed: The first world's number.
+        particle_count: Particles N; None: as trained.
+
+    Raises:
+        NPAError: The folder holds no run, or one that has not written a rule yet.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        device: torch.device,
+        seed: int = 0,
+        particle_count: int | None = None,
+    ) -> None:
+        self._run_folder = RunFolder(folder)
+        self._log = JsonlLog(self._run_folder.log)
+        check_run(self._run_folder)
+        self._written = self._stamp()
+        self._logged = 0
+        self._iteration = 0
+        self._due = 0.0
+        super().__init__(
+            str(self._run_folder.rule), device=device, seed=seed, particle_count=particle_count,
+            choices={},
+        )  # fmt: skip
+
+    def _note(self) -> str:
+        return f"a run in {self._run_folder.path.name}, iteration {self._iteration}"
+
+    def news(self) -> list[dict[str, Any]]:
+        """Return the run's new losses, and the world where its rule has changed."""
+        if time.monotonic() >= self._due:
+            self._due = time.monotonic() + POLL_SECONDS
+            try:
+                self._poll()
+            except NPAError as error:
+                # A file that is just being written is whole a moment later.
+                self._news.append({"type": "error", "message": str(error)})
+        return super().news()
+
+    def _stamp(self) -> int:
+        try:
+            return self._run_folder.rule.stat().st_mtime_ns
+        except OSError:
+            return 0
+
+    def _poll(self) -> None:
+        records = self._log.records()
+        if len(records) < self._logged:
+            # The run was begun anew, or went back to its checkpoint.
+            self._logged = 0
+        fresh = records[self._logged :]
+        if fresh:
+            self._iteration = int(fresh[-1].get("iteration", 0))
+            points = [
+                [record["iteration"], record["loss"]]
+                for record in fresh
+                if is_real(record.get("loss")) and is_real(record.get("iteration"))
+            ]
+            self._news.append(
+                {
+                    "type": "curve", "name": "Training loss", "points": points,
+                    "append": self._logged > 0,
+                }
+            )  # fmt: skip
+            self._logged = len(records)
+        written = self._stamp()
+        if written and written != self._written:
+            # Its weights alone: the world goes on under the rule as it is now.
+            rule = load_rule(self._run_folder.rule, device=self._device).float()
+            self.main.rule.load_state_dict(rule.state_dict())
+            self._written = written
+        if fresh or written:
+            self._news.append(self.describe())
+
+
+def check_run(folder: RunFolder) -> None:
+    """Check that a folder holds a run with a rule.
+
+    Raises:
+        NPAError: It does not; the message says what is missing.
+    """
+    path = str(folder.path)
+    if not folder.path.is_dir():
+        raise NPAError(f"a run must be a folder, got {shown(path)}: name the one given as --out")
+    if folder.rule.is_file():
+        return
+    others = sorted(folder.path.glob("rule-*.safetensors"))
+    if others:
+        raise NPAError(
+            f"the run in {shown(path)} trains {len(others)} rules together: view one of them, such "
+            f"as {shown(str(others[0]))}"
+        )
+    if folder.config.is_file() or folder.log.is_file():
+        raise NPAError(
+            f"the run in {shown(path)} has not written its rule {folder.rule.name} yet: wait for "
+            "its first checkpoint"
+        )
+    raise NPAError(
+        f"the folder {shown(path)} must hold the {folder.rule.name} of a run, it does not: name "
+        "another one"
+    )

@@ -1,0 +1,305 @@
+"""Brushes: what a hand does to a world at a place, as functions of positions and states.
+
+Whatever gardens a world uses these: damage of training pools, the viewer, agents. They work on
+batches, each world at its own place, and are differentiable in positions, states, places and
+amounts, but for which particles lie inside. Nothing waits for the device, except for `removed`,
+which changes how many particles there are.
+
+In all of them x are positions [length units], shape [B, N, D], s states (dimensionless), shape
+[B, N, C], and `box` the sides of the periodic box [length units], shape [D], across whose edges a
+brush reaches, or None in open space. Positions may leave the box; the next step wraps them.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from npa_envs.errors import NPAError, shown
+from npa_envs.ops.checks import check_world, checked_number
+
+Sides = tuple[float, ...] | None
+
+
+def offsets_from(x: Tensor, centre: Tensor, box: Sides = None) -> Tensor:
+    """Return the way from a place to each particle, to its nearest image in a box, [B, N, D].
+
+    Args:
+        x: Particle positions [length units], shape [B, N, D].
+        centre: A place in each world [length units], shape [B, D].
+        box: Sides of the periodic box [length units], or None.
+
+    Raises:
+        NPAError: `centre` has another shape, dtype or device than x asks for.
+    """
+    _check_vector("centre", centre, x)
+    offset = x - centre[:, None]
+    if box is None:
+        return offset
+    # Side by side: a tensor of the sides would be a copy to the device.
+    parts = zip(offset.unbind(dim=-1), box, strict=True)
+    return torch.stack([part - side * torch.round(part / side) for part, side in parts], dim=-1)
+
+
+def inside_ball(x: Tensor, *, centre: Tensor, radius: float | Tensor, box: Sides = None) -> Tensor:
+    """Return which particles lie in a ball, bool, shape [B, N].
+
+    Args:
+        x: Particle positions [length units], shape [B, N, D].
+        centre: Centre of the ball in each world [length units], shape [B, D].
+        radius: Radius [length units], a number or a tensor of shape [B].
+        box: Sides of the periodic box [length units], or None.
+
+    Raises:
+        NPAError: A wrong shape or dtype, or a radius that is negative or not finite.
+    """
+    distance = torch.linalg.vector_norm(offsets_from(x, centre, box), dim=-1)
+    return torch.le(distance, _per_world("radius", radius, x).squeeze(-1))
+
+
+def softness(x: Tensor, *, centre: Tensor, radius: float | Tensor, box: Sides = None) -> Tensor:
+    """Return how much a soft brush holds of each particle: (1 - r²)², 0 outside, [B, N, 1].
+
+    r is the distance from the place in radii. Arguments and errors are those of `inside_ball`.
+    """
+    size = _per_world("radius", radius, x)
+    square = offsets_from(x, centre, box).square().sum(dim=-1, keepdim=True)
+    # Masked before the division: a radius of zero holds nothing, and must not give NaN.
+    share = square / torch.where(size > 0, size, torch.ones_like(size)).square()
+    return torch.where(size > 0, (1.0 - share).clamp_min(0.0), 0.0).square()
+
+
+def removed(x: Tensor, s: Tensor, *, gone: Tensor) -> tuple[Tensor, Tensor]:
+    """Return worlds without some of their particles; waits for the device.
+
+    Args:
+        x: Particle positions [length units], shape [B, N, D].
+        s: Particle states (dimensionless), shape [B, N, C].
+        gone: Which particles go, as many in each world, bool, shape [B, N]: of `inside_ball`.
+
+    Returns:
+        Positions, shape [B, N', D], and states, shape [B, N', C], in the order that they had.
+
+    Raises:
+        NPAError: A wrong shape or dtype, or worlds would not keep equally many particles.
+    """
+    check_world(x, s)
+    if gone.shape != x.shape[:2] or gone.dtype != torch.bool:
+        raise NPAError(
+            f"gone must be bool of shape [B, N] = {list(x.shape[:2])}, got {gone.dtype} "
+            f"{list(gone.shape)}: take inside_ball"
+        )
+    counts = gone.sum(dim=1).tolist()
+    if len(set(counts)) > 1:
+        raise NPAError(
+            f"gone must take as many particles from each world, got {shown(counts)}: change one "
+            "world at a time, or set states with erase_state"
+        )
+    left = ~gone
+    kept = x.shape[1] - counts[0]
+    return x[left].view(len(x), kept, -1), s[left].view(len(s), kept, -1)
+
+
+def push(
+    x: Tensor,
+    *,
+    centre: Tensor,
+    move: Tensor,
+    radius: float | Tensor,
+    strength: float | Tensor = 1.0,
+    box: Sides = None,
+) -> Tensor:
+    """Return the positions with those under a soft brush carried along, shape [B, N, D].
+
+    Args:
+        x: Particle positions [length units], shape [B, N, D].
+        centre: Where the brush is in each world [length units], shape [B, D].
+        move: How it moves [length units], shape [B, D].
+        radius: Radius of the brush [length units], a number or a tensor of shape [B].
+        strength: Share of the movement that a particle in the middle follows (dimensionless), from
+            0 to 1; a number or a tensor of shape [B].
+        box: Sides of the periodic box [length units], or None.
+
+    Raises:
+        NPAError: A wrong shape or dtype, or a number out of its range.
+    """
+    check_world(x, x)
+    _check_vector("move", move, x)
+    share = _per_world("strength", strength, x, highest=1.0)
+    return x + share * softness(x, centre=centre, radius=radius, box=box) * move[:, None]
+
+
+def inject(
+    x: Tensor,
+    s: Tensor,
+    *,
+    centre: Tensor,
+    radius: float | Tensor,
+    state: Tensor,
+    strength: float | Tensor = 1.0,
+    box: Sides = None,
+) -> Tensor:
+    """Return the states with those under a soft brush drawn towards a given one, [B, N, C].
+
+    Args:
+        x: Particle positions [length units], shape [B, N, D].
+        s: Particle states (dimensionless), shape [B, N, C].
+        centre: Where the brush is in each world [length units], shape [B, D].
+        radius: Radius of the brush [length units], a number or a tensor of shape [B].
+        state: What is injected in each world (dimensionless), shape [B, C].
+        strength: Share of the way that a particle in the middle goes (dimensionless), from 0 to 1;
+            a number or a tensor of shape [B].
+        box: Sides of the periodic box [length units], or None.
+
+    Raises:
+        NPAError: A wrong shape or dtype, or a number out of its range.
+    """
+    check_world(x, s)
+    if state.shape != (s.shape[0], s.shape[2]):
+        raise NPAError(
+            f"state must have shape [B, C] = {(s.shape[0], s.shape[2])}, got {tuple(state.shape)}: "
+            "give one state for each world"
+        )
+    share = _per_world("strength", strength, x, highest=1.0)
+    return s + share * softness(x, centre=centre, radius=radius, box=box) * (state[:, None] - s)
+
+
+def erase_state(
+    x: Tensor, s: Tensor, *, centre: Tensor, radius: float | Tensor, box: Sides = None
+) -> Tensor:
+    """Return the states with those of the particles inside a ball set to zero.
+
+    Args:
+        x: Particle positions [length units], shape [B, N, D].
+        s: Particle states (dimensionless), shape [B, N, C].
+        centre: Centre of the ball in each world [length units], shape [B, D].
+        radius: Radius of the ball [length units], a number or a tensor of shape [B].
+        box: Sides of the periodic box [length units], or None.
+
+    Returns:
+        The new states, shape [B, N, C]; `s` itself is left as it is.
+
+    Raises:
+        NPAError: A wrong shape or dtype, or a radius that is negative or not finite.
+    """
+    check_world(x, s)
+    inside = inside_ball(x, centre=centre, radius=radius, box=box)
+    return s.masked_fill(inside[..., None], 0.0)
+
+
+def cut(
+    x: Tensor,
+    s: Tensor,
+    *,
+    centre: Tensor,
+    normal: Tensor,
+    gap: float | Tensor,
+    along: Tensor | None = None,
+    box: Sides = None,
+) -> tuple[Tensor, Tensor]:
+    """Open a slit along a line (a plane in 3D), as a knife would.
+
+    Particles within `gap` of the line move away from it, those on the line by half the gap and
+    those at the distance `gap` not at all: none is left within half the gap, the bands beside the
+    slit are twice as dense, and everything further away stays where it is.
+
+    Args:
+        x: Particle positions [length units], shape [B, N, D].
+        s: Particle states (dimensionless), shape [B, N, C].
+        centre: A point on the line in each world [length units], shape [B, D].
+        normal: Direction across the line, of any length, shape [B, D]; a zero vector cuts nothing.
+        gap: Width of the slit [length units], a number or a tensor of shape [B].
+        along: From `centre` to one end of the slit, and back to the other end [length units], shape
+            [B, D]; None: it has no ends. In 3D it ends there too, and goes on across.
+        box: Sides of the periodic box [length units], or None.
+
+    Returns:
+        The new positions, shape [B, N, D], and the states as they came.
+
+    Raises:
+        NPAError: A wrong shape or dtype, or a gap that is negative or not finite.
+    """
+    check_world(x, s)
+    _check_vector("centre", centre, x)
+    _check_vector("normal", normal, x)
+    width = _per_world("gap", gap, x)
+    length = torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
+    # Masked before the division: a zero normal must give a shift of zero, not NaN.
+    direction = normal / torch.where(length > 0, length, torch.ones_like(length))
+    offset = offsets_from(x, centre, box)
+    height = (offset * direction[:, None]).sum(dim=-1, keepdim=True)
+    side = (height >= 0).to(x.dtype) - 0.5
+    shift = side * (width - height.abs()).clamp_min(0.0)
+    if along is not None:
+        _check_vector("along", along, x)
+        reach = along.square().sum(dim=-1, keepdim=True)[:, None]
+        place = (offset * along[:, None]).sum(dim=-1, keepdim=True)
+        shift = torch.where(place.abs() <= reach, shift, 0.0)
+    return x + shift * direction[:, None], s
+
+
+def clump(
+    x: Tensor,
+    s: Tensor,
+    *,
+    centre: Tensor,
+    radius: float | Tensor,
+    factor: float | Tensor,
+    box: Sides = None,
+) -> tuple[Tensor, Tensor]:
+    """Draw the particles inside a ball together.
+
+    Args:
+        x: Particle positions [length units], shape [B, N, D].
+        s: Particle states (dimensionless), shape [B, N, C].
+        centre: Centre of the ball in each world [length units], shape [B, D].
+        radius: Radius of the ball [length units], a number or a tensor of shape [B].
+        factor: The share of its distance from the centre that a particle loses (dimensionless),
+            from 0, nothing moves, to 1, all meet in the centre; a number or a tensor of shape [B].
+        box: Sides of the periodic box [length units], or None.
+
+    Returns:
+        The new positions, shape [B, N, D], and the states as they came.
+
+    Raises:
+        NPAError: A wrong shape or dtype, a radius that is negative or not finite, or a factor
+            outside [0, 1].
+    """
+    check_world(x, s)
+    inside = inside_ball(x, centre=centre, radius=radius, box=box)
+    share = _per_world("factor", factor, x, highest=1.0)
+    pulled = x - share * offsets_from(x, centre, box)
+    return torch.where(inside[..., None], pulled, x), s
+
+
+def _per_world(name: str, value: float | Tensor, x: Tensor, *, highest: float = math.inf) -> Tensor:
+    """Return the number of each world in a shape [B, 1, 1] or [1, 1, 1]."""
+    if isinstance(value, Tensor):
+        if value.shape not in ((), (x.shape[0],)):
+            raise NPAError(
+                f"{name} must be a number or a tensor of shape [B] = [{x.shape[0]}], "
+                f"got {list(value.shape)}: give one number for each world"
+            )
+        # The values stay unread: looking at them would wait for the device.
+        return value.to(x).reshape(-1, 1, 1)
+    value = checked_number(name, value)
+    if not 0 <= value <= min(highest, torch.finfo(x.dtype).max):
+        rule = "finite and at least 0" if highest == math.inf else f"in [0, {highest:g}]"
+        raise NPAError(f"{name} must be {rule}, got {shown(value)}: try 0.1")
+    return x.new_full((1, 1, 1), value)
+
+
+def _check_vector(name: str, vector: Tensor, x: Tensor) -> None:
+    wanted = (x.shape[0], x.shape[2])
+    if vector.shape != wanted:
+        raise NPAError(
+            f"{name} must have shape [B, D] = {wanted}, got {tuple(vector.shape)}: "
+            f"give one vector for each world, for example {name}.expand{wanted}"
+        )
+    if vector.device != x.device or vector.dtype != x.dtype:
+        raise NPAError(
+            f"{name} must be {x.dtype} on {x.device} like x, got {vector.dtype} on "
+            f"{vector.device}: convert it with {name}.to(x)"
+        )
