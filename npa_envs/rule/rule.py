@@ -228,9 +228,12 @@ class NPARule(nn.Module):
         try:
             return super().__getattr__(name)
         except AttributeError as error:
+            if name.startswith("_"):
+                # What libraries ask for to see whether it is there must cost nothing.
+                raise
             # As Python's own errors do, which torch's modules replace.
             nearest = difflib.get_close_matches(name, [n for n in dir(self) if n[0] != "_"], n=1)
-            hint = f": did you mean {nearest[0]!r}?" if nearest and name[0] != "_" else ""
+            hint = f": did you mean {nearest[0]!r}?" if nearest else ""
             raise AttributeError(f"{error}{hint}", name=name, obj=self) from None
 
     def hyper_parameters(self) -> RuleHyperParameters:

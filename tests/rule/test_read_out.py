@@ -95,3 +95,8 @@ def test_a_name_that_a_rule_lacks_is_answered_with_the_nearest():
         _ = rule._color
     assert not hasattr(rule, "color")
     assert isinstance(copy.deepcopy(rule), NPARule)
+
+
+def test_to_ask_a_rule_for_what_libraries_mark_it_with_searches_for_no_name(monkeypatch):
+    monkeypatch.setattr("difflib.get_close_matches", None)
+    assert not hasattr(NPARule(), "_orig_mod")
