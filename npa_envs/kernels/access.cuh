@@ -209,7 +209,16 @@ __device__ inline int first_in_warp(bool condition)
 
 __device__ inline unsigned vote_of_warp(bool condition) { return __ballot_sync(~0u, condition); }
 
-__device__ inline int largest_in_warp(int value) { return __reduce_max_sync(~0u, value); }
+__device__ inline int largest_in_warp(int value)
+{
+#if __CUDA_ARCH__ >= 800
+    return __reduce_max_sync(~0u, value);
+#else
+    for (int offset = 16; offset > 0; offset /= 2)
+        value = max(value, __shfl_xor_sync(~0u, value, offset));
+    return value;
+#endif
+}
 
 __device__ inline int sum_up_to(int value)
 {

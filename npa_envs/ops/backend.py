@@ -75,6 +75,12 @@ def is_modern(device: torch.device) -> bool:
     return device.type == "cuda" and torch.cuda.get_device_capability(device) >= (8, 0)
 
 
+@functools.lru_cache
+def processor_count(device: torch.device) -> int:
+    """Return how many blocks of threads a CUDA device runs at once, at least."""
+    return int(torch.cuda.get_device_properties(device).multi_processor_count)
+
+
 def _cuda(request: Request) -> bool:
     return request.dtype == torch.float32 and is_modern(request.device)
 

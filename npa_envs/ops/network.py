@@ -16,7 +16,7 @@ from npa_envs.kernels.cuda.network import (
     two_layer_kernel,
     weight_gradient_kernels,
 )
-from npa_envs.ops.backend import Request, choose
+from npa_envs.ops.backend import Request, choose, processor_count
 from npa_envs.ops.launch import launch
 from npa_envs.ops.opaque import once_differentiable, opaque
 
@@ -242,7 +242,7 @@ def _weight_gradients(
     kernels = weight_gradient_kernels(
         -(-width // 16), -(-width // 8), -(-out_width // 8), warps, unit_blocks, signs.shape[1]
     )
-    processors = torch.cuda.get_device_properties(rows.device).multi_processor_count
+    processors = processor_count(rows.device)
     each = 1 if count <= FEW_ROWS * processors else SHARES_PER_PROCESSOR
     most = max(each * processors // unit_blocks, 1)
     share_rows = max(-(-count // (most * ROW_GROUP)), 1) * ROW_GROUP

@@ -13,7 +13,7 @@ from npa_envs.kernels.access import CUDA_LANES, WARP
 from npa_envs.kernels.cuda.sort import BLOCKS, STATE_SHARE, order_particles, sort_small_worlds
 from npa_envs.kernels.domain import make_domain
 from npa_envs.kernels.portable.sort import sort_kernels
-from npa_envs.ops.backend import Operator, Request, choose
+from npa_envs.ops.backend import Operator, Request, choose, processor_count
 from npa_envs.ops.launch import channel_width, launch, scalar_type
 
 LARGEST_INDEX = 2**31 - 1
@@ -24,9 +24,6 @@ LARGEST_MASK = 2**28
 
 LARGEST_THREAD_MASK = 2**22
 """The same of masks that threads of a CPU sort."""
-
-BUSY_BLOCKS = 128
-"""Blocks that occupy a device: fewer worlds are cut into slices."""
 
 SMALLEST_SLICE = 128
 """Particles of a slice, at least."""
@@ -304,7 +301,9 @@ def _sort_by_blocks(
     """Sort small worlds in one launch."""
     ordered = _empty_worlds(plan, x, s, with_rows)
     starts = torch.empty(plan.start_count, dtype=torch.int32, device=x.device)
-    slices = max(min(BUSY_BLOCKS // plan.world_count, plan.particle_count // SMALLEST_SLICE), 1)
+    # Worlds that leave processors idle are cut into slices.
+    idle = processor_count(x.device) // plan.world_count
+    slices = max(min(idle, plan.particle_count // SMALLEST_SLICE), 1)
     block = BLOCKS[capacity]
     launch(
         sort_small_worlds(plan.space_dim, capacity),

@@ -1,0 +1,64 @@
+"""Kernels compile for every GPU generation that is served; nothing is run, no GPU is needed."""
+
+import pytest
+import warp as wp
+
+from npa_envs.kernels.cuda.adjoint import listed_adjoint
+from npa_envs.kernels.cuda.density import listed_density
+from npa_envs.kernels.cuda.network import (
+    arrangement_kernels,
+    two_layer_kernel,
+    weight_gradient_kernels,
+)
+from npa_envs.kernels.cuda.perceive import listed_perception
+from npa_envs.kernels.cuda.sort import BLOCKS, order_particles, sort_small_worlds
+from npa_envs.kernels.portable.episodes import judge_worlds
+from npa_envs.ops import warmup
+from npa_envs.ops.launch import launched
+
+TURING = 75
+MODERN = (80, 86, 89, 90, 100, 120)
+"""Compute capabilities, times ten, from which kernels/cuda/ is used."""
+
+
+def compile_for(kernel, capability, folder):
+    wp.compile_aot_module(kernel.module, arch=capability, module_dir=folder, use_ptx=False)
+
+
+def cuda_engine():
+    """A variant of each kernel of kernels/cuda/, in 2D and 3D."""
+    for space_dim in (2, 3):
+        yield listed_density(space_dim, 1, True, 128, False)
+        yield listed_density(space_dim, 4, False, 128, True)
+        yield listed_perception(
+            space_dim, 16, 4, True, "threshold", False, False, 128, True, teams=2
+        )
+        yield listed_adjoint(space_dim, 16, True, False, False).unscale_cotangents
+        yield order_particles(space_dim, 16)
+        yield sort_small_worlds(space_dim, max(BLOCKS))
+    yield arrangement_kernels().arrange_hidden
+    for mode in ("rectify", "note", "mask"):
+        yield two_layer_kernel(5, 3, mode)
+    yield weight_gradient_kernels(5, 9, 3, 4, 1, 4).sum_weight_gradients
+
+
+@pytest.mark.parametrize("capability", [TURING, MODERN[-1]])
+def test_a_kernel_compiles_with_all_native_code_for_the_oldest_and_the_newest(capability, tmp_path):
+    compile_for(judge_worlds, capability, tmp_path)
+    assert list(tmp_path.glob(f"*.sm{capability}.cubin"))
+
+
+@pytest.mark.slow
+def test_portable_kernels_compile_for_turing(tmp_path):
+    warmup("cpu", space_dims=(2, 3))
+    modules = {kernel.module.name: kernel for kernel, _ in launched}
+    assert len(modules) > 15
+    for kernel in modules.values():
+        compile_for(kernel, TURING, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("capability", MODERN)
+def test_cuda_kernels_compile_from_ampere_on(capability, tmp_path):
+    for kernel in cuda_engine():
+        compile_for(kernel, capability, tmp_path)
