@@ -296,8 +296,7 @@ class _Recording:
         before = _reserved(self.device)
         results: list[Tensor] = []
         kept: list[Tensor] = []
-        count = None if call.keep_every is None else steps // call.keep_every
-        outputs = self._outputs.setdefault(count, self._kept_worlds(count))
+        outputs = self._kept(self._outputs, steps)
 
         def forward() -> None:
             kept.clear()
@@ -308,23 +307,26 @@ class _Recording:
         draws = None if self._streams is not None else self._generator
         forward_graph = capture(forward, self.device, pool=self._pool, generator=draws)
         backward_graph = None
-        if any(self._wanted):
-            bars = self._bars.setdefault(count, [torch.zeros_like(out) for out in outputs])
+        if self.differentiable:
+            bars = self._kept(self._bars, steps)
             backward_graph = capture(
                 functools.partial(self._pull_back, results, bars), self.device, pool=self._pool
             )
         self._graphs[steps] = _Graphs(forward_graph, backward_graph)
         self.bytes += max(_reserved(self.device) - before, 0)
 
-    def _kept_worlds(self, count: int | None) -> list[Tensor]:
-        own = self._inputs[:3]
-        if count is None:
-            return [torch.empty_like(tensor) for tensor in own]
-        return [tensor.new_empty(count, *tensor.shape) for tensor in own]
+    def _kept(self, made: dict[int | None, list[Tensor]], steps: int) -> list[Tensor]:
+        """Return tensors for the worlds that so many steps keep, the same ones for each count."""
+        every = self._call.keep_every
+        count = None if every is None else steps // every
+        if count not in made:
+            first = () if count is None else (count,)
+            made[count] = [tensor.new_empty(*first, *tensor.shape) for tensor in self._inputs[:3]]
+        return made[count]
 
     def _warm_up(self, call: Call) -> None:
         results = self._run(call, [])
-        if any(self._wanted):
+        if self.differentiable:
             self._pull_back(results, [torch.zeros_like(result) for result in results])
 
     def _run(self, call: Call, kept: list[Tensor]) -> Worlds:
@@ -336,7 +338,7 @@ class _Recording:
 
         generator = self._generator if self._streams is None else self._streams
         hooks = torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor)
-        with torch.set_grad_enabled(any(self._wanted)), hooks:
+        with torch.set_grad_enabled(self.differentiable), hooks:
             return call.run(self._rules, Worlds(*self._inputs[:3]), generator)
 
     def _pull_back(self, results: Sequence[Tensor], bars: list[Tensor]) -> None:
@@ -367,8 +369,7 @@ class _Recording:
             graphs = self._graphs[steps]
             self._graphs.move_to_end(steps)
             graphs.forward.replay()
-            count = None if self._call.keep_every is None else steps // self._call.keep_every
-            return [value.clone() for value in self._outputs[count]]
+            return [value.clone() for value in self._kept(self._outputs, steps)]
 
     def backward(
         self, steps: int, bars: Sequence[Tensor | None], wanted: Sequence[bool]
@@ -376,8 +377,7 @@ class _Recording:
         """Replay the backward pass of the rollout under way; return copies of the gradients."""
         with self._placed():
             self._take_turns()
-            count = None if self._call.keep_every is None else steps // self._call.keep_every
-            for buffer, bar in zip(self._bars[count], bars, strict=True):
+            for buffer, bar in zip(self._kept(self._bars, steps), bars, strict=True):
                 buffer.zero_() if bar is None else buffer.copy_(bar)
             graph = self._graphs[steps].backward
             assert graph is not None, "it was recorded for gradients"
@@ -560,6 +560,8 @@ def _lease(
             # A launched rollout says what is wrong if that cannot run either.
             logger.debug("rollouts of this kind are launched, not recorded: %s", error)
             kind.refused = True
+            # It would return to the list of the free ones.
+            lease = None
             kind.recordings.clear()
             kind.free.clear()
             return None
