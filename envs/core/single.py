@@ -197,7 +197,7 @@ class NPAEnv(gymnasium.Env[Any, Any]):
             diverged = bool(endings[0] & DIVERGED)
             ending = int(worlds.guarded(endings, observation)[0])
         ended, late = ending & (SUCCESS | DIVERGED) != 0, ending & TIME_LIMIT != 0
-        names, numbers = worlds.part_names, worlds.report.numbers[:, 0].tolist()
+        names, numbers = worlds.part_names, worlds.told()
         info = self._losses(numbers)
         info |= {f"reward_{name}": numbers[2 + len(names) + k] for k, name in enumerate(names)}
         info |= {"success": bool(ending & SUCCESS), "diverged": diverged}

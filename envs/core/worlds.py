@@ -29,16 +29,23 @@ from npa_envs.envs.core.memory import check_memory
 from npa_envs.envs.core.spaces import number_tensor
 from npa_envs.envs.core.task import EnvTask, Start, WorldTask
 from npa_envs.errors import DivergedError, NPAError, shown
-from npa_envs.world.actions import Actions, SurveyedWorlds, survey_worlds
+from npa_envs.world.actions import (
+    DIVERGED,
+    NOT_FINITE,
+    SUCCESS,
+    TIME_LIMIT,
+    Actions,
+    EpisodeRules,
+    PreparedJudgement,
+    SurveyedWorlds,
+    survey_worlds,
+)
 from npa_envs.world.cuda_graph import Beside, Replayed, WeakFunction, sent
 from npa_envs.world.divergence import LARGEST_REPORT, term_name
 from npa_envs.world.randomness import WorldRandom
 
-SUCCESS, DIVERGED, TIME_LIMIT = 1, 2, 4
-"""Bits of an ending: why an episode is over; none is set while it runs."""
-
-NOT_FINITE = 8
-"""Bit of a world whose reward is not finite: its step is an error."""
+FEW_PARTICLES = 8192
+"""Particles of all worlds up to which a step on CUDA is one graph: larger ones hide launches."""
 
 FLAGS = ("success", "diverged")
 """Names of the first two endings in `info`."""
@@ -184,10 +191,9 @@ class Worlds(Batch):
         """Names of the parts of the loss, known once worlds have been placed."""
         self.report = Report.empty(world_count, 0, device)
         """What a step hands out besides the observation."""
-        # Each world's ending, then whether the actions were finite: all that the host reads.
-        self._host_endings = torch.zeros(
-            world_count + 1, dtype=torch.uint8, pin_memory=device.type == "cuda"
-        )
+        # Each world's ending, then whether the actions were finite.
+        self._endings = torch.zeros(world_count + 1, dtype=torch.uint8, device=device)
+        self._host_endings, self._host_numbers = self._for_host()
         self._actions = Actions(
             self.x,
             self.s,
@@ -197,8 +203,11 @@ class Worlds(Batch):
             diverged=self._diverged,
         )
         self._surveyed: SurveyedWorlds | None = None
+        self._judgement: PreparedJudgement | None = None
         self._draw = Replayed(self._actions.draw, device)
-        self._judge_and_survey = Replayed(self._look, device)
+        self._act = Replayed(self._act_and_look, device)
+        self._judge = Replayed(self._judge_worlds, device)
+        self._survey = Replayed(self._survey_worlds, device)
         self.restart = Restarts(
             self._start_and_survey, world_count, device, recorded=self.task.start_is_short
         )
@@ -207,19 +216,32 @@ class Worlds(Batch):
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what only the next step needs, and which cannot be pickled."""
-        return self.__dict__ | {"_surveyed": None}
+        none = dict.fromkeys(("_surveyed", "_judgement", "_host_endings", "_host_numbers"))
+        return self.__dict__ | none
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Pin memory again that the device writes to."""
+        """Make again what was left out."""
         self.__dict__.update(state)
-        if self._beside is not None:
-            self._host_endings = self._host_endings.pin_memory()
+        self._host_endings, self._host_numbers = self._for_host()
+
+    def _for_host(self) -> tuple[Tensor, Tensor]:
+        """Return where the host reads endings and numbers: on CUDA pinned memory for copies."""
+        told = (self._endings, self.report.numbers)
+        if self.device.type == "cpu":
+            return told
+        endings, numbers = (torch.empty_like(t, device="cpu", pin_memory=True) for t in told)
+        return endings, numbers
 
     def limit_steps(self, episode_steps: int | None) -> None:
         """Cut episodes off after so many steps from now on, or never."""
         if episode_steps != self.episode_steps:
             self.episode_steps = episode_steps
-            self._judge_and_survey = Replayed(self._look, self.device)
+            self._renew_judgement()
+
+    def _renew_judgement(self) -> None:
+        self._judgement = None
+        self._act = Replayed(self._act_and_look, self.device)
+        self._judge = Replayed(self._judge_worlds, self.device)
 
     @property
     def reward(self) -> Tensor:
@@ -279,6 +301,7 @@ class Worlds(Batch):
         if not self.part_names:
             self.part_names = tuple(parts)
             self.report = Report.empty(self.world_count, len(parts), x.device)
+            self._host_endings, self._host_numbers = self._for_host()
         self.x.index_copy_(0, worlds, x)
         self.s.index_copy_(0, worlds, s)
         still = torch.zeros_like(values)
@@ -313,13 +336,14 @@ class Worlds(Batch):
         self.report.endings.copy_(paid.endings)
         if own is not None and self.particle_reward is not None:
             self.particle_reward.copy_(own)
+        self._host_numbers.copy_(numbers)
 
     @torch.no_grad()
     def step(self, action: Tensor, out: Tensor | None = None) -> tuple[NDArray[np.uint8], Tensor]:
         """Apply actions to all worlds; return their endings, [B], and what is perceived, [B, N, P].
 
-        The endings are all that the host reads, one byte a world. On CUDA the worlds are judged
-        and sorted side by side, and the device perceives while the host reads.
+        The endings, one byte a world, and of a single world its numbers are all that the host
+        reads. On CUDA the worlds are judged beside the sorting and the perceiving of them.
 
         Args:
             action: Float32, shape [B, N, A], on any device.
@@ -335,7 +359,6 @@ class Worlds(Batch):
             self._beside.wait()
         if not self._host_endings[-1]:
             self.random.steps -= 1
-            self.elapsed -= 1
             raise self._not_finite(action)
         endings = self._host_endings[:-1].numpy().copy()
         if (endings & NOT_FINITE).any():
@@ -350,65 +373,87 @@ class Worlds(Batch):
     @torch.no_grad()
     def queue(self, action: Tensor, out: Tensor | None = None) -> Tensor:
         """Do what `step` does but wait for the device, and return what is perceived there then."""
-        self._draw()
-        self._actions.apply(action)
-        self._judge_and_survey()
-        if self._beside is not None:
-            # The host learns the endings while the device perceives.
-            self._beside.mark()
+        beside = self._beside
+        small = self.world_count * self.particle_count <= FEW_PARTICLES
+        if beside is not None and small:
+            # To copy actions takes less than to launch what one graph then does.
+            self._actions.hold(action)
+            self._act()
+            beside.mark()
+        else:
+            self._draw()
+            self._actions.apply(action)
+            if beside is None:
+                self._judge()
+            else:
+                with beside.aside():
+                    self._judge()
+                    beside.mark()
+            self._survey()
         assert self._surveyed is not None, "the worlds were sorted just now"
-        return self._surveyed.perceive(out)
+        observation = self._surveyed.perceive(out)
+        if beside is not None and not small:
+            beside.join()
+        return observation
 
-    def _look(self) -> None:
-        """Judge the worlds and, beside that, sort them."""
-        self.elapsed += 1
-        with contextlib.nullcontext() if self._beside is None else self._beside.aside():
-            self._judge()
+    def _act_and_look(self) -> None:
+        """Apply the actions that are held, and judge the worlds while they are sorted."""
+        assert self._beside is not None, "on CUDA alone"
+        self._actions.draw()
+        self._actions.apply_held()
+        with self._beside.aside():
+            self._judge_worlds()
+        self._survey_worlds()
+        self._beside.join()
+
+    def _survey_worlds(self) -> None:
         self._surveyed = survey_worlds(self.x, self.s, self.physics)
-        if self._beside is not None:
-            self._beside.join()
 
-    def _judge(self) -> None:
+    def _judge_worlds(self) -> None:
         """Write rewards, losses and endings of the worlds as they now are."""
-        config, task = self.task.config, self._aimed
-        diverged = self._diverged.bool()
-        # Worlds that have to go on as they are pay and are paid for what they are.
-        lost = torch.zeros_like(diverged) if config.on_divergence == "ignore" else diverged
-        ended = diverged if config.on_divergence == "terminate" else torch.zeros_like(diverged)
+        task = self._aimed
         losses = task.losses(self.x, self.s)
         parts = torch.stack(checked_losses(task, losses, self.world_count, self.part_names))
-        loss = total(parts)
-        # Leaving the world must not pay, even where an empty picture is better than the start.
-        loss = torch.where(lost, torch.maximum(loss, self._start_loss), loss)
-        success = (loss <= self._success_loss) & ~lost
-        late = torch.zeros_like(success)
-        if self.episode_steps is not None:
-            late = self.elapsed >= self.episode_steps
-        enabled = self._enabled.bool()
-        endings = torch.stack((success | ended, late, success, diverged))
-        self.report.endings.copy_(torch.where(enabled, endings, self.report.endings))
-        improvement = self.loss - loss
-        broken = ~torch.isfinite(improvement)
-        if self.particle_loss is not None and self.particle_reward is not None:
+        if self._judgement is None:
+            self._judgement = self._make_judgement()
+        if self.particle_loss is None or self.particle_reward is None:
+            self._judgement(parts)
+        else:
             shares = task.particle_losses(self.x, self.s)
             shares = checked_shares(task, shares, (self.world_count, self.particle_count))
-            own = torch.where(lost[:, None], improvement[:, None], self.particle_loss - shares)
-            self.particle_reward.copy_(torch.where(enabled, own, self.particle_reward))
+            own = self.particle_loss - shares
+            self._judgement(parts, (~torch.isfinite(own).all(dim=1)).byte())
+            # Worlds that left their bounds are paid as a whole.
+            whole = self._diverged.bool() & (self.task.config.on_divergence != "ignore")
+            own = torch.where(whole[:, None], self.reward[:, None], own)
+            happened = self._enabled.bool()
+            self.particle_reward.copy_(torch.where(happened, own, self.particle_reward))
             self.particle_loss.copy_(shares)
-            broken |= ~torch.isfinite(own).all(dim=1)
-        reward = improvement
-        if config.reward == "sparse":
-            limit = self.episode_steps or config.episode_steps
-            over = success | ended | (self.elapsed == limit)
-            reward = torch.where(over, -loss, torch.zeros_like(loss))
-        numbers = self.report.numbers
-        before = numbers[2 : 2 + len(parts)]
-        now = torch.cat((reward[None], loss[None], parts, before - parts))
-        numbers.copy_(torch.where(enabled, now, numbers))
-        ending = SUCCESS * success.byte() + DIVERGED * diverged.byte() + TIME_LIMIT * late.byte()
-        ending += NOT_FINITE * broken.byte()
-        self._host_endings.copy_(torch.cat((ending, self._enabled)), non_blocking=True)
+        if self._beside is not None:
+            self._host_endings.copy_(self._endings, non_blocking=True)
+            if self.world_count == 1:
+                self._host_numbers.copy_(self.report.numbers, non_blocking=True)
         self._enabled.fill_(1)
+
+    def _make_judgement(self) -> PreparedJudgement:
+        config = self.task.config
+        paid = (self.episode_steps or config.episode_steps) if config.reward == "sparse" else None
+        return PreparedJudgement(
+            EpisodeRules(self.episode_steps, paid, config.on_divergence),
+            enabled=self._enabled,
+            diverged=self._diverged,
+            first_loss=self._start_loss,
+            success_loss=self._success_loss,
+            elapsed=self.elapsed,
+            numbers=self.report.numbers,
+            flags=self.report.endings,
+            endings=self._endings,
+        )
+
+    def told(self) -> list[float]:
+        """Return the numbers of a single world's report after a step."""
+        numbers: list[float] = self._host_numbers[:, 0].tolist()
+        return numbers
 
     @torch.no_grad()
     def guarded(self, endings: NDArray[np.uint8], observation: Tensor) -> NDArray[np.uint8]:

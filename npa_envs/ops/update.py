@@ -319,11 +319,12 @@ class PreparedActions:
         self._step = (mask, noise, enabled, diverged)
         self._check: PreparedLaunch | None = None
         self._apply: PreparedLaunch | None = None
+        self._sent: _Sent | None = None
         _check_worlds(self._buffer, x, s, mask, noise, enabled, diverged, rules.moving)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out the recorded launches, which cannot be pickled."""
-        return self.__dict__ | {"_check": None, "_apply": None}
+        """Leave out what cannot be pickled."""
+        return self.__dict__ | {"_check": None, "_apply": None, "_sent": None}
 
     def __call__(self, action: Tensor) -> None:
         """Apply actions.
@@ -335,14 +336,33 @@ class PreparedActions:
             NPAError: It has another shape.
         """
         buffer = self._buffer
+        fits = action.dtype == buffer.dtype and action.device == buffer.device
+        fits = fits and action.shape == buffer.shape and action.is_contiguous()
+        if fits and not action.data_ptr() % 16:
+            self._run(action)
+        else:
+            self.hold(action)
+            self.apply_held()
+
+    def hold(self, action: Tensor) -> None:
+        """Copy actions, as `__call__` takes them, to where `apply_held` reads them."""
+        buffer = self._buffer
         if action.shape != buffer.shape:
             raise NPAError(
                 f"action must have shape {tuple(buffer.shape)}, got {tuple(action.shape)}"
             )
-        fits = action.dtype == buffer.dtype and action.device == buffer.device
-        if not fits or not action.is_contiguous() or action.data_ptr() % 16:
+        if buffer.is_cuda and not action.is_cuda:
+            if self._sent is None:
+                self._sent = _Sent(buffer)
+            self._sent.send(action)
+        else:
             buffer.copy_(action)
-            action = buffer
+
+    def apply_held(self) -> None:
+        """Apply the actions held last; may be captured in a CUDA graph."""
+        self._run(self._buffer)
+
+    def _run(self, action: Tensor) -> None:
         flat = action.detach().view(-1)
         if self._check is None or self._apply is None:
             self._check, self._apply = self._record(flat)
@@ -366,6 +386,26 @@ class PreparedActions:
         launched = _launch_of(flat, x, s, self._rules, *self._step, aligned=aligned)
         apply = PreparedLaunch(*launched, changing=flat)
         return check, apply
+
+
+class _Sent:
+    """Copies from the host to a tensor of a device, for which the host does not wait.
+
+    Args:
+        tensor: Where they go.
+    """
+
+    def __init__(self, tensor: Tensor) -> None:
+        self._tensor = tensor
+        self._pinned = torch.empty_like(tensor, device="cpu", pin_memory=True)
+        self._gone = torch.cuda.Event()  # type: ignore[no-untyped-call]
+
+    def send(self, values: Tensor) -> None:
+        """Copy values of any dtype; they may change afterwards."""
+        self._gone.synchronize()
+        self._pinned.copy_(values)
+        self._tensor.copy_(self._pinned, non_blocking=True)
+        self._gone.record(torch.cuda.current_stream(self._tensor.device))
 
 
 def _launch_of(

@@ -8,6 +8,7 @@ import torch
 
 from npa_envs.ops.backend import SHARED_WORLD
 from npa_envs.ops.draws import bernoulli_draw, integer_draw, normal_draw, uniform_draw
+from npa_envs.ops.episodes import EpisodeRules, PreparedJudgement
 from npa_envs.ops.mean import world_mean
 from npa_envs.ops.network import arrange_weights, run_network
 from npa_envs.ops.passes import Terms
@@ -37,6 +38,7 @@ def warmup(
     counts = torch.zeros(1, dtype=torch.int32, device=device)
     bernoulli_draw(keys, counts, counts, 0, 1, 0.5)
     integer_draw(keys, counts, counts, 0, 1, 2)
+    _warm_judgement(counts)
     for dtype in dtypes:
         uniform_draw(keys, counts, counts, 0, 1, dtype)
         normal_draw(keys, counts, counts, 0, 1, dtype)
@@ -53,6 +55,22 @@ def warmup(
             _warm_observation(x, s)
             if space_dim == 2:
                 _warm_pictures(x)
+
+
+def _warm_judgement(elapsed: torch.Tensor) -> None:
+    number, flag = elapsed.float(), elapsed.byte()
+    judge = PreparedJudgement(
+        EpisodeRules(None, None, "terminate"),
+        enabled=flag,
+        diverged=flag,
+        first_loss=number,
+        success_loss=number,
+        elapsed=elapsed.clone(),
+        numbers=number.new_zeros(4, 1),
+        flags=flag.new_zeros(4, 1, dtype=torch.bool),
+        endings=flag.new_zeros(2),
+    )
+    judge(number[None])
 
 
 def _warm_rows(x: torch.Tensor, s: torch.Tensor) -> None:

@@ -13,6 +13,14 @@ import torch
 from torch import Tensor
 
 from npa_envs.ops.checks import MomentInverse
+from npa_envs.ops.episodes import (
+    DIVERGED,
+    NOT_FINITE,
+    SUCCESS,
+    TIME_LIMIT,
+    EpisodeRules,
+    PreparedJudgement,
+)
 from npa_envs.ops.passes import Terms
 from npa_envs.ops.perceive import SurveyedWorlds, survey
 from npa_envs.ops.species import perceive_by_species
@@ -20,9 +28,15 @@ from npa_envs.ops.update import ActionRules, PreparedActions
 from npa_envs.world.randomness import WorldRandom
 
 __all__ = [
+    "DIVERGED",
+    "NOT_FINITE",
+    "SUCCESS",
+    "TIME_LIMIT",
     "Actions",
+    "EpisodeRules",
     "MomentInverse",
     "Physics",
+    "PreparedJudgement",
     "SurveyedWorlds",
     "perceive_each_species",
     "survey_worlds",
@@ -200,3 +214,11 @@ class Actions:
                 fraction of `state_scale` (C, clipped to [-1, 1]); shape [B, N, A], any device.
         """
         self._apply(action)
+
+    def hold(self, action: Tensor) -> None:
+        """Copy actions, as `apply` takes them, to where `apply_held` reads them."""
+        self._apply.hold(action)
+
+    def apply_held(self) -> None:
+        """Apply the actions held last with what was drawn last; may be captured in a CUDA graph."""
+        self._apply.apply_held()

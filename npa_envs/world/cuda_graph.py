@@ -226,7 +226,7 @@ class Beside:
     def __init__(self, device: torch.device) -> None:
         self._device = device
         self._stream = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
-        self._mark = torch.cuda.Event()  # type: ignore[no-untyped-call]
+        self._begin, self._end, self._mark = (torch.cuda.Event() for _ in range(3))  # type: ignore[no-untyped-call]
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the device alone: streams and events are a process's own."""
@@ -235,13 +235,15 @@ class Beside:
     @contextlib.contextmanager
     def aside(self) -> Iterator[None]:
         """What is launched inside begins once the current stream has done its work so far."""
-        self._stream.wait_stream(torch.cuda.current_stream(self._device))
+        self._begin.record(torch.cuda.current_stream(self._device))
+        self._stream.wait_event(self._begin)
         with torch.cuda.stream(self._stream):
             yield
+        self._end.record(self._stream)
 
     def join(self) -> None:
         """Let what the current stream is given from now on wait until the work is done."""
-        torch.cuda.current_stream(self._device).wait_stream(self._stream)
+        torch.cuda.current_stream(self._device).wait_event(self._end)
 
     def mark(self) -> None:
         """Remember what the current stream has been given so far."""

@@ -1,0 +1,87 @@
+"""Episodes: rewards and endings of worlds that were acted on, from their losses."""
+
+import warp as wp
+
+from npa_envs.kernels import native
+
+SUCCESS, DIVERGED, TIME_LIMIT = 1, 2, 4
+"""Bits of an ending: why an episode is over; none is set while it runs."""
+
+NOT_FINITE = 8
+"""Bit of a world whose reward is not finite: its step is an error."""
+
+GO_ON, TELL, END = 0, 1, 2
+"""What divergence does to an episode: nothing; its loss is not below the first one; it ends it."""
+
+
+@wp.kernel(enable_backward=False, module=native.module("npa_envs.kernels.episodes"))
+def judge_worlds(
+    part_count: wp.int32,
+    last_step: wp.int32,
+    paid_step: wp.int32,
+    on_divergence: wp.int32,
+    parts: wp.array(dtype=wp.float32),
+    enabled: wp.array(dtype=wp.uint8),
+    diverged: wp.array(dtype=wp.uint8),
+    first_loss: wp.array(dtype=wp.float32),
+    success_loss: wp.array(dtype=wp.float32),
+    broken: wp.array(dtype=wp.uint8),
+    # changed in place
+    elapsed: wp.array(dtype=wp.int32),
+    numbers: wp.array(dtype=wp.float32),
+    flags: wp.array(dtype=wp.uint8),
+    # outputs
+    endings: wp.array(dtype=wp.uint8),
+):
+    """Write rewards, losses, flags and endings; of no step, where not enabled, endings alone."""
+    world = wp.tid()
+    count = elapsed.shape[0]
+    happens = enabled[0]
+    if world == 0:
+        endings[count] = happens
+    if happens == wp.uint8(0):
+        endings[world] = wp.uint8(0)
+        return
+    step = elapsed[world] + 1
+    fled = diverged[world] != wp.uint8(0)
+    lost = fled and on_divergence != wp.static(GO_ON)
+    loss = parts[world]
+    for k in range(1, part_count):
+        loss += parts[k * count + world]
+    # Leaving the world must not pay, even where an empty picture is better than the start.
+    if lost and loss < first_loss[world]:
+        loss = first_loss[world]
+    success = loss <= success_loss[world] and not lost
+    ended = success or (fled and on_divergence == wp.static(END))
+    late = last_step > 0 and step >= last_step
+    improvement = numbers[count + world] - loss
+    reward = improvement
+    if paid_step > 0:
+        reward = wp.float32(0.0)
+        if ended or step == paid_step:
+            reward = -loss
+    ending = wp.int32(0)
+    if success:
+        ending += wp.static(SUCCESS)
+    if fled:
+        ending += wp.static(DIVERGED)
+    if late:
+        ending += wp.static(TIME_LIMIT)
+    unfit = not wp.isfinite(improvement)
+    if broken.shape[0] > 0 and not lost:
+        unfit = unfit or broken[world] != wp.uint8(0)
+    if unfit:
+        ending += wp.static(NOT_FINITE)
+    elapsed[world] = step
+    numbers[world] = reward
+    numbers[count + world] = loss
+    for k in range(part_count):
+        place = (2 + k) * count + world
+        part = parts[k * count + world]
+        numbers[place + part_count * count] = numbers[place] - part
+        numbers[place] = part
+    flags[world] = wp.uint8(ended)
+    flags[count + world] = wp.uint8(late)
+    flags[2 * count + world] = wp.uint8(success)
+    flags[3 * count + world] = wp.uint8(fled)
+    endings[world] = wp.uint8(ending)

@@ -1,0 +1,100 @@
+"""Rewards and endings of worlds that were acted on, in one launch instead of forty."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from npa_envs.kernels.portable.episodes import (
+    DIVERGED,
+    END,
+    GO_ON,
+    NOT_FINITE,
+    SUCCESS,
+    TELL,
+    TIME_LIMIT,
+    judge_worlds,
+)
+from npa_envs.ops.launch import launch
+
+__all__ = ["DIVERGED", "NOT_FINITE", "SUCCESS", "TIME_LIMIT", "EpisodeRules", "PreparedJudgement"]
+
+ON_DIVERGENCE = {"ignore": GO_ON, "terminate": END, "reset": TELL, "raise": TELL}
+
+
+class EpisodeRules(NamedTuple):
+    """What rewards and endings follow from, the same in every step."""
+
+    last_step: int | None
+    """Step in which an episode is cut off, or None for never."""
+    paid_step: int | None
+    """Step at which, or earlier at its end, an episode is paid minus its loss; None: each step is
+    paid by how much the loss fell."""
+    on_divergence: Literal["ignore", "terminate", "reset", "raise"]
+    """"ignore": a world that diverged is judged as it is. Else its loss is at least the first one;
+    with "terminate" its episode ends."""
+
+
+class PreparedJudgement:
+    """Judges the same B worlds again and again, by what their losses have become.
+
+    Args:
+        rules: What rewards and endings follow from.
+        enabled: Whether there was a step at all, uint8, shape [1]; nothing changes where not.
+        diverged: Which worlds diverged in the step, uint8, shape [B].
+        first_loss: Loss at the start of each episode, shape [B].
+        success_loss: Loss at which each episode ends in success, shape [B].
+        elapsed: Steps of each episode, int32, shape [B]; counted on.
+        numbers: Reward; loss; its K parts; their improvements; float32, shape [2 + 2 K, B]. Losses
+            and parts are those of the step before; all become those of this step.
+        flags: Terminated; truncated; success; diverged; bool, shape [4, B]; written.
+        endings: Bits of each world, then whether there was a step, uint8, shape [B + 1]; written.
+    """
+
+    def __init__(
+        self,
+        rules: EpisodeRules,
+        *,
+        enabled: Tensor,
+        diverged: Tensor,
+        first_loss: Tensor,
+        success_loss: Tensor,
+        elapsed: Tensor,
+        numbers: Tensor,
+        flags: Tensor,
+        endings: Tensor,
+    ) -> None:
+        way = ON_DIVERGENCE[rules.on_divergence]
+        self._rules = (rules.last_step or 0, rules.paid_step or 0, way)
+        self._read = (enabled, diverged, first_loss, success_loss)
+        self._written = (elapsed, numbers.view(-1), flags.view(torch.uint8).view(-1), endings)
+
+    def __call__(self, parts: Tensor, broken: Tensor | None = None) -> None:
+        """Judge the worlds.
+
+        Args:
+            parts: Parts of each world's loss, whose sum it is, float32, contiguous, shape [K, B].
+            broken: Worlds whose losses are not finite elsewhere, uint8, shape [B]; they count where
+                the world is judged as it is.
+        """
+        elapsed, numbers, flags, endings = self._written
+        enabled, diverged, first_loss, success_loss = self._read
+        launch(
+            judge_worlds,
+            len(elapsed),
+            parts.device,
+            len(parts),
+            *self._rules,
+            parts.view(-1),
+            enabled,
+            diverged,
+            first_loss,
+            success_loss,
+            broken,
+            elapsed,
+            numbers,
+            flags,
+            endings,
+        )

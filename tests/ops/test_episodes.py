@@ -1,0 +1,95 @@
+"""Rewards and endings of worlds, against the same said in torch."""
+
+import itertools
+
+import pytest
+import torch
+
+from npa_envs.ops.episodes import (
+    DIVERGED,
+    NOT_FINITE,
+    SUCCESS,
+    TIME_LIMIT,
+    EpisodeRules,
+    PreparedJudgement,
+)
+
+B, PARTS = 64, 3
+
+
+def worlds(device):
+    """Worlds of all kinds: diverged, successful, late, with losses that are not finite."""
+    generator = torch.Generator().manual_seed(0)
+
+    def draw(*shape):
+        return torch.randn(*shape, generator=generator).to(device)
+
+    parts = draw(PARTS, B)
+    parts[1, 3], parts[0, 4] = torch.nan, torch.inf
+    numbers = draw(2 + 2 * PARTS, B)
+    numbers[1, 5] = torch.nan
+    return {
+        "parts": parts,
+        "broken": (draw(B) > 1.0).byte(),
+        "diverged": (draw(B) > 0.5).byte(),
+        "first_loss": draw(B),
+        "success_loss": torch.where(draw(B) > 0.0, draw(B), -torch.inf),
+        "elapsed": torch.arange(B, dtype=torch.int32, device=device) % 12,
+        "numbers": numbers,
+        "flags": torch.ones(4, B, dtype=torch.bool, device=device),
+    }
+
+
+def expected(rules, given):
+    """Numbers, flags and endings after a step."""
+    parts, fled = given["parts"], given["diverged"].bool()
+    lost = fled & (rules.on_divergence != "ignore")
+    ended = fled & (rules.on_divergence == "terminate")
+    loss = parts[0] + parts[1] + parts[2]
+    loss = torch.where(lost, torch.maximum(loss, given["first_loss"]), loss)
+    step = given["elapsed"] + 1
+    success = (loss <= given["success_loss"]) & ~lost
+    late = step >= rules.last_step if rules.last_step else torch.zeros_like(fled)
+    improvement = given["numbers"][1] - loss
+    reward = improvement
+    if rules.paid_step is not None:
+        reward = torch.where(success | ended | (step == rules.paid_step), -loss, 0.0)
+    fallen = given["numbers"][2 : 2 + PARTS] - parts
+    flags = torch.stack((success | ended, late, success, fled))
+    unfit = ~improvement.isfinite() | (given["broken"].bool() & ~lost)
+    bits = SUCCESS * success.int() + DIVERGED * fled.int() + TIME_LIMIT * late.int()
+    return torch.cat((reward[None], loss[None], parts, fallen)), flags, bits + NOT_FINITE * unfit
+
+
+@pytest.mark.device
+@pytest.mark.parametrize("happened", [True, False])
+@pytest.mark.parametrize(
+    "rules",
+    [
+        EpisodeRules(last, paid, way)
+        for last, paid, way in itertools.product(
+            (None, 8), (None, 8), ("ignore", "terminate", "reset", "raise")
+        )
+    ],
+)
+def test_worlds_are_judged_as_torch_would(rules, happened, device):
+    given = worlds(device)
+    before = {name: value.clone() for name, value in given.items()}
+    endings = torch.zeros(B + 1, dtype=torch.uint8, device=device)
+    judge = PreparedJudgement(
+        rules,
+        enabled=torch.full((1,), happened, dtype=torch.uint8, device=device),
+        endings=endings,
+        **{name: given[name] for name in given.keys() - {"parts", "broken"}},
+    )
+    judge(given["parts"], given["broken"])
+    if happened:
+        numbers, flags, bits = expected(rules, before)
+        assert torch.equal(given["elapsed"], before["elapsed"] + 1)
+    else:
+        numbers, flags, bits = before["numbers"], before["flags"], torch.zeros_like(endings[:-1])
+        assert torch.equal(given["elapsed"], before["elapsed"])
+    assert torch.equal(given["numbers"].nan_to_num(7.5), numbers.nan_to_num(7.5))
+    assert torch.equal(given["flags"], flags)
+    assert torch.equal(endings[:-1], bits.byte())
+    assert bool(endings[-1]) == happened
