@@ -51,7 +51,7 @@ def action_tensor(
                 raise TypeError("complex numbers")
             # Torch cannot read what may not be written.
             action = torch.from_numpy(np.require(action, np.float32, ("C", "W")))
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             came = type(action).__name__
     if not came and (tuple(action.shape) != wanted or action.dtype.is_complex):
         came = f"{tuple(action.shape)} of {action.dtype}"
