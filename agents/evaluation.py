@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy as np
 import torch
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from numpy.typing import NDArray
 
 from npa_envs.agents.policies import unwrapped
@@ -60,21 +60,24 @@ def evaluate_policy(env: Any, policy: Callable[[Any], Any], seeds: Iterable[int]
     long ones, and the environment's draws do not depend on the number of worlds.
 
     Args:
-        env: A single or a vector environment of `npa_envs`, or Gymnasium's `SyncVectorEnv` of
-            single ones; wrapped or not, in any autoreset mode, with `max_episode_steps`.
+        env: A single or a vector environment of `npa_envs`, or Gymnasium's `SyncVectorEnv` or
+            `AsyncVectorEnv` of single ones; wrapped or not, in any autoreset mode, with
+            `max_episode_steps`.
         policy: Maps observations, [B, N, P], to actions, [B, N, A]; B is 1 where `env` is single.
         seeds: One for each episode, integers of at least 0.
 
     Raises:
         NPAError: There are no seeds or wrong ones, or the environment is another one.
     """
-    worlds = unwrapped(env).worlds
+    # What lives in other processes shows what it is by what it returns.
+    elsewhere = isinstance(getattr(env, "unwrapped", None), AsyncVectorEnv)
+    worlds = None if elsewhere else unwrapped(env).worlds
     if not (hasattr(env, "num_envs") or isinstance(env, gymnasium.Env)):
         raise NPAError(
             f"env must be a single or a vector environment, got {type(env).__name__}: of several "
             "species take Problem(...).make_envs() of npa_envs.agents.learning"
         )
-    if worlds.episode_steps is None and _step_limit(env) is None:
+    if getattr(worlds, "episode_steps", None) is None and _step_limit(env) is None:
         raise NPAError("env must end its episodes: make it with max_episode_steps=256")
     if not isinstance(seeds, Iterable):
         raise NPAError(
@@ -98,6 +101,11 @@ def evaluate_policy(env: Any, policy: Callable[[Any], Any], seeds: Iterable[int]
 def _run(env: Any, policy: Callable[[Any], Any], seeds: list[int]) -> tuple[NDArray[Any], ...]:
     """Run the first episode of each world: returns, start and final losses, lengths, endings."""
     observation, infos = env.reset(seed=seeds)
+    if "loss" not in infos:
+        raise NPAError(
+            f"env must hold environments of npa_envs, got others in {type(env).__name__}: make it "
+            "with gymnasium.make_vec('npa/Morphogenesis2D-v0', num_envs=8)"
+        )
     start_losses = _host(infos["loss"])
     returns, final_losses = np.zeros(len(seeds)), np.zeros(len(seeds))
     steps = np.zeros(len(seeds), dtype=np.int64)
@@ -142,10 +150,12 @@ def _ending(info: Mapping[str, Any]) -> str:
 
 def _step_limit(env: Any) -> int | None:
     """Return the steps after which Gymnasium cuts off episodes of single environments, or None."""
-    inner = env.unwrapped
-    if isinstance(inner, SyncVectorEnv):
-        env = inner.envs[0]
-    limit = getattr(env.spec, "max_episode_steps", None) if isinstance(env, gymnasium.Env) else None
+    inner, spec = env.unwrapped, None
+    if isinstance(inner, SyncVectorEnv | AsyncVectorEnv):
+        spec = inner.get_attr("spec")[0]
+    elif isinstance(env, gymnasium.Env):
+        spec = env.spec
+    limit = getattr(spec, "max_episode_steps", None)
     return limit if limit is not None and limit > 0 else None
 
 

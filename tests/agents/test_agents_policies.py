@@ -1,5 +1,6 @@
 """Policies: a rule's episodes are its rollouts, and what the scripted ones do and achieve."""
 
+import contextlib
 import functools
 
 import gymnasium
@@ -342,7 +343,7 @@ def test_episodes_do_not_depend_on_how_many_run_at_once(output):
     assert len(set(episodes.returns.tolist())) == 4
 
 
-@pytest.mark.parametrize("form", ["single", "tensors", "next-step", "disabled", "sync"])
+@pytest.mark.parametrize("form", ["single", "tensors", "next-step", "disabled", "sync", "async"])
 @pytest.mark.parametrize("ending", [{}, {"success_loss": 0.9}])
 def test_episodes_are_the_same_in_every_form_of_an_environment(form, ending):
     keywords = {"particle_count": 32, "max_episode_steps": 40} | ending
@@ -352,12 +353,13 @@ def test_episodes_are_the_same_in_every_form_of_an_environment(form, ending):
         env = make(**keywords)
     elif form == "tensors":
         env = make(**keywords, output="torch", disable_env_checker=True)
-    elif form == "sync":
-        name, mode = "npa/Morphogenesis2D-v0", {"vectorization_mode": "sync"}
+    elif form in ("sync", "async"):
+        name, mode = "npa/Morphogenesis2D-v0", {"vectorization_mode": form}
         env = gymnasium.make_vec(name, num_envs=2, **mode, **keywords)
     else:
         env = make_vector(world_count=2, autoreset_mode=form, **keywords)
-    found = evaluate_policy(env, PaintPolicy(env), range(3))
+    found = evaluate_policy(env, PaintPolicy(usual if form == "async" else env), range(3))
+    env.close()
     assert found.endings == expected.endings
     assert ("success" in found.endings) == bool(ending)
     assert found.steps.tolist() == expected.steps.tolist()
@@ -444,6 +446,11 @@ def test_the_error_about_foreign_vector_environments_says_how_to_make_ours():
     cure = str(caught.value).split("make it with ")[1]
     envs = eval(cure, {"gymnasium": gymnasium})
     assert interface_of(envs) == Interface(2, 16, True, 1.0)
+    with (
+        contextlib.closing(gymnasium.vector.AsyncVectorEnv([single])) as elsewhere,
+        pytest.raises(NPAError, match="must hold environments of npa_envs"),
+    ):
+        evaluate_policy(elsewhere, never, [0])
     with pytest.raises(NPAError, match=r"got CartPoleEnv.*gymnasium\.make\('npa"):
         interface_of(gymnasium.make("CartPole-v1").unwrapped)
 

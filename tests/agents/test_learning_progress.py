@@ -80,6 +80,22 @@ def test_time_is_kept_and_evaluations_take_none_of_it(rules):
     assert [entry.seconds for entry in log] == sorted(entry.seconds for entry in log)
 
 
+@pytest.mark.parametrize("entries", [1, 3])
+def test_a_budget_of_seconds_makes_at_most_as_many_evaluations_as_it_says(
+    rules, monkeypatch, entries
+):
+    ran = []
+    monkeypatch.setattr(
+        "npa_envs.agents.learning.progress.evaluate_policy",
+        lambda *given: ran.append(given) or evaluate_policy(*given),
+    )
+    # Each iteration takes more than one share of the budget, or less.
+    for pause in (0.001, 0.03):
+        learn_nothing(progress_of(PROBLEM, seconds=0.05, entries=entries), rules, pause)
+        assert 2 <= len(ran) <= entries + 2
+        ran.clear()
+
+
 def test_whichever_is_spent_first_ends_it(rules):
     progress = progress_of(PROBLEM, seconds=1000.0, particle_steps=1000)
     assert learn_nothing(progress, rules)[-1].seconds < 10.0

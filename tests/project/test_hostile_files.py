@@ -62,6 +62,25 @@ def test_a_pipe_is_refused_at_once(tmp_path, reader):
         read(path)
 
 
+@pytest.mark.skipif(not hasattr(os, "openpty"), reason="no terminals here")
+@pytest.mark.parametrize("reader", READERS)
+@pytest.mark.parametrize("device", ["/dev/zero", "/dev/random", "terminal"])
+def test_a_device_is_refused_at_once(tmp_path, reader, device):
+    suffix, read = READERS[reader]
+    path, ends = tmp_path / f"device{suffix}", ()
+    if device == "terminal":
+        # Nobody types: to read from it would block.
+        ends = os.openpty()
+        device = os.ttyname(ends[1])
+    path.symlink_to(device)
+    try:
+        with pytest.raises(NPAError, match="pipe or a device"):
+            read(path)
+    finally:
+        for end in ends:
+            os.close(end)
+
+
 @pytest.mark.parametrize("reader", READERS)
 @pytest.mark.parametrize("name", ["a\0b", "x" * 300, "~\0", "\ud800"])
 def test_names_that_no_file_has_are_refused(tmp_path, reader, name):
