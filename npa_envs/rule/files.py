@@ -64,6 +64,8 @@ class RuleParts:
     weights: dict[str, Tensor]
     header: dict[str, str] | None = None
     """Metadata of a file in our format."""
+    has_checksum: bool = False
+    """Whether the file has one, by which damage of it is told."""
 
 
 def shipped_rules(task: str | None = None) -> dict[str, Path]:
@@ -95,8 +97,9 @@ def load_rule(source: str | Path, *, device: str | torch.device = "cpu") -> NPAR
 
     Returns:
         The rule, its weights in the precision of the file (float32 or float64). Torch's random
-        state is left alone. A `.safetensors` file without a checksum, as older versions wrote them,
-        is loaded with a `UserWarning`: damage cannot be told there, nor in the authors' `.json`.
+        state is left alone. A file without a checksum is loaded with a `UserWarning`, as damage
+        cannot be told there: a `.safetensors` file of an older version, the authors' `.json`, and
+        a state dict that torch before 1.6 wrote, or that was saved in its format.
 
     Raises:
         NPAError: The name is unknown, the file is missing, garbage, truncated, of an unknown
@@ -117,11 +120,10 @@ def load_rule(source: str | Path, *, device: str | torch.device = "cpu") -> NPAR
             _verify(parts.header, parts.weights)
     except NPAError as error:
         raise NPAError(f"cannot load a rule from {shown(str(source))}: {error}") from error
-    if parts.header is not None and "checksum" not in parts.header:
+    if not parts.has_checksum:
         warnings.warn(
             f"the rule's file {shown(str(path))} has no checksum, so that damage cannot be told: "
-            "if it "
-            "is known to be good, save it again with npa_envs.save_rule",
+            "if it is known to be good, save it again with npa_envs.save_rule",
             stacklevel=2,
         )
     return rule.to(target)
@@ -260,7 +262,7 @@ def _read_ours(path: Path) -> RuleParts:
             weights = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
     except (OSError, SafetensorError) as error:
         raise NPAError(f"the weights cannot be read ({shown(error)})") from error
-    return RuleParts(hyper_parameters, weights, header)
+    return RuleParts(hyper_parameters, weights, header, has_checksum="checksum" in header)
 
 
 def _checksum(header: Mapping[str, str], weights: Mapping[str, Tensor]) -> str:
@@ -400,7 +402,7 @@ def read_state_dict(data: bytes) -> RuleParts:
     if has_readout:
         hyper_parameters["readout_dim"] = weights["readout.2.weight"].shape[0]
         hyper_parameters["readout_hidden_dim"] = weights["readout.0.weight"].shape[0]
-    return RuleParts(hyper_parameters, weights)
+    return RuleParts(hyper_parameters, weights, has_checksum=data.startswith(_ZIP_MARK))
 
 
 def read_demo_json(data: bytes, name: str | None) -> RuleParts:
