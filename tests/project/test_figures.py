@@ -18,8 +18,9 @@ RESULTS = ROOT / "benchmarks" / "results"
 ROLLOUTS = RESULTS / "paper_h200.json"
 ENVIRONMENTS = RESULTS / "environments_h200.json"
 TRAINING = RESULTS / "training_h200.txt"
-ROLLOUTS_CPU = ROOT / "docs" / "performance.md"
-"""The lower of two runs' medians: only the table is kept."""
+ROLLOUTS_CPU = RESULTS / "throughput_cpu.json"
+PERCEPTIONS = (RESULTS / "accuracy_cpu.json", RESULTS / "accuracy_h200.json")
+HARD_SCENES = RESULTS / "stress_h200.json"
 
 
 def content(path: Path) -> Any:
@@ -55,11 +56,41 @@ def environment_times() -> list[float]:
 
 
 def cpu_times() -> list[float]:
-    """Inference and training on one thread and on two: ms a step."""
-    text = ROLLOUTS_CPU.read_text(encoding="utf-8")
-    pattern = r"\| 2D \(1, 4096, 16\) \| 1 \| (\S+) \| (\S+) \|.*\n\| \| 2 \| (\S+) \| (\S+) \|"
-    (found,) = re.findall(pattern, text)
-    return [float(number) for number in found]
+    """Inference and training on one thread: ms a step."""
+    rows = content(ROLLOUTS_CPU)["rows"]
+    (row,) = (r for r in rows if (r["workload"], r["memory"]) == ("2D (1, 4096, 16)", "store"))
+    return [row["infer_us"] * 1e-3, row["train_us"] * 1e-3]
+
+
+def errors() -> list[float]:
+    """Of random worlds; of hard scenes, how many, and in both precisions; of weights' gradients."""
+    fields = (
+        "density",
+        "smoothed",
+        "state_gradient",
+        "density_gradient",
+        "perception",
+        "cotangent",
+    )
+    rows = [row for path in PERCEPTIONS for row in content(path)["tables"]["perception"]]
+    own = [r for r in rows if (r["strategy"], r["precision"]) == ("library", "float32")]
+    checks = {check["name"]: check["figures"] for check in content(HARD_SCENES)["checks"]}
+    scenes = [figures for figures in checks.values() if "positions_float64" in figures]
+    return [
+        max(row[field] for row in own for field in fields),
+        len(scenes),
+        *(
+            max(
+                scene[f"{part}_{dtype}"]
+                for scene in scenes
+                for part in ("z", "states", "positions")
+            )
+            for dtype in ("float32", "float64")
+        ),
+        max(
+            f["by_weights_1"] for name, f in checks.items() if name.startswith("gradients/float32")
+        ),
+    ]
 
 
 def training_time() -> list[float]:
@@ -83,6 +114,15 @@ def picture_losses() -> list[float]:
     return found
 
 
+def texture_excess() -> list[float]:
+    """Loss of the shipped textures above their best, at worst; of the four that keep it [%]."""
+    excess = []
+    for name in shipped_rules("texture"):
+        losses = {row["step"]: row["loss"] for row in scores(name)["growth"]}
+        excess.append(max(losses[step] for step in (256, 1024, 4096)) / min(losses.values()) - 1.0)
+    return [100.0 * sorted(excess)[3]]
+
+
 def view_ratios() -> list[float]:
     """PSNR of the shipped things at two steps [dB]."""
     names = shipped_rules("morphogenesis3d")
@@ -97,24 +137,31 @@ def classifier_shares() -> list[float]:
 NUMBER = r"\d+(?:\.\d+)?"
 
 FIGURES: dict[str, tuple[str, Callable[[], list[float]]]] = {
+    "accuracy": (r"(\de-\d+|\d+(?= hard))", errors),
     "speed, H200": (rf"({NUMBER})(?= [µm]s)", rollout_times),
     "environments, H200": (rf"({NUMBER})(?= ms| billion)", environment_times),
-    "speed, CPU": (rf"({NUMBER})(?= ms| and| on two)", cpu_times),
+    "speed, CPU": (rf"({NUMBER})(?= ms)", cpu_times),
     "training": (rf"({NUMBER})(?= s )", training_time),
     "six shipped pictures": (r"(0\.\d+)", picture_losses),
+    "five shipped textures": (r"(\d+)(?= %)", texture_excess),
     "three shipped things in 3D": (r"(\d\d\.\d)", view_ratios),
     "the shipped classifier": (r"(\d\d\.\d)(?= %)", classifier_shares),
 }
 """Rows of the table "What is measured": which of its numbers are measured, and what they are."""
 
 
+def rounded(value: float, like: str) -> str:
+    """Return a number as another one is written, be it 0.25 or 3e-7."""
+    if "e" in like:
+        mantissa, exponent = f"{value:.0e}".split("e")
+        return f"{mantissa}e{int(exponent)}"
+    return f"{value:.{len(like.partition('.')[2])}f}"
+
+
 def differences(text: str, pattern: str, values: list[float]) -> list[str]:
     """Return the numbers of a text that are not these values, rounded to as many digits."""
     told = re.findall(pattern, text)
-    expected = [
-        f"{value:.{len(number.partition('.')[2])}f}"
-        for number, value in zip(told, values, strict=False)
-    ]
+    expected = [rounded(value, number) for number, value in zip(told, values, strict=False)]
     if len(told) != len(values):
         return [f"{len(told)} numbers, {len(values)} expected"]
     return [f"{a}, not {b}" for a, b in zip(told, expected, strict=True) if a != b]
@@ -133,6 +180,8 @@ def test_a_number_that_disagrees_is_told() -> None:
         "148, not 147",
         "1.07, not 1.08",
     ]
+    pattern, _ = FIGURES["accuracy"]
+    assert differences("in 40 hard scenes 3e-7", pattern, [40, 3.6e-7]) == ["3e-7, not 4e-7"]
 
 
 def test_the_page_on_species_has_the_numbers_of_its_file() -> None:
