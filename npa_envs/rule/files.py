@@ -7,7 +7,8 @@ rule. The checksum is SHA-256 over all else that the file says; older files have
 State dict (`npa.pth`): `model.0.weight` [H, P], `model.0.bias` [H], `model.2.weight` [A, H] with
 rows [δ (D); Δs (C)], `eps0`, `alpha`, and for rules with a read-out `decoder.0.*`, `decoder.2.*`.
 Web demo (`models.json`): for each name `w1.weight` [H, P], `w1.bias`, `w2.weight.T` [H, A] with
-columns [Δs (C), δ (2)], both padded with zeros to a multiple of four columns; float32 in base64.
+columns [Δs (C), δ (2)], both padded with zeros to a multiple of four columns; float32 in base64;
+`eps0`, `alpha`, and `N0`, with how many particles the demo starts. `save_demo_json` writes it.
 """
 
 from __future__ import annotations
@@ -41,6 +42,7 @@ from npa_envs.files import (
     parse_json,
     read_bytes,
     write_bytes,
+    write_text,
 )
 from npa_envs.rule.rule import NPARule, RuleHyperParameters, check_rule
 
@@ -343,6 +345,21 @@ def _check_finite(weights: Mapping[str, Tensor]) -> None:
 # The formats of the paper's authors.
 
 _DEMO_SPACE_DIM = 2
+_DEMO_KIND = {
+    "space_dim": _DEMO_SPACE_DIM,
+    "static": False,
+    "readout_dim": 0,
+    "moment_correction": True,
+    "moment_inverse": "threshold",
+    "state_gradient": True,
+    "density_gradient": True,
+    "species_count": 0,
+}
+"""What rules of the web demo are like; its files do not say it."""
+
+DEMO_PARTICLE_COUNT = 4096
+"""Particles of a world in the web demo where nothing else is said."""
+
 _TEXEL = 4
 """The web demo keeps its weights in RGBA textures: rows are padded to a multiple of this."""
 
@@ -455,6 +472,79 @@ def read_demo_json(data: bytes, name: str | None) -> RuleParts:
         "alpha": _scalar("alpha", entry.get("alpha")),
     }
     return RuleParts(hyper_parameters, weights)
+
+
+def save_demo_json(
+    rules: Mapping[str, NPARule],
+    path: str | Path,
+    *,
+    particle_counts: Mapping[str, int] | None = None,
+) -> None:
+    """Write rules as a collection of the authors' web demo, in float32, whole or not at all.
+
+    `load_rule("models.json#name")` gives each of them back.
+
+    Args:
+        rules: Name -> rule; the demo has 2D rules without read-out that perceive all the paper's
+            fields and nothing else.
+        path: The file to write, ending in `.json`; an existing one is replaced.
+        particle_counts: With how many particles a rule starts there; 4096 where nothing is said.
+
+    Raises:
+        NPAError: There are no rules, a rule is not of the demo's kind, a weight is not finite in
+            float32, the suffix is another one, or the file cannot be written.
+    """
+    path = checked_path(path)
+    if path.suffix != ".json":
+        raise NPAError(
+            f"a collection of the authors' demo must end in .json, got {shown(str(path))}: "
+            f"use {shown(str(path.with_suffix('.json')))}"
+        )
+    if not isinstance(rules, Mapping) or not rules:
+        raise NPAError(f"rules must map names to at least one rule, got {shown(rules)}")
+    counts = particle_counts or {}
+    entries = {
+        str(name): _demo_entry(name, rule, counts.get(name, DEMO_PARTICLE_COUNT))
+        for name, rule in rules.items()
+    }
+    write_text(path, json.dumps(entries))
+
+
+def _demo_entry(name: str, rule: NPARule, particle_count: int) -> dict[str, Any]:
+    check_rule(rule)
+    made = rule.hyper_parameters()
+    for field, wanted in _DEMO_KIND.items():
+        if made.get(field, wanted) != wanted:
+            raise NPAError(
+                f"the authors' demo runs rules with {field}={wanted!r} only, {shown(name)} has "
+                f"{made[field]!r}: save it with npa_envs.save_rule"  # type: ignore[literal-required]
+            )
+    if not rule.is_plain():
+        raise NPAError(
+            f"the authors' demo runs rules of two plain layers only, {shown(name)} is a "
+            f"{type(rule).__name__} with a network of its own"
+        )
+    weights = {k: v.detach().cpu().float() for k, v in rule.state_dict().items()}
+    _check_finite(weights)
+    displacement, states = weights["output.weight"].split([rule.space_dim, rule.state_dim])
+    return {
+        "eps0": _as_float32(rule.eps0),
+        "N0": particle_count,
+        "alpha": _as_float32(rule.alpha),
+        "w1.weight": _encode(_texels(weights["hidden.weight"])),
+        "w1.bias": _encode(weights["hidden.bias"]),
+        "w2.weight.T": _encode(_texels(torch.cat([states, displacement]).T)),
+    }
+
+
+def _texels(matrix: Tensor) -> Tensor:
+    """Return a matrix padded with columns of zeros to whole texels."""
+    return torch.nn.functional.pad(matrix, (0, -matrix.shape[1] % _TEXEL))
+
+
+def _encode(tensor: Tensor) -> dict[str, Any]:
+    data = base64.b64encode(tensor.contiguous().numpy().astype("<f4").tobytes()).decode()
+    return {"shape": list(tensor.shape), "dtype": "float32", "data64": data}
 
 
 def _unpickle(data: bytes) -> Mapping[Any, Any]:

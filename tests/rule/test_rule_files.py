@@ -15,7 +15,13 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.rule.files import load_rule, rule_metadata, save_rule, shipped_rules
+from npa_envs.rule.files import (
+    load_rule,
+    rule_metadata,
+    save_demo_json,
+    save_rule,
+    shipped_rules,
+)
 from npa_envs.rule.rule import NPARule
 from npa_envs.world.rollout import rollout
 
@@ -430,3 +436,46 @@ def test_the_authors_aubergine_has_the_layout_that_its_rollout_shows(reference: 
         x, s = rollout(rule, x, s, int(numbers["steps"]), update_prob=1.0)
     assert float((x[0] - torch.from_numpy(numbers["x"])).abs().max()) < 1e-11
     assert float((s[0] - torch.from_numpy(numbers["s"])).abs().max()) < 1e-11
+
+
+def test_the_authors_collection_is_written_as_they_wrote_it(
+    reference: Path, tmp_path: Path
+) -> None:
+    theirs = reference / "authors_demo_aubergine.json"
+    save_demo_json({"aubergine": load_rule(theirs)}, tmp_path / "models.json")
+    assert (tmp_path / "models.json").read_text() == theirs.read_text()
+
+
+@pytest.mark.parametrize("channels", [3, 16])
+def test_a_collection_gives_each_of_its_rules_back(tmp_path: Path, channels: int) -> None:
+    rules = {"mine": NPARule(2, channels, 7, eps0=0.12, alpha=0.3), "gecko": load_rule("gecko")}
+    path = tmp_path / "models.json"
+    save_demo_json(rules, path, particle_counts={"mine": 1000})
+    for name, rule in rules.items():
+        assert_same_rule(load_rule(f"{path}#{name}"), rule)
+    entries = json.loads(path.read_text())
+    assert {name: entry["N0"] for name, entry in entries.items()} == {"mine": 1000, "gecko": 4096}
+
+
+@pytest.mark.parametrize(
+    ("rule", "message"),
+    [
+        (NPARule(3), "space_dim=2 only, 'mine' has 3"),
+        (NPARule(2, 4, 8, static=True), "static=False only"),
+        (NPARule(moment_inverse="smooth"), "moment_inverse='threshold' only"),
+        (NPARule(species_count=2), "species_count=0 only"),
+    ],
+)
+def test_a_collection_refuses_rules_that_the_demo_would_run_as_others(
+    tmp_path: Path, rule: NPARule, message: str
+) -> None:
+    with pytest.raises(NPAError, match=message):
+        save_demo_json({"mine": rule}, tmp_path / "models.json")
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_collection_is_written_to_a_json_file_only(tmp_path: Path) -> None:
+    with pytest.raises(NPAError, match=r"must end in \.json"):
+        save_demo_json({"mine": NPARule()}, tmp_path / "models.txt")
+    with pytest.raises(NPAError, match="at least one rule"):
+        save_demo_json({}, tmp_path / "models.json")
