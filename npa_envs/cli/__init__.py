@@ -13,6 +13,7 @@ COMMANDS = {
     "train": "train a rule on a task",
     "rollout": "grow a rule from its seed, with damage on the way; writes GIF, MP4 and a filmstrip",
     "view": "watch and touch a rule, a training run or an environment in the browser",
+    "export-web": "rules as one HTML file that runs in any browser, without a server",
     "evaluate": "measure a rule: loss, PSNR, overflow and extent over thousands of steps",
     "interact": "grow rules beside each other: what each does to the other",
     "bench": "run time against error, the paper's table, scaling; a call explained",
@@ -85,6 +86,8 @@ def _dispatch(words: list[str]) -> int:
             from npa_envs.cli.rollout import main as command
         case "view":
             from npa_envs.cli.view import main as command
+        case "export-web":
+            from npa_envs.cli.export_web import main as command
         case "evaluate":
             from npa_envs.cli.evaluate import main as command
         case "interact":

@@ -36,6 +36,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "demo": ("demo", "demo --target star --train-seconds 60 --out star"),
     "doctor": ("doctor",),
     "evaluate": ("evaluate gecko --healing", "evaluate runs/heart --seed-count 2"),
+    "export-web": ("export-web gecko heart -o page.html", "export-web --gallery -o gallery.html"),
     "interact": ("interact gecko heart", "interact --quick"),
     "list": ("list",),
     "robustness": ("robustness heart --quick", "robustness --device cuda --out results"),

@@ -1,0 +1,66 @@
+"""`npa-envs export-web RULE...`: rules as one HTML file that runs in any browser by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from npa_envs.cli.output import parse_options, rule_of
+from npa_envs.errors import NPAError
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportOptions:
+    """Write one HTML file that runs rules in a browser, on a phone too, with brushes and sliders.
+
+    It needs neither a server nor a network. A name that ends in .json writes the collection that the
+    authors' web demo reads instead.
+    """
+
+    rules: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RULE")] = ()
+    """Shipped rules (`npa-envs list`), folders of runs, or files of ours or the authors'."""
+
+    out: Annotated[Path, tyro.conf.arg(aliases=("-o", "--output"))] = Path("page.html")
+    """The file to write."""
+
+    gallery: bool = False
+    """Begin with pictures to choose from; without RULE of all shipped 2D rules."""
+
+    title: str | None = None
+    """Title of the page; default: the first rule's name."""
+
+    particle_count: int | None = None
+    """Particles N of each world; default: as trained, and 3D worlds a quarter of it."""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Write what the words after `npa-envs export-web` ask for; return 0."""
+    options = parse_options(ExportOptions, "export-web", arguments)
+    from npa_envs.rule.files import load_rule, save_demo_json, shipped_rules
+    from npa_envs.web.export import export_web
+    from npa_envs.web.rule_world import name_of
+
+    sources = [rule_of(source) for source in options.rules]
+    title = options.title
+    if options.gallery and not sources:
+        sources = [name for name in shipped_rules() if load_rule(name).space_dim == 2]
+        title = title or "Neural Particle Automata"
+    if not sources:
+        raise NPAError("name at least one RULE, or --gallery for all shipped 2D rules")
+    if options.out.suffix == ".json":
+        save_demo_json({name_of(source): load_rule(source) for source in sources}, options.out)
+    else:
+        export_web(
+            sources,
+            options.out,
+            title=title,
+            particle_count=options.particle_count,
+            previews=options.gallery,
+        )
+    size = options.out.stat().st_size
+    print(f"wrote {options.out} ({size / 1000:.0f} kB)")
+    return 0

@@ -1,0 +1,291 @@
+"""Pages that run rules by themselves: one HTML file with weights, engine and brushes, no server."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import html
+import io
+import json
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from PIL import Image
+from torch import Tensor
+
+from npa_envs.errors import NPAError, shown
+from npa_envs.files import checked_path, write_text
+from npa_envs.render.colours import ramp
+from npa_envs.rule.files import load_rule
+from npa_envs.rule.rule import NPARule, check_rule
+from npa_envs.tasks.growth import GrowthTask
+from npa_envs.tasks.point_classification import PALETTE, UNDECIDED, PointClassification
+from npa_envs.web.colouring import DARK
+from npa_envs.web.live import checked_seed
+from npa_envs.web.rule_world import RuleWorld, name_of
+
+PAGE = Path(__file__).resolve().parent / "page"
+"""The folder of the page's own files."""
+
+PAGE_MODULES = ("exported.js",)
+"""Modules that the exported page begins with; they import the others."""
+
+STYLES = ("page.css", "exported.css")
+"""Style sheets of the exported page."""
+
+WORKER_MODULE = "live_world.js"
+"""The module that the page's worker begins with."""
+
+SOLID_SHARE = 4
+"""3D worlds begin with so much fewer particles than rules were trained with: what a browser bears."""
+
+PREVIEW_STEPS = 256
+"""Steps that a world has grown for its preview; half as many where no shape has to form."""
+
+PREVIEW_PIXELS = 192
+"""Pixels on each side of a preview."""
+
+MOST_WEIGHTS = 2**20
+"""Weights of a rule that a page takes: 5.6 MB of text, and far too slow for a browser already."""
+
+POLICY = (
+    "default-src 'none'; script-src {scripts} 'wasm-unsafe-eval'; style-src {styles}; "
+    "worker-src blob:; img-src data: blob:; media-src blob:; base-uri 'none'; form-action 'none'"
+)
+"""What the page may load: nothing but itself."""
+
+_IMPORT = re.compile(r'^import \{ ([\w, ]+) \} from "\./(\w+\.js)";$', re.MULTILINE)
+_EXPORT = re.compile(r"^export (?=(?:async function|function|class|const) (\w+))", re.MULTILINE)
+_MODULE_LINE = re.compile(r"^(?:import|export)\b.*$", re.MULTILINE)
+
+
+def joined_modules(names: Sequence[str], folder: Path = PAGE) -> str:
+    """Return modules and all that they import as one script, each in a scope of its own.
+
+    Afterwards the exports of `page.js` are members of the constant `page`, and so on.
+
+    Args:
+        names: Files in the folder.
+        folder: Where they are.
+
+    Raises:
+        ValueError: An import or an export is written in a way that is not read here, or modules
+            import each other in a circle.
+    """
+    order: list[str] = []
+    texts: dict[str, str] = {}
+
+    def visit(name: str, path: tuple[str, ...]) -> None:
+        if name in path:
+            raise ValueError(f"modules import each other: {' -> '.join((*path, name))}")
+        if name in texts:
+            return
+        source = (folder / name).read_text(encoding="utf-8")
+        for _, other in _IMPORT.findall(source):
+            visit(other, (*path, name))
+        exported = ", ".join(_EXPORT.findall(source))
+        source = _EXPORT.sub("", source)
+        source = _IMPORT.sub(lambda found: f"const {{ {found[1]} }} = {_scope(found[2])};", source)
+        left = _MODULE_LINE.search(source)
+        if left is not None:
+            raise ValueError(f"{name} must import and export as the others do, got {left[0]!r}")
+        texts[name] = f"const {_scope(name)} = (() => {{\n{source}\nreturn {{ {exported} }};\n}})();"
+        order.append(name)
+
+    for name in names:
+        visit(name, ())
+    return "\n".join(('"use strict";', *(texts[name] for name in order)))
+
+
+def _scope(module: str) -> str:
+    return module.removesuffix(".js")
+
+
+def export_web(
+    sources: Sequence[str],
+    path: str | Path,
+    *,
+    title: str | None = None,
+    particle_count: int | None = None,
+    previews: bool = False,
+    seed: int = 0,
+) -> None:
+    """Write one HTML file that runs rules in a browser, whole or not at all.
+
+    Nothing is loaded from anywhere: weights, engine and page are in the file, and its policy forbids
+    the browser any connection.
+
+    Args:
+        sources: Rules, each as `load_rule` takes it; the first one is shown first.
+        path: The file to write, ending in `.html`; an existing one is replaced.
+        title: Of the page; None: the first rule's name.
+        particle_count: Particles of each world; None: as trained, and 3D worlds a quarter of it.
+        previews: The page begins with a picture of each rule's grown world, to choose from.
+        seed: Randomness of the first world, 0 to 2^53 - 1.
+
+    Raises:
+        NPAError: The suffix is another one, a rule cannot be loaded, two have one name, a browser
+            cannot run one, or the file cannot be written.
+    """
+    path = checked_path(path)
+    if path.suffix != ".html":
+        raise NPAError(
+            f"a page must end in .html, got {shown(str(path))}: "
+            f"use {shown(str(path.with_suffix('.html')))}"
+        )
+    rules = [page_rule(source, particle_count=particle_count) for source in sources]
+    names = [rule["name"] for rule in rules]
+    if not names or len(set(names)) < len(names):
+        raise NPAError(f"a page needs rules of different names, got {shown(names)}")
+    if previews:
+        for source, rule in zip(sources, rules, strict=True):
+            rule["preview"] = preview(source)
+    write_text(path, page_text(rules, title=title or names[0], seed=checked_seed(seed)))
+
+
+def page_rule(source: str, *, particle_count: int | None = None) -> dict[str, Any]:
+    """Return a rule as the page's engine reads it: numbers as float32 in base64, and its world.
+
+    Args:
+        source: As `load_rule` takes it.
+        particle_count: Particles N; None: as trained, and 3D worlds a quarter of it.
+
+    Raises:
+        NPAError: It cannot be loaded, or a browser cannot run it.
+    """
+    check_browser_rule(load_rule(source), name_of(source))
+    live = RuleWorld(source, device=torch.device("cpu"), particle_count=particle_count, choices={})
+    if live.dimension == 3 and particle_count is None:
+        live.handle({"type": "set", "name": "count", "value": live.full // SOLID_SHARE})
+    rule, task = live.main.rule, live.task
+    seed: dict[str, Any]
+    if isinstance(task, PointClassification):
+        seed = {"kind": "clouds", "clouds": [_packed(cloud) for cloud in one_of_each(task)]}
+    elif task.box is not None:
+        seed = {"kind": "box"}
+    elif isinstance(task, GrowthTask):
+        seed = {"kind": "ball", "radius": task.config.seed_radius}
+    else:
+        raise NPAError(
+            f"a page grows rules from a ball, a box or a point cloud, {shown(source)} begins with "
+            f"a {type(task).__name__}: watch it with npa-envs view"
+        )
+    # What the engine in the page says itself.
+    own = {"type", "rules", "rule", "others", "species", "show", "capabilities", "playing", "seed"}
+    world = {name: value for name, value in live.describe().items() if name not in own}
+    classes = {"palette": PALETTE, "undecided": UNDECIDED}
+    return {
+        **{"moment_inverse": "threshold"} | rule.hyper_parameters(),
+        "name": live.main.name,
+        "classes": classes if isinstance(task, PointClassification) else None,
+        "weights": {name: _packed(tensor) for name, tensor in rule.state_dict().items()},
+        "world": world | {"count": live.full, "seed": seed},
+    }
+
+
+def check_browser_rule(rule: NPARule, name: str) -> None:
+    """Check that the page's engine can run a rule.
+
+    Raises:
+        NPAError: It has a network of its own, perceives species by themselves, or is too large.
+    """
+    check_rule(rule)
+    if not rule.is_plain():
+        raise NPAError(
+            f"a page runs rules of two plain layers only, {shown(name)} is a "
+            f"{type(rule).__name__} with a network of its own: run it in Python"
+        )
+    if rule.species_count:
+        raise NPAError(
+            f"a page runs rules that perceive all species alike, {shown(name)} has species_count="
+            f"{rule.species_count}: run it with npa_envs.rollout_species"
+        )
+    if rule.weight_count > MOST_WEIGHTS:
+        raise NPAError(
+            f"a page takes rules of at most {MOST_WEIGHTS} weights, {shown(name)} has "
+            f"{rule.weight_count}: watch it with npa-envs view"
+        )
+
+
+def one_of_each(task: PointClassification) -> list[Tensor]:
+    """Return a cloud of each class, the first one of the data, shape [N, 2]."""
+    label = task.clouds.label.tolist()
+    return [task.clouds.x[label.index(kind)] for kind in sorted(set(label))]
+
+
+def preview(source: str, *, seed: int = 0) -> str:
+    """Return a picture of a rule's grown world as a data address: WebP with transparency.
+
+    Args:
+        source: As `load_rule` takes it.
+        seed: Randomness of the world.
+
+    Raises:
+        NPAError: The rule cannot be loaded.
+    """
+    live = RuleWorld(source, device=torch.device("cpu"), seed=seed, choices={})
+    live.speed = PREVIEW_STEPS if live.task.aligned else PREVIEW_STEPS // 2
+    live.advance()
+    with torch.no_grad():
+        fields = live.task.picture(live.x, live.s)[0].flip(0)
+    colour = fields[..., :3] / fields[..., 3:].clamp_min(1e-6)
+    pixels = torch.cat((colour, fields[..., 3:]), dim=-1).clamp(0.0, 1.0)
+    picture = Image.fromarray((pixels * 255.0).round().to(torch.uint8).numpy(), "RGBA")
+    shrunk = picture.resize((PREVIEW_PIXELS, PREVIEW_PIXELS), Image.Resampling.LANCZOS)
+    file = io.BytesIO()
+    shrunk.save(file, "WEBP", quality=80)
+    return f"data:image/webp;base64,{base64.b64encode(file.getvalue()).decode()}"
+
+
+def page_text(rules: Sequence[Mapping[str, Any]], *, title: str, seed: int = 0) -> str:
+    """Return the HTML of a page.
+
+    Args:
+        rules: As `page_rule` gives them; the first one is shown first.
+        title: Of the page.
+        seed: Randomness of the first world.
+    """
+    table = ramp(DARK)[1024 // 6:]
+    settings = {
+        "worker": "worker",
+        "seed": seed,
+        "ramp": base64.b64encode(table.tobytes()).decode(),
+        "rules": rules,
+    }
+    # What could end the element that holds it is written otherwise.
+    data = json.dumps(settings, separators=(",", ":")).replace("<", "\\u003c")
+    worker = f"{joined_modules([WORKER_MODULE])}\nlive_world.serve(self);\n"
+    code = f"{joined_modules(PAGE_MODULES)}\nexported.begin();\n"
+    style = "\n".join((PAGE / name).read_text(encoding="utf-8") for name in STYLES)
+    policy = POLICY.format(scripts=_digest(code), styles=_digest(style))
+    page = (PAGE / "index.html").read_text(encoding="utf-8")
+    for before, after in (
+        (
+            '<meta name="viewport"',
+            f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n<meta name="viewport"',
+        ),
+        ("<title>npa-envs</title>", f"<title>{html.escape(title)}</title>"),
+        ('<link rel="stylesheet" href="page.css">', f"<style>{style}</style>"),
+        (
+            '<script type="module" src="viewer.js"></script>',
+            f'<script type="application/json" id="rules">{data}</script>\n'
+            f'<script type="text/plain" id="worker">{worker}</script>\n'
+            f'<script type="module">{code}</script>',
+        ),
+    ):
+        if page.count(before) != 1:
+            raise ValueError(f"index.html must hold {before!r} once, found {page.count(before)}")
+        page = page.replace(before, after)
+    return page
+
+
+def _digest(text: str) -> str:
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+
+
+def _packed(tensor: Tensor) -> str:
+    data = tensor.detach().cpu().contiguous().numpy().astype("<f4")
+    return base64.b64encode(data.tobytes()).decode()

@@ -1,0 +1,227 @@
+// Colours of single particles, as npa_envs/web/colouring.py gives them: what each tells of its state,
+// its surroundings, its movement.
+
+// Of npa_envs/render/colours.py and npa_envs/web/colouring.py.
+const COLOUR_OFFSET = 0.5;
+const GOLDEN_ANGLE = Math.PI * (3 - Math.sqrt(5));
+const STATE_CHROMA = 0.16;
+const STATE_GAIN = 2.8;
+const BALANCE = 0.9;
+const UPDATED = [0.98, 0.78, 0.36];
+const RESTING = [0.29, 0.33, 0.42];
+
+const ROWS_TOGETHER = 64;
+const JACOBI_SWEEPS = 12;
+
+// Colours frame after frame: bytes red, green and blue of each particle.
+export class Colouring {
+  // ramp: Uint8Array, red, green and blue from sparse to dense.
+  constructor(ramp) {
+    this.ramp = ramp;
+    this.covariance = null;
+    this.basis = null;
+  }
+
+  // live: the LiveWorld; show: one of its shows.
+  of(live, show) {
+    const { world } = live;
+    const bytes = new Uint8ClampedArray(3 * world.count);
+    if (show === "colours") {
+      live.looks.forEach((look, number) => look.colour(world, number, bytes));
+    } else if (show === "density") {
+      this.densities(live, bytes);
+    } else if (show === "components") {
+      this.components(world.s, live.channels, bytes);
+    } else if (show === "species") {
+      const tints = live.species.map((_, k) => speciesColour(k));
+      each(bytes, (i) => tints[world.species[i]]);
+    } else if (show === "speed") {
+      each(bytes, (i) => this.onRamp(Math.sqrt(live.travelled[i] || 0)));
+    } else if (show === "mask") {
+      each(bytes, (i) => (live.updated[i] ? UPDATED : RESTING));
+    } else {
+      const channel = Number(show.slice("state ".length));
+      each(bytes, (i) => signedColour(world.s[i * live.channels + channel]));
+    }
+    return new Uint8Array(bytes.buffer);
+  }
+
+  // 1 is a world whose particles fill [-1, 1]^D, or its box, evenly. In open space worlds fill a part
+  // only, and so are denser.
+  densities({ physics, world, eps, box, dimension, full }, bytes) {
+    physics.sort(world, eps, box);
+    physics.computeDensities(world.count, eps);
+    const volume = box === null ? 2 ** dimension : box.reduce((product, side) => product * side, 1);
+    const usual = (full / volume) * (box === null ? 4 : 1);
+    for (let k = 0; k < world.count; k++) {
+      put(bytes, physics.order[k], this.onRamp(1 - 2 ** (-physics.density[k] / usual)));
+    }
+  }
+
+  // The first three principal components as colours; their basis moves slowly.
+  components(s, channels, bytes) {
+    const count = s.length / channels;
+    const mean = new Float64Array(channels);
+    for (let k = 0; k < s.length; k++) mean[k % channels] += s[k] / count;
+    const fresh = new Float64Array(channels * channels);
+    const row = new Float64Array(channels);
+    for (let i = 0; i < count; i++) {
+      for (let c = 0; c < channels; c++) row[c] = s[i * channels + c] - mean[c];
+      for (let a = 0; a < channels; a++) for (let b = 0; b <= a; b++) fresh[a * channels + b] += (row[a] * row[b]) / count;
+    }
+    for (let a = 0; a < channels; a++) for (let b = 0; b < a; b++) fresh[b * channels + a] = fresh[a * channels + b];
+    if (this.covariance?.length !== fresh.length) {
+      this.covariance = fresh.slice();
+      this.basis = null;
+    }
+    this.covariance = this.covariance.map((kept, k) => BALANCE * kept + (1 - BALANCE) * fresh[k]);
+    const found = eigenvectors(this.covariance, channels).slice(0, 3);
+    found.forEach(({ vector }, k) => {
+      // An eigenvector may come with either sign: colours must not flip between frames.
+      if (this.basis?.[k] && product(vector, this.basis[k]) < 0) vector.forEach((part, c) => (vector[c] = -part));
+    });
+    this.basis = found.map(({ vector }) => vector);
+    const tint = [0.5, 0.5, 0.5];
+    for (let i = 0; i < count; i++) {
+      found.forEach(({ value, vector }, k) => {
+        let sum = 0;
+        for (let c = 0; c < channels; c++) sum += (s[i * channels + c] - mean[c]) * vector[c];
+        tint[k] = 0.5 + (0.22 * sum) / Math.sqrt(Math.max(value, 1e-12));
+      });
+      put(bytes, i, tint);
+    }
+  }
+
+  onRamp(share) {
+    const last = this.ramp.length / 3 - 1;
+    const entry = 3 * Math.round(last * Math.min(1, Math.max(0, share)));
+    return [this.ramp[entry] / 255, this.ramp[entry + 1] / 255, this.ramp[entry + 2] / 255];
+  }
+}
+
+// How particles of one rule look: their last three outputs as colours, or the colour of the class that
+// they say, greyer the less they are sure of it.
+export class Look {
+  // rule: of LiveWorld; its `classes` are {palette, undecided}, or null.
+  constructor(rule, kernels) {
+    this.classes = rule.classes;
+    this.channels = rule.state_dim;
+    const { weights, readout_dim: outputs, readout_hidden_dim: hidden } = rule;
+    this.kernels = kernels;
+    this.outputs = outputs === 0 ? this.channels : rule.classes === null ? 3 : outputs;
+    if (outputs === 0) return;
+    // Of the read-out only what is seen.
+    const kept = this.outputs;
+    this.first = kernels.layer(weights["readout.0.weight"], weights["readout.0.bias"], this.channels, hidden);
+    this.second = kernels.layer(
+      weights["readout.2.weight"].slice((outputs - kept) * hidden), weights["readout.2.bias"].slice(outputs - kept), hidden, kept,
+    );
+    this.rows = kernels.floats(ROWS_TOGETHER * this.channels);
+    this.hidden = kernels.floats(ROWS_TOGETHER * this.first.width);
+    this.read = kernels.floats(ROWS_TOGETHER * this.second.width);
+  }
+
+  // Colours the particles of species `number`.
+  colour({ s, species, count }, number, bytes) {
+    const { channels } = this;
+    if (this.first === undefined) {
+      for (let i = 0; i < count; i++) if (species[i] === number) put(bytes, i, this.tint(s, i * channels));
+      return;
+    }
+    const block = [];
+    const flush = () => {
+      block.forEach((i, row) => this.rows.set(s.subarray(i * channels, (i + 1) * channels), row * channels));
+      this.kernels.product(this.first, block.length, this.rows, channels, this.hidden, true);
+      this.kernels.product(this.second, block.length, this.hidden, this.first.width, this.read, false);
+      block.forEach((i, row) => put(bytes, i, this.tint(this.read, row * this.second.width)));
+      block.length = 0;
+    };
+    for (let i = 0; i < count; i++) {
+      if (species[i] === number && block.push(i) === ROWS_TOGETHER) flush();
+    }
+    flush();
+  }
+
+  tint(values, at) {
+    if (this.classes === null) {
+      const last = at + this.outputs;
+      return [values[last - 3] + COLOUR_OFFSET, values[last - 2] + COLOUR_OFFSET, values[last - 1] + COLOUR_OFFSET];
+    }
+    const { palette, undecided } = this.classes;
+    let chosen = 0;
+    for (let k = 1; k < this.outputs; k++) if (values[at + k] > values[at + chosen]) chosen = k;
+    const sure = Math.min(1, Math.max(0, values[at + chosen]));
+    return undecided.map((grey, c) => grey + sure * (palette[chosen % palette.length][c] - grey));
+  }
+}
+
+function each(bytes, tintOf) {
+  for (let i = 0; 3 * i < bytes.length; i++) put(bytes, i, tintOf(i));
+}
+
+function put(bytes, i, tint) {
+  bytes[3 * i] = 255 * tint[0];
+  bytes[3 * i + 1] = 255 * tint[1];
+  bytes[3 * i + 2] = 255 * tint[2];
+}
+
+// Blue below 0, grey at 0, orange above.
+function signedColour(value) {
+  const pull = Math.tanh(0.5 * STATE_GAIN * value);
+  return srgb(0.62 + 0.18 * Math.abs(pull), 0.5 * STATE_CHROMA * pull, STATE_CHROMA * pull);
+}
+
+function speciesColour(number) {
+  const hue = 0.9 + GOLDEN_ANGLE * number;
+  return srgb(0.72, 0.13 * Math.cos(hue), 0.13 * Math.sin(hue));
+}
+
+// Red, green and blue of an OKLab colour (B. Ottosson, 2020).
+function srgb(lightness, a, b) {
+  const long = (lightness + 0.3963377774 * a + 0.2158037573 * b) ** 3;
+  const middle = (lightness - 0.1055613458 * a - 0.0638541728 * b) ** 3;
+  const short = (lightness - 0.0894841775 * a - 1.291485548 * b) ** 3;
+  return [
+    4.0767416621 * long - 3.3077115913 * middle + 0.2309699292 * short,
+    -1.2684380046 * long + 2.6097574011 * middle - 0.3413193965 * short,
+    -0.0041960863 * long - 0.7034186147 * middle + 1.7076147010 * short,
+  ].map((linear) => {
+    const clipped = Math.min(1, Math.max(0, linear));
+    return clipped <= 0.0031308 ? 12.92 * clipped : 1.055 * clipped ** (1 / 2.4) - 0.055;
+  });
+}
+
+function product(a, b) {
+  return a.reduce((sum, part, k) => sum + part * b[k], 0);
+}
+
+// Eigenvalues and eigenvectors of a symmetric matrix, the largest first, by Jacobi's rotations.
+export function eigenvectors(matrix, size) {
+  const m = Float64Array.from(matrix);
+  const vectors = new Float64Array(size * size);
+  for (let k = 0; k < size; k++) vectors[k * size + k] = 1;
+  for (let sweep = 0; sweep < JACOBI_SWEEPS; sweep++) {
+    for (let p = 0; p < size; p++) {
+      for (let q = p + 1; q < size; q++) {
+        const off = m[p * size + q];
+        if (Math.abs(off) < 1e-18) continue;
+        const theta = (m[q * size + q] - m[p * size + p]) / (2 * off);
+        const t = (theta >= 0 ? 1 : -1) / (Math.abs(theta) + Math.sqrt(theta * theta + 1));
+        const cosine = 1 / Math.sqrt(t * t + 1), sine = t * cosine;
+        const turn = (array, i, j) => {
+          const first = array[i], second = array[j];
+          array[i] = cosine * first - sine * second;
+          array[j] = sine * first + cosine * second;
+        };
+        for (let k = 0; k < size; k++) turn(m, k * size + p, k * size + q);
+        for (let k = 0; k < size; k++) turn(m, p * size + k, q * size + k);
+        for (let k = 0; k < size; k++) turn(vectors, k * size + p, k * size + q);
+      }
+    }
+  }
+  const found = Array.from({ length: size }, (_, k) => ({
+    value: m[k * size + k],
+    vector: Float64Array.from({ length: size }, (_, c) => vectors[c * size + k]),
+  }));
+  return found.sort((a, b) => b.value - a.value);
+}

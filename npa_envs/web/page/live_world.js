@@ -1,0 +1,391 @@
+// The world behind the exported page: what its messages do, and the frames that it shows. Messages and
+// events are those of page.js, and what they do is what RuleWorld of npa_envs/web/live.py does.
+
+import { clump, cut, eraseState, insideBall, push } from "./brushes.js";
+import { Colouring, Look } from "./colours.js";
+import { fastestKernels } from "./kernels_simd.js";
+import { padded, Physics, prepareRule, wrap } from "./physics.js";
+import { Random } from "./random.js";
+
+// Frames that are on the way to the page at most: a page that is slow or hidden holds the world.
+const FRAMES_AHEAD = 2;
+
+// Numbers of npa_envs/web/live.py and npa_envs/tasks/damage.py.
+const CLUMP_RATE = 0.25;
+const CLUMP_FACTOR = 0.9;
+const SEED_SHARE = 0.5;
+const LEAST_SEED = 16;
+const DAMAGE_SIZES = { erase: 0.2, cut: 0.1, clump: 0.2, noise: 0.05 };
+
+// What rules must have in common to live in one world, as AGREEMENTS of npa_envs/world/species.py.
+const AGREEMENTS = [
+  "space_dim", "state_dim", "eps0", "static", "state_gradient", "moment_correction", "moment_inverse",
+  "density_gradient",
+];
+
+export class LiveWorld {
+  // settings: {rules: [...], seed, ramp} as npa_envs/web/export.py writes them; the first rule is shown
+  // first. send(event, transferred) hands an event to the page.
+  constructor(settings, send) {
+    this.rules = settings.rules.map(decoded);
+    this.ramp = bytesOf(settings.ramp);
+    this.send = send;
+    this.playing = true;
+    this.changed = false;
+    this.onTheWay = 0;
+    this.show = "colours";
+    this.seed = settings.seed;
+    this.plant(this.rules[0]);
+  }
+
+  // A rule by its name.
+  known(name) {
+    const rule = this.rules.find((own) => own.name === name);
+    if (rule === undefined) throw Error(`no rule is called ${name}`);
+    return rule;
+  }
+
+  // Begins a fresh world of a rule, in the world that it was trained in.
+  plant(rule) {
+    this.rule = rule;
+    this.values = {};
+    for (const [name, { value }] of Object.entries(rule.world.settings)) this.values[name] = value;
+    this.values.count ??= rule.world.count;
+    if (!rule.world.shows.includes(this.show)) this.show = "colours";
+    this.reset(this.seed);
+  }
+
+  // A fresh world of the chosen rule alone.
+  reset(seed) {
+    this.seed = seed;
+    this.random = new Random(seed);
+    this.steps = this.milliseconds = 0;
+    this.species = [this.rule];
+    // What each species divides densities by: what a hand takes away or adds is felt nearby, and
+    // nowhere else.
+    this.full = this.values.count;
+    this.divisors = [this.full];
+    this.colouring = new Colouring(this.ramp);
+    this.take(this.places(), new Float32Array(this.full * this.channels), new Uint8Array(this.full));
+    this.prepare();
+    this.announce();
+  }
+
+  get dimension() {
+    return this.rule.space_dim;
+  }
+
+  get channels() {
+    return this.rule.state_dim;
+  }
+
+  get box() {
+    return this.rule.world.box;
+  }
+
+  get eps() {
+    return this.values.eps;
+  }
+
+  // Where the particles of a fresh world lie [length units].
+  places() {
+    const { seed } = this.rule.world;
+    if (seed.kind === "ball") return this.random.ball(this.full, this.dimension, seed.radius);
+    if (seed.kind === "box") return this.random.box(this.full, this.box);
+    return seed.clouds[this.random.below(seed.clouds.length)].slice();
+  }
+
+  // Goes on with these particles.
+  take(x, s, species) {
+    const count = species.length;
+    this.world = { count, x, s, species };
+    // How far each went in the last step, as a share of the farthest way, and whether it was updated.
+    this.travelled = new Float32Array(count);
+    this.updated = new Uint8Array(count);
+    if (this.physics !== undefined && count > this.physics.capacity) this.prepare();
+  }
+
+  // Room and weights for the particles and species that live now.
+  prepare() {
+    const kernels = fastestKernels(padded(this.channels), this.dimension);
+    this.physics = new Physics(this.species.map((rule) => prepareRule(rule, kernels)), this.world.count, kernels);
+    this.looks = this.species.map((rule) => new Look(rule, kernels));
+  }
+
+  step() {
+    const started = performance.now();
+    const { world, random, values, dimension, box, updated } = this;
+    if (world.count > 0) {
+      const before = world.x.slice();
+      for (let i = 0; i < world.count; i++) updated[i] = random.uniform() < values.update_prob ? 1 : 0;
+      const noise = values.noise > 0 ? random.normals(world.x.length, values.noise) : null;
+      this.physics.step(world, { eps: this.eps, box, mask: updated, noise, densityCounts: this.divisors });
+      const reach = this.eps * Math.max(...this.species.map((rule) => rule.alpha));
+      for (let i = 0; i < world.count; i++) {
+        let square = 0;
+        for (let d = 0; d < dimension; d++) {
+          let part = world.x[i * dimension + d] - before[i * dimension + d];
+          if (box !== null) part -= box[d] * Math.round(part / box[d]);
+          square += part * part;
+        }
+        this.travelled[i] = Math.sqrt(square) / reach;
+      }
+    }
+    this.steps++;
+    const taken = performance.now() - started;
+    this.milliseconds += (this.milliseconds > 0 ? 0.2 : 1) * (taken - this.milliseconds);
+  }
+
+  // Does what a message of the page says.
+  receive(message) {
+    switch (message.type) {
+      case "drawn":
+        this.onTheWay = Math.max(0, this.onTheWay - 1);
+        return;
+      case "play":
+        this.playing = Boolean(message.on);
+        return;
+      case "step":
+        this.playing = false;
+        this.step();
+        break;
+      case "reset":
+        this.reset(message.seed ?? this.seed + 1);
+        break;
+      case "set":
+        this.set(message.name, message.value);
+        break;
+      case "brush":
+        this.brush(message);
+        break;
+      case "damage":
+        this.damage(message.name);
+        break;
+      default:
+        throw Error(`no message is called ${message.type}`);
+    }
+    this.changed = true;
+  }
+
+  set(name, value) {
+    if (name === "loss") return;
+    if (name === "rule") return this.plant(this.known(value));
+    if (name === "show") {
+      if (!this.rule.world.shows.includes(value)) throw Error(`nothing to show is called ${value}`);
+      this.show = value;
+      return this.announce();
+    }
+    const range = this.rule.world.settings[name];
+    if (range === undefined) throw Error(`no setting is called ${name}`);
+    if (!(value >= range.low && value <= range.high)) {
+      const [low, high] = [range.low, range.high].map((end) => +end.toPrecision(3));
+      throw Error(`${name} must lie in [${low}, ${high}], got ${value}`);
+    }
+    this.values[name] = value;
+    if (name === "count") this.reset(this.seed);
+    else this.announce();
+  }
+
+  // What a hand does at a place: page.js says what the parts of a message are.
+  brush({ tool, at, move, radius, strength, rule, view }) {
+    const { dimension, box } = this;
+    const { x, s, species } = this.world;
+    if (tool === "erase") {
+      const gone = new Set(insideBall(x, dimension, at, radius, box));
+      this.keep((i) => !gone.has(i));
+    } else if (tool === "push") {
+      push(x, dimension, at, move, radius, Math.min(1, 0.5 + strength), box);
+    } else if (tool === "clump") {
+      clump(x, dimension, at, radius, CLUMP_RATE * strength, box);
+    } else if (tool === "cut") {
+      const half = move.map((part) => part / 2);
+      const normal = dimension === 2 ? [-move[1], move[0]] : cross(view ?? [0, 0, 1], move);
+      cut(x, dimension, at.map((part, d) => part + half[d]), normal, radius, half, box);
+    } else if (tool === "graft") {
+      const inside = insideBall(x, dimension, at, radius, box);
+      const number = this.speciesOf(rule, this.full);
+      for (const i of inside) species[i] = number;
+    } else if (tool === "add") {
+      this.add(at, radius, Math.max(LEAST_SEED, Math.round(strength * SEED_SHARE * this.full)), rule);
+    } else throw Error(`no brush is called ${tool}`);
+    if (box !== null) wrap(this.world.x, this.world.count, box);
+  }
+
+  // Removes the particles that are not kept.
+  keep(kept) {
+    const { x, s, species, count } = this.world;
+    const left = Array.from({ length: count }, (_, i) => i).filter(kept);
+    if (left.length === count) return;
+    const rows = (array, width) => {
+      const chosen = new array.constructor(left.length * width);
+      left.forEach((i, k) => chosen.set(array.subarray(i * width, (i + 1) * width), k * width));
+      return chosen;
+    };
+    this.take(rows(x, this.dimension), rows(s, this.channels), rows(species, 1));
+  }
+
+  // Adds blank particles of a rule in a ball.
+  add(at, radius, count, name) {
+    const { x, s, species } = this.world;
+    const room = (this.rule.world.settings.count?.high ?? this.full) - this.world.count;
+    if (count > room) throw Error(`the world has room for ${Math.max(0, room)} particles more, got ${count}`);
+    // As if it grew alone: what is new divides densities by its own number.
+    const number = this.speciesOf(name, count);
+    const ball = this.random.ball(count, this.dimension, radius);
+    for (let k = 0; k < ball.length; k++) ball[k] += at[k % this.dimension];
+    this.take(
+      joined(x, ball),
+      joined(s, new Float32Array(count * this.channels)),
+      joined(species, new Uint8Array(count).fill(number)),
+    );
+  }
+
+  // The number of a rule among the species; a rule that is new here gets the next one.
+  speciesOf(name, divisor) {
+    const rule = this.known(name);
+    const number = this.species.indexOf(rule);
+    if (number >= 0) return number;
+    if (!this.mayJoin(rule)) {
+      throw Error(`${name} cannot live in a world of ${this.rule.name}: rules of one world must agree in ${AGREEMENTS.join(", ")}`);
+    }
+    this.species.push(rule);
+    this.divisors.push(divisor);
+    this.prepare();
+    this.announce();
+    return this.species.length - 1;
+  }
+
+  mayJoin(rule) {
+    return AGREEMENTS.every((what) => rule[what] === this.rule[what]);
+  }
+
+  // Damage at a random place, or through the middle at a random angle.
+  damage(name) {
+    const { dimension, random } = this;
+    const { x, s, count } = this.world;
+    const size = DAMAGE_SIZES[name];
+    if (size === undefined) throw Error(`no damage is called ${name}`);
+    if (count === 0) return;
+    const particle = random.below(count);
+    const centre = x.slice(particle * dimension, (particle + 1) * dimension);
+    if (name === "erase") eraseState(x, s, dimension, centre, size, null);
+    if (name === "clump") clump(x, dimension, centre, size, CLUMP_FACTOR, null);
+    if (name === "cut") cut(x, dimension, meanOf(x, dimension), random.direction(dimension), size, null, null);
+    if (name === "noise") random.normals(x.length, size).forEach((part, k) => (x[k] += part));
+    if (this.box !== null) wrap(x, count, this.box);
+  }
+
+  // Whether there is something to show, and the page takes it.
+  get pending() {
+    return (this.playing || this.changed) && this.onTheWay < FRAMES_AHEAD;
+  }
+
+  // Goes on to the next frame where the world runs, and shows it.
+  advance() {
+    if (this.playing) for (let k = 0; k < this.values.speed; k++) this.step();
+    const positions = this.world.x.slice();
+    const colours = this.colouring.of(this, this.show);
+    const { steps, milliseconds } = this;
+    this.onTheWay++;
+    this.changed = false;
+    this.send({ type: "frame", step: steps, positions, colours, milliseconds }, [positions.buffer, colours.buffer]);
+  }
+
+  // Tells the page what there is.
+  announce() {
+    const { rule, values, show, playing, seed } = this;
+    const { settings: ranges, ...world } = rule.world;
+    const settings = {};
+    for (const [name, range] of Object.entries(ranges)) settings[name] = { ...range, value: values[name] };
+    this.changed = true;
+    this.send({
+      type: "world",
+      title: world.title,
+      note: world.note,
+      dimension: world.dimension,
+      box: world.box,
+      centre: world.centre,
+      half_width: world.half_width,
+      spot: world.spot,
+      rules: this.rules.map((own) => own.name),
+      rule: rule.name,
+      others: this.rules.filter((own) => this.mayJoin(own)).map((own) => own.name),
+      species: this.species.map((own) => own.name),
+      shows: world.shows,
+      show,
+      tools: world.tools,
+      damages: world.damages,
+      settings,
+      capabilities: ["step", "reset"],
+      playing,
+      seed,
+    });
+  }
+}
+
+function joined(first, second) {
+  const both = new first.constructor(first.length + second.length);
+  both.set(first);
+  both.set(second, first.length);
+  return both;
+}
+
+function meanOf(x, dimension) {
+  const mean = new Array(dimension).fill(0);
+  for (let k = 0; k < x.length; k++) mean[k % dimension] += (x[k] * dimension) / x.length;
+  return mean;
+}
+
+function cross(a, b) {
+  return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+}
+
+// A rule with its weights and clouds as numbers.
+function decoded(rule) {
+  const floats = (text) => new Float32Array(bytesOf(text).buffer);
+  const weights = {};
+  for (const [name, text] of Object.entries(rule.weights)) weights[name] = floats(text);
+  const { seed } = rule.world;
+  const world = seed.clouds ? { ...rule.world, seed: { ...seed, clouds: seed.clouds.map(floats) } } : rule.world;
+  return { ...rule, weights, world };
+}
+
+function bytesOf(text) {
+  return Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+}
+
+// Runs a live world in a worker: answers its messages, and computes frames between them.
+export function serve(scope) {
+  const send = (event, transferred = []) => scope.postMessage(event, transferred);
+  // Messages get their turn between two frames.
+  const clock = new MessageChannel();
+  let live = null;
+  let waiting = false;
+  const goOn = () => {
+    if (waiting || live === null || !live.pending) return;
+    waiting = true;
+    clock.port2.postMessage(null);
+  };
+  const attempt = (act) => {
+    try {
+      act();
+      return true;
+    } catch (error) {
+      send({ type: "error", message: error.message });
+      return false;
+    }
+  };
+  clock.port1.onmessage = () => {
+    waiting = false;
+    // A world that cannot go on stands still.
+    if (!attempt(() => live.pending && live.advance())) live.playing = live.changed = false;
+    goOn();
+  };
+  scope.onmessage = ({ data }) => {
+    attempt(() => {
+      if (data.type === "begin") live = new LiveWorld(data.settings, send);
+      else live.receive(data);
+    });
+    goOn();
+  };
+}

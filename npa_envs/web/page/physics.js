@@ -1,0 +1,472 @@
+// The step of Neural Particle Automata in plain JavaScript: the same formulas, in the same order, as
+// npa_envs/reference.py and docs/mathematics.md. Nothing here knows of pages, brushes or drawing.
+//
+// Particles are sorted by cell, densities are summed over pairs in double precision, and only active
+// particles perceive. The two sums that take most of the time, states over neighbours and the
+// network, are `kernels`: those of this file, or the WebAssembly ones of kernels_simd.js.
+
+const MOMENT_THRESHOLD = 1e-3;
+const MOMENT_SOFTENING = 1e-2;
+
+// Rows that the network takes at once.
+const BLOCK_ROWS = 64;
+
+// What states are padded to a multiple of, and what a layer's outputs are.
+const LANES = 4;
+const TILE_OUTPUTS = 8;
+
+// Cells on each side of the grid at most: farther particles share cells with others, and are told
+// apart by their distance.
+const MOST_CELLS = { 2: 256, 3: 64 };
+
+// Cells in which eps is divided.
+const CELLS_PER_RADIUS = { 2: 2, 3: 2 };
+
+export function padded(channels) {
+  return LANES * Math.ceil(channels / LANES);
+}
+
+export function tiled(outputs) {
+  return TILE_OUTPUTS * Math.ceil(outputs / TILE_OUTPUTS);
+}
+
+// The length P of the perception vector of a rule, as NPARule.perception_dim.
+export function perceptionLength(rule) {
+  const { space_dim: dimension, state_dim: channels } = rule;
+  const gradients = (rule.state_gradient ? channels * dimension : 0) + (rule.density_gradient ? dimension : 0);
+  return 2 * channels + gradients;
+}
+
+// A rule ready to run: hyper-parameters by NPARule's names, weights by those of its file.
+export function prepareRule(description, kernels) {
+  const rule = { ...description };
+  const { weights, hidden_dim: hidden, state_dim: channels } = rule;
+  rule.inputs = perceptionLength(rule);
+  const outputs = channels + (rule.static ? 0 : rule.space_dim);
+  rule.hidden = kernels.layer(weights["hidden.weight"], weights["hidden.bias"], rule.inputs, hidden);
+  rule.output = kernels.layer(weights["output.weight"], null, hidden, outputs);
+  return rule;
+}
+
+// The kernels in plain JavaScript. `floats` and `integers` give zeroed arrays that they can read.
+export function plainKernels() {
+  // Sums over the neighbours of a particle whose state begins at `own`, into `sums` [1 + D, width]:
+  // Σ a s_j, and Σ k (s_j - s_i) for each axis. Neighbours' states begin where `place` says.
+  function gather(states, width, dimension, own, { count, place, a, slopes }, sums) {
+    const [kx, ky, kz] = slopes;
+    for (let c = 0; c < width; c++) {
+      const mine = states[own + c];
+      let blur = 0, x = 0, y = 0, z = 0;
+      for (let n = 0; n < count; n++) {
+        const other = states[place[n] + c], offset = other - mine;
+        blur += a[n] * other;
+        x += kx[n] * offset;
+        y += ky[n] * offset;
+        if (dimension === 3) z += kz[n] * offset;
+      }
+      sums[c] = blur;
+      sums[width + c] = x;
+      sums[2 * width + c] = y;
+      if (dimension === 3) sums[3 * width + c] = z;
+    }
+  }
+
+  // A matrix [outputs, inputs], row by row, and a bias or null, as `product` reads them.
+  function layer(weight, bias, inputs, outputs) {
+    const width = tiled(outputs);
+    const transposed = new Float32Array(inputs * width), offset = new Float32Array(width);
+    for (let a = 0; a < outputs; a++) {
+      if (bias !== null) offset[a] = bias[a];
+      for (let p = 0; p < inputs; p++) transposed[p * width + a] = weight[a * inputs + p];
+    }
+    return { inputs, width, transposed, offset, sums: new Float64Array(width) };
+  }
+
+  // out = W in + b for `count` rows; max(out, 0) where `rectified`.
+  function product({ inputs, width, transposed, offset, sums }, count, rows, rowWidth, out, rectified) {
+    for (let row = 0; row < count; row++) {
+      for (let a = 0; a < width; a++) sums[a] = offset[a];
+      for (let p = 0; p < inputs; p++) {
+        const value = rows[row * rowWidth + p], from = p * width;
+        if (value === 0) continue;
+        for (let a = 0; a < width; a++) sums[a] += value * transposed[from + a];
+      }
+      for (let a = 0; a < width; a++) out[row * width + a] = rectified && sums[a] < 0 ? 0 : sums[a];
+    }
+  }
+
+  return {
+    name: "JavaScript",
+    floats: (length) => new Float32Array(length),
+    integers: (length) => new Int32Array(length),
+    gather,
+    layer,
+    product,
+  };
+}
+
+// What a step needs besides the world: sorted copies, densities, lists. Made once for each size.
+export class Physics {
+  // rules: prepared, all of one dimension and number of channels. capacity: particles at most.
+  constructor(rules, capacity, kernels) {
+    this.rules = rules;
+    this.kernels = kernels;
+    this.dimension = rules[0].space_dim;
+    this.channels = rules[0].state_dim;
+    this.width = padded(this.channels);
+    this.capacity = capacity;
+
+    const doubles = () => new Float64Array(capacity);
+    this.px = doubles();
+    this.py = doubles();
+    this.pz = doubles();
+    this.density = doubles();
+    this.volume = doubles();
+    this.gradientX = doubles();
+    this.gradientY = doubles();
+    this.gradientZ = doubles();
+    this.order = new Int32Array(capacity);
+    this.cellOf = new Int32Array(capacity);
+    this.starts = new Int32Array(1);
+    this.states = kernels.floats(capacity * this.width);
+    // The neighbours of one particle: where their states begin, and their factors in the sums.
+    this.list = {
+      count: 0,
+      place: kernels.integers(capacity),
+      a: kernels.floats(capacity),
+      slopes: [kernels.floats(capacity), kernels.floats(capacity), kernels.floats(capacity)],
+    };
+    this.sums = kernels.floats((1 + this.dimension) * this.width);
+    const widest = (width) => kernels.floats(BLOCK_ROWS * Math.max(...rules.map(width)));
+    this.rowWidth = Math.max(...rules.map((rule) => rule.inputs));
+    this.rows = widest(() => this.rowWidth);
+    this.hidden = widest((rule) => rule.hidden.width);
+    this.updates = widest((rule) => rule.output.width);
+    this.blockRows = new Int32Array(BLOCK_ROWS);
+    this.ranges = new Int32Array(4 * 25);
+  }
+
+  // Advances a world {count, x, s, species} by one step, in place.
+  //
+  // eps: perception radius [length units]; box: sides, or null; mask: Uint8Array, 1 where a particle
+  // is updated, or null for all; noise: what positions are moved by, or null; densityCounts: what each
+  // rule divides densities by, by default the particles of the world; dt: dimensionless.
+  step(world, { eps, box = null, mask = null, noise = null, densityCounts = null, dt = 1 }) {
+    this.sort(world, eps, box);
+    this.computeDensities(world.count, eps);
+    for (let number = 0; number < this.rules.length; number++) {
+      const divisor = densityCounts === null ? world.count : densityCounts[number];
+      this.advance(world, number, eps, divisor, mask, dt);
+    }
+    if (noise !== null) {
+      for (let n = 0; n < noise.length; n++) world.x[n] += noise[n];
+    }
+    if (box !== null) wrap(world.x, world.count, box);
+  }
+
+  sort({ count, x, s }, eps, box) {
+    const { dimension, channels, width, order, cellOf, states } = this;
+    const three = dimension === 3;
+    const cells = [1, 1, 1], inverse = [0, 0, 0];
+    this.sides = [Infinity, Infinity, Infinity];
+    for (let d = 0; d < dimension; d++) {
+      if (box !== null) {
+        this.sides[d] = box[d];
+        const fitting = Math.floor((box[d] / eps) * CELLS_PER_RADIUS[dimension] * (1 + 1e-12));
+        cells[d] = Math.max(1, Math.min(MOST_CELLS[dimension], fitting));
+        inverse[d] = cells[d] / box[d];
+      } else {
+        let low = Infinity, high = -Infinity;
+        for (let i = d; i < count * dimension; i += dimension) {
+          if (x[i] < low) low = x[i];
+          if (x[i] > high) high = x[i];
+        }
+        inverse[d] = CELLS_PER_RADIUS[dimension] / eps;
+        const fitting = Math.ceil((high - low) * inverse[d]) + 2 * CELLS_PER_RADIUS[dimension] + 1;
+        cells[d] = Math.min(MOST_CELLS[dimension], Number.isFinite(fitting) ? fitting : MOST_CELLS[dimension]);
+      }
+    }
+    const [nx, ny, nz] = cells;
+    this.cells = cells;
+    const total = nx * ny * nz;
+    if (this.starts.length < total + 1) this.starts = new Int32Array(total + 1);
+    const starts = this.starts.fill(0, 0, total + 1);
+    const cellAlong = (position, d) => {
+      const cell = Math.floor(position * inverse[d]) % cells[d];
+      return cell < 0 ? cell + cells[d] : cell | 0;
+    };
+    for (let i = 0; i < count; i++) {
+      const at = i * dimension;
+      const cz = three ? cellAlong(x[at + 2], 2) : 0;
+      const cell = (cz * ny + cellAlong(x[at + 1], 1)) * nx + cellAlong(x[at], 0);
+      cellOf[i] = cell;
+      starts[cell + 1]++;
+    }
+    for (let cell = 0; cell < total; cell++) starts[cell + 1] += starts[cell];
+    // Counted down from the end, so that `starts` itself can serve as the cursor of each cell.
+    for (let i = count - 1; i >= 0; i--) order[--starts[cellOf[i] + 1]] = i;
+    for (let cell = 0; cell < total; cell++) starts[cell] = starts[cell + 1];
+    starts[total] = count;
+    const [sideX, sideY, sideZ] = this.sides;
+    const inBox = (position, side) => (side < Infinity ? position - side * Math.floor(position / side + 0.5) : position);
+    for (let k = 0; k < count; k++) {
+      const i = order[k];
+      this.px[k] = inBox(x[i * dimension], sideX);
+      this.py[k] = inBox(x[i * dimension + 1], sideY);
+      this.pz[k] = three ? inBox(x[i * dimension + 2], sideZ) : 0;
+      for (let c = 0; c < channels; c++) states[k * width + c] = s[i * channels + c];
+    }
+  }
+
+  // Fills `ranges` with the runs of sorted particles that may be neighbours of those of a cell.
+  rangesAround(cell) {
+    const [nx, ny, nz] = this.cells;
+    const { starts, ranges, dimension } = this;
+    const reach = CELLS_PER_RADIUS[dimension];
+    const cx = cell % nx, cy = Math.floor(cell / nx) % ny, cz = Math.floor(cell / (nx * ny));
+    // In a small box each cell is looked at once, however often it lies around.
+    const around = 2 * reach + 1;
+    const countX = Math.min(nx, around), countY = Math.min(ny, around), countZ = Math.min(nz, around);
+    const firstX = countX < around ? 0 : (cx - reach + nx) % nx;
+    const firstY = countY < around ? 0 : cy - reach + ny;
+    const firstZ = countZ < around ? 0 : cz - reach + nz;
+    let used = 0;
+    const add = (from, to) => {
+      if (from < to) {
+        ranges[used++] = from;
+        ranges[used++] = to;
+      }
+    };
+    for (let z = 0; z < countZ; z++) {
+      for (let y = 0; y < countY; y++) {
+        const row = (((firstZ + z) % nz) * ny + ((firstY + y) % ny)) * nx;
+        const before = Math.min(countX, nx - firstX);
+        add(starts[row + firstX], starts[row + firstX + before]);
+        if (before < countX) add(starts[row], starts[row + countX - before]);
+      }
+    }
+    return used;
+  }
+
+  computeDensities(count, eps) {
+    const { px, py, pz, density, volume, gradientX, gradientY, gradientZ, ranges, starts, dimension } = this;
+    const [sideX, sideY, sideZ] = this.sides;
+    const halfX = sideX / 2, halfY = sideY / 2, halfZ = sideZ / 2;
+    const weight = smoothingNorm(eps, dimension), slope = spikyNorm(eps, dimension);
+    const squaredRadius = eps * eps;
+    gradientX.fill(0, 0, count);
+    gradientY.fill(0, 0, count);
+    gradientZ.fill(0, 0, count);
+    // A particle counts itself.
+    density.fill(weight * squaredRadius ** 3, 0, count);
+    const total = this.cells[0] * this.cells[1] * this.cells[2];
+    for (let cell = 0; cell < total; cell++) {
+      const end = starts[cell + 1];
+      if (starts[cell] === end) continue;
+      const used = this.rangesAround(cell);
+      for (let i = starts[cell]; i < end; i++) {
+        const x = px[i], y = py[i], z = pz[i];
+        let sum = 0, sumX = 0, sumY = 0, sumZ = 0;
+        for (let r = 0; r < used; r += 2) {
+          const last = ranges[r + 1];
+          // Each pair once: what i adds to j is what j adds to i, the gradient with the other sign.
+          for (let j = Math.max(ranges[r], i + 1); j < last; j++) {
+            let dx = px[j] - x, dy = py[j] - y, dz = pz[j] - z;
+            if (dx > halfX) dx -= sideX;
+            else if (dx < -halfX) dx += sideX;
+            if (dy > halfY) dy -= sideY;
+            else if (dy < -halfY) dy += sideY;
+            if (dz > halfZ) dz -= sideZ;
+            else if (dz < -halfZ) dz += sideZ;
+            const squared = dx * dx + dy * dy + dz * dz;
+            if (!(squared < squaredRadius)) continue;
+            const left = squaredRadius - squared;
+            const w = weight * left * left * left;
+            sum += w;
+            density[j] += w;
+            if (squared === 0) continue;
+            const distance = Math.sqrt(squared);
+            const k = (slope * (eps - distance) * (eps - distance)) / distance;
+            sumX += k * dx;
+            sumY += k * dy;
+            sumZ += k * dz;
+            gradientX[j] -= k * dx;
+            gradientY[j] -= k * dy;
+            gradientZ[j] -= k * dz;
+          }
+        }
+        density[i] += sum;
+        gradientX[i] += sumX;
+        gradientY[i] += sumY;
+        gradientZ[i] += sumZ;
+      }
+    }
+    for (let i = 0; i < count; i++) volume[i] = 1 / density[i];
+  }
+
+  // Perceives the active particles of one rule, runs its network, and updates them.
+  advance(world, number, eps, divisor, mask, dt) {
+    const { order, starts, blockRows, kernels, rows, rowWidth, hidden, updates } = this;
+    const rule = this.rules[number];
+    const total = this.cells[0] * this.cells[1] * this.cells[2];
+    let filled = 0;
+    const flush = () => {
+      if (filled === 0) return;
+      kernels.product(rule.hidden, filled, rows, rowWidth, hidden, true);
+      kernels.product(rule.output, filled, hidden, rule.hidden.width, updates, false);
+      for (let row = 0; row < filled; row++) this.update(world, rule, order[blockRows[row]], row, eps, dt);
+      filled = 0;
+    };
+    for (let cell = 0; cell < total; cell++) {
+      let used = -1;
+      for (let i = starts[cell]; i < starts[cell + 1]; i++) {
+        const particle = order[i];
+        if (world.species[particle] !== number || (mask !== null && mask[particle] === 0)) continue;
+        if (used < 0) used = this.rangesAround(cell);
+        this.perceive(world, rule, i, used, filled * rowWidth, eps, divisor);
+        blockRows[filled++] = i;
+        if (filled === BLOCK_ROWS) flush();
+      }
+    }
+    flush();
+  }
+
+  // Writes the perception vector of sorted particle i into `rows` at `at`.
+  perceive(world, rule, i, used, at, eps, divisor) {
+    const { px, py, pz, volume, list, width, dimension, channels, rows, sums, states, ranges } = this;
+    const { place, a, slopes: [kx, ky, kz] } = list;
+    const [sideX, sideY, sideZ] = this.sides;
+    const halfX = sideX / 2, halfY = sideY / 2, halfZ = sideZ / 2;
+    const weight = smoothingNorm(eps, dimension), slope = spikyNorm(eps, dimension);
+    const squaredRadius = eps * eps;
+    const x = px[i], y = py[i], z = pz[i];
+    // The moment matrix, symmetric.
+    let xx = 0, xy = 0, xz = 0, yy = 0, yz = 0, zz = 0;
+    let count = 0;
+    for (let r = 0; r < used; r += 2) {
+      const last = ranges[r + 1];
+      for (let j = ranges[r]; j < last; j++) {
+        let dx = px[j] - x, dy = py[j] - y, dz = pz[j] - z;
+        if (dx > halfX) dx -= sideX;
+        else if (dx < -halfX) dx += sideX;
+        if (dy > halfY) dy -= sideY;
+        else if (dy < -halfY) dy += sideY;
+        if (dz > halfZ) dz -= sideZ;
+        else if (dz < -halfZ) dz += sideZ;
+        const squared = dx * dx + dy * dy + dz * dz;
+        if (!(squared < squaredRadius)) continue;
+        const left = squaredRadius - squared;
+        const w = weight * left * left * left;
+        const distance = Math.sqrt(squared);
+        const k = squared > 0 ? (slope * (eps - distance) * (eps - distance)) / distance : 0;
+        const share = k * volume[j];
+        place[count] = j * width;
+        a[count] = w * volume[j];
+        kx[count] = share * dx;
+        ky[count] = share * dy;
+        kz[count] = share * dz;
+        count++;
+        xx += share * dx * dx;
+        xy += share * dx * dy;
+        yy += share * dy * dy;
+        if (dimension === 3) {
+          xz += share * dx * dz;
+          yz += share * dy * dz;
+          zz += share * dz * dz;
+        }
+      }
+    }
+    list.count = count;
+    this.kernels.gather(states, width, dimension, i * width, list, sums);
+
+    let to = at;
+    for (let c = 0; c < channels; c++) rows[to++] = states[i * width + c];
+    for (let c = 0; c < channels; c++) rows[to++] = sums[c];
+    const scale = eps / rule.eps0;
+    if (rule.state_gradient) {
+      const m = rule.moment_correction
+        ? momentInverse(dimension, xx, xy, xz, yy, yz, zz, rule.moment_inverse)
+        : [1, 0, 0, 1, 0, 1];
+      for (let c = 0; c < channels; c++) {
+        const gx = sums[width + c], gy = sums[2 * width + c], gz = dimension === 3 ? sums[3 * width + c] : 0;
+        to = logScaled(
+          rows, to, dimension,
+          scale * (gx * m[0] + gy * m[1] + gz * m[2]),
+          scale * (gx * m[1] + gy * m[3] + gz * m[4]),
+          scale * (gx * m[2] + gy * m[4] + gz * m[5]),
+        );
+      }
+    }
+    const densityScale = scale ** (1 + dimension) / divisor;
+    if (rule.density_gradient) {
+      to = logScaled(
+        rows, to, dimension,
+        densityScale * this.gradientX[i],
+        densityScale * this.gradientY[i],
+        densityScale * this.gradientZ[i],
+      );
+    }
+  }
+
+  // x ← x + dt α ε δ / (1 + |δ|), s ← s + dt Δs for one particle.
+  update({ x, s }, rule, particle, row, eps, dt) {
+    const { dimension, channels, updates } = this;
+    let from = row * rule.output.width;
+    if (!rule.static) {
+      let squared = 0;
+      for (let d = 0; d < dimension; d++) squared += updates[from + d] ** 2;
+      const share = (dt * rule.alpha * eps) / (1 + Math.sqrt(squared));
+      for (let d = 0; d < dimension; d++) x[particle * dimension + d] += share * updates[from + d];
+      from += dimension;
+    }
+    for (let c = 0; c < channels; c++) s[particle * channels + c] += dt * updates[from + c];
+  }
+}
+
+// Moves positions into a periodic box around the origin.
+export function wrap(x, count, box) {
+  const dimension = box.length;
+  for (let i = 0; i < count * dimension; i++) {
+    const side = box[i % dimension];
+    x[i] -= side * Math.floor(x[i] / side + 0.5);
+  }
+}
+
+function smoothingNorm(eps, dimension) {
+  return dimension === 2 ? 4 / (Math.PI * eps ** 8) : 315 / (64 * Math.PI * eps ** 9);
+}
+
+function spikyNorm(eps, dimension) {
+  return dimension === 2 ? 30 / (Math.PI * eps ** 5) : 45 / (Math.PI * eps ** 6);
+}
+
+// Writes L(v) = log(1 + |v|) v / |v| and returns the place behind it.
+function logScaled(rows, at, dimension, x, y, z) {
+  if (dimension === 2) z = 0;
+  const length = Math.sqrt(x * x + y * y + z * z);
+  const factor = length > 0 ? Math.log1p(length) / length : 1;
+  rows[at] = factor * x;
+  rows[at + 1] = factor * y;
+  if (dimension === 2) return at + 2;
+  rows[at + 2] = factor * z;
+  return at + 3;
+}
+
+// The upper triangle (xx, xy, xz, yy, yz, zz) of what stands for M^-1.
+function momentInverse(dimension, xx, xy, xz, yy, yz, zz, kind) {
+  let determinant, adjugate;
+  if (dimension === 2) {
+    determinant = xx * yy - xy * xy;
+    adjugate = [yy, -xy, 0, xx, 0, 0];
+  } else {
+    adjugate = [yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy, xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy];
+    determinant = xx * adjugate[0] + xy * adjugate[1] + xz * adjugate[2];
+  }
+  if (kind === "smooth") {
+    const softening = MOMENT_SOFTENING ** 2;
+    const divisor = determinant * determinant + softening;
+    return adjugate.map((entry, k) => (determinant * entry + (k === 0 || k === 3 || k === 5 ? softening : 0)) / divisor);
+  }
+  if (!(Math.abs(determinant) >= MOMENT_THRESHOLD)) return [1, 0, 0, 1, 0, 1];
+  return adjugate.map((entry) => entry / determinant);
+}

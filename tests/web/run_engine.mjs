@@ -1,0 +1,83 @@
+// Runs modules of the exported page: answers each line of JSON from the standard input with one of JSON.
+// Floats travel as base64 of little-endian float32.
+
+import { createInterface } from "node:readline";
+import { pathToFileURL } from "node:url";
+
+const folder = process.argv[2];
+const load = (name) => import(pathToFileURL(`${folder}/${name}`));
+const { Physics, padded, plainKernels, prepareRule } = await load("physics.js");
+const { simdKernels } = await load("kernels_simd.js");
+const brushes = await load("brushes.js");
+const { LiveWorld } = await load("live_world.js");
+
+const floats = (text) => new Float32Array(Uint8Array.from(Buffer.from(text, "base64")).buffer);
+const text = (array) => Buffer.from(array.buffer, array.byteOffset, array.byteLength).toString("base64");
+
+const acts = {
+  // One step of rules with given masks.
+  step({ rules, kernels: kind, x, s, species, mask, eps, box, noise, density_counts: densityCounts, dt }) {
+    const { state_dim: channels, space_dim: dimension } = rules[0];
+    const kernels = kind === "simd" ? simdKernels(padded(channels), dimension) : plainKernels();
+    const prepared = rules.map((rule) => {
+      const weights = Object.fromEntries(Object.entries(rule.weights).map(([name, data]) => [name, floats(data)]));
+      return prepareRule({ ...rule, weights }, kernels);
+    });
+    const world = { x: floats(x), s: floats(s), species: Uint8Array.from(species), count: species.length };
+    const physics = new Physics(prepared, world.count, kernels);
+    physics.step(world, {
+      eps, box, dt, densityCounts, mask: mask && Uint8Array.from(mask), noise: noise && floats(noise),
+    });
+    return { x: text(world.x), s: text(world.s), kernels: kernels.name };
+  },
+
+  // A brush on positions and states.
+  brush({ tool: name, dimension, x, s, box, at, move, radius, strength, normal, along }) {
+    x = floats(x);
+    s = floats(s);
+    if (name === "erase") brushes.eraseState(x, s, dimension, at, radius, box);
+    if (name === "push") brushes.push(x, dimension, at, move, radius, strength, box);
+    if (name === "clump") brushes.clump(x, dimension, at, radius, strength, box);
+    if (name === "cut") brushes.cut(x, dimension, at, normal, radius, along, box);
+    const inside = brushes.insideBall(x, dimension, at, radius, box);
+    return { x: text(x), s: text(s), inside };
+  },
+
+  // A live world: what it sends on messages and on going on.
+  live({ settings, script }) {
+    const events = [];
+    const errors = [];
+    const live = new LiveWorld(settings, (event) => events.push(event));
+    for (const message of script) {
+      if (message.type === "advance") {
+        live.advance();
+        live.onTheWay = 0;
+        continue;
+      }
+      try {
+        live.receive(message);
+      } catch (error) {
+        errors.push(error.message);
+      }
+    }
+    return {
+      errors,
+      events: events.map((event) =>
+        event.type === "frame" ? { ...event, positions: text(event.positions), colours: [...event.colours] } : event,
+      ),
+      x: text(live.world.x), s: text(live.world.s), species: [...live.world.species], updated: [...live.updated],
+      travelled: text(live.travelled),
+    };
+  },
+};
+
+for await (const line of createInterface({ input: process.stdin })) {
+  const { act, ...told } = JSON.parse(line);
+  let answer;
+  try {
+    answer = acts[act](told);
+  } catch (error) {
+    answer = { failed: error.stack };
+  }
+  process.stdout.write(`${JSON.stringify(answer)}\n`);
+}

@@ -1,0 +1,472 @@
+"""Pages that run by themselves: their engine steps as Python's, and they need nothing but one file."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import shutil
+import subprocess
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from npa_envs import reference
+from npa_envs.cli import main
+from npa_envs.errors import NPAError
+from npa_envs.rule.files import load_rule, save_rule
+from npa_envs.rule.rule import NPARule
+from npa_envs.tasks.point_classification import class_colours
+from npa_envs.web.colouring import Colouring, Seen
+from npa_envs.web.export import (
+    PAGE,
+    check_browser_rule,
+    export_web,
+    joined_modules,
+    page_rule,
+    page_text,
+)
+from npa_envs.world import brushes
+from npa_envs.world.rollout import rollout
+from npa_envs.world.species import rollout_species
+
+TOLERANCE = 1e-4
+"""Largest difference of a step from Python's in float64; the worst measured is 7e-7."""
+
+NODE_SECONDS = 60
+
+Box = tuple[float, ...] | None
+Run = Callable[..., Any]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
+    """Run an act of run_engine.mjs on the page's modules; one Node.js serves all tests."""
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("needs Node.js, which runs the page's modules without a browser")
+    folder = tmp_path_factory.mktemp("page")
+    for module in PAGE.glob("*.js"):
+        shutil.copy(module, folder)
+    (folder / "package.json").write_text('{"type": "module"}')
+    command = [node, str(Path(__file__).with_name("run_engine.mjs")), str(folder)]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+
+        def act(name: str, **told: Any) -> Any:
+            limit = threading.Timer(NODE_SECONDS, process.kill)
+            limit.start()
+            process.stdin.write(json.dumps({"act": name, **told}) + "\n")
+            process.stdin.flush()
+            line = process.stdout.readline()
+            limit.cancel()
+            assert line, "Node.js ended, or needed too long"
+            answer = json.loads(line)
+            assert "failed" not in answer, answer["failed"]
+            return answer
+
+        yield act
+        process.kill()
+
+
+def packed(tensor: Tensor) -> str:
+    return base64.b64encode(tensor.float().contiguous().numpy().tobytes()).decode()
+
+
+def unpacked(text: str, shape: Sequence[int]) -> Tensor:
+    return torch.frombuffer(bytearray(base64.b64decode(text)), dtype=torch.float32).view(*shape)
+
+
+def described(rule: NPARule) -> dict[str, Any]:
+    weights = {name: packed(tensor.detach()) for name, tensor in rule.state_dict().items()}
+    return {**{"moment_inverse": "threshold"} | rule.hyper_parameters(), "weights": weights}
+
+
+def scattered(count: int, dimension: int, channels: int, box: Box) -> tuple[Tensor, Tensor]:
+    """A world of which each particle has a score of neighbours and a state of its own."""
+    generator = torch.Generator().manual_seed(3)
+    sides = torch.tensor(box or (0.5,) * dimension)
+    x = sides * (torch.rand(1, count, dimension, generator=generator) - 0.5)
+    return x, 0.5 * torch.randn(1, count, channels, generator=generator)
+
+
+def grown(name: str, count: int, box: Box) -> tuple[Tensor, Tensor]:
+    rule = load_rule(name)
+    x, s = scattered(count, rule.space_dim, rule.state_dim, box)
+    with torch.no_grad():
+        return rollout(rule, x, 0.0 * s, 12, box=box, generator=torch.Generator().manual_seed(5))
+
+
+def lively(rule: NPARule) -> NPARule:
+    """The rule with weights that are large enough to see each of them."""
+    torch.manual_seed(1)
+    for parameter in rule.parameters():
+        parameter.data.normal_(0.0, 0.3)
+    return rule
+
+
+def stepped(
+    rule: NPARule, x: Tensor, s: Tensor, mask: Tensor, *, eps: float, box: Box
+) -> tuple[Tensor, Tensor]:
+    """One step in float64 by `npa_envs.reference`."""
+    rule, x, s = rule.double(), x.double(), s.double()
+    z = reference.perceive(x, s, eps, rule.eps0, box, moment_inverse=rule.moment_inverse)
+    with torch.no_grad():
+        update = rule(z)
+    moved = torch.zeros_like(x)
+    if not rule.static:
+        moved, update = update.split([rule.space_dim, rule.state_dim], dim=-1)
+        moved = rule.alpha * eps * moved / (1.0 + moved.norm(dim=-1, keepdim=True))
+    x, s = x + mask[..., None] * moved, s + mask[..., None] * update
+    if box is not None:
+        sides = torch.tensor(box, dtype=x.dtype)
+        x = x - sides * torch.floor(x / sides + 0.5)
+    return x, s
+
+
+WORLDS: dict[str, tuple[str | Callable[[], NPARule], int, Box, float]] = {
+    "gecko": ("gecko", 300, None, 0.1),
+    "gecko at another radius": ("gecko", 300, None, 0.13),
+    "dots in their box": ("dots", 400, (1.1, 0.9), 0.2),
+    "dots in the smallest box": ("dots", 200, (0.4, 0.4), 0.2),
+    "duck": ("duck", 300, None, 0.1),
+    "duck in a box": ("duck", 300, (0.5, 0.4, 0.3), 0.1),
+    "digits, which stay": ("digits", 300, None, 0.1),
+    "smooth inverse": (lambda: NPARule(2, 5, 9, moment_inverse="smooth"), 200, None, 0.1),
+}
+
+
+@pytest.mark.parametrize("kind", WORLDS)
+def test_a_step_with_a_given_mask_is_that_of_python(run: Run, kind: str) -> None:
+    source, count, box, eps = WORLDS[kind]
+    if isinstance(source, str):
+        rule = load_rule(source)
+        moving = not rule.static
+        x, s = grown(source, count, box) if moving else scattered(count, 2, rule.state_dim, box)
+    else:
+        rule = lively(source())
+        x, s = scattered(count, rule.space_dim, rule.state_dim, box)
+    mask = (torch.rand(1, count, generator=torch.Generator().manual_seed(9)) < 0.5).double()
+    want_x, want_s = stepped(rule, x, s, mask, eps=eps, box=box)
+    # The step is no small one.
+    assert float((want_s - s).abs().max()) > 1000 * TOLERANCE
+    for kernels, name in (("plain", "JavaScript"), ("simd", "WebAssembly")):
+        got = run(
+            "step", rules=[described(rule)], kernels=kernels, x=packed(x), s=packed(s),
+            species=[0] * count, mask=mask[0].int().tolist(), eps=eps, box=box,
+        )  # fmt: skip
+        assert got["kernels"] == name
+        assert float((unpacked(got["x"], x.shape) - want_x).abs().max()) < TOLERANCE
+        assert float((unpacked(got["s"], s.shape) - want_s).abs().max()) < TOLERANCE
+        assert torch.equal(unpacked(got["s"], s.shape)[mask == 0], s[mask == 0])
+
+
+@pytest.mark.parametrize(
+    "left_out", ["moment_correction", "state_gradient", "density_gradient", "nothing"]
+)
+def test_a_step_has_the_time_the_noise_and_the_groups_of_perception_of_a_rollout(
+    run: Run, left_out: str
+) -> None:
+    groups = {} if left_out == "nothing" else {left_out: False}
+    rule = lively(NPARule(2, 6, 5, alpha=0.8, **groups))
+    x, s = scattered(200, 2, 6, None)
+    got = run(
+        "step", rules=[described(rule)], kernels="simd", x=packed(x), s=packed(s),
+        species=[0] * 200, eps=0.1, box=None, dt=0.5, noise=packed(torch.full_like(x, 0.25)),
+    )  # fmt: skip
+    with torch.no_grad():
+        want_x, want_s = rollout(
+            rule.double(), x.double(), s.double(), 1, eps=0.1, update_prob=1.0, dt=0.5
+        )
+    assert float((unpacked(got["x"], x.shape) - want_x - 0.25).abs().max()) < TOLERANCE
+    assert float((unpacked(got["s"], s.shape) - want_s).abs().max()) < TOLERANCE
+
+
+@pytest.mark.parametrize("density_counts", [None, (200, 100)])
+def test_two_species_step_as_in_python(run: Run, density_counts: tuple[int, int] | None) -> None:
+    rules = [load_rule("gecko"), lively(NPARule(2, 16, 24, alpha=0.3))]
+    x, s = grown("gecko", 300, None)
+    got = run(
+        "step", rules=[described(rule) for rule in rules], kernels="simd", x=packed(x),
+        s=packed(s), species=[0] * 200 + [1] * 100, eps=0.1, box=None,
+        density_counts=density_counts,
+    )  # fmt: skip
+    with torch.no_grad():
+        want_x, want_s = rollout_species(
+            [rule.double() for rule in rules], x.double(), s.double(), 1, counts=(200, 100),
+            update_prob=1.0, density_counts=density_counts,
+        )  # fmt: skip
+    assert float((unpacked(got["x"], x.shape) - want_x).abs().max()) < TOLERANCE
+    assert float((unpacked(got["s"], s.shape) - want_s).abs().max()) < TOLERANCE
+
+
+@pytest.mark.parametrize(("dimension", "box"), [(2, None), (2, (0.6, 0.5)), (3, None)])
+@pytest.mark.parametrize("name", ["erase", "push", "clump", "cut", "cut for ever"])
+def test_brushes_are_those_of_python(run: Run, name: str, dimension: int, box: Box) -> None:
+    x, s = scattered(200, dimension, 4, box)
+    at, move = x.new_full((1, dimension), 0.2), x.new_tensor([[0.05, -0.1, 0.2][:dimension]])
+    along = None if name == "cut for ever" else 0.5 * move
+    told = {"centre": at, "radius": 0.15, "box": box}
+    want_x, want_s = x, s
+    match name.split()[0]:
+        case "erase":
+            want_s = brushes.erase_state(x, s, **told)
+        case "push":
+            want_x = brushes.push(x, move=move, strength=0.7, **told)
+        case "clump":
+            want_x, _ = brushes.clump(x, s, factor=0.7, **told)
+        case "cut":
+            want_x, _ = brushes.cut(
+                x, s, centre=at, normal=move.flip(1), gap=0.15, along=along, box=box
+            )
+    got = run(
+        "brush", tool=name.split()[0], dimension=dimension, x=packed(x), s=packed(s), box=box,
+        at=at[0].tolist(), move=move[0].tolist(), radius=0.15, strength=0.7,
+        normal=move.flip(1)[0].tolist(), along=None if along is None else along[0].tolist(),
+    )  # fmt: skip
+    assert float((unpacked(got["x"], x.shape) - want_x).abs().max()) < 1e-6
+    assert torch.equal(unpacked(got["s"], s.shape), want_s)
+    assert not (torch.equal(want_x, x) and torch.equal(want_s, s))
+    inside = brushes.inside_ball(want_x, **told)[0]
+    assert got["inside"] == inside.nonzero()[:, 0].tolist()
+
+
+@pytest.fixture(scope="module")
+def settings() -> dict[str, Any]:
+    """What the page hands to its engine: two rules that may live together, and a static one."""
+    rules = [page_rule(name, particle_count=300) for name in ("gecko", "heart")]
+    text = page_text([*rules, page_rule("dots", particle_count=200)], title="mine")
+    return json.loads(re.search(r'id="rules">(.*?)</script>', text)[1])  # type: ignore[index]
+
+
+def live(run: Run, settings: dict[str, Any], *script: dict[str, Any]) -> Any:
+    return run("live", settings=settings, script=list(script))
+
+
+ADVANCE = {"type": "advance"}
+
+
+def last(told: Any, kind: str) -> Any:
+    return next(event for event in reversed(told["events"]) if event["type"] == kind)
+
+
+def test_a_live_world_moves_and_the_same_seed_gives_the_same_world(
+    run: Run, settings: dict[str, Any]
+) -> None:
+    first, second = (live(run, settings, ADVANCE, ADVANCE) for _ in range(2))
+    assert first["x"] == second["x"]
+    frame, world = last(first, "frame"), last(first, "world")
+    assert (frame["step"], world["rule"], world["settings"]["count"]["value"]) == (2, "gecko", 300)
+    assert 0.3 < sum(first["updated"]) / 300 < 0.7
+    assert live(run, settings, {"type": "reset", "seed": 1}, ADVANCE, ADVANCE)["x"] != first["x"]
+    assert live(run, settings, {"type": "reset", "seed": 0}, ADVANCE, ADVANCE)["x"] == first["x"]
+
+
+def test_the_rubber_takes_particles_away_and_the_others_go_on(
+    run: Run, settings: dict[str, Any]
+) -> None:
+    rubber = {"type": "brush", "tool": "erase", "at": [0.1, 0], "radius": 0.08, "strength": 1}
+    before = live(run, settings)
+    after = live(run, settings, {"type": "play", "on": False}, rubber)
+    x = unpacked(before["x"], (300, 2))
+    near = (x - torch.tensor([0.1, 0.0])).norm(dim=-1) <= 0.08
+    assert 0 < int(near.sum()) < 300
+    assert torch.equal(unpacked(after["x"], (-1, 2)), x[~near])
+    assert len(live(run, settings, rubber, ADVANCE)["species"]) == 300 - int(near.sum())
+    everything = dict(rubber, radius=9)
+    assert last(live(run, settings, everything, ADVANCE, ADVANCE), "frame")["colours"] == []
+
+
+def test_species_are_grafted_and_added_where_rules_agree(
+    run: Run, settings: dict[str, Any]
+) -> None:
+    where = {"type": "brush", "at": [0.1, 0], "radius": 0.1, "strength": 0.5, "rule": "heart"}
+    grafted = live(run, settings, {**where, "tool": "graft"}, ADVANCE)
+    assert 0 < sum(grafted["species"]) < 300
+    assert last(grafted, "world")["species"] == ["gecko", "heart"]
+    assert last(grafted, "world")["others"] == ["gecko", "heart"]
+    added = live(run, settings, {"type": "play", "on": False}, {**where, "tool": "add"}, ADVANCE)
+    assert added["species"] == [0] * 300 + [1] * 75
+    seed = unpacked(added["x"], (375, 2))[300:]
+    assert float((seed - torch.tensor([0.1, 0.0])).norm(dim=-1).max()) <= 0.1
+    wrong = live(run, settings, {**where, "tool": "graft", "rule": "dots"}, ADVANCE)
+    assert wrong["errors"] == [
+        "dots cannot live in a world of gecko: rules of one world must agree in space_dim, "
+        "state_dim, eps0, static, state_gradient, moment_correction, moment_inverse, "
+        "density_gradient"
+    ]
+    assert sum(wrong["species"]) == 0
+
+
+def test_settings_reach_the_world_and_wrong_messages_are_told(
+    run: Run, settings: dict[str, Any]
+) -> None:
+    def set_to(name: str, value: Any) -> dict[str, Any]:
+        return {"type": "set", "name": name, "value": value}
+
+    told = live(run, settings, set_to("eps", 0.15), set_to("speed", 4), ADVANCE)
+    ranges = last(told, "world")["settings"]
+    assert (ranges["eps"]["value"], ranges["speed"]["value"]) == (0.15, 4)
+    assert last(told, "frame")["step"] == 4
+    assert told["x"] != live(run, settings, set_to("speed", 4), ADVANCE)["x"]
+    counted = live(run, settings, set_to("count", 500), ADVANCE)
+    assert len(counted["species"]) == 500
+    texture = live(run, settings, set_to("rule", "dots"), ADVANCE)
+    assert last(texture, "world")["box"] == [2.0, 2.0]
+    assert float(unpacked(texture["x"], (200, 2)).abs().max()) <= 1.0
+    wrong = live(
+        run, settings, set_to("eps", 9), set_to("rule", "nobody"), set_to("show", "nothing"),
+        {"type": "damage", "name": "luck"}, {"type": "fly"},
+    )  # fmt: skip
+    assert wrong["errors"] == [
+        "eps must lie in [0.04, 0.25], got 9", "no rule is called nobody",
+        "nothing to show is called nothing", "no damage is called luck", "no message is called fly",
+    ]  # fmt: skip
+    for name in ("erase", "cut", "clump", "noise"):
+        hurt = live(run, settings, *[ADVANCE] * 3, {"type": "damage", "name": name})
+        whole = live(run, settings, *[ADVANCE] * 3)
+        assert (hurt["x"], hurt["s"]) != (whole["x"], whole["s"])
+
+
+@pytest.mark.parametrize(
+    "show", ["colours", "density", "components", "species", "speed", "mask", "state 3"]
+)
+def test_particles_have_the_colours_of_the_viewer(
+    run: Run, settings: dict[str, Any], show: str
+) -> None:
+    told = live(
+        run, settings, *[ADVANCE] * 8, {"type": "play", "on": False},
+        {"type": "set", "name": "show", "value": show}, ADVANCE,
+    )  # fmt: skip
+    frame = last(told, "frame")
+    x, s = unpacked(told["x"], (1, 300, 2)), unpacked(told["s"], (1, 300, 16))
+    rule = load_rule("gecko")
+    seen = Seen(
+        x, s, rule.colour, 0.1, None, [300], 300, unpacked(told["travelled"], (1, 300)),
+        torch.tensor([told["updated"]]).bool(),
+    )  # fmt: skip
+    want = torch.from_numpy(Colouring()(show, seen)).int()
+    got = torch.tensor(frame["colours"]).view(300, 3).int()
+    if show == "components":
+        # Each of them may have either sign.
+        kept = (got - want).abs().amax(dim=0) <= (255 - got - want).abs().amax(dim=0)
+        got = torch.where(kept, got, 255 - got)
+    assert float((got - want).abs().max()) <= 1
+    assert len(want.unique(dim=0)) > (0 if show == "species" else 1)
+
+
+@pytest.mark.parametrize("name", ["duck", "digits"])
+def test_read_outs_have_the_colours_of_the_viewer(run: Run, name: str) -> None:
+    if name == "digits":
+        pytest.importorskip("sklearn")
+    rule = page_rule(name) if name == "digits" else page_rule(name, particle_count=300)
+    text = page_text([rule], title="mine")
+    settings = json.loads(re.search(r'id="rules">(.*?)</script>', text)[1])  # type: ignore[index]
+    told = live(run, settings, *[ADVANCE] * 6)
+    count = len(told["species"])
+    s = unpacked(told["s"], (1, count, -1))
+    loaded = load_rule(name)
+    with torch.no_grad():
+        own = class_colours(loaded.read_out(s)) if name == "digits" else loaded.colour(s)
+    got = torch.tensor(last(told, "frame")["colours"]).view(count, 3)
+    assert float((own[0].clamp(0, 1) * 255.0 - got).abs().max()) <= 1.0
+    assert len(got.unique(dim=0)) > 20
+
+
+def test_each_class_of_digits_begins_as_a_cloud_of_its_own(run: Run) -> None:
+    pytest.importorskip("sklearn")
+    world = page_rule("digits")["world"]
+    clouds = world["seed"]["clouds"]
+    assert (len(clouds), len(set(clouds)), world["count"]) == (10, 10, 512)
+    assert "count" not in world["settings"]
+
+
+# The file.
+
+
+def test_a_page_is_one_small_file_that_asks_for_nothing(tmp_path: Path) -> None:
+    export_web(["gecko"], tmp_path / "page.html")
+    text = (tmp_path / "page.html").read_text()
+    assert len(text) < 300_000
+    assert "default-src 'none'" in text
+    # What a page could load: no element of it names anything but data.
+    loads = re.findall(r"""<[^<>]*\b(?:src|href|action)\s*=\s*["']?([^"'\s>]+)""", text)
+    assert [address for address in loads if not address.startswith(("data:", "#"))] == []
+    assert not re.search(r"\bimport\b *[({'\"*]|\bfetch\(|WebSocket|XMLHttpRequest", text)
+    assert "<title>gecko</title>" in text
+
+
+def test_a_title_cannot_leave_its_element(tmp_path: Path) -> None:
+    export_web(["gecko"], tmp_path / "page.html", title="</title><script>alert(1)</script>")
+    text = (tmp_path / "page.html").read_text()
+    assert "<script>alert(1)" not in text
+
+
+def test_modules_are_joined_in_the_order_of_their_imports(tmp_path: Path) -> None:
+    (tmp_path / "a.js").write_text('import { two } from "./b.js";\nexport const four = two + two;\n')
+    (tmp_path / "b.js").write_text("const one = 1;\nexport const two = one + one;\n")
+    text = joined_modules(["a.js"], tmp_path)
+    assert text.index("const b =") < text.index("const a =")
+    assert "const { two } = b;" in text
+    (tmp_path / "b.js").write_text('import { four } from "./a.js";\nexport const two = four;\n')
+    with pytest.raises(ValueError, match=r"a\.js -> b\.js -> a\.js"):
+        joined_modules(["a.js"], tmp_path)
+    (tmp_path / "b.js").write_text('export default 2;\n')
+    with pytest.raises(ValueError, match="export default 2;"):
+        joined_modules(["a.js"], tmp_path)
+
+
+class OwnNetwork(NPARule):
+    def forward(self, perception: Tensor) -> Tensor:
+        return super().forward(perception).tanh()
+
+
+@pytest.mark.parametrize(
+    ("rule", "message"),
+    [
+        (OwnNetwork(), "two plain layers only, 'mine' is a OwnNetwork with a network of its own"),
+        (NPARule(species_count=2), "perceive all species alike, 'mine' has species_count=2"),
+        (NPARule(hidden_dim=13000), "at most 1048576 weights, 'mine' has 1105000"),
+    ],
+)
+def test_rules_that_a_browser_cannot_run_are_refused(rule: NPARule, message: str) -> None:
+    with pytest.raises(NPAError, match=message):
+        check_browser_rule(rule, "mine")
+
+
+def test_bad_pages_are_refused(tmp_path: Path) -> None:
+    for sources, path, message in (
+        (["gecko"], "page.htm", r"must end in \.html"),
+        ([], "page.html", "rules of different names"),
+        (["gecko", "gecko"], "page.html", "rules of different names"),
+        (["geko"], "page.html", "did you mean 'gecko'"),
+    ):
+        with pytest.raises(NPAError, match=message):
+            export_web(sources, tmp_path / path)
+    assert not any(tmp_path.iterdir())
+
+
+def test_the_command_writes_pages_and_collections(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page, collection = tmp_path / "page.html", tmp_path / "models.json"
+    (tmp_path / "run").mkdir()
+    save_rule(NPARule(), tmp_path / "run" / "rule.safetensors")
+    run_folder = str(tmp_path / "run")
+    assert main(["export-web", "gecko", run_folder, "-o", str(page)]) == 0
+    assert f"wrote {page}" in capsys.readouterr().out
+    names = re.findall(r'"name":"(\w+)"', page.read_text())
+    assert names == ["gecko", "run"]
+    assert main(["export-web", "gecko", "--out", str(collection)]) == 0
+    assert torch.equal(
+        load_rule(f"{collection}#gecko").output.weight, load_rule("gecko").output.weight
+    )
+    assert main(["export-web", "-o", str(page)]) == 2
+    assert main(["export-web", "duck", "-o", str(collection)]) == 2
