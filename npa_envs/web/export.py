@@ -92,7 +92,9 @@ def joined_modules(names: Sequence[str], folder: Path = PAGE) -> str:
         left = _MODULE_LINE.search(source)
         if left is not None:
             raise ValueError(f"{name} must import and export as the others do, got {left[0]!r}")
-        texts[name] = f"const {_scope(name)} = (() => {{\n{source}\nreturn {{ {exported} }};\n}})();"
+        texts[name] = (
+            f"const {_scope(name)} = (() => {{\n{source}\nreturn {{ {exported} }};\n}})();"
+        )
         order.append(name)
 
     for name in names:
@@ -142,7 +144,7 @@ def export_web(
         raise NPAError(f"a page needs rules of different names, got {shown(names)}")
     if previews:
         for source, rule in zip(sources, rules, strict=True):
-            rule["preview"] = preview(source)
+            rule["preview"] = preview(source, particle_count=particle_count)
     write_text(path, page_text(rules, title=title or names[0], seed=checked_seed(seed)))
 
 
@@ -216,17 +218,20 @@ def one_of_each(task: PointClassification) -> list[Tensor]:
     return [task.clouds.x[label.index(kind)] for kind in sorted(set(label))]
 
 
-def preview(source: str, *, seed: int = 0) -> str:
+def preview(source: str, *, particle_count: int | None = None, seed: int = 0) -> str:
     """Return a picture of a rule's grown world as a data address: WebP with transparency.
 
     Args:
         source: As `load_rule` takes it.
+        particle_count: Particles N; None: as trained.
         seed: Randomness of the world.
 
     Raises:
         NPAError: The rule cannot be loaded.
     """
-    live = RuleWorld(source, device=torch.device("cpu"), seed=seed, choices={})
+    live = RuleWorld(
+        source, device=torch.device("cpu"), seed=seed, particle_count=particle_count, choices={}
+    )
     live.speed = PREVIEW_STEPS if live.task.aligned else PREVIEW_STEPS // 2
     live.advance()
     with torch.no_grad():
@@ -248,7 +253,7 @@ def page_text(rules: Sequence[Mapping[str, Any]], *, title: str, seed: int = 0) 
         title: Of the page.
         seed: Randomness of the first world.
     """
-    table = ramp(DARK)[1024 // 6:]
+    table = ramp(DARK)[1024 // 6 :]
     settings = {
         "worker": "worker",
         "seed": seed,

@@ -362,7 +362,7 @@ def test_particles_have_the_colours_of_the_viewer(
     assert len(want.unique(dim=0)) > (0 if show == "species" else 1)
 
 
-@pytest.mark.parametrize("name", ["duck", "digits"])
+@pytest.mark.parametrize("name", ["duck", pytest.param("digits", marks=pytest.mark.slow)])
 def test_read_outs_have_the_colours_of_the_viewer(run: Run, name: str) -> None:
     if name == "digits":
         pytest.importorskip("sklearn")
@@ -380,6 +380,7 @@ def test_read_outs_have_the_colours_of_the_viewer(run: Run, name: str) -> None:
     assert len(got.unique(dim=0)) > 20
 
 
+@pytest.mark.slow
 def test_each_class_of_digits_begins_as_a_cloud_of_its_own(run: Run) -> None:
     pytest.importorskip("sklearn")
     world = page_rule("digits")["world"]
@@ -410,7 +411,9 @@ def test_a_title_cannot_leave_its_element(tmp_path: Path) -> None:
 
 
 def test_modules_are_joined_in_the_order_of_their_imports(tmp_path: Path) -> None:
-    (tmp_path / "a.js").write_text('import { two } from "./b.js";\nexport const four = two + two;\n')
+    (tmp_path / "a.js").write_text(
+        'import { two } from "./b.js";\nexport const four = two + two;\n'
+    )
     (tmp_path / "b.js").write_text("const one = 1;\nexport const two = one + one;\n")
     text = joined_modules(["a.js"], tmp_path)
     assert text.index("const b =") < text.index("const a =")
@@ -418,7 +421,7 @@ def test_modules_are_joined_in_the_order_of_their_imports(tmp_path: Path) -> Non
     (tmp_path / "b.js").write_text('import { four } from "./a.js";\nexport const two = four;\n')
     with pytest.raises(ValueError, match=r"a\.js -> b\.js -> a\.js"):
         joined_modules(["a.js"], tmp_path)
-    (tmp_path / "b.js").write_text('export default 2;\n')
+    (tmp_path / "b.js").write_text("export default 2;\n")
     with pytest.raises(ValueError, match="export default 2;"):
         joined_modules(["a.js"], tmp_path)
 
