@@ -17,8 +17,8 @@ from npa_envs.errors import NPAError
 class ExportOptions:
     """Write one HTML file that runs rules in a browser, on a phone too, with brushes and sliders.
 
-    It needs neither a server nor a network. A name that ends in .json writes the collection that the
-    authors' web demo reads instead.
+    It needs neither a server nor a network. A name that ends in .json writes the collection that
+    the authors' web demo reads instead.
     """
 
     rules: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RULE")] = ()

@@ -154,11 +154,16 @@ def _known(values: Tensor | None, seen: Seen) -> Tensor:
     return values[0]
 
 
-def _ramp(share: Tensor) -> NDArray[np.uint8]:
+def colour_ramp() -> NDArray[np.uint8]:
+    """Return the colours of densities and speeds from low to high, uint8, shape [entries, 3]."""
     table = ramp(DARK)
     # The darkest colours would not be seen on a dark background.
-    first = len(table) // 6
-    entry = first + (share.nan_to_num(0.0) * (len(table) - 1 - first)).round()
+    return table[len(table) // 6 :]
+
+
+def _ramp(share: Tensor) -> NDArray[np.uint8]:
+    table = colour_ramp()
+    entry = (share.nan_to_num(0.0) * (len(table) - 1)).round()
     colours: NDArray[np.uint8] = table[entry.to(torch.int32).cpu().numpy()]
     return colours
 

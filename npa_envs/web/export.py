@@ -18,12 +18,11 @@ from torch import Tensor
 
 from npa_envs.errors import NPAError, shown
 from npa_envs.files import checked_path, write_text
-from npa_envs.render.colours import ramp
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule, check_rule
 from npa_envs.tasks.growth import GrowthTask
 from npa_envs.tasks.point_classification import PALETTE, UNDECIDED, PointClassification
-from npa_envs.web.colouring import DARK
+from npa_envs.web.colouring import colour_ramp
 from npa_envs.web.live import checked_seed
 from npa_envs.web.rule_world import RuleWorld, name_of
 
@@ -39,8 +38,8 @@ STYLES = ("page.css", "exported.css")
 WORKER_MODULE = "live_world.js"
 """The module that the page's worker begins with."""
 
-SOLID_SHARE = 4
-"""3D worlds begin with so much fewer particles than rules were trained with: what a browser bears."""
+SOLID_SHARE = 0.25
+"""3D worlds begin with this share of a rule's usual particles: what a browser bears."""
 
 PREVIEW_STEPS = 256
 """Steps that a world has grown for its preview; half as many where no shape has to form."""
@@ -117,8 +116,8 @@ def export_web(
 ) -> None:
     """Write one HTML file that runs rules in a browser, whole or not at all.
 
-    Nothing is loaded from anywhere: weights, engine and page are in the file, and its policy forbids
-    the browser any connection.
+    Nothing is loaded from anywhere: weights, engine and page are in the file, and its policy
+    forbids the browser any connection.
 
     Args:
         sources: Rules, each as `load_rule` takes it; the first one is shown first.
@@ -161,7 +160,7 @@ def page_rule(source: str, *, particle_count: int | None = None) -> dict[str, An
     check_browser_rule(load_rule(source), name_of(source))
     live = RuleWorld(source, device=torch.device("cpu"), particle_count=particle_count, choices={})
     if live.dimension == 3 and particle_count is None:
-        live.handle({"type": "set", "name": "count", "value": live.full // SOLID_SHARE})
+        live.handle({"type": "set", "name": "count", "value": int(live.full * SOLID_SHARE)})
     rule, task = live.main.rule, live.task
     seed: dict[str, Any]
     if isinstance(task, PointClassification):
@@ -253,11 +252,10 @@ def page_text(rules: Sequence[Mapping[str, Any]], *, title: str, seed: int = 0) 
         title: Of the page.
         seed: Randomness of the first world.
     """
-    table = ramp(DARK)[1024 // 6 :]
     settings = {
         "worker": "worker",
         "seed": seed,
-        "ramp": base64.b64encode(table.tobytes()).decode(),
+        "ramp": base64.b64encode(colour_ramp().tobytes()).decode(),
         "rules": rules,
     }
     # What could end the element that holds it is written otherwise.
@@ -267,11 +265,9 @@ def page_text(rules: Sequence[Mapping[str, Any]], *, title: str, seed: int = 0) 
     style = "\n".join((PAGE / name).read_text(encoding="utf-8") for name in STYLES)
     policy = POLICY.format(scripts=_digest(code), styles=_digest(style))
     page = (PAGE / "index.html").read_text(encoding="utf-8")
+    limits = f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
     for before, after in (
-        (
-            '<meta name="viewport"',
-            f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n<meta name="viewport"',
-        ),
+        ('<meta charset="utf-8">', f'<meta charset="utf-8">\n{limits}'),
         ("<title>npa-envs</title>", f"<title>{html.escape(title)}</title>"),
         ('<link rel="stylesheet" href="page.css">', f"<style>{style}</style>"),
         (

@@ -1,4 +1,4 @@
-"""Pages that run by themselves: their engine steps as Python's, and they need nothing but one file."""
+"""Pages that run by themselves: their engine steps as Python's, and one file is all they need."""
 
 from __future__ import annotations
 
