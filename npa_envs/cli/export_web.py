@@ -34,7 +34,7 @@ class ExportOptions:
     """Title of the page; default: the first rule's name."""
 
     particle_count: int | None = None
-    """Particles N of each world; default: as trained, and 3D worlds a quarter of it."""
+    """Particles N of each world; default: as trained."""
 
 
 def main(arguments: Sequence[str]) -> int:

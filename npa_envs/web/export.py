@@ -38,9 +38,6 @@ STYLES = ("page.css", "exported.css")
 WORKER_MODULE = "live_world.js"
 """The module that the page's worker begins with."""
 
-SOLID_SHARE = 0.25
-"""3D worlds begin with this share of a rule's usual particles: what a browser bears."""
-
 PREVIEW_STEPS = 256
 """Steps that a world has grown for its preview; half as many where no shape has to form."""
 
@@ -123,7 +120,7 @@ def export_web(
         sources: Rules, each as `load_rule` takes it; the first one is shown first.
         path: The file to write, ending in `.html`; an existing one is replaced.
         title: Of the page; None: the first rule's name.
-        particle_count: Particles of each world; None: as trained, and 3D worlds a quarter of it.
+        particle_count: Particles of each world; None: as trained.
         previews: The page begins with a picture of each rule's grown world, to choose from.
         seed: Randomness of the first world, 0 to 2^53 - 1.
 
@@ -152,15 +149,13 @@ def page_rule(source: str, *, particle_count: int | None = None) -> dict[str, An
 
     Args:
         source: As `load_rule` takes it.
-        particle_count: Particles N; None: as trained, and 3D worlds a quarter of it.
+        particle_count: Particles N; None: as trained.
 
     Raises:
         NPAError: It cannot be loaded, or a browser cannot run it.
     """
     check_browser_rule(load_rule(source), name_of(source))
     live = RuleWorld(source, device=torch.device("cpu"), particle_count=particle_count, choices={})
-    if live.dimension == 3 and particle_count is None:
-        live.handle({"type": "set", "name": "count", "value": int(live.full * SOLID_SHARE)})
     rule, task = live.main.rule, live.task
     seed: dict[str, Any]
     if isinstance(task, PointClassification):

@@ -121,7 +121,7 @@ def test_solid_and_still_worlds_live_in_a_page(
     page = new_page()
     export_web([name], tmp_path / "page.html")
     page.open((tmp_path / "page.html").as_uri())
-    page.wait(f"{STEP} >= 12", 120)
-    count = {"duck": 4096, "digits": 512}[name]
+    page.wait(f"{STEP} >= 3", 120)
+    count = {"duck": 16384, "digits": 512}[name]
     assert re.match(rf"step \d+ · {count} particles", page.run("document.body.innerText"))
     alone(page)
