@@ -51,7 +51,8 @@ class Page:
 
     def __init__(self, address: str) -> None:
         connect = pytest.importorskip("websockets.sync.client").connect
-        self._socket = connect(address, max_size=2**28, open_timeout=30)
+        self._open = contextlib.ExitStack()
+        self._socket = self._open.enter_context(connect(address, max_size=2**28, open_timeout=30))
         self._numbers = itertools.count(1)
         self.complaints: list[str] = []
         """What the page wrote to the console as warnings and errors, and what it failed to load;
@@ -141,7 +142,7 @@ class Page:
 
     def close(self) -> None:
         """Let go of the page."""
-        self._socket.close()
+        self._open.close()
 
 
 @contextlib.contextmanager

@@ -144,14 +144,14 @@ class Live:
                 self.reset(None if seed is None else checked_seed(seed))
                 return True
             case "set":
-                return self._set(message.get("name"), message.get("value"))
+                return self._set(str(message.get("name")), message.get("value"))
             case "brush":
                 return self._brush(message)
             case "damage":
                 name = message.get("name")
-                if name not in DAMAGE_SIZES:
+                if not isinstance(name, str) or name not in DAMAGE_SIZES:
                     raise NPAError(f"unknown damage {shown(name)}: {suggest(name, DAMAGE_SIZES)}")
-                self._damage(str(name))
+                self._damage(name)
             case _:
                 known = ("play", "step", "reset", "set", "brush", "damage")
                 raise NPAError(f"unknown message {shown(kind)}: {suggest(kind, known)}")
@@ -182,7 +182,7 @@ class Live:
     def _brush(self, message: Mapping[str, Any]) -> bool:
         raise NotImplementedError
 
-    def _set(self, name: Any, value: Any) -> bool:
+    def _set(self, name: str, value: Any) -> bool:
         match name:
             case "speed":
                 self.speed = int(SPEED.checked("speed", value))

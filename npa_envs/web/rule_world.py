@@ -225,7 +225,7 @@ class RuleWorld(Live):
     def _shows(self) -> list[str]:
         return shows_of(self.main.rule.state_dim)
 
-    def _set(self, name: Any, value: Any) -> bool:
+    def _set(self, name: str, value: Any) -> bool:
         if name == "rule":
             self._plant(value)
             return True

@@ -18,7 +18,7 @@ import socket
 import struct
 import threading
 import time
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -177,12 +177,6 @@ def make_app(site: Site) -> Starlette:
         finally:
             site.open_sessions.remove(session)
 
-    @contextlib.asynccontextmanager
-    async def lifespan(app: Starlette) -> AsyncIterator[None]:
-        yield
-        for session in site.open_sessions:
-            session.stop()
-
     app = Starlette(
         routes=[
             Route("/", page),
@@ -190,7 +184,6 @@ def make_app(site: Site) -> Starlette:
             Route("/films/{name}", film),
             Route("/{name}", part),
         ],
-        lifespan=lifespan,
     )
     app.add_middleware(HostCheck, site=site)
     return app
@@ -254,21 +247,13 @@ class Session:
 
     async def serve(self) -> None:
         """Read and write until the reader leaves or the server stops."""
-        thread = threading.Thread(target=self._live, name="npa-envs world", daemon=True)
-        thread.start()
-        reading = asyncio.create_task(self._read())
+        threading.Thread(target=self._live, name="npa-envs world", daemon=True).start()
         writing = asyncio.create_task(self._write())
         try:
-            await asyncio.wait({reading, writing}, return_when=asyncio.FIRST_COMPLETED)
+            await self._read()
         finally:
             self.stop()
-            for task in (reading, writing):
-                task.cancel()
-            await asyncio.gather(reading, writing, return_exceptions=True)
-            await asyncio.to_thread(thread.join)
-            # The reader may have closed it.
-            with contextlib.suppress(RuntimeError, WebSocketDisconnect):
-                await self._reader.close(1001, "the viewer has ended: start npa-envs view again")
+            writing.cancel()
 
     def stop(self) -> None:
         """Let the world end after what it is doing."""
@@ -288,10 +273,13 @@ class Session:
             elif isinstance(message, dict) and message.get("type") == "drawn":
                 self._room.release()
             else:
-                try:
-                    self._inbox.put_nowait(message)
-                except queue.Full:
-                    self._tell({"type": "error", "message": "too many messages: some are lost"})
+                self._keep(message)
+
+    def _keep(self, message: dict[str, Any] | bytes) -> None:
+        try:
+            self._inbox.put_nowait(message)
+        except queue.Full:
+            self._tell({"type": "error", "message": "too many messages: some are lost"})
 
     async def _write(self) -> None:
         while (data := await self._outbox.get()) is not None:
@@ -515,8 +503,8 @@ def address_of(site: Site, listener: socket.socket) -> str:
     return f"http://{name}:{port}/{token}"
 
 
-def serve(site: Site, listener: socket.socket) -> None:
-    """Serve a site until Ctrl-C."""
+def make_server(site: Site) -> uvicorn.Server:
+    """Return what serves a site until its `should_exit` is set."""
     config = uvicorn.Config(
         make_app(site),
         log_level="warning",
@@ -526,6 +514,11 @@ def serve(site: Site, listener: socket.socket) -> None:
         server_header=False,
         timeout_graceful_shutdown=2,
     )
-    # It ends its work in order and then raises it.
+    return uvicorn.Server(config)
+
+
+def serve(site: Site, listener: socket.socket) -> None:
+    """Serve a site until Ctrl-C."""
+    # The server ends its work in order and then raises it.
     with contextlib.suppress(KeyboardInterrupt):
-        uvicorn.Server(config).run(sockets=[listener])
+        make_server(site).run(sockets=[listener])

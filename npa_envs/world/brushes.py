@@ -99,7 +99,7 @@ def removed(x: Tensor, s: Tensor, *, gone: Tensor) -> tuple[Tensor, Tensor]:
         )
     left = ~gone
     kept = x.shape[1] - counts[0]
-    return x[left].view(len(x), kept, -1), s[left].view(len(s), kept, -1)
+    return x[left].view(len(x), kept, x.shape[2]), s[left].view(len(s), kept, s.shape[2])
 
 
 def push(

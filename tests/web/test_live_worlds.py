@@ -1,0 +1,488 @@
+"""Live worlds: what each message does to a rule's, a run's and an environment's world."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+
+from npa_envs import NPAError, load_rule, rollout, save_rule
+from npa_envs.agents.policies import ZeroPolicy
+from npa_envs.rule.files import rule_metadata, shipped_rules
+from npa_envs.tasks.damage import DAMAGE_SIZES
+from npa_envs.web.colouring import Colouring, Seen, signed_colours, species_colours
+from npa_envs.web.environment_world import EnvironmentWorld, make_environment
+from npa_envs.web.rule_world import RuleWorld, RunWorld
+
+CPU = torch.device("cpu")
+COUNT = 96
+
+
+def gecko(**options) -> RuleWorld:
+    return RuleWorld("gecko", device=CPU, particle_count=COUNT, **options)
+
+
+def brush(tool, **told):
+    return {"type": "brush", "tool": tool, "at": [0.0, 0.0], "radius": 0.1} | told
+
+
+@pytest.fixture
+def world() -> RuleWorld:
+    return gecko()
+
+
+def test_a_live_world_is_the_rollout_of_its_rule(world):
+    world.handle({"type": "set", "name": "speed", "value": 3})
+    rule, generator = load_rule("gecko").float(), torch.Generator().manual_seed(0)
+    x, s = world.task.seed(1, generator=generator, device=CPU)
+    for _ in range(2):
+        world.advance()
+    with torch.no_grad():
+        x, s = rollout(
+            rule, x, s, 6, eps=world.task.eps, update_prob=world.task.update_prob,
+            generator=generator,
+        )  # fmt: skip
+    frame = world.frame()
+    assert frame.step == 6
+    assert frame.milliseconds > 0.0
+    np.testing.assert_array_equal(frame.positions, x[0].numpy())
+    own = ((s[0, :, -3:] + 0.5).clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
+    np.testing.assert_array_equal(frame.colours, own.numpy())
+
+
+def test_what_is_shown_does_not_change_the_world():
+    plain, watched = gecko(), gecko()
+    for show in ("mask", "speed", "density", "components", "species", "state 3"):
+        watched.handle({"type": "set", "name": "show", "value": show})
+        for world in (plain, watched):
+            world.handle({"type": "set", "name": "speed", "value": 2})
+            world.advance()
+        assert watched.frame().colours.shape == (COUNT, 3)
+        assert torch.equal(plain.x, watched.x)
+        assert torch.equal(plain.s, watched.s)
+
+
+def test_the_mask_shows_about_as_many_as_are_updated():
+    world = RuleWorld("gecko", device=CPU, particle_count=1024)
+    world.handle({"type": "set", "name": "update_prob", "value": 0.25})
+    world.handle({"type": "set", "name": "show", "value": "mask"})
+    for _ in range(3):
+        world.advance()
+    bright = (world.frame().colours[:, 0] > 200).mean()
+    # Four standard deviations of a share of 1024 draws.
+    assert abs(bright - 0.25) < 0.06
+
+
+def test_play_and_step(world):
+    assert world.playing
+    world.handle({"type": "step"})
+    assert not world.playing
+    assert world.frame().step == 1
+    world.handle({"type": "play", "on": True})
+    assert world.playing
+
+
+def test_the_same_seed_gives_the_same_world_and_the_next_one_another(world):
+    first = world.frame().positions.copy()
+    world.advance()
+    world.handle({"type": "reset", "seed": 0})
+    np.testing.assert_array_equal(world.frame().positions, first)
+    world.handle({"type": "reset"})
+    assert world.describe()["seed"] == 1
+    assert not np.array_equal(world.frame().positions, first)
+    assert world.frame().step == 0
+
+
+def test_erase_takes_particles_and_the_others_feel_it_nearby_only(world):
+    other = gecko()
+    for live in (world, other):
+        live.x = 4.0 * live.x
+    far = world.x[0, :, 0] > 0.25
+    assert not world.handle(brush("erase", at=[-0.2, 0.0], radius=0.15))
+    frame = world.frame()
+    assert 0 < len(frame.positions) < COUNT
+    assert np.linalg.norm(frame.positions - [-0.2, 0.0], axis=1).min() > 0.15
+    assert far.sum() > 3
+    for live in (world, other):
+        # All are updated, so that both draw nothing.
+        live.handle({"type": "set", "name": "update_prob", "value": 1.0})
+        live.handle({"type": "set", "name": "eps", "value": 0.05})
+        live.advance()
+    apart = (world.x[0][:, None] - other.x[0]).norm(dim=-1).min(dim=0).values
+    assert float(apart[far].max()) < 1e-6
+
+
+def test_a_world_without_particles_goes_on(world):
+    world.handle(brush("erase", radius=9.0))
+    world.advance()
+    assert world.frame().positions.shape == (0, 2)
+    assert world.frame().colours.shape == (0, 3)
+    world.handle({"type": "damage", "name": "cut"})
+    world.handle(brush("add", rule="heart", radius=0.2))
+    world.advance()
+    assert world.describe()["species"] == ["heart"]
+
+
+def test_push_carries_particles_along(world):
+    before = world.x.clone()
+    world.handle(brush("push", move=[0.05, 0.0], radius=0.2, strength=1.0))
+    moved = world.x - before
+    assert float(moved[..., 0].max()) > 0.03
+    assert float(moved[..., 0].min()) >= 0.0
+    assert float(moved[..., 1].abs().max()) == 0.0
+
+
+def test_clump_and_cut_move_particles(world):
+    before = world.x.clone()
+    world.handle(brush("clump", radius=0.3, strength=1.0))
+    assert world.x.norm(dim=-1).mean() < before.norm(dim=-1).mean()
+    world.handle(brush("cut", at=[-1.0, 0.0], move=[2.0, 0.0], radius=0.05))
+    assert float(world.x[..., 1].abs().min()) >= 0.025 - 1e-6
+
+
+def test_grafts_follow_the_other_rule(world):
+    assert world.handle(brush("graft", rule="heart", radius=0.15))
+    told = world.describe()
+    assert told["species"] == ["gecko", "heart"]
+    inside = np.linalg.norm(world.frame().positions, axis=1) <= 0.15
+    assert world.counts == [COUNT - inside.sum(), inside.sum()]
+    # Species after species: those within follow the second.
+    assert inside[world.counts[0] :].all()
+    world.advance()
+    world.handle({"type": "set", "name": "show", "value": "species"})
+    np.testing.assert_array_equal(
+        world.frame().colours, species_colours(2).repeat(world.counts, axis=0)
+    )
+    assert world.handle(brush("graft", rule="gecko", radius=9.0))
+    assert world.describe()["species"] == ["gecko"]
+
+
+def test_a_seed_that_is_added_grows_as_it_would_alone(world):
+    world.handle({"type": "set", "name": "update_prob", "value": 1.0})
+    world.handle(brush("add", rule="heart", at=[30.0, 0.0], radius=0.2, strength=1.0))
+    assert world.counts == [COUNT, COUNT // 2]
+    heart = world.x[:, COUNT:].clone(), world.s[:, COUNT:].clone()
+    for _ in range(2):
+        world.advance()
+    rule = load_rule("heart").float()
+    with torch.no_grad():
+        x, s = rollout(rule, *heart, 2, update_prob=1.0)
+    torch.testing.assert_close(world.x[:, COUNT:], x, rtol=0.0, atol=2e-5)
+    torch.testing.assert_close(world.s[:, COUNT:], s, rtol=0.0, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", DAMAGE_SIZES)
+def test_damage_changes_the_world(world, name):
+    for _ in range(3):
+        world.advance()
+    x, s = world.x.clone(), world.s.clone()
+    world.handle({"type": "damage", "name": name})
+    assert not (torch.equal(x, world.x) and torch.equal(s, world.s))
+
+
+def test_settings_are_taken_and_told(world):
+    for name, value in (("eps", 0.12), ("update_prob", 0.9), ("noise", 0.01), ("speed", 4)):
+        assert world.handle({"type": "set", "name": name, "value": value})
+        assert world.describe()["settings"][name]["value"] == value
+    world.advance()
+    assert world.step == 4
+    world.handle({"type": "set", "name": "count", "value": 64})
+    assert len(world.frame().positions) == 64
+    assert world.describe()["settings"]["eps"]["value"] == 0.12
+
+
+def test_noise_moves_particles_that_the_rule_leaves(world):
+    still = gecko()
+    for live in (world, still):
+        live.handle({"type": "set", "name": "update_prob", "value": 0.05})
+    world.handle({"type": "set", "name": "noise", "value": 0.02})
+    before = world.x.clone()
+    for live in (world, still):
+        live.advance()
+    assert int(((world.x - before).norm(dim=-1) > 0).sum()) == COUNT
+    assert int(((still.x - before).norm(dim=-1) > 0).sum()) < COUNT // 2
+
+
+def test_another_rule_is_another_world(world):
+    world.handle({"type": "set", "name": "show", "value": "state 15"})
+    assert world.handle({"type": "set", "name": "rule", "value": "dots"})
+    told = world.describe()
+    assert told["rule"] == "dots"
+    assert told["box"] == [2.0, 2.0]
+    assert told["half_width"] == 1.0
+    assert "dots" in told["others"]
+    assert "gecko" not in told["others"]
+    with pytest.raises(NPAError, match="gecko cannot live in a world of dots"):
+        world.handle(brush("graft", rule="gecko"))
+
+
+def test_the_loss_is_computed_only_where_it_is_wanted(world):
+    assert world.frame().loss is None
+    world.handle({"type": "set", "name": "loss", "value": True})
+    world.advance()
+    loss = world.frame().loss
+    assert loss == pytest.approx(float(world.task.metric(world.x, world.s)))
+    # It may take only a tenth of the time.
+    assert world.frame().loss is None
+
+
+@pytest.mark.parametrize(
+    ("message", "error"),
+    [
+        ({}, "unknown message None"),
+        ([], "unknown message None"),
+        ({"type": "fly"}, "unknown message 'fly'"),
+        ({"type": "play", "on": 1}, "on must be true or false, got 1"),
+        ({"type": "reset", "seed": -1}, r"seed must be a whole number in \[0, 9"),
+        ({"type": "reset", "seed": 0.5}, "seed must be a whole number"),
+        ({"type": "set"}, "unknown setting 'None'"),
+        ({"type": "set", "name": ["eps"], "value": 0.1}, "unknown setting"),
+        ({"type": "set", "name": "eps", "value": 0.0}, r"eps must be a number in \[0\.04, 0\.25\]"),
+        ({"type": "set", "name": "eps", "value": float("nan")}, "eps must be a number"),
+        ({"type": "set", "name": "eps", "value": "1"}, "eps must be a number in"),
+        ({"type": "set", "name": "count", "value": 10**9}, "count must be a whole number in"),
+        ({"type": "set", "name": "speed", "value": 0}, "speed must be a whole number in"),
+        ({"type": "set", "name": "rule", "value": "/etc/passwd"}, "unknown rule '/etc/passwd'"),
+        ({"type": "set", "name": "rule", "value": ["gecko"]}, "unknown rule"),
+        ({"type": "set", "name": "show", "value": "state 16"}, "unknown show 'state 16'"),
+        ({"type": "damage", "name": "burn"}, "unknown damage 'burn'"),
+        ({"type": "damage", "name": []}, "unknown damage"),
+        (brush("paint"), "unknown tool 'paint'"),
+        (brush(["erase"]), "unknown tool"),
+        (brush("erase", at=[0.0]), "at must be 2 finite numbers, got"),
+        (brush("erase", at=[0.0, float("inf")]), "at must be 2 finite numbers"),
+        (brush("erase", at="00"), "at must be 2 finite numbers"),
+        (brush("erase", radius=-1), "radius must be a number in"),
+        (brush("push", move=[1e9, 0.0]), "move must be 2 finite numbers"),
+        (brush("push", strength=2), "strength must be a number in"),
+        (brush("graft", rule="worm"), "unknown rule 'worm'"),
+        (brush("graft", rule="duck"), "duck cannot live in a world of gecko"),
+    ],
+)
+def test_a_wrong_message_is_refused_and_changes_nothing(message, error):
+    world = shared_world()
+    x, s, told = world.x, world.s, world.describe()
+    with pytest.raises(NPAError, match=error):
+        world.handle(message)
+    assert world.x is x
+    assert world.s is s
+    assert world.describe() == told
+
+
+_shared: list[RuleWorld] = []
+
+
+def shared_world() -> RuleWorld:
+    """One world for all messages that must leave it as it is."""
+    if not _shared:
+        _shared.append(gecko())
+    return _shared[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", shipped_rules())
+def test_every_shipped_rule_can_be_viewed(name):
+    world = RuleWorld(name, device=CPU)
+    told = world.describe()
+    assert name in told["others"]
+    for show in (*told["shows"][:6], "state 0"):
+        world.handle({"type": "set", "name": "show", "value": show})
+        world.advance()
+        frame = world.frame()
+        assert frame.positions.shape == (world.full, told["dimension"])
+        assert frame.colours.shape == (world.full, 3)
+        middle = np.array(told["centre"])
+        inside = np.abs(frame.positions - middle).max(axis=1) <= 1.1 * told["half_width"]
+        assert inside.mean() > 0.95
+    world.handle({"type": "set", "name": "loss", "value": True})
+    assert np.isfinite(world.frame().loss)
+
+
+def test_brushes_work_in_3d():
+    world = RuleWorld("duck", device=CPU, particle_count=256)
+    told = {"at": [0.0, 0.0, 0.0], "radius": 0.5}
+    world.handle(brush("push", move=[0.0, 0.0, 0.1], strength=1.0, **told))
+    world.handle(brush("cut", move=[1.0, 0.0, 0.0], view=[0.0, 0.0, 1.0], **told))
+    world.handle(brush("erase", **told))
+    assert float(world.x.norm(dim=-1).min()) > 0.5
+    world.advance()
+    assert world.frame().positions.shape[1] == 3
+
+
+# Colours.
+
+
+def seen(**told) -> Seen:
+    generator = torch.Generator().manual_seed(3)
+    x = torch.rand(1, 50, 2, generator=generator)
+    s = torch.randn(1, 50, 6, generator=generator)
+    usual = {
+        "x": x, "s": s, "colours": lambda s: s[..., -3:], "eps": 0.2, "box": None,
+        "counts": [50], "full": 50, "travelled": None, "updated": None,
+    }  # fmt: skip
+    return Seen(**(usual | told))
+
+
+def test_zero_is_grey_and_signs_are_opposite():
+    grey, low, high = (signed_colours(torch.tensor([v]))[0] for v in (0.0, -2.0, 2.0))
+    assert float(grey.max() - grey.min()) < 0.02
+    assert low[2] > low[0] + 0.2
+    assert high[0] > high[2] + 0.2
+
+
+def test_components_do_not_flip_from_frame_to_frame():
+    colouring, world = Colouring(), seen()
+    first = colouring("components", world).astype(int)
+    turned = seen(s=world.s * torch.tensor([1.0, 1.0, 1.01, 1.0, 1.0, 1.0]))
+    later = colouring("components", turned).astype(int)
+    assert np.abs(first - later).max() < 30
+    assert first.std() > 20
+
+
+def test_crowded_particles_are_brighter():
+    crowd = torch.cat((0.01 * torch.rand(1, 25, 2), 1.0 + torch.rand(1, 25, 2)), dim=1)
+    colours = Colouring()("density", seen(x=crowd)).astype(int).sum(axis=1)
+    assert colours[:25].min() > colours[25:].max()
+
+
+def test_species_have_colours_of_their_own():
+    colours = species_colours(6).astype(int)
+    apart = np.abs(colours[:, None] - colours[None]).sum(axis=-1)
+    assert apart[~np.eye(6, dtype=bool)].min() > 40
+
+
+# Runs.
+
+
+def write_run(folder: Path, name: str = "gecko") -> None:
+    folder.mkdir(exist_ok=True)
+    path = shipped_rules()[name]
+    metadata = rule_metadata(path)
+    told = {key: metadata[key] for key in ("task", "config") if key in metadata}
+    save_rule(load_rule(name), folder / "rule.safetensors", metadata=told)
+    (folder / "config.json").write_text("{}")
+    if not (folder / "log.jsonl").exists():
+        log(folder, 0, 10)
+
+
+def log(folder: Path, first: int, end: int) -> None:
+    with (folder / "log.jsonl").open("a") as file:
+        for k in range(first, end):
+            file.write(json.dumps({"iteration": k, "loss": 1.0 / (k + 1)}) + "\n")
+
+
+def test_a_run_is_followed(tmp_path):
+    folder = tmp_path / "mine"
+    write_run(folder)
+    world = RunWorld(folder, device=CPU, particle_count=COUNT)
+    curve, told = world.news()
+    assert curve["points"] == [[k, 1.0 / (k + 1)] for k in range(10)]
+    assert not curve["append"]
+    assert told["note"] == "a run in mine, iteration 9"
+    assert told["title"] == "mine"
+    assert world.news() == []
+    world.advance()
+    x = world.x
+    write_run(folder, "heart")
+    log(folder, 10, 12)
+    world._due = 0.0
+    curve, told = (event for event in world.news() if event["type"] != "error")
+    assert torch.equal(world.main.rule.hidden.weight, load_rule("heart").hidden.weight)
+    # The world lives on.
+    assert world.x is x
+    assert world.step == 1
+
+
+def test_a_line_that_is_being_written_waits(tmp_path):
+    write_run(tmp_path)
+    with (tmp_path / "log.jsonl").open("a") as file:
+        file.write('{"iteration": 10, "lo')
+    curve = RunWorld(tmp_path, device=CPU, particle_count=COUNT).news()[0]
+    assert curve["points"][-1] == [9, 0.1]
+
+
+def test_a_rule_that_is_damaged_meanwhile_is_told_and_the_world_lives_on(tmp_path):
+    write_run(tmp_path)
+    world = RunWorld(tmp_path, device=CPU, particle_count=COUNT)
+    world.news()
+    (tmp_path / "rule.safetensors").write_bytes(b"half")
+    world._due = 0.0
+    (error,) = [event for event in world.news() if event["type"] == "error"]
+    assert "cannot load a rule" in error["message"]
+    world.advance()
+    assert world.step == 1
+
+
+def test_an_unfinished_run_is_refused_in_words(tmp_path):
+    with pytest.raises(NPAError, match=r"must hold the rule\.safetensors of a run"):
+        RunWorld(tmp_path, device=CPU)
+    (tmp_path / "config.json").write_text("{}")
+    with pytest.raises(NPAError, match=r"has not written its rule .* yet: wait for its first"):
+        RunWorld(tmp_path, device=CPU)
+    save_rule(load_rule("gecko"), tmp_path / "rule-0.safetensors")
+    with pytest.raises(NPAError, match="trains 1 rules together: view one of them"):
+        RunWorld(tmp_path, device=CPU)
+    with pytest.raises(NPAError, match="a run must be a folder"):
+        RunWorld(tmp_path / "none", device=CPU)
+
+
+# Environments.
+
+
+@pytest.fixture
+def episodes():
+    env = gymnasium.make(
+        "npa/Morphogenesis2D-v0", particle_count=64, resolution=16, max_episode_steps=3,
+        disable_env_checker=True,
+    )  # fmt: skip
+    world = EnvironmentWorld(env, ZeroPolicy(env))
+    yield world
+    world.close()
+
+
+def test_episodes_follow_each_other(episodes):
+    first = episodes.frame().positions.copy()
+    for _ in range(2):
+        episodes.advance()
+    assert episodes.frame().step == 2
+    assert episodes.news() == []
+    episodes.advance()
+    curve, told = episodes.news()
+    assert curve["name"] == "Return"
+    assert curve["points"][0][0] == 1
+    assert told["note"].startswith("episode 2; the last one ended after 3 steps: time limit")
+    assert episodes.frame().step == 0
+    assert not np.array_equal(episodes.frame().positions, first)
+    episodes.handle({"type": "reset", "seed": 0})
+    np.testing.assert_array_equal(episodes.frame().positions, first)
+
+
+def test_hands_reach_into_environments(episodes):
+    before = episodes.frame().positions.copy()
+    episodes.handle(brush("push", move=[0.1, 0.0], radius=0.3, strength=1.0))
+    after = episodes.frame().positions
+    assert (after - before)[:, 0].max() > 0.05
+    episodes.handle({"type": "damage", "name": "noise"})
+    assert not np.array_equal(episodes.frame().positions, after)
+    with pytest.raises(NPAError, match="keeps its particles, so that the brush 'erase'"):
+        episodes.handle(brush("erase"))
+    episodes.handle({"type": "set", "name": "loss", "value": True})
+    assert episodes.frame().loss == pytest.approx(episodes._info["loss"])
+
+
+def test_environments_are_made_with_a_policy():
+    env, policy = make_environment("npa/Morphogenesis2D-v0", "gecko", particle_count=64)
+    world = EnvironmentWorld(env, policy)
+    before = world.frame().positions.copy()
+    world.handle({"type": "set", "name": "show", "value": "speed"})
+    world.advance()
+    assert not np.array_equal(world.frame().positions, before)
+    world.close()
+    with pytest.raises(NPAError, match="unknown environment 'npa/Nothing-v0'"):
+        make_environment("npa/Nothing-v0")
+    with pytest.raises(NPAError, match="env must be an environment of npa_envs"):
+        EnvironmentWorld(gymnasium.make("CartPole-v1"), lambda seen: 0)

@@ -1,0 +1,252 @@
+"""The page in a real browser: it shows the world, and hands reach into it."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+import torch
+from browser import DESK, PHONE, browser
+from PIL import Image
+
+pytest.importorskip("uvicorn")
+
+from npa_envs.web import server
+from npa_envs.web.rule_world import RuleWorld
+
+FRAME = "document.page.frame"
+
+
+@pytest.fixture(scope="module")
+def pages(tmp_path_factory):
+    with browser(tmp_path_factory.mktemp("profile")) as new_page:
+        yield new_page
+
+
+@pytest.fixture
+def shown(pages, tmp_path):
+    """A function that serves a rule and opens it; gives the page and the world behind it."""
+    running = []
+
+    def show(rule="gecko", count=256, size=DESK, query="", **options):
+        worlds = []
+
+        def make_world():
+            torch.set_num_threads(1)
+            worlds.append(RuleWorld(rule, device=torch.device("cpu"), particle_count=count))
+            return worlds[-1]
+
+        site = server.make_site(make_world, films=tmp_path / "films")
+        listener = server.open_port(site.host, 0)
+        running.append(server.make_server(site))
+        thread = threading.Thread(target=running[-1].run, kwargs={"sockets": [listener]})
+        thread.start()
+        running.append(thread)
+        page = pages()
+        page.open(server.address_of(site, listener) + query, size, **options)
+        page.wait(f"{FRAME}.step > 2")
+        return page, worlds[0]
+
+    yield show
+    for started in running:
+        if isinstance(started, threading.Thread):
+            started.join(timeout=20)
+            assert not started.is_alive()
+        else:
+            started.should_exit = True
+
+
+def positions(page) -> np.ndarray:
+    return np.array(page.run(f"Array.from({FRAME}.positions)")).reshape(-1, 2)
+
+
+def choose(page, name: str, value: str) -> None:
+    page.run(
+        f"(() => {{ const chosen = document.getElementById('{name}'); "
+        f"chosen.value = {json.dumps(value)}; "
+        "chosen.dispatchEvent(new Event(chosen.type === 'range' ? 'input' : 'change')); })()"
+    )
+
+
+def place_of(page, x: float, y: float) -> tuple[float, float]:
+    """Where a position is on the page [pixels]."""
+    told = page.run(
+        "(() => { const { camera, canvas } = document.page; return camera.project("
+        f"[{x}, {y}, 0], canvas.clientWidth, canvas.clientHeight); }})()"
+    )
+    return told[0], told[1]
+
+
+def nearest(page, x: float, y: float) -> float:
+    return float(np.linalg.norm(positions(page) - [x, y], axis=1).min())
+
+
+def test_the_world_moves_the_brush_erases_and_a_slider_changes_eps(shown, tmp_path):
+    page, world = shown()
+    assert page.run("document.title") == "gecko · npa-envs"
+    page.wait(f"{FRAME}.step > 5")
+    page.run("document.getElementById('play').click()")
+    page.wait("!document.page.world.playing")
+    middle = positions(page).mean(axis=0)
+    assert nearest(page, *middle) < 0.1
+    page.drag([place_of(page, *middle)] * 3)
+    page.wait(f"{FRAME}.positions.length < 512")
+    # The brush of 0.1 was there.
+    assert nearest(page, *middle) > 0.1
+    choose(page, "eps", str(np.log(0.2)))
+    # The slider has 200 places.
+    page.wait("Math.abs(document.page.world.settings.eps.value - 0.2) < 0.004")
+    assert world.eps == page.run("document.page.world.settings.eps.value")
+    page.run("document.getElementById('one').click()")
+    step = page.run(f"{FRAME}.step")
+    page.wait(f"{FRAME}.step >= {step} && !document.page.world.playing")
+    page.picture(tmp_path / "page.png")
+    picture = np.asarray(Image.open(tmp_path / "page.png").convert("RGB")).astype(int)
+    assert picture.shape == (800, 1280, 3)
+    # Something green is in the middle of the canvas, and nothing in its corner.
+    assert (picture[100:700, 100:900, 1] > 120).sum() > 2000
+    assert np.ptp(picture[300:500, 5:60].reshape(-1, 3), axis=0).max() == 0
+    assert page.complaints == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("painter", ["canvas", "webgl2"])
+def test_what_is_erased_heals(shown, painter):
+    page, _ = shown(count=4096, query=f"?painter={painter}")
+    page.wait(f"{FRAME}.step > 150", 240)
+    kind = page.run("document.page.painter.kind")
+    assert kind == painter
+    page.run("document.getElementById('play').click()")
+    page.wait("!document.page.world.playing")
+    # A small hole in the head.
+    page.run("document.getElementById('radius').value = 0.08")
+    hole = (0.0, 0.55)
+    page.drag([place_of(page, *hole)] * 3)
+    page.wait(f"{FRAME}.positions.length < 8192")
+    assert nearest(page, *hole) > 0.08
+    page.run("document.getElementById('play').click()")
+    page.wait(f"{FRAME}.step > 260", 240)
+    inside = np.linalg.norm(positions(page) - hole, axis=1) < 0.08
+    assert inside.sum() > 20
+    assert page.complaints == []
+
+
+@pytest.mark.slow
+def test_every_tool_and_every_show_works(shown):
+    page, _ = shown(count=512)
+    page.wait(f"{FRAME}.step > 20")
+    for tool in ("push", "clump", "cut", "graft", "add"):
+        page.run(f"document.querySelector('[data-tool={tool}]').click()")
+        page.drag([place_of(page, x, 0.0) for x in (-0.2, -0.1, 0.0, 0.1, 0.2)])
+        time.sleep(0.3)
+    page.wait("document.page.world.species.length === 2")
+    for show in page.run("document.page.world.shows"):
+        choose(page, "show", show)
+        page.wait(f"document.page.world.show === {json.dumps(show)}")
+    for name in ("erase", "cut", "clump", "noise"):
+        page.run(f"document.querySelector('#damages [title$={name}]').click()")
+    page.run("document.getElementById('plots').open = true")
+    page.run("document.getElementById('tracers').click()")
+    page.run("document.getElementById('reset').click()")
+    page.wait("document.page.world.seed === 1")
+    page.wait("document.page.plots.loss.points.length > 1", 60)
+    choose(page, "rule", "dots")
+    page.wait("document.page.world.rule === 'dots'")
+    page.wait(f"{FRAME} && {FRAME}.step > 3", 60)
+    assert page.run("document.getElementById('message').hidden")
+    assert page.complaints == []
+
+
+@pytest.mark.slow
+def test_a_recording_yields_a_film_and_a_snapshot_a_picture(shown, tmp_path):
+    page, _ = shown()
+    page.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
+    page.run("document.getElementById('record').click()")
+    step = page.run(f"{FRAME}.step")
+    page.wait(f"{FRAME}.step > {step + 12}")
+    page.run("document.getElementById('record').click()")
+    page.wait("document.querySelectorAll('#files a').length === 2", 60)
+    (film,) = (tmp_path / "films").glob("*.gif")
+    with Image.open(film) as frames:
+        assert frames.size == (640, 640)
+        assert frames.n_frames >= 4
+        frames.seek(frames.n_frames - 1)
+        assert len(np.unique(np.asarray(frames.convert("RGB")).reshape(-1, 3), axis=0)) > 20
+    page.run("document.getElementById('snapshot').click()")
+    page.wait("document.querySelectorAll('#files a').length === 3")
+    end = time.monotonic() + 20
+    while not (pictures := list(tmp_path.glob("gecko-*.png"))) and time.monotonic() < end:
+        time.sleep(0.1)
+    with Image.open(pictures[0]) as picture:
+        assert picture.size == (992, 800)
+    assert page.complaints == []
+
+
+@pytest.mark.slow
+def test_on_a_phone_fingers_brush_and_the_settings_fold(shown):
+    page, _ = shown(size=PHONE)
+    assert page.run("document.getElementById('panel').hidden")
+    width = page.run("document.documentElement.scrollWidth")
+    assert width == PHONE[0]
+    for button in page.run(
+        "[...document.querySelectorAll('.bar button')].map((b) => { "
+        "const r = b.getBoundingClientRect(); return [r.left, r.right, r.bottom, r.width]; })"
+    ):
+        left, right, bottom, size = button
+        assert left >= 0
+        assert right <= PHONE[0]
+        assert bottom <= PHONE[1]
+        assert size >= 40
+    page.run("document.getElementById('play').click()")
+    page.wait("!document.page.world.playing")
+    middle = positions(page).mean(axis=0)
+    page.touch([place_of(page, *middle)] * 2)
+    page.wait(f"{FRAME}.positions.length < 512")
+    page.run("document.getElementById('fold').click()")
+    assert page.run("document.getElementById('panel').getBoundingClientRect().width") > 300
+    assert page.complaints == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("painter", ["canvas", "webgl2"])
+def test_a_3d_world_turns_under_the_pointer(shown, painter, tmp_path):
+    page, _ = shown("duck", 1024, query=f"?painter={painter}")
+    assert page.run("document.page.tool") == "look"
+    page.drag([(400, 400), (450, 400), (500, 400)])
+    assert page.run("document.page.camera.azimuth") == pytest.approx(-40.0)
+    page.run("document.querySelector('[data-tool=erase]').click()")
+    page.drag([place_of(page, 0.0, 0.0)] * 3)
+    page.wait(f"{FRAME}.positions.length < 3072")
+    page.picture(tmp_path / "page.png")
+    picture = np.asarray(Image.open(tmp_path / "page.png").convert("RGB")).astype(int)
+    assert (np.abs(picture[100:650, 100:900] - picture[60, 950]).sum(axis=-1) > 60).mean() > 0.05
+    assert page.complaints == []
+
+
+@pytest.mark.slow
+def test_the_command_prints_its_link_and_ends_by_ctrl_c(pages, tmp_path):
+    command = [sys.executable, "-m", "npa_envs.cli", "view", "heart", "--particle-count", "128"]
+    command += ["--no-browser", "--port", "0", "--out", str(tmp_path)]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as run:
+        line = run.stdout.readline()
+        address = line.split()[1]
+        assert address.startswith("http://127.0.0.1:")
+        page = pages()
+        page.open(address)
+        page.wait(f"{FRAME}.step > 3")
+        run.send_signal(signal.SIGINT)
+        start = time.monotonic()
+        _, errors = run.communicate(timeout=30)
+    assert run.returncode == 0
+    assert "Traceback" not in errors
+    assert time.monotonic() - start < 10
+    page.wait("!document.getElementById('message').hidden")
+    assert "start npa-envs view again" in page.run("document.getElementById('message').textContent")

@@ -1,0 +1,384 @@
+"""The viewer's server: who may connect, what travels, what it does with bad messages."""
+
+from __future__ import annotations
+
+import io
+import json
+import queue
+import socket
+import struct
+import threading
+import time
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from npa_envs import NPAError
+from npa_envs.web.live import Frame
+
+pytest.importorskip("uvicorn")
+testclient = pytest.importorskip("starlette.testclient")
+
+from starlette.websockets import WebSocketDisconnect  # noqa: E402
+
+from npa_envs.web import server  # noqa: E402
+
+HERE = "http://127.0.0.1:8765"
+SOCKET = "ws://127.0.0.1:8765/socket"
+THERE = "ws://lab.example:8765/socket"
+
+
+class Counter:
+    """A live world of two particles that counts its steps, and remembers what it was told."""
+
+    def __init__(self) -> None:
+        self.playing = True
+        self.step = 0
+        self.messages: list[dict] = []
+        self.closed = threading.Event()
+
+    def describe(self):
+        return {"type": "world", "title": "counter", "playing": self.playing}
+
+    def handle(self, message):
+        self.messages.append(message)
+        match message.get("type"):
+            case "play":
+                self.playing = message["on"]
+                return True
+            case "break":
+                raise NPAError("this cannot be done")
+        return False
+
+    def advance(self):
+        self.step += 1
+        if self.step == 13:
+            raise NPAError("thirteen")
+
+    def frame(self):
+        positions = np.array([[self.step, 0.5], [-1.0, 0.25]], dtype=np.float32)
+        colours = np.array([[255, 0, 1], [2, 3, 4]], dtype=np.uint8)
+        return Frame(self.step, positions, colours, 1.5, 0.125 if self.step == 2 else None)
+
+    def news(self):
+        return []
+
+    def close(self):
+        self.closed.set()
+
+
+@pytest.fixture
+def worlds():
+    return []
+
+
+@pytest.fixture
+def site(tmp_path, worlds):
+    def make_world():
+        worlds.append(Counter())
+        return worlds[-1]
+
+    return server.make_site(make_world, films=tmp_path / "films")
+
+
+@pytest.fixture
+def client(site):
+    return testclient.TestClient(server.make_app(site), base_url=HERE)
+
+
+def meet(client, **options):
+    """Open the socket, and take the first event."""
+    return client.websocket_connect(SOCKET, **options)
+
+
+def next_error(reader) -> str:
+    while True:
+        message = reader.receive()
+        if "text" in message and json.loads(message["text"])["type"] == "error":
+            return json.loads(message["text"])["message"]
+        if "bytes" in message:
+            reader.send_json({"type": "drawn"})
+
+
+def test_the_page_and_its_files_are_served(client):
+    page = client.get("/")
+    assert page.status_code == 200
+    assert "frame-ancestors 'none'" in page.headers["content-security-policy"]
+    assert "unsafe" not in page.headers["content-security-policy"]
+    for name in ("page.js", "drawing.js", "plots.js", "engine_socket.js", "viewer.js", "page.css"):
+        part = client.get(f"/{name}")
+        assert part.status_code == 200
+        assert name.split(".")[1] in part.headers["content-type"].replace("javascript", "js")
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/server.py", "/../server.py", "/%2e%2e/server.py", "/..%2fserver.py", "/page",
+        "/index.html",
+        "/films/secret.txt", "/films/..%2f..%2fpage.js", "/films/none.mp4", "/nothing.js",
+    ],
+)  # fmt: skip
+def test_nothing_else_is_served(client, path):
+    assert client.get(path).status_code == 404
+
+
+@pytest.mark.parametrize("host", ["evil.example", "evil.example:8765", "192.168.1.5", ""])
+def test_other_names_are_refused(client, host):
+    answer = client.get("/", headers={"host": host})
+    assert answer.status_code == 403
+    assert "refused" in answer.text
+    with pytest.raises(WebSocketDisconnect), meet(client, headers={"host": host}):
+        pass
+
+
+@pytest.mark.parametrize("host", ["localhost:8765", "127.0.0.1", "[::1]:8765"])
+def test_names_of_this_computer_are_known(client, host):
+    assert client.get("/", headers={"host": host}).status_code == 200
+
+
+@pytest.mark.parametrize(
+    "origin", ["http://evil.example", "null", "http://127.0.0.1:9999", "http://localhost:8765"]
+)
+def test_sockets_of_foreign_pages_are_refused(client, worlds, origin):
+    with pytest.raises(WebSocketDisconnect) as refusal, meet(client, headers={"origin": origin}):
+        pass
+    assert refusal.value.code == 1008
+    assert worlds == []
+
+
+def test_the_own_page_may_open_a_socket(client):
+    with meet(client, headers={"origin": HERE}) as reader:
+        assert reader.receive_json() == {"type": "world", "title": "counter", "playing": True}
+
+
+def test_a_server_that_others_reach_asks_for_a_token(tmp_path):
+    site = server.make_site(Counter, films=tmp_path, host="0.0.0.0")
+    assert len(site.token) >= 24
+    other = server.make_site(Counter, films=tmp_path, host="0.0.0.0")
+    assert site.token != other.token
+    client = testclient.TestClient(server.make_app(site), base_url="http://lab.example:8765")
+    assert client.get("/").status_code == 403
+    assert client.get("/?token=wrong").status_code == 403
+    assert client.get("/films/film.mp4?token=é").status_code == 403
+    assert client.get(f"/?token={site.token}").status_code == 200
+    for path in (THERE, f"{THERE}?token=", f"{THERE}?token=wrong"):
+        with pytest.raises(WebSocketDisconnect) as refusal, client.websocket_connect(path):
+            pass
+        assert refusal.value.code == 1008
+    foreign = {"origin": "http://evil.example"}
+    with (
+        pytest.raises(WebSocketDisconnect),
+        client.websocket_connect(f"{THERE}?token={site.token}", headers=foreign),
+    ):
+        pass
+    with client.websocket_connect(f"{THERE}?token={site.token}") as reader:
+        assert reader.receive_json()["title"] == "counter"
+
+
+@pytest.mark.parametrize(
+    ("host", "loopback"),
+    [
+        ("127.0.0.1", True), ("localhost", True), ("::1", True), ("127.8.9.1", True),
+        ("0.0.0.0", False), ("::", False), ("192.168.0.2", False), ("", False), ("lab", False),
+    ],
+)  # fmt: skip
+def test_loopback_addresses_are_told_from_others(tmp_path, host, loopback):
+    assert server.is_loopback(host) == loopback
+    assert (server.make_site(Counter, films=tmp_path, host=host).token is None) == loopback
+
+
+def test_frames_travel_as_they_are(client):
+    with meet(client) as reader:
+        reader.receive_json()
+        first, second = reader.receive_bytes(), reader.receive_bytes()
+    kind, step, count, dimension, milliseconds, loss = struct.unpack("<IIIIff", second[:24])
+    assert (kind, step, count, dimension, milliseconds, loss) == (1, 2, 2, 2, 1.5, 0.125)
+    np.testing.assert_array_equal(
+        np.frombuffer(second[24:40], "<f4"), np.array([2.0, 0.5, -1.0, 0.25], np.float32)
+    )
+    assert list(second[40:]) == [255, 0, 1, 2, 3, 4]
+    assert np.isnan(struct.unpack("<f", first[20:24])[0])
+
+
+def test_the_world_waits_for_a_page_that_does_not_draw(client, worlds):
+    with meet(client) as reader:
+        reader.receive_json()
+        for _ in range(server.FRAMES_AHEAD):
+            reader.receive_bytes()
+        time.sleep(0.3)
+        assert worlds[0].step == server.FRAMES_AHEAD
+        reader.send_json({"type": "drawn"})
+        reader.receive_bytes()
+        time.sleep(0.1)
+        assert worlds[0].step == server.FRAMES_AHEAD + 1
+        # What is told meanwhile is done at once, and seen in the next frame.
+        reader.send_json({"type": "play", "on": False})
+        assert reader.receive_json()["playing"] is False
+    assert worlds[0].closed.wait(5)
+
+
+def test_a_world_that_is_paused_is_shown_after_each_message(client, worlds):
+    with meet(client) as reader:
+        reader.receive_json()
+        reader.send_json({"type": "play", "on": False})
+        while "text" not in (message := reader.receive()):
+            reader.send_json({"type": "drawn"})
+        assert json.loads(message["text"])["playing"] is False
+        for _ in range(server.FRAMES_AHEAD):
+            reader.send_json({"type": "drawn"})
+        steps = {struct.unpack_from("<I", reader.receive_bytes(), 4)[0]}
+        reader.send_json({"type": "brush"})
+        steps.add(struct.unpack_from("<I", reader.receive_bytes(), 4)[0])
+        assert steps == {worlds[0].step}
+
+
+@pytest.mark.parametrize(
+    ("text", "error"),
+    [
+        ("{", "a message must be a JSON object, got '{'"),
+        ("[1]", "a message must be a JSON object"),
+        ("null", "a message must be a JSON object"),
+        ("[" * 100_000, "a message must be a JSON object"),
+        ('{"type": "break"}', "this cannot be done"),
+        ('{"type": "film", "action": "sing"}', "action must be 'start', then 'stop', got 'sing'"),
+        ('{"type": "film", "action": "stop"}', "action must be 'start', then 'stop'"),
+    ],
+)
+def test_bad_messages_are_told_and_the_world_goes_on(client, text, error):
+    with meet(client) as reader:
+        reader.receive_json()
+        reader.send_text(text)
+        assert error in next_error(reader)
+        reader.send_json({"type": "drawn"})
+        assert reader.receive_bytes()
+
+
+def test_a_world_that_fails_is_paused_and_says_why(client, worlds):
+    with meet(client) as reader:
+        assert next_error(reader) == "thirteen; the world is paused"
+        assert reader.receive_json()["playing"] is False
+        worlds[0].step = 20
+        reader.send_json({"type": "play", "on": True})
+        reader.receive_json()
+        assert reader.receive_bytes()
+
+
+def test_a_world_that_cannot_be_made_says_why(tmp_path):
+    def make_world():
+        raise NPAError("no such rule")
+
+    site = server.make_site(make_world, films=tmp_path)
+    client = testclient.TestClient(server.make_app(site), base_url=HERE)
+    with meet(client) as reader:
+        assert next_error(reader) == "no such rule"
+
+
+def test_each_reader_has_a_world_and_there_is_room_for_some(client, worlds):
+    readers = [meet(client) for _ in range(server.MOST_SESSIONS)]
+    for reader in readers:
+        reader.__enter__().receive_json()
+    assert len(worlds) == server.MOST_SESSIONS
+    with meet(client) as late, pytest.raises(WebSocketDisconnect, match=r".*"):
+        late.receive_json()
+    for reader in readers:
+        reader.__exit__(None, None, None)
+    assert all(world.closed.wait(5) for world in worlds)
+    with meet(client) as reader:
+        assert reader.receive_json()["title"] == "counter"
+
+
+def jpeg(size=(32, 24), colour=(200, 30, 40)) -> bytes:
+    file = io.BytesIO()
+    Image.new("RGB", size, colour).save(file, "JPEG")
+    return file.getvalue()
+
+
+def test_a_recording_is_a_film(client, site):
+    with meet(client) as reader:
+        reader.receive_json()
+        reader.send_json({"type": "play", "on": False})
+        reader.send_json({"type": "film", "action": "start"})
+        for k in range(5):
+            reader.send_bytes(jpeg(colour=(40 * k, 30, 40)))
+        reader.send_json({"type": "film", "action": "stop"})
+        files = []
+        while len(files) < 2:
+            message = reader.receive()
+            if "text" in message:
+                event = json.loads(message["text"])
+                assert event["type"] != "error", event
+                files += [event] if event["type"] == "file" else []
+    assert {path.suffix for path in site.films.iterdir()} == {".gif", ".mp4"}
+    for event in files:
+        film = client.get("/" + event["url"])
+        assert film.status_code == 200
+        assert film.content == (site.films / event["name"]).read_bytes()
+    (gif,) = site.films.glob("*.gif")
+    with Image.open(gif) as film:
+        assert film.n_frames == 5
+        assert film.size == (32, 24)
+
+
+@pytest.mark.parametrize(
+    ("pictures", "error"),
+    [
+        ([b"no picture"], "a film's picture must be a JPEG"),
+        ([jpeg((2000, 8))], r"at most 1024 pixels on each side, got (2000, 8)"),
+        ([], "the film has no pictures"),
+        ([jpeg()[:-8]], "the film cannot be written"),
+        ([jpeg(), jpeg((16, 16))], "frames must all have one size"),
+    ],
+)
+def test_wrong_pictures_of_a_film_are_told(client, pictures, error):
+    with meet(client) as reader:
+        reader.receive_json()
+        reader.send_json({"type": "film", "action": "start"})
+        for picture in pictures:
+            reader.send_bytes(picture)
+        reader.send_json({"type": "film", "action": "stop"})
+        assert error in next_error(reader)
+
+
+def test_a_port_in_use_is_passed_over_or_named():
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(NPAError, match=rf"port {port} of 127\.0\.0\.1 cannot be bound"):
+            server.open_port("127.0.0.1", port)
+    with server.open_port("127.0.0.1", None) as first, server.open_port("127.0.0.1", None) as next_:
+        assert first.getsockname()[1] != next_.getsockname()[1]
+
+
+@pytest.mark.parametrize(
+    ("host", "port", "error"),
+    [
+        ("127.0.0.1", 70000, r"port must be in \[0, 65535\], got 70000"),
+        ("no.such.host.invalid", 0, "host must be an address of this computer"),
+        ("203.0.113.7", 0, "cannot be bound"),
+    ],
+)
+def test_wrong_addresses_are_named(host, port, error):
+    with pytest.raises(NPAError, match=error):
+        server.open_port(host, port)
+
+
+def test_links_open_the_page(tmp_path):
+    for host, link in (("127.0.0.1", "http://127.0.0.1:"), ("0.0.0.0", "http://127.0.0.1:")):
+        site = server.make_site(Counter, films=tmp_path, host=host)
+        with server.open_port(host, 0) as listener:
+            address = server.address_of(site, listener)
+        assert address.startswith(link)
+        assert ("?token=" in address) == (host == "0.0.0.0")
+
+
+def test_more_messages_than_there_is_room_for_are_refused(site):
+    # Without a thread that takes them out.
+    session = server.Session.__new__(server.Session)
+    session._inbox = queue.Queue(2)
+    told = []
+    session._tell = told.append
+    for _ in range(4):
+        session._keep({"type": "brush"})
+    assert session._inbox.qsize() == 2
+    assert [event["message"] for event in told] == ["too many messages: some are lost"] * 2
