@@ -1,17 +1,16 @@
-// The two kernels of physics.js in WebAssembly with 128-bit vectors, assembled here: no compiler, no
+// The kernels of physics.js in WebAssembly with 128-bit vectors, assembled here: no compiler, no
 // binary file. Four channels, or four hidden units, are added up at a time, in float32.
 //
 // The texts of the kernels stand below as functions of the assembler's words; the instructions and
 // the format of a module are those of https://webassembly.github.io/spec/core/binary/.
 
-import { plainKernels, tiled } from "./physics.js";
+import { plainKernels, TILE_OUTPUTS, tiledLayer } from "./physics.js";
 
 const MEMORY_PAGES = 512;
 const PAGE_BYTES = 65536;
 
-// Rows and outputs that a step of the product computes together, in registers.
-export const TILE_ROWS = 4;
-const TILE_OUTPUTS = tiled(1);
+// Rows that a step of the product computes together, in registers.
+const TILE_ROWS = 4;
 
 // The assembler's words: each gives the bytes of one instruction.
 
@@ -46,12 +45,28 @@ const loadInteger = (at) => [...at, 0x28, 2, 0];
 const load = (at, offset = 0) => [...at, ...vector(0x00, 2, ...unsigned(offset))];
 const loadSplat = (at, offset = 0) => [...at, ...vector(0x09, 2, ...unsigned(offset))];
 const store = (at, value, offset = 0) => [...at, ...value, ...vector(0x0b, 2, ...unsigned(offset))];
-const zeros = vector(0x0c, ...new Array(16).fill(0));
 const plus = (left, right) => [...left, ...right, ...vector(0xe4)];
 const minus = (left, right) => [...left, ...right, ...vector(0xe5)];
 const times = (left, right) => [...left, ...right, ...vector(0xe6)];
 const larger = (left, right) => [...left, ...right, ...vector(0xe9)];
+const storeInteger = (at, value) => [...at, ...value, 0x36, 2, 0];
+const constant = (bytes) => vector(0x0c, ...bytes);
+const over = (left, right) => [...left, ...right, ...vector(0xe7)];
+const root = (value) => [...value, ...vector(0xe3)];
+const nearest = (value) => [...value, ...vector(0x6a)];
+const less = (left, right) => [...left, ...right, ...vector(0x43)];
+const and = (left, right) => [...left, ...right, ...vector(0x4e)];
+const spreadInteger = (value) => [...value, ...vector(0x11)];
+const plusIntegers = (left, right) => [...left, ...right, ...vector(0xae)];
+const timesIntegers = (left, right) => [...left, ...right, ...vector(0xb5)];
+const lessIntegers = (left, right) => [...left, ...right, ...vector(0x39)];
+const bits = (value) => [...value, ...vector(0xa4)];
+const shuffled = (value, order) => [...value, ...order, ...vector(0x0e)];
+const ones = (value) => [...value, 0x69];
+const when = (condition, body) => [...condition, 0x04, 0x40, ...body, 0x0b];
 const select = (yes, no, condition) => [...yes, ...no, ...condition, 0x1b];
+
+const zeros = constant(new Array(16).fill(0));
 
 // Repeats a body while a local is below a limit, which is looked at first.
 function loopBelow(local, limit, body) {
@@ -96,6 +111,92 @@ function gatherCode(width, dimension) {
     }
   }
   return { parameters: 9, integers: 2, vectors: 2 + 4 + 2 + 8, code };
+}
+
+// Numbers that `pairs` reads, each of them a word in memory.
+const PROBE = ["x", "y", "z", "eps", "square", "weight", "slope", "sideX", "sideY", "sideZ", "perX", "perY", "perZ"];
+
+// pairs(probe, order, x, y, z, volume, ranges, rangesEnd, width, place, a, kx, ky, kz, out): as in
+// plainKernels. `order` holds, for each set of lanes, the bytes that bring them to the front; `out` gets
+// the number of neighbours, and from its 16th byte on six vectors, the lanes of the moment matrix.
+function pairsCode(dimension) {
+  const names = [
+    "probe", "order", "x", "y", "z", "volume", "ranges", "rangesEnd", "width", "place", "a", "kx", "ky", "kz", "out",
+    // Integers of its own.
+    "byte", "end", "count", "found", "at",
+    // Vectors.
+    "lanes", "dx", "dy", "dz", "squared", "inside", "left", "distance", "share", "front",
+    "xx", "xy", "xz", "yy", "yz", "zz", "sx", "sy", "sz",
+    ...PROBE.map((name) => `probe ${name}`),
+  ];
+  const local = (name) => names.indexOf(name);
+  const value = (name) => get(local(name));
+  const put = (name, code) => set(local(name), code);
+  const told = (name) => value(`probe ${name}`);
+  const axes = ["x", "y", "z"].slice(0, dimension);
+  const large = { x: "X", y: "Y", z: "Z" };
+  const offset = (axis) => [
+    ...put(`d${axis}`, minus(load(add(value(axis), value("byte"))), told(axis))),
+    ...put(`d${axis}`, minus(value(`d${axis}`), times(told(`side${large[axis]}`), nearest(times(value(`d${axis}`), told(`per${large[axis]}`)))))),
+  ];
+  const sum = (terms) => terms.reduce((left, right) => plus(left, right));
+  const append = (list, code) => store(add(value(list), value("at")), shuffled(code, value("front")));
+  const hit = [
+    ...put("distance", root(value("squared"))),
+    ...put("left", minus(told("square"), value("squared"))),
+    ...put("share", minus(told("eps"), value("distance"))),
+    ...put("share", over(times(told("slope"), times(value("share"), value("share"))), value("distance"))),
+    ...put("share", times(value("share"), load(add(value("volume"), value("byte"))))),
+    // What is no number where a particle meets itself, or behind the last one, is masked.
+    ...put("share", and(value("share"), and(value("inside"), less(zeros, value("squared"))))),
+    ...axes.flatMap((axis) => put(`s${axis}`, times(value("share"), value(`d${axis}`)))),
+    ...axes.flatMap((axis, k) => axes.slice(k).flatMap((other) =>
+      put(axis + other, plus(value(axis + other), times(value(`s${axis}`), value(`d${other}`)))))),
+    ...put("front", load(add(value("order"), multiply(value("found"), number(16))))),
+    ...put("at", multiply(value("count"), number(4))),
+    ...append("place", timesIntegers(value("lanes"), spreadInteger(value("width")))),
+    ...append("a", times(
+      times(told("weight"), times(value("left"), times(value("left"), value("left")))),
+      load(add(value("volume"), value("byte"))),
+    )),
+    ...axes.flatMap((axis) => append(`k${axis}`, value(`s${axis}`))),
+    ...put("count", add(value("count"), ones(value("found")))),
+  ];
+  const four = [
+    ...axes.flatMap(offset),
+    ...put("squared", sum(axes.map((axis) => times(value(`d${axis}`), value(`d${axis}`))))),
+    ...put("inside", and(less(value("squared"), told("square")), lessIntegers(value("lanes"), spreadInteger(value("end"))))),
+    ...put("found", bits(value("inside"))),
+    ...when(value("found"), hit),
+    ...put("byte", add(value("byte"), number(16))),
+    ...put("lanes", plusIntegers(value("lanes"), spreadInteger(number(4)))),
+  ];
+  const range = [
+    ...put("byte", multiply(loadInteger(value("ranges")), number(4))),
+    ...put("lanes", plusIntegers(spreadInteger(loadInteger(value("ranges"))), constant([0, 0, 0, 0, 1, 0, 0, 0, 2, 0, 0, 0, 3, 0, 0, 0]))),
+    ...put("end", loadInteger(add(value("ranges"), number(4)))),
+    ...loopBelow(local("byte"), multiply(value("end"), number(4)), four),
+    ...put("ranges", add(value("ranges"), number(8))),
+  ];
+  const code = [
+    ...PROBE.flatMap((name, k) => put(`probe ${name}`, loadSplat(value("probe"), 4 * k))),
+    ...loopBelow(local("ranges"), value("rangesEnd"), range),
+    ...storeInteger(value("out"), value("count")),
+    ...["xx", "xy", "xz", "yy", "yz", "zz"].flatMap((name, k) => store(value("out"), value(name), 16 + 16 * k)),
+  ];
+  return { parameters: 15, integers: 5, vectors: names.length - 20, code };
+}
+
+// For each set of four lanes the bytes that bring them to the front, in order: [16, 16].
+function lanesToFront() {
+  const order = new Uint8Array(256).fill(0xff);
+  for (let set = 0; set < 16; set++) {
+    const lanes = [0, 1, 2, 3].filter((lane) => set & (1 << lane));
+    lanes.forEach((lane, k) => {
+      for (let byte = 0; byte < 4; byte++) order[16 * set + 4 * k + byte] = 4 * lane + byte;
+    });
+  }
+  return order;
 }
 
 // product(rows, rowBytes, rowEnd, weights, bias, outputs, outputBytes, inputBytes, limit, tiles): for all
@@ -180,13 +281,17 @@ export function fastestKernels(width, dimension) {
 
 export function simdKernels(width, dimension) {
   const memory = new WebAssembly.Memory({ initial: MEMORY_PAGES });
-  const code = assemble({ gather: gatherCode(width, dimension), product: productCode() });
+  const code = assemble({
+    gather: gatherCode(width, dimension),
+    pairs: pairsCode(dimension),
+    product: productCode(),
+  });
   const instance = new WebAssembly.Instance(new WebAssembly.Module(code), { page: { memory } });
-  const { gather: gatherAt, product: multiplyAt } = instance.exports;
+  const { gather: gatherAt, pairs: pairsAt, product: multiplyAt } = instance.exports;
   let used = 16;
   const reserve = (Kind, length) => {
     const at = used;
-    used += 16 * Math.ceil((4 * length) / 16);
+    used += 16 * Math.ceil((Kind.BYTES_PER_ELEMENT * length) / 16);
     if (used > MEMORY_PAGES * PAGE_BYTES) throw new RangeError("the world is too large for the kernels' memory");
     return new Kind(memory.buffer, at, length);
   };
@@ -200,17 +305,31 @@ export function simdKernels(width, dimension) {
     );
   }
 
-  function layer(weight, bias, inputs, outputs) {
-    const width = tiled(outputs);
-    const weights = floats(width * inputs), offset = floats(width);
-    if (bias !== null) offset.set(bias);
-    for (let a = 0; a < outputs; a++) {
-      const tile = Math.floor(a / TILE_OUTPUTS) * inputs;
-      for (let p = 0; p < inputs; p++) {
-        weights[(tile + p) * TILE_OUTPUTS + (a % TILE_OUTPUTS)] = weight[a * inputs + p];
-      }
+  const probe = floats(PROBE.length);
+  const order = reserve(Uint8Array, 256);
+  order.set(lanesToFront());
+  const out = floats(4 + 6 * 4);
+  const found = new Int32Array(memory.buffer, out.byteOffset, 1);
+
+  function pairs(points, i, ranges, used, { eps, weight, slope, sides, width: stride }, list, moment) {
+    const { x, y, z, volume } = points;
+    const told = [x[i], y[i], z[i], eps, eps * eps, weight, slope];
+    // In open space no image is nearer.
+    probe.set(told);
+    for (let d = 0; d < 3; d++) {
+      const periodic = sides[d] < Infinity;
+      probe[told.length + d] = periodic ? sides[d] : 0;
+      probe[told.length + 3 + d] = periodic ? 1 / sides[d] : 0;
     }
-    return { inputs, width, weights, offset };
+    const at = ranges.byteOffset;
+    const { place, a, slopes } = list;
+    pairsAt(
+      probe.byteOffset, order.byteOffset, x.byteOffset, y.byteOffset, z.byteOffset, volume.byteOffset,
+      at, at + 4 * used, stride, place.byteOffset, a.byteOffset,
+      slopes[0].byteOffset, slopes[1].byteOffset, slopes[2].byteOffset, out.byteOffset,
+    );
+    list.count = found[0];
+    for (let k = 0; k < 6; k++) moment[k] = out[4 + 4 * k] + out[5 + 4 * k] + out[6 + 4 * k] + out[7 + 4 * k];
   }
 
   // Rows are taken four at a time: arrays have room for a multiple of them.
@@ -222,5 +341,5 @@ export function simdKernels(width, dimension) {
     );
   }
 
-  return { name: "WebAssembly", floats, integers: (length) => reserve(Int32Array, length), gather, layer, product };
+  return { name: "WebAssembly", floats, integers: (length) => reserve(Int32Array, length), gather, pairs, layer: (...matrix) => tiledLayer(floats, ...matrix), product };
 }

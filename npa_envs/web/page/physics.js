@@ -13,7 +13,7 @@ const BLOCK_ROWS = 64;
 
 // What states are padded to a multiple of, and what a layer's outputs are.
 const LANES = 4;
-const TILE_OUTPUTS = 8;
+export const TILE_OUTPUTS = 8;
 
 // Cells on each side of the grid at most: farther particles share cells with others, and are told
 // apart by their distance.
@@ -71,38 +71,114 @@ export function plainKernels() {
     }
   }
 
-  // A matrix [outputs, inputs], row by row, and a bias or null, as `product` reads them.
-  function layer(weight, bias, inputs, outputs) {
-    const width = tiled(outputs);
-    const transposed = new Float32Array(inputs * width), offset = new Float32Array(width);
-    for (let a = 0; a < outputs; a++) {
-      if (bias !== null) offset[a] = bias[a];
-      for (let p = 0; p < inputs; p++) transposed[p * width + a] = weight[a * inputs + p];
+  // Lists the neighbours of sorted particle i among runs of particles, with their factors in `gather`,
+  // and adds up their moment matrix: xx, xy, xz, yy, yz, zz.
+  function pairs({ x, y, z, volume }, i, ranges, used, { eps, weight, slope, sides, width }, list, moment) {
+    const { place, a, slopes: [kx, ky, kz] } = list;
+    const [sideX, sideY, sideZ] = sides;
+    const halfX = sideX / 2, halfY = sideY / 2, halfZ = sideZ / 2;
+    const squaredRadius = eps * eps;
+    const ownX = x[i], ownY = y[i], ownZ = z[i];
+    let xx = 0, xy = 0, xz = 0, yy = 0, yz = 0, zz = 0;
+    let count = 0;
+    for (let r = 0; r < used; r += 2) {
+      const last = ranges[r + 1];
+      for (let j = ranges[r]; j < last; j++) {
+        let dx = x[j] - ownX, dy = y[j] - ownY, dz = z[j] - ownZ;
+        if (dx > halfX) dx -= sideX;
+        else if (dx < -halfX) dx += sideX;
+        if (dy > halfY) dy -= sideY;
+        else if (dy < -halfY) dy += sideY;
+        if (dz > halfZ) dz -= sideZ;
+        else if (dz < -halfZ) dz += sideZ;
+        const squared = dx * dx + dy * dy + dz * dz;
+        if (!(squared < squaredRadius)) continue;
+        const left = squaredRadius - squared;
+        const distance = Math.sqrt(squared);
+        const k = squared > 0 ? (slope * (eps - distance) * (eps - distance)) / distance : 0;
+        const share = k * volume[j];
+        place[count] = j * width;
+        a[count] = weight * left * left * left * volume[j];
+        kx[count] = share * dx;
+        ky[count] = share * dy;
+        kz[count] = share * dz;
+        count++;
+        xx += share * dx * dx;
+        xy += share * dx * dy;
+        xz += share * dx * dz;
+        yy += share * dy * dy;
+        yz += share * dy * dz;
+        zz += share * dz * dz;
+      }
     }
-    return { inputs, width, transposed, offset, sums: new Float64Array(width) };
+    list.count = count;
+    moment[0] = xx;
+    moment[1] = xy;
+    moment[2] = xz;
+    moment[3] = yy;
+    moment[4] = yz;
+    moment[5] = zz;
   }
 
   // out = W in + b for `count` rows; max(out, 0) where `rectified`.
-  function product({ inputs, width, transposed, offset, sums }, count, rows, rowWidth, out, rectified) {
-    for (let row = 0; row < count; row++) {
-      for (let a = 0; a < width; a++) sums[a] = offset[a];
-      for (let p = 0; p < inputs; p++) {
-        const value = rows[row * rowWidth + p], from = p * width;
-        if (value === 0) continue;
-        for (let a = 0; a < width; a++) sums[a] += value * transposed[from + a];
+  function product({ inputs, width, weights, offset }, count, rows, rowWidth, out, rectified) {
+    for (let tile = 0; tile < width; tile += TILE_OUTPUTS) {
+      for (let row = 0; row < count; row++) {
+        const from = row * rowWidth;
+        let s0 = offset[tile], s1 = offset[tile + 1], s2 = offset[tile + 2], s3 = offset[tile + 3];
+        let s4 = offset[tile + 4], s5 = offset[tile + 5], s6 = offset[tile + 6], s7 = offset[tile + 7];
+        for (let p = 0, at = tile * inputs; p < inputs; p++, at += TILE_OUTPUTS) {
+          const value = rows[from + p];
+          s0 += value * weights[at];
+          s1 += value * weights[at + 1];
+          s2 += value * weights[at + 2];
+          s3 += value * weights[at + 3];
+          s4 += value * weights[at + 4];
+          s5 += value * weights[at + 5];
+          s6 += value * weights[at + 6];
+          s7 += value * weights[at + 7];
+        }
+        const to = row * width + tile;
+        out[to] = s0;
+        out[to + 1] = s1;
+        out[to + 2] = s2;
+        out[to + 3] = s3;
+        out[to + 4] = s4;
+        out[to + 5] = s5;
+        out[to + 6] = s6;
+        out[to + 7] = s7;
       }
-      for (let a = 0; a < width; a++) out[row * width + a] = rectified && sums[a] < 0 ? 0 : sums[a];
+    }
+    if (rectified) {
+      for (let k = 0; k < count * width; k++) if (out[k] < 0) out[k] = 0;
     }
   }
 
+  const floats = (length) => new Float32Array(length);
   return {
     name: "JavaScript",
-    floats: (length) => new Float32Array(length),
+    floats,
     integers: (length) => new Int32Array(length),
     gather,
-    layer,
+    pairs,
+    layer: (...matrix) => tiledLayer(floats, ...matrix),
     product,
   };
+}
+
+// A matrix [outputs, inputs], row by row, and a bias or null, as products read them: eight outputs at a
+// time lie beside each other, [tiles, inputs, 8].
+export function tiledLayer(floats, weight, bias, inputs, outputs) {
+  const width = tiled(outputs);
+  const weights = floats(width * inputs), offset = floats(width);
+  if (bias !== null) offset.set(bias);
+  for (let a = 0; a < outputs; a++) {
+    const tile = Math.floor(a / TILE_OUTPUTS) * inputs;
+    for (let p = 0; p < inputs; p++) {
+      weights[(tile + p) * TILE_OUTPUTS + (a % TILE_OUTPUTS)] = weight[a * inputs + p];
+    }
+  }
+  return { inputs, width, weights, offset };
 }
 
 // What a step needs besides the world: sorted copies, densities, lists. Made once for each size.
@@ -117,11 +193,11 @@ export class Physics {
     this.capacity = capacity;
 
     const doubles = () => new Float64Array(capacity);
-    this.px = doubles();
-    this.py = doubles();
-    this.pz = doubles();
+    // Kernels look at four particles at a time, and write four.
+    const room = capacity + LANES;
+    const floats = () => kernels.floats(room);
+    this.points = { x: floats(), y: floats(), z: floats(), volume: floats() };
     this.density = doubles();
-    this.volume = doubles();
     this.gradientX = doubles();
     this.gradientY = doubles();
     this.gradientZ = doubles();
@@ -132,10 +208,11 @@ export class Physics {
     // The neighbours of one particle: where their states begin, and their factors in the sums.
     this.list = {
       count: 0,
-      place: kernels.integers(capacity),
-      a: kernels.floats(capacity),
-      slopes: [kernels.floats(capacity), kernels.floats(capacity), kernels.floats(capacity)],
+      place: kernels.integers(room),
+      a: floats(),
+      slopes: [floats(), floats(), floats()],
     };
+    this.moment = new Float64Array(6);
     this.sums = kernels.floats((1 + this.dimension) * this.width);
     const widest = (width) => kernels.floats(BLOCK_ROWS * Math.max(...rules.map(width)));
     this.rowWidth = Math.max(...rules.map((rule) => rule.inputs));
@@ -143,7 +220,7 @@ export class Physics {
     this.hidden = widest((rule) => rule.hidden.width);
     this.updates = widest((rule) => rule.output.width);
     this.blockRows = new Int32Array(BLOCK_ROWS);
-    this.ranges = new Int32Array(4 * 25);
+    this.ranges = kernels.integers(4 * 25);
   }
 
   // Advances a world {count, x, s, species} by one step, in place.
@@ -165,7 +242,7 @@ export class Physics {
   }
 
   sort({ count, x, s }, eps, box) {
-    const { dimension, channels, width, order, cellOf, states } = this;
+    const { dimension, channels, width, order, cellOf, states, points } = this;
     const three = dimension === 3;
     const cells = [1, 1, 1], inverse = [0, 0, 0];
     this.sides = [Infinity, Infinity, Infinity];
@@ -211,9 +288,9 @@ export class Physics {
     const inBox = (position, side) => (side < Infinity ? position - side * Math.floor(position / side + 0.5) : position);
     for (let k = 0; k < count; k++) {
       const i = order[k];
-      this.px[k] = inBox(x[i * dimension], sideX);
-      this.py[k] = inBox(x[i * dimension + 1], sideY);
-      this.pz[k] = three ? inBox(x[i * dimension + 2], sideZ) : 0;
+      points.x[k] = inBox(x[i * dimension], sideX);
+      points.y[k] = inBox(x[i * dimension + 1], sideY);
+      points.z[k] = three ? inBox(x[i * dimension + 2], sideZ) : 0;
       for (let c = 0; c < channels; c++) states[k * width + c] = s[i * channels + c];
     }
   }
@@ -249,7 +326,8 @@ export class Physics {
   }
 
   computeDensities(count, eps) {
-    const { px, py, pz, density, volume, gradientX, gradientY, gradientZ, ranges, starts, dimension } = this;
+    const { x: px, y: py, z: pz, volume } = this.points;
+    const { density, gradientX, gradientY, gradientZ, ranges, starts, dimension } = this;
     const [sideX, sideY, sideZ] = this.sides;
     const halfX = sideX / 2, halfY = sideY / 2, halfZ = sideZ / 2;
     const weight = smoothingNorm(eps, dimension), slope = spikyNorm(eps, dimension);
@@ -333,51 +411,10 @@ export class Physics {
 
   // Writes the perception vector of sorted particle i into `rows` at `at`.
   perceive(world, rule, i, used, at, eps, divisor) {
-    const { px, py, pz, volume, list, width, dimension, channels, rows, sums, states, ranges } = this;
-    const { place, a, slopes: [kx, ky, kz] } = list;
-    const [sideX, sideY, sideZ] = this.sides;
-    const halfX = sideX / 2, halfY = sideY / 2, halfZ = sideZ / 2;
+    const { points, list, moment, ranges, width, dimension, channels, rows, sums, states, kernels } = this;
     const weight = smoothingNorm(eps, dimension), slope = spikyNorm(eps, dimension);
-    const squaredRadius = eps * eps;
-    const x = px[i], y = py[i], z = pz[i];
-    // The moment matrix, symmetric.
-    let xx = 0, xy = 0, xz = 0, yy = 0, yz = 0, zz = 0;
-    let count = 0;
-    for (let r = 0; r < used; r += 2) {
-      const last = ranges[r + 1];
-      for (let j = ranges[r]; j < last; j++) {
-        let dx = px[j] - x, dy = py[j] - y, dz = pz[j] - z;
-        if (dx > halfX) dx -= sideX;
-        else if (dx < -halfX) dx += sideX;
-        if (dy > halfY) dy -= sideY;
-        else if (dy < -halfY) dy += sideY;
-        if (dz > halfZ) dz -= sideZ;
-        else if (dz < -halfZ) dz += sideZ;
-        const squared = dx * dx + dy * dy + dz * dz;
-        if (!(squared < squaredRadius)) continue;
-        const left = squaredRadius - squared;
-        const w = weight * left * left * left;
-        const distance = Math.sqrt(squared);
-        const k = squared > 0 ? (slope * (eps - distance) * (eps - distance)) / distance : 0;
-        const share = k * volume[j];
-        place[count] = j * width;
-        a[count] = w * volume[j];
-        kx[count] = share * dx;
-        ky[count] = share * dy;
-        kz[count] = share * dz;
-        count++;
-        xx += share * dx * dx;
-        xy += share * dx * dy;
-        yy += share * dy * dy;
-        if (dimension === 3) {
-          xz += share * dx * dz;
-          yz += share * dy * dz;
-          zz += share * dz * dz;
-        }
-      }
-    }
-    list.count = count;
-    this.kernels.gather(states, width, dimension, i * width, list, sums);
+    kernels.pairs(points, i, ranges, used, { eps, weight, slope, sides: this.sides, width }, list, moment);
+    kernels.gather(states, width, dimension, i * width, list, sums);
 
     let to = at;
     for (let c = 0; c < channels; c++) rows[to++] = states[i * width + c];
@@ -385,7 +422,7 @@ export class Physics {
     const scale = eps / rule.eps0;
     if (rule.state_gradient) {
       const m = rule.moment_correction
-        ? momentInverse(dimension, xx, xy, xz, yy, yz, zz, rule.moment_inverse)
+        ? momentInverse(dimension, moment, rule.moment_inverse)
         : [1, 0, 0, 1, 0, 1];
       for (let c = 0; c < channels; c++) {
         const gx = sums[width + c], gy = sums[2 * width + c], gz = dimension === 3 ? sums[3 * width + c] : 0;
@@ -453,7 +490,7 @@ function logScaled(rows, at, dimension, x, y, z) {
 }
 
 // The upper triangle (xx, xy, xz, yy, yz, zz) of what stands for M^-1.
-function momentInverse(dimension, xx, xy, xz, yy, yz, zz, kind) {
+function momentInverse(dimension, [xx, xy, xz, yy, yz, zz], kind) {
   let determinant, adjugate;
   if (dimension === 2) {
     determinant = xx * yy - xy * xy;
