@@ -71,10 +71,16 @@ def main(arguments: Sequence[str]) -> int:
     from npa_envs.devices import check_device
     from npa_envs.web.server import address_of, make_site, open_port, serve
 
-    make_world = world_maker(options, check_device(options.device))
+    device = check_device(options.device)
+    make_world = world_maker(options, device)
     # Made once before the server starts: what is wrong with it is said here.
     make_world().close()
-    site = make_site(make_world, films=writable_folder(options.out), host=options.host)
+    site = make_site(
+        make_world,
+        films=writable_folder(options.out),
+        host=options.host,
+        one_at_a_time=device.type == "cuda",
+    )
     with (
         contextlib.closing(open_port(options.host, options.port)) as listener,
         torch_threads(options.threads),

@@ -145,7 +145,7 @@ class RuleWorld(Live):
     def describe(self) -> dict[str, Any]:
         """Return the event "world"."""
         task, box = self.task, self.task.box
-        half_width, centre = 1.1, [0.0] * self.dimension
+        half_width, centre = 1.1 if self.dimension == 2 else 0.95, [0.0] * self.dimension
         if box is not None:
             half_width = 0.5 * min(box)
         elif isinstance(task, PointClassification):

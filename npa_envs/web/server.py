@@ -103,7 +103,16 @@ class Site:
     """The address that is bound."""
     token: str | None = None
     """What readers must name; None: nothing."""
+    one_at_a_time: bool = False
+    """Worlds take turns: on CUDA, work that one thread records must not meet another's."""
+    turn: threading.Lock = field(default_factory=threading.Lock)
+    """Held by the world whose turn it is."""
     open_sessions: list[Session] = field(default_factory=list)
+    """Readers that are here."""
+
+    def alone(self) -> contextlib.AbstractContextManager[Any]:
+        """Return what a world works within."""
+        return self.turn if self.one_at_a_time else contextlib.nullcontext()
 
     def knows(self, host: str) -> bool:
         """Return whether a request's `Host` may name this server."""
@@ -120,10 +129,16 @@ class Site:
         return token is not None and secrets.compare_digest(token.encode(), self.token.encode())
 
 
-def make_site(make_world: Callable[[], LiveWorld], *, films: Path, host: str = "127.0.0.1") -> Site:
+def make_site(
+    make_world: Callable[[], LiveWorld],
+    *,
+    films: Path,
+    host: str = "127.0.0.1",
+    one_at_a_time: bool = False,
+) -> Site:
     """Return a site that asks for a token of its own unless it is bound to a loopback address."""
     token = None if is_loopback(host) else secrets.token_urlsafe(24)
-    return Site(make_world, films, host, token)
+    return Site(make_world, films, host, token, one_at_a_time)
 
 
 def is_loopback(host: str) -> bool:
@@ -302,7 +317,8 @@ class Session:
 
     def _live(self) -> None:
         try:
-            world = self._site.make_world()
+            with self._site.alone():
+                world = self._site.make_world()
         except NPAError as error:
             self._tell({"type": "error", "message": str(error)})
             return
@@ -317,7 +333,9 @@ class Session:
         due = self._clock()
         while not self._stopped.is_set():
             changed |= self._take(world, wait=not (world.playing or changed))
-            for event in world.news():
+            with self._site.alone():
+                events = world.news()
+            for event in events:
                 self._tell(event)
                 changed = True
             if not (world.playing or changed):
@@ -330,18 +348,17 @@ class Session:
                 self._stopped.wait(pause)
             due = max(due, self._clock() - FRAME_SECONDS) + FRAME_SECONDS
             try:
-                if world.playing:
-                    world.advance()
-                self._send(world.frame())
+                with self._site.alone():
+                    if world.playing:
+                        world.advance()
+                    frame = world.frame()
+                self._post(frame_bytes(frame))
             except NPAError as error:
                 world.playing = False
                 self._room.release()
                 self._tell({"type": "error", "message": f"{error}; the world is paused"})
                 self._tell(world.describe())
             changed = False
-
-    def _send(self, frame: Frame) -> None:
-        self._post(frame_bytes(frame))
 
     def _clock(self) -> float:
         return self._loop.time()
@@ -360,8 +377,11 @@ class Session:
                     self._add_picture(message)
                 elif message.get("type") == "film":
                     self._direct(message.get("action"))
-                elif world.handle(message):
-                    self._tell(world.describe())
+                else:
+                    with self._site.alone():
+                        changed = world.handle(message)
+                    if changed:
+                        self._tell(world.describe())
             except NPAError as error:
                 self._tell({"type": "error", "message": str(error)})
         return taken

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
 
 import gymnasium
@@ -17,13 +18,16 @@ from npa_envs.tasks.damage import DAMAGE_SIZES
 from npa_envs.web.colouring import Colouring, Seen, signed_colours, species_colours
 from npa_envs.web.environment_world import EnvironmentWorld, make_environment
 from npa_envs.web.rule_world import RuleWorld, RunWorld
+from npa_envs.web.server import frame_bytes
 
 CPU = torch.device("cpu")
 COUNT = 96
 
 
-def gecko(**options) -> RuleWorld:
-    return RuleWorld("gecko", device=CPU, particle_count=COUNT, **options)
+@pytest.fixture
+def gecko(device):
+    """A function that makes a small world of geckos."""
+    return lambda: RuleWorld("gecko", device=device, particle_count=COUNT)
 
 
 def brush(tool, **told):
@@ -31,14 +35,16 @@ def brush(tool, **told):
 
 
 @pytest.fixture
-def world() -> RuleWorld:
+def world(gecko) -> RuleWorld:
     return gecko()
 
 
 def test_a_live_world_is_the_rollout_of_its_rule(world):
     world.handle({"type": "set", "name": "speed", "value": 3})
-    rule, generator = load_rule("gecko").float(), torch.Generator().manual_seed(0)
-    x, s = world.task.seed(1, generator=generator, device=CPU)
+    device = world.x.device
+    rule = load_rule("gecko", device=device).float()
+    generator = torch.Generator(device).manual_seed(0)
+    x, s = world.task.seed(1, generator=generator, device=device)
     for _ in range(2):
         world.advance()
     with torch.no_grad():
@@ -49,12 +55,12 @@ def test_a_live_world_is_the_rollout_of_its_rule(world):
     frame = world.frame()
     assert frame.step == 6
     assert frame.milliseconds > 0.0
-    np.testing.assert_array_equal(frame.positions, x[0].numpy())
+    np.testing.assert_array_equal(frame.positions, x[0].cpu().numpy())
     own = ((s[0, :, -3:] + 0.5).clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
-    np.testing.assert_array_equal(frame.colours, own.numpy())
+    np.testing.assert_array_equal(frame.colours, own.cpu().numpy())
 
 
-def test_what_is_shown_does_not_change_the_world():
+def test_what_is_shown_does_not_change_the_world(gecko):
     plain, watched = gecko(), gecko()
     for show in ("mask", "speed", "density", "components", "species", "state 3"):
         watched.handle({"type": "set", "name": "show", "value": show})
@@ -66,8 +72,8 @@ def test_what_is_shown_does_not_change_the_world():
         assert torch.equal(plain.s, watched.s)
 
 
-def test_the_mask_shows_about_as_many_as_are_updated():
-    world = RuleWorld("gecko", device=CPU, particle_count=1024)
+def test_the_mask_shows_about_as_many_as_are_updated(device):
+    world = RuleWorld("gecko", device=device, particle_count=1024)
     world.handle({"type": "set", "name": "update_prob", "value": 0.25})
     world.handle({"type": "set", "name": "show", "value": "mask"})
     for _ in range(3):
@@ -97,7 +103,7 @@ def test_the_same_seed_gives_the_same_world_and_the_next_one_another(world):
     assert world.frame().step == 0
 
 
-def test_erase_takes_particles_and_the_others_feel_it_nearby_only(world):
+def test_erase_takes_particles_and_the_others_feel_it_nearby_only(world, gecko):
     other = gecko()
     for live in (world, other):
         live.x = 4.0 * live.x
@@ -168,7 +174,7 @@ def test_a_seed_that_is_added_grows_as_it_would_alone(world):
     heart = world.x[:, COUNT:].clone(), world.s[:, COUNT:].clone()
     for _ in range(2):
         world.advance()
-    rule = load_rule("heart").float()
+    rule = load_rule("heart", device=world.x.device).float()
     with torch.no_grad():
         x, s = rollout(rule, *heart, 2, update_prob=1.0)
     torch.testing.assert_close(world.x[:, COUNT:], x, rtol=0.0, atol=2e-5)
@@ -195,7 +201,7 @@ def test_settings_are_taken_and_told(world):
     assert world.describe()["settings"]["eps"]["value"] == 0.12
 
 
-def test_noise_moves_particles_that_the_rule_leaves(world):
+def test_noise_moves_particles_that_the_rule_leaves(world, gecko):
     still = gecko()
     for live in (world, still):
         live.handle({"type": "set", "name": "update_prob", "value": 0.05})
@@ -279,14 +285,14 @@ _shared: list[RuleWorld] = []
 def shared_world() -> RuleWorld:
     """One world for all messages that must leave it as it is."""
     if not _shared:
-        _shared.append(gecko())
+        _shared.append(RuleWorld("gecko", device=CPU, particle_count=COUNT))
     return _shared[0]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", shipped_rules())
-def test_every_shipped_rule_can_be_viewed(name):
-    world = RuleWorld(name, device=CPU)
+def test_every_shipped_rule_can_be_viewed(name, device):
+    world = RuleWorld(name, device=device)
     told = world.describe()
     assert name in told["others"]
     for show in (*told["shows"][:6], "state 0"):
@@ -302,8 +308,8 @@ def test_every_shipped_rule_can_be_viewed(name):
     assert np.isfinite(world.frame().loss)
 
 
-def test_brushes_work_in_3d():
-    world = RuleWorld("duck", device=CPU, particle_count=256)
+def test_brushes_work_in_3d(device):
+    world = RuleWorld("duck", device=device, particle_count=256)
     told = {"at": [0.0, 0.0, 0.0], "radius": 0.5}
     world.handle(brush("push", move=[0.0, 0.0, 0.1], strength=1.0, **told))
     world.handle(brush("cut", move=[1.0, 0.0, 0.0], view=[0.0, 0.0, 1.0], **told))
@@ -311,6 +317,22 @@ def test_brushes_work_in_3d():
     assert float(world.x.norm(dim=-1).min()) > 0.5
     world.advance()
     assert world.frame().positions.shape[1] == 3
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("name", ["gecko", "dots", "duck"])
+def test_a_gpu_makes_sixty_frames_a_second(name):
+    world = RuleWorld(name, device=torch.device("cuda"))
+    for _ in range(200):
+        world.advance()
+        world.frame()
+    times = []
+    for _ in range(200):
+        start = time.perf_counter()
+        world.advance()
+        frame_bytes(world.frame())
+        times.append(time.perf_counter() - start)
+    assert sorted(times)[180] < 1.0 / 60.0
 
 
 # Colours.

@@ -289,6 +289,30 @@ def test_each_reader_has_a_world_and_there_is_room_for_some(client, worlds):
         assert reader.receive_json()["title"] == "counter"
 
 
+def test_worlds_that_take_turns_are_never_at_work_together(tmp_path):
+    busy = threading.Lock()
+    clashes = []
+
+    class Jealous(Counter):
+        def advance(self):
+            if not busy.acquire(blocking=False):
+                clashes.append(self.step)
+                return
+            time.sleep(0.002)
+            self.step += self.step != 12
+            busy.release()
+
+    site = server.make_site(Jealous, films=tmp_path, one_at_a_time=True)
+    client = testclient.TestClient(server.make_app(site), base_url=HERE)
+    with meet(client) as first, meet(client) as second:
+        for _ in range(30):
+            for reader in (first, second):
+                while "bytes" not in reader.receive():
+                    pass
+                reader.send_json({"type": "drawn"})
+    assert clashes == []
+
+
 def jpeg(size=(32, 24), colour=(200, 30, 40)) -> bytes:
     file = io.BytesIO()
     Image.new("RGB", size, colour).save(file, "JPEG")

@@ -84,7 +84,7 @@ function dot(a, b) {
 
 // What a painter draws:
 //   {positions, colours, dimension, box, spot, camera, background: [r, g, b] in [0, 1],
-//    look: "soft" | "points", trails: {positions: Float32Array of pairs of points [x, y, z],
+//    look: "soft" | "points", still: nothing moves, so that there is time, trails: {positions: Float32Array of pairs of points [x, y, z],
 //    fades: Float32Array} or null, ink: [r, g, b] of trails}
 // `kind`: "webgl2", "canvas", or "auto": WebGL2 unless it would be a processor that draws, which is
 // faster without it.
@@ -143,7 +143,7 @@ void main() {
   gl_Position = place(position, scale, near);
   gl_PointSize = size * scale;
   tint = colour;
-  light = distance_ > 0.0 ? clamp(0.78 + 0.4 * near / nearest, 0.35, 1.1) : 1.0;
+  light = distance_ > 0.0 ? clamp(0.95 + 0.5 * near / nearest, 0.45, 1.15) : 1.0;
 }`;
 
 // Sums of colours and of densities: soft spots, which the second pass shows over the background.
@@ -182,7 +182,7 @@ void main() {
   if (square > 1.0) discard;
   if (ball) {
     vec3 normal = vec3(r.x, -r.y, sqrt(1.0 - square));
-    float shade = 0.62 + 0.38 * dot(normal, vec3(-0.35, 0.6, 0.72));
+    float shade = 0.74 + 0.34 * dot(normal, vec3(-0.35, 0.6, 0.72));
     shown = vec4(tint * shade * light, 1.0);
   } else {
     float cover = clamp((1.0 - sqrt(square)) * edge, 0.0, 1.0);
@@ -368,7 +368,7 @@ function linked(gl, vertex, fragment) {
   return found;
 }
 
-const PLAIN_PIXELS = [320, 1000]; // on the longer side of the small picture, least and most
+const PLAIN_PIXELS = [360, 1200]; // on the longer side of the small picture, least and most
 const PLAIN_TIME = 10; // milliseconds that a picture may take
 const COVERS = Float32Array.from({ length: 1024 }, (_, k) => 1 - Math.exp(-2.4 * (k / 256)));
 
@@ -385,7 +385,7 @@ class PlainPainter {
   draw(scene) {
     const started = performance.now(), { context, small } = this;
     const { width, height } = context.canvas;
-    const shrink = Math.min(1, this.pixels / Math.max(width, height));
+    const shrink = Math.min(1, (scene.still ? PLAIN_PIXELS[1] : this.pixels) / Math.max(width, height));
     const across = Math.ceil(width * shrink), down = Math.ceil(height * shrink);
     if (small.width !== across || small.height !== down) {
       Object.assign(small, { width: across, height: down });
@@ -406,6 +406,7 @@ class PlainPainter {
     context.imageSmoothingQuality = "high";
     context.drawImage(small, 0, 0, width, height);
     if (scene.trails) this.drawTrails(scene, width, height);
+    if (scene.still) return;
     const taken = performance.now() - started, [least, most] = PLAIN_PIXELS;
     // In steps, so that the picture is not laid out anew in every frame.
     if (taken > 1.5 * PLAIN_TIME) this.pixels = Math.max(least, this.pixels - 80);
@@ -476,7 +477,7 @@ function addBalls(sums, width, height, places, { colours, dimension, camera }, s
     const column = places[4 * k], row = places[4 * k + 1], near = places[4 * k + 2];
     const radius = (solid ? 1.6 : 0.9) * spot * places[4 * k + 3];
     const depth = near * camera.unit(width, height);
-    const light = solid ? Math.min(1.1, Math.max(0.35, 0.78 + (0.4 * depth) / span)) : 1;
+    const light = solid ? Math.min(1.15, Math.max(0.45, 0.95 + (0.5 * depth) / span)) : 1;
     const left = Math.max(0, Math.ceil(column - radius)), last = Math.min(width - 1, column + radius);
     const top = Math.max(0, Math.ceil(row - radius)), end = Math.min(height - 1, row + radius);
     for (let y = top; y <= end; y++) {
@@ -486,7 +487,7 @@ function addBalls(sums, width, height, places, { colours, dimension, camera }, s
         if (square > 1) continue;
         const front = Math.sqrt(1 - square), nearness = 1e6 + near + (solid ? front * radius : k * 1e-3);
         if (nearness < sums[p + 3]) continue;
-        const shade = solid ? light * (0.62 + 0.38 * (0.72 * front - 0.35 * across - 0.6 * down)) : 1;
+        const shade = solid ? light * (0.74 + 0.34 * (0.72 * front - 0.35 * across - 0.6 * down)) : 1;
         sums[p] = shade * colours[3 * k];
         sums[p + 1] = shade * colours[3 * k + 1];
         sums[p + 2] = shade * colours[3 * k + 2];

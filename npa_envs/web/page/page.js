@@ -152,7 +152,8 @@ class Page {
       this.camera = new Camera(world.dimension, world.half_width, world.centre);
       this.frame = null;
       const first = world.tools.includes("erase") && world.dimension === 2 ? "erase" : "look";
-      this.choose(world.tools.includes(this.tool) ? this.tool : first);
+      const keep = before.dimension === world.dimension && world.tools.includes(this.tool);
+      this.choose(keep ? this.tool : first);
     }
     if (before.rule !== world.rule || before.seed !== world.seed) {
       this.tracers.clear();
@@ -516,7 +517,7 @@ class Page {
     }
   }
 
-  draw() {
+  draw({ still = false } = {}) {
     const { canvas, frame, world, camera } = this;
     // More pixels than this are not seen, and cost where the processor draws.
     const ratio = Math.min(devicePixelRatio || 1, 1600 / Math.max(canvas.clientWidth, canvas.clientHeight, 1), 2);
@@ -529,6 +530,7 @@ class Page {
       positions: frame?.positions ?? new Float32Array(), colours: frame?.colours ?? new Uint8Array(),
       dimension: world.dimension, box: world.box, spot: world.spot * $("size").value, camera,
       background: this.background, look: $("style").value, ink: this.ink,
+      still: still || (!world.playing && !this.stroke),
       trails: $("tracers").checked ? this.tracers.lines(world.box) : null,
     });
     this.film();
@@ -537,7 +539,7 @@ class Page {
   // Pictures and films.
 
   snapshot() {
-    this.draw();
+    this.draw({ still: true });
     this.canvas.toBlob((blob) => {
       const name = `${this.world.title}-${this.frame?.step ?? 0}.png`.replace(/[^\w.-]+/g, "-");
       this.offer(name, URL.createObjectURL(blob)).click();
