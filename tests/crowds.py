@@ -2,16 +2,13 @@
 
 import functools
 import math
-from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-import pytest
 
 from npa_envs.envs import multispecies_v0
 from npa_envs.envs.multispecies_v0 import MultiSpeciesEnv
-from npa_envs.tasks import morphogenesis2d
 
 TASKS = ("mixing", "segregation", "co_morphogenesis", "invasion", "symbiosis")
 PICTURES = ("co_morphogenesis", "invasion", "symbiosis")
@@ -32,14 +29,6 @@ def few(task: str, **keywords: Any) -> dict[str, Any]:
     if "particle_counts" not in keywords:
         keywords = {"particle_count": 9} | keywords
     return small(task, **keywords)
-
-
-def targets_made_once() -> Iterator[None]:
-    """Keep targets: to draw and resample one takes longer than what is tested with it."""
-    with pytest.MonkeyPatch.context() as patch:
-        made_once = functools.cache(morphogenesis2d.load_target)
-        patch.setattr(morphogenesis2d, "load_target", made_once)
-        yield
 
 
 def still(env: Any) -> dict[str, Any]:

@@ -49,3 +49,48 @@ def assert_same(left: Any, right: Any, where: str = "") -> None:
     else:
         arrays = [v.cpu().numpy() if isinstance(v, torch.Tensor) else v for v in (left, right)]
         assert np.array_equal(*arrays), where
+
+
+def assert_info_equal(infos, k, info):
+    for name, value in info.items():
+        assert np.array_equal(infos[name][k], value), name
+        assert infos[f"_{name}"][k], name
+
+
+def assert_batch_of_singles(
+    envs: Any, singles: Any, actions: Any, mode: str = "same-step"
+) -> tuple[set[str | None], int]:
+    """Compare each world of a batch with its single environment, whatever the others do.
+
+    Returns why episodes ended, None among it, and how many steps diverged.
+    """
+    observations, infos = envs.reset(seed=40)
+    for k, env in enumerate(singles):
+        observation, info = env.reset(seed=40 + k)
+        assert np.array_equal(observations[k], observation)
+        assert_info_equal(infos, k, info)
+    reasons, diverged, over = set(), 0, [False] * len(singles)
+    for action in actions:
+        observations, rewards, terminations, truncations, infos = envs.step(action)
+        for k, env in enumerate(singles):
+            if over[k] and mode == "next-step":
+                assert np.array_equal(observations[k], env.reset()[0])
+                over[k] = False
+                continue
+            observation, reward_k, terminated, truncated, info = env.step(action[k])
+            assert rewards[k] == reward_k
+            assert (terminations[k], truncations[k]) == (terminated, truncated)
+            over[k] = terminated or truncated
+            diverged += info["diverged"]
+            reasons.add(info.get("reason"))
+            if over[k] and mode == "same-step":
+                assert infos["_final_obs"][k]
+                assert np.array_equal(infos["final_obs"][k], observation)
+                assert_info_equal(infos["final_info"], k, info)
+                observation, info = env.reset()
+                assert not infos["_success"][k]
+            elif "_final_obs" in infos:
+                assert not infos["_final_obs"][k]
+            assert np.array_equal(observations[k], observation)
+            assert_info_equal(infos, k, info)
+    return reasons, diverged

@@ -16,7 +16,7 @@ from small_envs import IDS, assert_same, make, make_vec, small
 
 import npa_envs
 from npa_envs.envs import multispecies_v0
-from npa_envs.errors import DivergedError, NPAError
+from npa_envs.errors import NPAError
 from npa_envs.world.randomness import Purpose
 
 every_id = pytest.mark.parametrize("name", IDS)
@@ -81,9 +81,9 @@ def test_spec_survives_pickling_and_json(name):
     "program",
     [
         "import gymnasium; gymnasium.make('npa_envs:npa/Morphogenesis2D-v0', particle_count=8)",
-        "import npa_envs, gymnasium; gymnasium.make('npa/Morphogenesis2D-v0', particle_count=8)",
-        "import gymnasium, npa_envs; gymnasium.make_vec('npa/Morphogenesis2D-v0', 2, "
-        "vectorization_mode='vector_entry_point', particle_count=8)",
+        "import npa_envs, gymnasium; name = 'npa/Morphogenesis2D-v0'\n"
+        "gymnasium.make(name, particle_count=8)\n"
+        "gymnasium.make_vec(name, 2, vectorization_mode='vector_entry_point', particle_count=8)",
     ],
 )
 def test_ids_are_found_in_a_fresh_process(program):
@@ -119,21 +119,14 @@ def test_an_environment_survives_pickling_in_the_midst_of_an_episode(name, copy,
 
 
 @every_id
-def test_episodes_follow_from_the_seed_and_differ(name):
+def test_episodes_follow_from_the_seed_or_a_generator_and_differ(name):
     env = make(name)
     firsts, again = ([env.reset(seed=seed)[0] for seed in (7, None, None)] for _ in range(2))
     assert_same(firsts, again)
     assert not np.array_equal(firsts[0], firsts[1])
     assert not np.array_equal(firsts[1], firsts[2])
-
-
-@every_id
-def test_a_generator_put_into_np_random_decides_what_follows(name):
-    env = make(name)
-    seeded, _ = env.reset(seed=11)
-    env.reset(seed=3)
-    env.unwrapped.np_random = np.random.default_rng(11)
-    assert np.array_equal(env.reset()[0], seeded)
+    env.unwrapped.np_random = np.random.default_rng(7)
+    assert np.array_equal(env.reset()[0], firsts[0])
 
 
 @every_id
@@ -236,18 +229,6 @@ def sync_envs(count):
     return gymnasium.vector.SyncVectorEnv([lambda: make(IDS[0])] * count)
 
 
-def test_rewards_and_losses_have_the_same_type_natively_and_through_gymnasium():
-    native, sync = make_vec(IDS[0], 2, max_episode_steps=3), sync_envs(2)
-    native.reset(seed=0)
-    sync.reset(seed=0)
-    for action in actions(native, 2, scale=0.2):
-        left, right = native.step(action), sync.step(action)
-        assert left[1].dtype == right[1].dtype == np.float64
-        for name in ("loss", "reward_colour", "diverged"):
-            assert left[4][name].dtype == right[4][name].dtype
-        assert np.array_equal(left[1], right[1])
-
-
 def test_sparse_reward_that_was_cut_off_is_told():
     env = make(IDS[0], reward="sparse", max_episode_steps=-1)
     env.reset(seed=0)
@@ -330,19 +311,6 @@ def test_action_moves_masked_particles_by_the_documented_amount():
     assert torch.allclose((new_x - x)[moved], step.expand(int(moved.sum()), 2), atol=1e-6)
     assert torch.allclose((new_s - s)[moved], torch.tensor(-0.125))
     assert torch.equal(new_s[~moved], s[~moved])
-
-
-def test_periodic_boundary_wraps_positions():
-    env = make(IDS[0], boundary="periodic", box_size=0.7, seed_radius=0.34, update_prob=1.0)
-    env.reset(seed=0)
-    action = np.zeros(env.action_space.shape, np.float32)
-    action[:, 0] = 1.0
-    for _ in range(5):
-        _, _, terminated, *_ = env.step(action)
-        assert not terminated
-    x, _ = env.unwrapped.particles()
-    assert float(x.abs().max()) <= 0.35
-    assert float(x[:, 0].min()) < -0.3
 
 
 def test_seed_pool_repeats_its_starts():
@@ -451,25 +419,13 @@ def test_numbers_of_numpy_are_numbers():
 
 
 @every_id
-def test_action_that_is_no_number_is_an_error_and_changes_nothing(name):
-    env, other = make(name), make(name)
-    env.reset(seed=0)
-    other.reset(seed=0)
-    bad, good = actions(env, 2)
-    bad[4, 1] = np.nan
-    with pytest.raises(
-        DivergedError, match="action must be finite, got nan at world 0, particle 4"
-    ):
-        env.unwrapped.step(bad)
-    assert np.array_equal(env.unwrapped.step(good)[0], other.unwrapped.step(good)[0])
-
-
-@every_id
 @pytest.mark.parametrize("shape", [(61,), (60, 0), (61, -1), (1, 61, 0)])
-def test_action_of_another_shape_is_an_error(name, shape):
+def test_action_before_a_reset_or_of_another_shape_is_an_error(name, shape):
     env = make(name).unwrapped
-    env.reset(seed=0)
     right = env.action_space.shape
+    with pytest.raises(NPAError, match="call reset first"):
+        env.step(np.zeros(right, np.float32))
+    env.reset(seed=0)
     shape = shape if len(shape) == 1 else (*shape[:-1], right[1] + shape[-1])
     with pytest.raises(
         NPAError, match=rf"action must be real numbers of shape \[N, A\] = \(61, {right[1]}\)"
@@ -490,13 +446,6 @@ def test_an_unknown_keyword_is_a_type_error_in_pythons_words(name):
     for many in (False, True):
         with pytest.raises(TypeError, match=r"got an unexpected keyword argument 'frameskip': "):
             make_vec(name, 2, frameskip=1) if many else make(name, frameskip=1)
-
-
-@every_id
-def test_step_before_reset_is_an_error(name):
-    env = make(name).unwrapped
-    with pytest.raises(NPAError, match="call reset first"):
-        env.step(np.zeros((61, 18), np.float32))
 
 
 @every_id

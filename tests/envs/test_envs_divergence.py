@@ -106,40 +106,6 @@ def test_a_reset_world_begins_its_next_episode_within_this_one(name, reward, dev
     assert infos["final_info"]["reason"].tolist() == ["time limit"] * 3
 
 
-@pytest.mark.parametrize(("way", "mode"), [("reset", "next-step"), ("ignore", "same-step")])
-def test_world_k_is_the_single_environment_whichever_worlds_diverge(way, mode, device):
-    keywords = {"reward": "particle", "position_noise": 1e-3, "update_prob": 0.8}
-    envs = vector(device, way, max_episode_steps=11, autoreset_mode=mode, **keywords)
-    keywords |= {"observation_limit": LIMIT, "device": str(device), "on_divergence": way}
-    singles = [make(NAME, max_episode_steps=11, **keywords) for _ in range(3)]
-    observations, _ = envs.reset(seed=9)
-    over = [False] * 3
-    diverged = 0
-    for k, env in enumerate(singles):
-        assert np.array_equal(observations[k], env.reset(seed=9 + k)[0])
-    random = np.random.default_rng(0)
-    for t in range(24):
-        action = random.uniform(-1.0, 1.0, envs.action_space.shape).astype(np.float32)
-        action[t // 5 % 3, :, 2:] = 1.0
-        observations, rewards, terminations, truncations, infos = envs.step(action)
-        for k, env in enumerate(singles):
-            if mode == "next-step" and over[k]:
-                assert np.array_equal(observations[k], env.reset()[0])
-                over[k] = False
-                continue
-            observation, reward, terminated, over[k], info = env.step(action[k])
-            assert (rewards[k], terminations[k], truncations[k]) == (reward, terminated, over[k])
-            final = mode == "same-step" and over[k]
-            told = infos["final_info"] if final else infos
-            for name in ("loss", "diverged", "particle_reward", "reward_colour"):
-                assert np.array_equal(told[name][k], info[name])
-            if final:
-                observation, _ = env.reset()
-            assert np.array_equal(observations[k], observation)
-            diverged += info["diverged"]
-    assert diverged >= 3
-
-
 def test_an_ignored_world_goes_on_held_at_the_limits_and_rewards_telescope(device):
     envs = vector(device, "ignore")
     _, start = envs.reset(seed=5)

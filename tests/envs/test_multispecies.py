@@ -1,21 +1,16 @@
 """Species as agents: seeds, turns, deaths, pictures, errors."""
 
 import pickle
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 import torch
-from crowds import TASKS, apart, drawn, make, pair, placed, small, still, targets_made_once
+from crowds import TASKS, apart, drawn, make, pair, placed, small, still
 from small_envs import assert_same
 
 import npa_envs
-from npa_envs.agents import RulePolicy
 from npa_envs.envs import multispecies_v0
 from npa_envs.errors import NPAError
-
-quick_targets = pytest.fixture(scope="module", autouse=True)(targets_made_once)
 
 
 def test_a_window_without_a_screen_warns_and_goes_on(monkeypatch):
@@ -78,17 +73,6 @@ def test_turns_clip_actions_that_are_too_large(recwarn):
     assert np.array_equal(*states)
 
 
-def test_particles_perceive_those_of_all_species():
-    env = make(species_count=3)
-    env.reset(seed=0)
-    observations, *_ = env.step(still(env))
-    x, s = env.particles()
-    z = npa_envs.perceive(x[None], s[None], 0.3, 0.1)[0].numpy()
-    seen = np.concatenate([observations[f"species_{k}"] for k in range(3)])
-    np.testing.assert_allclose(seen, z, rtol=1e-5, atol=1e-6)
-    assert [len(rows) for rows in observations.values()] == [14, 14, 13]
-
-
 def test_species_have_spaces_of_their_own_sizes_and_the_state_shows_all():
     env = make(species_count=2, particle_counts=[3, 5])
     observations, _ = env.reset(seed=0)
@@ -119,24 +103,6 @@ def test_an_action_moves_particles_and_changes_states_as_far_as_it_says():
     x, s = env.particles()
     torch.testing.assert_close(x, torch.tensor([[0.0, 0.0], [0.3, 0.0]]))
     assert s.unique(dim=1).flatten().tolist() == [0.25, 0.0]
-
-
-@pytest.mark.parametrize("update_prob", [0.5, 1.0])
-def test_species_that_follow_one_rule_live_as_its_rollout(update_prob):
-    rule = npa_envs.load_rule("gecko")
-    policy = RulePolicy(rule)
-    keywords = {"eps": 0.1, "update_prob": update_prob, "species_count": 3}
-    env = make("co_morphogenesis", particle_count=150, **keywords)
-    observations, _ = env.reset(seed=7)
-    x, s = (tensor[None] for tensor in env.particles())
-    random = npa_envs.WorldRandom(7)
-    with torch.no_grad():
-        x, s = npa_envs.rollout(rule, x, s, steps=6, update_prob=update_prob, generator=random)
-    while env.agents:
-        actions = {agent: policy(seen) for agent, seen in observations.items()}
-        observations, *_ = env.step(actions)
-    torch.testing.assert_close(env.particles()[0], x[0], rtol=0.0, atol=2e-5)
-    torch.testing.assert_close(env.particles()[1], s[0], rtol=0.0, atol=2e-4)
 
 
 def test_a_species_that_is_removed_is_gone():
@@ -291,24 +257,6 @@ def test_torch_tensors_come_out_where_asked_for():
     assert_same(arrays.step(actions), found)
     assert_same(arrays.state(), tensors.state())
     assert all(isinstance(v, torch.Tensor) for v in (*found[0].values(), tensors.state()))
-
-
-def test_the_package_is_imported_without_pettingzoo_which_is_asked_for_by_name():
-    program = (
-        "import sys\n"
-        "import npa_envs, npa_envs.envs, npa_envs.envs.multi\n"
-        "print('pettingzoo' in sys.modules)\n"
-        "sys.modules['pettingzoo'] = None\n"
-        "try:\n"
-        "    import npa_envs.envs.multispecies_v0\n"
-        "except npa_envs.MissingDependencyError as error:\n"
-        "    print(error)\n"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    first, second = done.stdout.splitlines()
-    assert first == "False"
-    assert "pip install 'npa-envs[envs]'" in second
 
 
 @pytest.mark.parametrize(

@@ -2,12 +2,10 @@
 
 import numpy as np
 import pytest
-from crowds import HALF_WAY, TASKS, drawn, few, still, targets_made_once
+from crowds import HALF_WAY, TASKS, drawn, few, still
 
 from npa_envs.envs import multispecies_v0, particles_v0
 from npa_envs.errors import NPAError
-
-quick_targets = pytest.fixture(scope="module", autouse=True)(targets_made_once)
 
 
 def make(task="mixing", **keywords):

@@ -3,7 +3,7 @@
 import numpy as np
 import pettingzoo
 import pytest
-from crowds import TASKS, drawn, few, module_of, small, targets_made_once
+from crowds import TASKS, drawn, few, module_of, small
 from pettingzoo.test import api_test, parallel_api_test, render_test, seed_test
 from pettingzoo.test.max_cycles_test import max_cycles_test
 from pettingzoo.test.seed_test import parallel_seed_test
@@ -14,7 +14,6 @@ from npa_envs.envs import multispecies_v0, particles_v0
 from npa_envs.envs.multi import TASKS as TABLE
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:pettingzoo")
-quick_targets = pytest.fixture(scope="module", autouse=True)(targets_made_once)
 
 KINDS = {"species": (multispecies_v0, small), "particle": (particles_v0, few)}
 """Modules by what their agents are called, and keywords of small worlds."""

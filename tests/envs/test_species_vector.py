@@ -5,14 +5,12 @@ import pickle
 import numpy as np
 import pytest
 import torch
-from crowds import TASKS, make, small, targets_made_once
+from crowds import TASKS, make, small
 from small_envs import assert_same
 
 from npa_envs.envs import multispecies_v0
 from npa_envs.envs.core import memory
 from npa_envs.errors import DivergedError, NPAError
-
-quick_targets = pytest.fixture(scope="module", autouse=True)(targets_made_once)
 
 # Species leave, run out of bounds in their states, are removed, and are cut off.
 DEADLY = {
@@ -118,25 +116,6 @@ def test_a_batch_equals_single_environments_while_species_die_here_and_there(tas
     )
     # Worlds had lost different species at the same time.
     assert any(len(set(zip(*pattern, strict=True))) > 1 for pattern in patterns)
-
-
-def second(by_agent):
-    """What the second world of a batch has."""
-    return {agent: values[1:2] for agent, values in by_agent.items()}
-
-
-def test_a_world_does_not_depend_on_the_number_of_worlds(where):
-    one, many = batch(world_count=1, **DEADLY | where), batch(world_count=5, **DEADLY | where)
-    seen, _ = one.reset(seed=3)
-    there, _ = many.reset(seed=[9, 3, 8, 7, 6])
-    generator = np.random.default_rng(0)
-    assert_same(seen, second(there))
-    for _ in range(20):
-        actions = drawn(many, generator)
-        there = many.step(actions)
-        assert_same(one.step(second(actions))[:4], [second(values) for values in there[:4]])
-    assert np.array_equal(one.state()[0], many.state()[1])
-    assert not np.array_equal(one.state()[0], many.state()[0])
 
 
 def test_resetting_one_world_leaves_the_others_as_they_are(where):

@@ -13,6 +13,7 @@ import torch
 from crowds import TASKS, still
 from crowds import small as small_crowd
 from gymnasium.utils.env_checker import check_env
+from small_envs import assert_batch_of_singles
 
 import npa_envs
 from npa_envs.agents.learning import METHODS, Budget, train
@@ -185,22 +186,8 @@ def test_a_batch_of_the_own_environment_equals_single_ones(ring):
     envs = gym.make_vec("my/Ring-v0", num_envs=3, max_episode_steps=5, **keywords)
     singles = [gym.make("my/Ring-v0", max_episode_steps=5, **keywords) for _ in range(3)]
     actions = np.random.default_rng(0).uniform(-1, 1, (8, *envs.action_space.shape))
-    together, _ = envs.reset(seed=4)
-    for k, env in enumerate(singles):
-        alone, _ = env.reset(seed=4 + k)
-        assert np.array_equal(together[k], alone)
-    for action in actions.astype(np.float32):
-        together, rewards, _, truncated, infos = envs.step(action)
-        last = infos.get("final_info", infos)
-        for k, env in enumerate(singles):
-            alone, reward, _, cut_off, info = env.step(action[k])
-            assert reward == rewards[k]
-            assert info["loss_ring"] == last["loss_ring"][k]
-            assert cut_off == truncated[k]
-            if cut_off:
-                assert np.array_equal(infos["final_obs"][k], alone)
-                alone, _ = env.reset()
-            assert np.array_equal(together[k], alone)
+    reasons, _ = assert_batch_of_singles(envs, singles, actions.astype(np.float32))
+    assert reasons == {None, "time limit"}
 
 
 def test_the_own_environment_measures_the_distance_from_the_ring(ring):

@@ -8,7 +8,6 @@ import warnings
 import numpy as np
 import pytest
 import torch
-from crowds import targets_made_once
 from fuzzing import TARGETS, call
 
 from npa_envs import NPAError
@@ -23,7 +22,6 @@ PATIENCE = 30.0
 
 
 # A target drawn once serves all calls; drawing it takes longer than they do.
-quick_targets = pytest.fixture(scope="module", autouse=True)(targets_made_once)
 
 
 def refusal(seed: int) -> str | None:
