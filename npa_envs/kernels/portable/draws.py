@@ -191,19 +191,3 @@ def draw_integers(
         element = wp.static(INTEGERS_PER_THREAD) * block + k
         if element < values.shape[1]:
             values[world, element] = wp.int64(joined(w[2 * k], w[2 * k + 1]) % high)
-
-
-@wp.kernel(enable_backward=False)
-def draw_words(
-    counters: wp.array(dtype=wp.uint32, ndim=2),
-    low_key: wp.uint32,
-    high_key: wp.uint32,
-    # outputs
-    values: wp.array(dtype=wp.uint32, ndim=2),
-):
-    """The generator itself, for its published answers."""
-    t = wp.tid()
-    c = words(counters[t, 0], counters[t, 1], counters[t, 2], counters[t, 3])
-    w = philox(c, low_key, high_key)
-    for k in range(4):
-        values[t, k] = w[k]
