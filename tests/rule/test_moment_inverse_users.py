@@ -1,4 +1,7 @@
-"""Who uses the smooth inverse of moment matrices: rules and their files, training, environments."""
+"""Who uses the smooth inverse of moment matrices: rules' files, training, environments.
+
+Rollouts of rules that do are among those of tests/world/.
+"""
 
 import gymnasium
 import numpy as np
@@ -6,60 +9,13 @@ import pytest
 import torch
 from circle_task import CircleTask, circle_config
 from training_runs import train
-from worlds import random_world, relative_error
+from worlds import relative_error
 
 import npa_envs
-from npa_envs import reference as oracle
 from npa_envs.agents import RulePolicy
 from npa_envs.envs import multispecies_v0
 from npa_envs.training import load_config
 from npa_envs.training.trainer import initial_rule
-
-
-def strong_rule(device, dtype=torch.float64, **options):
-    """A rule whose updates are large enough to matter."""
-    torch.manual_seed(0)
-    rule = npa_envs.NPARule(2, 5, 12, eps0=0.1, **options).to(device, dtype)
-    with torch.no_grad():
-        rule.output.weight *= 4.0
-    return rule
-
-
-@pytest.mark.parametrize("static", [False, True], ids=("moving", "static"))
-def test_a_rollout_follows_the_rules_own_choice(static, device):
-    """Static ones weigh their pairs once for all steps."""
-    rule = strong_rule(device, moment_inverse="smooth", static=static)
-    x, s = random_world(2, 150, 2, 5, dtype=torch.float64, device=device)
-    steps = 4
-    expected_x, expected_s = x.cpu(), s.cpu()
-    twin = strong_rule("cpu", static=static)
-    for _ in range(steps):
-        z = oracle.perceive(expected_x, expected_s, 0.1, 0.1, moment_inverse="smooth")
-        update = twin(z)
-        moved = 0 if static else 2
-        delta = update[..., :moved]
-        reach = twin.alpha * 0.1
-        if not static:
-            expected_x = expected_x + reach * delta / (1.0 + delta.norm(dim=-1, keepdim=True))
-        expected_s = expected_s + update[..., moved:]
-    found_x, found_s = npa_envs.rollout(rule, x, s, steps, update_prob=1.0)
-    assert relative_error(found_x, expected_x) < 1e-11
-    assert relative_error(found_s, expected_s) < 1e-11
-    rule.moment_inverse = "threshold"
-    _, other = npa_envs.rollout(rule, x, s, steps, update_prob=1.0)
-    assert relative_error(other, expected_s) > 1e-6
-
-
-def test_gradients_of_a_static_rollout_are_those_of_one_that_sorts_in_every_step(device):
-    rule = strong_rule(device, moment_inverse="smooth", static=True)
-    x, s = random_world(2, 100, 2, 5, dtype=torch.float64, device=device)
-    answers = []
-    for detach_positions in (True, False):
-        t = s.clone().requires_grad_()
-        _, end = npa_envs.rollout(rule, x, t, 4, update_prob=1.0, detach_positions=detach_positions)
-        answers.append(torch.autograd.grad(end.square().sum(), [t, *rule.parameters()]))
-    for found, expected in zip(*answers, strict=True):
-        assert relative_error(found[None], expected[None]) < 1e-11
 
 
 def test_the_choice_is_saved_with_a_rule_and_files_without_it_mean_the_threshold(tmp_path):
@@ -74,13 +30,6 @@ def test_the_choice_is_saved_with_a_rule_and_files_without_it_mean_the_threshold
     path.write_bytes(path.read_bytes().replace(b'\\"smooth\\"', b'\\"smoosh\\"'))
     with pytest.raises(npa_envs.NPAError, match="got 'smoosh'"):
         npa_envs.load_rule(path)
-
-
-def test_species_must_agree(device):
-    x, s = random_world(1, 20, 2, 16, dtype=torch.float32, device=device)
-    rules = [npa_envs.NPARule(moment_inverse="smooth").to(device), npa_envs.NPARule().to(device)]
-    with pytest.raises(npa_envs.NPAError, match="moment_inverse"):
-        npa_envs.rollout_species(rules, x, s, 1, counts=(10, 10))
 
 
 def test_training_gives_its_rule_the_choice(tmp_path):
