@@ -141,82 +141,77 @@ def changed(row, column, value):
     return motions
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"world_to_camera": torch.eye(4)}, r"\[V, 4, 4\].*world_to_camera\[None\]"),
-        ({"world_to_camera": torch.zeros(2, 3, 4)}, r"got \(2, 3, 4\): reshape"),
-        ({"world_to_camera": torch.eye(4)[None].half()}, "must be a float32 or float64 tensor"),
-        ({"world_to_camera": [[1.0]]}, "must be a float32 or float64 tensor, got list"),
-        ({"world_to_camera": torch.zeros(2, 4, 4)}, "neither singular.*as camera 0"),
-        ({"world_to_camera": changed(2, 2, 0.0)}, "neither singular.*as camera 1"),
-        ({"world_to_camera": changed(0, 0, 1.1)}, "nor scaled.*as camera 1"),
-        ({"world_to_camera": changed(0, 0, -1.0)}, "nor mirrored.*as camera 1"),
-        ({"world_to_camera": changed(0, 3, math.nan)}, "rigid motions.*as camera 1"),
-        ({"world_to_camera": changed(3, 0, 0.5)}, "rigid motions.*as camera 1"),
-        ({"intrinsics": torch.tensor([0.0, 50.0, 20.0, 15.0])}, "positive focal lengths"),
-        ({"intrinsics": torch.tensor([50.0, -50.0, 20.0, 15.0])}, "turn a flipped axis round"),
-        ({"intrinsics": torch.tensor([[50.0, 50.0, 0.0, 0.0], [1.0, 1.0, math.inf, 0.0]])}, "a 1:"),
-        ({"intrinsics": torch.ones(3)}, r"in shape \[4\] or \[2, 4\] for .* got \(3,\)"),
-        ({"intrinsics": torch.ones(3, 4)}, r"got \(3, 4\)"),
-        ({"intrinsics": torch.ones(4).double()}, "must share dtype and device"),
-        ({"width": 0}, r"width must lie in \[1, 16384\] pixels, got 0"),
-        ({"height": 1 << 20}, "height must lie in"),
-        ({"height": 2.5}, "height must be an integer"),
-        ({"near": 0.0}, "near must be positive and finite"),
-        ({"near": math.nan}, "near must be positive and finite"),
-    ],
-)
-def test_bad_cameras_are_refused(change, message):
-    given = {
-        "world_to_camera": torch.eye(4)[None].repeat(2, 1, 1),
-        "intrinsics": torch.tensor([50.0, 50.0, 20.0, 15.0]),
-        **SIZE,
-    }
-    Cameras(**given)
-    with pytest.raises(NPAError, match=message):
-        Cameras(**{**given, **change})
+def made(**change):
+    motions = torch.eye(4)[None].repeat(2, 1, 1)
+    given = {"world_to_camera": motions, "intrinsics": torch.tensor([50.0, 50.0, 20.0, 15.0])}
+    return Cameras(**given | SIZE | change)
+
+
+def turned(count=3, **change):
+    return orbit(count, **SIZE | change)
+
+
+def looking(eyes=(2, 3), targets=(0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0)):
+    return look_at(torch.zeros(eyes), targets, up=up)
+
+
+def posed(poses):
+    return cameras_of_poses(poses, 0.7, **SIZE)
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("make", "change", "message"),
     [
-        ({"count": 0}, "count must be at least 1"),
-        ({"elevation": 90.0}, "elevation must lie between -90 and 90"),
-        ({"elevation": math.nan}, "elevation must be finite"),
-        ({"radius": 0.0}, "radius must be positive"),
-        ({"fov": 180.0}, "between 0 and 180 degrees, got 180"),
-        ({"fov": 0.0}, "between 0 and 180 degrees"),
-        ({"centre": (0.0, 0.0)}, "centre must be 3 numbers"),
+        (made, {"world_to_camera": torch.eye(4)}, r"\[V, 4, 4\].*world_to_camera\[None\]"),
+        (made, {"world_to_camera": torch.zeros(2, 3, 4)}, r"got \(2, 3, 4\): reshape"),
+        (
+            made,
+            {"world_to_camera": torch.eye(4)[None].half()},
+            "must be a float32 or float64 tensor",
+        ),
+        (made, {"world_to_camera": [[1.0]]}, "must be a float32 or float64 tensor, got list"),
+        (made, {"world_to_camera": torch.zeros(2, 4, 4)}, "neither singular.*as camera 0"),
+        (made, {"world_to_camera": changed(2, 2, 0.0)}, "neither singular.*as camera 1"),
+        (made, {"world_to_camera": changed(0, 0, 1.1)}, "nor scaled.*as camera 1"),
+        (made, {"world_to_camera": changed(0, 0, -1.0)}, "nor mirrored.*as camera 1"),
+        (made, {"world_to_camera": changed(0, 3, math.nan)}, "rigid motions.*as camera 1"),
+        (made, {"world_to_camera": changed(3, 0, 0.5)}, "rigid motions.*as camera 1"),
+        (made, {"intrinsics": torch.tensor([0.0, 50.0, 20.0, 15.0])}, "positive focal lengths"),
+        (
+            made,
+            {"intrinsics": torch.tensor([50.0, -50.0, 20.0, 15.0])},
+            "turn a flipped axis round",
+        ),
+        (
+            made,
+            {"intrinsics": torch.tensor([[50.0, 50.0, 0.0, 0.0], [1.0, 1.0, math.inf, 0.0]])},
+            "a 1:",
+        ),
+        (made, {"intrinsics": torch.ones(3)}, r"in shape \[4\] or \[2, 4\] for .* got \(3,\)"),
+        (made, {"intrinsics": torch.ones(3, 4)}, r"got \(3, 4\)"),
+        (made, {"intrinsics": torch.ones(4).double()}, "must share dtype and device"),
+        (made, {"width": 0}, r"width must lie in \[1, 16384\] pixels, got 0"),
+        (made, {"height": 1 << 20}, "height must lie in"),
+        (made, {"height": 2.5}, "height must be an integer"),
+        (made, {"near": 0.0}, "near must be positive and finite"),
+        (made, {"near": math.nan}, "near must be positive and finite"),
+        (turned, {"count": 0}, "count must be at least 1"),
+        (turned, {"elevation": 90.0}, "elevation must lie between -90 and 90"),
+        (turned, {"elevation": math.nan}, "elevation must be finite"),
+        (turned, {"radius": 0.0}, "radius must be positive"),
+        (turned, {"fov": 180.0}, "between 0 and 180 degrees, got 180"),
+        (turned, {"fov": 0.0}, "between 0 and 180 degrees"),
+        (turned, {"centre": (0.0, 0.0)}, "centre must be 3 numbers"),
+        (looking, {}, "another place than its own"),
+        (looking, {"eyes": (4,)}, r"eyes must be .* shape \[..., 3\]"),
+        (looking, {"targets": torch.zeros(3, 3)}, "targets must have shape"),
+        (looking, {"targets": (1.0, 0.0, 0.0), "up": (0.0, 1.0)}, "up must be 3 numbers"),
+        (looking, {"targets": (0.0, 3.0, 0.0)}, "choose another up"),
+        (posed, {"poses": torch.zeros(2, 3, 4)}, "camera_to_world must have shape"),
+        (posed, {"poses": 2.0 * torch.eye(4)[None]}, "rigid motions"),
     ],
 )
-def test_bad_turntables_are_refused(change, message):
+def test_what_is_no_camera_is_refused(make, change, message):
+    assert made().count == 2
     with pytest.raises(NPAError, match=message):
-        orbit(**{"count": 3, **SIZE, **change})
-
-
-@pytest.mark.parametrize(
-    ("eyes", "targets", "up", "message"),
-    [
-        ((2, 3), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), "another place than its own"),
-        ((4,), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), r"eyes must be .* shape \[..., 3\]"),
-        ((2, 3), torch.zeros(3, 3), (0.0, 1.0, 0.0), "targets must have shape"),
-        ((2, 3), (1.0, 0.0, 0.0), (0.0, 1.0), "up must be 3 numbers"),
-        ((2, 3), (0.0, 3.0, 0.0), (0.0, 1.0, 0.0), "choose another up"),
-    ],
-)
-def test_a_camera_must_look_somewhere_and_not_along_up(eyes, targets, up, message):
-    with pytest.raises(NPAError, match=message):
-        look_at(torch.zeros(eyes), targets, up=up)
-
-
-@pytest.mark.parametrize(
-    ("poses", "message"),
-    [
-        (torch.zeros(2, 3, 4), "camera_to_world must have shape"),
-        (2.0 * torch.eye(4)[None], "rigid motions"),
-    ],
-)
-def test_poses_of_wrong_shape_or_no_motion_are_refused(poses, message):
-    with pytest.raises(NPAError, match=message):
-        cameras_of_poses(poses, 0.7, **SIZE)
+        make(**change)

@@ -88,18 +88,6 @@ def test_periodic_picture_and_adjoints_equal_a_sum_over_images(dtype, options, d
         assert relative_error(value, answer) < PERIODIC_BOUND[dtype]
 
 
-@both_pictures
-def test_gradients_pass_gradcheck(draw, device):
-    x, colour = scattered(1, 11, torch.float64, device)
-    # Across the seam and outside.
-    places = [[-0.99, 0.97], [0.98, -0.31], [0.12, 0.23], [3.05, -2.96]]
-    x[0, :4] = torch.tensor(places, dtype=torch.float64)
-    assert torch.autograd.gradcheck(
-        lambda x, c: draw(x, c, resolution=12, pixel_size=0.2),
-        (x.requires_grad_(), colour.requires_grad_()),
-    )
-
-
 @pytest.mark.parametrize("pixel_size", [0.02, 0.09, 0.25])
 @pytest.mark.parametrize("resolution", [8, 13, 33, 38])
 def test_gathered_and_scattered_pictures_are_the_same(resolution, pixel_size, device):
@@ -151,17 +139,6 @@ def test_every_particle_has_the_area_of_a_target_pixel(draw, device):
     area = (24 * 0.11 / 2.0) ** 2
     expected = torch.cat((colour, torch.ones_like(colour[..., :1])), dim=-1).sum((0, 1)) * area
     torch.testing.assert_close(draw(x, colour, **OPTIONS).sum((0, 1, 2)), expected)
-
-
-def test_away_from_the_seam_it_is_the_open_picture(device):
-    x, colour = in_the_box(1, 50, torch.float64, device)
-    x = 0.5 * x
-    # The open picture's first and last pixels are centred on the window's edges.
-    half = 1.0 / 24
-    h = OPTIONS["pixel_size"] * 23 / 24
-    expected = splat(x, colour, **OPTIONS | {"pixel_size": h}, lo=-1.0 + half, hi=1.0 - half)
-    picture = periodic_splat(x, colour, **OPTIONS)
-    torch.testing.assert_close(picture, expected, rtol=1e-11, atol=1e-13)
 
 
 def test_rows_point_up_and_columns_right(device):
