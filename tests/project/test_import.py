@@ -1,10 +1,76 @@
 """Importing the package is cheap: it starts no device and pulls in no heavy extra."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
 
-UNWANTED = ("stable_baselines3", "matplotlib", "imageio", "tensorboard", "tyro", "yaml")
+import pytest
+
+PACKAGE = """
+import sys, torch
+
+def settings():
+    b = torch.backends
+    return (torch.get_default_dtype(), torch.get_num_threads(), torch.initial_seed(),
+            torch.is_grad_enabled(), b.cuda.matmul.allow_tf32, b.cudnn.benchmark)
+
+torch.manual_seed(5)
+before, state = settings(), torch.get_rng_state()
+import npa_envs
+print("names:", sorted(dir(npa_envs)) == sorted([*npa_envs.__all__, "__version__"]))
+import npa_envs.envs, npa_envs.envs.multi, npa_envs.render
+print("settings:", settings() == before, torch.equal(state, torch.get_rng_state()))
+unwanted = ("stable_baselines3", "matplotlib", "imageio", "imageio_ffmpeg", "tensorboard", "tyro",
+            "yaml", "pettingzoo")
+print("extras:", [name for name in unwanted if name in sys.modules])
+warp = sys.modules.get("warp")
+runtime = None if warp is None else sys.modules["warp._src.context"].runtime
+print("devices:", torch.cuda.is_initialized(), runtime)
+"""
+
+OLD_NAMES = """
+import warnings; warnings.simplefilter('ignore')
+import npa_envs.sph, npa_envs.tasks.task, npa_envs.ops, npa_envs.tasks.base
+print(npa_envs.sph is npa_envs.ops, npa_envs.tasks.task is npa_envs.tasks.base)
+try:
+    import npa_envs.sph.perceive
+except ModuleNotFoundError as error:
+    print(error)
+"""
+
+WITHOUT_EXTRAS = """
+import sys
+for name in ("stable_baselines3", "pettingzoo", "ray", "torchrl", "rsl_rl"):
+    sys.modules[name] = None
+from npa_envs.wrappers import *
+print("ParticleVecEnv" in globals(), DamageEvents.__name__, VectorSpeciesTags.__name__)
+import npa_envs.wrappers as wrappers
+from npa_envs.errors import MissingDependencyError
+print(issubclass(MissingDependencyError, ImportError))
+try:
+    wrappers.ParticleVecEnv
+except MissingDependencyError as error:
+    print(str(error).split(": ")[-1])
+try:
+    import npa_envs.envs.multispecies_v0
+except MissingDependencyError as error:
+    print(str(error).split(": ")[-1])
+"""
+
+PROGRAMS = {
+    "the package": (PACKAGE, "names: True\nsettings: True True\nextras: []\ndevices: False None\n"),
+    "old names": (
+        OLD_NAMES,
+        "True True\nno module npa_envs.sph.perceive: npa_envs.sph is now npa_envs.ops\n",
+    ),
+    "without extras": (
+        WITHOUT_EXTRAS,
+        "False DamageEvents VectorSpeciesTags\nTrue\n"
+        "pip install 'npa-envs[sb3]'\npip install 'npa-envs[envs]'\n",
+    ),
+}
+"""What runs in a process of its own, and what that prints."""
 
 
 def run(program: str) -> str:
@@ -14,51 +80,33 @@ def run(program: str) -> str:
     return done.stdout
 
 
-def test_import_prints_nothing_starts_no_device_and_leaves_heavy_libraries_alone() -> None:
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_a_fresh_process_imports_no_more_than_is_asked_for(name: str) -> None:
+    program, printed = PROGRAMS[name]
+    assert run(program) == printed
+
+
+@pytest.mark.parametrize("policy", [None, "active"])
+def test_wrappers_and_help_come_without_torch_whose_threads_wait_as_told(
+    policy: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Threads of OpenMP wait without a busy loop, unless somebody has said otherwise."""
+    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
+    if policy is not None:
+        monkeypatch.setenv("OMP_WAIT_POLICY", policy)
     program = (
-        "import sys, npa_envs\n"
-        f"print([m for m in {UNWANTED!r} if m in sys.modules])\n"
-        "import torch\n"
-        "warp = sys.modules.get('warp')\n"
-        "runtime = None if warp is None else sys.modules['warp._src.context'].runtime\n"
-        "print(torch.cuda.is_initialized(), runtime)"
+        "import os, sys, npa_envs.wrappers as wrappers\nfrom npa_envs.cli import main\n"
+        "main(['--help']), main(['--version'])\n"
+        "heavy = [m for m in ('torch', 'warp', 'tyro') if m in sys.modules]\n"
+        "print(heavy, os.environ['OMP_WAIT_POLICY'])\n"
+        "assert {*wrappers.__all__, 'ParticleVecEnv'} <= set(dir(wrappers))\n"
+        "if sys.argv[-1] == 'load':\n"
+        "    wrappers.DamageEvents, wrappers.TorchNormalizeReward\n"
+        "print('stable_baselines3' in sys.modules)"
     )
-    assert run(program) == "[]\nFalse None\n"
-
-
-def test_import_leaves_the_global_settings_of_torch_alone() -> None:
-    program = (
-        "import torch\n"
-        "def settings():\n"
-        "    b = torch.backends\n"
-        "    return (torch.get_default_dtype(), torch.get_num_threads(), torch.initial_seed(),\n"
-        "            torch.is_grad_enabled(), b.cuda.matmul.allow_tf32, b.cudnn.benchmark)\n"
-        "torch.manual_seed(5)\n"
-        "before, state = settings(), torch.get_rng_state()\n"
-        "import npa_envs\n"
-        "print(settings() == before, torch.equal(state, torch.get_rng_state()))"
-    )
-    assert run(program) == "True True\n"
-
-
-def test_old_names_are_the_new_modules_and_nothing_within_them_runs_a_second_time() -> None:
-    program = (
-        "import warnings; warnings.simplefilter('ignore')\n"
-        "import npa_envs.sph, npa_envs.tasks.task, npa_envs.ops, npa_envs.tasks.base\n"
-        "print(npa_envs.sph is npa_envs.ops, npa_envs.tasks.task is npa_envs.tasks.base)\n"
-        "try: import npa_envs.sph.perceive\n"
-        "except ModuleNotFoundError as error: print(error)\n"
-    )
-    refused = "no module npa_envs.sph.perceive: npa_envs.sph is now npa_envs.ops"
-    assert run(program) == f"True True\n{refused}\n"
-
-
-def test_the_package_shows_its_public_names_alone() -> None:
-    program = (
-        "import npa_envs\n"
-        "print(sorted(dir(npa_envs)) == sorted([*npa_envs.__all__, '__version__']))"
-    )
-    assert run(program) == "True\n"
+    words = [sys.executable, "-c", program, *(["load"] if policy is None else [])]
+    done = subprocess.run(words, capture_output=True, text=True, env=os.environ)
+    assert done.stdout.endswith(f"\n[] {policy or 'passive'}\nFalse\n"), done.stdout + done.stderr
 
 
 def test_folders_that_kernels_are_compiled_in_are_removed_without_a_warning() -> None:

@@ -37,23 +37,31 @@ def read_film(path: Path) -> list[np.ndarray]:
     return frames
 
 
-def test_empty_picture_is_all_background():
-    empty = torch.zeros(5, 5, 4)
-    assert (to_uint8(empty) == 255).all()
-    assert (to_uint8(empty, background="black") == 0).all()
-    assert (to_uint8(empty, background="#102030") == (16, 32, 48)).all()
-    assert (to_uint8(empty, background=(0.0, 0.5, 1.0)) == (0, 128, 255)).all()
+NAN, INFINITE = float("nan"), float("inf")
 
 
-def test_overlapping_particles_average_and_thin_ones_let_the_background_through():
-    picture = torch.zeros(1, 3, 4)
-    picture[0, 0] = torch.tensor([0.5, 0.0, 1.0, 1.0])
-    picture[0, 1] = torch.tensor([2.0, 0.0, 1.0, 4.0])
-    picture[0, 2] = torch.tensor([0.0, 0.25, 0.0, 0.25])
-    over_white = [[128, 0, 255], [128, 0, 64], [191, 255, 191]]
-    over_black = [[128, 0, 255], [128, 0, 64], [0, 64, 0]]
-    np.testing.assert_array_equal(to_uint8(picture)[0], over_white)
-    np.testing.assert_array_equal(to_uint8(picture, "black")[0], over_black)
+@pytest.mark.parametrize(
+    ("pixel", "background", "shown"),
+    [
+        # Nobody is there.
+        ((0.0, 0.0, 0.0, 0.0), "white", (255, 255, 255)),
+        ((0.0, 0.0, 0.0, 0.0), "black", (0, 0, 0)),
+        ((0.0, 0.0, 0.0, 0.0), "#102030", (16, 32, 48)),
+        ((0.0, 0.0, 0.0, 0.0), (0.0, 0.5, 1.0), (0, 128, 255)),
+        # Overlapping particles average, and thin ones let the background through.
+        ((0.5, 0.0, 1.0, 1.0), "white", (128, 0, 255)),
+        ((2.0, 0.0, 1.0, 4.0), "white", (128, 0, 64)),
+        ((0.0, 0.25, 0.0, 0.25), "white", (191, 255, 191)),
+        ((0.0, 0.25, 0.0, 0.25), "black", (0, 64, 0)),
+        # Colours are clipped; what is not finite is not there.
+        ((9.0, -9.0, 0.5, 1.0), "black", (255, 0, 128)),
+        ((NAN, 0.0, 0.0, 1.0), "black", (0, 0, 0)),
+        ((0.0, 0.0, 0.0, INFINITE), "black", (0, 0, 0)),
+    ],
+)
+def test_a_pixel_is_shown_over_its_background(pixel, background, shown):
+    picture = torch.tensor(pixel, dtype=torch.float64).expand(3, 3, 4).clone().requires_grad_()
+    assert (to_uint8(picture, background) == shown).all()
 
 
 def test_first_row_of_the_shown_picture_is_the_highest_y():
@@ -62,20 +70,6 @@ def test_first_row_of_the_shown_picture_is_the_highest_y():
     expected = np.full((2, 4, 4, 3), 255)
     expected[1, 3, 2] = (255, 0, 0)
     np.testing.assert_array_equal(to_uint8(picture), expected)
-
-
-def test_colours_outside_their_range_are_clipped_and_nonfinite_ones_shown_as_background():
-    picture = torch.zeros(1, 3, 4)
-    picture[0, 0] = torch.tensor([9.0, -9.0, 0.5, 1.0])
-    picture[0, 1] = torch.tensor([float("nan"), 0.0, 0.0, 1.0])
-    picture[0, 2] = torch.tensor([0.0, 0.0, 0.0, float("inf")])
-    shown = to_uint8(picture, "black")
-    np.testing.assert_array_equal(shown[0], [[255, 0, 128], [0, 0, 0], [0, 0, 0]])
-
-
-def test_picture_that_requires_grad_is_shown():
-    picture = torch.ones(2, 2, 4, dtype=torch.float64, requires_grad=True)
-    assert (to_uint8(picture) == 255).all()
 
 
 @pytest.mark.parametrize(
@@ -259,24 +253,27 @@ from npa_envs.errors import NPAError
 from npa_envs.render import film
 noise = np.random.default_rng(0).integers(0, 256, (6, 128, 128, 3), dtype=np.uint8)
 resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
-try:
-    getattr(film, sys.argv[1])(sys.argv[2], noise)
-except NPAError as error:
-    print("refused:", error)
+for writer, path in zip(sys.argv[1::2], sys.argv[2::2]):
+    try:
+        getattr(film, writer)(path, noise)
+    except NPAError as error:
+        print("refused:", error)
 """
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a limit on the size of files")
-@EVERY_WRITER
-def test_disk_that_fills_up_is_a_clear_error_and_keeps_the_old_file(tmp_path, writer, name):
-    path = tmp_path / name
-    path.write_bytes(b"old")
-    program = [sys.executable, "-c", FILE_SIZE_LIMIT, writer.__name__, str(path)]
+def test_disk_that_fills_up_is_a_clear_error_and_keeps_the_old_file(tmp_path):
+    words = [word for writer, name in WRITERS for word in (writer.__name__, str(tmp_path / name))]
+    for path in words[1::2]:
+        Path(path).write_bytes(b"old")
+    program = [sys.executable, "-c", FILE_SIZE_LIMIT, *words]
     done = subprocess.run(program, capture_output=True, text=True, timeout=120, check=False)
-    assert "refused: cannot write" in done.stdout, done.stderr
-    assert str(path) in done.stdout
-    assert path.read_bytes() == b"old"
-    assert os.listdir(tmp_path) == [path.name]
+    _, *told = done.stdout.split("refused: ")
+    assert len(told) == len(WRITERS), done.stderr
+    for text, path in zip(told, words[1::2], strict=True):
+        assert text.startswith(f"cannot write '{path}'")
+        assert Path(path).read_bytes() == b"old"
+    assert sorted(os.listdir(tmp_path)) == sorted(name for _, name in WRITERS)
 
 
 def test_write_error_of_the_system_names_the_path(tmp_path, monkeypatch):
@@ -294,14 +291,3 @@ def test_mp4_without_ffmpeg_names_the_pip_command(tmp_path, monkeypatch):
     with pytest.raises(MissingDependencyError, match=r"pip install 'imageio\[ffmpeg\]'"):
         write_mp4(tmp_path / "film.mp4", film())
     assert list(tmp_path.iterdir()) == []
-
-
-def test_importing_render_loads_neither_matplotlib_nor_imageio():
-    program = (
-        "import sys, npa_envs.render\n"
-        "print([m for m in ('matplotlib', 'imageio', 'imageio_ffmpeg') if m in sys.modules])"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True
-    )
-    assert done.stdout.strip() == "[]"

@@ -1,7 +1,5 @@
 """Rows of Stable-Baselines3: particles, worlds and particles of species; SuperSuit's as well."""
 
-import subprocess
-import sys
 import warnings
 
 import gymnasium as gym
@@ -472,48 +470,6 @@ def test_supersuit_trains_on_particles(one_thread):
     assert model.num_timesteps == 768
     after = model.policy.parameters()
     assert any(not torch.equal(a, b) for a, b in zip(before, after, strict=True))
-
-
-# Names that are imported when they are asked for
-
-EXTRAS = ("stable_baselines3", "pettingzoo", "ray", "torchrl", "rsl_rl")
-WITHOUT_EXTRAS = "".join(f"sys.modules[{name!r}] = None\n" for name in EXTRAS)
-
-
-@pytest.mark.parametrize(
-    ("code", "printed"),
-    [
-        (
-            "import npa_envs.wrappers as wrappers\n"
-            "assert 'torch' not in sys.modules\n"
-            "wrappers.DamageEvents, wrappers.TorchNormalizeReward\n"
-            "assert 'stable_baselines3' not in sys.modules\n"
-            "assert {*wrappers.__all__, 'ParticleVecEnv'} <= set(dir(wrappers))\n",
-            "",
-        ),
-        (
-            WITHOUT_EXTRAS + "from npa_envs.wrappers import *\n"
-            "assert 'ParticleVecEnv' not in globals()\n"
-            "print(DamageEvents.__name__, VectorSpeciesTags.__name__)\n",
-            "DamageEvents VectorSpeciesTags",
-        ),
-        (
-            WITHOUT_EXTRAS + "import npa_envs.wrappers as wrappers\n"
-            "from npa_envs.errors import MissingDependencyError\n"
-            "assert issubclass(MissingDependencyError, ImportError)\n"
-            "try:\n    wrappers.ParticleVecEnv\n"
-            "except MissingDependencyError as error:\n    print(error)\n",
-            "pip install 'npa-envs[sb3]'",
-        ),
-    ],
-    ids=["no trainer", "star", "missing"],
-)
-def test_a_wrapper_is_imported_when_it_is_asked_for(code, printed):
-    done = subprocess.run(
-        [sys.executable, "-c", "import sys\n" + code], capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
-    assert printed in done.stdout
 
 
 def test_an_unknown_wrapper_is_an_attribute_error():
