@@ -130,7 +130,7 @@ def test_rllib_trains_one_policy_on_the_particles_of_worlds_of_one_species(runne
 
 
 def test_rllib_rows_need_a_known_id_and_right_keywords():
-    pytest.importorskip("ray")
+    pytest.importorskip("ray.rllib")
     from npa_envs.wrappers.rllib import rllib_rows_config
 
     with pytest.raises(

@@ -29,18 +29,40 @@ def test_statistics_of_episodes_under_a_time_limit(id):
     assert episode["r"] == pytest.approx(sum(step[1] for step in steps), abs=1e-6)
 
 
-def test_clip_and_rescale_action():
-    plain = single()
-    clipped = wrappers.ClipAction(single())
-    rescaled = wrappers.RescaleAction(single(), np.float32(0.0), np.float32(1.0))
-    for env in (plain, clipped, rescaled):
-        env.reset(seed=0)
-    action = actions(0)
-    expected, *_ = plain.step(action)
-    np.testing.assert_allclose(rescaled.step((action + 1) / 2)[0], expected, atol=1e-4)
-    expected, *_ = plain.step(np.clip(3 * action, -1, 1))
-    clipped.step(action)
-    np.testing.assert_array_equal(clipped.step(3 * action)[0], expected)
+ROW = spaces.Box(-1.0, 1.0, (64 * ACTIONS,))
+BINS = np.arange(64 * ACTIONS) % 5
+ACTION = actions(0)
+
+
+@pytest.mark.parametrize(
+    ("wrap", "given", "expected"),
+    [
+        (wrappers.ClipAction, 3 * ACTION, np.clip(3 * ACTION, -1, 1)),
+        (
+            lambda env: wrappers.RescaleAction(env, np.float32(0.0), np.float32(1.0)),
+            (ACTION + 1) / 2,
+            ACTION,
+        ),
+        # The middles of five bins of [-1, 1].
+        (
+            lambda env: wrappers.DiscretizeAction(env, bins=5, multidiscrete=True),
+            BINS,
+            (0.4 * BINS - 0.8).astype(np.float32).reshape(64, ACTIONS),
+        ),
+        # In one row, as RLlib takes them.
+        (
+            lambda env: wrappers.TransformAction(env, lambda a: a.reshape(64, ACTIONS), ROW),
+            ACTION.ravel(),
+            ACTION,
+        ),
+    ],
+    ids=["clipped", "rescaled", "numbers of bins", "one row"],
+)
+def test_actions_of_other_forms(wrap, given, expected):
+    env, plain = wrap(single()), single()
+    env.reset(seed=0)
+    plain.reset(seed=0)
+    np.testing.assert_allclose(env.step(given)[0], plain.step(expected)[0], atol=1e-4)
 
 
 def test_flatten_observation_and_normalize_reward():
@@ -56,27 +78,6 @@ def test_flatten_observation_and_normalize_reward():
         np.testing.assert_array_equal(observation, expected.reshape(-1))
     scale = np.sqrt(env.return_rms.var + env.epsilon)
     assert reward == pytest.approx(unscaled / scale, rel=1e-6)
-
-
-def test_actions_as_numbers_of_bins():
-    env, plain = wrappers.DiscretizeAction(single(), bins=5, multidiscrete=True), single()
-    env.reset(seed=0)
-    plain.reset(seed=0)
-    chosen = np.arange(64 * ACTIONS) % 5
-    # The middles of five bins of [-1, 1].
-    expected, *_ = plain.step((0.4 * chosen - 0.8).astype(np.float32).reshape(64, ACTIONS))
-    np.testing.assert_allclose(env.step(chosen)[0], expected, atol=1e-5)
-
-
-def test_actions_in_one_row_as_rllib_takes_them():
-    plain = single()
-    shape = plain.action_space.shape
-    flat = spaces.Box(-1.0, 1.0, (np.prod(shape),))
-    env = wrappers.TransformAction(single(), lambda action: action.reshape(shape), flat)
-    env.reset(seed=0)
-    plain.reset(seed=0)
-    expected, *_ = plain.step(actions(0))
-    np.testing.assert_array_equal(env.step(actions(0).ravel())[0], expected)
 
 
 @pytest.mark.parametrize("output", ["numpy", "torch"])
