@@ -195,17 +195,6 @@ def particles(problem, envs):
     return state[..., :2], state[..., 2:-1]
 
 
-def test_species_follow_rules_of_their_own():
-    problem = species(particle_counts=(20, 15))
-    rules, envs = wild_rules(problem), problem.make_envs()
-    observation, _ = envs.reset(seed=0)
-    together = rules.policy()(observation)
-    for rule, span in zip(rules, problem.new_rules(0).spans, strict=True):
-        alone = RulePolicy(rule)(observation[:, span])
-        assert torch.equal(together[:, span], alone)
-    assert not torch.equal(*[RulePolicy(rule)(observation) for rule in rules])
-
-
 def test_rules_that_tell_species_apart_may_perceive_less_besides():
     problem = species(perception="per_species")
     envs = problem.make_envs()
