@@ -130,16 +130,9 @@ def test_erased_disk_blanks_states_of_the_grown_world(monkeypatch):
 @pytest.mark.parametrize(
     ("measured", "options", "rule"),
     [
-        (evaluate, {"checkpoints": []}, "checkpoints must be whole numbers of at least 1"),
-        (
-            evaluate,
-            {"checkpoints": [5, 5]},
-            "checkpoints must be whole numbers of at least 1",
-        ),
-        (
-            evaluate,
-            {"checkpoints": [0, 5]},
-            "checkpoints must be whole numbers of at least 1",
+        *(
+            (evaluate, {"checkpoints": steps}, "checkpoints must be whole numbers of at least 1")
+            for steps in ([], [5, 5], [0, 5])
         ),
         (evaluate, {"seeds": []}, "seeds must hold at least one number"),
         *((healing, {name: 0}, name) for name in ("grow_steps", "heal_steps", "every")),

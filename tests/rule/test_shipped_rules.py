@@ -72,7 +72,15 @@ def test_the_classifier_is_right():
     assert row["particle"] >= 0.96
 
 
-@pytest.mark.parametrize("name", sorted(RULES.keys() - named("point_classification")))
+GROWING = [
+    pytest.param(name, marks=() if name == named(task)[0] else pytest.mark.slow)
+    for task in ("morphogenesis2d", "texture", "morphogenesis3d")
+    for name in named(task)
+]
+"""Rules of which the first of each task is quick to run."""
+
+
+@pytest.mark.parametrize("name", GROWING)
 def test_a_world_grows_as_measured(name, device):
     rule = npa_envs.load_rule(name, device=device)
     trained = task_of_rule(name, rule, device)
