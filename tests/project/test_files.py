@@ -105,13 +105,8 @@ def _fail_with(number: int) -> Any:
     ],
 )
 def test_what_the_system_refuses_is_said_and_keeps_the_old_file(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    place: Any,
-    name: str,
-    number: int,
-    message: str,
-) -> None:
+    tmp_path, monkeypatch, place, name, number, message
+):
     target = tmp_path / "a.bin"
     target.write_bytes(b"old")
     monkeypatch.setattr(place, name, _fail_with(number))
