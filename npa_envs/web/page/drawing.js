@@ -73,6 +73,21 @@ export class Camera {
     }
   }
 
+  // Show all positions, but for strays.
+  fit(positions) {
+    const { dimension } = this, count = positions.length / dimension;
+    if (!count) return;
+    let far = 0;
+    for (let d = 0; d < dimension; d++) {
+      const along = Float32Array.from({ length: count }, (_, k) => positions[dimension * k + d]).sort();
+      const low = along[Math.floor(0.01 * count)], high = along[Math.ceil(0.99 * count) - 1];
+      this.centre[d] = (low + high) / 2;
+      far = Math.max(far, (high - low) / 2);
+    }
+    this.zoom = 1;
+    this.magnify(this.halfWidth / (1.15 * far || 1));
+  }
+
   magnify(factor) {
     this.zoom = Math.min(20, Math.max(0.3, this.zoom * factor));
   }
@@ -447,9 +462,9 @@ function projected({ positions, dimension, camera }, offset, width, height) {
   return places;
 }
 
-// Adds soft spots: sums of colours and of weights.
+// Adds soft spots: sums of colours and of weights. They end round, where they are faint.
 function addSpots(sums, width, height, places, colours, spot) {
-  const reach = 2.4 * spot, fall = -0.5 / (spot * spot);
+  const reach = 2.4 * spot, fall = -0.5 / (spot * spot), faint = Math.exp(-0.5 * 2.4 ** 2);
   const weights = new Float32Array(2 * Math.ceil(reach) + 2);
   for (let k = 0; k < places.length / 4; k++) {
     const column = places[4 * k], row = places[4 * k + 1];
@@ -460,7 +475,8 @@ function addSpots(sums, width, height, places, colours, spot) {
     for (let y = top; y <= end; y++) {
       const share = Math.exp(fall * (y - row) ** 2);
       for (let x = left, p = 4 * (y * width + left); x <= last; x++, p += 4) {
-        const weight = share * weights[x - left];
+        const weight = share * weights[x - left] - faint;
+        if (weight <= 0) continue;
         sums[p] += weight * red;
         sums[p + 1] += weight * green;
         sums[p + 2] += weight * blue;

@@ -61,7 +61,7 @@ const BLANK = {
 };
 
 const TOOLS = {
-  look: ["Look: drag to move, wheel or pinch to zoom", "M12 5v14M5 12h14M12 5l-2 2M12 5l2 2M12 19l-2-2M12 19l2-2M5 12l2-2M5 12l2 2M19 12l-2-2M19 12l-2 2"],
+  look: ["Look: drag to move, wheel or pinch to zoom, double click to see all", "M12 5v14M5 12h14M12 5l-2 2M12 5l2 2M12 19l-2-2M12 19l2-2M5 12l2-2M5 12l2 2M19 12l-2-2M19 12l-2 2"],
   erase: ["Erase", "M4 15l8-9 7 6-7 8H8zM9 20h11"],
   push: ["Pull with the pointer", "M12 20c-4 0-6-3-7-7 2-1 3 0 4 2V6a1.4 1.4 0 0 1 3 0v5a1.4 1.4 0 0 1 3 0v1a1.4 1.4 0 0 1 3 0v3c0 3-2 5-6 5z"],
   clump: ["Clump", "M4 4l5 5M20 4l-5 5M4 20l5-5M20 20l-5-5M9 6v3H6M15 6v3h3M9 18v-3H6M15 18v-3h3"],
@@ -346,7 +346,7 @@ class Page {
     const tools = [...$("tools").children];
     const acts = {
       " ": () => this.play(!this.world.playing), s: () => $("one").click(), r: () => $("reset").click(),
-      p: () => $("fold").click(),
+      p: () => $("fold").click(), f: () => this.fit(),
     };
     const act = acts[event.key] ?? tools[+event.key - 1]?.onclick;
     if (!act || (event.key === " " && event.target.matches("button, summary"))) return;
@@ -362,6 +362,7 @@ class Page {
     canvas.onpointermove = (event) => this.move(event);
     canvas.onpointerup = canvas.onpointercancel = (event) => this.release(event);
     canvas.onpointerleave = () => { if (!this.pointers.size) $("cursor").hidden = true; };
+    canvas.ondblclick = () => { if (this.tool === "look") this.fit(); };
     canvas.oncontextmenu = (event) => event.preventDefault();
     canvas.addEventListener("wheel", (event) => {
       event.preventDefault();
@@ -369,6 +370,12 @@ class Page {
       this.dirty = true;
     }, { passive: false });
     new ResizeObserver(() => (this.dirty = true)).observe(canvas);
+  }
+
+  // All of the world, wherever it has gone.
+  fit() {
+    if (this.frame) this.camera.fit(this.frame.positions);
+    this.dirty = true;
   }
 
   place(event) {
