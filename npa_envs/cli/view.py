@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import sys
 import webbrowser
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -73,24 +75,33 @@ def main(arguments: Sequence[str]) -> int:
 
     device = check_device(options.device)
     make_world = world_maker(options, device)
-    # Made once before the server starts: what is wrong with it is said here.
-    make_world().close()
     site = make_site(
         make_world,
         films=writable_folder(options.out),
         host=options.host,
         one_at_a_time=device.type == "cuda",
     )
-    with (
-        contextlib.closing(open_port(options.host, options.port)) as listener,
-        torch_threads(options.threads),
-    ):
+    listener = open_port(options.host, options.port)
+    with contextlib.closing(listener), torch_threads(options.threads):
+        # Made once before the server starts: what is wrong with it is said here.
+        make_world().close()
         address = address_of(site, listener)
         print(f"{options.what}: {address}  (Ctrl-C ends it)", flush=True)
-        if options.browser and not webbrowser.open(address):
-            print("no browser was found: open the link above", flush=True)
+        if options.browser and not open_browser(address):
+            print("no browser was found here: open the link in yours", flush=True)
         serve(site, listener)
     return 0
+
+
+def open_browser(address: str) -> bool:
+    """Open a page in the user's browser; return whether there is one.
+
+    Where there is no screen, a browser for the terminal would take the terminal.
+    """
+    screens = ("DISPLAY", "WAYLAND_DISPLAY")
+    if sys.platform.startswith("linux") and not any(map(os.environ.get, screens)):
+        return False
+    return webbrowser.open(address)
 
 
 def world_maker(options: ViewOptions, device: torch.device) -> Callable[[], LiveWorld]:

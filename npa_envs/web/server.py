@@ -67,8 +67,8 @@ LARGEST_MESSAGE = 2**20
 MESSAGES_KEPT = 256
 """Messages that wait for a world, at most: more are refused until it has read them."""
 
-MOST_PICTURES = 1500
-"""Pictures of a film: a minute, at most."""
+MOST_PICTURES = 500
+"""Pictures of a film, 20 seconds, at most: each takes a megabyte while it is written."""
 
 FILM_RATE = 25.0
 """Pictures a second of a film."""
@@ -390,11 +390,14 @@ class Session:
         if action == "start":
             self._film = Film()
         elif action == "stop" and self._film is not None:
-            film, self._film = self._film, None
-            # The world goes on meanwhile.
-            threading.Thread(target=self._write_film, args=(film,), daemon=True).start()
+            self._end_film()
         else:
             raise NPAError(f"a film's action must be 'start', then 'stop', got {shown(action)}")
+
+    def _end_film(self) -> None:
+        film, self._film = self._film, None
+        # The world goes on meanwhile.
+        threading.Thread(target=self._write_film, args=(film,), daemon=True).start()
 
     def _write_film(self, film: Film) -> None:
         try:
@@ -407,8 +410,11 @@ class Session:
             self._tell({"type": "file", "name": path.name, "url": f"films/{path.name}{token}"})
 
     def _add_picture(self, data: bytes) -> None:
+        # Pictures that were on the way when the film ended are left out.
         if self._film is not None:
             self._film.add(data)
+            if self._film.is_full:
+                self._end_film()
 
 
 class Film:
@@ -417,14 +423,17 @@ class Film:
     def __init__(self) -> None:
         self._pictures: list[bytes] = []
 
+    @property
+    def is_full(self) -> bool:
+        """Whether it has as many pictures as it may have."""
+        return len(self._pictures) >= MOST_PICTURES
+
     def add(self, data: bytes) -> None:
-        """Add a picture, a JPEG file; those after the first `MOST_PICTURES` are left out.
+        """Add a picture, a JPEG file.
 
         Raises:
             NPAError: It is no picture, or too large.
         """
-        if len(self._pictures) >= MOST_PICTURES:
-            return
         try:
             with Image.open(io.BytesIO(data), formats=["JPEG"]) as picture:
                 size = picture.size

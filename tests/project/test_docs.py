@@ -281,6 +281,12 @@ def test_the_code_about_ppo_runs(capsys):
     assert [line.split(":")[0] for line in told] == [form for form in forms for _ in range(3)]
 
 
+def test_the_code_about_the_viewer_runs(capsys):
+    (block,) = code_blocks(DOCS / "view.md")
+    exec(compile(block, "view.md", "exec"), {})
+    assert capsys.readouterr().out == "(256, 2)\n"
+
+
 def test_the_code_of_the_readme_runs():
     operators, environments, species = code_blocks(ROOT / "README.md")
     names = {}

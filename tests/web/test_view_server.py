@@ -345,6 +345,22 @@ def test_a_recording_is_a_film(client, site):
         assert film.size == (32, 24)
 
 
+def test_a_film_that_is_long_enough_ends_by_itself(client, site, monkeypatch):
+    monkeypatch.setattr(server, "MOST_PICTURES", 3)
+    with meet(client) as reader:
+        reader.receive_json()
+        reader.send_json({"type": "film", "action": "start"})
+        for _ in range(5):
+            reader.send_bytes(jpeg())
+        while True:
+            message = reader.receive()
+            if json.loads(message.get("text", "{}")).get("type") == "file":
+                break
+    (film,) = site.films.glob("*.gif")
+    with Image.open(film) as frames:
+        assert frames.info["duration"] * getattr(frames, "n_frames", 1) <= 120
+
+
 @pytest.mark.parametrize(
     ("pictures", "error"),
     [

@@ -141,7 +141,11 @@ class Page {
       this.fresh = true;
     } else if (event.type === "world") this.meet(event);
     else if (event.type === "curve") this.curve(event);
-    else if (event.type === "file") this.offer(event.name, event.url);
+    else if (event.type === "file") {
+      // Also one that was ended because it is long enough.
+      if (this.recording?.picture) this.showRecording((this.recording = null));
+      this.offer(event.name, event.url);
+    }
     else if (event.type === "error") this.complain(event.message);
   }
 
@@ -555,8 +559,7 @@ class Page {
 
   // An engine that makes films gets pictures; else the browser records the canvas.
   record(on) {
-    $("record").setAttribute("aria-pressed", String(on));
-    $("record").textContent = on ? "Stop" : "Record";
+    this.showRecording(on);
     if (!on) {
       this.recording.stop();
       this.recording = null;
@@ -566,6 +569,11 @@ class Page {
       this.send({ type: "film", action: "start" });
       this.dirty = true;
     } else this.recording = recorder(this.canvas, (name, url) => this.offer(name, url));
+  }
+
+  showRecording(on) {
+    $("record").setAttribute("aria-pressed", String(Boolean(on)));
+    $("record").textContent = on ? "Stop" : "Record";
   }
 
   film() {

@@ -1,0 +1,86 @@
+"""The command `npa-envs view`: what it shows, what it prints, what it refuses."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from npa_envs import NPAError, load_rule, save_rule
+from npa_envs.cli import main
+from npa_envs.cli import view as command
+from npa_envs.cli.view import ViewOptions, open_browser, world_maker
+from npa_envs.web.environment_world import EnvironmentWorld
+from npa_envs.web.rule_world import RuleWorld, RunWorld
+
+pytest.importorskip("uvicorn")
+
+from npa_envs.web import server
+
+CPU = torch.device("cpu")
+
+
+def make(what, **options):
+    world = world_maker(ViewOptions(what=str(what), particle_count=64, **options), CPU)()
+    world.close()
+    return world
+
+
+def test_a_rule_a_run_and_an_environment_are_told_apart(tmp_path):
+    save_rule(load_rule("gecko"), tmp_path / "rule.safetensors")
+    assert type(make("heart")) is RuleWorld
+    # A folder with nothing but a rule is that rule.
+    assert type(make(tmp_path)) is RuleWorld
+    (tmp_path / "config.json").write_text("{}")
+    assert type(make(tmp_path)) is RunWorld
+    assert type(make("npa/Morphogenesis2D-v0", policy="heart")) is EnvironmentWorld
+
+
+@pytest.mark.parametrize(
+    ("words", "error"),
+    [
+        (["worm"], "unknown rule 'worm'"),
+        (["npa/Worm-v0"], "unknown environment 'npa/Worm-v0'"),
+        (["gecko", "--policy", "random"], "policy is for environments"),
+        (["gecko", "--threads", "0"], "threads must be in [1, 256], got 0"),
+        (["gecko", "--port", "-1"], "port must be in [0, 65535], got -1"),
+        (["gecko", "--host", "nowhere.invalid"], "host must be an address of this computer"),
+        (["gecko", "--device", "tpu"], "device must name a device"),
+        (["gecko", "--seed", "-1"], "seed must be a whole number"),
+    ],
+)
+def test_what_is_wrong_is_said_before_anything_is_served(words, error, capsys, tmp_path):
+    port = [] if "--port" in words else ["--port", "0"]
+    assert main(["view", *words, "--no-browser", *port, "--out", str(tmp_path)]) == 2
+    assert error in capsys.readouterr().err
+
+
+def test_an_unfinished_run_is_refused(tmp_path):
+    (tmp_path / "log.jsonl").write_text("")
+    with pytest.raises(NPAError, match="has not written its rule"):
+        make(tmp_path)
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0"])
+def test_the_link_is_printed_and_opened(host, capsys, monkeypatch, tmp_path):
+    served, opened = [], []
+    monkeypatch.setattr(server, "serve", lambda site, listener: served.append(site))
+    monkeypatch.setattr(command, "open_browser", lambda address: opened.append(address) or False)
+    words = ["view", "gecko", "--particle-count", "64", "--host", host, "--port", "0"]
+    assert main([*words, "--out", str(tmp_path)]) == 0
+    told = capsys.readouterr().out
+    assert opened[0] in told
+    assert "no browser was found here: open the link in yours" in told
+    (site,) = served
+    assert ("?token=" in opened[0]) == (host == "0.0.0.0")
+    assert site.token is None or opened[0].endswith(site.token)
+
+
+def test_no_browser_of_the_terminal_is_opened(monkeypatch):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(command.sys, "platform", "linux")
+    monkeypatch.setattr(command.webbrowser, "open", lambda address: pytest.fail("opened"))
+    assert not open_browser("http://127.0.0.1:1/")
+    monkeypatch.setenv("DISPLAY", ":0")
+    monkeypatch.setattr(command.webbrowser, "open", lambda address: True)
+    assert open_browser("http://127.0.0.1:1/")
