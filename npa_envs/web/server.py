@@ -65,7 +65,7 @@ LARGEST_MESSAGE = 2**20
 """Bytes of what a page sends at once, at most."""
 
 MESSAGES_KEPT = 256
-"""Messages that wait for a world, at most: more are refused until it has read them."""
+"""Messages that wait for a world, or for a page, at most: more are refused until it reads them."""
 
 MOST_PICTURES = 500
 """Pictures of a film, 20 seconds, at most: each takes a megabyte while it is written."""
@@ -256,7 +256,7 @@ class Session:
         self._site, self._reader, self._loop = site, reader, loop
         self._inbox: queue.Queue[dict[str, Any] | bytes] = queue.Queue(MESSAGES_KEPT)
         self._outbox: asyncio.Queue[bytes | str | None] = asyncio.Queue()
-        self._room = threading.Semaphore(FRAMES_AHEAD)
+        self._room = threading.BoundedSemaphore(FRAMES_AHEAD)
         self._stopped = threading.Event()
         self._film: Film | None = None
 
@@ -273,7 +273,7 @@ class Session:
     def stop(self) -> None:
         """Let the world end after what it is doing."""
         self._stopped.set()
-        self._room.release()
+        self._give_room()
         self._post(None)
 
     async def _read(self) -> None:
@@ -286,7 +286,7 @@ class Session:
             if isinstance(message, str):
                 self._tell({"type": "error", "message": message})
             elif isinstance(message, dict) and message.get("type") == "drawn":
-                self._room.release()
+                self._give_room()
             else:
                 self._keep(message)
 
@@ -306,12 +306,21 @@ class Session:
             except (WebSocketDisconnect, RuntimeError):
                 return
 
+    def _give_room(self) -> None:
+        with contextlib.suppress(ValueError):  # A page that says more than it has drawn.
+            self._room.release()
+
     def _tell(self, event: Mapping[str, Any]) -> None:
         self._post(json.dumps(event))
 
     def _post(self, data: bytes | str | None) -> None:
         with contextlib.suppress(RuntimeError):  # The loop has ended.
-            self._loop.call_soon_threadsafe(self._outbox.put_nowait, data)
+            self._loop.call_soon_threadsafe(self._put, data)
+
+    def _put(self, data: bytes | str | None) -> None:
+        # A page that does not read is told no more; the end always.
+        if data is None or self._outbox.qsize() < MESSAGES_KEPT:
+            self._outbox.put_nowait(data)
 
     # In the world's own thread.
 
@@ -324,6 +333,10 @@ class Session:
             return
         try:
             self._go_on(world)
+        except Exception as error:
+            # A mistake of ours, or a device that has failed: told here, and raised for the log.
+            self._tell({"type": "error", "message": f"the world has ended: {shown(error)}"})
+            raise
         finally:
             world.close()
 
@@ -355,7 +368,7 @@ class Session:
                 self._post(frame_bytes(frame))
             except NPAError as error:
                 world.playing = False
-                self._room.release()
+                self._give_room()
                 self._tell({"type": "error", "message": f"{error}; the world is paused"})
                 self._tell(world.describe())
             changed = False

@@ -275,6 +275,31 @@ def test_a_world_that_cannot_be_made_says_why(tmp_path):
         assert next_error(reader) == "no such rule"
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_world_that_breaks_says_so(tmp_path):
+    class Broken(Counter):
+        def advance(self):
+            raise RuntimeError("out of memory")
+
+    site = server.make_site(Broken, films=tmp_path)
+    client = testclient.TestClient(server.make_app(site), base_url=HERE)
+    with meet(client) as reader:
+        reader.receive_json()
+        assert next_error(reader) == "the world has ended: out of memory"
+
+
+def test_a_page_that_says_it_has_drawn_more_gets_no_more_ahead(client, worlds):
+    with meet(client) as reader:
+        reader.receive_json()
+        for _ in range(50):
+            reader.send_json({"type": "drawn"})
+        time.sleep(0.3)
+        frames = worlds[0].step
+        time.sleep(0.2)
+        assert worlds[0].step == frames
+        assert frames < 50
+
+
 def test_each_reader_has_a_world_and_there_is_room_for_some(client, worlds):
     readers = [meet(client) for _ in range(server.MOST_SESSIONS)]
     for reader in readers:
