@@ -146,9 +146,9 @@ class Page:
 
 
 @contextlib.contextmanager
-def browser(folder: Path) -> Iterator[Callable[[], Page]]:
+def browser(folder: Path, *flags: str) -> Iterator[Callable[[], Page]]:
     """Run a Chromium with its profile in a folder; gives a function that returns a new page."""
-    command = [chromium(), *FLAGS, f"--user-data-dir={folder}", "about:blank"]
+    command = [chromium(), *FLAGS, *flags, f"--user-data-dir={folder}", "about:blank"]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
         try:
             told = folder / "DevToolsActivePort"

@@ -44,18 +44,18 @@ const acts = {
   },
 
   // A live world: what it sends on messages and on going on.
-  live({ settings, script }) {
+  async live({ settings, script }) {
     const events = [];
     const errors = [];
     const live = new LiveWorld(settings, (event) => events.push(event));
     for (const message of script) {
       if (message.type === "advance") {
-        live.advance();
+        await live.advance();
         live.onTheWay = 0;
         continue;
       }
       try {
-        live.receive(message);
+        await live.receive(message);
       } catch (error) {
         errors.push(error.message);
       }
@@ -75,7 +75,7 @@ for await (const line of createInterface({ input: process.stdin })) {
   const { act, ...told } = JSON.parse(line);
   let answer;
   try {
-    answer = acts[act](told);
+    answer = await acts[act](told);
   } catch (error) {
     answer = { failed: error.stack };
   }

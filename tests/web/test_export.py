@@ -2,21 +2,32 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import re
 import shutil
 import subprocess
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from page_worlds import (
+    TOLERANCE,
+    WORLDS,
+    Box,
+    described,
+    grown,
+    lively,
+    packed,
+    scattered,
+    stepped,
+    unpacked,
+    world_of,
+)
 from torch import Tensor
 
-from npa_envs import reference
 from npa_envs.cli import main
 from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule, save_rule
@@ -35,12 +46,8 @@ from npa_envs.world import brushes
 from npa_envs.world.rollout import rollout
 from npa_envs.world.species import rollout_species
 
-TOLERANCE = 1e-4
-"""Largest difference of a step from Python's in float64; the worst measured is 7e-7."""
-
 NODE_SECONDS = 60
 
-Box = tuple[float, ...] | None
 Run = Callable[..., Any]
 
 
@@ -76,83 +83,10 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
         process.kill()
 
 
-def packed(tensor: Tensor) -> str:
-    return base64.b64encode(tensor.float().contiguous().numpy().tobytes()).decode()
-
-
-def unpacked(text: str, shape: Sequence[int]) -> Tensor:
-    return torch.frombuffer(bytearray(base64.b64decode(text)), dtype=torch.float32).view(*shape)
-
-
-def described(rule: NPARule) -> dict[str, Any]:
-    weights = {name: packed(tensor.detach()) for name, tensor in rule.state_dict().items()}
-    return {**{"moment_inverse": "threshold"} | rule.hyper_parameters(), "weights": weights}
-
-
-def scattered(count: int, dimension: int, channels: int, box: Box) -> tuple[Tensor, Tensor]:
-    """A world of which each particle has a score of neighbours and a state of its own."""
-    generator = torch.Generator().manual_seed(3)
-    sides = torch.tensor(box or (0.5,) * dimension)
-    x = sides * (torch.rand(1, count, dimension, generator=generator) - 0.5)
-    return x, 0.5 * torch.randn(1, count, channels, generator=generator)
-
-
-def grown(name: str, count: int, box: Box) -> tuple[Tensor, Tensor]:
-    rule = load_rule(name)
-    x, s = scattered(count, rule.space_dim, rule.state_dim, box)
-    with torch.no_grad():
-        return rollout(rule, x, 0.0 * s, 12, box=box, generator=torch.Generator().manual_seed(5))
-
-
-def lively(rule: NPARule) -> NPARule:
-    """The rule with weights that are large enough to see each of them."""
-    torch.manual_seed(1)
-    for parameter in rule.parameters():
-        parameter.data.normal_(0.0, 0.3)
-    return rule
-
-
-def stepped(
-    rule: NPARule, x: Tensor, s: Tensor, mask: Tensor, *, eps: float, box: Box
-) -> tuple[Tensor, Tensor]:
-    """One step in float64 by `npa_envs.reference`."""
-    rule, x, s = rule.double(), x.double(), s.double()
-    z = reference.perceive(x, s, eps, rule.eps0, box, moment_inverse=rule.moment_inverse)
-    with torch.no_grad():
-        update = rule(z)
-    moved = torch.zeros_like(x)
-    if not rule.static:
-        moved, update = update.split([rule.space_dim, rule.state_dim], dim=-1)
-        moved = rule.alpha * eps * moved / (1.0 + moved.norm(dim=-1, keepdim=True))
-    x, s = x + mask[..., None] * moved, s + mask[..., None] * update
-    if box is not None:
-        sides = torch.tensor(box, dtype=x.dtype)
-        x = x - sides * torch.floor(x / sides + 0.5)
-    return x, s
-
-
-WORLDS: dict[str, tuple[str | Callable[[], NPARule], int, Box, float]] = {
-    "gecko": ("gecko", 300, None, 0.1),
-    "gecko at another radius": ("gecko", 300, None, 0.13),
-    "dots in their box": ("dots", 400, (1.1, 0.9), 0.2),
-    "dots in the smallest box": ("dots", 200, (0.4, 0.4), 0.2),
-    "duck": ("duck", 300, None, 0.1),
-    "duck in a box": ("duck", 300, (0.5, 0.4, 0.3), 0.1),
-    "digits, which stay": ("digits", 300, None, 0.1),
-    "smooth inverse": (lambda: NPARule(2, 5, 9, moment_inverse="smooth"), 200, None, 0.1),
-}
-
-
 @pytest.mark.parametrize("kind", WORLDS)
 def test_a_step_with_a_given_mask_is_that_of_python(run: Run, kind: str) -> None:
-    source, count, box, eps = WORLDS[kind]
-    if isinstance(source, str):
-        rule = load_rule(source)
-        moving = not rule.static
-        x, s = grown(source, count, box) if moving else scattered(count, 2, rule.state_dim, box)
-    else:
-        rule = lively(source())
-        x, s = scattered(count, rule.space_dim, rule.state_dim, box)
+    (rule,), x, s, eps, box = world_of(kind)
+    count = x.shape[1]
     mask = (torch.rand(1, count, generator=torch.Generator().manual_seed(9)) < 0.5).double()
     want_x, want_s = stepped(rule, x, s, mask, eps=eps, box=box)
     # The step is no small one.

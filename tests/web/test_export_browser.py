@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+import torch
 from browser import DESK, PHONE, Page, browser
+from page_worlds import TOLERANCE, WORLDS, described, lively, packed, stepped, world_of
 
-from npa_envs.web.export import export_web
+from npa_envs.rule.rule import NPARule
+from npa_envs.web.export import export_web, joined_modules
+from npa_envs.world.species import rollout_species
 
 
 @pytest.fixture(scope="module")
@@ -125,3 +130,89 @@ def test_solid_and_still_worlds_live_in_a_page(
     count = {"duck": 16384, "digits": 512}[name]
     assert re.match(rf"step \d+ · {count} particles", page.run("document.body.innerText"))
     alone(page)
+
+
+# A graphics card in software: slow, but the shaders are those that any card runs.
+CARD = (
+    "--enable-unsafe-webgpu",
+    "--use-webgpu-adapter=swiftshader",
+    "--enable-features=Vulkan",
+)
+
+CARD_STEP = """(async ({ rules, x, s, species, mask, eps, box, densityCounts }) => {
+  const floats = (text) =>
+    new Float32Array(Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0)).buffer);
+  const kernels = physics.plainKernels();
+  const prepared = rules.map((rule) => {
+    const named = Object.entries(rule.weights).map(([name, text]) => [name, floats(text)]);
+    return physics.prepareRule({ ...rule, weights: Object.fromEntries(named) }, kernels);
+  });
+  const world = {
+    count: species.length, x: floats(x), s: floats(s), species: Uint8Array.from(species),
+  };
+  const device = await physics_gpu.openDevice();
+  const card = await physics_gpu.GpuPhysics.make(
+    device, new physics.Physics(prepared, world.count, kernels));
+  await card.step(world, { eps, box, densityCounts, mask: Uint8Array.from(mask) });
+  return { x: [...world.x], s: [...world.s] };
+})"""
+
+
+@pytest.fixture(scope="module")
+def card_page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[], Page]]:
+    with browser(tmp_path_factory.mktemp("card"), *CARD) as opened:
+        yield opened
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [*WORLDS, "two species"])
+def test_a_step_on_a_graphics_card_is_that_of_python(
+    tmp_path: Path, card_page: Callable[[], Page], kind: str
+) -> None:
+    script = joined_modules(["physics_gpu.js"])
+    shown = "Object.assign(window, { physics, physics_gpu });"
+    text = f"<!doctype html><script>{script}\n{shown}</script>"
+    (tmp_path / "card.html").write_text(text)
+    page = card_page()
+    page.open((tmp_path / "card.html").as_uri())
+    page.wait("window.physics_gpu")
+    rules, x, s, eps, box = world_of("gecko" if kind == "two species" else kind)
+    count = x.shape[1]
+    mask = (torch.rand(1, count, generator=torch.Generator().manual_seed(9)) < 0.5).double()
+    counts = None
+    if kind == "two species":
+        rules, counts = [rules[0], lively(NPARule(2, 16, 24, alpha=0.3))], (200, 100)
+        mask = torch.ones(1, count)
+        with torch.no_grad():
+            want_x, want_s = rollout_species(
+                [rule.double() for rule in rules], x.double(), s.double(), 1, counts=counts,
+                update_prob=1.0, density_counts=counts,
+            )  # fmt: skip
+    else:
+        want_x, want_s = stepped(rules[0], x, s, mask, eps=eps, box=box)
+    told = {
+        "rules": [described(rule) for rule in rules], "x": packed(x), "s": packed(s),
+        "species": [0] * count if counts is None else [0] * counts[0] + [1] * counts[1],
+        "mask": mask[0].int().tolist(), "eps": eps, "box": box, "densityCounts": counts,
+    }  # fmt: skip
+    got = page.run(f"{CARD_STEP}({json.dumps(told)})")
+    assert float((torch.tensor(got["x"]).view_as(want_x) - want_x).abs().max()) < TOLERANCE
+    assert float((torch.tensor(got["s"]).view_as(want_s) - want_s).abs().max()) < TOLERANCE
+    assert page.complaints == []
+
+
+@pytest.mark.slow
+def test_a_page_lives_on_a_graphics_card(tmp_path: Path, card_page: Callable[[], Page]) -> None:
+    address = export(tmp_path, "gecko", "heart", count=256)
+    for engine, name in (("gpu", "WebGPU"), ("auto", ""), ("processor", "WebAssembly")):
+        page = card_page()
+        page.open(f"{address}?engine={engine}")
+        page.wait(f"{STEP} >= 8", 60)
+        page.run(
+            "document.page.send({ type: 'brush', tool: 'graft', rule: 'heart', "
+            "at: [0.1, 0], move: [0, 0], radius: 0.1, strength: 1 })"
+        )
+        page.wait("document.page.world.species.length === 2")
+        assert page.run("document.page.frame.engine") == name or not name
+        page.wait(f"{STEP} >= {page.run(STEP)} + 8", 60)
+        alone(page)

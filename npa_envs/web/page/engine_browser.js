@@ -27,7 +27,9 @@ export async function connect({ worker: element, ...settings }, listener) {
     event.preventDefault();
     listener({ type: "error", message: event.message || "this browser does not let the page start a worker" });
   };
-  worker.postMessage({ type: "begin", settings });
+  // "?engine=processor" behind the address keeps off the graphics card, "?engine=gpu" insists on it.
+  const engine = new URLSearchParams(location.search).get("engine") ?? "auto";
+  worker.postMessage({ type: "begin", settings: { ...settings, engine } });
   return {
     send(message) {
       worker.postMessage(message);

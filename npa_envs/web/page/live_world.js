@@ -5,6 +5,7 @@ import { clump, cut, eraseState, insideBall, push } from "./brushes.js";
 import { Colouring, Look } from "./colours.js";
 import { fastestKernels } from "./kernels_simd.js";
 import { padded, Physics, prepareRule, wrap } from "./physics.js";
+import { GpuPhysics, openDevice } from "./physics_gpu.js";
 import { Random } from "./random.js";
 
 // Frames that are on the way to the page at most: a page that is slow or hidden holds the world.
@@ -17,6 +18,10 @@ const SEED_SHARE = 0.5;
 const LEAST_SEED = 16;
 const DAMAGE_SIZES = { erase: 0.2, cut: 0.1, clump: 0.2, noise: 0.05 };
 
+// A graphics card is tried for so many steps, whose results may differ so much from the processor's.
+const TRIAL_STEPS = 4;
+const TRIAL_TOLERANCE = 1e-3;
+
 // What rules must have in common to live in one world, as AGREEMENTS of npa_envs/world/species.py.
 const AGREEMENTS = [
   "space_dim", "state_dim", "eps0", "static", "state_gradient", "moment_correction", "moment_inverse",
@@ -25,8 +30,11 @@ const AGREEMENTS = [
 
 export class LiveWorld {
   // settings: {rules: [...], seed, ramp} as npa_envs/web/export.py writes them; the first rule is shown
-  // first. send(event, transferred) hands an event to the page.
-  constructor(settings, send) {
+  // first. send(event, transferred) hands an event to the page; device: a graphics card, or null.
+  // settings.engine: "auto" tries the card and keeps what is faster, "gpu" takes it untried.
+  constructor(settings, send, device = null) {
+    this.device = device;
+    this.engine = settings.engine ?? "auto";
     this.rules = settings.rules.map(decoded);
     this.ramp = bytesOf(settings.ramp);
     this.send = send;
@@ -107,19 +115,49 @@ export class LiveWorld {
 
   // Room and weights for the particles and species that live now.
   prepare() {
-    const kernels = fastestKernels(padded(this.channels), this.dimension);
+    const kernels = (this.kernels = fastestKernels(padded(this.channels), this.dimension));
     this.physics = new Physics(this.species.map((rule) => prepareRule(rule, kernels)), this.world.count, kernels);
     this.looks = this.species.map((rule) => new Look(rule, kernels));
+    this.card?.close();
+    this.card = null;
+    this.trial = { left: this.engine === "gpu" ? 0 : TRIAL_STEPS, processor: Infinity, card: Infinity };
   }
 
-  step() {
+  // One step of the physics: by the graphics card where it is faster, and right.
+  async compute(options) {
+    const { world, physics, trial } = this;
+    if (this.device === null) return physics.step(world, options);
+    try {
+      this.card ??= await GpuPhysics.make(this.device, physics);
+      if (trial.left === 0) return await this.card.step(world, options);
+    } catch {
+      this.leaveCard();
+      return physics.step(world, options);
+    }
+    const other = { ...world, x: world.x.slice(), s: world.s.slice() };
+    const started = performance.now();
+    physics.step(world, options);
+    const between = performance.now();
+    const right = await this.card.step(other, options).then(() => alike(world, other), () => false);
+    trial.processor = Math.min(trial.processor, between - started);
+    trial.card = Math.min(trial.card, performance.now() - between);
+    trial.left--;
+    if (!right || (trial.left === 0 && trial.card > trial.processor)) this.leaveCard();
+  }
+
+  leaveCard() {
+    this.card?.close();
+    this.card = this.device = null;
+  }
+
+  async step() {
     const started = performance.now();
     const { world, random, values, dimension, box, updated } = this;
     if (world.count > 0) {
       const before = world.x.slice();
       for (let i = 0; i < world.count; i++) updated[i] = random.uniform() < values.update_prob ? 1 : 0;
       const noise = values.noise > 0 ? random.normals(world.x.length, values.noise) : null;
-      this.physics.step(world, { eps: this.eps, box, mask: updated, noise, densityCounts: this.divisors });
+      await this.compute({ eps: this.eps, box, mask: updated, noise, densityCounts: this.divisors });
       const reach = this.eps * Math.max(...this.species.map((rule) => rule.alpha));
       for (let i = 0; i < world.count; i++) {
         let square = 0;
@@ -137,7 +175,7 @@ export class LiveWorld {
   }
 
   // Does what a message of the page says.
-  receive(message) {
+  async receive(message) {
     switch (message.type) {
       case "drawn":
         this.onTheWay = Math.max(0, this.onTheWay - 1);
@@ -147,7 +185,7 @@ export class LiveWorld {
         return;
       case "step":
         this.playing = false;
-        this.step();
+        await this.step();
         break;
       case "reset":
         this.reset(message.seed ?? this.seed + 1);
@@ -281,14 +319,15 @@ export class LiveWorld {
   }
 
   // Goes on to the next frame where the world runs, and shows it.
-  advance() {
-    if (this.playing) for (let k = 0; k < this.values.speed; k++) this.step();
+  async advance() {
+    if (this.playing) for (let k = 0; k < this.values.speed; k++) await this.step();
     const positions = this.world.x.slice();
     const colours = this.colouring.of(this, this.show);
-    const { steps, milliseconds } = this;
+    const { steps: step, milliseconds } = this;
+    const engine = this.card !== null && this.trial.left === 0 ? "WebGPU" : this.kernels.name;
     this.onTheWay++;
     this.changed = false;
-    this.send({ type: "frame", step: steps, positions, colours, milliseconds }, [positions.buffer, colours.buffer]);
+    this.send({ type: "frame", step, positions, colours, milliseconds, engine }, [positions.buffer, colours.buffer]);
   }
 
   // Tells the page what there is.
@@ -321,6 +360,11 @@ export class LiveWorld {
       seed,
     });
   }
+}
+
+function alike(world, other) {
+  const close = (a, b) => a.every((value, k) => Math.abs(value - b[k]) <= TRIAL_TOLERANCE);
+  return close(world.x, other.x) && close(world.s, other.s);
 }
 
 function joined(first, second) {
@@ -357,35 +401,47 @@ function bytesOf(text) {
 // Runs a live world in a worker: answers its messages, and computes frames between them.
 export function serve(scope) {
   const send = (event, transferred = []) => scope.postMessage(event, transferred);
-  // Messages get their turn between two frames.
+  const messages = [];
   const clock = new MessageChannel();
   let live = null;
-  let waiting = false;
-  const goOn = () => {
-    if (waiting || live === null || !live.pending) return;
-    waiting = true;
-    clock.port2.postMessage(null);
-  };
-  const attempt = (act) => {
+  let busy = false;
+
+  const attempt = async (act) => {
     try {
-      act();
+      await act();
       return true;
     } catch (error) {
       send({ type: "error", message: error.message });
       return false;
     }
   };
-  clock.port1.onmessage = () => {
-    waiting = false;
-    // A world that cannot go on stands still.
-    if (!attempt(() => live.pending && live.advance())) live.playing = live.changed = false;
-    goOn();
+
+  const obey = async ({ type, settings, ...rest }) => {
+    if (type !== "begin") return live.receive({ type, ...rest });
+    const device = settings.engine === "processor" ? null : await openDevice().catch(() => null);
+    live = new LiveWorld(settings, send, device);
   };
+
+  // One message or one frame after the other, never two at a time.
+  const go = async () => {
+    if (busy) return;
+    busy = true;
+    while (messages.length > 0) {
+      const message = messages.shift();
+      await attempt(() => obey(message));
+    }
+    if (live?.pending) {
+      // A world that cannot go on stands still.
+      if (!(await attempt(() => live.advance()))) live.playing = live.changed = false;
+    }
+    busy = false;
+    // New messages get their turn first.
+    if (messages.length > 0 || live?.pending) clock.port2.postMessage(null);
+  };
+
+  clock.port1.onmessage = go;
   scope.onmessage = ({ data }) => {
-    attempt(() => {
-      if (data.type === "begin") live = new LiveWorld(data.settings, send);
-      else live.receive(data);
-    });
-    goOn();
+    messages.push(data);
+    go();
   };
 }

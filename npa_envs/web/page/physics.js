@@ -17,10 +17,10 @@ export const TILE_OUTPUTS = 8;
 
 // Cells on each side of the grid at most: farther particles share cells with others, and are told
 // apart by their distance.
-const MOST_CELLS = { 2: 256, 3: 64 };
+export const MOST_CELLS = { 2: 256, 3: 64 };
 
 // Cells in which eps is divided.
-const CELLS_PER_RADIUS = { 2: 2, 3: 2 };
+export const CELLS_PER_RADIUS = { 2: 2, 3: 2 };
 
 export function padded(channels) {
   return LANES * Math.ceil(channels / LANES);
@@ -42,9 +42,9 @@ export function prepareRule(description, kernels) {
   const rule = { ...description };
   const { weights, hidden_dim: hidden, state_dim: channels } = rule;
   rule.inputs = perceptionLength(rule);
-  const outputs = channels + (rule.static ? 0 : rule.space_dim);
+  rule.outputs = channels + (rule.static ? 0 : rule.space_dim);
   rule.hidden = kernels.layer(weights["hidden.weight"], weights["hidden.bias"], rule.inputs, hidden);
-  rule.output = kernels.layer(weights["output.weight"], null, hidden, outputs);
+  rule.output = kernels.layer(weights["output.weight"], null, hidden, rule.outputs);
   return rule;
 }
 
@@ -235,6 +235,11 @@ export class Physics {
       const divisor = densityCounts === null ? world.count : densityCounts[number];
       this.advance(world, number, eps, divisor, mask, dt);
     }
+    this.finish(world, noise, box);
+  }
+
+  // What a step ends with: noise, and back into the box.
+  finish(world, noise, box) {
     if (noise !== null) {
       for (let n = 0; n < noise.length; n++) world.x[n] += noise[n];
     }
@@ -392,7 +397,9 @@ export class Physics {
       if (filled === 0) return;
       kernels.product(rule.hidden, filled, rows, rowWidth, hidden, true);
       kernels.product(rule.output, filled, hidden, rule.hidden.width, updates, false);
-      for (let row = 0; row < filled; row++) this.update(world, rule, order[blockRows[row]], row, eps, dt);
+      for (let row = 0; row < filled; row++) {
+        this.update(world, rule, order[blockRows[row]], updates, row * rule.output.width, eps, dt);
+      }
       filled = 0;
     };
     for (let cell = 0; cell < total; cell++) {
@@ -445,10 +452,9 @@ export class Physics {
     }
   }
 
-  // x ← x + dt α ε δ / (1 + |δ|), s ← s + dt Δs for one particle.
-  update({ x, s }, rule, particle, row, eps, dt) {
-    const { dimension, channels, updates } = this;
-    let from = row * rule.output.width;
+  // x ← x + dt α ε δ / (1 + |δ|), s ← s + dt Δs for one particle, whose δ and Δs begin at `from`.
+  update({ x, s }, rule, particle, updates, from, eps, dt) {
+    const { dimension, channels } = this;
     if (!rule.static) {
       let squared = 0;
       for (let d = 0; d < dimension; d++) squared += updates[from + d] ** 2;
@@ -469,11 +475,11 @@ export function wrap(x, count, box) {
   }
 }
 
-function smoothingNorm(eps, dimension) {
+export function smoothingNorm(eps, dimension) {
   return dimension === 2 ? 4 / (Math.PI * eps ** 8) : 315 / (64 * Math.PI * eps ** 9);
 }
 
-function spikyNorm(eps, dimension) {
+export function spikyNorm(eps, dimension) {
   return dimension === 2 ? 30 / (Math.PI * eps ** 5) : 45 / (Math.PI * eps ** 6);
 }
 
