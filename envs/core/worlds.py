@@ -205,9 +205,8 @@ class Worlds(Batch):
         self._surveyed: SurveyedWorlds | None = None
         self._judgement: PreparedJudgement | None = None
         self._draw = Replayed(self._actions.draw, device)
+        self._look = Replayed(self._judge_and_survey, device)
         self._act = Replayed(self._act_and_look, device)
-        self._judge = Replayed(self._judge_worlds, device)
-        self._survey = Replayed(self._survey_worlds, device)
         self.restart = Restarts(
             self._start_and_survey, world_count, device, recorded=self.task.start_is_short
         )
@@ -236,12 +235,9 @@ class Worlds(Batch):
         """Cut episodes off after so many steps from now on, or never."""
         if episode_steps != self.episode_steps:
             self.episode_steps = episode_steps
-            self._renew_judgement()
-
-    def _renew_judgement(self) -> None:
-        self._judgement = None
-        self._act = Replayed(self._act_and_look, self.device)
-        self._judge = Replayed(self._judge_worlds, self.device)
+            self._judgement = None
+            self._look = Replayed(self._judge_and_survey, self.device)
+            self._act = Replayed(self._act_and_look, self.device)
 
     @property
     def reward(self) -> Tensor:
@@ -343,7 +339,8 @@ class Worlds(Batch):
         """Apply actions to all worlds; return their endings, [B], and what is perceived, [B, N, P].
 
         The endings, one byte a world, and of a single world its numbers are all that the host
-        reads. On CUDA the worlds are judged beside the sorting and the perceiving of them.
+        reads. On CUDA the worlds are judged and sorted side by side, and the device perceives while
+        the host reads.
 
         Args:
             action: Float32, shape [B, N, A], on any device.
@@ -373,41 +370,33 @@ class Worlds(Batch):
     @torch.no_grad()
     def queue(self, action: Tensor, out: Tensor | None = None) -> Tensor:
         """Do what `step` does but wait for the device, and return what is perceived there then."""
-        beside = self._beside
-        small = self.world_count * self.particle_count <= FEW_PARTICLES
-        if beside is not None and small:
+        if self.x.is_cuda and self.x.shape[:2].numel() <= FEW_PARTICLES:
             # To copy actions takes less than to launch what one graph then does.
             self._actions.hold(action)
             self._act()
-            beside.mark()
         else:
             self._draw()
             self._actions.apply(action)
-            if beside is None:
-                self._judge()
-            else:
-                with beside.aside():
-                    self._judge()
-                    beside.mark()
-            self._survey()
+            self._look()
+        if self._beside is not None:
+            # The host learns the endings while the device perceives.
+            self._beside.mark()
         assert self._surveyed is not None, "the worlds were sorted just now"
-        observation = self._surveyed.perceive(out)
-        if beside is not None and not small:
-            beside.join()
-        return observation
+        return self._surveyed.perceive(out)
 
     def _act_and_look(self) -> None:
-        """Apply the actions that are held, and judge the worlds while they are sorted."""
-        assert self._beside is not None, "on CUDA alone"
+        """Apply the actions that are held, and look."""
         self._actions.draw()
         self._actions.apply_held()
-        with self._beside.aside():
-            self._judge_worlds()
-        self._survey_worlds()
-        self._beside.join()
+        self._judge_and_survey()
 
-    def _survey_worlds(self) -> None:
+    def _judge_and_survey(self) -> None:
+        """Judge the worlds and, beside that, sort them."""
+        with contextlib.nullcontext() if self._beside is None else self._beside.aside():
+            self._judge_worlds()
         self._surveyed = survey_worlds(self.x, self.s, self.physics)
+        if self._beside is not None:
+            self._beside.join()
 
     def _judge_worlds(self) -> None:
         """Write rewards, losses and endings of the worlds as they now are."""
