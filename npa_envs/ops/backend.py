@@ -205,8 +205,12 @@ class Listing(NamedTuple):
         return -(-row_count // 32), self.capacity, 32
 
 
-CAPACITY, LARGE_CAPACITY, HUGE_CAPACITY = 64, 128, 96
-"""Neighbours that lists have room for: in small worlds of a batch, elsewhere, in huge worlds."""
+CAPACITY, LARGE_CAPACITY, HUGE_CAPACITY, CROWDED_CAPACITY = 64, 128, 96, 256
+"""Neighbours that lists have room for: in small worlds of a batch, elsewhere, in huge worlds, in
+crowded boxes."""
+
+CROWD = range(80, 200)
+"""Mean neighbours in a box of which many are more than `LARGE_CAPACITY`, few `CROWDED_CAPACITY`."""
 
 SMALL_WORLD = 2048
 """Particles of a small world."""
@@ -221,10 +225,18 @@ DENSITY_LANES = 4
 """Threads of a particle in the density pass of small worlds."""
 
 
-def rollout_listing(particle_count: int) -> Listing:
-    """Return how rollouts of worlds of N particles list neighbours: few worlds shall fill a GPU."""
+def rollout_listing(particle_count: int, mean_neighbours: float = 0.0) -> Listing:
+    """Return how rollouts list neighbours: few worlds shall fill a GPU.
+
+    Args:
+        particle_count: Particles of a world, N.
+        mean_neighbours: Neighbours of particles that are spread evenly over a periodic box; 0 in
+            open space.
+    """
     if particle_count <= SHARED_WORLD:
-        return Listing(LARGE_CAPACITY, lanes=DENSITY_LANES, teams=2)
+        crowded = int(mean_neighbours) in CROWD
+        capacity = CROWDED_CAPACITY if crowded else LARGE_CAPACITY
+        return Listing(capacity, lanes=DENSITY_LANES, teams=2)
     # The lists of worlds that fill a device's memory would be the largest part of it.
     huge = particle_count > HUGE_WORLD
     return Listing(HUGE_CAPACITY if huge else LARGE_CAPACITY, lanes=1, teams=1)

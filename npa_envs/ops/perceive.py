@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.ops.adjoint import SavedPerception, perceive_rows_backward
-from npa_envs.ops.backend import batch_listing, rollout_listing
+from npa_envs.ops.backend import batch_listing
 from npa_envs.ops.checks import (
     Box,
     MomentInverse,
@@ -216,9 +216,7 @@ def _perceive_rows(
     plan = make_plan(x, x.shape, s.shape[2], row_capacity, mask is not None, eps, box)
     terms = Terms(state_gradient, moment_inverse, density_gradient)
     ordered = sort_worlds(plan, x, s, mask)
-    densities = compute_densities(
-        plan, ordered, terms, rollout_listing(plan.particle_count), with_particles=for_adjoint
-    )
+    densities = compute_densities(plan, ordered, terms, plan.listing, with_particles=for_adjoint)
     perception = x.new_empty(row_capacity, row_width)
     row_kernel_sum = x.new_empty(row_capacity if for_adjoint else 0, plan.space_dim)
     launch(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -13,7 +14,14 @@ from npa_envs.kernels.access import CUDA_LANES, WARP
 from npa_envs.kernels.cuda.sort import BLOCKS, STATE_SHARE, order_particles, sort_small_worlds
 from npa_envs.kernels.domain import make_domain
 from npa_envs.kernels.portable.sort import sort_kernels
-from npa_envs.ops.backend import Operator, Request, choose, processor_count
+from npa_envs.ops.backend import (
+    Listing,
+    Operator,
+    Request,
+    choose,
+    processor_count,
+    rollout_listing,
+)
 from npa_envs.ops.launch import channel_width, launch, scalar_type
 
 LARGEST_INDEX = 2**31 - 1
@@ -43,6 +51,8 @@ class Plan(NamedTuple):
     domain: Any
     request: Request
     """What the backend table asks for."""
+    listing: Listing
+    """How rollouts list neighbours on CUDA."""
 
     def runs(
         self, operator: Operator, *, aligned: bool = True, position_gradient: bool = False
@@ -154,6 +164,7 @@ def make_plan(
         masked=masked,
         domain=domain,
         request=Request(like.device, like.dtype, particle_count, int(domain.cell_count)),
+        listing=rollout_listing(particle_count, mean_neighbours(particle_count, eps, sides)),
     )
     largest = max(2 * plan.cell_total, plan.total * (1 + plan.state_dim))
     if largest >= LARGEST_INDEX:
@@ -163,6 +174,14 @@ def make_plan(
             f"split the batch"
         )
     return plan
+
+
+def mean_neighbours(particle_count: int, eps: float, box: Sequence[float] | None) -> float:
+    """Return how many neighbours particles spread evenly over a box have; 0 in open space."""
+    if box is None:
+        return 0.0
+    ball = math.pi * eps**2 if len(box) == 2 else 4.0 / 3.0 * math.pi * eps**3
+    return particle_count * ball / math.prod(box)
 
 
 def sort_worlds(

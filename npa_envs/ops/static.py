@@ -13,7 +13,6 @@ from torch import Tensor
 
 from npa_envs.kernels.portable.density import density_kernels
 from npa_envs.kernels.portable.sort import give_rows
-from npa_envs.ops.backend import rollout_listing
 from npa_envs.ops.launch import launch, scalar_type
 from npa_envs.ops.opaque import opaque
 from npa_envs.ops.passes import (
@@ -105,7 +104,7 @@ def _prepare_static(
     plan = make_plan(x, x.shape, state_dim, total, False, eps, box)
     ordered = sort_worlds(plan, x, None, None)
     terms = Terms(state_gradient, moment_inverse, density_gradient)
-    densities = compute_densities(plan, ordered, terms, rollout_listing(plan.particle_count))
+    densities = compute_densities(plan, ordered, terms, plan.listing)
     lists: list[Tensor] = []
     if densities.lists is not None:
         lists = [densities.lists.steps, densities.lists.lengths, densities.lists.records]
@@ -158,7 +157,7 @@ def _(
     lists: list[Tensor] = []
     on_cuda = plan.runs("density") == "cuda"
     if on_cuda:
-        shape = rollout_listing(plan.particle_count).shape(total)
+        shape = plan.listing.shape(total)
         lists = [
             x.new_empty(shape, dtype=torch.int16),
             integers(total),
@@ -312,9 +311,7 @@ def static_worlds(
     lists = None
     if plan.runs("density") == "cuda":
         steps, lengths, records = tensors.lists
-        lists = NeighbourLists(
-            rollout_listing(plan.particle_count), steps, lengths, records, by_place=True
-        )
+        lists = NeighbourLists(plan.listing, steps, lengths, records, by_place=True)
     ordered = SortedWorlds(
         starts=rows.starts,
         source=tensors.everyone,

@@ -271,6 +271,26 @@ def test_neighbourhoods_may_be_longer_than_lists(device):
     assert torch.equal(together[1], observed(x[1:2], s[1:2]).perceive()[0])
 
 
+@pytest.mark.parametrize("masked", [False, True], ids=("all", "active"))
+def test_rows_of_crowded_boxes_are_right(masked, device):
+    """On CUDA lists are longer there; some of these particles have more neighbours all the same."""
+    count, box = 900, (1.0, 1.0)
+    x, s = random_world(2, count, 2, 16, dtype=torch.float32, device=device)
+    x = x / 1.4
+    x[:, :200] *= 0.2
+    neighbours = (torch.cdist(x, x) < 0.2).sum(-1)
+    assert neighbours.min() < 64
+    assert neighbours.max() > 256
+    mask = random_mask(x) if masked else None
+    rows, places = rows_of(x, s, mask, eps=0.2, width=68, capacity=2 * count, box=box)
+    expected = oracle.perceive(*exact(x, s), 0.2, 0.2, box=box).view(-1, 66)
+    row_of = places.row_of.cpu().long()
+    active = row_of >= 0
+    assert (
+        relative_error(rows.cpu()[row_of[active], :66], expected[active]) < FORWARD[torch.float32]
+    )
+
+
 def test_detached_positions_get_no_gradient(device):
     x, s = random_world(1, 20, 2, 4, dtype=torch.float32, device=device)
     x.requires_grad_()

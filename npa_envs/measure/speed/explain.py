@@ -12,7 +12,7 @@ from torch.profiler import ProfilerActivity, profile
 
 from npa_envs.measure.speed.timing import Session
 from npa_envs.measure.speed.workloads import Workload, rollout_call
-from npa_envs.ops.backend import Request, describe, rollout_listing
+from npa_envs.ops.backend import Request, describe
 from npa_envs.ops.launch import Launch, noted_launches
 from npa_envs.ops.sort import Plan, make_plan
 from npa_envs.rule.rule import NPARule
@@ -187,7 +187,7 @@ def _request(plan: Plan, rule: NPARule) -> Request:
 def _neighbours(plan: Plan) -> str:
     if plan.runs("density") == "portable":
         return "searched for in each pass"
-    listing = rollout_listing(plan.particle_count)
+    listing = plan.listing
     return (
         f"listed by the density pass for the perception pass, {listing.lanes} threads a particle, "
         f"with room for {listing.capacity} each: longer lists are searched for again"
