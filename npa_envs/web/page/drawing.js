@@ -273,7 +273,7 @@ class GlPainter {
       gl.blendFunc(gl.ONE, gl.ONE);
       gl.uniform1f(program.size, Math.max(2 * SOFT_REACH * pixels * shrink, 2));
     } else {
-      const size = Math.max((dimension === 3 ? 3.2 : 1.7) * pixels, 2);
+      const size = Math.max((dimension === 3 ? 3.2 : 1.4) * pixels, 2);
       gl.uniform1f(program.size, size);
       gl.uniform1i(program.ball, dimension === 3);
       gl.uniform1f(program.edge, size / 2);
@@ -418,7 +418,7 @@ class PlainPainter {
     show(this.picture.data, this.sums, scene.background, soft);
     small.getContext("2d").putImageData(this.picture, 0, 0);
     context.imageSmoothingEnabled = true;
-    context.imageSmoothingQuality = "high";
+    context.imageSmoothingQuality = "low";
     context.drawImage(small, 0, 0, width, height);
     if (scene.trails) this.drawTrails(scene, width, height);
     if (scene.still) return;
@@ -491,7 +491,7 @@ function addBalls(sums, width, height, places, { colours, dimension, camera }, s
   const solid = dimension === 3, span = 2 * camera.halfWidth;
   for (let k = 0; k < places.length / 4; k++) {
     const column = places[4 * k], row = places[4 * k + 1], near = places[4 * k + 2];
-    const radius = (solid ? 1.6 : 0.9) * spot * places[4 * k + 3];
+    const radius = (solid ? 1.6 : 0.7) * spot * places[4 * k + 3];
     const depth = near * camera.unit(width, height);
     const light = solid ? Math.min(1.15, Math.max(0.45, 0.95 + (0.5 * depth) / span)) : 1;
     const left = Math.max(0, Math.ceil(column - radius)), last = Math.min(width - 1, column + radius);

@@ -26,6 +26,7 @@ export class Plot {
     if (!Number.isFinite(y)) return;
     const last = this.points.at(-1);
     if (last && x < last[0]) this.points = [];
+    if (last && x === last[0]) this.points.pop(); // A world that stands still.
     this.points.push([x, y]);
     if (this.points.length > KEPT) this.points = this.points.filter((_, k) => k % 2 || k > KEPT / 2);
   }
