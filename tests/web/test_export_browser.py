@@ -63,6 +63,13 @@ def test_an_exported_page_lives_and_is_touched(
     page.run("document.page.send({ type: 'set', name: 'eps', value: 0.12 })")
     page.wait("document.page.world.settings.eps.value === 0.12")
     page.wait(f"{STEP} > {page.run(STEP)} + 2")
+    # Another world may come before a frame of the last one was drawn.
+    before = page.run(STEP)
+    page.run(
+        "document.page.fresh = true;"
+        "document.page.listen({ ...document.page.world, type: 'world', half_width: 2 })"
+    )
+    page.wait(f"{STEP} > {before} + 2")
     alone(page)
 
 
@@ -113,6 +120,7 @@ def test_a_gallery_opens_a_rule_and_goes_back(tmp_path: Path, new_page: Callable
     page.wait("!document.getElementById('gallery').hidden && !document.page.world.playing")
     page.run("location.hash = 'gecko'")
     page.wait(f"document.page.world.rule === 'gecko' && {STEP} >= 2")
+    assert page.run("document.page.world.playing")
     alone(page)
 
 

@@ -54,8 +54,9 @@ class Gallery {
       const others = this.settings.rules.filter((rule) => rule !== chosen);
       this.page = await start(connect, { ...this.settings, rules: [chosen, ...others] });
     } else {
-      this.page.send({ type: "set", name: "rule", value: chosen.name });
+      // The world tells whether it runs when its rule is set.
       this.page.play(true);
+      this.page.send({ type: "set", name: "rule", value: chosen.name });
     }
   }
 }

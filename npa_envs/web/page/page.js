@@ -155,6 +155,9 @@ class Page {
     if (!this.met || before.dimension !== world.dimension || before.half_width !== world.half_width) {
       this.camera = new Camera(world.dimension, world.half_width, world.centre);
       this.frame = null;
+      // A frame of the world before that was not drawn yet; the engine waits to hear of it.
+      if (this.fresh) this.send({ type: "drawn" });
+      this.fresh = false;
       const first = world.tools.includes("erase") && world.dimension === 2 ? "erase" : "look";
       const keep = before.dimension === world.dimension && world.tools.includes(this.tool);
       this.choose(keep ? this.tool : first);
