@@ -203,42 +203,34 @@ def test_a_rule_policy_takes_the_state_scale_of_wrapped_environments(gecko):
     assert RulePolicy(gecko, envs).interface.state_scale == 3.0
 
 
-@pytest.mark.parametrize(
-    ("rule", "keywords", "message"),
-    [
-        ({}, {"eps0": 0.2}, "eps0, 0.2, got 0.1: make the environment with eps0=0.1"),
-        ({}, {"alpha": 1.0}, "alpha, 1, got 0.5: make the environment with alpha=0.5"),
-        ({}, {"state_dim": 8}, "make the environment with state_dim=16"),
-        ({"space_dim": 3}, {}, "space_dim, 2, got 3"),
-        ({"static": True}, {}, "got one of static particles"),
-        ({"moment_correction": False}, {}, "moment_correction=True"),
-    ],
-)
-def test_a_rule_that_does_not_fit_is_refused(rule, keywords, message):
-    env = make(particle_count=64, **keywords)
-    with pytest.raises(NPAError, match=message):
-        RulePolicy(npa_envs.NPARule(**rule), env)
+def fitted(rule, **keywords):
+    return RulePolicy(npa_envs.NPARule(**rule), make(particle_count=64, **keywords))
 
 
 @pytest.mark.parametrize(
     ("use", "message"),
     [
+        (lambda _: fitted({}, eps0=0.2), "eps0, 0.2, got 0.1: make .* with eps0=0.1"),
+        (lambda _: fitted({}, alpha=1.0), "alpha, 1, got 0.5: make .* with alpha=0.5"),
+        (lambda _: fitted({}, state_dim=8), "make the environment with state_dim=16"),
+        (lambda _: fitted({"space_dim": 3}), "space_dim, 2, got 3"),
+        (lambda _: fitted({"static": True}), "got one of static particles"),
+        (lambda _: fitted({"moment_correction": False}), "moment_correction=True"),
         (lambda env: RulePolicy("gecko", env), "rule must be an NPARule, got str"),
-        (lambda env: RulePolicy(wild_rule(), state_scale=0.0), "state_scale must be positive"),
-        (
-            lambda env: ZeroPolicy(gymnasium.make("CartPole-v1")),
-            "must be an environment of npa_envs",
-        ),
+        (lambda _: RulePolicy(wild_rule(), state_scale=0.0), "state_scale must be positive"),
+        (lambda _: ZeroPolicy(gymnasium.make("CartPole-v1")), "an environment of npa_envs"),
         (lambda env: RandomPolicy(env, seed=-1), "a seed"),
         (lambda env: PaintPolicy(env, colour=(0.5,)), "colour must have three numbers"),
-        (lambda env: ZeroPolicy(env)(np.zeros((64,), np.float32)), "P = 66"),
-        (lambda env: ZeroPolicy(env)(np.zeros((64, 65), np.float32)), "P = 66"),
-        (lambda env: ZeroPolicy(env)(np.zeros((1, 1, 64, 66), np.float32)), "P = 66"),
+        *(
+            (lambda env, shape=shape: ZeroPolicy(env)(np.zeros(shape, np.float32)), "P = 66")
+            for shape in ((64,), (64, 65), (1, 1, 64, 66))
+        ),
     ],
 )
-def test_wrong_arguments_are_refused(use, message):
+def test_what_does_not_fit_is_refused(use, message):
+    env = make(particle_count=64)
     with pytest.raises(NPAError, match=message):
-        use(make(particle_count=64))
+        use(env)
 
 
 def test_random_actions_repeat_by_seed_and_each_world_has_its_own():

@@ -45,18 +45,20 @@ def learn_nothing(progress, rules, pause=0.0):
 
 
 @pytest.mark.parametrize(
-    ("fields", "message"),
+    ("make", "fields", "message"),
     [
-        ({}, "must say something"),
-        ({"seconds": 0.0}, "seconds must be"),
-        ({"seconds": float("nan")}, "seconds must be"),
-        ({"particle_steps": -1}, "particle_steps must be"),
-        ({"particle_steps": 1.5}, "particle_steps must be"),
+        (Budget, {}, "must say something"),
+        (Budget, {"seconds": 0.0}, "seconds must be"),
+        (Budget, {"seconds": float("nan")}, "seconds must be"),
+        (Budget, {"particle_steps": -1}, "particle_steps must be"),
+        (Budget, {"particle_steps": 1.5}, "particle_steps must be"),
+        (progress_of, {"problem": PROBLEM, "particle_steps": 10, "entries": 0}, "entries"),
+        (progress_of, {"problem": PROBLEM, "particle_steps": 10, "seeds": []}, "seed"),
     ],
 )
-def test_a_budget_that_means_nothing_is_refused(fields, message):
+def test_a_budget_or_a_curve_that_means_nothing_is_refused(make, fields, message):
     with pytest.raises(NPAError, match=message):
-        Budget(**fields)
+        make(**fields)
 
 
 def test_particle_steps_are_kept_up_to_one_iteration(rules):
@@ -134,12 +136,6 @@ def test_progress_has_to_start_first_and_once(rules):
     progress.start(rules)
     with pytest.raises(NPAError, match="start once"):
         progress.start(rules)
-
-
-@pytest.mark.parametrize(("fields", "word"), [({"entries": 0}, "entries"), ({"seeds": []}, "seed")])
-def test_a_curve_without_points_is_refused(fields, word):
-    with pytest.raises(NPAError, match=word):
-        progress_of(heart(), particle_steps=10, **fields)
 
 
 def test_rules_that_diverged_are_reported(rules):

@@ -345,22 +345,21 @@ def test_rollouts_refuse_what_does_not_fit(change, message):
         npa_envs.rollout_species(x=x, s=s, **given | change)
 
 
-def test_a_plain_rollout_refuses_rules_that_tell_species_apart():
-    with pytest.raises(NPAError, match=r"species_count=2: run it with npa_envs\.rollout_spec"):
-        npa_envs.rollout(make_rule("cpu", species_count=2), *make_world("cpu"), 1)
-
-
-def test_a_number_of_species_is_checked():
-    with pytest.raises(NPAError, match="species_count must be at least 0, got -1"):
-        npa_envs.NPARule(2, 5, 12, species_count=-1)
-
-
-def test_fields_refuse_what_does_not_fit():
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (
+            lambda x, s: npa_envs.rollout(make_rule("cpu", species_count=2), x, s, 1),
+            r"species_count=2: run it with npa_envs\.rollout_spec",
+        ),
+        (lambda x, s: make_rule("cpu", species_count=-1), "must be at least 0, got -1"),
+        (lambda x, s: npa_envs.species_fields(x[0], [60], eps=0.3), r"shape \[B, N, D\]"),
+        (lambda x, s: npa_envs.perceive_species(x, s, [50], 0.3), "sum to the 60 particles"),
+        (lambda x, s: npa_envs.species_fields(x, [60], eps=0.3), "world 1, particle 3"),
+    ],
+)
+def test_rules_and_fields_of_species_refuse_what_does_not_fit(call, message):
     x, s = make_world("cpu")
-    with pytest.raises(NPAError, match=r"x must have shape \[B, N, D\]"):
-        npa_envs.species_fields(x[0], [60], eps=0.3)
-    with pytest.raises(NPAError, match="sum to the 60 particles"):
-        npa_envs.perceive_species(x, s, [50], 0.3)
     x[1, 3] = torch.nan
-    with pytest.raises(NPAError, match="world 1, particle 3"):
-        npa_envs.species_fields(x, [60], eps=0.3)
+    with pytest.raises(NPAError, match=message):
+        call(x, s)
