@@ -132,6 +132,8 @@ def test_draws_follow_from_key_episode_step_and_number_alone(kind, history, devi
     assert_drawn(kind, random.beside(7), [(episode, step, 0)] * 3)
     beside.advance()
     assert_drawn(kind, beside, [(episode, step + 1, 0)] * 3)
+    beside.restart()
+    assert_drawn(kind, beside, [(episode + 1, 0, 0)] * 3)
     assert_drawn(kind, random, [(episode, step, number + 1)] * 3)
 
 
@@ -158,9 +160,11 @@ def test_streams_can_be_taken_restarted_and_put_back(device):
     random.put(chosen, part)
     # All worlds share the number of the next draw, so that none is drawn twice.
     assert_drawn("uniform", random, [(0, 1, 2), (1, 0, 2)] * 2)
+    copy = random.take(slice(None))
     random.put(slice(1, 2), WorldRandom(9, device=device))
     random.advance()
     assert random.keys.tolist() == WorldRandom([1, 9, 3, 4]).keys.tolist()
+    assert copy.keys.tolist() == WorldRandom([1, 2, 3, 4]).keys.tolist()
     assert_drawn("uniform", random, [(0, 2, 0), (0, 1, 0), (0, 2, 0), (1, 1, 0)])
 
 
