@@ -502,9 +502,9 @@ class Crowd:
             assert abs(sum(rewards.values())) <= 1e-6 * (1 + max(map(abs, rewards.values())))
 
     def numbers(self) -> dict[str, Any]:
-        """Return losses as they are counted from now on: deaths change them at no charge."""
-        losses = self.parallel._episodes.account.loss[0].tolist()
-        return dict(zip(self.parallel.possible_agents, losses, strict=True))
+        """Return losses of the world as it is: deaths and placing change them at no charge."""
+        losses = sum(self.parallel.worlds.measured().values())[0].double()
+        return dict(zip(self.parallel.possible_agents, losses.tolist(), strict=True))
 
     def expect_batch(
         self, observations: Any, rewards: Any, ended: Any, late: Any, infos: Any
