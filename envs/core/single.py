@@ -23,8 +23,9 @@ from npa_envs.envs.core.spaces import (
 )
 from npa_envs.envs.core.task import EnvTask
 from npa_envs.envs.core.vector import check_options, plain_seed, world_keys
-from npa_envs.envs.core.worlds import DIVERGED, SUCCESS, TIME_LIMIT, Worlds, reason
+from npa_envs.envs.core.worlds import Worlds, reason
 from npa_envs.errors import NPAError
+from npa_envs.world.actions import DIVERGED, SUCCESS, TIME_LIMIT
 
 
 class NPAEnv(gymnasium.Env[Any, Any]):

@@ -23,9 +23,10 @@ from npa_envs.envs.core.spaces import (
     to_output,
 )
 from npa_envs.envs.core.task import EnvTask
-from npa_envs.envs.core.worlds import FLAGS, TIME_LIMIT, Report, Worlds, reason
+from npa_envs.envs.core.worlds import FLAGS, Report, Worlds, reason
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.tasks.checks import is_whole
+from npa_envs.world.actions import TIME_LIMIT
 from npa_envs.world.cuda_graph import sent
 from npa_envs.world.randomness import WorldRandom
 

@@ -17,7 +17,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from crowds import few, small, targets_made_once
+from crowds import few, small
 from fuzz_values import wrong
 from gymnasium.vector import AutoresetMode
 from small_envs import IDS
@@ -41,9 +41,6 @@ MEMORY = 4 * 2**30
 USED, USED_BY_WORKERS = resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN
 
 REFUSALS = (NPAError, gymnasium.error.Error)
-
-# A target drawn once serves all calls; drawing it takes longer than they do.
-quick_targets = pytest.fixture(scope="module", autouse=True)(targets_made_once)
 
 
 @pytest.fixture(autouse=True)
