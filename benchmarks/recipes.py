@@ -96,77 +96,89 @@ STRAYS: Fields = {
 }
 """What keeps worlds together for 100 000 steps, and heals clumps and cuts."""
 
-AGES: Fields = {"lifetimes": (64, 16_384), "pool_size": 64}
-"""Worlds of all ages in every batch."""
+NO_STRAYS: Fields = dict.fromkeys(STRAYS, 0.0) | {"bound_weight": 100.0}
 
-RECIPE: Fields = {
-    **AGES,
+FIRST: Fields = {
     **STRAYS,
+    "lifetimes": (64, 16_384),
+    "pool_size": 64,
     "schedule": "cosine",
     "learning_rate": 1e-3,
     "average": 0.999,
     "blur_levels": 3,
     "steps": (48, 80),
 }
-"""The candidate that the arms change one thing of each."""
+"""The first candidate: worlds of all ages, all of them damaged."""
 
-NO_STRAYS: Fields = dict.fromkeys(
-    ("stray_share", "stray_weight", "drift_weight", "clump_radius", "cut_gap"), 0.0
-) | {"bound_weight": 100.0}
-
-ARMS: Mapping[str, Fields] = {
-    "recipe": {},
-    "no ages, seeds every 3rd": {"lifetimes": (0, 0), "pool_size": 512, "seed_interval": 3},
-    "no average": {"average": 0.0},
-    "no blur": {"blur_levels": 0},
-    "no strays": NO_STRAYS,
-    "milestones": {"schedule": "milestones"},
-    "rate 2e-3": {"learning_rate": 2e-3},
-    "rate 5e-4": {"learning_rate": 5e-4},
-    "lifetimes to 4096": {"lifetimes": (64, 4096)},
-    "lifetimes from 256": {"lifetimes": (256, 16_384)},
-    "lifetimes from 16": {"lifetimes": (16, 16_384)},
-    "seed radius 0.56": {"seed_radius": 0.56},
-    "hidden 256": {"hidden_dim": 256},
-    "lifetimes to 65536": {"lifetimes": (64, 65_536)},
-    "pool 256": {"pool_size": 256},
-    "blur 5": {"blur_levels": 5},
-    "steps 32 to 96": {"steps": (32, 96)},
-    "steps 32 to 48": {"steps": (32, 48), "iterations": 4800},
-    "4 worlds": {"world_count": 4, "iterations": 6000},
-    "16 worlds": {"world_count": 16, "iterations": 1500},
+SECOND: Fields = {
+    **FIRST,
+    "average": 0.0,
+    "blur_levels": 0,
+    "damage_share": 0.5,
+    "stray_share": 5e-5,
 }
-"""Arms of `full` and `small`: what each changes of the recipe."""
+"""The second candidate: half of the worlds are left to themselves; what did not help is gone."""
 
-PAPER: Mapping[str, Fields] = {
-    "paper": {},
-    "paper, seeds every 3rd": {"seed_interval": 3},
-}
-"""The paper's schedule in one repeat, from which the recipe starts."""
-
-FAST_RECIPE: Fields = {
+FAST_FIRST: Fields = {
     "lifetimes": (24, 2048),
     "pool_size": 16,
     "schedule": "cosine",
     "average": 0.99,
     "blur_levels": 2,
 }
+"""The first candidate in small."""
+
+FAST_SECOND: Fields = FAST_FIRST | {"average": 0.0, "blur_levels": 0, "damage_share": 0.5}
+"""The second candidate in small."""
+
+ARMS: Mapping[str, Fields] = {
+    "paper": {},
+    "paper, seeds every 3rd": {"seed_interval": 3},
+    "first": FIRST,
+    "first, no ages, seeds every 3rd": {
+        **FIRST,
+        "lifetimes": (0, 0),
+        "pool_size": 512,
+        "seed_interval": 3,
+    },
+    "first, no average": FIRST | {"average": 0.0},
+    "first, no blur": FIRST | {"blur_levels": 0},
+    "first, no strays": FIRST | NO_STRAYS,
+    "first, milestones": FIRST | {"schedule": "milestones"},
+    "first, rate 2e-3": FIRST | {"learning_rate": 2e-3},
+    "second": SECOND,
+    "second, no strays": SECOND | NO_STRAYS,
+    "second, share 0.25": SECOND | {"damage_share": 0.25},
+    "second, share 1": SECOND | {"damage_share": 1.0},
+    "second, rate 2e-3": SECOND | {"learning_rate": 2e-3},
+    "second, steps 96 to 128": SECOND | {"steps": (96, 128), "iterations": 1700},
+    "second, lifetimes to 65536": SECOND | {"lifetimes": (64, 65_536)},
+    "second, hidden 256": SECOND | {"hidden_dim": 256},
+    "second, 4 worlds": SECOND | {"world_count": 4, "iterations": 6000},
+}
+"""Arms of `full` and `small`: what each changes of the preset `paper`."""
 
 FAST_ARMS: Mapping[str, Fields] = {
-    "recipe": {},
-    "no ages": {"lifetimes": (0, 0), "pool_size": 32},
-    "no average": {"average": 0.0},
-    "no blur": {"blur_levels": 0},
-    "milestones": {"schedule": "milestones"},
-    "strays": {**STRAYS, "drift_weight": 1.0},
-    "rate 1e-3": {"learning_rate": 1e-3},
-    "rate 4e-3": {"learning_rate": 4e-3},
-    "lifetimes to 8192": {"lifetimes": (24, 8192)},
-    "lifetimes from 96": {"lifetimes": (96, 2048)},
-    "4 worlds": {"world_count": 4, "iterations": 1200},
-    "damage 0.2": {"damage_radius": 0.2},
+    "fast": {},
+    "fast, share 0.5": {"damage_share": 0.5},
+    "fast, rate 4e-3": {"learning_rate": 4e-3},
+    "first": FAST_FIRST,
+    "first, no ages": FAST_FIRST | {"lifetimes": (0, 0), "pool_size": 32},
+    "first, no average": FAST_FIRST | {"average": 0.0},
+    "first, no blur": FAST_FIRST | {"blur_levels": 0},
+    "first, milestones": FAST_FIRST | {"schedule": "milestones"},
+    "first, strays": FAST_FIRST | STRAYS,
+    "first, rate 1e-3": FAST_FIRST | {"learning_rate": 1e-3},
+    "second": FAST_SECOND,
+    "second, rate 4e-3": FAST_SECOND | {"learning_rate": 4e-3},
+    "second, no damage": FAST_SECOND | {"damage": False},
+    "second, strays": FAST_SECOND | STRAYS | {"stray_share": 1e-3},
+    "second, steps 32 to 48": FAST_SECOND | {"steps": (32, 48), "iterations": 1440},
+    "second, 4 worlds": FAST_SECOND | {"world_count": 4, "iterations": 1200},
+    "second, lifetimes from 96": FAST_SECOND | {"lifetimes": (96, 2048)},
+    "second, hidden 128": FAST_SECOND | {"hidden_dim": 128},
 }
-"""Arms of `fast`."""
+"""Arms of `fast`: what each changes of it."""
 
 
 @dataclass(frozen=True)
@@ -176,7 +188,7 @@ class Run:
     size: str
     """A name of `SIZES`."""
     arm: str
-    """A name of `ARMS`, `FAST_ARMS` or `PAPER`."""
+    """A name of `ARMS`, or of `FAST_ARMS`."""
     picture: str
     """Stem of the picture's file."""
     seed: int
@@ -196,21 +208,17 @@ def configuration(
     """Return what a run is told."""
     fields: dict[str, Any] = {"repeats": 1, "tensorboard": False, "picture_interval": 0}
     if run.size == "fast":
-        base = "fast"
-        if run.arm != "fast":
-            fields |= FAST_RECIPE | FAST_ARMS[run.arm]
+        fields |= FAST_ARMS[run.arm]
     else:
-        base = "paper"
-        if run.arm in PAPER:
-            fields |= PAPER[run.arm] | SIZES[run.size]
-        else:
-            fields |= RECIPE | SIZES[run.size] | ARMS[run.arm]
+        arm = ARMS[run.arm]
+        # An arm's own number of iterations is meant for small worlds.
+        fields |= SIZES[run.size] | arm if run.size == "small" else arm | SIZES[run.size]
     fields |= changes
     if run.size != "fast" and fields.get("schedule") != "cosine":
         fields["milestones"] = tuple(round(share * fields["iterations"]) for share in QUARTERS)
     fields |= {"out": out, "device": device, "seed": run.seed, "target": str(picture)}
     fields["checkpoint_interval"] = 10**9
-    return preset(base, **fields)
+    return preset("fast" if run.size == "fast" else "paper", **fields)
 
 
 @contextlib.contextmanager
@@ -258,7 +266,15 @@ def measured(trainer: Trainer, size: str) -> dict[str, Any]:
     healed = healing(rule, task, grow_steps=grow, heal_steps=heal, seeds=SEEDS, device=device)
     if trainer.config.device.startswith("cuda"):
         release_recordings()
-    return {"growth": [asdict(row) for row in rows], "healing": [asdict(row) for row in healed]}
+    found = {"growth": [asdict(row) for row in rows], "healing": [asdict(row) for row in healed]}
+    pool = trainer.pool
+    if pool.age is not None:
+        with torch.no_grad():
+            losses = task.metric(pool.x, pool.s).tolist()
+        # What training saw last, place by place: age and loss.
+        pairs = zip(pool.age.tolist(), losses, strict=True)
+        found["pool"] = [[age, round(loss, 4)] for age, loss in pairs]
+    return found
 
 
 @torch.no_grad()
@@ -319,9 +335,7 @@ def run_all(arguments: argparse.Namespace) -> None:
     changes = json.loads(arguments.fields)
     changes = {k: tuple(v) if isinstance(v, list) else v for k, v in changes.items()}
     done = {key_of(line) for line in read_lines(out)}
-    arms = arguments.arms or ["fast", *FAST_ARMS]
-    if arguments.size != "fast":
-        arms = arguments.arms or [*PAPER, *ARMS]
+    arms = arguments.arms or list(FAST_ARMS if arguments.size == "fast" else ARMS)
     runs = [
         Run(arguments.size, arm, picture, seed)
         for seed in arguments.seeds
@@ -372,7 +386,7 @@ def warm_up(arguments: argparse.Namespace) -> None:
     with tempfile.TemporaryDirectory() as folder:
 
         def config(size: str, name: str, **fields: Any) -> Morphogenesis2DTrainConfig:
-            run = Run(size, "recipe", name, fields.pop("seed", 0))
+            run = Run(size, fields.pop("arm", "second"), name, fields.pop("seed", 0))
             # Few numbers of steps, each of which is a capture.
             few = fields if arguments.tiny else {"steps": (48, 50)} | fields
             return configuration(run, target, Path(folder) / name, arguments.device, few)
@@ -383,7 +397,7 @@ def warm_up(arguments: argparse.Namespace) -> None:
         size = sizes[0]
         wide = config(size, "wide", iterations=3, hidden_dim=256)
         measured(train_side_by_side([wide])[0][0], "tiny")
-        wide = config(size, "paper", iterations=3, lifetimes=(0, 0), average=0.0, blur_levels=0)
+        wide = config(size, "paper", iterations=8, arm="paper")
         measured(train_side_by_side([wide])[0][0], "tiny")
         for name in ("alone", "again"):
             (trainer,), _ = train_side_by_side([config(size, name, iterations=40)])
@@ -396,7 +410,7 @@ def warm_up(arguments: argparse.Namespace) -> None:
         same = same and bool(torch.isfinite(weights[2]).all())
         found: dict[str, Any] = {"same": same, "repeatable": repeatable}
         write_record(arguments.out / "check.json", found)
-        for size, counts in {} if arguments.tiny else PACES.items():
+        for size, counts in PACES.items() if arguments.paces else ():
             for count in counts:
                 name = f"{size}-{count}"
                 many = [config(size, f"{name}-{k}", iterations=60) for k in range(count)]
@@ -475,6 +489,7 @@ def main() -> None:
     own.add_argument("--out", type=Path, required=True)
     own.add_argument("--device", default="cpu")
     own.add_argument("--tiny", action="store_true", help="worlds of a test")
+    own.add_argument("--no-paces", dest="paces", action="store_false", help="time nothing")
     own = commands.add_parser("run")
     own.set_defaults(main=run_all)
     own.add_argument("--out", type=Path, required=True)

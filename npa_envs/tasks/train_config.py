@@ -104,6 +104,10 @@ class TrainConfig(Generic[TaskConfigT]):
     damage: bool = True
     """Worlds from the pool are damaged before the rollout, so that the rule learns to heal."""
 
+    damage_share: float = 1.0
+    """Share of the pool's places whose worlds are damaged, evenly spread; the worlds of the others
+    are left to themselves for all their lives, as a grown world mostly is."""
+
     runaway_limit: float = 10.0
     """A world with |x| or |s| above this, or not finite, is replaced by a seed in the pool."""
 
@@ -142,7 +146,7 @@ class TrainConfig(Generic[TaskConfigT]):
         check_positive(self, int, "iterations", "repeats", "world_count", "pool_size")
         check_positive(self, int, "seed_interval", "log_interval", "checkpoint_interval")
         check_positive(self, float, "learning_rate", "runaway_limit")
-        check_fraction(self, "decay")
+        check_fraction(self, "decay", "damage_share")
         check_non_negative(self, "weight_decay", "fresh_share", "average")
         if self.average >= 1.0:
             raise NPAError(f"average must be below 1, got {self.average}: try 0.999")

@@ -132,11 +132,8 @@ class TrainingCycle:
         config, worlds = self._config, self.generators["worlds"]
         self._index.copy_(self.pool.sample(config.world_count, worlds))
         x0, s0, goal = self.pool.read(self._index)
-        if isinstance(self.task, GoalTask) and goal is not None:
-            if config.damage:
-                x0, s0, goal = self.task.damage_with_goals(x0, s0, goal, worlds)
-        elif config.damage:
-            x0, s0 = self.task.damage(x0, s0, worlds)
+        if config.damage:
+            x0, s0, goal = self._damaged(x0, s0, goal)
         # Drawn in every iteration, needed or not: nobody on the host knows which worlds run away.
         fresh_x, fresh_s, fresh_goal = self._seeds(config.world_count)
         self._fresh_x.copy_(fresh_x)
@@ -156,6 +153,27 @@ class TrainingCycle:
         self.batch.s0.copy_(s0)
         if goal is not None:
             self.batch.aim(goal)
+
+    def _damaged(
+        self, x: Tensor, s: Tensor, goal: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Return worlds of the pool damaged, where they are in places of damaged ones."""
+        worlds, whole = self.generators["worlds"], (x, s, goal)
+        if isinstance(self.task, GoalTask) and goal is not None:
+            x, s, goal = self.task.damage_with_goals(x, s, goal, worlds)
+        else:
+            x, s = self.task.damage(x, s, worlds)
+        share = self._config.damage_share
+        if share < 1.0:
+            # Places at which the number of damaged ones up to there grows.
+            hit = torch.floor((self._index + 1) * share) > torch.floor(self._index * share)
+            x, s = (
+                torch.where(hit[:, None, None], hurt, old)
+                for hurt, old in ((x, whole[0]), (s, whole[1]))
+            )
+            if goal is not None and whole[2] is not None:
+                goal = torch.where(hit, goal, whole[2])
+        return x, s, goal
 
     def _begin_anew(self, count: int) -> None:
         """Let the first worlds of the batch be fresh seeds."""

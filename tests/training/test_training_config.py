@@ -94,6 +94,7 @@ def test_no_field_of_the_run_hides_one_of_the_task():
         ("steps", 5, "steps must be a list, got 5"),
         ("lifetimes", [5, 2], "lifetimes must be two whole numbers"),
         ("lifetimes", [0, 2], "lifetimes must be two whole numbers"),
+        ("damage_share", 0.0, r"damage_share must lie in \(0, 1\], got 0.0"),
         ("average", 1.0, "average must be below 1, got 1.0"),
         ("schedule", "linear", "schedule must be one of milestones, cosine, got 'linear'"),
         ("blur_levels", 7, "blur_levels must leave pictures of at least 4 pixels a side, got 7"),

@@ -47,8 +47,11 @@ def runaway():
         (circle_cycle, {"dtype": "float64", "damage": False, "normalise_gradients": False}),
         (tiny_cycle, {}),
         (clouds_cycle, {"steps": (2, 4), "pool_size": 10}),
-        (tiny_cycle, {"lifetimes": (4, 40), "average": 0.9, "blur_levels": 2}),
-        (clouds_cycle, {"steps": (2, 4), "pool_size": 16, "lifetimes": (2, 6)}),
+        (tiny_cycle, {"lifetimes": (4, 40), "average": 0.9, "blur_levels": 2, "damage_share": 0.5}),
+        (
+            clouds_cycle,
+            {"steps": (2, 4), "pool_size": 16, "lifetimes": (2, 6), "damage_share": 0.5},
+        ),
     ],
 )
 def test_replayed_operations_train_the_same_rule_as_called_ones(tmp_path, make, fields):

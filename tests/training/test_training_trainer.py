@@ -1,6 +1,7 @@
 """The trainer as a whole: it learns, it leaves files behind, it can be killed and resumed."""
 
 import io
+import itertools
 import math
 import os
 import signal
@@ -212,6 +213,27 @@ def test_worlds_from_the_pool_are_damaged_where_asked_and_fresh_seeds_are_not(tm
     total = sum(sum(counts) for counts in blank)
     assert (50 < total < 130) if damage else total == 0
     assert [counts[0] for counts in blank[::4]] == [0, 0, 0]
+
+
+def test_worlds_in_a_share_of_the_places_are_damaged_and_the_others_never(tmp_path):
+    task, blank = WatchedTask(), []
+
+    def rollout(rule, x, s, steps, **options):
+        blank.append([*zip(chosen(), (s == 0).all(-1).any(1).tolist(), strict=True)])
+        return plain_rollout(rule, x, s, steps, **options)
+
+    fields = {"iterations": 60, "pool_size": 8, "damage_share": 0.25, "milestones": []}
+    config = circle_config(tmp_path, seed_interval=100, **fields)
+    trainer = trainer_of(config, task, rollout=rollout)
+    chosen = trainer._cycle._index.tolist
+    trainer.run(progress=False)
+    hurt = {place: [] for place in range(8)}
+    for place, damaged in itertools.chain.from_iterable(blank[1:]):
+        hurt[place].append(damaged)
+    shares = [sum(hurt[place]) / len(hurt[place]) for place in range(8)]
+    # 12 particles, each blanked with probability 0.2: 7 % of the damaged worlds have none.
+    assert [share > 0.7 for share in shares] == [False, False, False, True] * 2
+    assert [share for share in shares if share <= 0.7] == [0.0] * 6
 
 
 def test_run_leaves_rule_configuration_and_pictures(tmp_path):
