@@ -18,6 +18,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import math
 import statistics
 import sys
 import tarfile
@@ -32,6 +33,8 @@ import numpy as np
 import torch
 from PIL import Image
 
+from npa_envs.files import write_bytes
+from npa_envs.measure.plots import new_figure, png
 from npa_envs.measure.quality import Runner, evaluate, healing
 from npa_envs.measure.record import machine, write_record
 from npa_envs.render.colours import to_uint8
@@ -117,7 +120,16 @@ SECOND: Fields = {
     "damage_share": 0.5,
     "stray_share": 5e-5,
 }
-"""The second candidate: half of the worlds are left to themselves; what did not help is gone."""
+"""The second candidate: half of the worlds are left to themselves; what did not help is gone.
+
+Its damaged worlds were those of every other place of the pool, the longest-lived ones too."""
+
+THIRD: Fields = SECOND | {
+    "lifetimes": (256, 32_768),
+    "damage_share": 0.25,
+    "stray_share": 2e-4,
+}
+"""The third candidate: fewer seeds, older worlds, and only worlds of short lives are damaged."""
 
 FAST_FIRST: Fields = {
     "lifetimes": (24, 2048),
@@ -130,6 +142,9 @@ FAST_FIRST: Fields = {
 
 FAST_SECOND: Fields = FAST_FIRST | {"average": 0.0, "blur_levels": 0, "damage_share": 0.5}
 """The second candidate in small."""
+
+FAST_STRAYS: Fields = STRAYS | {"stray_share": 1e-3}
+"""As `STRAYS`, of fewer particles."""
 
 ARMS: Mapping[str, Fields] = {
     "paper": {},
@@ -155,6 +170,9 @@ ARMS: Mapping[str, Fields] = {
     "second, lifetimes to 65536": SECOND | {"lifetimes": (64, 65_536)},
     "second, hidden 256": SECOND | {"hidden_dim": 256},
     "second, 4 worlds": SECOND | {"world_count": 4, "iterations": 6000},
+    "third": THIRD,
+    "third, no strays": THIRD | NO_STRAYS,
+    "third, lifetimes from 64": THIRD | {"lifetimes": (64, 32_768)},
 }
 """Arms of `full` and `small`: what each changes of the preset `paper`."""
 
@@ -172,11 +190,26 @@ FAST_ARMS: Mapping[str, Fields] = {
     "second": FAST_SECOND,
     "second, rate 4e-3": FAST_SECOND | {"learning_rate": 4e-3},
     "second, no damage": FAST_SECOND | {"damage": False},
-    "second, strays": FAST_SECOND | STRAYS | {"stray_share": 1e-3},
+    "second, strays": FAST_SECOND | FAST_STRAYS,
     "second, steps 32 to 48": FAST_SECOND | {"steps": (32, 48), "iterations": 1440},
     "second, 4 worlds": FAST_SECOND | {"world_count": 4, "iterations": 1200},
     "second, lifetimes from 96": FAST_SECOND | {"lifetimes": (96, 2048)},
     "second, hidden 128": FAST_SECOND | {"hidden_dim": 128},
+    "fast, rate 8e-3": {"learning_rate": 8e-3},
+    "fast, rate 4e-3, strays": FAST_STRAYS | {"learning_rate": 4e-3},
+    "fast, rate 4e-3, strays, cosine": {
+        **FAST_STRAYS,
+        "learning_rate": 4e-3,
+        "schedule": "cosine",
+    },
+    "third": {
+        **FAST_SECOND,
+        **FAST_STRAYS,
+        "learning_rate": 4e-3,
+        "lifetimes": (96, 4096),
+        "steps": (24, 40),
+        "iterations": 1800,
+    },
 }
 """Arms of `fast`: what each changes of it."""
 
@@ -233,9 +266,14 @@ def on(stream: Any) -> Any:
 
 
 def train_side_by_side(
-    configs: Sequence[Morphogenesis2DTrainConfig], iterations: int | None = None
+    configs: Sequence[Morphogenesis2DTrainConfig], longest: float = math.inf
 ) -> tuple[list[Trainer], float]:
-    """Train several rules, an iteration of each in turn; return the trainers and the seconds."""
+    """Train several rules, an iteration of each in turn; return the trainers and the seconds.
+
+    Args:
+        configs: What they are told.
+        longest: Stop after this time [s], finished or not.
+    """
     device = torch.device(configs[0].device)
     streams, trainers = [], []
     for config in configs:
@@ -244,8 +282,12 @@ def train_side_by_side(
             trainers.append(Trainer(task, config, task_name="morphogenesis2d"))
             streams.append(stream)
     begun = time.perf_counter()
-    most = max(config.total_iterations for config in configs) if iterations is None else iterations
-    for _ in range(most):
+    for number in range(max(config.total_iterations for config in configs)):
+        if number % 64 == 0 and device.type == "cuda":
+            # The host would run ahead of the time that the device needs.
+            torch.cuda.synchronize()
+        if time.perf_counter() - begun >= longest:
+            break
         for trainer, stream in zip(trainers, streams, strict=True):
             if trainer.iteration < trainer.config.total_iterations:
                 with on(stream):
@@ -358,7 +400,7 @@ def run_all(arguments: argparse.Namespace) -> None:
                 )
                 for run in group
             ]
-            trainers, seconds = train_side_by_side(configs)
+            trainers, seconds = train_side_by_side(configs, arguments.longest)
             for run, trainer in zip(group, trainers, strict=True):
                 line = asdict(run) | {"iterations": trainer.iteration, "seconds": seconds}
                 line |= {"together": len(group), "fields": changes} | measured(trainer, run.size)
@@ -466,13 +508,33 @@ def table(runs: Sequence[Mapping[str, Any]], size: str) -> str:
     return "\n".join(lines)
 
 
+def draw(runs: Sequence[Mapping[str, Any]]) -> bytes:
+    """Return a PNG of the arms' mean losses against steps from the seed, a panel a size."""
+    sizes = [size for size in SIZES if any(run["size"] == size for run in runs)]
+    figure, ((*panels,),) = new_figure(1, len(sizes), (6.0 * len(sizes), 6.5))
+    for size, panel in zip(sizes, panels, strict=True):
+        own = [run for run in runs if run["size"] == size]
+        for number, arm in enumerate(dict.fromkeys(run["arm"] for run in own)):
+            members = [run for run in own if run["arm"] == arm]
+            steps = [row["step"] for row in members[0]["growth"]]
+            means = [statistics.fmean(_loss(run, step) or 0.0 for run in members) for step in steps]
+            dashes = ("-", "--", ":")[number // 10 % 3]
+            panel.plot(steps, means, dashes, color=f"C{number % 10}", label=arm)
+        panel.set(xscale="log", yscale="log", title=size)
+        panel.set(xlabel="steps from the seed", ylabel="splat loss, mean of pictures and seeds")
+        panel.legend(fontsize=7)
+    return png(figure)
+
+
 def _loss(run: Mapping[str, Any], step: int) -> float | None:
     return next((row["loss"] for row in run["growth"] if row["step"] == step), None)
 
 
 def report(arguments: argparse.Namespace) -> None:
-    """Print the tables of a record."""
+    """Print the tables of a record, and draw its figure where asked."""
     runs = json.loads(arguments.record.read_text("utf-8"))["runs"]
+    if arguments.figure:
+        write_bytes(arguments.figure, draw(runs))
     for size in SIZES:
         if any(run["size"] == size for run in runs):
             print(f"\n{size}\n\n{table(runs, size)}")
@@ -501,6 +563,7 @@ def main() -> None:
     own.add_argument("--seeds", type=int, nargs="+", default=[0])
     own.add_argument("--together", type=int, default=1, help="runs that share the device")
     own.add_argument("--seconds", type=float, default=1e9, help="begin no run that would end later")
+    own.add_argument("--longest", type=float, default=math.inf, help="seconds of a run, at most")
     own.add_argument("--process", default="0", help="part of the name of the file of results")
     own.add_argument("--fields", default="{}", help="JSON object of fields for all arms")
     own.add_argument("--strips", action="store_true", help="pictures of what grows")
@@ -511,6 +574,7 @@ def main() -> None:
     own = commands.add_parser("report")
     own.set_defaults(main=report)
     own.add_argument("record", type=Path)
+    own.add_argument("--figure", type=Path, help="a PNG file of the arms' losses over steps")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     arguments.main(arguments)

@@ -38,9 +38,10 @@ COMMON = ("target", "iterations", "device", "out")
 class TrainOptions:
     """What most runs are told; the paper's schedule, pool and world follow below."""
 
-    preset: str = "fast"
-    """Configuration to start from: `paper`, `fast` (minutes on a CPU) or `tiny` (seconds);
-    `npa-envs list` has their sizes and times."""
+    preset: str = ""
+    """Configuration to start from: `paper`, `fast` (minutes on a CPU), `tiny` (seconds), or for
+    morphogenesis2d `best` (minutes on a GPU); `npa-envs list` has their sizes and times. By
+    default `best` on CUDA where the task has it, else `fast`."""
 
     target: str = ""
     """What is to be learned: a built-in name (`npa-envs list`), a file, or for morphogenesis2d an
@@ -104,13 +105,15 @@ def starting_configuration(task_name: str, arguments: Sequence[str]) -> TrainCon
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     parser.add_argument("--preset")
     parser.add_argument("--config", type=Path)
+    parser.add_argument("--device", default="cpu")
     parser.add_argument("--resume", action="store_true")
     parser.add_argument("--out", "--output", type=Path)
     try:
         first, _ = parser.parse_known_args(arguments)
     except argparse.ArgumentError as error:
         raise NPAError(f"{error.argument_name}: {error.message}") from error
-    base = preset(first.preset or TrainOptions.preset, task_name)
+    device = first.device if first.config is None else "cpu"
+    base = preset(first.preset or default_preset(task_name, device), task_name)
     if first.resume and not {"-h", "--help"} & set(arguments):
         folder = RunFolder(first.out or base.out)
         if not folder.checkpoint.is_file():
@@ -126,6 +129,12 @@ def starting_configuration(task_name: str, arguments: Sequence[str]) -> TrainCon
             presets = dict.fromkeys(presets, base)
         base = load_config(first.config, base, presets=presets)
     return base
+
+
+def default_preset(task_name: str, device: str) -> str:
+    """Return the preset of runs that name none: `best` on CUDA where there is one, else `fast`."""
+    cuda = device.startswith("cuda")
+    return "best" if cuda and "best" in task_entry(task_name).presets else "fast"
 
 
 def parse(
@@ -227,7 +236,8 @@ def announcement(
     species = getattr(task, "species", (task,))
     goals = [getattr(own, "target", None) or f"the data {own.data}" for own in species]
     particles = " and ".join(str(own.particle_count) for own in species)
-    source = f"preset {options.preset}" if options.config is None else str(options.config)
+    named = options.preset or default_preset(task_name, config.device)
+    source = f"preset {named}" if options.config is None else str(options.config)
     expected = task_entry(task_name).expected_seconds(config)
     if expected is None:
         time = f"how long that takes on {config.device} the progress bar tells"

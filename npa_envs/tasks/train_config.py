@@ -105,8 +105,8 @@ class TrainConfig(Generic[TaskConfigT]):
     """Worlds from the pool are damaged before the rollout, so that the rule learns to heal."""
 
     damage_share: float = 1.0
-    """Share of the pool's places whose worlds are damaged, evenly spread; the worlds of the others
-    are left to themselves for all their lives, as a grown world mostly is."""
+    """Share of the pool's places whose worlds are damaged: the first ones, which with `lifetimes`
+    are those of the shortest; all other worlds are left to themselves for all their lives."""
 
     runaway_limit: float = 10.0
     """A world with |x| or |s| above this, or not finite, is replaced by a seed in the pool."""

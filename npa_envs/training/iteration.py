@@ -165,8 +165,7 @@ class TrainingCycle:
             x, s = self.task.damage(x, s, worlds)
         share = self._config.damage_share
         if share < 1.0:
-            # Places at which the number of damaged ones up to there grows.
-            hit = torch.floor((self._index + 1) * share) > torch.floor(self._index * share)
+            hit = self._index < share * self._config.pool_size
             x, s = (
                 torch.where(hit[:, None, None], hurt, old)
                 for hurt, old in ((x, whole[0]), (s, whole[1]))

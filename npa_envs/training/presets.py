@@ -30,7 +30,7 @@ class TaskEntry:
     """One line for lists."""
 
     presets: Mapping[str, TrainConfig[Any]]
-    """Configurations by name: `paper`, `fast`, `tiny`."""
+    """Configurations by name: `paper`, `fast`, `tiny`, and `best` where a recipe was searched."""
 
     make: Callable[[Any, torch.device], PictureTask]
     """Builds the task from its own configuration, on a device."""
@@ -124,7 +124,7 @@ def preset(name: str, task_name: str = "morphogenesis2d", /, **fields: Any) -> T
     """Return a preset with fields changed by plain name.
 
     Args:
-        name: `paper`, `fast` or `tiny`.
+        name: `paper`, `fast`, `tiny`, or `best` where the task has it.
         task_name: The task it is for.
         fields: New values by field name, the run's and the task's alike.
 

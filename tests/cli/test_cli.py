@@ -165,6 +165,27 @@ def test_a_configuration_file_goes_over_the_preset_and_options_over_the_file(tmp
     assert config.iterations == 40
 
 
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [
+        ("morphogenesis2d", "fast"),
+        ("morphogenesis2d --device cuda", "best"),
+        ("co_morphogenesis2d --device cuda:1", "best"),
+        ("texture --device cuda", "fast"),
+        ("morphogenesis2d --device cuda --preset fast", "fast"),
+    ],
+)
+def test_runs_that_name_no_preset_take_the_best_one_on_cuda_and_the_fast_one_elsewhere(words, name):
+    from npa_envs.cli.train import announcement, parse, starting_configuration
+    from npa_envs.training import preset
+
+    task, *rest = words.split()
+    base = starting_configuration(task, rest)
+    assert base == preset(name, task)
+    options, config = parse(task, base, rest)
+    assert announcement(task, options, config)[0].endswith(f"(preset {name})")
+
+
 def test_a_configuration_file_may_name_its_preset_and_the_command_line_another(tmp_path, capsys):
     from npa_envs.cli.train import starting_configuration
 

@@ -10,6 +10,7 @@ import torch
 from PIL import Image, ImageDraw
 
 from npa_envs.errors import NPAError
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.tasks.targets import images
 from npa_envs.tasks.targets.images import read_image, resample
 from npa_envs.tasks.targets.points import (
@@ -273,6 +274,39 @@ def test_picture_without_transparency_is_cut_out_of_its_background(tmp_path, suf
     assert target.pixel_size == pytest.approx(reference.pixel_size, rel=0.03)
     assert (target.colours[:, 0] > 0.85).all()
     assert (target.colours[:, 1:] < 0.25).float().mean() > 0.97
+
+
+@pytest.mark.parametrize("mode", ["RGB", "RGBA"])
+def test_whole_rectangle_is_grown_where_the_background_is_kept(tmp_path, mode):
+    """Opaque pictures as they are, transparent ones on white."""
+    image = Image.new("RGB", (120, 60), "white")
+    ImageDraw.Draw(image).rectangle((0, 0, 59, 59), fill=BLUE)
+    if mode == "RGBA":
+        image.putalpha(Image.new("L", image.size, 0))
+        image.paste((*BLUE[:3], 255), (0, 0, 60, 60))
+    image.save(tmp_path / "photo.png")
+    target = load_target(tmp_path / "photo.png", point_count=800, keep_background=True)
+    assert target.point_count == 800
+    sides = target.points.amax(0) - target.points.amin(0) + target.pixel_size
+    torch.testing.assert_close(sides, torch.tensor([1.8, 0.9]), rtol=0.0, atol=1e-5)
+    left = target.points[:, 0] < -2 * target.pixel_size
+    right = target.points[:, 0] > 2 * target.pixel_size
+    blue = torch.tensor(BLUE[:3]) / 255
+    # Filters ring beside the edge, by a level or two of 255.
+    assert (target.colours[left] - blue).abs().max() < 2.5 / 255
+    assert (target.colours[right] - 1.0).abs().max() < 2.5 / 255
+
+
+def test_a_photograph_says_that_its_background_can_be_kept(tmp_path):
+    noise = np.random.default_rng(0).integers(0, 255, (40, 50, 3), dtype=np.uint8)
+    Image.fromarray(noise).save(tmp_path / "photo.png")
+    with pytest.raises(NPAError, match=r"or grow the whole picture \(keep_background\)"):
+        load_target(tmp_path / "photo.png")
+    config = Morphogenesis2DConfig(
+        target=str(tmp_path / "photo.png"), keep_background=True, target_point_count=500
+    )
+    assert Morphogenesis2D(config).target.point_count == pytest.approx(500, rel=0.02)
+    assert load_target("heart", point_count=400, keep_background=True).colours.max() == 1.0
 
 
 def test_opaque_alpha_channel_counts_as_none(tmp_path):

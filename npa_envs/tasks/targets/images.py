@@ -59,6 +59,12 @@ def read_image(path: Path) -> Image.Image:
     return image
 
 
+def with_background(image: Image.Image) -> Image.Image:
+    """Return an RGBA picture whose whole rectangle is opaque: what it does not cover is white."""
+    white = Image.new("RGBA", image.size, (255, 255, 255, 255))
+    return Image.alpha_composite(white, image)
+
+
 def open_image(path: Path) -> Image.Image:
     """Read a picture as RGBA, as it is.
 
@@ -176,14 +182,16 @@ def cut_out_background(image: Image.Image, *, label: str) -> Image.Image:
             f"target {shown(label)} has no transparency, so at least {_UNIFORM_SHARE:.0%} of its "
             "border "
             f"must have one colour (the background), but only {uniform:.0%} have: "
-            "give a PNG or WebP with a transparent background"
+            "give a PNG or WebP with a transparent background, or grow the whole picture "
+            "(keep_background)"
         )
     similar = np.abs(rgb - background).max(axis=-1) <= _BACKGROUND_TOLERANCE
     outside = _connected_to_border(similar)
     if outside.all():
         raise NPAError(
             f"target {shown(label)} has no transparency and one colour all over, nothing to grow: "
-            "give a picture with an object, best a PNG with a transparent background"
+            "give a picture with an object, best a PNG with a transparent background, or grow the "
+            "whole picture (keep_background)"
         )
     colour, alpha = _unmix_edge(rgb, ~outside, background)
     pixels = np.concatenate([colour, 255 * alpha[..., None]], axis=-1)

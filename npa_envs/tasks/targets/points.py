@@ -23,9 +23,11 @@ from npa_envs.tasks.targets.images import (
     LARGEST_POINT_COUNT,
     OPAQUE,
     looks_like_path,
+    open_image,
     read_image,
     require_opaque_pixels,
     resample,
+    with_background,
 )
 
 
@@ -70,6 +72,7 @@ def load_target(
     *,
     point_count: int = 4096,
     extent: float = 1.8,
+    keep_background: bool = False,
     device: str | torch.device = "cpu",
 ) -> PointTarget:
     """Make a target from a built-in name, a picture file or an emoji.
@@ -86,6 +89,8 @@ def load_target(
         extent: Side of the smallest square around the origin, the mean of the points, that holds
             the whole target [length units]. The picture shows [-1, 1]; the default leaves a margin
             of 0.1 on each side.
+        keep_background: The picture's whole rectangle is the target, white where it is transparent:
+            for photographs.
         device: Where the tensors are made.
 
     Raises:
@@ -99,17 +104,20 @@ def load_target(
         raise NPAError(
             f"extent must be finite and above 0 length units, got {shown(extent)}: try 1.8"
         )
-    name, image = load_target_image(source)
+    name, image = load_target_image(source, keep_background=keep_background)
     return target_from_image(
         image, name=name, point_count=point_count, extent=extent, device=device
     )
 
 
-def load_target_image(source: str | Path) -> tuple[str, Image.Image]:
+def load_target_image(
+    source: str | Path, *, keep_background: bool = False
+) -> tuple[str, Image.Image]:
     """Return the name and the full-size RGBA picture of what `load_target` accepts as source.
 
     Args:
         source: A built-in name, the path of a picture file, or one emoji.
+        keep_background: As for `load_target`.
 
     Raises:
         NPAError: As for `load_target`.
@@ -120,11 +128,19 @@ def load_target_image(source: str | Path) -> tuple[str, Image.Image]:
             f"target must be a string or a Path, got {type(source).__name__}: "
             "for a Pillow picture in memory use target_from_image"
         )
+    name, image = _named_image(source, open_image if keep_background else read_image)
+    return name, with_background(image) if keep_background else image
+
+
+def _named_image(
+    source: str | Path, read: Callable[[Path], Image.Image]
+) -> tuple[str, Image.Image]:
+    """Return the name and the RGBA picture of a source; files are read by the function."""
     if isinstance(source, str) and source in DRAWINGS:
         return source, DRAWINGS[source]()
     if isinstance(source, Path) or looks_like_path(source):
         path = home_path(source)
-        return path.stem, read_image(path)
+        return path.stem, read(path)
     if is_emoji(source):
         return source, render_emoji(source)
     raise NPAError(
