@@ -3,14 +3,16 @@
 An arm is a recipe with one choice changed. `run` trains every arm on every picture of a folder and
 measures the rules as `npa-envs evaluate --healing` does, with seeds that training never saw; on a
 GPU several runs share the device, each on a stream of its own. Every finished run is a line of
-JSON, so that a stopped call goes on where it was. `warm-up` compiles all kernels and tests that
-runs side by side learn bit for bit what they learn alone; `merge` makes one record, one sheet of
-pictures and one archive of rules of what several processes left; `report` prints the tables.
+JSON, so that a stopped call goes on where it was. `pictures` draws the emoji; `warm-up` compiles
+all kernels and tests that runs side by side learn bit for bit what they learn alone; `merge` makes
+one record, one sheet of pictures and one archive of rules of what several processes left; `report`
+prints the tables and draws the figure.
 
+    python benchmarks/recipes.py pictures --out PICTURES
     python benchmarks/recipes.py warm-up --device cuda --out OUT
-    CUDA_VISIBLE_DEVICES=0 python benchmarks/recipes.py run --pictures DIR --device cuda --out OUT
+    python benchmarks/recipes.py run --pictures PICTURES/development --device cuda --out OUT
     python benchmarks/recipes.py merge --out OUT
-    python benchmarks/recipes.py report OUT/recipes.json
+    python benchmarks/recipes.py report OUT/recipes.json --figure recipes.png
 """
 
 from __future__ import annotations
@@ -19,11 +21,13 @@ import argparse
 import contextlib
 import json
 import math
+import random
 import statistics
 import sys
 import tarfile
 import tempfile
 import time
+import unicodedata
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -33,13 +37,15 @@ import numpy as np
 import torch
 from PIL import Image
 
+from npa_envs.errors import NPAError
 from npa_envs.files import write_bytes
-from npa_envs.measure.plots import new_figure, png
+from npa_envs.measure.plots import new_figure, number_plainly, png
 from npa_envs.measure.quality import Runner, evaluate, healing
 from npa_envs.measure.record import machine, write_record
 from npa_envs.render.colours import to_uint8
 from npa_envs.rule.files import save_rule
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DTrainConfig
+from npa_envs.tasks.targets.emoji import render_emoji
 from npa_envs.training import Trainer, preset
 from npa_envs.world.recorded import release_recordings
 
@@ -131,6 +137,14 @@ THIRD: Fields = SECOND | {
 }
 """The third candidate: fewer seeds, older worlds, and only worlds of short lives are damaged."""
 
+FAST_BEFORE: Fields = {
+    **NO_STRAYS,
+    "learning_rate": 2e-3,
+    "schedule": "milestones",
+    "milestones": (1500, 2100),
+}
+"""The preset `fast` as it was when its arms were compared, laid over what it is."""
+
 FAST_FIRST: Fields = {
     "lifetimes": (24, 2048),
     "pool_size": 16,
@@ -211,7 +225,7 @@ FAST_ARMS: Mapping[str, Fields] = {
         "iterations": 1800,
     },
 }
-"""Arms of `fast`: what each changes of it."""
+"""Arms of `fast`: what each changes of it as it was; the preset is the cosine with strays now."""
 
 
 @dataclass(frozen=True)
@@ -241,7 +255,7 @@ def configuration(
     """Return what a run is told."""
     fields: dict[str, Any] = {"repeats": 1, "tensorboard": False, "picture_interval": 0}
     if run.size == "fast":
-        fields |= FAST_ARMS[run.arm]
+        fields |= FAST_BEFORE | FAST_ARMS[run.arm]
     else:
         arm = ARMS[run.arm]
         # An arm's own number of iterations is meant for small worlds.
@@ -461,6 +475,37 @@ def warm_up(arguments: argparse.Namespace) -> None:
     print((arguments.out / "check.json").read_text(), flush=True)
 
 
+BLOCKS = (
+    (0x1F300, 0x1F5FF),
+    (0x1F600, 0x1F64F),
+    (0x1F680, 0x1F6FF),
+    (0x1F900, 0x1F9FF),
+    (0x1FA70, 0x1FAFF),
+)
+"""Code points of pictures in Unicode, first and last."""
+
+SKIN_TONES = (0x1F3FB, 0x1F3FF)
+"""Those of them that change others."""
+
+DRAWN = 12
+"""Pictures to develop on, and as many to test."""
+
+
+def draw_pictures(arguments: argparse.Namespace) -> None:
+    """Write emoji, drawn at random but always the same of the same font, as PNG files."""
+    emoji = {}
+    for code in (code for first, last in BLOCKS for code in range(first, last + 1)):
+        name = unicodedata.name(chr(code), "")
+        if name and not SKIN_TONES[0] <= code <= SKIN_TONES[1]:
+            with contextlib.suppress(NPAError):
+                emoji[name.lower().replace(" ", "-")] = render_emoji(chr(code))
+    drawn = random.Random(0).sample(list(emoji), 2 * DRAWN)
+    for number, name in enumerate(drawn):
+        folder = arguments.out / ("development" if number < DRAWN else "test")
+        folder.mkdir(parents=True, exist_ok=True)
+        emoji[name].save(folder / f"{name}.png", optimize=True)
+
+
 def merge(arguments: argparse.Namespace) -> None:
     """Make one record, one sheet and one archive of what several processes left in a folder."""
     out: Path = arguments.out
@@ -483,7 +528,7 @@ def merge(arguments: argparse.Namespace) -> None:
         path.unlink()
 
 
-REPORTED = (64, 128, 512, 4096, LAST)
+REPORTED = (64, 128, 512, 1024, 4096, LAST)
 """Steps of the tables."""
 
 
@@ -511,7 +556,7 @@ def table(runs: Sequence[Mapping[str, Any]], size: str) -> str:
 def draw(runs: Sequence[Mapping[str, Any]]) -> bytes:
     """Return a PNG of the arms' mean losses against steps from the seed, a panel a size."""
     sizes = [size for size in SIZES if any(run["size"] == size for run in runs)]
-    figure, ((*panels,),) = new_figure(1, len(sizes), (6.0 * len(sizes), 6.5))
+    figure, ((*panels,),) = new_figure(1, len(sizes), (5.6 * len(sizes), 6.5))
     for size, panel in zip(sizes, panels, strict=True):
         own = [run for run in runs if run["size"] == size]
         for number, arm in enumerate(dict.fromkeys(run["arm"] for run in own)):
@@ -522,7 +567,9 @@ def draw(runs: Sequence[Mapping[str, Any]]) -> bytes:
             panel.plot(steps, means, dashes, color=f"C{number % 10}", label=arm)
         panel.set(xscale="log", yscale="log", title=size)
         panel.set(xlabel="steps from the seed", ylabel="splat loss, mean of pictures and seeds")
-        panel.legend(fontsize=7)
+        number_plainly(panel.xaxis)
+        number_plainly(panel.yaxis)
+        panel.legend(fontsize=8, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.12))
     return png(figure)
 
 
@@ -552,6 +599,9 @@ def main() -> None:
     own.add_argument("--device", default="cpu")
     own.add_argument("--tiny", action="store_true", help="worlds of a test")
     own.add_argument("--no-paces", dest="paces", action="store_false", help="time nothing")
+    own = commands.add_parser("pictures")
+    own.set_defaults(main=draw_pictures)
+    own.add_argument("--out", type=Path, required=True)
     own = commands.add_parser("run")
     own.set_defaults(main=run_all)
     own.add_argument("--out", type=Path, required=True)

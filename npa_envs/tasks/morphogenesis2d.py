@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -257,17 +258,22 @@ Morphogenesis2DTrainConfig = TrainConfig[Morphogenesis2DConfig]
 
 _OUT = Path("runs/morphogenesis2d")
 
+_TOGETHER: Mapping[str, Any] = {
+    "stray_weight": 10.0,
+    "bound_weight": 10.0,
+    "drift_weight": 1.0,
+    "clump_radius": 0.2,
+    "cut_gap": 0.1,
+}
+"""What keeps worlds together for long, and heals clumps and cuts (docs/stability.md)."""
+
 MORPHOGENESIS2D_PRESETS: Mapping[str, Morphogenesis2DTrainConfig] = {
     "paper": TrainConfig(task=Morphogenesis2DConfig(), out=_OUT),
     # Found by experiment on pictures that nobody tuned for: docs/recipes.md.
     "best": TrainConfig(
         task=Morphogenesis2DConfig(
             stray_share=2e-4,
-            stray_weight=10.0,
-            bound_weight=10.0,
-            drift_weight=1.0,
-            clump_radius=0.2,
-            cut_gap=0.1,
+            **_TOGETHER,
         ),
         repeats=1,
         iterations=6000,
@@ -279,9 +285,7 @@ MORPHOGENESIS2D_PRESETS: Mapping[str, Morphogenesis2DTrainConfig] = {
         damage_share=0.25,
         out=_OUT,
     ),
-    # A few particles that see far, in worlds that start from seeds often: a recognisable gecko
-    # after about four minutes on one core (means of 4 worlds: splat loss 0.16 and PSNR 25 dB at
-    # step 64, 0.22 and 23 dB at step 1024; with a seed in every sixth batch 0.21 and 0.43).
+    # A few particles that see far, in worlds that start from seeds often.
     "fast": fast_run(
         Morphogenesis2DConfig(
             target_point_count=512,
@@ -290,11 +294,14 @@ MORPHOGENESIS2D_PRESETS: Mapping[str, Morphogenesis2DTrainConfig] = {
             eps=0.2,
             seed_radius=0.4,
             resolution=64,
+            stray_share=1e-3,
+            **_TOGETHER,
         ),
         iterations=2400,
         pool_size=32,
         steps=(16, 32),
-        milestones=(1500, 2100),
+        learning_rate=4e-3,
+        schedule="cosine",
         seed_interval=2,
         picture_interval=200,
         out=_OUT,
