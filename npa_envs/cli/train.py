@@ -121,7 +121,7 @@ def starting_configuration(task_name: str, arguments: Sequence[str]) -> TrainCon
                 f"there is no checkpoint to resume from at {str(folder.checkpoint)!r}: give the "
                 "folder of an earlier run with --out, or leave --resume out to start a new run"
             )
-        base = load_config(folder.config, base)
+        base = load_config(folder.config, base, whole=True)
     if first.config is not None:
         presets = task_entry(task_name).presets
         if first.preset or first.resume:

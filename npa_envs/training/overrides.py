@@ -65,6 +65,7 @@ def load_config(
     base: TrainConfig[TaskConfigT],
     *,
     presets: Mapping[str, TrainConfig[TaskConfigT]] | None = None,
+    whole: bool = False,
 ) -> TrainConfig[TaskConfigT]:
     """Return `base` with the fields that a YAML, TOML or JSON file sets.
 
@@ -75,6 +76,8 @@ def load_config(
         path: A file that ends in .yaml, .yml, .toml or .json.
         base: The configuration that gives every field the file does not, for example a preset.
         presets: Those that a `preset` of the file may name to stand for `base`; None: none.
+        whole: The file is all of a run's configuration: fields that are younger than it get their
+            defaults, not what `base` has.
 
     Raises:
         NPAError: The file cannot be read, is no such file, names an unknown field, or gives a
@@ -99,7 +102,7 @@ def load_config(
             if not isinstance(name, str) or name not in presets:
                 raise NPAError(f"unknown preset {name!r}: {suggest(name, presets)}")
             base = presets[name]
-        return override(base, **own)
+        return override(base, **(completed(own, base) if whole else own))
     except NPAError as error:
         raise NPAError(f"in the configuration file {shown(str(path))}: {error}") from error
 
@@ -130,8 +133,9 @@ def completed(held: Any, config: Any) -> Any:
         }
         now = {name: getattr(config, name, None) for name in held}
         return younger | {name: completed(value, now[name]) for name, value in held.items()}
-    if isinstance(config, tuple) and isinstance(held, list) and len(config) == len(held):
-        return [completed(one, own) for one, own in zip(held, config, strict=True)]
+    if isinstance(config, tuple) and config and isinstance(held, list):
+        last = len(config) - 1
+        return [completed(one, config[min(k, last)]) for k, one in enumerate(held)]
     return held
 
 

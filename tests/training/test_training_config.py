@@ -66,13 +66,16 @@ def test_override_reaches_fields_of_the_run_and_of_the_task():
     assert (PAPER.iterations, PAPER.task.target) == (10_000, "gecko")
 
 
-def test_configurations_that_were_kept_get_the_defaults_of_younger_fields():
+def test_configurations_that_were_kept_get_the_defaults_of_younger_fields(tmp_path):
     config = preset("fast", "co_morphogenesis2d", average=0.5)
     held = config_to_dict(config)
     whole = json.loads(json.dumps(held))
     del held["lifetimes"], held["average"], held["task"]["species"][1]["blur_levels"]
     assert completed(held, config) == whole | {"average": 0.0}
     assert completed(whole, config) == whole
+    (tmp_path / "config.json").write_text(json.dumps(held))
+    assert load_config(tmp_path / "config.json", config).average == 0.5
+    assert load_config(tmp_path / "config.json", config, whole=True).average == 0.0
 
 
 def test_no_field_of_the_run_hides_one_of_the_task():
