@@ -37,6 +37,9 @@ SEED_SHARE = 0.5
 SMALL_VIEWS = {"resolution": 64, "training_views": 1, "held_out_views": 6}
 """What the loss of a 3D world looks at: as trained, drawing the target alone takes many seconds."""
 
+MOST_TASKS = 8
+"""Tasks that are kept, with their targets: a slider of N asks for many."""
+
 POLL_SECONDS = 1.0
 """Time between two looks into the folder of a run [s]."""
 
@@ -96,6 +99,8 @@ class RuleWorld(Live):
     def _task_of(self, organism: Organism, particle_count: int | None) -> TrainedTask:
         key = (organism.name, particle_count)
         if key not in self._trained:
+            if len(self._trained) >= MOST_TASKS:
+                self._trained.clear()
             self._trained[key] = task_of_rule(
                 self._choices[organism.name],
                 organism.rule,
@@ -265,8 +270,7 @@ class RuleWorld(Live):
 
     def _go(self, steps: int, told: Mapping[str, Any], *, path: bool = False) -> Tensor | None:
         rules = [organism.rule for organism in self.organisms]
-        alone = self.counts == [self.full]
-        if alone:
+        if self.counts == [self.full] and self._divisors == [float(self.full)]:
             self.x, self.s, travelled = rollout(
                 rules[0], self.x, self.s, steps, return_path_length=True, **told
             )
@@ -423,7 +427,7 @@ class RunWorld(RuleWorld):
         )  # fmt: skip
 
     def _note(self) -> str:
-        return f"a run in {self._run_folder.path.name}, iteration {self._iteration}"
+        return f"a run in {self._run_folder.path.resolve().name}, iteration {self._iteration}"
 
     def news(self) -> list[dict[str, Any]]:
         """Return the run's new losses, and the world where its rule has changed."""
@@ -463,13 +467,24 @@ class RunWorld(RuleWorld):
             )  # fmt: skip
             self._logged = len(records)
         written = self._stamp()
-        if written and written != self._written:
-            # Its weights alone: the world goes on under the rule as it is now.
-            rule = load_rule(self._run_folder.rule, device=self._device).float()
-            self.main.rule.load_state_dict(rule.state_dict())
+        fresher = bool(written) and written != self._written
+        if fresher:
+            # Also where it cannot be read: that is told once.
             self._written = written
-        if fresh or written:
+            self._take_rule()
+        if fresh or fresher:
             self._news.append(self.describe())
+
+    def _take_rule(self) -> None:
+        """Take the rule as it is now: the world goes on under it, if it fits."""
+        rule = load_rule(self._run_folder.rule, device=self._device).float()
+        if rule.hyper_parameters() == self.main.rule.hyper_parameters():
+            self.main.rule.load_state_dict(rule.state_dict())
+        else:
+            # Another run has begun in this folder.
+            self._rules.clear()
+            self._trained.clear()
+            self._plant(self.main.name)
 
 
 def check_run(folder: RunFolder) -> None:

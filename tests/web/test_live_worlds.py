@@ -417,6 +417,21 @@ def test_a_run_is_followed(tmp_path):
     # The world lives on.
     assert world.x is x
     assert world.step == 1
+    # Nothing is told again.
+    world._due = 0.0
+    assert world.news() == []
+
+
+def test_another_run_in_the_folder_is_another_world(tmp_path):
+    write_run(tmp_path)
+    world = RunWorld(tmp_path, device=CPU, particle_count=COUNT)
+    world.news()
+    write_run(tmp_path, "dots")
+    world._due = 0.0
+    (told,) = world.news()
+    assert told["box"] == [2.0, 2.0]
+    world.advance()
+    assert world.frame().step == 1
 
 
 def test_a_line_that_is_being_written_waits(tmp_path):
@@ -433,8 +448,11 @@ def test_a_rule_that_is_damaged_meanwhile_is_told_and_the_world_lives_on(tmp_pat
     world.news()
     (tmp_path / "rule.safetensors").write_bytes(b"half")
     world._due = 0.0
-    (error,) = [event for event in world.news() if event["type"] == "error"]
+    (error,) = world.news()
+    assert error["type"] == "error"
     assert "cannot load a rule" in error["message"]
+    world._due = 0.0
+    assert world.news() == []
     world.advance()
     assert world.step == 1
 
