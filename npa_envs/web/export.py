@@ -17,7 +17,7 @@ from PIL import Image
 from torch import Tensor
 
 from npa_envs.errors import NPAError, shown
-from npa_envs.files import checked_path, write_text
+from npa_envs.files import atomic_path, checked_path
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule, check_rule
 from npa_envs.tasks.growth import GrowthTask
@@ -134,14 +134,18 @@ def export_web(
             f"a page must end in .html, got {shown(str(path))}: "
             f"use {shown(str(path.with_suffix('.html')))}"
         )
-    rules = [page_rule(source, particle_count=particle_count) for source in sources]
-    names = [rule["name"] for rule in rules]
+    names = [name_of(source) for source in sources]
     if not names or len(set(names)) < len(names):
         raise NPAError(f"a page needs rules of different names, got {shown(names)}")
-    if previews:
-        for source, rule in zip(sources, rules, strict=True):
-            rule["preview"] = preview(source, particle_count=particle_count)
-    write_text(path, page_text(rules, title=title or names[0], seed=checked_seed(seed)))
+    seed = checked_seed(seed)
+    # Where it cannot be written is told before previews are grown.
+    with atomic_path(path) as temporary:
+        rules = [page_rule(source, particle_count=particle_count) for source in sources]
+        if previews:
+            for source, rule in zip(sources, rules, strict=True):
+                rule["preview"] = preview(source, particle_count=particle_count)
+        text = page_text(rules, title=title or names[0], seed=seed)
+        temporary.write_bytes(text.encode())
 
 
 def page_rule(source: str, *, particle_count: int | None = None) -> dict[str, Any]:

@@ -407,3 +407,11 @@ def test_the_command_writes_pages_and_collections(
     )
     assert main(["export-web", "-o", str(page)]) == 2
     assert main(["export-web", "duck", "-o", str(collection)]) == 2
+
+
+def test_a_place_that_cannot_be_written_to_is_told_before_any_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("npa_envs.web.export.page_rule", lambda *_, **__: pytest.fail("worked"))
+    with pytest.raises(NPAError, match="does not exist"):
+        export_web(["gecko"], tmp_path / "nowhere" / "page.html")
