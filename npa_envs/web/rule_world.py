@@ -17,9 +17,13 @@ from npa_envs.rule.files import load_rule, shipped_rules
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import PictureTask, seed_worlds, task_toward
 from npa_envs.tasks.checks import is_real
+from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig
 from npa_envs.tasks.damage import DAMAGE_SIZES, damage_worlds
 from npa_envs.tasks.point_classification import PointClassification, class_colours
 from npa_envs.tasks.seeds import uniform_ball
+from npa_envs.tasks.train_config import TrainConfig
+from npa_envs.training.overrides import load_config
+from npa_envs.training.presets import preset
 from npa_envs.training.run_folder import JsonlLog, RunFolder
 from npa_envs.training.trained_tasks import TrainedTask, task_of_rule
 from npa_envs.web.colouring import Colouring, Seen, shows_of
@@ -161,7 +165,7 @@ class RuleWorld(Live):
             tools.remove("add")
         return {
             "type": "world",
-            "title": self.main.name,
+            "title": self._title(),
             "note": self._note(),
             "dimension": self.dimension,
             "box": None if box is None else list(box),
@@ -181,6 +185,9 @@ class RuleWorld(Live):
             "playing": self.playing,
             "seed": self.seed,
         }
+
+    def _title(self) -> str:
+        return self.main.name
 
     def _note(self) -> str:
         return ""
@@ -394,7 +401,7 @@ def name_of(source: str) -> str:
 
 
 class RunWorld(RuleWorld):
-    """The rule of a training run, as of its last checkpoint, in a world that lives on.
+    """The rules of a training run, as of its last checkpoint, in a world that lives on.
 
     Args:
         folder: The run's folder.
@@ -416,18 +423,57 @@ class RunWorld(RuleWorld):
     ) -> None:
         self._run_folder = RunFolder(folder)
         self._log = JsonlLog(self._run_folder.log)
-        check_run(self._run_folder)
+        files = rules_of_run(self._run_folder)
+        self._files = {name_of(str(path)): path for path in files}
+        self._centres = [0.0]
+        if len(files) > 1:
+            # Seeds lie in a row, as in training.
+            config = load_config(self._run_folder.config, joint_preset(), whole=True)
+            self._centres = list(config.task.centres)
+        self._each = None if particle_count is None else max(1, particle_count // len(files))
         self._written = self._stamp()
         self._logged = 0
         self._iteration = 0
         self._due = 0.0
+        choices = {name: str(path) for name, path in self._files.items()}
         super().__init__(
-            str(self._run_folder.rule), device=device, seed=seed, particle_count=particle_count,
-            choices={},
-        )  # fmt: skip
+            str(files[0]), device=device, seed=seed, particle_count=self._each, choices=choices
+        )
+
+    @torch.no_grad()
+    def reset(self, seed: int | None) -> None:
+        """Begin a fresh world of all rules of the run."""
+        super().reset(seed)
+        if len(self._files) == 1:
+            return
+        self.organisms = [self._organism(name) for name in self._files]
+        worlds = []
+        for organism, centre in zip(self.organisms, self._centres, strict=True):
+            task = self._task_of(organism, self._each).task
+            x, s = task.seed(1, generator=self._generator, device=self._device)
+            x[..., 0] += centre
+            worlds.append((x, s))
+        self.x, self.s = (torch.cat(parts, dim=1) for parts in zip(*worlds, strict=True))
+        self.counts = [x.shape[1] for x, _ in worlds]
+        self.full = sum(self.counts)
+        # As in training, each sees densities as it would alone.
+        self._divisors = [float(count) for count in self.counts]
+
+    def describe(self) -> dict[str, Any]:
+        """Return the event "world"; which rules there are is the run's matter."""
+        return super().describe() | {"rules": [], "rule": None}
+
+    def _settings(self) -> dict[str, Any]:
+        told = super()._settings()
+        if len(self._files) > 1:
+            del told["count"]
+        return told
+
+    def _title(self) -> str:
+        return self._run_folder.path.resolve().name
 
     def _note(self) -> str:
-        return f"a run in {self._run_folder.path.resolve().name}, iteration {self._iteration}"
+        return f"a training run, iteration {self._iteration}"
 
     def news(self) -> list[dict[str, Any]]:
         """Return the run's new losses, and the world where its rule has changed."""
@@ -440,11 +486,9 @@ class RunWorld(RuleWorld):
                 self._news.append({"type": "error", "message": str(error)})
         return super().news()
 
-    def _stamp(self) -> int:
-        try:
-            return self._run_folder.rule.stat().st_mtime_ns
-        except OSError:
-            return 0
+    def _stamp(self) -> list[int]:
+        """Return when the rules were written."""
+        return [path.stat().st_mtime_ns if path.exists() else 0 for path in self._files.values()]
 
     def _poll(self) -> None:
         records = self._log.records()
@@ -467,47 +511,54 @@ class RunWorld(RuleWorld):
             )  # fmt: skip
             self._logged = len(records)
         written = self._stamp()
-        fresher = bool(written) and written != self._written
+        fresher = written != self._written
         if fresher:
             # Also where it cannot be read: that is told once.
             self._written = written
-            self._take_rule()
+            self._take_rules()
         if fresh or fresher:
             self._news.append(self.describe())
 
-    def _take_rule(self) -> None:
-        """Take the rule as it is now: the world goes on under it, if it fits."""
-        rule = load_rule(self._run_folder.rule, device=self._device).float()
-        if rule.hyper_parameters() == self.main.rule.hyper_parameters():
-            self.main.rule.load_state_dict(rule.state_dict())
+    def _take_rules(self) -> None:
+        """Take the rules as they are now: the world goes on under them, if they fit."""
+        fresh = {
+            name: load_rule(path, device=self._device).float() for name, path in self._files.items()
+        }
+        own = {name: self._organism(name).rule for name in fresh}
+        if all(fresh[k].hyper_parameters() == own[k].hyper_parameters() for k in own):
+            for name, rule in own.items():
+                rule.load_state_dict(fresh[name].state_dict())
         else:
             # Another run has begun in this folder.
             self._rules.clear()
             self._trained.clear()
-            self._plant(self.main.name)
+            self._plant(self.main.name, self._each)
 
 
-def check_run(folder: RunFolder) -> None:
-    """Check that a folder holds a run with a rule.
+def joint_preset() -> TrainConfig[CoMorphogenesis2DConfig]:
+    """Return what the configuration of a run of several rules begins with."""
+    config: TrainConfig[CoMorphogenesis2DConfig] = preset("fast", "co_morphogenesis2d")
+    return config
+
+
+def rules_of_run(folder: RunFolder) -> list[Path]:
+    """Return the files of a run's rules: one, or those of the species that it trains together.
 
     Raises:
-        NPAError: It does not; the message says what is missing.
+        NPAError: There are none; the message says what is missing.
     """
     path = str(folder.path)
     if not folder.path.is_dir():
         raise NPAError(f"a run must be a folder, got {shown(path)}: name the one given as --out")
     if folder.rule.is_file():
-        return
-    others = sorted(folder.path.glob("rule-*.safetensors"))
-    if others:
-        raise NPAError(
-            f"the run in {shown(path)} trains {len(others)} rules together: view one of them, such "
-            f"as {shown(str(others[0]))}"
-        )
+        return [folder.rule]
+    found = sorted(folder.path.glob("rule-[0-9]*.safetensors"))
+    several = [folder.rule_of(number) for number in range(len(found))]
+    if found and all(path.is_file() for path in several):
+        return several
     if folder.config.is_file() or folder.log.is_file():
         raise NPAError(
-            f"the run in {shown(path)} has not written its rule {folder.rule.name} yet: wait for "
-            "its first checkpoint"
+            f"the run in {shown(path)} has not written its rules yet: wait for its first checkpoint"
         )
     raise NPAError(
         f"the folder {shown(path)} must hold the {folder.rule.name} of a run, it does not: name "

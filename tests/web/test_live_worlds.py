@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import time
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from npa_envs import NPAError, load_rule, rollout, save_rule
+from npa_envs import NPAError, load_rule, rollout, rollout_species, save_rule
 from npa_envs.agents.policies import ZeroPolicy
 from npa_envs.rule.files import rule_metadata, shipped_rules
 from npa_envs.tasks.damage import DAMAGE_SIZES
@@ -22,6 +23,7 @@ from npa_envs.web.server import frame_bytes
 
 CPU = torch.device("cpu")
 COUNT = 96
+UNFINISHED = Path(__file__).resolve().parents[1] / "golden" / "unfinished_joint_run"
 
 
 @pytest.fixture
@@ -404,7 +406,7 @@ def test_a_run_is_followed(tmp_path):
     curve, told = world.news()
     assert curve["points"] == [[k, 1.0 / (k + 1)] for k in range(10)]
     assert not curve["append"]
-    assert told["note"] == "a run in mine, iteration 9"
+    assert told["note"] == "a training run, iteration 9"
     assert told["title"] == "mine"
     assert world.news() == []
     world.advance()
@@ -420,6 +422,36 @@ def test_a_run_is_followed(tmp_path):
     # Nothing is told again.
     world._due = 0.0
     assert world.news() == []
+
+
+@pytest.mark.filterwarnings("ignore:.*has no checksum")
+def test_a_run_of_several_rules_is_one_world_of_them(tmp_path):
+    folder = tmp_path / "pair"
+    shutil.copytree(UNFINISHED, folder)
+    world = RunWorld(folder, device=CPU)
+    told = world.describe()
+    assert told["title"] == "pair"
+    assert told["species"] == ["rule-0", "rule-1"]
+    assert world.counts == [128, 128]
+    curve, _ = world.news()
+    assert len(curve["points"]) > 1
+    rules = [load_rule(folder / f"rule-{k}.safetensors").float() for k in (0, 1)]
+    x, s, generator = world.x, world.s, torch.Generator()
+    generator.set_state(world._generator.get_state())
+    world.advance()
+    with torch.no_grad():
+        x, _ = rollout_species(
+            rules, x, s, 1, counts=[128, 128], density_counts=[128, 128], eps=0.3,
+            update_prob=0.5, generator=generator,
+        )  # fmt: skip
+    assert torch.equal(world.x, x)
+    # A newer checkpoint.
+    save_rule(rules[0], folder / "rule-1.safetensors")
+    world._due = 0.0
+    world.news()
+    assert torch.equal(world.organisms[1].rule.hidden.weight, rules[0].hidden.weight)
+    world.handle({"type": "reset"})
+    assert world.counts == [128, 128]
 
 
 def test_another_run_in_the_folder_is_another_world(tmp_path):
@@ -461,10 +493,7 @@ def test_an_unfinished_run_is_refused_in_words(tmp_path):
     with pytest.raises(NPAError, match=r"must hold the rule\.safetensors of a run"):
         RunWorld(tmp_path, device=CPU)
     (tmp_path / "config.json").write_text("{}")
-    with pytest.raises(NPAError, match=r"has not written its rule .* yet: wait for its first"):
-        RunWorld(tmp_path, device=CPU)
-    save_rule(load_rule("gecko"), tmp_path / "rule-0.safetensors")
-    with pytest.raises(NPAError, match="trains 1 rules together: view one of them"):
+    with pytest.raises(NPAError, match="has not written its rules yet: wait for its first"):
         RunWorld(tmp_path, device=CPU)
     with pytest.raises(NPAError, match="a run must be a folder"):
         RunWorld(tmp_path / "none", device=CPU)

@@ -56,7 +56,7 @@ def test_what_is_wrong_is_said_before_anything_is_served(words, error, capsys, t
 
 def test_an_unfinished_run_is_refused(tmp_path):
     (tmp_path / "log.jsonl").write_text("")
-    with pytest.raises(NPAError, match="has not written its rule"):
+    with pytest.raises(NPAError, match="has not written its rules"):
         make(tmp_path)
 
 
