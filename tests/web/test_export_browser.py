@@ -96,6 +96,31 @@ def test_an_exported_page_heals(
 
 
 @pytest.mark.slow
+def test_a_page_records_a_film_and_a_picture(tmp_path: Path, new_page: Callable[[], Page]) -> None:
+    page = new_page()
+    page.open(export(tmp_path, "gecko", count=256))
+    page.wait(f"{STEP} >= 2")
+    page.run("document.getElementById('record').click()")
+    page.wait(f"{STEP} >= 30")
+    page.run("document.getElementById('record').click()")
+    page.wait("document.querySelector('#files a').download.startsWith('film.')")
+    page.run("document.getElementById('snapshot').click()")
+    page.wait("document.querySelectorAll('#files a').length === 2")
+    # The page may not fetch, not even its own files: a film that plays has its width.
+    width = page.run(
+        """new Promise((told) => {
+          const film = document.createElement("video");
+          film.onloadedmetadata = () => told(film.videoWidth);
+          film.onerror = () => told(0);
+          film.src = [...document.querySelectorAll("#files a")]
+            .find((link) => link.download.startsWith("film.")).href;
+        })"""
+    )
+    assert width == page.run("document.getElementById('world').width")
+    alone(page)
+
+
+@pytest.mark.slow
 def test_a_page_may_not_reach_the_network(tmp_path: Path, new_page: Callable[[], Page]) -> None:
     page = new_page()
     page.open(export(tmp_path, "gecko", count=64))
