@@ -298,7 +298,7 @@ def test_devices_agree_and_a_rollout_can_be_captured(perception):
         ({"space_dim": 3}, "agree in space_dim, got 2 for rule 0 and 3"),
         ({"eps0": 0.2}, r"agree in eps0, got 0\.3 for rule 0 and 0\.2"),
         ({"static": True}, "agree in static, got False for rule 0"),
-        ({"moment_inverse": "smooth"}, "agree in moment_inverse, got 'threshold' for rule 0"),
+        ({"moment_inverse": "smooth"}, "agree in moment_inverse, got threshold for rule 0"),
         (
             {"density_gradient": False},
             "agree in density_gradient, got True for rule 0 and False for rule 1",
