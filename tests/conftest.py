@@ -1,6 +1,5 @@
 """Options and fixtures of the whole suite."""
 
-import functools
 import os
 import tempfile
 from pathlib import Path
@@ -9,8 +8,6 @@ import pytest
 import torch
 import warp as wp
 from filelock import FileLock
-
-from npa_envs.tasks.targets.points import DRAWINGS
 
 REFERENCE = Path(
     os.environ.get(
@@ -47,15 +44,6 @@ def compiled_once():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(wp.Module, "load", load_in_turn)
-        yield
-
-
-@pytest.fixture(scope="session", autouse=True)
-def drawn_once():
-    """Draw each built-in picture once: a thousand tests make an environment or a task of one."""
-    with pytest.MonkeyPatch.context() as patch:
-        for name, draw in DRAWINGS.items():
-            patch.setitem(DRAWINGS, name, functools.cache(draw))
         yield
 
 

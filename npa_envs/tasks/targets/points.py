@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import colorsys
+import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -137,7 +138,7 @@ def _named_image(
 ) -> tuple[str, Image.Image]:
     """Return the name and the RGBA picture of a source; files are read by the function."""
     if isinstance(source, str) and source in DRAWINGS:
-        return source, DRAWINGS[source]()
+        return source, _drawing(source).copy()
     if isinstance(source, Path) or looks_like_path(source):
         path = home_path(source)
         return path.stem, read(path)
@@ -148,6 +149,12 @@ def _named_image(
         f"{shown(source)}: "
         f"{suggest(source, DRAWINGS)}"
     )
+
+
+@functools.cache
+def _drawing(name: str) -> Image.Image:
+    """Return a built-in picture, drawn once: every environment and task asks for one."""
+    return DRAWINGS[name]()
 
 
 def target_from_image(
