@@ -64,7 +64,7 @@ def wrong_tensor(draw: random.Random, legal: Tensor) -> Any:
         return made
 
     makers: tuple[Callable[[], Any], ...] = (
-        lambda: legal[0],
+        lambda: legal[0] if len(legal) else legal[None],
         lambda: legal[None],
         lambda: legal[..., :1],
         lambda: legal[:0],

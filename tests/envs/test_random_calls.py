@@ -500,7 +500,7 @@ class Crowd:
 
     def numbers(self) -> dict[str, Any]:
         """Return losses of the world as it is: deaths and placing change them at no charge."""
-        losses = sum(self.parallel.worlds.measured().values())[0].double()
+        losses = sum(part[0].double() for part in self.parallel.worlds.measured().values())
         return dict(zip(self.parallel.possible_agents, losses.tolist(), strict=True))
 
     def expect_batch(
