@@ -62,8 +62,8 @@ def once_differentiable(
     """Return the backward pass of an autograd function, made to refuse second derivatives.
 
     Torch's own `once_differentiable` says nothing where the cotangent needs no gradient, as that of
-    a sum: second derivatives are then zero. So they still are of a function that `torch.compile`
-    has taken: what it makes of this one asks nothing.
+    a sum: second derivatives are then zero. Functions that `torch.compile` has taken refuse them by
+    themselves, but for its backend "eager", which is there to look for faults.
 
     Args:
         backward: The backward pass, of a context and cotangents.

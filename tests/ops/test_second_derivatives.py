@@ -57,3 +57,14 @@ def test_the_reference_that_the_error_names_has_second_derivatives():
     )
     (second,) = torch.autograd.grad(gradient.square().sum(), s)
     assert float(second.abs().max()) > 0.0
+
+
+def test_a_compiled_function_refuses_second_derivatives_too():
+    x, s = torch.rand(1, 12, 2), torch.randn(1, 12, 4, requires_grad=True)
+    compiled = torch.compile(
+        lambda x, s: npa_envs.perceive(x, s, 0.3).square().sum(), backend="aot_eager"
+    )
+    (gradient,) = torch.autograd.grad(compiled(x, s), s, create_graph=True)
+    penalty = gradient.square().sum()
+    with pytest.raises(RuntimeError, match="double backward"):
+        penalty.backward()
