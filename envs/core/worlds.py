@@ -332,7 +332,9 @@ class Worlds(Batch):
         self.report.endings.copy_(paid.endings)
         if own is not None and self.particle_reward is not None:
             self.particle_reward.copy_(own)
-        self._host_numbers.copy_(numbers)
+        if self.world_count == 1:
+            # Of several the host reads none, and this waits for the device.
+            self._host_numbers.copy_(numbers)
 
     @torch.no_grad()
     def step(self, action: Tensor, out: Tensor | None = None) -> tuple[NDArray[np.uint8], Tensor]:
