@@ -4,6 +4,7 @@
 #   make test-all     all tests
 #   make test-cuda    the tests of kernels, worlds and training on a GPU, kernels compiled once
 #   make check        ruff, formatting, types, spelling
+#   make docs         the documentation's site, in build/docs/; warnings are errors
 #   make bench-check  is the library still as much faster than its alternatives as it was?
 # PIP_ARGS goes to pip: PIP_ARGS='--extra-index-url https://download.pytorch.org/whl/cpu' takes
 # torch's smaller CPU build.
@@ -17,12 +18,13 @@ CHECK := build/check
 # A stamp a set of extras, older than these files: pip runs again only when they change.
 CORE := $(VENV)/installed-core
 DEV := $(VENV)/installed-dev
+DOCS := $(VENV)/installed-docs
 INPUTS := pyproject.toml constraints.txt
 
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
 CUDA_WORKERS ?= 8
 
-.PHONY: demo test test-all test-cuda check bench-check clean
+.PHONY: demo test test-all test-cuda check docs bench-check clean
 .DELETE_ON_ERROR:
 
 $(BIN)/python:
@@ -36,6 +38,10 @@ $(CORE): $(INPUTS) | $(BIN)/python
 $(DEV): $(INPUTS) | $(BIN)/python
 	$(BIN)/python -m pip install --quiet $(PIP_ARGS) -e '.[dev]' -c constraints.txt
 	touch $@ $(CORE)
+
+$(DOCS): $(INPUTS) | $(BIN)/python
+	$(BIN)/python -m pip install --quiet $(PIP_ARGS) -e '.[dev,docs]' -c constraints.txt
+	touch $@ $(DEV) $(CORE)
 
 demo: $(CORE)
 	$(BIN)/npa-envs warmup --device cpu
@@ -61,6 +67,10 @@ check: $(DEV)
 	cp -R pyproject.toml README.md LICENSE npa_envs envs wrappers agents $(CHECK)/source
 	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --target $(CHECK)/site $(CHECK)/source
 	cd $(CHECK)/site && ../../../$(BIN)/mypy --config-file ../../../pyproject.toml --cache-dir ../cache -p npa_envs
+
+# The source folder is the root, so that links lead where they lead on a code host.
+docs: $(DOCS)
+	$(BIN)/sphinx-build -W --keep-going --quiet -b html -c docs -d build/docs-cache . build/docs
 
 bench-check: $(CORE)
 	OMP_NUM_THREADS=1 $(BIN)/npa-envs bench --quick --device cpu --check benchmarks/results/ratios.json --no-progress

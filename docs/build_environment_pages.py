@@ -11,7 +11,6 @@ section that an environment has not is that of `Morphogenesis2DEnv`.
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import inspect
 import re
@@ -22,7 +21,7 @@ from pathlib import Path
 
 import species_pages
 from draw_environment_pictures import FILMS, picture_path
-from page_parts import NOTE, default_text, field_meanings, kind_text, sections, table
+from page_parts import default_text, field_meanings, kind_text, sections, table, write_or_check
 
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
@@ -160,7 +159,7 @@ def page(registration: Registration) -> str:
     opening = (f"# {registration.id}", text.pop(""), picture(registration), facts)
     example = EXAMPLE.format(id=registration.id)
     body = [f"## {heading}\n\n{content}" for heading, content in text.items()]
-    return "\n\n".join((NOTE, *opening, example, *body)) + "\n"
+    return "\n\n".join((species_pages.MADE, *opening, example, *body)) + "\n"
 
 
 def picture(registration: Registration) -> str:
@@ -177,12 +176,12 @@ def index() -> str:
         rows.append((f"[`{registration.id}`]({registration.name}.md)", text))
     opening = (
         "One page each: observation, action, reward, episodes, arguments. Words and letters are "
-        "explained in [the mathematics](../mathematics.md#glossary). To train a first policy: [the "
-        "tutorial](../tutorial.md). To make one of your own: "
+        "explained in [the glossary](../glossary.md). To train a first policy: "
+        "[the tutorial](../tutorial.md). To make one of your own: "
         "[your own task as an environment](../own_environment.md)."
     )
     listing = table(("Environment", "Task"), [*rows, *species_pages.index_rows()])
-    return "\n\n".join((NOTE, "# Environments", opening, listing)) + "\n"
+    return "\n\n".join((species_pages.MADE, "# Environments", opening, listing)) + "\n"
 
 
 def pages() -> dict[str, str]:
@@ -191,28 +190,10 @@ def pages() -> dict[str, str]:
     return made | species_pages.pages() | {"README.md": index()}
 
 
-def stale_pages(folder: Path = PAGES) -> list[str]:
-    """Return the names of pages in a folder that are missing, not current, or nobody's."""
-    made = pages()
-    there = {path.name: path.read_text(encoding="utf-8") for path in folder.glob("*.md")}
-    return sorted(name for name in made | there if made.get(name) != there.get(name))
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Write or check the pages; return the exit status."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--check", action="store_true", help="write nothing; fail if not current")
-    chosen = parser.parse_args(arguments)
-    if chosen.check:
-        stale = stale_pages()
-        if stale:
-            cure = "python docs/build_environment_pages.py"
-            print(f"not current: {', '.join(stale)}: run {cure}", file=sys.stderr)
-        return int(bool(stale))
-    PAGES.mkdir(exist_ok=True)
-    for name, text in pages().items():
-        (PAGES / name).write_text(text, encoding="utf-8")
-    return 0
+def main(arguments: list[str] | None = None, folder: Path = PAGES) -> int:
+    """Write or check the pages of a folder; return the exit status."""
+    there = [path.name for path in folder.glob("*.md")]
+    return write_or_check(folder, pages(), there, __doc__, arguments)
 
 
 if __name__ == "__main__":

@@ -1,18 +1,21 @@
-"""What pages of environments are put together from: sections of docstrings, tables of arguments."""
+"""Parts of pages that are made by scripts: sections of docstrings, tables, files kept current."""
 
 from __future__ import annotations
 
+import argparse
 import ast
 import inspect
 import json
 import re
+import sys
 import textwrap
 import typing
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
+from pathlib import Path
 from typing import Any, Literal
 
-NOTE = "<!-- Made by docs/build_environment_pages.py from the docstrings: edit those. -->"
+NOTE = "<!-- Made by {script} from the {source}: edit those. -->"
 
 
 def sections(env_class: type) -> dict[str, str]:
@@ -60,3 +63,43 @@ def table(heading: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
     lines = [heading, ("---",) * len(heading), *rows]
     cells = ((re.sub(r"\s+", " ", cell).replace("|", "\\|") for cell in line) for line in lines)
     return "\n".join(f"| {' | '.join(line)} |" for line in cells)
+
+
+def stale_pages(folder: Path, made: Mapping[str, str], there: Iterable[str]) -> list[str]:
+    """Return the names of pages in a folder that are missing, not current, or nobody's."""
+    found = {name: folder / name for name in there}
+    texts = {n: path.read_text(encoding="utf-8") for n, path in found.items() if path.exists()}
+    return sorted(name for name in made | texts if made.get(name) != texts.get(name))
+
+
+def write_or_check(
+    folder: Path,
+    made: Mapping[str, str],
+    there: Iterable[str],
+    about: str | None,
+    arguments: list[str] | None,
+) -> int:
+    """Write pages, or with `--check` compare them with those that are there.
+
+    Args:
+        folder: Where they belong.
+        made: Texts by file name.
+        there: Names of the files that the script answers for.
+        about: The script's docstring.
+        arguments: Words of the command line; None takes them from the process.
+
+    Returns:
+        The exit status.
+    """
+    parser = argparse.ArgumentParser(description=(about or "").split("\n")[0])
+    parser.add_argument("--check", action="store_true", help="write nothing; fail if not current")
+    if parser.parse_args(arguments).check:
+        stale = stale_pages(folder, made, there)
+        if stale:
+            cure = (about or "").split("    ")[1].split("  ")[0].strip()
+            print(f"not current: {', '.join(stale)}: run {cure}", file=sys.stderr)
+        return int(bool(stale))
+    folder.mkdir(exist_ok=True)
+    for name, text in made.items():
+        (folder / name).write_text(text, encoding="utf-8")
+    return 0

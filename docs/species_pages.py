@@ -12,6 +12,7 @@ from npa_envs.envs import multispecies_v0, particles_v0
 from npa_envs.envs.multi import TASKS, SpeciesConfig
 from npa_envs.envs.multi.parallel import CrowdEnv
 
+MADE = NOTE.format(script="docs/build_environment_pages.py", source="docstrings")
 MODULES = {"MultiSpecies": multispecies_v0, "Particles": particles_v0}
 """Modules by the names of their pages."""
 
@@ -104,7 +105,7 @@ def page(name: str) -> str:
     shown = [picture] if name == "MultiSpecies" else []
     opening = (f"# npa_envs.envs.{short}", text.pop(""), *shown, facts, example)
     body = [f"## {heading}\n\n{content}" for heading, content in text.items()]
-    return "\n\n".join((NOTE, *opening, *body)) + "\n"
+    return "\n\n".join((MADE, *opening, *body)) + "\n"
 
 
 def pages() -> dict[str, str]:

@@ -17,10 +17,13 @@ from small_envs import assert_batch_of_singles
 
 import npa_envs
 from npa_envs.agents.learning import METHODS, Budget, train
+from npa_envs.cli import COMMANDS
 from npa_envs.envs import multispecies_v0, particles_v0
 from npa_envs.envs.multi import TASKS as TABLE
 from npa_envs.ops.backend import Request, describe
 from npa_envs.registration import ENVIRONMENTS
+from npa_envs.rule.files import shipped_rules
+from npa_envs.training import TASKS as TRAINED
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
@@ -71,6 +74,17 @@ def builder():
 
 
 @pytest.fixture(scope="module")
+def gallery():
+    """The script that makes the page of the rules."""
+    sys.path.insert(0, str(DOCS))
+    try:
+        import build_gallery_page
+    finally:
+        sys.path.remove(str(DOCS))
+    return build_gallery_page
+
+
+@pytest.fixture(scope="module")
 def ring(tmp_path_factory):
     """The module that the page about own environments shows."""
     path = tmp_path_factory.mktemp("own") / "ring.py"
@@ -89,16 +103,54 @@ def test_pages_of_environments_are_current(builder, capsys):
     assert status == 0, capsys.readouterr().err
 
 
-def test_check_finds_pages_that_are_changed_missing_or_nobodys(builder, tmp_path):
+def test_the_gallery_is_current_and_shows_every_rule(gallery, capsys):
+    status = gallery.main(["--check"])
+    assert status == 0, capsys.readouterr().err
+    text = (DOCS / "gallery.md").read_text()
+    assert sorted(re.findall(r"^### (.+)$", text, re.MULTILINE)) == sorted(shipped_rules())
+    films = re.findall(r"\(images/(gallery/[\w-]+\.webp)\)", text)
+    assert len(films) == len(shipped_rules())
+    assert all((DOCS / "images" / film).stat().st_size < 300_000 for film in films)
+
+
+def test_the_reference_of_commands_has_every_command_and_task():
+    text = (DOCS / "commands.md").read_text()
+    asked = re.findall(r"^```\{command-help\} (.+)$", text, re.MULTILINE)
+    assert asked == re.findall(r"^##+ (.+)$", text, re.MULTILINE)
+    assert sorted(asked) == sorted([*COMMANDS, *(f"train {name}" for name in TRAINED)])
+
+
+@pytest.mark.parametrize(
+    ("package", "page"),
+    [
+        ("npa_envs", "engine"),
+        ("npa_envs.envs", "environments"),
+        ("npa_envs.wrappers", "wrappers"),
+        ("npa_envs.agents", "agents"),
+        ("npa_envs.agents.learning", "agents"),
+        ("npa_envs.render", "pictures"),
+    ],
+)
+def test_the_reference_of_the_interface_has_every_public_name(package, page):
+    module = importlib.import_module(package)
+    public = {*module.__all__, *getattr(module, "ON_REQUEST", {})}
+    text = (DOCS / "api" / f"{page}.md").read_text()
+    told = re.findall(rf"^\.\. auto\w+:: {re.escape(package)}\.(\w+)$", text, re.MULTILINE)
+    assert sorted(told) == sorted(public)
+
+
+def test_check_finds_pages_that_are_changed_missing_or_nobodys(builder, tmp_path, capsys):
     made = builder.pages()
     for name, text in made.items():
         (tmp_path / name).write_text(text)
-    assert builder.stale_pages(tmp_path) == []
+    assert builder.main(["--check"], tmp_path) == 0
     changed = tmp_path / "Morphogenesis2D.md"
     changed.write_text(changed.read_text().replace("1024", "1023", 1))
     (tmp_path / "README.md").unlink()
     (tmp_path / "Forgotten.md").write_text("# An environment of the past\n")
-    assert builder.stale_pages(tmp_path) == ["Forgotten.md", "Morphogenesis2D.md", "README.md"]
+    assert builder.main(["--check"], tmp_path) == 1
+    told = capsys.readouterr().err
+    assert "not current: Forgotten.md, Morphogenesis2D.md, README.md: run python docs/" in told
 
 
 def test_a_table_of_columns_must_name_each_column_once(builder):

@@ -1,0 +1,90 @@
+"""Write the gallery of shipped rules, `docs/gallery.md`, from their cards and scores.
+
+python docs/build_gallery_page.py          write the page
+python docs/build_gallery_page.py --check  fail where it is not current
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from page_parts import NOTE, write_or_check
+
+from npa_envs.measure.quality import score_line, scores
+from npa_envs.rule.files import shipped_rules
+
+DOCS = Path(__file__).resolve().parent
+CARDS = DOCS.parent / "npa_envs" / "rule" / "shipped"
+OPENING = """\
+# Gallery
+
+The rules that come with the library. Each film is made by one rule: particles start as a blank
+disk, ball or random cloud, and nobody tells them where they are. A name stands for the file
+wherever a rule is wanted, in commands and in `npa_envs.load_rule`.
+
+The figures are means over seeds that training never saw, each after so many steps; a lower loss is
+better. A card tells how the rule was trained and all that was measured.
+`npa-envs export-web --gallery -o gallery.html` writes one page that runs all 2D rules in a
+browser."""
+HEADINGS = {
+    "morphogenesis2d": "Pictures",
+    "morphogenesis3d": "Things in 3D",
+    "texture": "Textures",
+    "point_classification": "A classifier",
+}
+SHOWN = {
+    "morphogenesis2d": "{name} grows from a grey disk, is cut in two, and heals.",
+    "morphogenesis3d": "{name} grows from a ball while the camera goes once around it.",
+    "texture": "{name} arises from particles at random places.",
+    "point_classification": "Four clouds agree on what they are; the colour is the class.",
+}
+COMMANDS = {
+    "morphogenesis2d": (
+        "npa-envs view {name}",
+        "npa-envs rollout {name} --steps 700 --damage 512:cut --out runs/{name}",
+    ),
+    "morphogenesis3d": (
+        "npa-envs view {name}",
+        "npa-envs rollout {name} --steps 128 --out runs/{name}",
+    ),
+    "texture": (
+        "npa-envs view {name}",
+        "npa-envs rollout {name} --steps 512 --out runs/{name}",
+    ),
+    "point_classification": ("npa-envs view {name}", "npa-envs evaluate {name}"),
+}
+
+
+def entry(task: str, name: str) -> str:
+    """Return what the page says of a rule, Markdown."""
+    caption = SHOWN[task].format(name=name.capitalize())
+    sentence = (CARDS / f"{name}.md").read_text(encoding="utf-8").split("\n\n")[1]
+    commands = "\n".join(command.format(name=name) for command in COMMANDS[task])
+    score = score_line(scores(name))
+    return "\n\n".join(
+        (
+            f"### {name}",
+            f"![{caption}](images/gallery/{name}.webp)",
+            f"{sentence} Measured: {score}.",
+            f"```sh\n{commands}\n```",
+            f"- [The card of {name}](../npa_envs/rule/shipped/{name}.md)",
+        )
+    )
+
+
+def page() -> str:
+    """Return the page, Markdown."""
+    parts = [NOTE.format(script="docs/build_gallery_page.py", source="cards and scores"), OPENING]
+    for task, heading in HEADINGS.items():
+        parts += [f"## {heading}", *(entry(task, name) for name in shipped_rules(task))]
+    return "\n\n".join(parts) + "\n"
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Write or check the page; return the exit status."""
+    return write_or_check(DOCS, {"gallery.md": page()}, ["gallery.md"], __doc__, arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

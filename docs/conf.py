@@ -1,0 +1,137 @@
+"""The site: Sphinx reads the pages as they lie in the repository. `make docs` builds it.
+
+Pages are plain Markdown that reads as well on a code host. Two things are made here: menus, from
+the lists of links that pages hold anyway, and the help of each command, from the command itself.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import re
+import sys
+from itertools import zip_longest
+from pathlib import Path
+from textwrap import dedent, indent
+from typing import Any
+from unittest.mock import patch
+
+from docutils import nodes
+from sphinx.application import Sphinx
+from sphinx.util.docutils import SphinxDirective
+
+import npa_envs
+
+ROOT = Path(__file__).resolve().parents[1]
+
+project = "npa-envs"
+author = "the npa-envs contributors"
+project_copyright = author
+version = release = npa_envs.__version__
+
+# The source folder is the repository's root, so that links lead where they lead on a code host.
+root_doc = "docs/index"
+include_patterns = [
+    "docs/**.md",
+    "docs/**.ipynb",
+    "benchmarks/results/**.md",
+    "npa_envs/rule/shipped/*.md",
+    "CONTRIBUTING.md",
+    "CHANGELOG.md",
+]
+exclude_patterns = [".*", "agents", "build", "demo", "dist", "runs", "tests"]
+
+extensions = [
+    "myst_nb",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx_copybutton",
+]
+myst_heading_anchors = 4
+nb_execution_mode = "off"
+copybutton_exclude = ".linenos, .gp, .go"
+
+# Docstrings write code as Markdown does, between single backticks.
+default_role = "code"
+autodoc_member_order = "bysource"
+autodoc_typehints = "none"
+autodoc_mock_imports = ["rsl_rl", "tensordict", "torchrl"]
+napoleon_google_docstring = True
+napoleon_numpy_docstring = False
+
+html_theme = "furo"
+html_title = "npa-envs"
+html_static_path = ["static"]
+html_css_files = ["site.css"]
+html_extra_path = ["static/index.html"]
+html_show_sphinx = False
+html_copy_source = False
+
+LISTS = ("docs/index", "docs/environments/README", "docs/api/README", "docs/gallery")
+"""Pages whose lists of links are the site's menu."""
+
+LINK = re.compile(r"^(?:- |\| |### )\[[^\]]+\]\(([\w./-]+)\.(?:md|ipynb)\)", re.MULTILINE)
+
+
+def add_menus(_: Sphinx, name: str, source: list[str]) -> None:
+    """Add what a page lists to the menu: one part of it for each of the page's sections."""
+    if name.startswith("benchmarks/"):
+        source[0] = f"---\norphan: true\n---\n{source[0]}"
+    if name not in LISTS:
+        return
+    parts = re.split(r"^## (.+)$", source[0], flags=re.MULTILINE)
+    for heading, text in zip(["", *parts[1::2]], parts[::2], strict=True):
+        names = LINK.findall(text)
+        if names:
+            caption = f":caption: {heading}\n" if heading and name == root_doc else ""
+            listed = "\n".join(names)
+            source[0] += f"\n```{{toctree}}\n:hidden:\n{caption}\n{listed}\n```\n"
+
+
+def as_restructured_text(*event: Any) -> None:
+    """Turn a docstring from Markdown to what Sphinx reads, and leave out what its page shows."""
+    lines: list[str] = event[-1]
+    text = "\n".join(lines).split("\n## ")[0]
+    blocks = re.split(r"^ *```(\w+)\n(.*?)^ *```$", text, flags=re.MULTILINE | re.DOTALL)
+    parts = []
+    for plain, language, code in zip_longest(blocks[::3], blocks[1::3], blocks[2::3]):
+        # Bars and stars mean nothing in Markdown's code, and sizes or products in formulas.
+        spans = re.split(r"(`[^`]+`)", plain)
+        spans[::2] = [re.sub(r"(?<!\s)\*|\|", r"\\\g<0>", span) for span in spans[::2]]
+        parts.append("".join(spans))
+        if code:
+            parts.append(f".. code-block:: {language}\n\n{indent(dedent(code), '   ')}")
+    lines[:] = "".join(parts).split("\n")
+
+
+class CommandHelp(SphinxDirective):
+    """What `npa-envs COMMAND --help` prints: `{command-help} COMMAND`."""
+
+    required_arguments = 0
+    optional_arguments = 2
+
+    def run(self) -> list[nodes.Node]:
+        """Return the text as a block."""
+        from npa_envs.cli import main
+
+        printed = io.StringIO()
+        terminal = {"COLUMNS": "88", "NO_COLOR": "1"}
+        with (
+            patch.dict(os.environ, terminal),
+            patch.object(sys, "argv", ["npa-envs"]),
+            contextlib.redirect_stdout(printed),
+            contextlib.suppress(SystemExit),
+        ):
+            main([*self.arguments, "--help"])
+        text = printed.getvalue().strip()
+        if not text:
+            raise self.error(f"npa-envs {' '.join(self.arguments)} --help prints nothing")
+        return [nodes.literal_block(text, text, language="text")]
+
+
+def setup(app: Sphinx) -> None:
+    """Tell Sphinx of what is made here."""
+    app.add_directive("command-help", CommandHelp)
+    app.connect("source-read", add_menus)
+    app.connect("autodoc-process-docstring", as_restructured_text, priority=100)

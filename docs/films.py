@@ -1,0 +1,87 @@
+"""Looping films for the pages, as WebP: a GIF of the same film takes five times as much."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+from torch import Tensor
+
+import npa_envs
+from npa_envs.files import atomic_path
+from npa_envs.rule.rule import NPARule
+from npa_envs.tasks.base import PictureTask
+
+IMAGES = Path(__file__).resolve().parent / "images"
+FRAME_MILLISECONDS = 50
+STILL = 8
+"""Frames for which a film holds its breath before something happens."""
+
+Frame = NDArray[np.uint8]
+
+
+def write_webp(path: Path, frames: Iterable[Frame], *, quality: int = 50) -> None:
+    """Write a film that repeats for ever.
+
+    Args:
+        path: The WebP file.
+        frames: Pictures of one size, uint8, shape [H, W, 3] each.
+        quality: 0 to 100.
+    """
+    first, *others = map(Image.fromarray, frames)
+    path.parent.mkdir(exist_ok=True)
+    with atomic_path(path) as temporary:
+        first.save(
+            temporary,
+            format="WebP",
+            save_all=True,
+            append_images=others,
+            duration=FRAME_MILLISECONDS,
+            loop=0,
+            quality=quality,
+            method=4,
+        )
+
+
+class FilmedWorld:
+    """Worlds of one rule that are drawn after each stretch of steps."""
+
+    x: Tensor
+    """Positions [length units], shape [B, N, D]."""
+
+    s: Tensor
+    """States, shape [B, N, C]."""
+
+    def __init__(
+        self,
+        rule: NPARule,
+        task: PictureTask,
+        draw: Callable[[Tensor, Tensor], Frame],
+        *,
+        seed: int,
+        world_count: int = 1,
+    ) -> None:
+        self.rule, self.task, self.draw = rule, task, draw
+        self.generator = torch.Generator().manual_seed(seed)
+        cpu = torch.device("cpu")
+        self.x, self.s = task.seed(world_count, generator=self.generator, device=cpu)
+
+    @torch.no_grad()
+    def run(self, stretches: Sequence[int]) -> Iterator[Frame]:
+        """Run so many steps before each picture; none for a picture that stands still."""
+        for steps in stretches:
+            if steps:
+                self.x, self.s = npa_envs.rollout(
+                    self.rule,
+                    self.x,
+                    self.s,
+                    steps,
+                    box=self.task.box,
+                    update_prob=self.task.update_prob,
+                    generator=self.generator,
+                )
+            yield self.draw(self.x, self.s)
