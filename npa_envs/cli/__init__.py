@@ -22,7 +22,7 @@ COMMANDS = {
     "compare": "reinforcement learning, evolution and the gradient on the same tasks",
     "list": "tasks, presets, environments, built-in targets, losses, shipped rules",
     "warmup": "compile the kernels ahead of time",
-    "doctor": "versions, devices, kernel cache, fonts",
+    "doctor": "what is broken, slow or missing on this machine, and the cure",
 }
 """Every sub-command with its summary."""
 

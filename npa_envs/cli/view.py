@@ -98,10 +98,13 @@ def open_browser(address: str) -> bool:
 
     Where there is no screen, a browser for the terminal would take the terminal.
     """
+    return has_screen() and webbrowser.open(address)
+
+
+def has_screen() -> bool:
+    """Return whether a browser can be shown here."""
     screens = ("DISPLAY", "WAYLAND_DISPLAY")
-    if sys.platform.startswith("linux") and not any(map(os.environ.get, screens)):
-        return False
-    return webbrowser.open(address)
+    return not sys.platform.startswith("linux") or any(map(os.environ.get, screens))
 
 
 def world_maker(options: ViewOptions, device: torch.device) -> Callable[[], LiveWorld]:

@@ -16,7 +16,7 @@ import pytest
 import torch
 from PIL import Image
 
-from npa_envs.cli import COMMANDS, main
+from npa_envs.cli import COMMANDS, doctor, main
 from npa_envs.cli.film import Film
 from npa_envs.cli.output import EXAMPLES
 from npa_envs.cli.rollout import RolloutOptions
@@ -136,6 +136,97 @@ def test_doctor_reports_what_there_is_and_goes_on_where_a_check_breaks(capsys, m
     text = capsys.readouterr().out
     assert re.search(r"^! warp devices +OSError: no driver$", text, re.MULTILINE)
     assert "ffmpeg" in text
+
+
+def test_doctor_tells_what_is_broken_from_what_is_slow_or_missing(capsys, monkeypatch):
+    findings = [
+        doctor.Finding("torch", "2.13"),
+        doctor.Finding("ffmpeg", "none", "install it"),
+        doctor.Finding("browser", "none", "open the link elsewhere", optional=True),
+    ]
+    monkeypatch.setattr(doctor, "examine", lambda: findings)
+    assert main(["doctor"]) == 1
+    first, second, cure, third, _, last = capsys.readouterr().out.splitlines()
+    assert (first, second) == ("  torch    2.13", "! ffmpeg   none")
+    assert (cure, third) == ("           -> install it", "- browser  none")
+    assert last == "1 broken (!); 1 slow, or missing where not everybody needs it (-)"
+    del findings[1]
+    assert main(["doctor"]) == 0
+    assert "nothing is broken; 1 slow" in capsys.readouterr().out
+
+
+def test_doctor_finds_packages_that_are_missing_or_old(monkeypatch):
+    lines = [
+        "torch>=999",
+        "numpy>=1.26",
+        "nosuchpackage>=1.0",
+        'pettingzoo>=1.25; extra == "envs"',
+        'nosuchpackage[server]>=1.0; extra == "view"',
+        'npa-envs[envs,view]; extra == "all"',
+    ]
+    monkeypatch.setattr(doctor.importlib.metadata, "requires", lambda _: lines)
+    found = {row.subject: row for row in (*doctor._packages(), *doctor._extras())}
+    assert {name: row.mark for name, row in found.items() if name != "[envs]"} == {
+        "npa-envs": " ",
+        "torch": "!",
+        "numpy": " ",
+        "nosuchpackage": "!",
+        "[view]": "-",
+    }
+    assert found["torch"].text.endswith("is older than 999")
+    assert found["nosuchpackage"].cure == "pip install -U 'nosuchpackage>=1.0'"
+    assert found["[view]"].cure == "pip install 'npa-envs[view]'"
+
+
+@pytest.mark.parametrize(
+    ("built", "cards", "hidden", "mark", "cure"),
+    [
+        (None, "", None, "-", "presets fast and tiny"),
+        (None, "A100, 580.65.06", None, "!", "its CUDA build"),
+        ("13.0", "A100, 550.54.15", None, "!", "driver 580 or newer"),
+        ("12.8", "A100, 550.54.15", "", "!", "unset CUDA_VISIBLE_DEVICES"),
+        ("13.0", "A100, 580.65.06", None, "!", "reboot"),
+    ],
+)
+def test_doctor_says_why_no_card_is_used(built, cards, hidden, mark, cure, monkeypatch, tmp_path):
+    program = tmp_path / "nvidia-smi"
+    program.write_text(f"#!/bin/sh\necho '{cards}'\n" if cards else "#!/bin/sh\nexit 9\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    if hidden is not None:
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", hidden)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(torch.version, "cuda", built)
+    finding = doctor._torch_devices()[-1]
+    assert finding.mark == mark
+    assert cure in finding.cure
+    assert ("A100 is idle" in finding.text) == bool(cards)
+
+
+def test_doctor_names_old_cards_idle_cores_cold_caches_and_what_is_not_there(monkeypatch, tmp_path):
+    card = SimpleNamespace(name="GTX 1080", total_memory=8 * 2**30, major=6, minor=1)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda _: card)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
+    monkeypatch.setattr(os, "cpu_count", lambda: 16)
+    cpu, cuda = doctor._torch_devices()
+    assert (cpu.mark, cuda.mark) == ("-", "-")
+    assert "1 threads of 16" in cpu.text
+    assert "8.0" in cuda.cure
+    monkeypatch.setattr("npa_envs.runtime.kernel_cache_folder", lambda: tmp_path)
+    assert [row.mark for row in doctor._kernel_cache()] == ["-"]
+    (tmp_path / "wp_npa_envs.kernels.cpu").mkdir()
+    assert [row.mark for row in doctor._kernel_cache()] == [" "]
+    monkeypatch.setattr("npa_envs.tasks.targets.emoji.find_emoji_fonts", list)
+    assert "apt install" in doctor._emoji_font()[0].cure
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    assert doctor._ffmpeg()[0].cure == "pip install 'imageio[ffmpeg]'"
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    assert "ssh -L" in doctor._browser()[0].cure
 
 
 def test_train_writes_a_rule_that_loads_and_says_where(tmp_path, capsys):

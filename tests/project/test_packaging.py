@@ -1,8 +1,10 @@
-"""The layout of the repository and the layout of the installed package agree."""
+"""The repository, the installed package, and what is said of its extras agree."""
 
+import re
 import shutil
 import subprocess
 import sys
+import tarfile
 import tomllib
 import zipfile
 from pathlib import Path
@@ -11,9 +13,11 @@ import pytest
 
 import npa_envs
 from npa_envs._module_search import MAPPED_PACKAGES, extend_path
+from npa_envs.cli.doctor import EXTRAS
 
 ROOT = Path(__file__).resolve().parents[2]
-SHIPPED = ("pyproject.toml", "README.md", "LICENSE", "npa_envs", *MAPPED_PACKAGES)
+SHIPPED = ("pyproject.toml", "MANIFEST.in", "README.md", "LICENSE", "npa_envs", *MAPPED_PACKAGES)
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 IGNORE = shutil.ignore_patterns("__pycache__", "*.egg-info")
 PRINT_FILES = (
     "import npa_envs, npa_envs.envs, npa_envs.wrappers, npa_envs.agents\n"
@@ -78,6 +82,22 @@ def test_wheel_holds_every_source_file_the_rules_and_the_license(site: Path) -> 
     assert license_file.read_bytes() == (ROOT / "LICENSE").read_bytes()
 
 
+def test_the_source_archive_holds_the_package_and_no_tests(tmp_path: Path, site: Path) -> None:
+    source = copy_sources(tmp_path / "source")
+    shutil.copytree(ROOT / "tests", source / "tests", ignore=shutil.ignore_patterns("golden"))
+    (source / "tests/test_of_the_root.py").touch()
+    program = "from setuptools.build_meta import build_sdist; build_sdist('..')"
+    subprocess.run([sys.executable, "-c", program], cwd=source, capture_output=True, check=True)
+    (archive,) = tmp_path.glob("npa_envs-*.tar.gz")
+    with tarfile.open(archive) as opened:
+        held = {name.partition("/")[2] for name in opened.getnames()}
+    assert not [name for name in held if name.startswith(("tests", "docs", "benchmarks"))]
+    installed = {p.relative_to(site / "npa_envs").as_posix() for p in site.rglob("npa_envs/**/*.*")}
+    packed = {name.removeprefix("npa_envs/") for name in held}
+    assert installed <= packed
+    assert {"README.md", "LICENSE", "pyproject.toml"} <= held
+
+
 @pytest.mark.parametrize("installed", [True, False], ids=["installed", "from a checkout's root"])
 def test_all_packages_are_found_in_one_place(site: Path, tmp_path: Path, installed: bool) -> None:
     """A checkout's own come first in its root, even after a plain install."""
@@ -117,9 +137,8 @@ def test_every_package_is_listed_in_pyproject() -> None:
 
 
 def test_constraints_pin_every_direct_dependency() -> None:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    requirements = [*project["dependencies"]]
-    for extra in project["optional-dependencies"].values():
+    requirements = [*PROJECT["dependencies"]]
+    for extra in PROJECT["optional-dependencies"].values():
         requirements += extra
     wanted = {r.split(">=")[0].split("[")[0].lower() for r in requirements} - {"npa-envs"}
     lines = (ROOT / "constraints.txt").read_text().splitlines()
@@ -129,6 +148,26 @@ def test_constraints_pin_every_direct_dependency() -> None:
 
 
 def test_the_version_is_the_same_everywhere() -> None:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert npa_envs.__version__ == project["version"]
-    assert f"\nversion: {project['version']}\n" in (ROOT / "CITATION.cff").read_text()
+    assert npa_envs.__version__ == PROJECT["version"]
+    assert f"\nversion: {PROJECT['version']}\n" in (ROOT / "CITATION.cff").read_text()
+
+
+def test_the_extras_are_told_as_they_are() -> None:
+    extras = PROJECT["optional-dependencies"]
+    (together,) = extras["all"]
+    assert list(EXTRAS) == re.findall(r"\w+", together.removeprefix("npa-envs"))
+    page = (ROOT / "docs/install.md").read_text()
+    rows = re.findall(r"^\| `(\w+)` \| .+ \| (.*?) ?\|$", page, re.MULTILINE)
+    assert [name for name, _ in rows[: len(EXTRAS) + 1]] == [*EXTRAS, "all"]
+    assert sorted(name for name, _ in rows) == sorted(extras)
+    for name, packages in rows:
+        if name not in ("all", "dev"):
+            assert packages.split(", ") == [re.split(r"[\[>]", r)[0] for r in extras[name]]
+
+
+def test_the_entries_for_lists_name_the_tested_versions() -> None:
+    lines = (ROOT / "constraints.txt").read_text()
+    pinned = dict(re.findall(r"^(\S+)==(\S+)$", lines, re.MULTILINE))
+    page = (ROOT / "docs/farama.md").read_text()
+    badges = dict(re.findall(r"badge/(\w+)-v([\d.]+)-blue", page))
+    assert badges == {"Gymnasium": pinned["gymnasium"], "PettingZoo": pinned["pettingzoo"]}
