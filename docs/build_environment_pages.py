@@ -20,8 +20,16 @@ from dataclasses import MISSING, fields
 from pathlib import Path
 
 import species_pages
-from draw_environment_pictures import FILMS, picture_path
-from page_parts import default_text, field_meanings, kind_text, sections, table, write_or_check
+from draw_environment_pictures import FILMS, film_path, picture_path
+from page_parts import (
+    default_text,
+    field_meanings,
+    film_and_strip,
+    kind_text,
+    sections,
+    table,
+    write_or_check,
+)
 
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
@@ -163,9 +171,9 @@ def page(registration: Registration) -> str:
 
 
 def picture(registration: Registration) -> str:
-    """Return the picture with its caption, Markdown."""
-    caption = FILMS[registration.name].caption
-    return f"![{caption}](../images/{picture_path(registration).name})\n\n*{caption}*"
+    """Return the film and the picture with their caption, Markdown."""
+    names = film_path(registration).name, picture_path(registration).name
+    return film_and_strip(FILMS[registration.name].caption, *names)
 
 
 def index() -> str:

@@ -1,25 +1,30 @@
-"""Draw the pictures of the environments' pages, `docs/images/env_*.png`: a shipped rule at work.
+"""Draw the pictures and films of the environments' pages: a shipped rule at work.
 
-    python docs/draw_environment_pictures.py
+    python docs/draw_environment_pictures.py [NAME ...]
 
-It takes three minutes on a CPU. Draw anew when an environment changes.
+It writes `docs/images/env_*.png` and `docs/images/env_*.webp` and takes five minutes on a CPU. Draw
+anew when an environment changes.
 """
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
+from films import IMAGES, STILL, Frame, write_webp
 
 from npa_envs import load_rule
 from npa_envs.agents import Policy, RulePolicy, SpreadPolicy
 from npa_envs.registration import ENVIRONMENTS, Registration
 from npa_envs.render import write_filmstrip
 
-IMAGES = Path(__file__).resolve().parent / "images"
 PICTURE_SIZE = 192
+FILM_SIZE = {1: 320, 2: 256, 3: 224}
+"""Pixels on each side, by how many worlds a film shows side by side."""
+
 SEED = 3
 
 
@@ -42,17 +47,23 @@ class Film(NamedTuple):
     """What acts where no rule does."""
 
 
+def film_steps(last: int) -> list[int]:
+    """Return the steps that a film shows, all at first and fewer later; it rests at both ends."""
+    moments = [*range(32), *range(32, 64, 2), *range(64, last, 4), last]
+    return [0] * STILL + [step for step in moments if step <= last] + [last] * 2 * STILL
+
+
 FILMS = {
     "Morphogenesis2D": Film(
         steps=(0, 8, 16, 32, 64, 128, 256),
         rows=({},),
-        caption="An episode of the shipped rule `gecko`: the world after so many steps.",
+        caption="An episode of the shipped rule `gecko`.",
     ),
     "Regeneration2D": Film(
         steps=(0, 2, 8, 32, 64, 128),
         rows=({"damage": "erase"}, {"damage": "cut"}, {"damage": "clump"}),
-        caption="Episodes of the shipped rule `gecko`, one row for each kind of damage. They go on "
-        "after success here, so that all of the healing can be seen.",
+        caption="The shipped rule `gecko` heals what was erased, a cut, and a clump. Episodes go "
+        "on after success here, so that all of the healing can be seen.",
     ),
     "Texture": Film(
         steps=(0, 2, 8, 16, 32, 64, 128),
@@ -94,39 +105,63 @@ def picture_path(registration: Registration) -> Path:
     return IMAGES / f"env_{registration.name.lower()}.png"
 
 
+def film_path(registration: Registration) -> Path:
+    """Return where the film of an environment is."""
+    return picture_path(registration).with_suffix(".webp")
+
+
 def film_episode(
-    registration: Registration, film: Film, keywords: dict[str, Any]
-) -> list[tuple[str, np.ndarray]]:
-    """Return captions and pictures, uint8, shape [R, R, 3], of one episode."""
+    registration: Registration, film: Film, keywords: dict[str, Any], size: int
+) -> dict[int, Frame]:
+    """Return the pictures of one episode, uint8, shape [size, size, 3], by step."""
+    last = max(film.steps)
     env = gymnasium.make(
         registration.id,
-        max_episode_steps=max(film.steps) + 1,
+        max_episode_steps=last + 1,
         render_mode="rgb_array",
-        render_size=PICTURE_SIZE,
+        render_size=size,
         success_loss=0.0,
         **keywords,
     )
     policy = film.policy(env) if film.rule is None else RulePolicy(load_rule(film.rule), env)
     observation, _ = env.reset(seed=SEED)
-    shots = []
-    for step in range(max(film.steps) + 1):
-        if step in film.steps:
-            words = dict.fromkeys(filter(str.isalpha, map(str, keywords.values())))
-            caption = ", ".join((*words, f"step {step}"))
-            shots.append((caption, np.asarray(env.render())))
+    shown = {*film.steps, *film_steps(last)}
+    frames = {}
+    for step in range(last + 1):
+        if step in shown:
+            frames[step] = np.asarray(env.render())
         observation, *_ = env.step(policy(observation))
     env.close()
-    return shots
+    return frames
 
 
-def main() -> None:
-    """Draw all pictures."""
+def caption(keywords: dict[str, Any], step: int) -> str:
+    """Return what stands below a picture of a strip."""
+    words = dict.fromkeys(filter(str.isalpha, map(str, keywords.values())))
+    return ", ".join((*words, f"step {step}"))
+
+
+def main(names: list[str]) -> None:
+    """Draw the pictures and films of the environments, all of them if none is named."""
     for registration in ENVIRONMENTS:
+        if names and registration.name not in names:
+            continue
         film = FILMS[registration.name]
-        shots = [shot for row in film.rows for shot in film_episode(registration, film, row)]
-        captions, frames = zip(*shots, strict=True)
-        write_filmstrip(picture_path(registration), frames, captions, columns=len(film.steps))
+        strips = [film_episode(registration, film, row, PICTURE_SIZE) for row in film.rows]
+        write_filmstrip(
+            picture_path(registration),
+            [frames[step] for frames in strips for step in film.steps],
+            [caption(row, step) for row in film.rows for step in film.steps],
+            columns=len(film.steps),
+        )
+        size = FILM_SIZE[len(film.rows)]
+        worlds = [film_episode(registration, film, row, size) for row in film.rows]
+        steps = film_steps(max(film.steps))
+        write_webp(
+            film_path(registration),
+            [np.hstack([frames[step] for frames in worlds]) for step in steps],
+        )
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])

@@ -65,6 +65,17 @@ def table(heading: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in cells)
 
 
+def film_and_strip(caption: str, film: str, strip: str) -> str:
+    """Return a film and a strip of moments of `docs/images/` with their caption, Markdown."""
+    return "\n\n".join(
+        (
+            f"![{caption}](../images/{film})",
+            f"*{caption}*",
+            f"![The same, moment by moment.](../images/{strip})",
+        )
+    )
+
+
 def stale_pages(folder: Path, made: Mapping[str, str], there: Iterable[str]) -> list[str]:
     """Return the names of pages in a folder that are missing, not current, or nobody's."""
     found = {name: folder / name for name in there}

@@ -6,7 +6,15 @@ import typing
 from dataclasses import fields
 
 from draw_species_pictures import CAPTION, IMAGE
-from page_parts import NOTE, default_text, field_meanings, kind_text, sections, table
+from page_parts import (
+    NOTE,
+    default_text,
+    field_meanings,
+    film_and_strip,
+    kind_text,
+    sections,
+    table,
+)
 
 from npa_envs.envs import multispecies_v0, particles_v0
 from npa_envs.envs.multi import TASKS, SpeciesConfig
@@ -16,6 +24,7 @@ MADE = NOTE.format(script="docs/build_environment_pages.py", source="docstrings"
 MODULES = {"MultiSpecies": multispecies_v0, "Particles": particles_v0}
 """Modules by the names of their pages."""
 
+SAME = "The worlds are those of `multispecies_v0`, such as these; here every particle is an agent."
 EXAMPLE = """\
 ```python
 from npa_envs.envs import {module}
@@ -101,9 +110,10 @@ def page(name: str) -> str:
     )
     short = module.__name__.rpartition(".")[2]
     example = EXAMPLE.format(module=short) + (RULES if name == "MultiSpecies" else "")
-    picture = f"![{CAPTION}](../images/{IMAGE.name})\n\n*{CAPTION}*"
-    shown = [picture] if name == "MultiSpecies" else []
-    opening = (f"# npa_envs.envs.{short}", text.pop(""), *shown, facts, example)
+    film = IMAGE.with_suffix(".webp").name
+    picture = film_and_strip(CAPTION, film, IMAGE.name)
+    shown = picture if name == "MultiSpecies" else f"![{SAME}](../images/{film})\n\n*{SAME}*"
+    opening = (f"# npa_envs.envs.{short}", text.pop(""), shown, facts, example)
     body = [f"## {heading}\n\n{content}" for heading, content in text.items()]
     return "\n\n".join((MADE, *opening, *body)) + "\n"
 
