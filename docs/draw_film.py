@@ -10,11 +10,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import torch
-from films import IMAGES, STILL, FilmedWorld, Frame, write_webp
+from films import FPS, IMAGES, STILL, FilmedWorld, Frame
 from torch import Tensor
 
 import npa_envs
-from npa_envs.render import draw_worlds
+from npa_envs.render import draw_worlds, write_webp
 from npa_envs.training.trained_tasks import task_of_rule
 from npa_envs.world.brushes import cut, erase_state
 
@@ -55,4 +55,4 @@ def frames() -> Iterator[Frame]:
 
 
 if __name__ == "__main__":
-    write_webp(IMAGES / "gecko.webp", frames())
+    write_webp(IMAGES / "gecko.webp", frames(), FPS)

@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from films import IMAGES, STILL, FilmedWorld, Frame, write_webp
+from films import FPS, IMAGES, STILL, FilmedWorld, Frame
 from torch import Tensor
 
 import npa_envs
-from npa_envs.render import to_uint8, turntable_frames
+from npa_envs.render import to_uint8, turntable_frames, write_webp
 from npa_envs.rule.files import shipped_rules
 from npa_envs.tasks.damage import damage_worlds
 from npa_envs.training.trained_tasks import task_of_rule
@@ -106,7 +106,7 @@ def main(names: list[str]) -> None:
     for task, film in FILMS.items():
         for name in shipped_rules(task):
             if name in names or not names:
-                write_webp(FOLDER / f"{name}.webp", film(name))
+                write_webp(FOLDER / f"{name}.webp", film(name), FPS)
 
 
 if __name__ == "__main__":

@@ -1,50 +1,25 @@
-"""Looping films for the pages, as WebP: a GIF of the same film takes five times as much."""
+"""Worlds in the looping films of the pages, which are WebP."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image
 from torch import Tensor
 
 import npa_envs
-from npa_envs.files import atomic_path
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import PictureTask
 
 IMAGES = Path(__file__).resolve().parent / "images"
-FRAME_MILLISECONDS = 50
+FPS = 20.0
 STILL = 8
 """Frames for which a film holds its breath before something happens."""
 
 Frame = NDArray[np.uint8]
-
-
-def write_webp(path: Path, frames: Iterable[Frame], *, quality: int = 50) -> None:
-    """Write a film that repeats for ever.
-
-    Args:
-        path: The WebP file.
-        frames: Pictures of one size, uint8, shape [H, W, 3] each.
-        quality: 0 to 100.
-    """
-    first, *others = map(Image.fromarray, frames)
-    path.parent.mkdir(exist_ok=True)
-    with atomic_path(path) as temporary:
-        first.save(
-            temporary,
-            format="WebP",
-            save_all=True,
-            append_images=others,
-            duration=FRAME_MILLISECONDS,
-            loop=0,
-            quality=quality,
-            method=4,
-        )
 
 
 class FilmedWorld:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import Protocol
+from typing import Any, Protocol
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
 from npa_envs.envs.core.config import WorldConfig
-from npa_envs.render import Window
+from npa_envs.render import Window, show
+from npa_envs.render.display import side_by_side
 
 SHOWN_ACROSS = 4
 """A window shows at most so many worlds side by side."""
@@ -51,6 +52,12 @@ class Screen:
         if self._config.render_mode != "rgb_array":
             return None
         return self._worlds.pictures(self._worlds.world_count)
+
+    def for_notebook(self, name: str) -> dict[str, Any]:
+        """Return what Jupyter shows in place of an environment: the worlds as they are, or some."""
+        count = min(self._worlds.world_count, SHOWN_ACROSS**2)
+        told: dict[str, Any] = show(side_by_side(self._worlds.pictures(count)))._repr_mimebundle_()
+        return told | {"text/plain": name}
 
     def show(self, title: str) -> None:
         """Show the worlds as they are, the first ones where they are many; only if "human"."""

@@ -217,6 +217,12 @@ class NPAEnv(gymnasium.Env[Any, Any]):
         pictures = self._screen.render()
         return None if pictures is None else pictures[0]
 
+    def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, Any]:
+        """Return what Jupyter shows: the world as it is, from the first reset on."""
+        if not self._started:
+            return {"text/plain": str(self)}
+        return self._screen.for_notebook(str(self))
+
     def close(self) -> None:
         """Close the window, if there is one."""
         self._screen.close()

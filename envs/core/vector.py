@@ -220,6 +220,12 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
         pictures = self._screen.render()
         return None if pictures is None else tuple(pictures)
 
+    def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, Any]:
+        """Return what Jupyter shows: the first worlds as they are, from the first reset on."""
+        if not self._started:
+            return {"text/plain": str(self)}
+        return self._screen.for_notebook(str(self))
+
     def close_extras(self, **kwargs: Any) -> None:
         """Close the window, if there is one."""
         self._screen.close()

@@ -69,6 +69,12 @@ class AgentsEnv:
         self._started = False
         self._screen = Screen(worlds, self.config, self.metadata["render_fps"])
 
+    def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, Any]:
+        """Return what Jupyter shows: the worlds as they are, from the first reset on."""
+        if not self._started:
+            return {"text/plain": str(self)}
+        return self._screen.for_notebook(str(self))
+
     def close(self) -> None:
         """Close the window, if there is one."""
         self._screen.close()

@@ -19,7 +19,7 @@ from npa_envs.errors import MissingDependencyError, NPAError, shown
 from npa_envs.files import atomic_path
 from npa_envs.ops import Cameras, orbit
 from npa_envs.ops.checks import checked_count, checked_finite
-from npa_envs.render.colours import Background, to_uint8
+from npa_envs.render.colours import Background, background_colour, to_uint8
 from npa_envs.tasks.checks import is_real
 from npa_envs.tasks.targets.views import ANGLE, DISTANCE
 
@@ -42,7 +42,7 @@ def write_png(path: str | Path, frame: Frame) -> None:
     Raises:
         NPAError: A wrong shape or dtype, or the file cannot be written.
     """
-    (checked,) = _check_frames([frame])
+    (checked,) = checked_frames([frame])
     with atomic_path(path) as temporary:
         Image.fromarray(checked).save(temporary, format="PNG", optimize=True)
 
@@ -53,7 +53,7 @@ def encode_frame(frame: Frame, kind: Literal["PNG", "JPEG"]) -> bytes:
     Raises:
         NPAError: A wrong shape or dtype.
     """
-    (checked,) = _check_frames([frame])
+    (checked,) = checked_frames([frame])
     options = {"compress_level": 1} if kind == "PNG" else {"quality": 90}
     buffer = io.BytesIO()
     Image.fromarray(checked).save(buffer, format=kind, **options)
@@ -72,7 +72,7 @@ def write_gif(path: str | Path, frames: Iterable[Frame], fps: float = 25) -> Non
     Raises:
         NPAError: No frames, a wrong shape, dtype or rate, or the file cannot be written.
     """
-    pictures = _check_frames(frames)
+    pictures = checked_frames(frames)
     check_rate(fps, highest=GIF_HIGHEST_RATE)
     palette, background, entry = _shared_palette(pictures)
     indexed = []
@@ -93,6 +93,43 @@ def write_gif(path: str | Path, frames: Iterable[Frame], fps: float = 25) -> Non
         )  # fmt: skip
 
 
+def write_webp(
+    path: str | Path, frames: Iterable[Frame], fps: float = 25, *, quality: int = 50
+) -> None:
+    """Write a WebP that repeats for ever; a GIF of the same film takes about five times as much.
+
+    Args:
+        path: The WebP file.
+        frames: Pictures of one size, uint8, shape [H, W, 3] each.
+        fps: Frames a second.
+        quality: 0 to 100.
+
+    Raises:
+        NPAError: No frames, a wrong shape, dtype, rate or quality, or the file cannot be written.
+    """
+    content = encode_webp(frames, fps, quality=quality)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content)
+
+
+def encode_webp(frames: Iterable[Frame], fps: float = 25, *, quality: int = 50) -> bytes:
+    """Return the content of the file that `write_webp` writes.
+
+    Raises:
+        NPAError: No frames, a wrong shape, dtype, rate or quality.
+    """
+    first, *others = map(Image.fromarray, checked_frames(frames))
+    check_rate(fps)
+    if not (is_real(quality) and 0 <= quality <= 100):
+        raise NPAError(f"quality must be in [0, 100], got {shown(quality)}: try 50")
+    buffer = io.BytesIO()
+    first.save(
+        buffer, format="WebP", save_all=True, append_images=others, duration=round(1000 / fps),
+        loop=0, quality=quality, method=4,
+    )  # fmt: skip
+    return buffer.getvalue()
+
+
 def write_mp4(path: str | Path, frames: Iterable[Frame], fps: float = 25) -> None:
     """Write an H.264 film that browsers play.
 
@@ -106,7 +143,7 @@ def write_mp4(path: str | Path, frames: Iterable[Frame], fps: float = 25) -> Non
         NPAError: No frames, a wrong shape, dtype or rate, or the file cannot be written.
         MissingDependencyError: imageio or its ffmpeg is not installed.
     """
-    pictures = _check_frames(frames)
+    pictures = checked_frames(frames)
     check_rate(fps)
     imageio, ffmpeg = _import_imageio()
     height, width, _ = pictures[0].shape
@@ -127,22 +164,24 @@ def write_filmstrip(
     frames: Iterable[Frame],
     captions: Sequence[str] | None = None,
     columns: int | None = None,
+    background: Background = "white",
 ) -> None:
     """Write frames side by side into one PNG, each with a caption below.
 
-    Where a caption is wider than the frames, white on either side of each makes room for it.
+    Where a caption is wider than the frames, background on either side of each makes room for it.
 
     Args:
         path: The PNG file.
         frames: Pictures of one size, uint8, shape [H, W, 3] each.
         captions: One text for each frame, or None for none.
         columns: Frames in a row; None is all of them, at most 8.
+        background: A colour name, "#rrggbb", or red, green and blue in [0, 1].
 
     Raises:
         NPAError: No frames, a wrong shape or dtype, another number of captions than of frames,
-            fewer than one column, or the file cannot be written.
+            fewer than one column, an unknown colour, or the file cannot be written.
     """
-    pictures = _check_frames(frames)
+    pictures = checked_frames(frames)
     count = len(pictures)
     if captions is not None and len(captions) != count:
         raise NPAError(
@@ -160,14 +199,17 @@ def write_filmstrip(
     cell = max([width, *(math.ceil(font.getlength(caption)) for caption in captions or [])])
     pitch_x, pitch_y = cell + _MARGIN, height + text_height + _MARGIN
     down = -(-count // across)
-    strip = Image.new("RGB", (across * pitch_x + _MARGIN, down * pitch_y + _MARGIN), "white")
+    red, green, blue = (round(255 * part) for part in background_colour(background))
+    size = (across * pitch_x + _MARGIN, down * pitch_y + _MARGIN)
+    strip = Image.new("RGB", size, (red, green, blue))
+    ink = "#333333" if red + green + blue > 3 * 127 else "#cccccc"
     draw = ImageDraw.Draw(strip)
     for k, picture in enumerate(pictures):
         left, upper = _MARGIN + (k % across) * pitch_x, _MARGIN + (k // across) * pitch_y
         strip.paste(Image.fromarray(picture), (left + (cell - width) // 2, upper))
         if captions:
             middle = (left + cell / 2, upper + height + _MARGIN / 2)
-            draw.text(middle, captions[k], fill="#333333", font=font, anchor="ma")
+            draw.text(middle, captions[k], fill=ink, font=font, anchor="ma")
     with atomic_path(path) as temporary:
         strip.save(temporary, format="PNG", optimize=True)
 
@@ -182,7 +224,12 @@ def check_rate(fps: float, *, highest: float = 1000) -> None:
         raise NPAError(f"fps must be in [0.1, {highest}], got {shown(fps)}: try 25")
 
 
-def _check_frames(frames: Iterable[Frame]) -> list[Frame]:
+def checked_frames(frames: Iterable[Frame]) -> list[Frame]:
+    """Return pictures of one size, uint8, shape [H, W, 3] each.
+
+    Raises:
+        NPAError: There are none, or of another shape or dtype.
+    """
     given: Any = frames
     if not isinstance(given, Iterable) or getattr(given, "ndim", 1) == 0:
         raise NPAError(

@@ -224,6 +224,25 @@ class NPARule(nn.Module):
         """
         return self.read_out(states)[..., -3:] + COLOUR_OFFSET
 
+    def _repr_html_(self) -> str:
+        """Return what Jupyter shows: what the rule sees, what it does, how large it is."""
+        seen = ["its own state", "the states around it"]
+        seen += ["where they change"] * self.state_gradient
+        seen += ["where particles stand denser"] * self.density_gradient
+        seen += [f"{self.species_count} species apart"] * (self.species_count > 0)
+        done = "changes its state" if self.static else "moves and changes its state"
+        rows = {
+            "a particle perceives": f"{', '.join(seen)}: {self.perception_dim} numbers",
+            "how far": f"ε0 = {self.eps0:g} (length units)",
+            "and then": f"{done}: {self.update_dim} numbers",
+            "state": f"{self.state_dim} channels",
+            "network": f"{self.hidden_dim} hidden units, {self.weight_count} weights",
+        }
+        if self.readout is not None:
+            rows["read-out"] = f"{self.readout_dim} outputs"
+        cells = "".join(f"<tr><th>{name}</th><td>{text}</td></tr>" for name, text in rows.items())
+        return f"<table><caption>a rule of {self.space_dim}D worlds</caption>{cells}</table>"
+
     def __getattr__(self, name: str) -> Any:
         try:
             return super().__getattr__(name)
