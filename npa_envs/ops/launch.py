@@ -294,6 +294,8 @@ class _Ready(threading.local):
 
     def __init__(self) -> None:
         self.by_kernel: dict[tuple[Any, torch.device, int], _Arguments] = {}
+        self.tape: LaunchTape | None = None
+        """Where launches are recorded."""
 
 
 _ready = _Ready()
@@ -323,10 +325,14 @@ def launch(
         noted.append(_described(kernel, size))
     if kernel in SMALLEST_RANGES:
         arguments = (0, *arguments)
-    key = (kernel, device, block_dim)
-    ready = _ready.by_kernel.get(key)
-    if ready is None:
-        ready = _ready.by_kernel[key] = _Arguments(kernel, size, device, block_dim, arguments)
+    if _ready.tape is not None:
+        ready = _ready.tape.arguments(kernel, size, device, block_dim, arguments)
+    else:
+        key = (kernel, device, block_dim)
+        found = _ready.by_kernel.get(key)
+        if found is None:
+            found = _ready.by_kernel[key] = _Arguments(kernel, size, device, block_dim, arguments)
+        ready = found
     ready.set(arguments)
     ready.run(size)
 
@@ -375,6 +381,72 @@ class PreparedLaunch:
         assert _form(tensor) == self._form, "only an address is replaced"
         self._arguments.set_address(self._place, tensor)
         self._arguments.run(self._size)
+
+
+class LaunchTape:
+    """Launches that are recorded once and made again and again, between tensors that stay."""
+
+    def __init__(self) -> None:
+        self._launches: list[tuple[_Arguments, tuple[int, ...]]] = []
+        self._given: list[tuple[Any, ...]] = []
+        """Their arguments, which hold addresses alone by themselves."""
+
+    @contextlib.contextmanager
+    def recording(self) -> Iterator[None]:
+        """Record this thread's launches in the block, which are made as well."""
+        _ready.tape, before = self, _ready.tape
+        try:
+            yield
+        finally:
+            _ready.tape = before
+
+    def arguments(
+        self,
+        kernel: Any,
+        size: tuple[int, ...],
+        device: torch.device,
+        block_dim: int,
+        arguments: tuple[Any, ...],
+    ) -> _Arguments:
+        """Return memory for the arguments of one more launch."""
+        made = _Arguments(kernel, size, device, block_dim, arguments)
+        self._launches.append((made, size))
+        self._given.append(arguments)
+        return made
+
+    def __len__(self) -> int:
+        """Return the number of launches."""
+        return len(self._launches)
+
+    def places(self, tensor: Tensor) -> list[tuple[_Arguments, int]]:
+        """Return where a tensor is an argument."""
+        return [
+            (made, k)
+            for (made, _), arguments in zip(self._launches, self._given, strict=True)
+            for k, value in enumerate(arguments)
+            if isinstance(value, Tensor) and value.data_ptr() == tensor.data_ptr()
+        ]
+
+    def move(self, places: list[tuple[_Arguments, int]], tensor: Tensor) -> None:
+        """Let arguments be another tensor of the same form, which the caller keeps."""
+        for made, index in places:
+            made.set_address(index, tensor)
+
+    def replay(
+        self, begin: int = 0, end: int | None = None, *, last_count: int | None = None
+    ) -> None:
+        """Make some of the launches again, the last one along fewer threads if they are given.
+
+        Args:
+            begin: The first launch.
+            end: One past the last.
+            last_count: Threads of the last one along its first dimension.
+        """
+        launches = self._launches[begin:end]
+        for made, size in launches[:-1]:
+            made.run(size)
+        made, size = launches[-1]
+        made.run(size if last_count is None else (last_count, *size[1:]))
 
 
 # Threads of the CPU, as many as torch is set to use. Where torch brings GNU's OpenMP, these are

@@ -168,14 +168,18 @@ def _hooked() -> bool:
     return hooks is not None and hooks(True) is not None
 
 
+def rule_form(rule: NPARule) -> Hashable:
+    """Return what a plain rule's steps depend on besides its weights."""
+    form: dict[str, Any] = {**rule.hyper_parameters()}
+    return tuple(value for name, value in form.items() if not name.startswith("readout"))
+
+
 def _form(rule: NPARule, plain: bool) -> tuple[Hashable, list[Tensor]]:
     """Return what a recording depends on of a rule besides its weights, and what these are."""
     if not plain:
         return weakref.ref(rule), [*rule.parameters(), *rule.buffers()]
     hidden = rule.hidden
-    form: dict[str, Any] = {**rule.hyper_parameters()}
-    values = tuple(value for name, value in form.items() if not name.startswith("readout"))
-    return values, [hidden.weight, hidden.bias, rule.output.weight]
+    return rule_form(rule), [hidden.weight, hidden.bias, rule.output.weight]
 
 
 def _twin(rule: NPARule, like: Tensor) -> NPARule:

@@ -26,8 +26,9 @@ from npa_envs.ops.static import StaticRows, StaticWorlds, prepare_static, static
 from npa_envs.ops.update import update_particles
 from npa_envs.rule.rule import FoldedRule, NPARule, check_rule
 from npa_envs.world.divergence import DivergenceWatch, OnDivergence, make_watch
+from npa_envs.world.prepared import Network, PreparedSteps, may_prepare, run_prepared
 from npa_envs.world.randomness import Randomness, WorldRandom, check_generator
-from npa_envs.world.recorded import CudaGraph, Worlds, check_cuda_graph, run_call
+from npa_envs.world.recorded import CudaGraph, Worlds, check_cuda_graph, rule_form, run_call
 
 Memory = Literal["store", "recompute", "minimal"]
 
@@ -189,7 +190,7 @@ class RuleStep(NamedTuple):
     """The step of one rule: perceive the active particles, run the network, update."""
 
     rule: NPARule
-    folded: FoldedRule | None
+    folded: Network | None
     """The rule's weights as they are run; None: it runs as the module that it is."""
     options: StepOptions
     static: StaticWorlds | None = None
@@ -324,6 +325,10 @@ class RolloutCall(NamedTuple):
         # Any other rule runs as the module that it is.
         folded = rule.folded() if rule.is_plain() else None
         static = _prepare_static(rule, worlds.x, self.steps, self.options)
+        if folded is not None and static is None and watch is None and may_prepare(worlds):
+            prepared = self._run_prepared(rule, folded, worlds, generator)
+            if prepared is not None:
+                return prepared
         if static is not None:
             worlds = Worlds(*map(static.sort, worlds))
         return run_steps(
@@ -335,6 +340,38 @@ class RolloutCall(NamedTuple):
             keep_every=self.keep_every,
             watch=watch,
         )
+
+    def _run_prepared(
+        self, rule: NPARule, folded: FoldedRule, worlds: Worlds, generator: Randomness | None
+    ) -> Worlds | None:
+        """Run the rollout by prepared steps; None where it is to be launched."""
+        options, steps, every = self.options, self.steps, self.keep_every or self.steps
+        if options.position_noise > 0.0 or steps == 0:
+            return None
+        x, s, _ = worlds
+
+        def advance(network: Network, worlds: Worlds, mask: Tensor | None) -> Worlds:
+            step = RuleStep(rule, network, options)
+            return step.advance(*worlds, mask, None, None)
+
+        def make() -> PreparedSteps:
+            widths = folded.row_width, folded.output_weight.shape[0]
+            return PreparedSteps(advance, worlds, *widths, options.update_prob < 1.0)
+
+        def run(prepared: PreparedSteps) -> list[Worlds]:
+            draws = RuleStep(rule, folded, options).draws(x, steps, generator)
+            with torch.autocast("cpu", enabled=False):
+                return prepared.run(
+                    folded, worlds, (draw.mask for draw in draws), lambda done: done % every == 0
+                )
+
+        key = (options, rule_form(rule), x.shape, s.shape[2], x.dtype)
+        kept = run_prepared(key, make, run)
+        if kept is None:
+            return None
+        if self.keep_every is None:
+            return kept[0]
+        return Worlds(*map(torch.stack, zip(*kept, strict=True)))
 
 
 def _prepare_static(

@@ -1,0 +1,130 @@
+"""Prepared steps on a CPU: what they give is what launched ones give, bit for bit."""
+
+import threading
+
+import pytest
+import torch
+from worlds import assert_same, lively_rule, random_world
+
+import npa_envs
+from npa_envs.world import prepared
+
+BOX = (1.4, 1.4)
+
+
+@pytest.fixture(autouse=True)
+def _nothing_prepared(monkeypatch):
+    monkeypatch.setattr(prepared, "_kinds", type(prepared._kinds)())
+
+
+def make_rule(dtype=torch.float32, seed=0, **options):
+    return lively_rule("cpu", dtype, eps0=0.3, gain=1.0, seed=seed, **options)
+
+
+def worlds(dtype=torch.float32, world_count=2, particle_count=40, space_dim=2, seed=0):
+    return random_world(
+        world_count, particle_count, space_dim, 5, dtype=dtype, device="cpu", seed=seed
+    )
+
+
+@torch.no_grad()
+def run(rule, x, s, steps=5, *, by_world=False, seed=3, **options):
+    """Return what a rollout gives, and what its generator draws next."""
+    generator = torch.Generator().manual_seed(seed)
+    if by_world:
+        generator = npa_envs.WorldRandom(range(seed, seed + len(x)))
+    found = npa_envs.rollout(
+        rule, x, s, steps, generator=generator, return_path_length=True, **options
+    )
+    return *found, generator.uniform(2) if by_world else torch.rand(2, generator=generator)
+
+
+def steps_ready():
+    return [steps for kind in prepared._kinds.values() for steps in kind.free]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"box": BOX, "update_prob": 1.0},
+        {"update_prob": 0.001, "keep_every": 2, "steps": 4},
+        {"by_world": True, "dt": 0.5, "steps": 1},
+    ],
+    ids=["open", "box", "few", "by world"],
+)
+def test_prepared_rollouts_are_the_launched_ones(options, dtype):
+    rule, (x, s) = make_rule(dtype), worlds(dtype)
+    launched = [run(rule, x, s, seed=seed, **options) for seed in (3, 4)]
+    assert not steps_ready()
+    ready = [run(rule, x, s, seed=seed, **options) for seed in (3, 4)]
+    assert len(steps_ready()) == 1
+    assert_same(ready, launched)
+
+
+def test_weights_are_read_anew_and_results_stay():
+    rules = [make_rule(seed=seed) for seed in range(3)]
+    starts = [worlds(seed=seed) for seed in range(3)]
+    launched = []
+    for rule, start in zip(rules, starts, strict=True):
+        prepared._kinds.clear()
+        launched.append(run(rule, *start))
+    for _ in range(2):
+        run(rules[0], *starts[0])
+    ready = [run(rule, *start) for rule, start in zip(rules, starts, strict=True)]
+    assert len(steps_ready()) == 1
+    assert_same(ready, launched)
+
+
+def test_worlds_of_inference_mode_are_stepped_too():
+    rule, (x, s) = make_rule(), worlds()
+    launched = run(rule, x, s)
+    for _ in range(3):
+        with torch.inference_mode():
+            ready = run(rule, x, s)
+    assert len(steps_ready()) == 1
+    assert_same((ready, run(rule, x, s)), (launched, launched))
+
+
+def test_what_needs_gradients_noise_or_a_rule_of_its_own_is_launched():
+    class Own(npa_envs.NPARule):
+        def forward(self, perception):
+            return super().forward(perception)
+
+    x, s = worlds()
+    rule = make_rule()
+    own = Own(2, 5, 12, eps0=0.3)
+    for _ in range(4):
+        run(rule, x, s, position_noise=0.01)
+        run(own, x, s)
+        _, after = npa_envs.rollout(rule, x, s, 2)
+        assert after.requires_grad
+    assert not steps_ready()
+
+
+def test_threads_step_worlds_of_their_own():
+    rule, starts = make_rule(), [worlds(seed=seed) for seed in range(4)]
+    expected = [run(rule, *start) for start in starts]
+    found = [None] * len(starts)
+
+    def go(k):
+        for _ in range(20):
+            found[k] = run(rule, *starts[k])
+
+    threads = [threading.Thread(target=go, args=(k,)) for k in range(len(starts))]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert_same(found, expected)
+    assert 1 <= len(steps_ready()) <= len(starts)
+
+
+def test_kinds_are_forgotten_in_turn(monkeypatch):
+    monkeypatch.setattr(prepared, "MOST_KINDS", 2)
+    rule = make_rule()
+    for particle_count in (30, 31, 32):
+        for _ in range(3):
+            run(rule, *worlds(particle_count=particle_count))
+    assert len(prepared._kinds) == len(steps_ready()) == 2
