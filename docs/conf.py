@@ -98,7 +98,7 @@ def as_restructured_text(*event: Any) -> None:
     for plain, language, code in zip_longest(blocks[::3], blocks[1::3], blocks[2::3]):
         # Bars and stars mean nothing in Markdown's code, and sizes or products in formulas.
         spans = re.split(r"(`[^`]+`)", plain)
-        spans[::2] = [re.sub(r"(?<!\s)\*|\|", r"\\\g<0>", span) for span in spans[::2]]
+        spans[::2] = [re.sub(r"(?<=\S)\*|(?<=\S )\*|\|", r"\\\g<0>", span) for span in spans[::2]]
         parts.append("".join(spans))
         if code:
             parts.append(f".. code-block:: {language}\n\n{indent(dedent(code), '   ')}")

@@ -287,6 +287,50 @@ def test_the_code_of_a_page_runs(page, tmp_path, monkeypatch, capsys):
         assert (tmp_path / "seed.ply").stat().st_size > 512 * 26 * 4
 
 
+def test_the_code_about_own_losses_runs(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (block,) = code_blocks(DOCS / "own_loss.md")
+    assert block.count("range(150)") == 1
+    names = {}
+    # Less of it: what is tested is that it runs and goes down.
+    exec(compile(block.replace("range(150)", "range(12)"), "own_loss.md", "exec"), names)
+    (first,) = re.findall(r"^0: (.+)$", capsys.readouterr().out, re.MULTILINE)
+    told = re.search(r"fell from (0\.\d+) at the start", (DOCS / "own_loss.md").read_text())
+    assert float(first) == pytest.approx(float(told[1]), abs=1e-3)
+    assert names["loss"].item() < 0.8 * float(first)
+    assert npa_envs.load_rule("ring.safetensors").state_dim == 16
+
+
+def test_the_code_about_own_tasks_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (block,) = code_blocks(DOCS / "own_task.md")
+    assert block.count("iterations=60") == 1
+    names = {}
+    exec(compile(block.replace("iterations=60", "iterations=6"), "own_task.md", "exec"), names)
+    assert names["result"].finished
+    assert (tmp_path / "runs" / "ring" / "rule.safetensors").exists()
+
+
+def test_the_code_about_own_kernels_prints_what_the_page_says(capsys):
+    (block,) = code_blocks(DOCS / "own_kernel.md")
+    exec(compile(block, "own_kernel.md", "exec"), {})
+    printed = re.search(r"It prints `(.+)`", (DOCS / "own_kernel.md").read_text())
+    assert capsys.readouterr().out.strip() == printed[1]
+
+
+def test_the_code_of_the_first_minutes_and_about_graphics_cards_runs():
+    names = {}
+    (block,) = code_blocks(DOCS / "first_minutes.md")
+    exec(compile(block, "first_minutes.md", "exec"), names)
+    assert names["x"].shape == (1, 1024, 2)
+    worlds, environments = code_blocks(DOCS / "gpu.md")
+    small_worlds = worlds.replace("8, 4096", "2, 256").replace("steps=64", "steps=2")
+    exec(compile(small_worlds, "gpu.md", "exec"), names)
+    assert names["x"].shape == (2, 256, 2)
+    exec(compile(environments.replace("num_envs=64", "num_envs=2"), "gpu.md", "exec"), names)
+    assert isinstance(names["observations"], torch.Tensor)
+
+
 def test_the_code_about_several_species_runs():
     names = {}
     exec(compile("\n".join(code_blocks(DOCS / "species.md")), "species.md", "exec"), names)
@@ -333,6 +377,25 @@ def test_the_code_about_ppo_runs(capsys):
     assert [line.split(":")[0] for line in told] == [form for form in forms for _ in range(3)]
 
 
+def test_the_code_about_exported_pages_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (block,) = code_blocks(DOCS / "export_web.md")
+    exec(compile(block, "export_web.md", "exec"), {})
+    assert "<title>Two rules</title>" in (tmp_path / "page.html").read_text()
+
+
+def test_the_code_about_stability_runs(capsys):
+    guards, inverse = code_blocks(DOCS / "stability.md")
+    x = torch.rand(3, 64, 2, generator=torch.Generator().manual_seed(0))
+    x[1, 5, 0] = torch.nan
+    names = {"npa_envs": npa_envs, "gym": gym, "rule": npa_envs.load_rule("heart")}
+    names |= {"x": x, "s": torch.zeros(3, 64, 16)}
+    exec(compile(guards.replace("512", "2"), "stability.md", "exec"), names)
+    assert names["x"].shape == (2, 64, 2)
+    exec(compile(inverse, "stability.md", "exec"), names)
+    assert names["z"].shape == (2, 64, 66)
+
+
 def test_the_code_about_the_viewer_runs(capsys):
     (block,) = code_blocks(DOCS / "view.md")
     exec(compile(block, "view.md", "exec"), {})
@@ -353,6 +416,14 @@ def test_the_code_of_the_readme_runs():
     exec(species, names)
     assert set(names["infos"]) == {"species_0", "species_1"}
     assert all(info["loss"] < 1.0 for info in names["infos"].values())
+
+
+def test_every_page_with_code_is_run_by_a_test():
+    """The names of pages in this folder's tests are the list of what is run."""
+    tests = "".join(path.read_text() for path in sorted(Path(__file__).parent.glob("test_*.py")))
+    pages = [path for path in sorted(DOCS.glob("*.md")) if code_blocks(path)]
+    assert len(pages) > 10
+    assert [path.stem for path in pages if path.stem not in tests] == []
 
 
 @pytest.mark.parametrize("path", TEXTS, ids=lambda path: path.relative_to(ROOT).as_posix())
