@@ -1,4 +1,4 @@
-"""The measured numbers of the README are those of the files that they come from, rounded."""
+"""The measured numbers of the pages are those of the files that they come from, rounded."""
 
 import json
 import re
@@ -168,9 +168,9 @@ def differences(text: str, pattern: str, values: list[float]) -> list[str]:
 
 
 @pytest.mark.parametrize("row", FIGURES)
-def test_a_row_of_the_readme_has_the_numbers_of_its_file(row: str) -> None:
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    (text,) = re.findall(rf"^\| {re.escape(row)} \| (.*) \|$", readme, re.MULTILINE)
+def test_a_row_of_what_is_measured_has_the_numbers_of_its_file(row: str) -> None:
+    page = (ROOT / "docs" / "measured.md").read_text(encoding="utf-8")
+    (text,) = re.findall(rf"^\| {re.escape(row)} \| (.*) \|$", page, re.MULTILINE)
     pattern, values = FIGURES[row]
     assert differences(text, pattern, values()) == []
 
