@@ -14,12 +14,12 @@ from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
-from films import IMAGES, STILL, Frame, write_webp
+from films import FPS, IMAGES, STILL, Frame
 
 from npa_envs import load_rule
 from npa_envs.agents import Policy, RulePolicy, SpreadPolicy
 from npa_envs.registration import ENVIRONMENTS, Registration
-from npa_envs.render import write_filmstrip
+from npa_envs.render import write_filmstrip, write_webp
 
 PICTURE_SIZE = 192
 FILM_SIZE = {1: 320, 2: 256, 3: 224}
@@ -160,6 +160,7 @@ def main(names: list[str]) -> None:
         write_webp(
             film_path(registration),
             [np.hstack([frames[step] for frames in worlds]) for step in steps],
+            FPS,
         )
 
 

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 from draw_environment_pictures import FILM_SIZE, PICTURE_SIZE, film_steps
-from films import IMAGES, Frame, write_webp
+from films import FPS, IMAGES, Frame
 
 from npa_envs import load_rule
 from npa_envs.agents import RulePolicy
 from npa_envs.envs import multispecies_v0
-from npa_envs.render import write_filmstrip
+from npa_envs.render import write_filmstrip, write_webp
 
 IMAGE = IMAGES / "env_multispecies.png"
 STEPS = (0, 8, 16, 32, 64, 128)
@@ -62,4 +62,5 @@ if __name__ == "__main__":
     write_webp(
         IMAGE.with_suffix(".webp"),
         [np.hstack([frames[step] for frames in worlds]) for step in film_steps(max(STEPS))],
+        FPS,
     )
