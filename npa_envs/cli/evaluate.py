@@ -40,6 +40,10 @@ class EvaluateOptions(RuleOptions):
     """Also cut the grown worlds and erase a part, and measure how they heal. Point clouds are
     always cut and changed."""
 
+    judge: bool = False
+    """Textures only: also judge worlds by three distances from the target that no loss compares, as
+    ratios, of which 1 is what particles make of the target itself."""
+
     json: Path | None = None
     """Also write the table to this JSON file."""
 
@@ -48,6 +52,7 @@ def main(arguments: Sequence[str]) -> int:
     """Measure and print."""
     options = parse_options(EvaluateOptions, "evaluate", arguments)
     from npa_envs.devices import check_device
+    from npa_envs.measure.judge import Judge, JudgeRow
     from npa_envs.measure.quality import CHECKPOINTS, check_steps, evaluate, healing
     from npa_envs.measure.tables import table_text
     from npa_envs.rule.files import load_rule
@@ -67,6 +72,8 @@ def main(arguments: Sequence[str]) -> int:
             f"cannot measure {options.rule!r}: {trained.doubt}: "
             "give --target, a built-in name or a picture"
         )
+    judge = Judge(trained.task) if options.judge else None
+    judged: list[JudgeRow] = []
     if isinstance(trained.task, PointClassification):
         return _evaluate_clouds(options, rule, trained.task)
     seeds = range(options.first_seed, options.first_seed + options.seed_count)
@@ -78,11 +85,15 @@ def main(arguments: Sequence[str]) -> int:
             seeds=seeds,
             device=device,
             progress=bar.advance,
+            watch=None if judge is None else lambda *world: judged.append(judge.row(*world)),
         )
     measure = trained.task.metric_name
     print(f"{options.rule}: {options.seed_count} worlds, loss: {measure}")
     print(table_text(rows, missing="-"))
     tables: dict[str, Sequence[Any]] = {"growth": rows}
+    if judged:
+        print(table_text(judged))
+        tables["judge"] = judged
     if options.healing:
         with StepBar(None, show=options.progress) as bar:
             healed = healing(rule, trained.task, seeds=seeds, device=device, progress=bar.advance)

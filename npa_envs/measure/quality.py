@@ -110,6 +110,7 @@ def evaluate(
     seeds: Sequence[int] = tuple(range(8)),
     device: str | torch.device = "cpu",
     progress: Callable[[int], None] | None = None,
+    watch: Callable[[Tensor, Tensor, int], None] | None = None,
 ) -> list[EvaluationRow]:
     """Grow one world from every seed and measure them along the way.
 
@@ -120,6 +121,7 @@ def evaluate(
         seeds: One number for each world; the same numbers give the same table.
         device: Where to run.
         progress: Called with the number of steps done since its last call.
+        watch: Called at each of `checkpoints` with positions, states and the step.
 
     Returns:
         One row for each of `checkpoints`.
@@ -133,6 +135,8 @@ def evaluate(
     for step, before in zip(checkpoints, (0, *checkpoints), strict=False):
         x, s = runner.run(x, s, step - before)
         rows.append(measure(runner.task, x, s, step))
+        if watch is not None:
+            watch(x, s, step)
     return rows
 
 

@@ -19,6 +19,7 @@ from npa_envs.tasks.checks import check_non_negative, check_positive, check_seed
 from npa_envs.tasks.damage import erase_state, random_particle
 from npa_envs.tasks.losses.texture import (
     DEFAULT_LOSS,
+    TEXTURE_LOSSES,
     LossOptions,
     TextureLoss,
     check_loss_name,
@@ -45,7 +46,8 @@ class TextureConfig(TaskConfig):
     """Whether the opposite edges of a picture file fit together; built-in textures tile."""
 
     loss: str = DEFAULT_LOSS
-    """How textures are compared: "patch_swd", "filter_swd", or the paper's "vgg_ot"."""
+    """How textures are compared: a name of `TEXTURE_LOSSES` such as "patch_ot", or the paper's
+    "vgg_ot"."""
 
     loss_seed: int = 0
     """What the loss draws its directions, filters and positions from, once."""
@@ -103,6 +105,15 @@ DENSITY_FLOOR = 1e-6
 
 DENSITY_POWER = 0.1
 """Power that densities are compared in: what is empty differs most from what is not."""
+
+JOINT_POWER = 0.5
+"""The same where colours and density are compared at once."""
+
+JITTER = 0.35
+"""How far points of a drawing lie from their lattice, as a share of its spacing, at most."""
+
+DRAWINGS = 16
+"""Drawings that `Texture.drawable` is the mean of."""
 
 
 class Texture(ParticleTask[TextureConfig]):
@@ -182,9 +193,41 @@ class Texture(ParticleTask[TextureConfig]):
         """Return the picture of each world: colour sums and density, shape [B, R, R, 4]."""
         return self._splat(x, s[..., -3:] + COLOUR_OFFSET)
 
+    def drawing(self, number: int, *, shifted: bool = True) -> Tensor:
+        """Return the target as particles draw it: a jittered lattice of them, with its colours.
+
+        Args:
+            number: What jitter and shift are drawn from.
+            shifted: Whether the target is moved round the box, so that another part is cut out.
+
+        Returns:
+            Colour sums and density, dimensionless, shape [1, R, R, 4].
+        """
+        side, resolution = self.config.box_size, self.config.resolution
+        generator = torch.Generator().manual_seed(number)
+        count = max(1, round(side / self.pixel_size))
+        axis = (torch.arange(count, dtype=torch.float64) + 0.5) / count
+        places = torch.stack(torch.meshgrid(axis, axis, indexing="xy"), dim=-1).flatten(0, 1)
+        jitter = torch.rand(places.shape, generator=generator, dtype=torch.float64) - 0.5
+        places = (places + 2.0 * JITTER * jitter / count) % 1.0
+        column, row = (places * resolution).long().clamp_max(resolution - 1).unbind(1)
+        seen = self.target_picture.double().cpu()[row, column]
+        kept = torch.rand(len(seen), generator=generator, dtype=torch.float64) < seen[:, 3]
+        shift = shifted * torch.rand(2, generator=generator, dtype=torch.float64)
+        x = ((places[kept] + shift) % 1.0 - 0.5) * side
+        colour = seen[kept, :3] / seen[kept, 3:]
+        return self._splat(x[None].to(self.target_picture), colour[None].to(self.target_picture))
+
+    @cached_property
+    def drawable(self) -> Tensor:
+        """The target as fine as particles can draw it: a mean of drawings, shape [R, R, 4]."""
+        drawn = [self.drawing(number, shifted=False) for number in range(DRAWINGS)]
+        return torch.cat(drawn).mean(0)
+
     def texture_losses(self, x: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return each world's loss of the colour image and of the density image, shape [B] each.
 
+        A joint loss sees the density with the colours, and has no part of the density alone.
         Losses that look at some places only see each world as its first particle does, in the
         middle: which places these are then differs from world to world and from step to step.
 
@@ -246,18 +289,33 @@ class Texture(ParticleTask[TextureConfig]):
     def _compare(self, picture: Tensor) -> tuple[Tensor, Tensor]:
         compare_colours, compare_densities = self._losses
         channels = picture.movedim(-1, 1)
+        if compare_densities is None:
+            joint = compare_colours(self._joint_image(channels))
+            return joint, torch.zeros_like(joint)
         # One by one: the end of a tensor, which lies elsewhere in other batches, rounds otherwise.
         density = torch.stack([density_image(world) for world in channels[:, 3:]])
         return compare_colours(colour_image(channels)), compare_densities(density)
 
+    def _joint_image(self, channels: Tensor) -> Tensor:
+        """Return colours and densities, shape [..., 4, R, R], each times the root of its weight."""
+        density = (channels[..., 3:, :, :] + DENSITY_FLOOR) ** JOINT_POWER
+        colour_scale = self.config.colour_weight**0.5
+        density_scale = self.config.density_weight**0.5
+        return torch.cat((colour_scale * colour_image(channels), density_scale * density), dim=-3)
+
     def _weighted(self, colour: Tensor, density: Tensor) -> Tensor:
+        if self._losses[1] is None:
+            return colour
         return self.config.colour_weight * colour + self.config.density_weight * density
 
     @cached_property
-    def _losses(self) -> tuple[TextureLoss, TextureLoss]:
+    def _losses(self) -> tuple[TextureLoss, TextureLoss | None]:
         # Made when first asked for: pictures can be drawn without weights.
         config = self.config
         options = LossOptions(self.target.tiles, config.loss_seed, config.vgg_weights)
+        if TEXTURE_LOSSES[config.loss].joint:
+            drawable = self._joint_image(self.drawable.movedim(-1, 0))
+            return make_texture_loss(config.loss, drawable, options), None
         target = self.target_picture.movedim(-1, 0)
         return (
             make_texture_loss(config.loss, colour_image(target), options),

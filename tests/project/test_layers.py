@@ -60,6 +60,7 @@ LADDER = {
     "npa_envs.measure.tables": rung(2),
     "npa_envs.measure.plots": rung(2, "matplotlib"),
     "npa_envs.measure.speed.hash_grid": rung(3, "warp torch", never=("npa_envs.reference",)),
+    "npa_envs.measure.judge": rung(9, "torch", never=INSIDES),
     "npa_envs.measure.quality": rung(9, "torch numpy tqdm", never=INSIDES),
     "npa_envs.measure.interaction": rung(10, "torch numpy matplotlib", never=ORACLES),
     "npa_envs.measure.speed": rung(

@@ -150,7 +150,12 @@ def test_a_target_of_another_size_is_refused():
 def test_list_names_targets_and_losses(capsys):
     assert main(["list"]) == 0
     text = capsys.readouterr().out
-    for word in ("texture:", "bubbles, cells, dots, grid, maze, stripes", "vgg_ot", "filter_swd"):
+    for word in (
+        "texture:",
+        "bubbles, cells, dots, droplets, grid, hearts, maze, stars",
+        "vgg_ot",
+        "filter_swd",
+    ):
         assert word in text
     assert "morphogenesis3d: doughnut, duck, mushroom, rocket" in text
 

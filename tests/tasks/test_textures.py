@@ -89,7 +89,7 @@ def test_transparency_is_the_density_and_colours_do_not_leak(tmp_path):
 @pytest.mark.parametrize(
     ("source", "options", "message"),
     [
-        ("cels", {}, "did you mean 'cells'.*known: bubbles, cells, dots, grid, maze, stripes"),
+        ("cels", {}, "did you mean 'cells'.*known: bubbles, cells, dots, droplets, grid"),
         ("", {}, "for example 'cells'"),
         (3, {}, "must be a built-in texture"),
         ("missing.png", {}, "does not exist"),

@@ -16,6 +16,27 @@ from torch import Tensor
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.files import check_torch_archive, home_path, open_regular
 from npa_envs.ops import world_mean
+from npa_envs.tasks.losses.pieces import (
+    SMALLEST,
+    check_images,
+    level_count,
+    moment_distance,
+    orthogonal,
+    patches,
+    products,
+    pyramid,
+    quantiles,
+    relaxed_transport,
+    stride_of,
+)
+from npa_envs.tasks.losses.shapes import (
+    SHIFTS,
+    FeatureTransport,
+    GramMatrices,
+    PatchTransport,
+    RandomFilters,
+    RectifiedWavelets,
+)
 
 DEFAULT_LOSS = "patch_swd"
 """The loss that needs nothing but what is here."""
@@ -65,6 +86,9 @@ class LossEntry:
     make: Callable[[Tensor, LossOptions], TextureLoss]
     """Prepares a target, shape [K, R, R]."""
 
+    joint: bool = False
+    """Whether colours and density are compared at once, K = 4, and as particles can draw them."""
+
 
 TEXTURE_LOSSES: Mapping[str, LossEntry] = {
     "vgg_ot": LossEntry(
@@ -84,6 +108,46 @@ TEXTURE_LOSSES: Mapping[str, LossEntry] = {
         lambda target, options: SlicedWasserstein(
             target, FilterDescriptor(target, seed=options.seed), tiles=options.tiles
         ),
+    ),
+    "joint_swd": LossEntry(
+        "`patch_swd` of colours and density at once",
+        lambda target, options: SlicedWasserstein(
+            target, PatchDescriptor(target, seed=options.seed), tiles=options.tiles
+        ),
+        joint=True,
+    ),
+    "patch_ot": LossEntry(
+        "relaxed optimal transport of raw patches at several sizes",
+        lambda target, options: PatchTransport(target, tiles=options.tiles),
+        joint=True,
+    ),
+    "filter_gram": LossEntry(
+        "Gram matrix of one layer of random filters of many sizes",
+        lambda target, options: GramMatrices(
+            target, RandomFilters(target, seed=options.seed), tiles=options.tiles
+        ),
+        joint=True,
+    ),
+    "filter_ot": LossEntry(
+        "relaxed optimal transport of the same filters",
+        lambda target, options: FeatureTransport(
+            target, RandomFilters(target, seed=options.seed), tiles=options.tiles
+        ),
+        joint=True,
+    ),
+    "wavelet_gram": LossEntry(
+        "products of rectified wavelets at several distances",
+        lambda target, options: GramMatrices(
+            target, RectifiedWavelets(target), tiles=options.tiles, shifts=SHIFTS
+        ),
+        joint=True,
+    ),
+    "wavelet_ot": LossEntry(
+        "relaxed optimal transport of the same wavelets",
+        lambda target, options: FeatureTransport(
+            target, RectifiedWavelets(target), tiles=options.tiles
+        ),
+        joint=True,
     ),
 }
 """Every texture loss by name."""
@@ -130,15 +194,6 @@ def make_texture_loss(
 PATCH = 5
 """Pixels along each side of a patch."""
 
-LEVELS = 4
-"""Sizes at most, each half of the one before."""
-
-SMALLEST = 12
-"""Pixels along each side of the smallest size at least."""
-
-PLACES = 64
-"""Places along each side that are compared at most; at finer sizes some pixels are left out."""
-
 FILTERS = 24
 """Random filters of the first layer; each gives two features, above zero and below."""
 
@@ -147,10 +202,6 @@ SECOND_PATCH = 3
 
 FLOOR = 0.01
 """Variance that is added to the target's, so that an even target can be compared with, too."""
-
-
-ALIGNMENT = 64
-"""Bytes that a table's address is a multiple of."""
 
 
 class Descriptor(Protocol):
@@ -286,111 +337,6 @@ class FilterDescriptor:
         return result
 
 
-def check_images(images: Tensor, shape: tuple[int, ...]) -> None:
-    """Check that images have the target's shape.
-
-    Args:
-        images: What is compared.
-        shape: The target's shape, (K, R, R).
-
-    Raises:
-        NPAError: They do not.
-    """
-    if images.ndim != 4 or tuple(images.shape[1:]) != shape:
-        raise NPAError(
-            f"images must have shape [B, K, R, R] with (K, R, R) = {shape} as the target, got "
-            f"{tuple(images.shape)}: draw them at the target's resolution"
-        )
-
-
-def level_count(resolution: int) -> int:
-    """Return how many sizes an image is looked at in."""
-    count = 1
-    while count < LEVELS and resolution % 2 == 0 and resolution // 2 >= SMALLEST:
-        resolution //= 2
-        count += 1
-    return count
-
-
-def pyramid(images: Tensor, count: int) -> list[Tensor]:
-    """Return images [B, K, R, R] and `count` - 1 smaller ones, each of means of 2 x 2 pixels."""
-    levels = [images]
-    while len(levels) < count:
-        fine = levels[-1]
-        # Written out: each sum has an order of its own, whatever the size of the batch.
-        rows = fine[:, :, ::2] + fine[:, :, 1::2]
-        levels.append(0.25 * (rows[..., ::2] + rows[..., 1::2]))
-    return levels
-
-
-def stride_of(level: Tensor, thinned: bool) -> int:
-    """Return how many pixels lie between places."""
-    return max(1, level.shape[-1] // PLACES) if thinned else 1
-
-
-def patches(images: Tensor, size: int, *, stride: int, wrap: bool) -> Tensor:
-    """Return the square patches of images as rows, shape [B, M, K size²].
-
-    Args:
-        images: The images, shape [B, K, R, R].
-        size: Pixels along each side, odd.
-        stride: Pixels from one patch to the next.
-        wrap: Whether patches reach across the edges; otherwise M is smaller.
-    """
-    if wrap:
-        reach = size // 2
-        images = torch.cat((images[:, :, -reach:], images, images[:, :, :reach]), dim=2)
-        images = torch.cat((images[..., -reach:], images, images[..., :reach]), dim=3)
-    windows = images.unfold(2, size, stride).unfold(3, size, stride)
-    return windows.permute(0, 2, 3, 1, 4, 5).flatten(3).flatten(1, 2)
-
-
-def products(rows: Tensor, weights: Tensor) -> Tensor:
-    """Return the rows of each image times weights, shape [B, M, F].
-
-    Image by image: the product of a whole batch may round otherwise than that of one image, and so
-    may that of numbers that lie otherwise in memory.
-
-    Args:
-        rows: Contiguous rows, shape [B, M, E].
-        weights: Shape [E, F].
-    """
-    weights = weights.to(rows)
-    tables = [one if one.data_ptr() % ALIGNMENT == 0 else one.clone() for one in rows]
-    return torch.stack([table @ weights for table in tables])
-
-
-def orthogonal(size: int, count: int, generator: torch.Generator) -> Tensor:
-    """Return `count` directions at right angles to each other as columns, shape [size, count].
-
-    Args:
-        size: Numbers in each, at least `count`.
-        count: Directions.
-        generator: What they are drawn from, on the CPU.
-    """
-    normal = torch.randn(size, count, generator=generator, dtype=torch.float64)
-    basis: Tensor = torch.linalg.qr(normal).Q
-    return basis
-
-
-def quantiles(values: Tensor, count: int) -> Tensor:
-    """Return `count` evenly spread quantiles of each row, sorted; the values themselves where fit.
-
-    Args:
-        values: Numbers, shape [F, M].
-        count: Quantiles, in the middles of `count` equal shares of probability.
-    """
-    ordered = values.sort(dim=1).values
-    total = ordered.shape[1]
-    if total == count:
-        return ordered
-    place = (torch.arange(count, dtype=values.dtype, device=values.device) + 0.5) / count
-    place = (place * total - 0.5).clamp(0.0, total - 1.0)
-    low = place.floor().long()
-    share = place - low
-    return ordered[:, low] * (1.0 - share) + ordered[:, (low + 1).clamp(max=total - 1)] * share
-
-
 # The paper's loss: relaxed optimal transport between features of VGG16, and their moments, after
 # Kolkin, Salavon and Shakhnarovich, "Style Transfer by Relaxed Optimal Transport and Self-
 # Similarity" (2019). Of VGG16 (Simonyan and Zisserman 2014) only the weights are needed, not
@@ -405,9 +351,6 @@ VGG_PLACES = 1024
 
 VGG_SMALLEST = 32
 """Pixels along each side that leave the deepest layer more than one place."""
-
-TINY_SQUARE = 1e-12
-"""Squared length of a feature vector below which it counts as no direction."""
 
 
 class VGGTransport:
@@ -477,46 +420,9 @@ class VGGTransport:
         return total
 
 
-def relaxed_transport(first: Tensor, second: Tensor) -> Tensor:
-    """Return the relaxed earth mover's distance of rows under the cosine distance, shape [B].
-
-    Either side may send all to the nearest of the other; the larger of both costs is taken, each
-    a lower bound of the cost of transport.
-
-    Args:
-        first: Rows, shape [B, M, F].
-        second: Rows, shape [1, L, F] or [B, L, F].
-    """
-    costs = 1.0 - _directions(first) @ _directions(second).transpose(1, 2)
-    there, back = costs.amin(dim=2).mean(dim=1), costs.amin(dim=1).mean(dim=1)
-    return torch.maximum(there, back)
-
-
-def moment_distance(first: Tensor, second: Tensor) -> Tensor:
-    """Return the mean absolute differences of means and of covariances, added, shape [B].
-
-    Args:
-        first: Rows, shape [B, M, F].
-        second: Rows, shape [1, L, F] or [B, L, F].
-    """
-    (mean, covariance), (other_mean, other_covariance) = _moments(first), _moments(second)
-    difference = (mean - other_mean).abs().mean(dim=(1, 2))
-    return difference + (covariance - other_covariance).abs().mean(dim=(1, 2))
-
-
 def _rows(field: Tensor, places: Tensor | None) -> Tensor:
     rows = field.flatten(2)
     return (rows if places is None else rows.index_select(2, places)).transpose(1, 2)
-
-
-def _directions(rows: Tensor) -> Tensor:
-    return rows * (rows.square().sum(dim=-1, keepdim=True) + TINY_SQUARE).rsqrt()
-
-
-def _moments(rows: Tensor) -> tuple[Tensor, Tensor]:
-    mean = rows.mean(dim=1, keepdim=True)
-    centred = rows - mean
-    return mean, centred.transpose(1, 2) @ centred / (rows.shape[1] - 1)
 
 
 WEIGHTS_FILE = "vgg16-397923af.pth"

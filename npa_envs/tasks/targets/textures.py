@@ -252,12 +252,78 @@ def maze(u: Array, v: Array, random: np.random.Generator) -> Array:
     return _opaque(np.where((height > -0.2)[..., None], inside, ground))
 
 
+def hearts(u: Array, v: Array, _: np.random.Generator) -> Array:
+    """Upright hearts in rows, red and pink by turns, nothing between them."""
+    places = [((k + 0.5 * (j % 2)) / 4.0, j / 4.0) for j in range(4) for k in range(4)]
+    colour = np.zeros((*u.shape, 3))
+    covered = np.zeros(u.shape, dtype=bool)
+    inner, rim = _colours("#e63946", "#ffafcc"), _colours("#8d0f20", "#d6407f")
+    for number, place in enumerate(places):
+        across, up = (way / 0.084 for way in _away(u, v, np.array(place)))
+        # Two round halves above a point.
+        depth = across**2 + (1.15 * up - 0.25 - 0.72 * np.sqrt(np.abs(across))) ** 2
+        depth = np.where(np.abs(across) < 1.5, depth, np.inf)
+        body, middle = depth < 1.1, depth < 0.62
+        colour[body], colour[middle] = rim[number % 2], inner[number % 2]
+        covered |= body
+    return _with_alpha(colour, covered)
+
+
+def droplets(u: Array, v: Array, random: np.random.Generator) -> Array:
+    """Slanted drops of three blues, dark at the rim, with a glint; nothing around them."""
+    places = _scattered(random, 14, 0.21)
+    body_tints, rim_tints = _colours("#90e0ef", "#4895ef", "#3f37c9"), _colours("#03045e")
+    colour = np.zeros((*u.shape, 3))
+    covered = np.zeros(u.shape, dtype=bool)
+    for number, place in enumerate(places):
+        across, up = (way / 0.068 for way in _away(u, v, place))
+        across, up = 0.94 * across + 0.34 * up, 0.94 * up - 0.34 * across
+        # A disk below, drawn out to a point above.
+        taper = np.where(up > 0.0, np.clip(1.0 - up / 2.0, 0.0, 1.0) ** 0.9, 1.0)
+        width = np.where(up > 0.0, taper, np.sqrt(np.clip(1.0 - up**2, 0.0, 1.0)))
+        depth = np.abs(across) - width
+        body, middle = (depth < 0.0) & (up < 2.0) & (up > -1.0), depth < -0.27
+        middle &= (up > -0.78) & (up < 1.3)
+        glint = np.hypot(across + 0.3, up + 0.2) < 0.22
+        colour[body], colour[middle & body] = rim_tints[0], body_tints[number % 3]
+        colour[glint] = 1.0
+        covered |= body
+    return _with_alpha(colour, covered)
+
+
+def stars(u: Array, v: Array, random: np.random.Generator) -> Array:
+    """Five-pointed stars of two colours, turned and scattered, on a night-blue ground."""
+    places = _scattered(random, 13, 0.23)
+    turns = random.random(len(places)) * 0.8 - 0.4
+    ground, *tints = _colours("#14213d", "#fca311", "#f1faee")
+    colour = np.broadcast_to(ground, (*u.shape, 3)).copy()
+    for number, (place, turn) in enumerate(zip(places, turns, strict=True)):
+        across, up = _away(u, v, place)
+        # The angle to the nearest of the five points, and the straight edge that lies there.
+        fifth = 2.0 * math.pi / 5.0
+        angle = np.abs((np.arctan2(across, up) + turn + 0.5 * fifth) % fifth - 0.5 * fifth)
+        inner = 0.45
+        edge = (
+            inner
+            * math.sin(0.5 * fifth)
+            / (
+                np.sin(angle) * (1.0 - inner * math.cos(0.5 * fifth))
+                + np.cos(angle) * inner * math.sin(0.5 * fifth)
+            )
+        )
+        colour[np.hypot(across, up) < 0.105 * edge] = tints[number % 2]
+    return _opaque(colour)
+
+
 PATTERNS: dict[str, Pattern] = {
     "bubbles": bubbles,
     "cells": cells,
     "dots": dots,
+    "droplets": droplets,
     "grid": grid,
+    "hearts": hearts,
     "maze": maze,
+    "stars": stars,
     "stripes": stripes,
 }
 """Every built-in texture by name."""

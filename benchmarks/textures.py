@@ -1,0 +1,220 @@
+"""Losses of textures compared: rules trained with each, and judged by what none of them compares.
+
+`run` trains rules, several side by side on one GPU, each on a stream of its own, and judges them as
+`npa-envs evaluate --judge` does, with seeds that training never saw. Every finished rule is a line
+of JSON, with its file and a strip of pictures; `report` prints the table. `particles` asks
+what a loss is worth without any rule: positions and colours of grey particles follow its slope.
+
+    python benchmarks/textures.py particles --out OUT
+    python benchmarks/textures.py run --device cuda --out OUT --losses patch_swd patch_ot
+    python benchmarks/textures.py report OUT
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+
+from npa_envs.measure.judge import Judge
+from npa_envs.measure.quality import Runner
+from npa_envs.render.colours import to_uint8
+from npa_envs.tasks.texture import Texture
+from npa_envs.training import Trainer, preset
+from npa_envs.world.recorded import release_recordings
+
+SEEDS = tuple(range(1_000_000, 1_000_008))
+"""Seeds of the worlds that rules are judged on."""
+
+
+def on(stream: Any) -> Any:
+    """Return a context in which work goes to a stream; None: on a CPU."""
+    return contextlib.nullcontext() if stream is None else torch.cuda.stream(stream)
+
+
+def train_side_by_side(
+    trainers: Sequence[Trainer], streams: Sequence[Any], longest: float
+) -> float:
+    """Train several rules, an iteration of each in turn; return the seconds.
+
+    Args:
+        trainers: What is trained.
+        streams: The stream that each was made on.
+        longest: Stop after this time [s], finished or not.
+    """
+    cuda = trainers[0].config.device.startswith("cuda")
+    begun = time.perf_counter()
+    for number in range(max(trainer.config.total_iterations for trainer in trainers)):
+        if number % 16 == 0 and cuda:
+            # The host would run ahead of the time that the device needs.
+            torch.cuda.synchronize()
+        if time.perf_counter() - begun >= longest:
+            break
+        for trainer, stream in zip(trainers, streams, strict=True):
+            if trainer.iteration < trainer.config.total_iterations:
+                with on(stream):
+                    trainer.iterate()
+    if cuda:
+        torch.cuda.synchronize()
+    return time.perf_counter() - begun
+
+
+@torch.no_grad()
+def judged(
+    trainer: Trainer, steps: Sequence[int]
+) -> tuple[list[dict[str, Any]], np.ndarray[Any, Any]]:
+    """Return what the judge says of a trained rule, and the target and a world side by side."""
+    task: Any = trainer.task
+    device = torch.device(trainer.config.device)
+    rule = trainer._cycle.average.rule(trainer.rule)
+    runner = Runner(rule, task, device, SEEDS[0] + len(SEEDS), None)
+    worlds = [
+        task.seed(1, generator=torch.Generator(device).manual_seed(seed), device=device)
+        for seed in SEEDS[: 8 if device.type == "cuda" else 1]
+    ]
+    x, s = (torch.cat(parts).to(runner.dtype) for parts in zip(*worlds, strict=True))
+    judge = Judge(task)
+    rows, frames, before = [], [task.target_picture[None]], 0
+    for step in steps:
+        x, s = runner.run(x, s, step - before)
+        rows.append(asdict(judge.row(x, s, step)))
+        frames.append(task.picture(x[:1], s[:1]))
+        before = step
+    picture = to_uint8(torch.cat([frame.cpu() for frame in frames]))
+    return rows, np.concatenate(list(picture), axis=1)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Train and judge, all runs side by side."""
+    out: Path = arguments.out
+    out.mkdir(parents=True, exist_ok=True)
+    changes = json.loads(arguments.fields)
+    changes = {k: tuple(v) if isinstance(v, list) else v for k, v in changes.items()}
+    started = time.perf_counter()
+    names, trainers, streams = [], [], []
+    for loss in arguments.losses:
+        for target in arguments.targets:
+            name = f"{target}-{loss}{arguments.label}"
+            fields: dict[str, Any] = {"tensorboard": False, "picture_interval": 0}
+            fields |= {"checkpoint_interval": 10**9, "log_interval": 100, "target": target}
+            fields |= {"loss": loss, "device": arguments.device, "out": arguments.runs / name}
+            config = preset(arguments.preset, "texture", **(fields | changes))
+            streams.append(torch.cuda.Stream() if arguments.device.startswith("cuda") else None)
+            with on(streams[-1]):
+                task = Texture(config.task, device=arguments.device)
+                trainers.append(Trainer(task, config, task_name="texture", overwrite=True))
+            names.append(name)
+    print(f"made in {time.perf_counter() - started:.0f} s", flush=True)
+    seconds = train_side_by_side(trainers, streams, arguments.longest)
+    print(f"{[t.iteration for t in trainers]} in {seconds:.0f} s", flush=True)
+    for name, trainer in zip(names, trainers, strict=True):
+        trainer.save()
+        (out / f"rule-{name}.safetensors").write_bytes(trainer.folder.rule.read_bytes())
+    if arguments.device.startswith("cuda"):
+        release_recordings()
+    for name, trainer in zip(names, trainers, strict=True):
+        begun = time.perf_counter()
+        rows, strip = judged(trainer, arguments.steps)
+        if arguments.device.startswith("cuda"):
+            release_recordings()
+        Image.fromarray(strip).save(out / f"strip-{name}.png")
+        line = {"name": name, "iterations": trainer.iteration, "seconds": seconds, "judge": rows}
+        with (out / "runs.jsonl").open("a") as file:
+            file.write(json.dumps(line | {"together": len(trainers), "fields": changes}) + "\n")
+        told = "  ".join(
+            f"{r['step']}: {r['ratio']:.2f} ({r['patches']:.1f} {r['spectra']:.1f} "
+            f"{r['colours']:.1f})"
+            for r in rows
+        )
+        print(f"{name:24s} {told}  {time.perf_counter() - begun:.1f} s", flush=True)
+
+
+def particles(arguments: argparse.Namespace) -> None:
+    """Let positions and colours themselves follow each loss, and judge where they come to."""
+    out: Path = arguments.out
+    out.mkdir(parents=True, exist_ok=True)
+    device = torch.device(arguments.device)
+    changes = json.loads(arguments.fields)
+    for target in arguments.targets:
+        frames = []
+        for loss in arguments.losses:
+            config = preset("paper", "texture", target=target, loss=loss, **changes).task
+            task = Texture(config, device=device)
+            generator = torch.Generator(device).manual_seed(0)
+            x, s = task.seed(1, generator=generator, device=device)
+            colour = s[..., -3:].clone().requires_grad_()
+            x.requires_grad_()
+            half = 0.5 * config.box_size
+            optimiser = torch.optim.Adam([{"params": [x]}, {"params": [colour]}], betas=(0.9, 0.9))
+            begun = time.perf_counter()
+            for number in range(arguments.iterations):
+                left = max(0.05, 1.0 - number / arguments.iterations)
+                optimiser.param_groups[0]["lr"] = 0.012 * left
+                optimiser.param_groups[1]["lr"] = 0.03 * left
+                shift = torch.rand(1, 1, 2, generator=generator, device=device) * 2.0 * half
+                pictured = task.picture((x + shift + half) % (2.0 * half) - half, colour)
+                value = task._weighted(*task._compare(pictured)).sum()
+                total = value + 10.0 * (colour.abs() - 0.5).relu().mean()
+                optimiser.zero_grad()
+                total.backward()
+                optimiser.step()
+            found = Judge(task).row((x.detach() + half) % (2.0 * half) - half, colour.detach(), 0)
+            seconds = time.perf_counter() - begun
+            line = {"target": target, "loss": loss, "value": value.item(), "seconds": seconds}
+            line |= {"iterations": arguments.iterations, "fields": changes}
+            line |= {"judge": asdict(found), "device": str(device)}
+            with (out / "particles.jsonl").open("a") as file:
+                file.write(json.dumps(line) + "\n")
+            print(
+                f"{target:9s} {loss:13s} {found.ratio:6.2f} ({found.patches:.1f} "
+                f"{found.spectra:.1f} {found.colours:.1f})  {seconds:.0f} s",
+                flush=True,
+            )
+            with torch.no_grad():
+                frames.append(task.picture(x, colour).cpu())
+        frames.insert(0, task.target_picture[None].cpu())
+        strip = np.concatenate(list(to_uint8(torch.cat(frames))), axis=1)
+        Image.fromarray(strip).save(out / f"particles-{target}.png")
+
+
+def report(arguments: argparse.Namespace) -> None:
+    """Print the ratios of all runs as a table."""
+    print("| run | iterations | " + " | ".join(str(step) for step in arguments.steps) + " |")
+    print("|---|---|" + "---|" * len(arguments.steps))
+    for text in (arguments.out / "runs.jsonl").read_text().splitlines():
+        line = json.loads(text)
+        by_step = {row["step"]: row["ratio"] for row in line["judge"]}
+        told = " | ".join(f"{by_step[s]:.2f}" if s in by_step else "" for s in arguments.steps)
+        print(f"| {line['name']} | {line['iterations']} | {told} |")
+
+
+def main() -> None:
+    """Read the arguments and do what they say."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("what", choices=("run", "particles", "report"))
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--runs", type=Path, default=Path("runs"))
+    parser.add_argument("--losses", nargs="+", default=["patch_ot"])
+    parser.add_argument("--targets", nargs="+", default=["hearts", "bubbles", "stripes"])
+    parser.add_argument("--preset", default="paper")
+    parser.add_argument("--fields", default="{}", help="fields to change, as JSON")
+    parser.add_argument("--iterations", type=int, default=120, help="of particles without a rule")
+    parser.add_argument("--label", default="")
+    parser.add_argument("--steps", type=int, nargs="+", default=[64, 512, 4096])
+    parser.add_argument("--longest", type=float, default=1e9, help="seconds of training")
+    parser.add_argument("--device", default="cpu")
+    arguments = parser.parse_args()
+    {"run": run, "particles": particles, "report": report}[arguments.what](arguments)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,241 @@
+"""The judge of textures, which nobody trains on: three distances from the target, as ratios.
+
+Each is divided by what the target itself comes to when particles draw it, so that 1 is as good as
+particles can be, and grey noise is 50 or less.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from npa_envs.errors import NPAError
+from npa_envs.tasks.losses.pieces import quantiles
+from npa_envs.tasks.texture import Texture, colour_image
+
+REFERENCE = 128
+"""Pixels along each side that lengths below are counted in; other pictures are as many times
+smaller or larger as their resolution says."""
+
+PATCH = 24
+"""Pixels along each side of a patch; no loss looks at this size."""
+
+DIRECTIONS = 64
+"""Random directions that patches are seen from."""
+
+BANDS = 7
+"""Bands of the wave number, each `BAND_RATIO` times the one before, up to half a wave a pixel."""
+
+BAND_RATIO = math.sqrt(2.0)
+"""Ratio of the wave numbers at both ends of a band."""
+
+ORIENTATIONS = 8
+"""Orientations of waves in half a turn."""
+
+CODES = 12
+"""Colours that a picture is told in."""
+
+DISTANCES = (1, 2, 4, 6, 9, 13, 19, 28)
+"""Pixels between two colours that are counted together."""
+
+AXES = ((0, 1), (1, 1), (1, 0), (1, -1))
+"""Directions in which they lie, rows and columns."""
+
+SOFTNESS = 0.15
+"""Distance from a colour's code at which it counts for little (dimensionless)."""
+
+DRAWINGS = 4
+"""How often the target is drawn from points to be measured."""
+
+FIRST_DRAWING = 1000
+"""Number of the first of them."""
+
+LEAST = 0.02
+"""Distances are divided by this share of the distance to grey noise at least."""
+
+
+@dataclass(frozen=True)
+class JudgeRow:
+    """Several worlds after a number of steps, judged; ratios, of which 1 is the target itself."""
+
+    step: int
+    """Steps from the seed."""
+    ratio: float
+    """Mean of the three ratios, mean of the worlds (dimensionless)."""
+    ratio_worst: float
+    """The same in the worst world."""
+    patches: float
+    """Ratio of the sliced Wasserstein distances of 24-pixel patches, mean of the worlds."""
+    spectra: float
+    """Ratio of the distances of oriented power spectra, mean of the worlds."""
+    colours: float
+    """Ratio of the distances of co-occurring colours, mean of the worlds."""
+
+
+class Judge:
+    """How far worlds of a texture task look from its target; no loss compares what it compares.
+
+    All is counted in float64 with directions drawn from one seed, so that a CPU and a GPU agree.
+
+    Args:
+        task: The texture task: its target, and how particles are drawn.
+
+    Raises:
+        NPAError: The task is no texture.
+    """
+
+    def __init__(self, task: object) -> None:
+        if not isinstance(task, Texture):
+            raise NPAError(
+                f"the judge compares textures, got {type(task).__name__}: leave out --judge, or "
+                "give a rule of the task texture"
+            )
+        self._task = task
+        resolution = task.config.resolution
+        self._scale = resolution / REFERENCE
+        device = task.target_picture.device
+        generator = torch.Generator().manual_seed(0)
+        side = max(2, min(resolution, round(PATCH * self._scale)))
+        directions = torch.randn(DIRECTIONS, 4, side, side, generator=generator).double()
+        directions /= directions.flatten(1).norm(dim=1)[:, None, None, None]
+        filters = torch.zeros(DIRECTIONS, 4, resolution, resolution, dtype=torch.float64)
+        filters[..., :side, :side] = directions
+        self._side = side
+        self._filters = torch.fft.rfft2(filters.to(device)).conj()
+        bins = _wave_bins(resolution)[:, None] == torch.arange(1, 1 + BANDS * ORIENTATIONS)
+        self._bins = bins.double().to(device)
+        self._window = torch.ones(resolution, resolution, dtype=torch.float64, device=device)
+        if not task.target.tiles:
+            ramp = torch.hann_window(resolution, periodic=False, dtype=torch.float64)
+            self._window = torch.outer(ramp, ramp).to(device)
+        target = _images(task.drawable[None])
+        self._codes = _codes(target[0].flatten(1).T, CODES)
+        wrap = task.target.tiles
+        self._patches = self._projections(target, wrap)
+        self._spectra = self._amplitudes(target)
+        self._colours = self._counts(target, wrap)
+        noise = torch.rand(DRAWINGS, resolution, resolution, 2, generator=generator)
+        grey, density = noise.to(device).split(1, dim=3)
+        noisy = torch.cat((grey * density,) * 3 + (density,), dim=3)
+        drawn = torch.cat([task.drawing(FIRST_DRAWING + number) for number in range(DRAWINGS)])
+        least = LEAST * self._distances(_images(noisy)).mean(0)
+        self._units = torch.maximum(self._distances(_images(drawn)).mean(0), least)
+
+    def __call__(self, pictures: Tensor) -> Tensor:
+        """Return each picture's ratios: of patches, of spectra, of colours; float64, shape [B, 3].
+
+        Args:
+            pictures: What `Texture.picture` returns: colour sums and density, shape [B, R, R, 4].
+
+        Raises:
+            NPAError: The pictures have another resolution than the target.
+        """
+        if pictures.shape[1:] != self._task.target_picture.shape:
+            raise NPAError(
+                f"pictures must have shape [B, R, R, 4] with R as the target's "
+                f"{self._task.config.resolution}, got {tuple(pictures.shape)}"
+            )
+        with torch.no_grad():
+            return self._distances(_images(pictures.to(self._task.target_picture.device))) / (
+                self._units
+            )
+
+    def row(self, x: Tensor, s: Tensor, step: int) -> JudgeRow:
+        """Judge worlds as they are.
+
+        Args:
+            x: Positions [length units], shape [B, N, 2].
+            s: States, shape [B, N, C].
+            step: Steps they have behind them.
+        """
+        ratios = self(self._task.picture(x, s))
+        each = ratios.mean(1)
+        patches, spectra, colours = ratios.mean(0).tolist()
+        return JudgeRow(step, each.mean().item(), each.max().item(), patches, spectra, colours)
+
+    def _distances(self, images: Tensor) -> Tensor:
+        found = []
+        for image in images.split(1):
+            patches = (self._projections(image, True) - self._patches).square().mean()
+            spectra = (self._amplitudes(image) - self._spectra).square().sum()
+            colours = (self._counts(image, True).sqrt() - self._colours.sqrt()).square().sum()
+            found.append(torch.stack((patches, spectra, colours)))
+        return torch.stack(found)
+
+    def _projections(self, image: Tensor, wrap: bool) -> Tensor:
+        """Return the quantiles of what patches look like from each direction, [DIRECTIONS, R²]."""
+        waves = torch.fft.rfft2(image)
+        seen = torch.fft.irfft2((waves * self._filters).sum(1), s=image.shape[-2:])
+        count = image.shape[-1] ** 2
+        if not wrap:
+            inside = image.shape[-1] - self._side + 1
+            seen = seen[:, :inside, :inside]
+        return quantiles(seen.flatten(1), count)
+
+    def _amplitudes(self, image: Tensor) -> Tensor:
+        """Return the square root of each channel's power in each bin of waves, [4, bins]."""
+        flat = (image - image.mean(dim=(2, 3), keepdim=True)) * self._window
+        power = torch.fft.fft2(flat, norm="forward").abs().square() / self._window.square().mean()
+        sums: Tensor = power[0].flatten(1) @ self._bins
+        return sums.sqrt()
+
+    def _counts(self, image: Tensor, wrap: bool) -> Tensor:
+        """Return how often two codes lie at each distance and direction, shares, [D, K, K]."""
+        away = (image[0].movedim(0, -1)[..., None, :] - self._codes).square().sum(-1)
+        near = torch.exp(-0.5 * away / SOFTNESS**2)
+        # What is like none of them counts as one more colour.
+        near = torch.cat((near, torch.full_like(near[..., :1], 0.05)), dim=-1)
+        near = near / near.sum(-1, keepdim=True)
+        result = []
+        side = near.shape[0]
+        for distance in DISTANCES:
+            for down, across in AXES:
+                steps = max(1, round(distance * self._scale))
+                moved = near.roll((-down * steps, -across * steps), dims=(0, 1))
+                first = near
+                if not wrap:
+                    rows = slice(0, side - down * steps)
+                    columns = slice(max(0, -across * steps), side - max(0, across * steps))
+                    first, moved = near[rows, columns], moved[rows, columns]
+                first, moved = first.flatten(0, 1), moved.flatten(0, 1)
+                result.append(first.T @ moved / len(first))
+        return torch.stack(result)
+
+
+def _images(pictures: Tensor) -> Tensor:
+    """Return colours and densities as they are compared, float64, shape [B, 4, R, R]."""
+    channels = pictures.double().movedim(-1, 1)
+    # No power of the density: how faint the last trace of an edge is does not decide.
+    return torch.cat((colour_image(channels), channels[:, 3:]), dim=1)
+
+
+def _wave_bins(resolution: int) -> Tensor:
+    """Return the bin of each wave by wave number and orientation, int64, [R²]; 0: none."""
+    waves = torch.fft.fftfreq(resolution, dtype=torch.float64)
+    down, across = torch.meshgrid(waves, waves, indexing="ij")
+    length = torch.hypot(down, across)
+    longest = 0.5 * REFERENCE / resolution
+    band = BANDS + torch.floor(torch.log(length / longest + 1e-300) / math.log(BAND_RATIO))
+    # The longest waves are one band, the shortest another, however many there are.
+    band = band.clamp(0, BANDS - 1)
+    turn = torch.atan2(down, across) % math.pi
+    orientation = torch.floor(turn / math.pi * ORIENTATIONS + 0.5) % ORIENTATIONS
+    bins = 1 + band * ORIENTATIONS + orientation
+    return torch.where(length > 0.0, bins, torch.zeros_like(bins)).long().flatten()
+
+
+def _codes(colours: Tensor, count: int) -> Tensor:
+    """Return the colours that most are near to, [K, F]: k-means from the farthest ones."""
+    centres = colours.mean(0, keepdim=True)
+    for _ in range(count - 1):
+        away = torch.cdist(colours, centres).amin(1)
+        centres = torch.cat((centres, colours[away.argmax()][None]))
+    for _ in range(20):
+        nearest = torch.cdist(colours, centres).argmin(1)
+        chosen = torch.nn.functional.one_hot(nearest, count).to(colours)
+        sums, sizes = chosen.T @ colours, chosen.sum(0)[:, None]
+        centres = torch.where(sizes > 0.0, sums / sizes.clamp_min(1.0), centres)
+    return centres

@@ -1,0 +1,141 @@
+"""The judge of textures: the target itself is about 1 at most, and what is wrong is far worse."""
+
+import dataclasses
+import json
+
+import pytest
+import torch
+import torch.nn.functional as F
+
+from npa_envs.cli import main
+from npa_envs.errors import NPAError
+from npa_envs.measure import judge as judges
+from npa_envs.measure.judge import Judge
+from npa_envs.tasks.losses import pieces, shapes, texture
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
+from npa_envs.tasks.targets.textures import TextureTarget, draw_pattern
+from npa_envs.tasks.texture import Texture, TextureConfig
+
+CONFIG = TextureConfig(target="hearts", particle_count=1024, resolution=64)
+
+
+@pytest.fixture(scope="module")
+def task():
+    return Texture(CONFIG)
+
+
+@pytest.fixture(scope="module")
+def judge(task):
+    return Judge(task)
+
+
+def wrong(picture):
+    """The picture [1, R, R, 4] spoiled in one way after the other."""
+    side = picture.shape[1]
+    order = torch.randperm(side * side, generator=torch.Generator().manual_seed(0))
+    channels = picture.movedim(-1, 1)
+    padded = F.pad(channels, (3, 3, 3, 3), mode="circular")
+    return {
+        "shuffled": picture.flatten(1, 2)[:, order].reshape_as(picture),
+        "blurred": F.avg_pool2d(padded, 7, 1).movedim(1, -1),
+        "half as large": F.avg_pool2d(channels, 2).repeat(1, 1, 2, 2).movedim(1, -1),
+        "turned": picture.transpose(1, 2).flip(1),
+        "other colours": picture[..., [1, 2, 0, 3]],
+        "nothing": torch.zeros_like(picture),
+    }
+
+
+def test_the_target_itself_is_one_at_most(task, judge):
+    for number in range(3):
+        ratios = judge(task.drawing(number))
+        assert ratios.shape == (1, 3)
+        # 0.55 was the largest seen: grey noise limits what they are divided by.
+        assert float(ratios.max()) < 1.1
+    # Pixels as sharp as no particles are: 2.1.
+    assert float(judge(task.target_picture[None]).mean()) < 6.0
+
+
+@pytest.mark.parametrize(
+    "kind", ["shuffled", "blurred", "half as large", "turned", "other colours", "nothing"]
+)
+def test_what_is_wrong_is_far_worse(task, judge, kind):
+    drawn = task.drawing(5)
+    good = float(judge(drawn).mean())
+    assert float(judge(wrong(drawn)[kind]).mean()) > max(3.0, 8.0 * good)
+
+
+def test_another_draw_of_scattered_things_is_near(task):
+    config = dataclasses.replace(CONFIG, target="droplets")
+    picture = torch.tensor(draw_pattern("droplets", 64, seed=7)).float()
+    other = Texture(config, target=TextureTarget("droplets", picture, True))
+    judge = Judge(Texture(config))
+    assert float(judge(other.drawing(0)).mean()) < 3.0
+    assert float(judge(task.drawing(0)).mean()) > 6.0
+
+
+def test_a_world_is_judged_alone_and_always_alike(task, judge):
+    pictures = torch.cat([task.drawing(number) for number in range(2)] + [torch.rand(1, 64, 64, 4)])
+    together = judge(pictures)
+    assert torch.equal(together, Judge(task)(pictures))
+    for picture, ratios in zip(pictures, together, strict=True):
+        assert torch.equal(judge(picture[None])[0], ratios)
+    moved = judge(pictures.roll((9, -14), dims=(1, 2)))
+    torch.testing.assert_close(moved, together, rtol=1e-6, atol=1e-9)
+
+
+def test_devices_agree(task, judge, device):
+    picture = task.drawing(3)
+    there = Judge(Texture(CONFIG, device=device))
+    torch.testing.assert_close(there(picture).cpu(), judge(picture), rtol=1e-3, atol=1e-3)
+
+
+def test_a_target_with_edges_is_not_read_across_them():
+    half = torch.zeros(64, 64, 4)
+    half[:, :, 3] = 1.0
+    half[:, :32, 0] = 1.0
+    task = Texture(CONFIG, target=TextureTarget("half", half, False))
+    judge = Judge(task)
+    assert judge._patches.shape == (judges.DIRECTIONS, 64 * 64)
+    tiled = Judge(Texture(CONFIG, target=TextureTarget("half", half, True)))
+    assert float(tiled(task.drawing(0)).mean()) < 1.1
+    # Its left edge is red and its right one black: only a torus has that step twice.
+    pair = judges.DISTANCES.index(9) * len(judges.AXES) + judges.AXES.index((0, 1))
+    image = judges._images(half[None])
+    same = [float(judge._counts(image, wrap)[pair].diagonal().sum()) for wrap in (True, False)]
+    assert same[0] < same[1] - 0.01
+
+
+def test_no_loss_compares_patches_of_the_judges_size():
+    side = judges.REFERENCE
+    sizes = {
+        patch * 2**level
+        for patch in (
+            texture.PATCH,
+            texture.PATCH + texture.SECOND_PATCH - 1,
+            shapes.MATCHED_PATCH,
+        )
+        for level in range(pieces.LEVELS)
+    }
+    assert round(judges.PATCH * 64 / side) == 12
+    assert judges.PATCH not in sizes | set(shapes.FILTER_SIZES)
+
+
+def test_only_textures_are_judged(task):
+    with pytest.raises(NPAError, match="judge compares textures, got Morphogenesis2D"):
+        Judge(Morphogenesis2D(Morphogenesis2DConfig(target="ring", resolution=32)))
+    with pytest.raises(NPAError, match=r"pictures must have shape \[B, R, R, 4\]"):
+        Judge(task)(torch.zeros(1, 32, 32, 4))
+
+
+def test_the_command_prints_ratios_and_writes_them(tmp_path, capsys):
+    path = tmp_path / "table.json"
+    asked = ["evaluate", "dots", "--judge", "--checkpoints", "2", "4", "--seed-count", "1"]
+    assert main([*asked, "--particle-count", "128", "--no-progress", "--json", str(path)]) == 0
+    assert "ratio worst" in capsys.readouterr().out
+    rows = json.loads(path.read_text())["judge"]
+    assert [row["step"] for row in rows] == [2, 4]
+    for row in rows:
+        mean = (row["patches"] + row["spectra"] + row["colours"]) / 3.0
+        assert row["ratio"] == pytest.approx(mean)
+        assert row["ratio_worst"] == row["ratio"] > 3.0
+    assert main(["evaluate", "digits", "--judge"]) == 2
