@@ -118,7 +118,7 @@ class Judge:
         self._spectra = self._amplitudes(target)
         self._colours = self._counts(target, wrap)
         noise = torch.rand(DRAWINGS, resolution, resolution, 2, generator=generator)
-        grey, density = noise.to(device).split(1, dim=3)
+        grey, density = noise[..., :1].to(device), noise[..., 1:].to(device)
         noisy = torch.cat((grey * density,) * 3 + (density,), dim=3)
         drawn = torch.cat([task.drawing(FIRST_DRAWING + number) for number in range(DRAWINGS)])
         least = LEAST * self._distances(_images(noisy)).mean(0)
@@ -158,7 +158,7 @@ class Judge:
 
     def _distances(self, images: Tensor) -> Tensor:
         found = []
-        for image in images.split(1):
+        for image in images[:, None]:
             patches = (self._projections(image, True) - self._patches).square().mean()
             spectra = (self._amplitudes(image) - self._spectra).square().sum()
             colours = (self._counts(image, True).sqrt() - self._colours.sqrt()).square().sum()

@@ -19,10 +19,10 @@ from npa_envs.tasks.checks import check_non_negative, check_positive, check_seed
 from npa_envs.tasks.damage import erase_state, random_particle
 from npa_envs.tasks.losses.texture import (
     DEFAULT_LOSS,
-    TEXTURE_LOSSES,
     LossOptions,
     TextureLoss,
     check_loss_name,
+    is_joint,
     make_texture_loss,
 )
 from npa_envs.tasks.seeds import uniform_box
@@ -46,8 +46,8 @@ class TextureConfig(TaskConfig):
     """Whether the opposite edges of a picture file fit together; built-in textures tile."""
 
     loss: str = DEFAULT_LOSS
-    """How textures are compared: a name of `TEXTURE_LOSSES` such as "patch_ot", or the paper's
-    "vgg_ot"."""
+    """How textures are compared: a name of `TEXTURE_LOSSES` such as "patch_ot" or the paper's
+    "vgg_ot", or the sum of some, such as "patch_ot+joint_swd"."""
 
     loss_seed: int = 0
     """What the loss draws its directions, filters and positions from, once."""
@@ -313,7 +313,7 @@ class Texture(ParticleTask[TextureConfig]):
         # Made when first asked for: pictures can be drawn without weights.
         config = self.config
         options = LossOptions(self.target.tiles, config.loss_seed, config.vgg_weights)
-        if TEXTURE_LOSSES[config.loss].joint:
+        if is_joint(config.loss):
             drawable = self._joint_image(self.drawable.movedim(-1, 0))
             return make_texture_loss(config.loss, drawable, options), None
         target = self.target_picture.movedim(-1, 0)

@@ -154,14 +154,39 @@ TEXTURE_LOSSES: Mapping[str, LossEntry] = {
 
 
 def check_loss_name(name: str) -> None:
-    """Check that there is a loss of a name.
+    """Check that there is a loss of a name, or that there are all of several joined by "+".
 
     Raises:
-        NPAError: There is none.
+        NPAError: There is none, or a sum has a loss in it that is not joint.
     """
-    if not isinstance(name, str) or name not in TEXTURE_LOSSES:
-        hint = suggest(name, TEXTURE_LOSSES)
-        raise NPAError(f"loss must be a texture loss that exists, got {shown(name)}: {hint}")
+    parts = name.split("+") if isinstance(name, str) else []
+    for part in parts or [name]:
+        if part not in TEXTURE_LOSSES:
+            hint = suggest(part, TEXTURE_LOSSES)
+            raise NPAError(f"loss must be a texture loss that exists, got {shown(name)}: {hint}")
+    if len(parts) > 1 and not all(TEXTURE_LOSSES[part].joint for part in parts):
+        joint = ", ".join(key for key, entry in TEXTURE_LOSSES.items() if entry.joint)
+        raise NPAError(f"losses that are summed must be joint ones, got {shown(name)}: {joint}")
+
+
+def is_joint(name: str) -> bool:
+    """Return whether a loss, or a sum of losses, compares colours and density at once."""
+    return TEXTURE_LOSSES[name.split("+")[0]].joint
+
+
+class LossSum:
+    """The sum of several losses; satisfies `TextureLoss`."""
+
+    def __init__(self, losses: Sequence[TextureLoss]) -> None:
+        self._losses = losses
+
+    def __call__(self, images: Tensor) -> Tensor:
+        """Return the sum of each image's losses (dimensionless), shape [B]; differentiable.
+
+        Args:
+            images: Pictures that tile (dimensionless), shape [B, K, R, R].
+        """
+        return torch.stack([loss(images) for loss in self._losses]).sum(0)
 
 
 def make_texture_loss(
@@ -170,8 +195,9 @@ def make_texture_loss(
     """Prepare a texture to be compared with.
 
     Args:
-        name: One of `TEXTURE_LOSSES`.
-        target: The texture (dimensionless), shape [K, R, R]; K is 3 for colours, 1 for a density.
+        name: One of `TEXTURE_LOSSES`, or several joint ones joined by "+", which are summed.
+        target: The texture (dimensionless), shape [K, R, R]; K is 3 for colours, 1 for a density,
+            4 for both.
         options: What else the loss is told.
 
     Raises:
@@ -184,7 +210,8 @@ def make_texture_loss(
             f"target must be a floating tensor of shape [K, R, R], got {target.dtype} "
             f"{tuple(target.shape)}: channels come first"
         )
-    return TEXTURE_LOSSES[name].make(target.detach(), options)
+    made = [TEXTURE_LOSSES[part].make(target.detach(), options) for part in name.split("+")]
+    return made[0] if len(made) == 1 else LossSum(made)
 
 
 # Sliced Wasserstein distances. A texture is described, size after size, by many numbers at each
