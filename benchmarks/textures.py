@@ -25,11 +25,15 @@ import numpy as np
 import torch
 from PIL import Image
 
-from npa_envs.measure.judge import Judge
-from npa_envs.measure.quality import Runner
+from npa_envs.measure.judge import Judge, JudgeRow
+from npa_envs.measure.quality import evaluate
+from npa_envs.measure.tables import as_objects
 from npa_envs.render.colours import to_uint8
+from npa_envs.rule.files import load_rule
+from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.texture import Texture
 from npa_envs.training import Trainer, preset
+from npa_envs.training.trained_tasks import task_of_rule
 from npa_envs.world.recorded import release_recordings
 
 SEEDS = tuple(range(1_000_000, 1_000_008))
@@ -68,29 +72,31 @@ def train_side_by_side(
     return time.perf_counter() - begun
 
 
-@torch.no_grad()
-def judged(
-    trainer: Trainer, steps: Sequence[int]
-) -> tuple[list[dict[str, Any]], np.ndarray[Any, Any]]:
-    """Return what the judge says of a trained rule, and the target and a world side by side."""
-    task: Any = trainer.task
-    device = torch.device(trainer.config.device)
-    rule = trainer._cycle.average.rule(trainer.rule)
-    runner = Runner(rule, task, device, SEEDS[0] + len(SEEDS), None)
-    worlds = [
-        task.seed(1, generator=torch.Generator(device).manual_seed(seed), device=device)
-        for seed in SEEDS[: 8 if device.type == "cuda" else 1]
-    ]
-    x, s = (torch.cat(parts).to(runner.dtype) for parts in zip(*worlds, strict=True))
+def measured(
+    rule: NPARule, task: Texture, steps: Sequence[int], device: str, seeds: Sequence[int]
+) -> tuple[dict[str, list[dict[str, Any]]], np.ndarray[Any, Any]]:
+    """Return what `npa-envs evaluate --judge` says, and the target and a world side by side."""
     judge = Judge(task)
-    rows, frames, before = [], [task.target_picture[None]], 0
-    for step in steps:
-        x, s = runner.run(x, s, step - before)
-        rows.append(asdict(judge.row(x, s, step)))
-        frames.append(task.picture(x[:1], s[:1]))
-        before = step
-    picture = to_uint8(torch.cat([frame.cpu() for frame in frames]))
-    return rows, np.concatenate(list(picture), axis=1)
+    judged: list[JudgeRow] = []
+    frames = [task.target_picture[None].cpu()]
+
+    def watch(x: torch.Tensor, s: torch.Tensor, step: int) -> None:
+        judged.append(judge.row(x, s, step))
+        frames.append(task.picture(x[:1], s[:1]).cpu())
+
+    rows = evaluate(rule, task, checkpoints=steps, seeds=seeds, device=device, watch=watch)
+    if device.startswith("cuda"):
+        release_recordings()
+    strip = np.concatenate(list(to_uint8(torch.cat(frames))), axis=1)
+    return {"growth": as_objects(rows), "judge": as_objects(judged)}, strip
+
+
+def told(tables: dict[str, list[dict[str, Any]]]) -> str:
+    """Return the judge's ratios in a line."""
+    return "  ".join(
+        f"{r['step']}: {r['ratio']:.2f} ({r['patches']:.1f} {r['spectra']:.1f} {r['colours']:.1f})"
+        for r in tables["judge"]
+    )
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -121,21 +127,26 @@ def run(arguments: argparse.Namespace) -> None:
         (out / f"rule-{name}.safetensors").write_bytes(trainer.folder.rule.read_bytes())
     if arguments.device.startswith("cuda"):
         release_recordings()
+    seeds = SEEDS[: 8 if arguments.device.startswith("cuda") else 1]
     for name, trainer in zip(names, trainers, strict=True):
         begun = time.perf_counter()
-        rows, strip = judged(trainer, arguments.steps)
-        if arguments.device.startswith("cuda"):
-            release_recordings()
+        rule = trainer._cycle.average.rule(trainer.rule)
+        task: Any = trainer.task
+        tables, strip = measured(rule, task, arguments.steps, arguments.device, seeds)
         Image.fromarray(strip).save(out / f"strip-{name}.png")
-        line = {"name": name, "iterations": trainer.iteration, "seconds": seconds, "judge": rows}
+        line = {"name": name, "iterations": trainer.iteration, "seconds": seconds, **tables}
+        line |= {"together": len(trainers), "metric": task.metric_name, "fields": changes}
         with (out / "runs.jsonl").open("a") as file:
-            file.write(json.dumps(line | {"together": len(trainers), "fields": changes}) + "\n")
-        told = "  ".join(
-            f"{r['step']}: {r['ratio']:.2f} ({r['patches']:.1f} {r['spectra']:.1f} "
-            f"{r['colours']:.1f})"
-            for r in rows
-        )
-        print(f"{name:24s} {told}  {time.perf_counter() - begun:.1f} s", flush=True)
+            file.write(json.dumps(line) + "\n")
+        print(f"{name:24s} {told(tables)}  {time.perf_counter() - begun:.1f} s", flush=True)
+    for name in arguments.rules:
+        rule = load_rule(name, device=arguments.device).float()
+        task = task_of_rule(name, rule, torch.device(arguments.device)).task
+        tables, strip = measured(rule, task, arguments.steps, arguments.device, seeds)
+        Image.fromarray(strip).save(out / f"strip-{name}-shipped.png")
+        with (out / "runs.jsonl").open("a") as file:
+            file.write(json.dumps({"name": f"{name}-shipped", **tables}) + "\n")
+        print(f"{name:24s} {told(tables)}", flush=True)
 
 
 def particles(arguments: argparse.Namespace) -> None:
@@ -193,8 +204,8 @@ def report(arguments: argparse.Namespace) -> None:
     for text in (arguments.out / "runs.jsonl").read_text().splitlines():
         line = json.loads(text)
         by_step = {row["step"]: row["ratio"] for row in line["judge"]}
-        told = " | ".join(f"{by_step[s]:.2f}" if s in by_step else "" for s in arguments.steps)
-        print(f"| {line['name']} | {line['iterations']} | {told} |")
+        cells = " | ".join(f"{by_step[s]:.2f}" if s in by_step else "" for s in arguments.steps)
+        print(f"| {line['name']} | {line.get('iterations', '')} | {cells} |")
 
 
 def main() -> None:
@@ -208,6 +219,7 @@ def main() -> None:
     parser.add_argument("--preset", default="paper")
     parser.add_argument("--fields", default="{}", help="fields to change, as JSON")
     parser.add_argument("--iterations", type=int, default=120, help="of particles without a rule")
+    parser.add_argument("--rules", nargs="*", default=[], help="shipped rules to judge as well")
     parser.add_argument("--label", default="")
     parser.add_argument("--steps", type=int, nargs="+", default=[64, 512, 4096])
     parser.add_argument("--longest", type=float, default=1e9, help="seconds of training")
