@@ -213,3 +213,18 @@ def test_targets_that_are_too_small_are_refused(name):
         make_texture_loss(name, noise(4, 10, 10))
     with pytest.raises(NPAError, match=r"images must have shape \[B, K, R, R\]"):
         make_texture_loss(name, noise(4, 16, 16))(noise(1, 3, 16, 16))
+
+
+def test_names_joined_by_a_plus_are_summed():
+    target = target_of("bubbles", 24)
+    images = noise(2, *target.shape)
+    parts = [make_texture_loss(name, target)(images) for name in ("patch_ot", "filter_ot")]
+    together = make_texture_loss("patch_ot+filter_ot", target)(images)
+    torch.testing.assert_close(together, parts[0] + parts[1], rtol=1e-12, atol=0.0)
+    for name, message in (
+        ("patch_ot+filter_op", "did you mean 'filter_ot'"),
+        ("patch_ot+patch_swd", "summed must be joint ones.*joint_swd"),
+        ("patch_ot+", "must be a texture loss that exists"),
+    ):
+        with pytest.raises(NPAError, match=message):
+            TextureConfig(loss=name)
