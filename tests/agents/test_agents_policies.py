@@ -31,14 +31,6 @@ STEP_TOLERANCE = 2e-6
 """Largest difference after one step from the same world; measured over 64 steps of each case below
 from four seeds: 1.2e-7, and none at all in states where matrix products round alike."""
 
-EARLY_TOLERANCE = 2e-3
-"""Likewise after 8 free steps; measured over 24 episodes: 3.8e-4. Rules amplify rounding about
-tenfold in four steps, until at step 32 only the picture is the same."""
-
-LOSS_TOLERANCE = 0.02
-"""Difference of the losses after 64 free steps; measured over 24 episodes: 0.0023, of a loss of 0.3
-(3.7 at the start)."""
-
 
 @pytest.fixture(scope="module")
 def gecko():
@@ -128,26 +120,6 @@ def test_every_step_of_a_rules_episode_is_a_step_of_its_rollout(gecko, name, key
         assert difference(env, x, s) < STEP_TOLERANCE
         observation = env.unwrapped.place_particles(x[0], s[0])
     assert (s - start).abs().mean() > 0.01
-
-
-@pytest.mark.parametrize(
-    "keywords", [{}, {"position_noise": 0.002}, {"boundary": "periodic"}], ids=str
-)
-def test_a_rules_episode_is_its_rollout_until_rounding_has_grown(gecko, keywords):
-    env = make(particle_count=512, **keywords)
-    policy = RulePolicy(gecko, env)
-    observation, x, s, random = seeded(env, 0)
-    for step in range(64):
-        action = policy(observation)
-        assert np.abs(action[:, 2:]).max() < 1.0, "a state step was clipped"
-        assert np.abs(observation).max() < env.unwrapped.config.observation_limit
-        observation, _, ended, _, info = env.step(action)
-        assert not ended
-        x, s = rolled(gecko, x, s, env, random)
-        if step < 8:
-            assert difference(env, x, s) < EARLY_TOLERANCE
-    loss = sum(env.unwrapped.task.losses(x, s).values()).item()
-    assert info["loss"] == pytest.approx(loss, abs=LOSS_TOLERANCE)
 
 
 def test_policies_give_back_the_kind_and_shape_that_they_are_given(gecko):
@@ -252,14 +224,6 @@ def test_random_actions_are_not_the_numbers_that_an_environment_draws():
     policy = RandomPolicy(make(particle_count=64), seed=5)
     action = policy(torch.zeros(1000, 66))
     assert abs(np.corrcoef(action.flatten(), drawn.flatten())[0, 1]) < 0.03
-
-
-def test_doing_nothing_leaves_the_particles_as_they_are():
-    env = make(particle_count=64)
-    observation, _ = env.reset(seed=0)
-    before = env.unwrapped.particles()
-    env.step(ZeroPolicy(env)(observation))
-    assert all(map(torch.equal, env.unwrapped.particles(), before))
 
 
 def test_the_density_gradient_is_read_off_an_observation():
@@ -437,29 +401,31 @@ def test_the_error_about_foreign_vector_environments_says_how_to_make_ours():
         interface_of(gymnasium.make("CartPole-v1").unwrapped)
 
 
-def test_the_shipped_rule_grows_the_picture_far_better_than_anything_scripted(gecko):
-    envs = make_vector(world_count=4, max_episode_steps=64)
-    rule = evaluate_policy(envs, RulePolicy(gecko, envs), range(4))
-    for maker in (RandomPolicy, ZeroPolicy, SpreadPolicy, PaintPolicy):
-        other = evaluate_policy(envs, maker(envs), range(4))
-        assert_better(rule, other, standard_errors=10.0)
-        assert rule.final_losses.mean() < 0.5 * other.final_losses.mean()
-    assert rule.final_losses.mean() < 0.1 * rule.start_losses.mean()
+HEALING = {"damage": "cut", "damage_size": 0.3, "world_count": 6, "max_episode_steps": 48}
 
 
-def test_the_shipped_rule_heals_a_cut_far_better_than_anything_scripted(gecko):
-    envs = make_vector(
-        REGENERATION, world_count=6, max_episode_steps=48, damage="cut", damage_size=0.3
-    )
-    rule = evaluate_policy(envs, RulePolicy(gecko, envs), range(6))
-    for maker in (RandomPolicy, ZeroPolicy, MendPolicy):
-        other = evaluate_policy(envs, maker(envs), range(6))
-        assert_better(rule, other, standard_errors=4.0)
-        assert rule.mean_return > 1.5 * other.mean_return
-
-
-def assert_better(episodes, others, *, standard_errors):
-    """Assert that returns from the same seeds differ by so many standard errors of the gaps."""
-    gaps = episodes.returns - others.returns
-    error = gaps.std(ddof=1) / np.sqrt(len(gaps))
-    assert gaps.mean() > standard_errors * error
+@pytest.mark.parametrize(
+    ("environment", "keywords", "scripted", "standard_errors", "factor"),
+    [
+        (
+            MORPHOGENESIS,
+            {"world_count": 4, "max_episode_steps": 64},
+            (RandomPolicy, ZeroPolicy, SpreadPolicy, PaintPolicy),
+            10.0,
+            1.2,
+        ),
+        (REGENERATION, HEALING, (RandomPolicy, ZeroPolicy, MendPolicy), 4.0, 1.5),
+    ],
+)
+def test_the_shipped_rule_does_far_better_than_anything_scripted(
+    gecko, environment, keywords, scripted, standard_errors, factor
+):
+    """By so many standard errors of the gaps between returns from the same seeds."""
+    envs = make_vector(environment, **keywords)
+    seeds = range(envs.num_envs)
+    rule = evaluate_policy(envs, RulePolicy(gecko, envs), seeds)
+    for maker in scripted:
+        other = evaluate_policy(envs, maker(envs), seeds)
+        gaps = rule.returns - other.returns
+        assert gaps.mean() > standard_errors * gaps.std(ddof=1) / np.sqrt(len(gaps))
+        assert rule.mean_return > factor * other.mean_return

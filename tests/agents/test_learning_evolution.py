@@ -44,15 +44,6 @@ def rules_of(problem: Problem, device: torch.device, weights: torch.Tensor) -> R
     return rules
 
 
-def test_weights_that_were_put_are_there(problem, device):
-    population, weights = candidates_of(problem, device, 1)
-    vector = weights[0].cpu().double().numpy()
-    assert not np.allclose(population.vector(), vector)
-    population.put(vector)
-    assert np.array_equal(population.vector(), vector)
-    assert population.scales().shape == vector.shape
-
-
 def test_scales_are_those_that_layers_are_drawn_with():
     problem = PROBLEMS["growth"]
     rules = problem.new_rules(0)

@@ -10,9 +10,7 @@ from learning_problems import digits, heart, species, wild_rules
 import npa_envs
 from npa_envs.agents import (
     RandomPolicy,
-    RulePolicy,
     SpreadPolicy,
-    evaluate_policy,
     interface_of,
 )
 from npa_envs.agents.learning import Budget, Problem, RuleSet, train
@@ -107,18 +105,6 @@ def test_rows_are_paid_where_that_is_asked_for():
 
 
 # Sets of rules
-
-
-@pytest.mark.parametrize("problem", [heart(), heart(state_scale=0.1), digits()])
-def test_the_policy_of_one_rule_is_rule_policy_bit_for_bit(problem):
-    rules, envs = wild_rules(problem), problem.make_envs()
-    observation, _ = envs.reset(seed=0)
-    theirs = RulePolicy(next(iter(rules)), envs)
-    for _ in range(4):
-        action = rules.policy()(observation)
-        assert torch.equal(action, theirs(observation))
-        observation, *_ = envs.step(action)
-    assert action.abs().mean() > 0.01
 
 
 @pytest.mark.parametrize("module", [multispecies_v0, particles_v0])
@@ -332,14 +318,6 @@ def test_a_world_terminates_where_its_last_species_ends():
     assert infos["final_info"]["reason"].tolist() == ["removed"] * 2
     # Who is alone has a loss of 1, and the species that is gone keeps the one that it had.
     assert (losses[3] > 0.6).all()
-
-
-def test_evaluation_runs_species():
-    problem = species(episode_steps=3)
-    episodes = evaluate_policy(problem.make_envs(2), wild_rules(problem).policy(), range(5))
-    gained = episodes.start_losses - episodes.final_losses
-    assert gained == pytest.approx(episodes.returns, abs=1e-6)
-    assert set(episodes.endings) == {"time limit"}
 
 
 @pytest.mark.parametrize("deaths", [[], [[0, 1]]], ids=["alone", "after a death"])

@@ -407,11 +407,6 @@ def test_a_gpu_is_kept_busy_where_neither_memory_nor_budget_forbids(monkeypatch)
     assert world_count(HEART, options, cuda, long) == 8
 
 
-def test_the_option_worlds_says_in_how_many_worlds_is_acted():
-    trained = run("device", HEART, 1, worlds=3, steps=4)
-    assert trained.log[-1].particle_steps == 4 * 3 * 64
-
-
 @pytest.fixture(scope="module")
 def taught():
     """Rules that were trained by gradient."""

@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-import torch
-from small_envs import IDS, assert_same, make, make_vec
+from small_envs import IDS, make, make_vec
 
 from npa_envs.envs import multispecies_v0
 from npa_envs.errors import DivergedError
@@ -117,19 +116,6 @@ def test_an_ignored_world_goes_on_held_at_the_limits_and_rewards_telescope(devic
         assert infos["diverged"].tolist() == [False, t >= LAST, False]
     assert (envs.unwrapped.particles()[1][1] == LIMIT).all()
     assert paid == pytest.approx(start["loss"] - infos["loss"], abs=1e-5)
-
-
-@pytest.mark.parametrize("way", WAYS)
-def test_torch_tensors_say_the_same_as_arrays(way, device):
-    arrays, tensors = vector(device, way), vector(device, way, output="torch")
-    expected = stepped(arrays)
-    tensors.reset(seed=5)
-    for _ in range(LAST):
-        found = tensors.step(torch.from_numpy(pushed(tensors)).to(device))
-    assert all(left.device == tensors.worlds.x.device for left in found[:4])
-    assert_same(found[:4], expected[:4])
-    told = found[4] if way != "terminate" else found[4]["final_info"]
-    assert told["diverged"].tolist() == [False, True, False]
 
 
 # ----------------------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ import pickle
 import numpy as np
 import pytest
 import torch
-from crowds import TASKS, apart, drawn, make, pair, placed, small, still
+from crowds import TASKS, drawn, make, placed, small, still
 from small_envs import assert_same
 
 import npa_envs
@@ -22,27 +22,6 @@ def test_a_window_without_a_screen_warns_and_goes_on(monkeypatch):
     assert rewards["species_0"] != 0.0
     assert env.render() is None
     env.close()
-
-
-def test_episodes_go_on_in_a_sequence_that_a_seed_begins():
-    env, longer = make(max_cycles=9), make(max_cycles=9)
-    first, _ = env.reset(seed=4)
-    longer.reset(seed=4)
-    for steps, e in ((1, env), (5, longer)):
-        for _ in range(steps):
-            e.step(still(e))
-    second, _ = env.reset()
-    assert np.array_equal(second["species_1"], longer.reset()[0]["species_1"])
-    assert not np.array_equal(second["species_1"], first["species_1"])
-    again, _ = env.reset(seed=4)
-    assert np.array_equal(again["species_1"], first["species_1"])
-    steps = 0
-    while env.agents:
-        env.step(still(env))
-        steps += 1
-    assert steps == env.max_cycles == 9
-    unseeded = [make().reset()[0]["species_0"] for _ in range(2)]
-    assert not np.array_equal(*unseeded)
 
 
 def test_turns_lead_to_the_same_world_as_acting_at_once():
@@ -93,16 +72,6 @@ def test_species_start_in_disks_in_a_row():
         offset = x[40 * k : 40 * (k + 1)] - torch.tensor([middle, 0.0])
         assert 0.15 < float(offset.norm(dim=1).max()) <= 0.2 + 1e-6
     assert float(s.abs().max()) == 0.0
-
-
-def test_an_action_moves_particles_and_changes_states_as_far_as_it_says():
-    env = pair()
-    actions = apart(env)
-    actions["species_0"][:, 2:] = 0.25
-    env.step(actions)
-    x, s = env.particles()
-    torch.testing.assert_close(x, torch.tensor([[0.0, 0.0], [0.3, 0.0]]))
-    assert s.unique(dim=1).flatten().tolist() == [0.25, 0.0]
 
 
 def test_a_species_that_is_removed_is_gone():
@@ -159,15 +128,6 @@ def test_a_species_ends_when_all_of_its_particles_have_left():
     assert infos["species_1"]["reason"] == "left the world"
     x, _ = env.particles()
     torch.testing.assert_close(x, torch.tensor([[0.7, 0.0], [0.15, 0.0]]))
-
-
-def test_states_that_run_away_end_a_species():
-    env = make(particle_counts=(1, 1), observation_limit=1.0, update_prob=1.0)
-    env.reset(seed=0)
-    actions = still(env)
-    actions["species_0"][0, 5] = 1.0
-    _, _, terminations, _, _ = env.step(actions)
-    assert terminations == {"species_0": True, "species_1": False}
 
 
 @pytest.mark.parametrize("dead", [0, 1])
@@ -247,16 +207,6 @@ def test_a_copy_by_pickle_goes_on_alike():
         actions = drawn(env, generator)
         assert_same(env.step(actions), copy.step(actions))
     assert_same(env.reset(), copy.reset())
-
-
-def test_torch_tensors_come_out_where_asked_for():
-    arrays, tensors = make(), make(output="torch")
-    assert_same(arrays.reset(seed=1), tensors.reset(seed=1))
-    actions = drawn(arrays, np.random.default_rng(0))
-    found = tensors.step({agent: torch.from_numpy(a) for agent, a in actions.items()})
-    assert_same(arrays.step(actions), found)
-    assert_same(arrays.state(), tensors.state())
-    assert all(isinstance(v, torch.Tensor) for v in (*found[0].values(), tensors.state()))
 
 
 @pytest.mark.parametrize(

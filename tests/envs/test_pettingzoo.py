@@ -1,14 +1,12 @@
 """Species and particles as agents: PettingZoo's own tests, seeds, and ids."""
 
-import numpy as np
 import pettingzoo
 import pytest
-from crowds import TASKS, drawn, few, module_of, small
+from crowds import TASKS, few, module_of, small
 from pettingzoo.test import api_test, parallel_api_test, render_test, seed_test
 from pettingzoo.test.max_cycles_test import max_cycles_test
 from pettingzoo.test.seed_test import parallel_seed_test
 from pettingzoo.test.state_test import state_test
-from small_envs import assert_same
 
 from npa_envs.envs import multispecies_v0, particles_v0
 from npa_envs.envs.multi import TASKS as TABLE
@@ -49,28 +47,6 @@ def test_passes_the_render_state_and_max_cycles_tests(task, kind, monkeypatch, r
     render_test(lambda **mode: module.env(**given, **mode))
     state_test(module.env(**given), module.parallel_env(**given), num_cycles=3)
     max_cycles_test(module_of(module, **given))
-
-
-@every_kind
-@every_task
-def test_thirty_steps_are_equal_for_equal_seeds_and_differ_for_others(task, kind):
-    module, keywords = KINDS[kind]
-    given = keywords(task, max_cycles=99, position_noise=0.01, deaths=((1, 20),))
-    envs = [module.parallel_env(**given) for _ in range(3)]
-    agent = f"{kind}_0"
-    first, again, other = (env.reset(seed=s)[0] for env, s in zip(envs, (4, 4, 5), strict=True))
-    assert np.array_equal(first[agent], again[agent])
-    assert not np.array_equal(first[agent], other[agent])
-    generators = [np.random.default_rng(0) for _ in envs]
-    # Once all invaders are gone, an invasion is over.
-    for _ in range(20 if task == "invasion" else 30):
-        first, again, other = (
-            env.step(drawn(env, generator)) for env, generator in zip(envs, generators, strict=True)
-        )
-        assert_same(first, again)
-        assert not np.array_equal(first[0][agent], other[0][agent])
-    assert (envs[0].agents == []) == (task == "invasion")
-    assert len(envs[0].agents) < len(envs[0].possible_agents)
 
 
 @every_kind

@@ -27,7 +27,6 @@ from npa_envs.measure.speed.errors import (
     rollout_rows,
 )
 from npa_envs.measure.speed.explain import Question, explain
-from npa_envs.measure.speed.hash_grid import grid_fields
 from npa_envs.measure.speed.strategies import NEIGHBOUR_CAP, PRECISIONS, STRATEGIES, nearest
 from npa_envs.measure.speed.suites import Point, Report, front, pictures
 from npa_envs.measure.speed.throughput import (
@@ -91,14 +90,6 @@ def test_the_neighbour_cap_leaves_out_all_but_the_nearest():
     assert crowded.any()
     lost = capped < 0.99 * STRATEGIES["dense"].density(x, s, 0.1)
     assert not lost[0, ~crowded].any()
-
-
-def test_the_hash_grid_keeps_worlds_apart():
-    x, s = TINY.worlds(torch.device("cpu"))
-    both = grid_fields(x, s, TINY.eps)
-    alone = grid_fields(x[1:], s[1:], TINY.eps)
-    for together, single in zip(both, alone, strict=True):
-        torch.testing.assert_close(together[1:], single)
 
 
 def test_steps_composed_in_torch_are_those_of_the_library_with_the_same_masks():

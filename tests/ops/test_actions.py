@@ -1,7 +1,6 @@
 """Applying actions: the formula, a rule as a policy, masks, noise, boxes, limits, errors."""
 
 import math
-import pickle
 
 import pytest
 import torch
@@ -182,15 +181,6 @@ def test_nothing_happens_where_it_is_switched_off(world, device):
     assert_same(applied(*world, enabled=on), applied(*world))
 
 
-def test_a_world_moves_in_any_batch_as_it_moves_alone(world, device):
-    mask = random_mask(world[1])
-    together = applied(*world, mask=mask)
-    for k in range(B):
-        part = slice(k, k + 1)
-        alone = applied(*(tensor[part] for tensor in world), mask=mask[part])
-        assert_same(alone, [value[part] for value in together])
-
-
 @pytest.mark.gpu
 def test_both_devices_agree_and_a_graph_can_be_captured():
     g = torch.Generator().manual_seed(1)
@@ -281,16 +271,6 @@ def test_one_number_that_is_not_finite_is_found_wherever_it_lies(world, device):
             enabled.fill_(1)
     act(torch.full_like(action, torch.finfo(action.dtype).max))
     assert enabled.item() == 1
-
-
-def test_prepared_actions_can_be_pickled_after_use(world):
-    action, x, s = (tensor.cpu() for tensor in world)
-    act, _, _ = prepared(x, s)
-    act(action)
-    again = pickle.loads(pickle.dumps(act))
-    again(action)
-    twice = applied(action, *applied(action, x, s)[:2])
-    assert torch.equal(again._worlds[0], twice[0])
 
 
 def test_prepared_actions_of_another_shape_are_clear_errors(world):

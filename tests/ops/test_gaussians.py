@@ -15,7 +15,6 @@ from npa_envs.ops import render_gaussians
 from npa_envs.ops.launch import launch, scalar_type
 from npa_envs.ops.pictures.cameras import Cameras, look_at, orbit
 from npa_envs.ops.pictures.gaussians import _frame, _gaussians
-from npa_envs.world.cuda_graph import capture
 
 # Worst error measured over all scenes, then the bound.
 PICTURE_BOUND = {torch.float32: 1e-5, torch.float64: 1e-13}  # 2e-6, 3e-15
@@ -310,34 +309,6 @@ def test_backgrounds_are_seen_through_the_gaussians(shape, device):
     torch.testing.assert_close(*gradients)
 
 
-def test_a_turned_world_looks_the_same_to_a_turned_camera(device):
-    """The world's motion g: means g p, rotations g R; a camera's frame is W inverse(g)."""
-    gaussians, cameras = SCENES["batch"].of(torch.float64, device)
-    turn = torch.tensor([0.3, -0.7, 0.5, 0.2], dtype=torch.float64, device=device)
-    turn = turn / turn.norm()
-    rotation = oracle.rotations(turn)
-    shift = torch.tensor([0.4, -1.0, 2.0], dtype=torch.float64, device=device)
-    w, v = turn[:1], turn[1:]
-    own_w, own_v = gaussians[2][..., :1], gaussians[2][..., 1:]
-    product = torch.cat(
-        (
-            w * own_w - (own_v * v).sum(-1, keepdim=True),
-            w * own_v + own_w * v + torch.linalg.cross(v.expand_as(own_v), own_v),
-        ),
-        dim=-1,
-    )
-    motion = torch.eye(4, dtype=torch.float64, device=device)
-    motion[:3, :3], motion[:3, 3] = rotation, shift
-    moved = [gaussians[0] @ rotation.mT + shift, gaussians[1], product, *gaussians[3:]]
-    turned = dataclasses.replace(
-        cameras, world_to_camera=cameras.world_to_camera @ torch.linalg.inv(motion)
-    )
-    expected = render_gaussians(*gaussians, cameras)
-    pictures = render_gaussians(*moved, turned)
-    assert relative_error(pictures.image, expected.image) < 1e-11  # 2e-14
-    assert relative_error(pictures.alpha, expected.alpha) < 1e-11
-
-
 def test_equally_deep_gaussians_lie_in_the_order_of_their_indices(device):
     """Hundreds at one depth: the first is on top, on every run."""
     generator = torch.Generator().manual_seed(5)
@@ -358,40 +329,6 @@ def test_equally_deep_gaussians_lie_in_the_order_of_their_indices(device):
     turned = render_gaussians(means.flip(1), *others, colours.flip(1), camera).image
     assert relative_error(turned, expected) > 0.01
     assert torch.equal(render_gaussians(means, *others, colours, camera).image, image)
-
-
-@pytest.mark.parametrize("name", ["a camera for each", "harmonics"])
-def test_results_are_bit_identical_and_independent_of_the_batch(name, device):
-    gaussians, cameras = SCENES[name].of(torch.float32, device)
-    expected = pulled(gaussians, cameras)
-    assert_same(pulled(gaussians, cameras), expected)
-    bars = cotangents(expected[:2])
-    for world in range(gaussians[0].shape[0]):
-        only = slice(world, world + 1)
-        alone = [t.detach()[only].requires_grad_() for t in gaussians]
-        own = cameras
-        if cameras.world_count is not None:
-            own = dataclasses.replace(
-                cameras,
-                world_to_camera=cameras.world_to_camera[only],
-                intrinsics=cameras.intrinsics[only],
-            )
-        drawn = render_gaussians(*alone, own)[:2]
-        gradients = torch.autograd.grad(drawn, alone, [bar[only] for bar in bars])
-        assert_same((*drawn, *gradients), [value[only] for value in expected])
-
-
-def test_quaternions_may_have_any_length(device):
-    gaussians, cameras = SCENES["one world"].of(torch.float64, device)
-    image, _, *gradients = pulled(gaussians, cameras)
-    longer = [t.detach().clone().requires_grad_() for t in gaussians]
-    with torch.no_grad():
-        longer[2] *= 7.0
-    other, _, *others = pulled(longer, cameras)
-    assert relative_error(other, image) < 1e-12
-    assert relative_error(7.0 * others[2], gradients[2]) < 1e-12
-    along = (gradients[2] * gaussians[2].detach()).sum(-1)
-    assert float(along.abs().max()) < 1e-10 * float(gradients[2].abs().max())
 
 
 def test_a_zero_quaternion_is_no_rotation_and_has_no_gradient(device):
@@ -511,30 +448,6 @@ def test_a_compiled_function_equals_the_eager_one(pairs, device):
     got = torch.autograd.grad(value, gaussians)
     wanted = torch.autograd.grad(expected, gaussians)
     assert_same(got, wanted)
-
-
-@pytest.mark.gpu
-def test_a_recorded_graph_draws_what_it_is_given():
-    gaussians, cameras = SCENES["batch"].of(torch.float32, torch.device("cuda"))
-    with torch.no_grad():
-        bars = cotangents(render_gaussians(*gaussians, cameras)[:2])
-    results = []
-
-    def draw():
-        pictures = render_gaussians(*gaussians, cameras)[:2]
-        gradients = torch.autograd.grad(pictures, gaussians, bars)
-        results.append([*(picture.detach() for picture in pictures), *gradients])
-
-    graph = capture(draw, torch.device("cuda"), warm_up=draw)
-    expected, recorded = results
-    with torch.no_grad():
-        gaussians[0].mul_(0.5)
-    graph.replay()
-    assert relative_error(recorded[0], expected[0]) > 0.01
-    with torch.no_grad():
-        gaussians[0].mul_(2.0)
-    graph.replay()
-    assert_same(recorded, expected)
 
 
 ONE = torch.zeros(1, 2, 3)

@@ -240,22 +240,29 @@ def test_a_world_of_a_batch_equals_that_world_alone(run, count, device):
         assert_same([value[0] for value in alone], [value[k] for value in together])
 
 
+all_or_some = pytest.mark.parametrize("masked", [False, True], ids=("all", "active"))
+
+
+def assert_rows_equal_the_oracle(x, s, masked, box=None):
+    """Compare the rows of two worlds in 2D, of all particles or of the active ones."""
+    mask = random_mask(x, 0.5 if masked else 1.0)
+    given = {"eps": 0.2, "width": 68, "capacity": mask.numel(), "box": box}
+    rows, places = rows_of(x, s, mask if masked else None, **given)
+    expected = oracle.perceive(*exact(x, s), 0.2, 0.2, box=box).view(-1, 66)
+    active, row_of = mask.cpu().view(-1) > 0, places.row_of.cpu().long()
+    assert torch.equal(row_of >= 0, active)
+    found = rows.cpu()[row_of[active], :66]
+    assert relative_error(found, expected[active]) < FORWARD[torch.float32]
+
+
 @threads
-@pytest.mark.parametrize("masked", [False, True], ids=("all", "active"))
+@all_or_some
 @pytest.mark.parametrize("count", [40, 130, 300, 900])
 def test_rows_of_crowded_worlds_are_right(count, masked, shared, device, monkeypatch):
     """Everybody sees everybody: on CUDA, lists overflow, and before that a lane's share of one."""
     monkeypatch.setattr(passes, "SHARED_WORLD", shared)
     x, s = random_world(2, count, 2, 16, dtype=torch.float32, device=device)
-    x *= 0.05
-    mask = random_mask(x) if masked else None
-    rows, places = rows_of(x, s, mask, eps=0.2, width=68, capacity=2 * count)
-    expected = oracle.perceive(*exact(x, s), 0.2, 0.2).view(-1, 66)
-    active = torch.ones(2 * count, dtype=torch.bool) if mask is None else mask.cpu().view(-1) > 0
-    row_of = places.row_of.cpu().long()
-    assert torch.equal(row_of >= 0, active)
-    found = rows.cpu()[row_of[active], :66]
-    assert relative_error(found, expected[active]) < FORWARD[torch.float32]
+    assert_rows_equal_the_oracle(0.05 * x, s, masked)
 
 
 def test_neighbourhoods_may_be_longer_than_lists(device):
@@ -271,24 +278,16 @@ def test_neighbourhoods_may_be_longer_than_lists(device):
     assert torch.equal(together[1], observed(x[1:2], s[1:2]).perceive()[0])
 
 
-@pytest.mark.parametrize("masked", [False, True], ids=("all", "active"))
+@all_or_some
 def test_rows_of_crowded_boxes_are_right(masked, device):
     """On CUDA lists are longer there; some of these particles have more neighbours all the same."""
-    count, box = 900, (1.0, 1.0)
-    x, s = random_world(2, count, 2, 16, dtype=torch.float32, device=device)
+    x, s = random_world(2, 900, 2, 16, dtype=torch.float32, device=device)
     x = x / 1.4
     x[:, :200] *= 0.2
     neighbours = (torch.cdist(x, x) < 0.2).sum(-1)
     assert neighbours.min() < 64
     assert neighbours.max() > 256
-    mask = random_mask(x) if masked else None
-    rows, places = rows_of(x, s, mask, eps=0.2, width=68, capacity=2 * count, box=box)
-    expected = oracle.perceive(*exact(x, s), 0.2, 0.2, box=box).view(-1, 66)
-    row_of = places.row_of.cpu().long()
-    active = row_of >= 0
-    assert (
-        relative_error(rows.cpu()[row_of[active], :66], expected[active]) < FORWARD[torch.float32]
-    )
+    assert_rows_equal_the_oracle(x, s, masked, (1.0, 1.0))
 
 
 def test_detached_positions_get_no_gradient(device):
@@ -309,28 +308,25 @@ def test_smoothing_kernel_integrates_to_one():
         assert integral == pytest.approx(1.0, abs=1e-4)
 
 
-def test_skipped_groups_leave_the_others_unchanged(device):
+@pytest.mark.parametrize("density_gradient", [False, True])
+@pytest.mark.parametrize("state_gradient", [False, True])
+def test_skipped_groups_leave_the_others_and_their_gradients(
+    state_gradient, density_gradient, device
+):
     x, s = random_world(2, 60, 2, 5, dtype=torch.float64, device=device)
-    full = npa_envs.perceive(x, s, 0.3)
-    no_density = npa_envs.perceive(x, s, 0.3, density_gradient=False)
-    no_gradient = npa_envs.perceive(x, s, 0.3, state_gradient=False)
-    neither = npa_envs.perceive(x, s, 0.3, state_gradient=False, density_gradient=False)
-    assert torch.equal(no_density, full[..., :20])
-    assert torch.equal(no_gradient, torch.cat((full[..., :10], full[..., 20:]), dim=-1))
-    assert torch.equal(neither, full[..., :10])
+    kept = [*range(10), *range(10, 20 * state_gradient), *range(20, 22 * density_gradient)]
+    terms = {"state_gradient": state_gradient, "density_gradient": density_gradient}
 
+    def whole(x, s):
+        return npa_envs.perceive(x, s, 0.3, detach_positions=False)[..., kept]
 
-def test_gradients_of_skipped_groups_equal_those_of_zero_cotangents(device):
-    x, s = random_world(2, 60, 2, 5, dtype=torch.float64, device=device)
-    gradients = []
-    for options, columns in (({"state_gradient": False}, 12), ({}, 22)):
-        s_, x_ = s.clone().requires_grad_(), x.clone().requires_grad_()
-        z = npa_envs.perceive(x_, s_, 0.3, detach_positions=False, **options)
-        assert z.shape[-1] == columns
-        (z[..., :10].square().sum() + z[..., -2:].square().sum()).backward()
-        gradients.append((x_.grad, s_.grad))
-    assert relative_error(gradients[0][0], gradients[1][0]) < 1e-13
-    assert relative_error(gradients[0][1], gradients[1][1]) < 1e-13
+    def fewer(x, s):
+        return npa_envs.perceive(x, s, 0.3, detach_positions=False, **terms)
+
+    (z, *bars), (expected, *others) = (with_gradients(f, x, s) for f in (fewer, whole))
+    assert torch.equal(z, expected)
+    for bar, other in zip(bars, others, strict=True):
+        assert relative_error(bar, other) < 1e-13
 
 
 @pytest.mark.parametrize(
@@ -441,16 +437,6 @@ def test_another_inverse_is_refused(moment_inverse):
             call(x, s, 0.1, moment_inverse=moment_inverse)
     with pytest.raises(npa_envs.NPAError, match=message):
         npa_envs.NPARule(moment_inverse=moment_inverse)
-
-
-def test_the_default_inverse_is_the_threshold(device):
-    x, s = random_world(2, 90, 2, 6, dtype=torch.float32, device=device)
-    z = npa_envs.perceive(x, s, 0.15)
-    assert torch.equal(z, npa_envs.perceive(x, s, 0.15, moment_inverse="threshold"))
-    smooth = npa_envs.perceive(x, s, 0.15, moment_inverse="smooth")
-    assert not torch.equal(z[..., 12:24], smooth[..., 12:24])
-    assert torch.equal(z[..., :12], smooth[..., :12])
-    assert torch.equal(z[..., 24:], smooth[..., 24:])
 
 
 class TestGeometryLimits:

@@ -74,15 +74,6 @@ def modulo(w, positions):
 
 
 @every(some())
-def test_fields_follow_the_order_of_particles(w):
-    clear_of_threshold(w)
-    order = w.permutation()
-    moved = npa_envs.perception_fields(w.x[:, order], w.s[:, order], w.eps, w.box)
-    for value, answer, allowed in zip(moved, fields_of(w), allowances(w), strict=True):
-        within(value, answer[:, order], allowed[:, order])
-
-
-@every(some())
 def test_perception_follows_the_order_of_particles(w):
     clear_of_threshold(w)
     order = w.permutation()
@@ -123,13 +114,6 @@ def test_fields_scale_with_lengths_bit_for_bit(drawn):
     powers = (-dim, 0, -1, 0, -1, -1 - dim)
     for value, answer, power in zip(fields_of(w.scaled(factor)), fields_of(w), powers, strict=True):
         assert torch.equal(value, answer * factor**power)
-
-
-@every(with_scale())
-def test_perception_does_not_depend_on_the_unit_of_length(drawn):
-    """Perceived at a larger radius than it was trained at, a larger world looks the same."""
-    w, factor = drawn
-    assert torch.equal(perceive(w.scaled(factor)), perceive(w))
 
 
 @every(some())

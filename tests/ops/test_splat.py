@@ -131,31 +131,11 @@ def test_cotangents_may_lie_anywhere_in_memory(device):
     assert torch.equal(torch.autograd.grad(picture, x, shifted)[0], expected)
 
 
-@both_pictures
-def test_every_particle_has_the_area_of_a_target_pixel(draw, device):
-    """In an open picture inside the window, in a periodic one anywhere."""
-    x, colour = in_the_box(1, 300, torch.float64, device)
-    x = 0.5 * x if draw is splat else 3.0 * x
-    area = (24 * 0.11 / 2.0) ** 2
-    expected = torch.cat((colour, torch.ones_like(colour[..., :1])), dim=-1).sum((0, 1)) * area
-    torch.testing.assert_close(draw(x, colour, **OPTIONS).sum((0, 1, 2)), expected)
-
-
 def test_rows_point_up_and_columns_right(device):
     x = torch.tensor([[[0.5, -0.75]]], device=device)
     picture = splat(x, torch.ones(1, 1, 3, device=device), resolution=65, pixel_size=0.05)
     row, column = divmod(int(picture[0, ..., 3].argmax()), 65)
     assert (row, column) == (8, 48)
-
-
-@both_pictures
-def test_pictures_are_bit_identical_and_independent_of_the_batch(draw, device):
-    x, colour = scattered(4, 500, torch.float32, device)
-    pictures = draw(x, colour, resolution=50, pixel_size=0.06)
-    assert torch.equal(pictures, draw(x, colour, resolution=50, pixel_size=0.06))
-    for k in range(4):
-        alone = draw(x[k : k + 1], colour[k : k + 1], resolution=50, pixel_size=0.06)
-        assert torch.equal(pictures[k], alone[0])
 
 
 HOSTILE = [(draw, value) for draw in (splat, periodic_splat) for value in ("inf", "nan")]

@@ -23,7 +23,6 @@ from npa_envs.rule.files import (
     shipped_rules,
 )
 from npa_envs.rule.rule import NPARule
-from npa_envs.world.rollout import rollout
 
 RULES: dict[str, Callable[[], NPARule]] = {
     "plain 2D": lambda: NPARule(),
@@ -423,19 +422,6 @@ def test_an_unknown_name_suggests_a_shipped_rule() -> None:
     with pytest.raises(NPAError, match="unknown rule 'geko': did you mean 'gecko'"):
         load_rule("geko")
     assert_same_rule(load_rule("gecko"), load_rule(shipped_rules()["gecko"]))
-
-
-def test_the_authors_aubergine_has_the_layout_that_its_rollout_shows(reference: Path) -> None:
-    """A wrong order of rows or columns moves particles by 0.3 and more in these eight steps."""
-    rule = load_rule(f"{reference / 'authors_demo_aubergine.json'}#aubergine").double()
-    assert (rule.eps0, rule.alpha, rule.state_dim, rule.hidden_dim) == (0.1, 0.5, 16, 128)
-    numbers = np.load(reference / "rollout_aubergine_8_steps.npz")
-    x = torch.from_numpy(numbers["x0"])[None]
-    s = torch.zeros(1, x.shape[1], 16, dtype=torch.float64)
-    with torch.no_grad():
-        x, s = rollout(rule, x, s, int(numbers["steps"]), update_prob=1.0)
-    assert float((x[0] - torch.from_numpy(numbers["x"])).abs().max()) < 1e-11
-    assert float((s[0] - torch.from_numpy(numbers["s"])).abs().max()) < 1e-11
 
 
 def test_the_authors_collection_is_written_as_they_wrote_it(

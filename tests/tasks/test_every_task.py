@@ -206,15 +206,6 @@ def test_resumed_run_is_bit_identical(tiny, name, fields):
         assert torch.equal(ours, theirs)
 
 
-def test_recomputing_trains_the_same_rule_as_storing(tiny):
-    logs = []
-    for memory in ("store", "recompute", "minimal"):
-        config = tiny("morphogenesis2d", memory, iterations=3, memory=memory)
-        logs.append(log_of(train(config, progress=False).folder))
-    for stored, *others in zip(*logs, strict=True):
-        assert all(other == pytest.approx(stored, rel=1e-5) for other in others)
-
-
 @pytest.mark.parametrize(
     ("name", "fields", "message"),
     [

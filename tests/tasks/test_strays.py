@@ -37,13 +37,6 @@ def test_as_many_are_thrown_out_as_was_said_and_on_all_sides(device, which, spac
     assert torch.equal(found[~out], x[~out])
 
 
-def test_each_world_throws_what_it_would_throw_alone():
-    x = torch.rand(2, 50, 2)
-    both = scatter(x, share=0.3, generator=WorldRandom([4, 5]))
-    alone = scatter(x[1:], share=0.3, generator=WorldRandom([5]))
-    assert torch.equal(both[1:], alone)
-
-
 def test_only_the_paths_of_those_outside_count():
     x = torch.tensor([[[0.5, 0.2], [1.5, 0.0], [0.0, -3.0]]])
     path = torch.tensor([[7.0, 1.0, 2.0]], requires_grad=True)

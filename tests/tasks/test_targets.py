@@ -213,14 +213,6 @@ def test_a_picture_without_pixels_is_a_clear_error():
         target_from_image(Image.new("RGBA", (0, 5)), name="nothing")
 
 
-def test_loading_twice_gives_the_same_target(builtins):
-    again = load_target("heart")
-    assert torch.equal(again.points, builtins["heart"].points)
-    assert torch.equal(again.colours, builtins["heart"].colours)
-    assert again.pixel_size == builtins["heart"].pixel_size
-    assert torch.equal(again.to("cpu").points, again.points)
-
-
 def test_colours_of_transparent_pixels_do_not_leak():
     image = Image.new("RGBA", (400, 400), (255, 0, 255, 0))
     ImageDraw.Draw(image).ellipse((50, 50, 350, 350), fill=(0, 255, 0, 255))

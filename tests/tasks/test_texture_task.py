@@ -147,19 +147,6 @@ def test_a_target_of_another_size_is_refused():
         Texture(SMALL, target=load_texture("cells", resolution=32))
 
 
-def test_list_names_targets_and_losses(capsys):
-    assert main(["list"]) == 0
-    text = capsys.readouterr().out
-    for word in (
-        "texture:",
-        "bubbles, cells, dots, droplets, grid, hearts, maze, stars",
-        "vgg_ot",
-        "filter_swd",
-    ):
-        assert word in text
-    assert "morphogenesis3d: doughnut, duck, mushroom, rocket" in text
-
-
 def test_a_loss_is_refused_where_there_is_none_to_choose(capsys):
     assert main(["evaluate", "gecko", "--loss", "patch_swd", "--no-progress"]) == 2
     assert "unknown field 'loss'" in capsys.readouterr().err

@@ -148,17 +148,6 @@ class TestRun:
             rows = evaluate(saved, task.tasks[number], checkpoints=[8], seeds=[1])
             assert rows[0].loss < 2.0
 
-    def test_a_frozen_rule_stays_and_the_given_ones_are_copied(self, tmp_path):
-        task = CoMorphogenesis2D(pair())
-        rules = task.make_rules(torch.Generator().manual_seed(3))
-        rules[0].requires_grad_(False)
-        before = [rule.output.weight.clone() for rule in rules]
-        result = train_together(run_config(tmp_path / "run"), rules, progress=False)
-        first, second = result.rule
-        assert torch.equal(first.output.weight, before[0])
-        assert not torch.equal(second.output.weight, before[1])
-        assert torch.equal(rules[1].output.weight, before[1])
-
     def test_all_species_correct_gradients_as_the_run_is_told(self, tmp_path):
         config = run_config(tmp_path / "run", iterations=1, moment_inverse="smooth")
         for given in (None, CoMorphogenesis2D(pair()).make_rules(torch.Generator())):

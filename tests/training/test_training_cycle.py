@@ -68,17 +68,3 @@ def test_replayed_operations_train_the_same_rule_as_called_ones(tmp_path, make, 
     assert_same(replayed.state_dict(), called.state_dict())
     assert len(replayed._draw.recorded) > 5
     assert len(replayed._keep.recorded) > 5
-
-
-@pytest.mark.gpu
-def test_graphs_draw_the_worlds_that_launches_draw(tmp_path):
-    drawn = []
-    for graphed in (True, False):
-        config = preset("tiny", out=tmp_path, device="cuda", cuda_graph=graphed, steps=(4, 6))
-        cycle, _ = make_cycle(config, Morphogenesis2D(config.task, device="cuda"), "cuda:0")
-        rows = []
-        for iteration in range(5):
-            cycle.run(iteration)
-            rows += [cycle._index.clone(), cycle._fresh_x.clone()]
-        drawn.append((rows, cycle.generators["worlds"].get_state()))
-    assert_same(*drawn)

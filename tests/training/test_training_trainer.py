@@ -5,10 +5,7 @@ import itertools
 import math
 import os
 import signal
-import subprocess
-import sys
 import threading
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,14 +15,11 @@ from PIL import Image
 from training_runs import Killed, KilledTask, kill, log_of, train, trainer_of
 from worlds import assert_same
 
-import npa_envs
 from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule, rule_metadata, save_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.training import DivergedError, JsonlLog, load_config, override
-from npa_envs.training.run_folder import load_checkpoint, save_checkpoint
-
-TESTS = Path(__file__).resolve().parents[1]
+from npa_envs.training.run_folder import load_checkpoint
 
 
 def test_training_learns_the_circle(tmp_path):
@@ -73,35 +67,6 @@ def test_killed_and_resumed_run_has_the_same_log_bit_for_bit(tmp_path, iteration
     assert resumed.finished
     assert log_of(tmp_path / "broken") == log_of(tmp_path / "whole")
     assert_same(resumed.rule.state_dict(), whole_rule.state_dict())
-
-
-SCRIPT = """
-import os, signal, sys
-from circle_task import circle_config
-from training_runs import KilledTask, train
-out, iteration, resume = sys.argv[1], int(sys.argv[2]), sys.argv[3] == "resume"
-end = lambda: os.kill(os.getpid(), signal.SIGKILL)
-train(circle_config(out), KilledTask(iteration, end), resume=resume)
-"""
-
-
-def run_script(*arguments):
-    # The package first: its root may hold only a part of it, where it was copied from a checkout.
-    paths = [Path(npa_envs.__file__).parent.parent, TESTS, os.environ.get("PYTHONPATH", "")]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, paths))}
-    command = [sys.executable, "-c", SCRIPT, *map(str, arguments)]
-    return subprocess.run(command, env=environment, capture_output=True, timeout=120, check=False)
-
-
-def test_run_killed_by_the_system_is_resumed_by_another_process(tmp_path):
-    killed = run_script(tmp_path / "broken", 5, "start")
-    assert killed.returncode == -signal.SIGKILL, killed.stderr
-    # What the kill cut short must not be read back.
-    with (tmp_path / "broken" / "log.jsonl").open("a") as file:
-        file.write('{"iteration": 5, "lo')
-    train(circle_config(tmp_path / "broken"), resume=True)
-    train(circle_config(tmp_path / "whole"))
-    assert log_of(tmp_path / "broken") == log_of(tmp_path / "whole")
 
 
 def test_training_works_in_a_thread_where_signals_cannot_be_caught(tmp_path):
@@ -447,11 +412,3 @@ def test_disk_that_fills_up_leaves_the_last_checkpoint(tmp_path):
     assert (tmp_path / "checkpoint.pt").read_bytes() == before
     assert not list(tmp_path.glob(".*tmp*"))
     assert train(config, resume=True).finished
-
-
-def test_checkpoint_round_trip_keeps_every_bit(tmp_path):
-    content = {"a": torch.tensor([1.0, math.nan]), "b": [1, "two", {"c": None}]}
-    save_checkpoint(tmp_path / "c.pt", content)
-    back = load_checkpoint(tmp_path / "c.pt")
-    assert back["b"] == content["b"]
-    assert back["a"].view(torch.int32).equal(content["a"].view(torch.int32))

@@ -180,26 +180,6 @@ def test_a_copied_object_replays_its_own_method():
 
 
 @pytest.mark.gpu
-def test_replays_draw_what_launches_would_have_drawn():
-    drawn = []
-    for replayed in (True, False):
-        generator = torch.Generator(CUDA).manual_seed(5)
-        numbers = torch.zeros(1000, device=CUDA)
-
-        def draw(numbers=numbers, generator=generator):
-            numbers.copy_(torch.rand(1000, generator=generator, device=CUDA))
-
-        call = Replayed(draw, CUDA, generator) if replayed else draw
-        rows = []
-        for _ in range(5):
-            call()
-            rows.append(numbers.clone())
-        drawn.append((torch.stack(rows), generator.get_state()))
-    assert torch.equal(drawn[0][0], drawn[1][0])
-    assert torch.equal(drawn[0][1], drawn[1][1])
-
-
-@pytest.mark.gpu
 def test_a_capture_in_between_leaves_the_numbers_of_busy_graphs_alone():
     drawn = []
     for busy in (True, False):

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from worlds import assert_same, lively_rule, random_world
+from worlds import lively_rule, random_world
 
 import npa_envs
 from npa_envs import WorldRandom
@@ -207,23 +207,6 @@ def test_both_devices_draw_the_same_normal_numbers_up_to_rounding():
     assert float((there.cpu() != here).double().mean()) < 1e-4
 
 
-@pytest.mark.gpu
-def test_a_captured_step_draws_anew_at_each_replay():
-    random, eager = (WorldRandom([3, 4], device="cuda") for _ in range(2))
-    random.advance()
-    random.bernoulli(0.5, 100), random.normal(7)
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        random.advance()
-        mask, noise = random.bernoulli(0.5, 100), random.normal(7)
-    eager.advance()
-    for _ in range(3):
-        graph.replay()
-        eager.advance()
-        assert torch.equal(mask, eager.bernoulli(0.5, 100))
-        assert torch.equal(noise, eager.normal(7))
-
-
 @pytest.mark.parametrize("position_noise", [0.0, 1e-3])
 def test_a_seeded_world_grows_in_a_batch_as_it_grows_alone(position_noise, task, device):
     """On CUDA up to the rounding of the rule's products, which depends on their size there."""
@@ -243,20 +226,6 @@ def test_a_seeded_world_grows_in_a_batch_as_it_grows_alone(position_noise, task,
         for value, expected in zip(grown(seed), together, strict=True):
             assert torch.allclose(value[0], expected[world], rtol=0.0, atol=tolerance)
     assert not torch.equal(together[0][0], together[0][1])
-
-
-def test_a_rollout_takes_one_step_of_the_stream_for_each_of_its_own(device):
-    rule = npa_envs.NPARule(2, 4, 8).to(device)
-    x = torch.rand(2, 30, 2, device=device)
-    s = torch.rand(2, 30, 4, device=device)
-    whole, parts = (WorldRandom([1, 2], device=device) for _ in range(2))
-    with torch.no_grad():
-        expected = npa_envs.rollout(rule, x, s, 5, generator=whole)
-        halfway = npa_envs.rollout(rule, x, s, 2, generator=parts)
-        for _ in range(3):
-            halfway = npa_envs.step(rule, *halfway, generator=parts)
-    assert whole.steps.tolist() == [5, 5]
-    assert_same(halfway, expected)
 
 
 def test_the_mask_of_a_step_is_the_streams_first_draw(device):

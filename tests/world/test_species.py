@@ -6,9 +6,7 @@ import pytest
 import torch
 from worlds import (
     assert_near,
-    assert_same,
     cotangents,
-    degenerate_world,
     lively_rule,
     random_world,
     relative_error,
@@ -134,48 +132,6 @@ def test_a_species_that_sleeps_stays_where_it_is_and_leaves_others_their_updates
         assert_near((after_x, after_s), (expected_x, expected_s), 1e-13)
 
 
-def test_equal_probabilities_of_each_draw_what_one_does(device):
-    rules = [make_rule(device), make_rule(device, seed=1)]
-    x, s = make_world(device)
-    runs = [
-        npa_envs.rollout_species(
-            rules, x, s, 4, counts=[30, 30], update_prob=chance, generator=seeded(device)
-        )
-        for chance in (0.5, [0.5, 0.5], torch.tensor(0.5))
-    ]
-    assert_same(runs[1:], [runs[0]] * 2)
-
-
-def test_gradients_of_many_steps_with_one_rule_are_those_of_a_rollout(device):
-    x, s = make_world(device)
-    results = []
-    for counts in ([60], [25, 35]):
-        rule = make_rule(device)
-        start = s.clone().requires_grad_()
-        place = x.clone().requires_grad_()
-        options = {"detach_positions": False, "generator": seeded(device)}
-        out = npa_envs.rollout_species(
-            [rule] * len(counts), place, start, 6, counts=counts, **options
-        )
-        loss = out[0].square().sum() + out[1].square().sum()
-        results.append(torch.autograd.grad(loss, [start, place, *rule.parameters()]))
-    for value, answer in zip(*results, strict=True):
-        assert relative_error(value, answer) < 1e-11
-
-
-def test_recomputing_gives_the_gradients_of_storing(device):
-    rules = [make_rule(device), make_rule(device, seed=1)]
-    x, s = make_world(device)
-    results = []
-    for memory in ("store", "recompute", "minimal"):
-        options = {"memory": memory, "return_path_length": True, "generator": seeded(device)}
-        out = npa_envs.rollout_species(rules, x, s, 5, counts=[20, 40], **options)
-        loss = sum(value.square().sum() for value in out)
-        parameters = [*rules[0].parameters(), *rules[1].parameters()]
-        results.append([*out, *torch.autograd.grad(loss, parameters)])
-    assert_same(results[1:], [results[0]] * 2)
-
-
 @pytest.mark.parametrize("periodic", [False, True])
 def test_fields_of_each_species_are_sums_over_it(dtype, space_dim, periodic, device):
     counts = [70, 1, 130]
@@ -188,19 +144,6 @@ def test_fields_of_each_species_are_sums_over_it(dtype, space_dim, periodic, dev
         assert relative_error(value, answer) < FIELD_ERRORS[dtype]
     assert relative_error(found.rho.sum(2), total.rho) < FIELD_ERRORS[dtype]
     assert relative_error(found.drho.sum(2), total.drho) < FIELD_ERRORS[dtype]
-
-
-def test_fields_are_right_where_particles_coincide_or_are_alone(device):
-    x, _ = degenerate_world(2, 3, dtype=torch.float64, device=device)
-    counts = [30, 45, 5]
-    found = npa_envs.species_fields(x, counts, eps=0.3)
-    expected = fields_by_species(x.cpu(), counts, 0.3, None)
-    for value, answer in zip(found, expected, strict=True):
-        assert relative_error(value, answer) < 1e-13
-    # The last particle is alone: its own species sees it, nobody else.
-    own = float(oracle.smoothing_kernel(torch.zeros((), dtype=torch.float64), 0.3, 2))
-    assert found.rho[0, -1].tolist() == [0.0, 0.0, pytest.approx(own)]
-    assert not found.drho[0, -1].any()
 
 
 def test_fields_of_species_can_be_compiled(device):

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import torch
 from gymnasium import spaces, wrappers
 from gymnasium.vector import AsyncVectorEnv
 from gymnasium.wrappers import vector
@@ -10,23 +9,9 @@ from wrapped_envs import ACTIONS, STEPS, batched, single
 
 from npa_envs.wrappers import VectorDamageEvents
 
-IDS = ["npa/Morphogenesis2D-v0", "npa/Regeneration2D-v0"]
-
 
 def actions(step, *shape):
     return np.random.default_rng(step).uniform(-1, 1, (*shape, 64, ACTIONS)).astype(np.float32)
-
-
-@pytest.mark.parametrize("id", IDS)
-def test_statistics_of_episodes_under_a_time_limit(id):
-    env = wrappers.TimeLimit(single(id, max_episode_steps=-1), 3)
-    env = wrappers.RecordEpisodeStatistics(env)
-    env.reset(seed=0)
-    steps = [env.step(actions(step)) for step in range(3)]
-    assert [step[3] for step in steps] == [False, False, True]
-    episode = steps[-1][4]["episode"]
-    assert episode["l"] == 3
-    assert episode["r"] == pytest.approx(sum(step[1] for step in steps), abs=1e-6)
 
 
 ROW = spaces.Box(-1.0, 1.0, (64 * ACTIONS,))
@@ -65,35 +50,6 @@ def test_actions_of_other_forms(wrap, given, expected):
     np.testing.assert_allclose(env.step(given)[0], plain.step(expected)[0], atol=1e-4)
 
 
-def test_flatten_observation_and_normalize_reward():
-    env = wrappers.NormalizeReward(wrappers.FlattenObservation(single()))
-    assert env.observation_space.shape == (64 * 66,)
-    plain = single()
-    observation, _ = env.reset(seed=0)
-    assert env.observation_space.contains(observation)
-    plain.reset(seed=0)
-    for step in range(STEPS):
-        observation, reward, *_ = env.step(actions(step))
-        expected, unscaled, *_ = plain.step(actions(step))
-        np.testing.assert_array_equal(observation, expected.reshape(-1))
-    scale = np.sqrt(env.return_rms.var + env.epsilon)
-    assert reward == pytest.approx(unscaled / scale, rel=1e-6)
-
-
-@pytest.mark.parametrize("output", ["numpy", "torch"])
-def test_arrays_as_tensors(output):
-    pytest.importorskip("array_api_compat")
-    options = {"output": output, "disable_env_checker": output == "torch"}
-    env, plain = wrappers.NumpyToTorch(single(**options)), single()
-    observation, _ = env.reset(seed=0)
-    np.testing.assert_array_equal(observation.numpy(), plain.reset(seed=0)[0])
-    for step in range(STEPS):
-        observation, reward, terminated, truncated, _ = env.step(torch.from_numpy(actions(step)))
-        expected = plain.step(actions(step))
-        np.testing.assert_array_equal(observation.numpy(), expected[0])
-        assert (reward, terminated, truncated) == expected[1:4]
-
-
 def test_record_video(tmp_path):
     pytest.importorskip("moviepy")
     env = wrappers.RecordVideo(single(render_mode="rgb_array", render_size=32), str(tmp_path))
@@ -117,21 +73,6 @@ def test_async_vector_env_gives_what_the_batched_one_gives():
             np.testing.assert_allclose(expected[1], seen[1])
     finally:
         env.close()
-
-
-def test_vector_wrappers():
-    env = vector.NormalizeReward(
-        vector.ClipAction(vector.RescaleAction(batched(), np.float32(-2.0), np.float32(2.0)))
-    )
-    env = vector.RecordEpisodeStatistics(env)
-    plain = batched()
-    env.reset(seed=0)
-    plain.reset(seed=0)
-    for step in range(STEPS):
-        observations, *_, infos = env.step(2 * actions(step, 3))
-        expected, *_ = plain.step(actions(step, 3))
-        np.testing.assert_allclose(observations, expected, atol=1e-3)
-    assert infos["episode"]["l"].tolist() == [STEPS] * 3
 
 
 def test_partial_resets_pass_through_gymnasiums_statistics():

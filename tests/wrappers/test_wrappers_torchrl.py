@@ -164,22 +164,3 @@ def test_torchrls_own_environment_of_gymnasium_takes_an_id(id):
         observation, reward, *_ = plain.step(rolled["action"][t].numpy())
         assert rolled["next", "reward"][t].item() == np.float32(reward)
     assert rolled["next", "done"].flatten().tolist() == [k % 3 == 2 for k in range(7)]
-
-
-def test_torchrls_ways_to_run_several_environments():
-    keywords = {**wrapped_envs.SMALL, "max_episode_steps": 3}
-    name = "npa/Morphogenesis2D-v0"
-    one_by_one = torchrl.SerialEnv(2, lambda: torchrl.GymEnv(name, **keywords))
-    rolled = one_by_one.rollout(7, break_when_any_done=False)
-    assert rolled.batch_size == (2, 7)
-    assert rolled["next", "done"].sum() == 4
-    one_by_one.close()
-
-
-@pytest.mark.slow
-def test_torchrls_processes_of_gymnasiums_vector_environment():
-    keywords = {**wrapped_envs.SMALL, "max_episode_steps": 3}
-    # Processes of their own import the package by this.
-    env = torchrl.GymEnv("npa_envs:npa/Morphogenesis2D-v0", num_envs=2, **keywords)
-    assert env.rollout(3).batch_size == (2, 3)
-    env.close()
