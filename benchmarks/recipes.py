@@ -53,10 +53,10 @@ SEEDS = tuple(range(1000, 1008))
 """Seeds of the worlds that rules are measured on."""
 
 STEPS = (64, 128, 256, 512, 1024, 2048, 4096)
-"""Steps at which they are measured; worlds of full size also at `LAST`."""
+"""Steps at which they are measured, before `LAST`."""
 
 LAST = 20_000
-"""The last step at which worlds of full size are measured."""
+"""The last step at which worlds are measured; of full size alone in the first three rounds."""
 
 QUARTERS = (0.2, 0.4, 0.6, 0.8)
 """Milestones of the paper's schedule, as shares of its length."""
@@ -137,6 +137,25 @@ THIRD: Fields = SECOND | {
 }
 """The third candidate: fewer seeds, older worlds, and only worlds of short lives are damaged."""
 
+FOURTH: Fields = THIRD | {
+    "lifetimes": (128, 32_768),
+    "pool_size": 32,
+    "ageing_steps": 512,
+    "loose_weight": 30.0,
+    "damage_radius": 0.2,
+    "damage_share": 0.5,
+}
+"""The fourth candidate: old worlds that age quickly, and loose particles drawn back."""
+
+FIFTH: Fields = THIRD | {
+    "lifetimes": (128, 32_768),
+    "pool_size": 32,
+    "ageing_steps": 512,
+    "damage_radius": 0.2,
+    "initial_rule": "heart",
+}
+"""The fifth candidate: a rule that has learned to grow and to last learns another picture."""
+
 FAST_BEFORE: Fields = {
     **NO_STRAYS,
     "learning_rate": 2e-3,
@@ -159,6 +178,14 @@ FAST_SECOND: Fields = FAST_FIRST | {"average": 0.0, "blur_levels": 0, "damage_sh
 
 FAST_STRAYS: Fields = STRAYS | {"stray_share": 1e-3}
 """As `STRAYS`, of fewer particles."""
+
+FAST_FOURTH: Fields = {
+    **FAST_STRAYS,
+    "learning_rate": 4e-3,
+    "schedule": "cosine",
+    "loose_weight": 30.0,
+}
+"""The preset `fast` after the third round, which draws loose particles back."""
 
 ARMS: Mapping[str, Fields] = {
     "paper": {},
@@ -187,6 +214,18 @@ ARMS: Mapping[str, Fields] = {
     "third": THIRD,
     "third, no strays": THIRD | NO_STRAYS,
     "third, lifetimes from 64": THIRD | {"lifetimes": (64, 32_768)},
+    "fourth": FOURTH,
+    "fourth, no ageing": FOURTH | {"ageing_steps": 0},
+    "fourth, ageing 2048": FOURTH | {"ageing_steps": 2048},
+    "fourth, no loose": FOURTH | {"loose_weight": 0.0},
+    "fourth, pool 64": FOURTH | {"pool_size": 64},
+    "fourth, damage 0.1": FOURTH | {"damage_radius": 0.1, "damage_share": 0.25},
+    "fourth, none thrown": FOURTH | {"stray_share": 0.0},
+    "fourth, rate 2e-3": FOURTH | {"learning_rate": 2e-3},
+    "fifth": FIFTH,
+    "fifth, untrained": FIFTH | {"initial_rule": ""},
+    "fifth, no ageing": FIFTH | {"ageing_steps": 0},
+    "fifth, rate 5e-4": FIFTH | {"learning_rate": 5e-4},
 }
 """Arms of `full` and `small`: what each changes of the preset `paper`."""
 
@@ -223,6 +262,28 @@ FAST_ARMS: Mapping[str, Fields] = {
         "lifetimes": (96, 4096),
         "steps": (24, 40),
         "iterations": 1800,
+    },
+    "fourth": FAST_FOURTH,
+    "fourth, no loose": FAST_FOURTH | {"loose_weight": 0.0},
+    "fourth, none thrown": FAST_FOURTH | {"stray_share": 0.0},
+    "fourth, none thrown, share 0.5": FAST_FOURTH | {"stray_share": 0.0, "damage_share": 0.5},
+    "fourth, 1 world": FAST_FOURTH | {"world_count": 1, "seed_interval": 4, "iterations": 4800},
+    "fourth, steps 12 to 24": FAST_FOURTH | {"steps": (12, 24), "iterations": 3200},
+    "fourth, ageing": {
+        **FAST_FOURTH,
+        "lifetimes": (48, 4096),
+        "pool_size": 16,
+        "ageing_steps": 128,
+        "damage_share": 0.5,
+    },
+    "fourth, rate 3e-3": FAST_FOURTH | {"learning_rate": 3e-3},
+    "fifth": FAST_FOURTH | {"loose_weight": 0.0},
+    "fifth, rate 2e-3": FAST_FOURTH | {"loose_weight": 0.0, "learning_rate": 2e-3},
+    "fifth, rate 2e-3, 2 seeds": {
+        **FAST_FOURTH,
+        "loose_weight": 0.0,
+        "learning_rate": 2e-3,
+        "seed_interval": 1,
     },
 }
 """Arms of `fast`: what each changes of it as it was; the preset is the cosine with strays now."""
@@ -316,10 +377,16 @@ def measured(trainer: Trainer, size: str) -> dict[str, Any]:
     task: Any = trainer.task
     rule = trainer._cycle.average.rule(trainer.rule)
     device = trainer.config.device
-    steps = {"full": (*STEPS, LAST), "tiny": (4, 8)}.get(size, STEPS)
-    rows = evaluate(rule, task, checkpoints=steps, seeds=SEEDS, device=device)
+    steps = (4, 8) if size == "tiny" else (*STEPS, LAST)
     grow, heal = (8, 8) if size == "tiny" else (1024, 500)
-    healed = healing(rule, task, grow_steps=grow, heal_steps=heal, seeds=SEEDS, device=device)
+    rows, healed = [], []
+    # A rule may diverge; then what came before is kept.
+    while steps and not rows:
+        with contextlib.suppress(NPAError):
+            rows = evaluate(rule, task, checkpoints=steps, seeds=SEEDS, device=device)
+        steps = steps[:-1]
+    with contextlib.suppress(NPAError):
+        healed = healing(rule, task, grow_steps=grow, heal_steps=heal, seeds=SEEDS, device=device)
     if trainer.config.device.startswith("cuda"):
         release_recordings()
     found = {"growth": [asdict(row) for row in rows], "healing": [asdict(row) for row in healed]}

@@ -33,6 +33,9 @@ RISE = 0.01
 LOWEST = 0.01
 """What is left of the learning rate at the end of the schedule "cosine"."""
 
+AGEING_BLOCK = 64
+"""Steps that worlds are aged by at a time: on CUDA, what one graph replays."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig(Generic[TaskConfigT]):
@@ -101,6 +104,14 @@ class TrainConfig(Generic[TaskConfigT]):
     of each of B equal sections, so that there are young and old ones in it. (0, 0): fresh seeds
     come by `seed_interval` instead."""
 
+    ageing_steps: int = 0
+    """Steps that worlds of the longer-lived half of the pool's places are run without gradients,
+    every `ageing_interval` iterations, so that they grow old under the rule as it is. So many once
+    the learning rate has fallen to 0, fewer before, in blocks of 64; 0: none. Needs `lifetimes`."""
+
+    ageing_interval: int = 16
+    """Iterations from one such ageing to the next."""
+
     damage: bool = True
     """Worlds from the pool are damaged before the rollout, so that the rule learns to heal."""
 
@@ -145,6 +156,8 @@ class TrainConfig(Generic[TaskConfigT]):
         """Check every field; raise NPAError where one has a wrong type or lies out of its range."""
         check_positive(self, int, "iterations", "repeats", "world_count", "pool_size")
         check_positive(self, int, "seed_interval", "log_interval", "checkpoint_interval")
+        check_positive(self, int, "ageing_interval")
+        check_positive(self, int, "ageing_steps", at_least=0)
         check_positive(self, float, "learning_rate", "runaway_limit")
         check_fraction(self, "decay", "damage_share")
         check_non_negative(self, "weight_decay", "fresh_share", "average")
@@ -220,6 +233,11 @@ class TrainConfig(Generic[TaskConfigT]):
                 f"{self.pool_size} and {self.world_count}: set "
                 f"pool_size={self.pool_size // self.world_count * self.world_count}"
             )
+        if self.ageing_steps > 0 and not self.ages:
+            raise NPAError(
+                f"ageing_steps needs worlds that have lifetimes, got {self.ageing_steps} without: "
+                "set lifetimes, for example to (256, 32768)"
+            )
 
     def _check_choice(self, name: str, choices: tuple[str, ...]) -> None:
         value = getattr(self, name)
@@ -259,12 +277,28 @@ class TrainConfig(Generic[TaskConfigT]):
             iteration: Iterations done so far in the run.
         """
         within = iteration % self.iterations
+        rate = self.learning_rate * self._fall(within)
         if self.schedule == "cosine":
-            rise = min(1.0, (within + 1) / (RISE * self.iterations))
+            rate *= min(1.0, (within + 1) / (RISE * self.iterations))
+        return rate
+
+    def ageing_at(self, iteration: int) -> int:
+        """Return the steps without gradients before an iteration, counted from 0 over all repeats.
+
+        Args:
+            iteration: Iterations done so far in the run.
+        """
+        if self.ageing_steps == 0 or iteration % self.ageing_interval:
+            return 0
+        share = 1.0 - self._fall(iteration % self.iterations)
+        return round(share * self.ageing_steps / AGEING_BLOCK) * AGEING_BLOCK
+
+    def _fall(self, within: int) -> float:
+        """Return what is left of the learning rate after some iterations of a repeat."""
+        if self.schedule == "cosine":
             fall = 0.5 + 0.5 * math.cos(math.pi * within / self.iterations)
-            return self.learning_rate * rise * (LOWEST + (1.0 - LOWEST) * fall)
-        passed = sum(milestone <= within for milestone in self.milestones)
-        return float(self.learning_rate * self.decay**passed)
+            return LOWEST + (1.0 - LOWEST) * fall
+        return float(self.decay ** sum(milestone <= within for milestone in self.milestones))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -25,7 +25,7 @@ from npa_envs.tasks.base import (
     task_for_rule,
     task_toward,
 )
-from npa_envs.tasks.train_config import TrainConfig
+from npa_envs.tasks.train_config import AGEING_BLOCK, TrainConfig
 from npa_envs.world.cuda_graph import Replayed, capture
 from npa_envs.world.rollout import Memory
 
@@ -53,7 +53,9 @@ class TrainingCycle:
     ) -> None:
         self.task = task_for_rule(task, rule)
         """The task, as it is for worlds of this rule."""
+        self._rule = rule
         self._config = config
+        self._rollout: Rollout = npa_envs.world.rollout.rollout if rollout is None else rollout
         worlds = torch.Generator(device).manual_seed(config.seed + 1)
         masks = torch.Generator(device).manual_seed(config.seed + 2)
         self.generators = {"schedule": schedule, "worlds": worlds, "masks": masks}
@@ -66,7 +68,7 @@ class TrainingCycle:
         goals = None if goal is None else goal[: config.world_count]
         graphed = device.type == "cuda" and config.cuda_graph
         iteration = GraphedIteration if graphed else EagerIteration
-        self.batch = iteration(self.task, rule, config, *batch, masks, rollout, goal=goals)
+        self.batch = iteration(self.task, rule, config, *batch, masks, self._rollout, goal=goals)
         """Worlds before and after the last rollout, the loss and its gradients."""
         self.optimiser = RuleOptimiser(self.batch.parameters, config)
         """Changes the rule."""
@@ -79,6 +81,7 @@ class TrainingCycle:
         self._steps = torch.zeros_like(self._index[0])
         self._fresh_x, self._fresh_s = (torch.empty_like(t) for t in batch)
         self._fresh_goal = None if goals is None else torch.empty_like(goals)
+        self._grow_old = Replayed(self._age_worlds, device, worlds) if graphed else self._age_worlds
         self._draw = Replayed(self._draw_worlds, device, worlds) if graphed else self._draw_worlds
         self._keep = Replayed(self._keep_worlds, device) if graphed else self._keep_worlds
 
@@ -89,6 +92,8 @@ class TrainingCycle:
         steps = int(torch.randint(lo, hi, (), generator=self.generators["schedule"]))
         if isinstance(self.task, ScheduledTask):
             self.task.begin(iteration)
+        for _ in range(config.ageing_at(iteration) // AGEING_BLOCK):
+            self._grow_old()
         self._draw()
         if not config.ages and iteration % config.seed_interval == 0:
             self._begin_anew(config.fresh_count)
@@ -125,6 +130,30 @@ class TrainingCycle:
         self.average.load_state_dict(state)
         for name, generator in self.generators.items():
             generator.set_state(state["random_states"][name])
+
+    @torch.no_grad()
+    def _age_worlds(self) -> None:
+        """Run the longer-lived half of the pool for some steps, without gradients."""
+        pool, worlds = self.pool, self.generators["worlds"]
+        assert pool.age is not None, "made with lifetimes"
+        old = torch.arange(len(pool.x) // 2, len(pool.x), device=pool.x.device)
+        x, s, goal = pool.read(old)
+        x, s, _ = self._rollout(
+            self._rule,
+            x,
+            s,
+            AGEING_BLOCK,
+            eps=self.task.eps,
+            box=self.task.box,
+            update_prob=self.task.update_prob,
+            memory=self._config.memory,
+            generator=worlds,
+            return_path_length=True,
+        )
+        fresh_x, fresh_s, fresh_goal = self._seeds(len(old))
+        goals = None if goal is None or fresh_goal is None else (goal, fresh_goal)
+        age = pool.age.index_select(0, old) + AGEING_BLOCK
+        self.meter.count_replaced(pool.write(old, x, s, fresh_x, fresh_s, goals, age))
 
     @torch.no_grad()
     def _draw_worlds(self) -> None:
@@ -636,13 +665,17 @@ class LossMeter:
         """
         terms = self._iteration.terms
         self._sums += terms
-        self._replaced += replaced.sum()
+        self.count_replaced(replaced)
         # A comparison with NaN is false: one reduction finds both NaN and infinity.
         finite = torch.linalg.vector_norm(terms, math.inf) < math.inf
         first = ~finite & (self._bad[0] == NONE_YET)
         torch.where(first, self._now, self._bad, out=self._bad)
         for name, value in self._observed().items():
             torch.where(first, value, self._snapshot[name], out=self._snapshot[name])
+
+    def count_replaced(self, replaced: Tensor) -> None:
+        """Take note of worlds that left the pool, shape [W], bool."""
+        self._replaced += replaced.sum()
 
     def send(self) -> None:
         """Let the interval's numbers go to the host, and start the next interval."""
