@@ -5,14 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 from npa_envs.cli.output import RuleOptions, StepBar, check_numbers, parse_options, rule_of
 from npa_envs.errors import NPAError
-
-if TYPE_CHECKING:
-    from npa_envs.rule.rule import NPARule
-    from npa_envs.tasks.point_classification import PointClassification
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,9 +47,10 @@ def main(arguments: Sequence[str]) -> int:
     """Measure and print."""
     options = parse_options(EvaluateOptions, "evaluate", arguments)
     from npa_envs.devices import check_device
+    from npa_envs.files import write_text
     from npa_envs.measure.judge import Judge, JudgeRow
-    from npa_envs.measure.quality import CHECKPOINTS, check_steps, evaluate, healing
-    from npa_envs.measure.tables import table_text
+    from npa_envs.measure.quality import CHECKPOINTS, check_steps, tables_of
+    from npa_envs.measure.tables import table_text, tables_json
     from npa_envs.rule.files import load_rule
     from npa_envs.tasks.point_classification import PointClassification
     from npa_envs.training.trained_tasks import task_of_rule
@@ -74,60 +70,28 @@ def main(arguments: Sequence[str]) -> int:
         )
     judge = Judge(trained.task) if options.judge else None
     judged: list[JudgeRow] = []
-    if isinstance(trained.task, PointClassification):
-        return _evaluate_clouds(options, rule, trained.task)
-    seeds = range(options.first_seed, options.first_seed + options.seed_count)
-    with StepBar(max(checkpoints), show=options.progress) as bar:
-        rows = evaluate(
+    clouds = isinstance(trained.task, PointClassification)
+    known = not (clouds or options.healing)
+    with StepBar(max(checkpoints) if known else None, show=options.progress) as bar:
+        tables = tables_of(
             rule,
             trained.task,
-            checkpoints=checkpoints,
-            seeds=seeds,
+            checkpoints=options.checkpoints,
+            seeds=range(options.first_seed, options.first_seed + options.seed_count),
+            changed=clouds or options.healing,
             device=device,
             progress=bar.advance,
             watch=None if judge is None else lambda *world: judged.append(judge.row(*world)),
         )
-    measure = trained.task.metric_name
-    print(f"{options.rule}: {options.seed_count} worlds, loss: {measure}")
-    print(table_text(rows, missing="-"))
-    tables: dict[str, Sequence[Any]] = {"growth": rows}
     if judged:
-        print(table_text(judged))
         tables["judge"] = judged
-    if options.healing:
-        with StepBar(None, show=options.progress) as bar:
-            healed = healing(rule, trained.task, seeds=seeds, device=device, progress=bar.advance)
-        print(table_text(healed))
-        tables["healing"] = healed
-    _write(options, tables, measure)
-    return 0
-
-
-def _evaluate_clouds(options: EvaluateOptions, rule: NPARule, task: PointClassification) -> int:
-    """Measure and print what a rule says of the clouds of a task."""
-    from npa_envs.measure.quality import (
-        CLOUD_CHECKPOINTS,
-        accuracies,
-        changes_of_mind,
-    )
-    from npa_envs.measure.tables import table_text
-
-    with StepBar(None, show=options.progress) as bar:
-        told: dict[str, Any] = {"seed": options.first_seed, "progress": bar.advance}
-        checkpoints = options.checkpoints or CLOUD_CHECKPOINTS
-        rows = accuracies(rule, task, checkpoints=checkpoints, **told)
-        changes = changes_of_mind(rule, task, **told)
-    print(f"{options.rule}: {len(task.clouds.label)} {task.split} clouds, loss: {task.metric_name}")
-    print(table_text(rows))
-    print(table_text(changes))
-    _write(options, {"accuracy": rows, "changes": changes}, task.metric_name)
-    return 0
-
-
-def _write(options: EvaluateOptions, tables: dict[str, Sequence[Any]], measure: str) -> None:
-    from npa_envs.files import write_text
-    from npa_envs.measure.tables import tables_json
-
+    what = f"{options.seed_count} worlds"
+    if isinstance(trained.task, PointClassification):
+        what = f"{len(trained.task.clouds.label)} {trained.task.split} clouds"
+    print(f"{options.rule}: {what}, loss: {trained.task.metric_name}")
+    for name, rows in tables.items():
+        print(table_text(rows, missing="-" if name == "growth" else "never"))
     if options.json is not None:
-        write_text(options.json, tables_json(tables, metric=measure))
+        write_text(options.json, tables_json(tables, metric=trained.task.metric_name))
         print(f"wrote {options.json}")
+    return 0

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -26,10 +26,17 @@ from npa_envs.render import (
 )
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.damage import DamageEvent, damage_worlds
+from npa_envs.training.trained_tasks import task_of_rule
 from npa_envs.world.rollout import rollout
 
 if TYPE_CHECKING:
     from npa_envs.tasks.base import PictureTask, ViewTask
+
+SCREEN = 256
+"""Least pixels on each side of a film whose resolution is not asked for."""
+
+FRAME_COUNT = 150
+"""Frames of a film whose pace is not asked for, without those of damage."""
 
 EARLY_STEPS = (0, 16, 32, 64, 128)
 """Steps that a filmstrip shows, or the frames nearest to them: most of the growth is there."""
@@ -146,6 +153,31 @@ def film_world(
             if stop():
                 break
     return x, s, film
+
+
+def frame_steps(steps: int) -> int:
+    """Return the steps between two frames that make about `FRAME_COUNT` of them."""
+    return math.ceil(steps / FRAME_COUNT)
+
+
+def large_task(
+    task: PictureTask, source: str, rule: NPARule, device: torch.device, **world: Any
+) -> PictureTask:
+    """Return a rule's task with pictures that are large enough to be seen.
+
+    Args:
+        task: The task as trained.
+        source: What the rule was loaded from.
+        rule: The rule.
+        device: Where the task keeps its target.
+        world: What was said of the rule's world, as `task_of_rule` takes it.
+
+    Raises:
+        NPAError: As for `task_of_rule`.
+    """
+    if len(task.target_picture) >= SCREEN:
+        return task
+    return task_of_rule(source, rule, device, **world, resolution=SCREEN).task
 
 
 def write_film(film: Film, folder: Path, name: str, *, fps: float = 25.0) -> list[Path]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,12 +18,6 @@ from npa_envs.cli.output import (
     writable_folder,
 )
 from npa_envs.errors import NPAError
-
-SCREEN = 256
-"""Least pixels on each side of a film whose resolution is not asked for."""
-
-FRAME_COUNT = 150
-"""Frames of a film whose pace is not asked for, without those of damage."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,7 +68,7 @@ def main(arguments: Sequence[str]) -> int:
     options = parse_options(RolloutOptions, "rollout", arguments)
     import torch
 
-    from npa_envs.cli.film import film_world, write_film, write_solid
+    from npa_envs.cli.film import film_world, frame_steps, large_task, write_film, write_solid
     from npa_envs.measure.quality import measure
     from npa_envs.rule.files import load_rule
     from npa_envs.tasks.base import ViewTask, seed_worlds, task_toward
@@ -99,8 +92,8 @@ def main(arguments: Sequence[str]) -> int:
     trained = task_of_rule(source, rule, device, **world, resolution=options.resolution)
     # Drawn large enough to be seen; measured as trained, so that the figures can be compared.
     task = shown = trained.task
-    if options.resolution is None and len(task.target_picture) < SCREEN:
-        shown = task_of_rule(source, rule, device, **world, resolution=SCREEN).task
+    if options.resolution is None:
+        shown = large_task(task, source, rule, device, **world)
     folder = writable_folder(options.out)
     generator = torch.Generator(device).manual_seed(options.seed)
     x, s, goal = seed_worlds(task, 1, generator=generator, device=device)
@@ -114,7 +107,7 @@ def main(arguments: Sequence[str]) -> int:
             options.steps,
             generator=generator,
             damages=damages,
-            every=options.every or math.ceil(options.steps / FRAME_COUNT),
+            every=options.every or frame_steps(options.steps),
             progress=bar.advance,
             stop=stop.is_set,
         )

@@ -14,6 +14,7 @@ import tyro
 
 from npa_envs.cli import INTERRUPTED
 from npa_envs.cli.output import OutFolder, duration, parse_options
+from npa_envs.cli.report import Training, write_report
 from npa_envs.errors import NPAError
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
@@ -23,6 +24,7 @@ from npa_envs.training import (
     RunFolder,
     TrainConfig,
     TrainResult,
+    check_device,
     load_config,
     override,
     preset,
@@ -71,6 +73,9 @@ class TrainOptions:
     progress: bool = True
     """Show a progress bar."""
 
+    report: bool = True
+    """End with a report in the folder `out`: figures, a film and a card of the rule."""
+
 
 def main(arguments: Sequence[str]) -> int:
     """Train what the words after `npa-envs train` ask for.
@@ -92,7 +97,7 @@ def main(arguments: Sequence[str]) -> int:
     task_name, rest = arguments[0], arguments[1:]
     task_entry(task_name)
     options, config = parse(task_name, starting_configuration(task_name, rest), rest)
-    return run(task_name, options, config)
+    return run(task_name, options, config, arguments)
 
 
 def starting_configuration(task_name: str, arguments: Sequence[str]) -> TrainConfig[Any]:
@@ -184,8 +189,17 @@ def _without(source: Any, names: Iterable[str]) -> Any:
     return _of_type(narrow, source)
 
 
-def run(task_name: str, options: TrainOptions, config: TrainConfig[Any]) -> int:
-    """Train, say where everything lies and how to go on, and return the exit code."""
+def run(
+    task_name: str, options: TrainOptions, config: TrainConfig[Any], words: Sequence[str]
+) -> int:
+    """Train, say where everything lies and how to go on, and return the exit code.
+
+    Args:
+        task_name: The task.
+        options: How it runs.
+        config: What it runs.
+        words: The words after `npa-envs train`.
+    """
     if options.max_seconds is not None and not 0 < options.max_seconds < math.inf:
         raise NPAError(f"max_seconds must be positive and finite, got {options.max_seconds}")
     folder = RunFolder(config.out)
@@ -212,13 +226,30 @@ def run(task_name: str, options: TrainOptions, config: TrainConfig[Any]) -> int:
         print(f"interrupted; the last checkpoint is {folder.checkpoint}\ngo on: {resume_command}")
         raise
     rules = [folder.rule]
-    look = f"npa-envs rollout {shlex.quote(str(folder.rule))}"
+    meet = ""
     if isinstance(config, JointTrainConfig):
         rules = [folder.rule_of(number) for number in range(len(config.task.species))]
-        look = f"npa-envs interact {shlex.join(map(str, rules))}"
-        look += f" --distances {config.task.distance:g}"
-        look += f" --particle-count {sum(config.task.counts[:2])}"
-    _report(result, rules, look, resume_command)
+        meet = f"npa-envs interact {shlex.join(map(str, rules))}"
+        meet += f" --distances {config.task.distance:g}"
+        meet += f" --particle-count {sum(config.task.counts[:2])}"
+    _say_how_it_ended(result, rules, resume_command)
+    if options.report and result.iteration > 0 and not result.interrupted:
+        training = Training(
+            task_name, ("train", *words), result.iteration, result.record.get("seconds", 0.0)
+        )
+        for rule in rules:
+            device = check_device(config.device)
+            try:
+                told = write_report(
+                    rule, folder.report, training, device, progress=options.progress
+                )
+                print(f"  report      {told[0]}: {told[1]}")
+            except NPAError as error:
+                # The rule is there all the same; a bad one may not live as long as is measured.
+                print(f"  no report   {error}")
+    if meet:
+        print(f"  together    {meet}")
+    print(f"  look at it  npa-envs view {shlex.quote(str(folder.path))}")
     return INTERRUPTED if result.interrupted else 0
 
 
@@ -252,7 +283,7 @@ def announcement(
     )
 
 
-def _report(result: TrainResult, rules: Sequence[Path], look: str, resume_command: str) -> None:
+def _say_how_it_ended(result: TrainResult, rules: Sequence[Path], resume_command: str) -> None:
     folder = RunFolder(result.folder)
     loss = result.record.get("loss")
     figures = "" if loss is None else f", loss {loss:.4g}"
@@ -266,7 +297,6 @@ def _report(result: TrainResult, rules: Sequence[Path], look: str, resume_comman
         print(f"  rule        {rule}")
     print(f"  log         {folder.log}")
     print(f"  pictures    {folder.pictures}/")
-    print(f"  look at it  {look}")
 
 
 # Options of tasks of several species: flat, although configurations nest.

@@ -42,6 +42,7 @@ __all__ = [
     "scores",
     "table_text",
     "tables_json",
+    "tables_of",
 ]
 
 PROGRESS_STEPS = 32
@@ -442,6 +443,46 @@ def _partners(label: Tensor) -> Tensor:
     # Classes lie side by side in this order, none of them longer than this.
     partner[order] = order.roll(-largest)
     return partner
+
+
+def tables_of(
+    rule: NPARule,
+    task: PictureTask,
+    *,
+    checkpoints: Sequence[int] | None = None,
+    seeds: Sequence[int] = tuple(range(8)),
+    changed: bool = True,
+    device: str | torch.device = "cpu",
+    progress: Callable[[int], None] | None = None,
+    watch: Callable[[Tensor, Tensor, int], None] | None = None,
+) -> dict[str, Sequence[Any]]:
+    """Return the tables that are measured of a rule of any task, by name.
+
+    Args:
+        rule: The rule, in the precision to run it in.
+        task: What it should do.
+        checkpoints: Steps to measure at; None: `CHECKPOINTS`, of clouds `CLOUD_CHECKPOINTS`.
+        seeds: One number for each world; of clouds the first is the randomness of the updates.
+        changed: Also damage worlds and measure how they heal, or change clouds.
+        device: Where to run; clouds are where their task is.
+        progress: Called with the number of steps done since its last call.
+        watch: As for `evaluate`; clouds are not watched.
+
+    Returns:
+        `growth` and, where asked for, `healing`; of clouds `accuracy` and `changes`.
+
+    Raises:
+        NPAError: As for the functions that measure them.
+    """
+    if isinstance(task, PointClassification):
+        told: dict[str, Any] = {"seed": seeds[0], "progress": progress}
+        clouds: dict[str, Sequence[Any]] = {
+            "accuracy": accuracies(rule, task, checkpoints=checkpoints or CLOUD_CHECKPOINTS, **told)
+        }
+        return clouds | ({"changes": changes_of_mind(rule, task, **told)} if changed else {})
+    told = {"seeds": seeds, "device": device, "progress": progress}
+    growth = evaluate(rule, task, checkpoints=checkpoints or CHECKPOINTS, watch=watch, **told)
+    return {"growth": growth} | ({"healing": healing(rule, task, **told)} if changed else {})
 
 
 # The rule at work

@@ -24,14 +24,30 @@ def table_text(rows: Sequence[Any], *, missing: str = "never") -> str:
     """
     if not rows:
         return ""
-    names = [field.name for field in dataclasses.fields(rows[0])]
-    cells = [[name.replace("_", " ") for name in names]]
-    cells += [[_cell(getattr(row, name), missing) for name in names] for row in rows]
+    cells = _cells(rows, missing)
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     return "\n".join(
         "  ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True))
         for line in cells
     )
+
+
+def table_markdown(rows: Sequence[Any], *, missing: str = "never") -> str:
+    """Return rows as a table in Markdown, with the headings and cells of `table_text`.
+
+    Args:
+        rows: Instances of one dataclass, one at least.
+        missing: What a None is shown as.
+    """
+    heads, *lines = _cells(rows, missing)
+    return markdown_table(heads, lines)
+
+
+def _cells(rows: Sequence[Any], missing: str) -> list[list[str]]:
+    """Return headings, and the cells of each row."""
+    names = [field.name for field in dataclasses.fields(rows[0])]
+    heads = [name.replace("_", " ") for name in names]
+    return [heads, *([_cell(getattr(row, name), missing) for name in names] for row in rows)]
 
 
 def _cell(value: object, missing: str) -> str:

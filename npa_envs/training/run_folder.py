@@ -59,6 +59,8 @@ class RunFolder:
         """What the first iteration with a loss that is not finite saw."""
         self.pictures = path / "pictures"
         """Pictures of a batch, named by iteration."""
+        self.report = path / "report"
+        """What the finished rule is, in figures and films (`npa-envs train`)."""
         self.tensorboard = path / "tensorboard"
         """TensorBoard's events."""
         self.lock = path / ".lock"
@@ -154,6 +156,7 @@ class RunFolder:
         patterns = (
             "rule-[0-9]*.safetensors",
             "pictures/[0-9]*.png",
+            "report/*.*",
             "tensorboard/events.out.tfevents.*",
         )
         for pattern in patterns:

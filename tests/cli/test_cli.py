@@ -22,7 +22,7 @@ from npa_envs.rule.files import load_rule, save_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.training import Trainer
 
-TINY = ["morphogenesis2d", "--preset", "tiny", "--iterations", "6", "--no-progress"]
+TINY = ["morphogenesis2d", "--preset", "tiny", "--no-report", "--iterations", "6", "--no-progress"]
 
 
 @pytest.fixture(scope="module")

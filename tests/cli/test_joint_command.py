@@ -14,7 +14,15 @@ from npa_envs.rule.files import load_rule, rule_metadata
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig
 from npa_envs.training import RunFolder, load_config, preset, train
 
-TINY = ("co_morphogenesis2d", "--preset", "tiny", "--iterations", "4", "--no-progress")
+TINY = (
+    "co_morphogenesis2d",
+    "--preset",
+    "tiny",
+    "--no-report",
+    "--iterations",
+    "4",
+    "--no-progress",
+)
 
 
 def parsed(*words):
@@ -57,7 +65,7 @@ def test_a_run_stopped_by_time_resumes_to_the_same_rules(tmp_path, capsys):
     assert "--distances 0.8 --particle-count 256" in text
     assert main([*words, str(tmp_path / "parts"), "--max-seconds", "1e-9"]) == 0
     (command,) = re.findall(r"go on +npa-envs (train .*--resume)", capsys.readouterr().out)
-    assert main([*command.split(), "--no-progress"]) == 0
+    assert main([*command.split(), "--no-progress", "--no-report"]) == 0
     assert "finished: 4 iterations" in capsys.readouterr().out
     for number, target in enumerate(("ring", "flower")):
         whole, parts = (tmp_path / n / f"rule-{number}.safetensors" for n in ("whole", "parts"))

@@ -149,7 +149,8 @@ def test_run_killed_at_the_old_commit_goes_on(task: str, tmp_path: Path) -> None
     runs.keep(FOLDER / runs.FOLDERS[task], folder)
     whole = records(folder / "whole_log.jsonl")
     assert len(records(folder / "log.jsonl")) < runs.ITERATIONS
-    assert main(["train", task, "--out", str(folder), "--resume", "--no-progress"]) == 0
+    words = ["train", task, "--out", str(folder), "--resume", "--no-progress", "--no-report"]
+    assert main(words) == 0
     resumed = records(folder / "log.jsonl")
     assert [r["iteration"] for r in resumed] == [r["iteration"] for r in whole]
     count = runs.ITERATIONS if EXACT else runs.CHECKPOINT_INTERVAL + 1

@@ -252,6 +252,7 @@ COMMANDS = {
 def test_commands_take_the_rule_of_a_task(tmp_path, capsys, name):
     to_evaluate, to_draw, told, files = COMMANDS[name]
     words = [name, "--preset", "tiny", "--iterations", "2", "--milestones", "--no-progress"]
+    words.append("--no-report")
     assert main(["train", *words, "--out", str(tmp_path / "run")]) == 0
     rule, table = str(tmp_path / "run" / "rule.safetensors"), tmp_path / "table.json"
     options = ["--checkpoints", "2", "4", "--seed-count", "2", "--no-progress"]

@@ -1,0 +1,190 @@
+"""What a training run ends with: figures, a film and a card of the rule, in the run's folder."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from npa_envs.cli.film import film_world, frame_steps, large_task, write_film, write_solid
+from npa_envs.cli.output import StepBar, writable_folder
+from npa_envs.files import write_text
+from npa_envs.measure.judge import Judge, JudgeRow
+from npa_envs.measure.quality import CHECKPOINTS, CLOUD_CHECKPOINTS, score_line, tables_of
+from npa_envs.measure.record import current_commit, machine, versions
+from npa_envs.measure.tables import markdown_table, table_markdown, tables_json
+from npa_envs.rule.files import load_rule
+from npa_envs.tasks.base import PictureTask, ViewTask, seed_worlds
+from npa_envs.tasks.damage import DamageEvent
+from npa_envs.tasks.point_classification import PointClassification
+from npa_envs.tasks.texture import Texture
+from npa_envs.training.trained_tasks import task_of_rule
+
+if TYPE_CHECKING:
+    from npa_envs.rule.rule import NPARule
+
+FIRST_SEED = 1_000_000
+"""The first world's number; training uses others."""
+
+FILM_STEPS = 512
+"""Steps of the film."""
+
+FILM_DAMAGES = (DamageEvent(200, "cut"), DamageEvent(350, "erase"))
+"""What is done on the way to worlds that are to match their target pixel by pixel."""
+
+TITLES: Mapping[str, str] = {
+    "growth": "",
+    "healing": "Damaged, and left to themselves:",
+    "judge": "Judged by what no loss compares, as ratios of which 1 is the target itself:",
+    "accuracy": "",
+    "changes": "Some steps after something was done to the clouds:",
+}
+"""What stands above each table of a card."""
+
+
+@dataclass(frozen=True)
+class Training:
+    """How a rule came to be, for its card."""
+
+    task_name: str
+    """The task."""
+    words: Sequence[str]
+    """The words after `npa-envs`."""
+    iterations: int
+    """Iterations done."""
+    seconds: float
+    """How long they took [s]."""
+
+
+def write_report(
+    path: Path, folder: Path, training: Training, device: torch.device, *, progress: bool
+) -> tuple[Path, str]:
+    """Measure and film a rule that was trained, and write its card.
+
+    On a CPU, where worlds take as long as training does, fewer are measured, for fewer steps, and
+    not damaged.
+
+    Args:
+        path: The rule's file.
+        folder: Where to: STEM.md, the card, STEM.json, its figures as `npa-envs evaluate --json`
+            writes them, STEM.gif, STEM.mp4 and STEM-filmstrip.png; of a 3D rule also a turntable
+            and point files.
+        training: How the rule came to be.
+        device: Where to run.
+        progress: Show a progress bar.
+
+    Returns:
+        The card, and the rule's scores in a line.
+
+    Raises:
+        NPAError: A file cannot be written, or the rule's target cannot be loaded any more.
+    """
+    writable_folder(folder)
+    rule = load_rule(path, device=device).float()
+    task = task_of_rule(str(path), rule, device).task
+    thorough = device.type == "cuda"
+    clouds = isinstance(task, PointClassification)
+    checkpoints = (CLOUD_CHECKPOINTS if clouds else CHECKPOINTS)[: None if thorough else 5]
+    count = 8 if thorough else 2
+    judge = Judge(task) if thorough and isinstance(task, Texture) else None
+    judged: list[JudgeRow] = []
+    with StepBar(None, show=progress) as bar:
+        tables = tables_of(
+            rule,
+            task,
+            checkpoints=checkpoints,
+            seeds=range(FIRST_SEED, FIRST_SEED + count),
+            changed=thorough and (clouds or task.aligned),
+            device=device,
+            progress=bar.advance,
+            watch=None if judge is None else lambda *world: judged.append(judge.row(*world)),
+        )
+        _film(path, rule, task, folder, device, bar)
+    if judged:
+        tables["judge"] = judged
+    command = f"npa-envs evaluate {shlex.quote(str(path))} --device {device.type}"
+    if not clouds:
+        command += f" --seed-count {count} --checkpoints {' '.join(map(str, checkpoints))}"
+        command += " --healing" if "healing" in tables else ""
+        command += " --judge" if judged else ""
+    facts = {"command": command, "commit": current_commit(), "date": date.today().isoformat()}
+    facts |= {"machine": machine(device), "metric": task.metric_name}
+    text = tables_json(tables, **facts)
+    write_text(folder / f"{path.stem}.json", text)
+    card = folder / f"{path.stem}.md"
+    write_text(card, _card(rule, task, training, facts, tables))
+    return card, score_line(json.loads(text))
+
+
+def _film(
+    path: Path,
+    rule: NPARule,
+    task: PictureTask,
+    folder: Path,
+    device: torch.device,
+    bar: StepBar,
+) -> None:
+    """Film a world of the rule from its seed."""
+    generator = torch.Generator(device).manual_seed(FIRST_SEED)
+    x, s, _ = seed_worlds(task, 1, generator=generator, device=device)
+    x, s, film = film_world(
+        rule,
+        large_task(task, str(path), rule, device),
+        x,
+        s,
+        FILM_STEPS,
+        generator=generator,
+        damages=FILM_DAMAGES if task.aligned else (),
+        every=frame_steps(FILM_STEPS),
+        progress=bar.advance,
+    )
+    write_film(film, folder, path.stem)
+    if isinstance(task, ViewTask):
+        write_solid(task, x, s, folder)
+
+
+def _card(
+    rule: NPARule,
+    task: Any,
+    training: Training,
+    facts: Mapping[str, str],
+    tables: Mapping[str, Sequence[Any]],
+) -> str:
+    config = task.config
+    goal = getattr(config, "target", None) or config.data
+    space = (
+        "open space" if task.box is None else f"periodic box of {' x '.join(map(str, task.box))}"
+    )
+    moves = "static" if rule.static else f"α {rule.alpha:g}"
+    wide, narrow = rule.hidden.weight.shape[1], rule.output.weight.shape[0]
+    read_out = f", read-out to {rule.readout_dim}" if rule.readout_dim else ""
+    used = versions()
+    world = f"N {config.particle_count}, C {rule.state_dim}, ε {task.eps:g}, {moves}"
+    sizes = f"{wide} → {rule.hidden_dim} → {narrow}{read_out}, {rule.weight_count} weights"
+    rows = [
+        ("task", f"{rule.space_dim}D, {space}, {world}, p {task.update_prob:g}"),
+        ("network", sizes),
+        ("format", "safetensors with all hyper-parameters in its metadata"),
+        ("machine", f"{facts['machine']}, torch {used['torch']}, warp-lang {used['warp-lang']}"),
+        ("date", facts["date"]),
+    ]  # fmt: skip
+    parts = [
+        f"# {Path(goal).stem}",
+        f"A rule of the task `{training.task_name}` for `{goal}`.",
+        markdown_table(("", ""), rows),
+        "## Training",
+        f"Commit {facts['commit']}: {training.iterations} iterations in {training.seconds:.0f} s.",
+        f"```sh\n{shlex.join(['npa-envs', *training.words])}\n```",
+        "## Measured",
+        f"`{facts['command']}`, seeds that training never saw; the loss is the {task.metric_name}.",
+    ]
+    for name, table in tables.items():
+        parts += [TITLES[name]] if TITLES[name] else []
+        parts.append(table_markdown(table, missing="-" if name == "growth" else "never"))
+    return "\n\n".join(parts) + "\n"

@@ -1,0 +1,110 @@
+"""A training run ends with its report: figures, a film and a card, for every task."""
+
+import json
+import re
+
+import pytest
+from PIL import Image
+from small_digits import write_idx
+
+from npa_envs.cli import main, report
+from npa_envs.measure.quality import evaluate
+from npa_envs.rule.files import load_rule
+from npa_envs.training import TASKS
+from npa_envs.training.trained_tasks import task_of_rule
+
+SOLID = {"turntable.gif", "points.ply", "gaussians.ply", "cloud.splat"}
+
+
+@pytest.fixture(autouse=True)
+def short(monkeypatch):
+    """Few steps, of which one is among those that scores tell."""
+    monkeypatch.setattr(report, "CHECKPOINTS", (8, 128))
+    monkeypatch.setattr(report, "CLOUD_CHECKPOINTS", (8, 32))
+    monkeypatch.setattr(report, "FILM_STEPS", 6)
+
+
+def words_of(task, folder):
+    words = ["train", task, "--preset", "tiny", "--iterations", "2", "--milestones"]
+    if task == "point_classification":
+        words += ["--data", str(write_idx(folder / "idx")), "--class-count", "3"]
+    return [*words, "--no-progress", "--out", str(folder / "run")]
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_a_run_of_every_task_ends_with_a_card_of_each_rule(task, tmp_path, capsys):
+    words = words_of(task, tmp_path)
+    assert main(words) == 0
+    told = capsys.readouterr().out
+    assert told.splitlines()[-1].split() == [
+        "look",
+        "at",
+        "it",
+        *f"npa-envs view {words[-1]}".split(),
+    ]
+    run = tmp_path / "run"
+    rules = sorted(run.glob("rule*.safetensors"))
+    assert len(rules) == (2 if TASKS[task].joint else 1)
+    expected = set(SOLID) if task == "morphogenesis3d" else set()
+    for rule in rules:
+        stem = rule.stem
+        expected |= {stem + end for end in (".md", ".json", ".gif", ".mp4", "-filmstrip.png")}
+        card = (run / "report" / f"{stem}.md").read_text("utf-8")
+        held = json.loads((run / "report" / f"{stem}.json").read_text("utf-8"))
+        assert "npa-envs train" in card
+        assert "2 iterations in" in card
+        assert held["machine"] in card
+        assert f"Commit {held['commit']}" in card
+        assert held["command"] in card
+        clouds = task == "point_classification"
+        rows = held["accuracy" if clouds else "growth"]
+        assert [row["step"] for row in rows] == ([8, 32] if clouds else [8, 128])
+        for row in rows:
+            (line,) = re.findall(rf"^\| {row['step']} \| (.*?) \|", card, re.MULTILINE)
+            assert float(line) == pytest.approx(row["majority" if clouds else "loss"], rel=1e-3)
+        with Image.open(run / "report" / f"{stem}.gif") as film:
+            assert film.n_frames == 7
+            assert min(film.size) >= 256
+        (said,) = re.findall(rf"report +{re.escape(str(run / 'report' / stem))}\.md: (.*)", told)
+        assert said
+    assert {path.name for path in (run / "report").iterdir()} == expected
+
+
+def test_the_figures_of_a_report_are_those_of_the_command_that_it_names(tmp_path, capsys):
+    words = words_of("morphogenesis2d", tmp_path)
+    assert main(words) == 0
+    held = json.loads((tmp_path / "run" / "report" / "rule.json").read_text("utf-8"))
+    _, *command = held["command"].split()
+    assert main([*command, "--no-progress", "--json", str(tmp_path / "again.json")]) == 0
+    assert json.loads((tmp_path / "again.json").read_text())["growth"] == held["growth"]
+    rule = load_rule(tmp_path / "run" / "rule.safetensors")
+    task = task_of_rule(
+        str(tmp_path / "run" / "rule.safetensors"), rule, report.torch.device("cpu")
+    )
+    seeds = (report.FIRST_SEED, report.FIRST_SEED + 1)
+    (row,) = evaluate(rule, task.task, checkpoints=(8,), seeds=seeds)
+    assert row.loss == held["growth"][0]["loss"]
+    capsys.readouterr()
+
+
+def test_a_run_writes_no_report_where_none_is_wanted_or_no_iteration_was_done(tmp_path, capsys):
+    words = words_of("morphogenesis2d", tmp_path)
+    assert main([*words, "--no-report"]) == 0
+    assert main([*words, "--overwrite", "--max-seconds", "1e-9"]) == 0
+    assert not (tmp_path / "run" / "report").exists()
+    assert main([*words, "--resume"]) == 0
+    assert (tmp_path / "run" / "report" / "rule.md").exists()
+    assert main([*words, "--overwrite", "--no-report"]) == 0
+    assert not list((tmp_path / "run" / "report").iterdir())
+    assert "  report  " not in capsys.readouterr().out.rpartition("finished")[2]
+
+
+def test_a_rule_that_cannot_be_measured_is_kept_and_said_to_have_no_report(
+    tmp_path, capsys, monkeypatch
+):
+    # The untrained rule's worlds leave all that float32 can say.
+    monkeypatch.setattr(report, "CHECKPOINTS", (8, 4096))
+    words = words_of("morphogenesis2d", tmp_path)
+    assert main([*words, "--learning-rate", "1"]) == 0
+    assert "no report   x must be finite" in capsys.readouterr().out
+    assert (tmp_path / "run" / "rule.safetensors").exists()
