@@ -156,6 +156,9 @@ FIFTH: Fields = THIRD | {
 }
 """The fifth candidate: a rule that has learned to grow and to last learns another picture."""
 
+SIXTH: Fields = FIFTH | {"lifetimes": (32, 32_768), "loose_weight": 3.0}
+"""The sixth candidate: more seeds, and a tenth of the pull on loose particles."""
+
 FAST_BEFORE: Fields = {
     **NO_STRAYS,
     "learning_rate": 2e-3,
@@ -186,6 +189,13 @@ FAST_FOURTH: Fields = {
     "loose_weight": 30.0,
 }
 """The preset `fast` after the third round, which draws loose particles back."""
+
+FAST_SIXTH: Fields = FAST_FOURTH | {
+    "loose_weight": 0.0,
+    "learning_rate": 2e-3,
+    "seed_interval": 1,
+}
+"""Half of the worlds are seeds; begins with a rule that has learned another picture."""
 
 ARMS: Mapping[str, Fields] = {
     "paper": {},
@@ -222,6 +232,7 @@ ARMS: Mapping[str, Fields] = {
     "fourth, damage 0.1": FOURTH | {"damage_radius": 0.1, "damage_share": 0.25},
     "fourth, none thrown": FOURTH | {"stray_share": 0.0},
     "fourth, rate 2e-3": FOURTH | {"learning_rate": 2e-3},
+    "sixth": SIXTH,
     "fifth": FIFTH,
     "fifth, untrained": FIFTH | {"initial_rule": ""},
     "fifth, no ageing": FIFTH | {"ageing_steps": 0},
@@ -277,14 +288,10 @@ FAST_ARMS: Mapping[str, Fields] = {
         "damage_share": 0.5,
     },
     "fourth, rate 3e-3": FAST_FOURTH | {"learning_rate": 3e-3},
+    "sixth": FAST_SIXTH,
+    "sixth, rate 4e-3": FAST_SIXTH | {"learning_rate": 4e-3},
     "fifth": FAST_FOURTH | {"loose_weight": 0.0},
     "fifth, rate 2e-3": FAST_FOURTH | {"loose_weight": 0.0, "learning_rate": 2e-3},
-    "fifth, rate 2e-3, 2 seeds": {
-        **FAST_FOURTH,
-        "loose_weight": 0.0,
-        "learning_rate": 2e-3,
-        "seed_interval": 1,
-    },
 }
 """Arms of `fast`: what each changes of it as it was; the preset is the cosine with strays now."""
 

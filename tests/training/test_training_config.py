@@ -97,6 +97,8 @@ def test_no_field_of_the_run_hides_one_of_the_task():
         ("steps", 5, "steps must be a list, got 5"),
         ("lifetimes", [5, 2], "lifetimes must be two whole numbers"),
         ("lifetimes", [0, 2], "lifetimes must be two whole numbers"),
+        ("ageing_steps", -64, "ageing_steps must be a whole number of at least 0, got -64"),
+        ("ageing_interval", 0, "ageing_interval must be a whole number of at least 1, got 0"),
         ("damage_share", 0.0, r"damage_share must lie in \(0, 1\], got 0.0"),
         ("average", 1.0, "average must be below 1, got 1.0"),
         ("schedule", "linear", "schedule must be one of milestones, cosine, got 'linear'"),
@@ -121,6 +123,21 @@ def test_no_field_of_the_run_hides_one_of_the_task():
 def test_each_wrong_value_is_named(field, value, rule):
     with pytest.raises(NPAError, match=rule):
         override(PAPER, **{field: value})
+
+
+def test_worlds_age_the_more_the_less_the_rule_changes():
+    with pytest.raises(NPAError, match="ageing_steps needs worlds that have lifetimes, got 64"):
+        override(PAPER, ageing_steps=64)
+    fields = {"lifetimes": (64, 128), "ageing_steps": 640, "ageing_interval": 5}
+    config = override(PAPER, iterations=100, schedule="cosine", **fields)
+    steps = [config.ageing_at(k) for k in range(200)]
+    assert steps[:100] == steps[100:]
+    assert {k % 5 for k, count in enumerate(steps) if count} == {0}
+    assert (steps[0], steps[5], steps[50], steps[95]) == (0, 0, 320, 640)
+    assert all(count % 64 == 0 for count in steps)
+    assert sorted(steps[:100:5]) == steps[:100:5]
+    stepwise = override(PAPER, iterations=100, milestones=(40,), decay=0.25, **fields)
+    assert [stepwise.ageing_at(k) for k in (0, 35, 40, 41, 95)] == [0, 0, 512, 0, 512]
 
 
 def test_sections_of_a_pool_with_lifetimes_are_equal():

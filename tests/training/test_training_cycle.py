@@ -30,6 +30,9 @@ def clouds_cycle(tmp_path, **fields):
     return make_cycle(config, PointClassification(config.task))
 
 
+AGEING = {"lifetimes": (4, 400), "ageing_steps": 64, "ageing_interval": 1, "milestones": (1,)}
+
+
 def runaway():
     """A rollout that makes the second world run away each time it ran, so that it is replaced."""
 
@@ -52,11 +55,13 @@ def runaway():
             clouds_cycle,
             {"steps": (2, 4), "pool_size": 16, "lifetimes": (2, 6), "damage_share": 0.5},
         ),
+        (circle_cycle, AGEING | {"pool_size": 6}),
     ],
 )
 def test_replayed_operations_train_the_same_rule_as_called_ones(tmp_path, make, fields):
     (called, called_rule), (replayed, replayed_rule) = (make(tmp_path, **fields) for _ in range(2))
     replayed._draw, replayed._keep = Recording(replayed._draw), Recording(replayed._keep)
+    replayed._grow_old = Recording(replayed._grow_old)
     for iteration in range(8):
         for cycle in (called, replayed):
             cycle.run(iteration)
@@ -68,3 +73,4 @@ def test_replayed_operations_train_the_same_rule_as_called_ones(tmp_path, make, 
     assert_same(replayed.state_dict(), called.state_dict())
     assert len(replayed._draw.recorded) > 5
     assert len(replayed._keep.recorded) > 5
+    assert (len(replayed._grow_old.recorded) > 5) == ("ageing_steps" in fields)

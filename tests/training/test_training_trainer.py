@@ -53,6 +53,7 @@ def test_training_starts_from_an_initial_rule_of_its_shape(tmp_path):
         (5, {"repeats": 2, "iterations": 3, "milestones": [1]}),
         (5, {"log_interval": 2, "checkpoint_interval": 3}),
         (5, {"lifetimes": (3, 40), "pool_size": 9, "average": 0.9, "schedule": "cosine"}),
+        (5, {"lifetimes": (3, 400), "pool_size": 9, "ageing_steps": 128, "ageing_interval": 2}),
         (5, {"dtype": "float64", "damage": False, "normalise_gradients": False}),
     ],
 )
@@ -162,6 +163,42 @@ def test_worlds_that_have_lived_are_replaced_by_seeds_and_all_others_grow_older(
         assert second == (ages[1] == 0 or ages[1] >= 40)
         ages[1] = (0 if second else ages[1]) + count
     assert 5 < sum(second for _, second in task.fresh) < 12
+
+
+def test_the_longer_lived_half_of_the_pool_ages_without_gradients_once_the_rate_has_fallen(
+    tmp_path,
+):
+    aged = []
+
+    def rollout(rule, x, s, steps, **options):
+        x, s, path_length = plain_rollout(rule, x, s, steps, **options)
+        if not torch.is_grad_enabled():
+            # A world that grows old sees 64 steps; the last one of them runs away.
+            assert steps == 64
+            x[-1] += 100.0
+            aged.append((x.clone(), s.clone(), [p.clone() for p in rule.parameters()]))
+        return x, s, path_length
+
+    fields = {"iterations": 7, "world_count": 2, "pool_size": 8, "milestones": [3], "decay": 0.25}
+    fields |= {"lifetimes": (900, 1000), "steps": (4, 5), "damage": False, "log_interval": 7}
+    config = circle_config(tmp_path, ageing_steps=170, ageing_interval=2, **fields)
+    trainer = trainer_of(config, rollout=rollout)
+    result = trainer.run(progress=False)
+    ages = trainer.pool.age
+    trained = 4 * 7 * 2
+    # Three quarters of 170 steps are two blocks, in iterations 4 and 6.
+    assert len(aged) == 4
+    assert ages[-1] < 16
+    assert int(ages[:4].sum()) + int((ages[4:7] - 256).sum()) + int(ages[-1]) <= trained
+    assert ages[:4].max() <= 28
+    assert ages[4:7].min() >= 256
+    assert result.record["replaced_worlds"] == 4
+    for before, after in itertools.pairwise(aged):
+        drawn_since = len(before[2]) == len(after[2])
+        assert drawn_since
+    # Blocks that follow each other begin where the one before ended, under the same weights.
+    assert all(torch.equal(a, b) for a, b in zip(aged[0][2], aged[1][2], strict=True))
+    assert not all(torch.equal(a, b) for a, b in zip(aged[1][2], aged[2][2], strict=True))
 
 
 @pytest.mark.parametrize("damage", [True, False])
