@@ -1,0 +1,102 @@
+"""The notebooks run on small settings, and are stored with what they showed on their own."""
+
+import ast
+import json
+import re
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import pytest
+import torch
+
+FOLDER = Path(__file__).resolve().parents[2] / "docs/notebooks"
+SMALL = {
+    "grow_and_hurt": {"particle_count": 256, "growth": 16, "healing": 16},
+    "own_loss": {"iterations": 2, "world_count": 2, "particle_count": 64, "watched": 6},
+    "hidden_channels": {"particle_count": 128, "growth": 16},
+    "species_and_ppo": {"particle_count": 256, "meeting": 2, "rounds": 1, "world_count": 4},
+}
+"""What the cell with the tag "parameters" assigns, small."""
+
+LARGEST = 300_000
+"""Bytes of a notebook, at most."""
+
+
+def cells(name: str, kind: str) -> list[dict]:
+    """The cells of a notebook that are of a kind."""
+    notebook = json.loads((FOLDER / f"{name}.ipynb").read_text())
+    return [cell for cell in notebook["cells"] if cell["cell_type"] == kind]
+
+
+def run_cell(source: str, names: dict) -> object:
+    """Run a cell as Jupyter does, and return what its last line is worth."""
+    tree = ast.parse(source)
+    last = tree.body.pop() if isinstance(tree.body[-1], ast.Expr) else None
+    exec(compile(tree, "cell", "exec"), names)
+    if last is None:
+        return None
+    return eval(compile(ast.Expression(last.value), "cell", "eval"), names)
+
+
+def test_every_notebook_is_tested():
+    assert sorted(SMALL) == sorted(path.stem for path in FOLDER.glob("*.ipynb"))
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_a_notebook_runs(name, capsys):
+    plt.switch_backend("Agg")
+    state = torch.random.get_rng_state()
+    names = {"__name__": "__main__"}
+    shown = 0
+    for cell in cells(name, "code"):
+        worth = run_cell("".join(cell["source"]), names)
+        if "parameters" in cell["metadata"].get("tags", ()):
+            assert set(SMALL[name]) <= set(names)
+            names |= SMALL[name]
+        if hasattr(worth, "_repr_mimebundle_"):
+            told = worth._repr_mimebundle_()
+            shown += "image/jpeg" in told or "text/html" in told
+    torch.random.set_rng_state(state)
+    # Where a notebook prints a number, it is one.
+    printed = capsys.readouterr().out
+    assert "nan" not in printed
+    stored = [out for cell in cells(name, "code") for out in cell["outputs"]]
+    assert bool(printed) == any(out["output_type"] == "stream" for out in stored)
+    figures = sum("image/png" in out.get("data", {}) for out in stored)
+    pictures = sum(
+        "image/jpeg" in out.get("data", {}) or "webp" in "".join(out["data"].get("text/html", ""))
+        for out in stored
+        if "data" in out
+    )
+    assert shown == pictures
+    assert figures == len(plt.get_fignums())
+    plt.close("all")
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_a_notebook_is_stored_as_it_ran(name):
+    assert (FOLDER / f"{name}.ipynb").stat().st_size < LARGEST
+    counts = [cell["execution_count"] for cell in cells(name, "code")]
+    assert counts == list(range(1, len(counts) + 1))
+    stored = [out for cell in cells(name, "code") for out in cell["outputs"]]
+    assert stored
+    assert not [out for out in stored if out["output_type"] == "error"]
+    assert not [out for out in stored if out.get("name") == "stderr"]
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_a_section_is_about_a_screen_long(name):
+    sections = []
+    for cell in json.loads((FOLDER / f"{name}.ipynb").read_text())["cells"]:
+        if cell["source"][0].startswith("#") and cell["cell_type"] == "markdown":
+            sections.append(0)
+        sections[-1] += len(cell["source"])
+    assert max(sections) <= 42, sections
+
+
+def test_an_own_loss_has_as_many_lines_as_is_said():
+    code = ["".join(cell["source"]) for cell in cells("own_loss", "code")]
+    (loss,) = (text[text.index("def loss") :] for text in code if "def loss" in text)
+    (training,) = (text for text in code if "optimiser.step" in text)
+    lines = [line for line in f"{loss}\n{training}".split("\n") if re.match(r"\s*[^\s#]", line)]
+    assert len(lines) == 25
