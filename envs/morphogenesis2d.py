@@ -80,19 +80,19 @@ class Morphogenesis2DEnv(NPAEnv):
 
     ## Description
 
-    A world holds N particles in the plane. Each has a position and a state of C numbers, of which
-    the last three, plus 0.5, are its colour: red, green and blue. In every step the policy tells
+    A world holds N particles in the plane. Each has a position and a state of C numbers. The last
+    three numbers, plus 0.5, are its colour: red, green and blue. In every step the policy tells
     each particle where to move and how to change its state. An episode begins with a small disk of
-    grey particles; at its end they should look like the target picture.
+    grey particles. At its end they should look like the target picture.
 
-    No particle sees the whole. A row of the observation tells what one particle perceives within
-    the radius ε around it, as averages that smoothed particle hydrodynamics (SPH) defines; it does
+    No particle sees the whole. A row of the observation holds what one particle perceives within
+    the radius ε around it, as averages that smoothed particle hydrodynamics (SPH) defines. It does
     not tell where the particle is, which one it is, or how many steps have passed. So a policy is
-    usually one small network, applied to every row alike.
+    usually one small network that is applied to every row.
 
-    That this can be done is known: update rules trained by gradient do it, and one is shipped.
-    `npa_envs.agents.RulePolicy(npa_envs.load_rule("gecko"), env)` makes a policy of it. The task is
-    2D morphogenesis of Neural Particle Automata, section 4.1 of the paper below.
+    The task can be solved: update rules trained by gradient do it, and some are shipped.
+    `npa_envs.agents.RulePolicy(npa_envs.load_rule("gecko"), env)` makes a policy of one. The task
+    is 2D morphogenesis of Neural Particle Automata, section 4.1 of the paper below.
 
     ## Observation space
 
@@ -120,12 +120,12 @@ class Morphogenesis2DEnv(NPAEnv):
     | `0 : 2` | displacement along x and y | α ε, a length | x ← x + dt α ε a |
     | `2 : 2 + C` | change of the state | `state_scale`, no unit | s ← s + dt `state_scale` a |
 
-    In every step each particle is updated with probability `update_prob`, on its own; the rows of
-    the others are ignored in this step. A displacement longer than 1 is shortened to length 1, and
-    state entries are clipped to [-1, 1]. A number that is not finite raises `NPAError` and leaves
-    the world as it was. An update rule's output [δ; Δs] is the action
-    [δ / (1 + |δ|); Δs / `state_scale`]; see [one step](../mathematics.md#one-step). A policy that
-    explores does better with `state_scale=0.1`: see [training](../training.md).
+    In every step each particle is updated with probability `update_prob`, independently of the
+    others. The rows of particles that are not updated are ignored in this step. A displacement
+    longer than 1 is shortened to length 1, and state entries are clipped to [-1, 1]. A number that
+    is not finite raises `NPAError` and leaves the world as it was. An update rule's output [δ; Δs]
+    is the action [δ / (1 + |δ|); Δs / `state_scale`]; see [one step](../mathematics.md#one-step). A
+    policy that explores does better with `state_scale=0.1`: see [training](../training.md).
 
     ## Reward
 

@@ -135,19 +135,19 @@ class Morphogenesis3DEnv(NPAEnv):
 
     ## Description
 
-    A world holds N particles in open 3D space. Each has a position and a state of C numbers, of
-    which the last three, plus 0.5, are its colour. An episode begins with grey particles all over a
-    ball; at its end they should be the target: a mushroom, a duck, a rocket, a doughnut, any mesh,
-    or a scene of which there are pictures. Particles are drawn as 3D Gaussians.
+    A world holds N particles in open 3D space. Each has a position and a state of C numbers. The
+    last three numbers, plus 0.5, are its colour. An episode begins with grey particles all over a
+    ball. At its end they should look like the target: a mushroom, a duck, a rocket, a doughnut, any
+    mesh, or a scene given by pictures. Particles are drawn as 3D Gaussians.
 
-    No particle sees the whole, nor knows where it is. As in `npa/Morphogenesis2D-v0` it perceives
-    its neighbourhood within the radius ε, and one small network, applied to every row of the
-    observation alike, is the usual policy. Rules are trained by gradient with `npa-envs train
+    No particle sees the whole or knows where it is. As in `npa/Morphogenesis2D-v0` it perceives its
+    neighbourhood within the radius ε. The usual policy is one small network that is applied to
+    every row of the observation. Rules are trained by gradient with `npa-envs train
     morphogenesis3d`; `npa_envs.agents.RulePolicy(npa_envs.load_rule("rule.safetensors"), env)`
-    makes a policy of one. Such a rule reads out of its states how particles look: give it as
-    `readout` too. Shipped ones want the worlds that they were trained in: `particle_count=16384`,
-    `state_dim=24`, `eps` and `eps0` 0.1, `alpha=1.0`, `seed_radius` 0.7 (the mushroom's 0.5),
-    `sigma=0.02`, `opacity=0.15`.
+    makes a policy of one. Such a rule also has a network that reads from the states how particles
+    look, so give it as `readout` too. Shipped rules need the worlds that they were trained in:
+    `particle_count=16384`, `state_dim=24`, `eps` and `eps0` 0.1, `alpha=1.0`, `seed_radius` 0.7
+    (the mushroom's 0.5), `sigma=0.02`, `opacity=0.15`.
 
     ## Observation space
 
@@ -173,17 +173,17 @@ class Morphogenesis3DEnv(NPAEnv):
     | `0 : 3` | displacement along x, y and z | α ε, a length | x ← x + dt α ε a |
     | `3 : 3 + C` | change of the state | `state_scale`, no unit | s ← s + dt `state_scale` a |
 
-    All else is as in `npa/Morphogenesis2D-v0`: only particles that are updated act, displacements
-    longer than 1 are shortened to length 1.
+    The rest is as in `npa/Morphogenesis2D-v0`: only particles that are updated act, and
+    displacements longer than 1 are shortened to length 1.
 
     ## Reward
 
-    `view_count` cameras, spread over a sphere, see the particles before grey. The loss L is the
-    mean absolute difference to what they should see, over red, green, blue and alpha; 0 is the
-    target. Formulas: [3D morphogenesis](../mathematics.md#3d-morphogenesis).
+    `view_count` cameras, spread over a sphere, see the particles in front of grey. The loss L is
+    the mean absolute difference from what they should see, over red, green, blue and alpha. 0 is
+    the target. Formulas: [3D morphogenesis](../mathematics.md#3d-morphogenesis).
 
-    A particle's own reward comes from how much better or worse, to first order, the views are for
-    its opacity.
+    A particle's own reward says how much its opacity makes the views better or worse, to first
+    order.
 
     ## Starting state
 
@@ -202,8 +202,8 @@ class Morphogenesis3DEnv(NPAEnv):
 
     ## Rendering
 
-    The camera goes round by two degrees a step. With a `readout` the style `"particles"` draws the
-    Gaussians that it says.
+    The camera goes round by two degrees a step. With a `readout` the style `"particles"` draws its
+    Gaussians.
 
     ## References
 

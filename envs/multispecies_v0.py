@@ -17,15 +17,14 @@ class MultiSpeciesEnv(CrowdEnv):
 
     ## Description
 
-    A world holds particles of K species in the plane, those of each one after the other. Each
-    particle has a position and a state of C numbers, of which the last three, plus 0.5, are its
-    colour. In every step each agent tells all of its particles where to move and how to change
-    their states.
+    A world holds particles of K species in the plane, species after species. Each particle has a
+    position and a state of C numbers. The last three numbers, plus 0.5, are its colour. In every
+    step each agent tells all of its particles where to move and how to change their states.
 
-    Particles perceive each other whatever their species, as in the paper: states and densities
-    around a particle are those of all. So species influence each other only by what they let others
-    perceive, and a species that wants to be told apart has to mark its particles by their states.
-    All of them perceive in one pass over the world.
+    As in the paper, particles perceive each other whatever their species: the states and densities
+    around a particle include all species. So species influence each other only by what others
+    perceive of them. A species that wants to be recognised has to mark its particles by their
+    states. All species perceive in one pass over the world.
 
     | `task` | Id | What it is about |
     |---|---|---|
@@ -35,18 +34,18 @@ class MultiSpeciesEnv(CrowdEnv):
     | `"invasion"` | `npa/Invasion-v0` | species 0 grows a picture, the others keep it from it |
     | `"symbiosis"` | `npa/Symbiosis-v0` | all grow one picture that takes all particles |
 
-    `parallel_env` has all agents act at once. `env` and `raw_env` have them act in turn, by
-    PettingZoo's own conversion: the world moves on after the last one; `env` also clips actions
+    In `parallel_env` all agents act at once. In `env` and `raw_env` they act in turn, by
+    PettingZoo's own conversion, and the world moves on after the last one. `env` also clips actions
     into their space. The ids are for `pettingzoo.make`, of PettingZoo 1.27 or newer, once
-    `npa_envs.envs.multispecies_v0` is imported: both `"parallel"` and `"aec"` are there. `batched`
-    steps [many worlds at once](../species.md#many-worlds-at-once), to train on.
+    `npa_envs.envs.multispecies_v0` is imported. Both `"parallel"` and `"aec"` are registered.
+    `batched` steps [many worlds at once](../species.md#many-worlds-at-once), to train on.
 
     A trained rule is a policy for one species:
-    `npa_envs.agents.RulePolicy(npa_envs.load_rule("gecko"))`. Where all species follow the same
-    rule, the episode is its rollout. That species disturb each other can be seen in an invasion by
-    the defaults: after 150 steps of this rule the loss of species 0 was 0.66 beside invaders that
-    did nothing, 0.85 beside some that followed the same rule, and 0.94 beside some that acted at
-    random (means of three seeds).
+    `npa_envs.agents.RulePolicy(npa_envs.load_rule("gecko"))`. If all species follow the same rule,
+    the episode is a rollout of it. An invasion with the defaults shows that species disturb each
+    other: after 150 steps of this rule the loss of species 0 was 0.66 beside invaders that did
+    nothing, 0.85 beside invaders that followed the same rule, and 0.94 beside invaders that acted
+    at random (means of three seeds).
 
     ## Observation space
 
@@ -55,17 +54,17 @@ class MultiSpeciesEnv(CrowdEnv):
     [`npa/Morphogenesis2D-v0`](Morphogenesis2D.md#observation-space). Nothing tells a particle's
     species.
 
-    With `perception="per_species"` K (1 + D) columns follow: what particles perceive of each
-    species, its density c² ρ_k / N for k = 0, 1, ..., and then, species after species, its density
-    gradient, scaled as that of all is. A species that is gone has zeros there. It takes a second
-    pass over the world. See [several rules in one world](../species.md#telling-species-apart).
+    With `perception="per_species"` K (1 + D) more columns follow: the density c² ρ_k / N of each
+    species k = 0, 1, ..., and then, species after species, its density gradient, scaled like that
+    of all particles. A species that is gone has zeros there. This takes a second pass over the
+    world. See [several rules in one world](../species.md#telling-species-apart).
 
     ## Action space
 
     `Box(-1, 1, (N_k, A), float32)` with A = 2 + C, for species k. The columns, and what they do,
     are those of [`npa/Morphogenesis2D-v0`](Morphogenesis2D.md#action-space). Every live agent has
-    to give an action, and no other may: see `agents`. What is missing, unwanted, of another shape
-    or not finite raises `NPAError` and leaves the world as it was.
+    to give an action, and no other agent may: see `agents`. An action that is missing, superfluous,
+    of another shape or not finite raises `NPAError` and leaves the world as it was.
 
     ## Reward
 
@@ -80,19 +79,19 @@ class MultiSpeciesEnv(CrowdEnv):
     | symbiosis | for all: the splat loss of all particles | `density`, `colour` |
 
     The entropy around a particle is -Σ f_k ln f_k / ln K, where f_k is the share of species k among
-    the SPH-weighted neighbours within ε, itself included: 0 where it sees its own species alone, 1
-    where it sees all in equal parts. K counts the species that there were at the start. The splat
-    loss is that of [`npa/Morphogenesis2D-v0`](Morphogenesis2D.md#reward); it moves a picture's
-    middle onto the target's, so where the whole thing lies does not count.
+    the SPH-weighted neighbours within ε, itself included. It is 0 if the particle sees only its own
+    species, and 1 if it sees all species in equal parts. K is the number of species at the start.
+    The splat loss is that of [`npa/Morphogenesis2D-v0`](Morphogenesis2D.md#reward). It moves a
+    picture's middle onto the target's, so it does not count where the picture lies.
 
-    With `reward="team"` every live agent is paid the mean of all; the parts in `info` stay its own.
-    In an invasion rewards sum to zero: what species 0 gains, the live invaders lose in equal parts,
-    and "team" is refused.
+    With `reward="team"` every live agent gets the mean of all rewards; the parts in `info` stay its
+    own. In an invasion rewards sum to zero: species 0 gains as much as the live invaders lose, in
+    equal parts. There "team" is refused.
 
-    Rewards telescope but for deaths: particles that are taken out change the others' losses, which
-    is nobody's merit and not paid. In the step in which a species leaves the world L_k counts as at
-    least its value at the start and what deaths added to it, so that leaving never pays; the parts
-    in `info` are as they are.
+    Rewards telescope, except at deaths: taking particles out changes the losses of others, and this
+    change is not rewarded. In the step in which a species leaves the world, L_k counts as at least
+    its value at the start plus what deaths added to it. So leaving never pays. The parts in `info`
+    are not changed by this.
 
     ## Starting state
 
@@ -110,11 +109,11 @@ class MultiSpeciesEnv(CrowdEnv):
     | one side of an invasion is gone | all | terminated | `"no opponent"` |
     | `max_cycles` steps are done | all | truncated | `"time limit"` |
 
-    A particle is out of bounds where a coordinate is held at ±`position_limit` or a state at
-    ±`observation_limit`; while others of its species are not, it stays and may come back. A species
-    that ends is taken out of `agents` and, but for the survivors of an invasion, out of the world:
-    the observations that the others get in that step are already without it, its own last one is
-    with it. No species comes back before `reset`.
+    A particle is out of bounds if a coordinate is held at ±`position_limit` or a state at
+    ±`observation_limit`. As long as others of its species are within bounds, it stays and may come
+    back. A species that ends is taken out of `agents` and, except for the survivors of an invasion,
+    out of the world. The observations that the others get in that step no longer show it; its own
+    last observation still does. No species comes back before `reset`.
 
     ## Info
 
@@ -131,9 +130,9 @@ class MultiSpeciesEnv(CrowdEnv):
     ## State
 
     `state()` is for central critics: float32, shape [N, 2 + C + 1], a row [position; state; 1] for
-    each particle that the episode began with, zeros for those that are gone. `state_space` is its
-    space. `particles()` returns positions and states of those that are there, and
-    `place_particles(x, s)` replaces them, at no reward.
+    each particle that the episode began with, and zeros for particles that are gone. `state_space`
+    is its space. `particles()` returns positions and states of the particles that are there, and
+    `place_particles(x, s)` replaces them, without a reward.
 
     ## Rendering
 
@@ -144,9 +143,9 @@ class MultiSpeciesEnv(CrowdEnv):
 
     ## Arguments
 
-    `task` and `species_count` come first, all else is by keyword, in `parallel_env`, `env`,
-    `raw_env` and `pettingzoo.make` alike. An unknown name, or a value out of range, raises an
-    `NPAError` that says what would be right.
+    `task` and `species_count` come first, and all else is given by keyword. This holds for
+    `parallel_env`, `env`, `raw_env` and `pettingzoo.make`. An unknown name, or a value out of
+    range, raises an `NPAError` that says what would be right.
 
     ## Version history
 

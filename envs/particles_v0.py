@@ -29,10 +29,10 @@ class ParticlesEnv(CrowdEnv):
 
     ## Description
 
-    The worlds and tasks of [several species](MultiSpecies.md), with the same seeds and the same
-    physics, but every particle is an agent: `particle_0`, `particle_1`, ... in the order of their
-    species. `info["species"]` tells which one it is of. Each agent costs places in five dicts a
-    step, so there are at most 512; beyond, let species be the agents.
+    These are the worlds and tasks of [several species](MultiSpecies.md), with the same seeds and
+    the same physics. But every particle is an agent: `particle_0`, `particle_1`, ... in the order
+    of their species. `info["species"]` tells its species. Each agent needs places in five dicts a
+    step, so there are at most 512. For more particles, let species be the agents.
 
     | `task` | Id |
     |---|---|
@@ -65,9 +65,10 @@ class ParticlesEnv(CrowdEnv):
     | invasion | species 0: its share of the splat loss; others: -Σ / their number | `picture` |
     | symbiosis | its share of the splat loss of all particles | `picture` |
 
-    A share comes from the errors of the pixels that a particle covers; what nobody covers is shared
-    by all alike. The mean of all shares is the splat loss, up to rounding, and Σ is their sum. With
-    `reward="team"` every particle is paid the mean of all. In an invasion rewards sum to zero.
+    A share comes from the errors of the pixels that a particle covers. Errors of pixels that no
+    particle covers are shared equally. The mean of all shares is the splat loss, up to rounding,
+    and Σ is their sum. With `reward="team"` every particle gets the mean of all rewards. In an
+    invasion rewards sum to zero.
 
     ## Starting state
 

@@ -149,23 +149,24 @@ class PointClassificationEnv(NPAEnv):
 
     ## Description
 
-    A world holds N particles that lie on the ink of a digit, spread evenly over it, and stay where
-    they are. Each has a state of C numbers, zero at first. Step by step the particles have to find
-    out what they form, and every one of them has to say it: the last `class_count` channels of a
-    state are what its particle says of class 0, 1, ..., and should be 1 for the digit's own class
-    and 0 for all others.
+    A world holds N particles that lie evenly spread on the ink of a digit and stay where they are.
+    Each has a state of C numbers, zero at first. Step by step the particles have to find out which
+    digit they form, and each of them has to say it. The last `class_count` channels of a state are
+    the particle's answer for class 0, 1, ...: they should be 1 for the digit's own class and 0 for
+    all others.
 
     No particle sees more than its neighbourhood within the radius ε, and the digit is ten times as
-    large: news have to travel. As in `npa/Morphogenesis2D-v0` one small network, applied to every
-    row of the observation alike, is the usual policy. Rules are trained by gradient with `npa-envs
-    train point_classification`; they say classes through a read-out network, so to run one as a
-    policy give its file to the environment as well: `gym.make(id, rule="rule.safetensors")` with
+    large. So news has to travel. As in `npa/Morphogenesis2D-v0` the usual policy is one small
+    network that is applied to every row of the observation. Rules are trained by gradient with
+    `npa-envs train point_classification`. They give their answers through a read-out network. So to
+    run one as a policy, give its file to the environment as well: `gym.make(id,
+    rule="rule.safetensors")` with
     `npa_envs.agents.RulePolicy(npa_envs.load_rule("rule.safetensors"), env)`. The task is that of
     Neural Particle Automata, "self-classifying point clouds".
 
-    `data="digits"` needs `pip install 'npa-envs[points]'`; see
-    [point clouds](../point_classification.md) for MNIST and data of one's own. The observation
-    space is that of `Morphogenesis2DEnv`.
+    `data="digits"` needs `pip install 'npa-envs[points]'`; see [point
+    clouds](../point_classification.md) for MNIST and data of your own. The observation space is
+    that of `Morphogenesis2DEnv`.
 
     ## Action space
 
@@ -175,10 +176,11 @@ class PointClassificationEnv(NPAEnv):
     |---|---|---|---|
     | `0 : C` | change of the state | `state_scale`, no unit | s ← s + dt `state_scale` a |
 
-    In every step each particle is updated with probability `update_prob`, on its own; the rows of
-    the others are ignored in this step. Entries are clipped to [-1, 1]. A number that is not finite
-    raises `NPAError` and leaves the world as it was. An update rule's output Δs is the action
-    Δs / `state_scale`; see [one step](../mathematics.md#one-step).
+    In every step each particle is updated with probability `update_prob`, independently of the
+    others. The rows of particles that are not updated are ignored in this step. Entries are clipped
+    to [-1, 1]. A number that is not finite raises `NPAError` and leaves the world as it was. An
+    update rule's output Δs is the action Δs / `state_scale`; see [one
+    step](../mathematics.md#one-step).
 
     ## Reward
 
@@ -186,16 +188,16 @@ class PointClassificationEnv(NPAEnv):
     plus `overflow_weight` times the mean of |s − clip(s, −1, 1)|. Blank states have
     L = 1 / `class_count`.
 
-    A particle's own reward is its own loss's.
+    A particle's own reward is how much its own loss fell.
 
     ## Starting state
 
-    A random cloud of the `split`, turned, stretched and shaken as `rotation`, `stretch` and
-    `jitter` say; all states are zero. `place_particles` leaves a world the class that it has.
+    A random cloud of the `split`, which is turned, stretched and shaken as `rotation`, `stretch`
+    and `jitter` say. All states are zero. After `place_particles` a world keeps its class.
 
     ## Episode end
 
-    `success_loss` is None by default. No particle moves, so that none leaves the world.
+    `success_loss` is None by default. No particle moves, so none leaves the world.
 
     ## Info
 
@@ -206,8 +208,8 @@ class PointClassificationEnv(NPAEnv):
 
     ## Rendering
 
-    A particle has the colour of the class that it says, greyer the less sure it is, and [0, 1] ×
-    [0, 1] with a little room around it is shown in place of the square named below.
+    A particle has the colour of the class that it says, and is greyer the less sure it is. The
+    picture shows [0, 1] × [0, 1] with a little room around it, instead of the square named below.
     """
 
     task_type = PointClassificationTask

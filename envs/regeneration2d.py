@@ -172,23 +172,23 @@ class Regeneration2DEnv(NPAEnv):
 
     ## Description
 
-    A picture was grown from N particles, and then hurt: a disk lost its state, a knife went
+    A picture was grown from N particles and then damaged: a disk lost its state, a knife went
     through it, or a disk was drawn together. The policy tells each particle where to move and how
     to change its state, so that the picture becomes whole again. As in `npa/Morphogenesis2D-v0`, a
-    particle perceives its neighbourhood alone: nobody tells it that there was damage.
+    particle perceives only its neighbourhood. Nobody tells it that there was damage.
 
-    Update rules that grow pictures can also heal them. The worlds are what such a rule has grown,
-    so that their hidden states mean something to it;
-    `npa_envs.agents.RulePolicy(npa_envs.load_rule("gecko"), env)` shows what it can do. To another
-    policy these hidden states are somebody else's notes: `rule="picture"` starts from the target's
-    own points instead, with blank hidden states. Spaces, reward and `info` are those of
-    `Morphogenesis2DEnv`.
+    Update rules that grow pictures can also heal them. Such a rule has grown these worlds, so their
+    hidden states mean something to it, and `npa_envs.agents.RulePolicy(npa_envs.load_rule("gecko"),
+    env)` shows what it can do. Another policy cannot read these hidden states. With
+    `rule="picture"` episodes start from the target's own points instead, with blank hidden states.
+    Spaces, reward and `info` are those of `Morphogenesis2DEnv`.
 
     ## Starting state
 
-    The rule grows a world for `grow_steps` steps from a disk of blank particles, and one kind of
-    damage is done to it. With the default `seed_pool=4` there are four grown worlds, made at the
-    first reset, which takes some seconds on a CPU; the damage is drawn anew for each episode.
+    The rule grows a world for `grow_steps` steps from a disk of blank particles. Then one kind of
+    damage is done to it. With the default `seed_pool=4` there are four grown worlds. They are made
+    at the first reset, which takes some seconds on a CPU. The damage is drawn anew for each
+    episode.
 
     | `damage` | What is done |
     |---|---|
@@ -203,9 +203,9 @@ class Regeneration2DEnv(NPAEnv):
 
     ## Episode end
 
-    The episode ends in success once `healed_share` of what the damage added to the loss is gone;
-    with `success_loss` given, once the loss is at most this instead. Damage that raises the loss by
-    less than 2 % cannot be healed, so that the episode runs to its limit.
+    The damage adds to the loss. The episode ends in success once `healed_share` of this addition is
+    gone. If you give `success_loss`, it ends once the loss is at most this instead. If damage
+    raises the loss by less than 2 %, there is nothing to heal, and the episode runs to its limit.
     """
 
     task_type = RegenerationTask

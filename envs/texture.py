@@ -92,29 +92,29 @@ class TextureEnv(NPAEnv):
 
     ## Description
 
-    A world holds N particles in a periodic box: what leaves it on one side comes in on the other.
-    Each has a position and a state of C numbers, of which the last three, plus 0.5, are its colour.
-    An episode begins with grey particles scattered over the box; at its end they should look like
-    the target, wherever its parts lie: dots, bubbles or meshes where particles gather and leave
-    places empty, cells or stripes in colours alone.
+    A world holds N particles in a periodic box: a particle that leaves it on one side comes in on
+    the other. Each has a position and a state of C numbers. The last three numbers, plus 0.5, are
+    its colour. An episode begins with grey particles scattered over the box. At its end they should
+    look like the target. It does not matter where the parts of the pattern lie. For dots, bubbles
+    and meshes particles gather and leave places empty; cells and stripes are made of colours alone.
 
-    No particle sees the whole, nor knows where it is. As in `npa/Morphogenesis2D-v0` it perceives
-    its neighbourhood within the radius ε, and one small network, applied to every row of the
-    observation alike, is the usual policy. Rules for textures are trained by gradient with
-    `npa-envs train texture`; `npa_envs.agents.RulePolicy(npa_envs.load_rule("rule.safetensors"),
-    env)` makes a policy of one. Spaces are those of `Morphogenesis2DEnv`.
+    No particle sees the whole or knows where it is. As in `npa/Morphogenesis2D-v0` it perceives its
+    neighbourhood within the radius ε. The usual policy is one small network that is applied to
+    every row of the observation. Rules for textures are trained by gradient with `npa-envs train
+    texture`; `npa_envs.agents.RulePolicy(npa_envs.load_rule("rule.safetensors"), env)` makes a
+    policy of one. Spaces are those of `Morphogenesis2DEnv`.
 
     ## Reward
 
     The particles' picture, which has no seam, is compared with the target on `resolution` ×
-    `resolution` pixels by a texture loss, which does not ask what lies where: whether patches of
-    all sizes (`"patch_swd"`), answers of random filters (`"filter_swd"`), or features of VGG16
-    (`"vgg_ot"`) are distributed alike. The loss L is the sum of that of the colour image, times
-    `colour_weight`, and that of the density image, times `density_weight`; 0 is the same texture.
-    Formulas: [textures](../mathematics.md#textures).
+    `resolution` pixels. The texture loss ignores where things lie. It compares how patches of
+    several sizes (`"patch_swd"`), answers of random filters (`"filter_swd"`), or features of VGG16
+    (`"vgg_ot"`) are distributed. The loss L is `colour_weight` times the loss of the colour image
+    plus `density_weight` times the loss of the density image. 0 is the same texture. Formulas:
+    [textures](../mathematics.md#textures).
 
-    A particle's own reward comes from how much better or worse, to first order, the texture is for
-    what the particle adds to the picture.
+    A particle's own reward says how much its part of the picture makes the texture better or worse,
+    to first order.
 
     ## Starting state
 
@@ -133,8 +133,8 @@ class TextureEnv(NPAEnv):
 
     ## Vectorized environment
 
-    With `loss="vgg_ot"` and `reward="particle"` particles' own rewards may differ in their last
-    bits from one number of worlds to another; nothing else does.
+    With `loss="vgg_ot"` and `reward="particle"`, particles' own rewards may depend in their last
+    bits on the number of worlds. Nothing else does.
     """
 
     task_type = TextureTask

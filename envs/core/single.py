@@ -33,7 +33,7 @@ class NPAEnv(gymnasium.Env[Any, Any]):
 
     Keywords are the fields of the task's configuration. An unknown or wrong one, or a world that
     does not fit into memory, raises `NPAError`. The sections below belong to the docstring of every
-    subclass, after what it says there of its own.
+    subclass, after its own sections of the same name.
 
     ## Reward
 
@@ -44,9 +44,9 @@ class NPAEnv(gymnasium.Env[Any, Any]):
     | `"particle"` | as dense; besides, `info["particle_reward"]` has each particle's own |
 
     Dense rewards telescope: their sum over an episode is L at its start minus L at its end. So the
-    undiscounted return is largest where the last world is best, whatever the way there. The mean of
-    all particles' own rewards is the dense reward, up to rounding. In a step that diverges L counts
-    as at least its value at the start, so that it never pays; the parts in `info` are as they are.
+    undiscounted return depends only on the first and the last world. The mean of all particles' own
+    rewards is the dense reward, up to rounding. In a step that diverges, L counts as at least its
+    value at the start, so diverging never pays. The parts in `info` are not changed by this.
 
     ## Starting state
 
@@ -61,9 +61,10 @@ class NPAEnv(gymnasium.Env[Any, Any]):
     | a particle has left the world, or its state has run away | terminated | `"diverged"` |
     | `max_episode_steps` steps are done | truncated | `"time limit"` |
 
-    A particle has left where a coordinate is beyond ±`position_limit`, and its state has run away
-    beyond ±`observation_limit`. With a step limit of your own instead of `max_episode_steps`, such
-    as another library's, tell `reward="sparse"` the number of steps as `episode_steps`.
+    A particle has left the world if a coordinate is beyond ±`position_limit`. Its state has run
+    away if a number is beyond ±`observation_limit`. If something else than `max_episode_steps`
+    limits the steps, such as another library, tell `reward="sparse"` the number of steps as
+    `episode_steps`.
 
     ## Info
 
@@ -79,8 +80,8 @@ class NPAEnv(gymnasium.Env[Any, Any]):
     `render_mode="rgb_array"` makes uint8 pictures of shape [R, R, 3], R = `render_size`, that show
     [-1, 1] × [-1, 1] with y up. `render_mode="human"` shows them in a window while the environment
     is stepped; it needs `pip install 'npa-envs[human]'` and a screen: without one, it warns once
-    and goes on. `render_style` chooses between the particles' colours, how dense they lie, and
-    their hidden channels.
+    and goes on. `render_style` chooses between the particles' colours, their density, and their
+    hidden channels.
 
     ## Arguments
 
@@ -94,8 +95,8 @@ class NPAEnv(gymnasium.Env[Any, Any]):
     flags [B]. World k after `reset(seed=s)` is the single environment after `reset(seed=s + k)`,
     bit for bit, for every B.
 
-    - With `output="torch"` everything that comes out is a tensor on the device, and actions may be
-      tensors as well: nothing but the episodes' ends is copied to the host.
+    - With `output="torch"` all results are tensors on the device, and actions may be tensors as
+      well. Only the ends of episodes are copied to the host.
     - Infos are arrays of shape [B], each with a mask of the same name behind an underscore, as
       Gymnasium's vector environments have them.
     - With `autoreset_mode="same-step"`, the default, a world whose episode is over starts the next
