@@ -33,9 +33,9 @@ from page_parts import (
 
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
-from npa_envs.envs.core.spaces import action_space, observation_space
+from npa_envs.envs.core.spaces import Rows
 from npa_envs.envs.core.vector import NPAVectorEnv
-from npa_envs.registration import ENVIRONMENTS, Registration
+from npa_envs.registration import ENVIRONMENTS, GARDENS, Registration
 
 DOCS = Path(__file__).resolve().parent
 PAGES = DOCS / "environments"
@@ -64,9 +64,14 @@ def environment_class(registration: Registration) -> type[NPAEnv]:
 
 def resolved_sections(env_class: type) -> dict[str, str]:
     """Return the sections with what is said of all environments, in one order."""
-    own, first, shared = map(sections, (env_class, environment_class(ENVIRONMENTS[0]), NPAEnv))
+    own = sections(env_class)
+    first = sections(environment_class(ENVIRONMENTS[0]))
+    shared = sections(NPAEnv)
+    order = [name for name in (first | shared) if name]
+    if env_class.form_type is not Rows:
+        first, shared = {}, shared | sections(env_class.__mro__[1])
     found = {"": own[""]}
-    for heading in [name for name in (first | shared) if name]:
+    for heading in order:
         parts = own.get(heading) or first.get(heading), shared.get(heading)
         found[heading] = "\n\n".join(part for part in parts if part)
     return found
@@ -145,14 +150,13 @@ def page(registration: Registration) -> str:
     config = task.config_type()
     physics = config.physics(task.space_dim, static=task.static)
     count = config.particle_count
-    spaces = {
-        "Observation space": observation_space(physics, count),
-        "Action space": action_space(physics, count),
-    }
+    form = env_class.form_type(physics, config)
+    spaces = {"Observation space": form.observation_space, "Action space": form.action_space}
     letters = {"C": config.state_dim, "D": task.space_dim, "N": count}
     text = resolved_sections(env_class)
-    for heading, space in spaces.items():
-        text[heading] = numbered_columns(text[heading], letters, space.shape[1])
+    if env_class.form_type is Rows:
+        for heading, space in spaces.items():
+            text[heading] = numbered_columns(text[heading], letters, space.shape[1])
     text["Arguments"] += "\n\n" + argument_tables(task.config_type)
     text["Vectorized environment"] += "\n\n" + vector_table()
     facts = table(
@@ -179,7 +183,7 @@ def picture(registration: Registration) -> str:
 def index() -> str:
     """Return the list of the pages, Markdown."""
     rows: list[tuple[str, ...]] = []
-    for registration in ENVIRONMENTS:
+    for registration in (*ENVIRONMENTS, *GARDENS):
         text = sections(environment_class(registration))[""]
         rows.append((f"[`{registration.id}`]({registration.name}.md)", text))
     opening = (
@@ -194,7 +198,8 @@ def index() -> str:
 
 def pages() -> dict[str, str]:
     """Return all pages by their file names."""
-    made = {f"{registration.name}.md": page(registration) for registration in ENVIRONMENTS}
+    listed = (*ENVIRONMENTS, *GARDENS)
+    made = {f"{registration.name}.md": page(registration) for registration in listed}
     return made | species_pages.pages() | {"README.md": index()}
 
 

@@ -9,6 +9,7 @@ anew when an environment changes.
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,8 +18,9 @@ import numpy as np
 from films import FPS, IMAGES, STILL, Frame
 
 from npa_envs import load_rule
-from npa_envs.agents import Policy, RulePolicy, SpreadPolicy
-from npa_envs.registration import ENVIRONMENTS, Registration
+from npa_envs.agents import RulePolicy, SpreadPolicy
+from npa_envs.agents.gardening import GradientGardener, ScriptedGardener, StillGardener
+from npa_envs.registration import ENVIRONMENTS, GARDENS, Registration
 from npa_envs.render import write_filmstrip, write_webp
 
 PICTURE_SIZE = 192
@@ -41,10 +43,10 @@ class Film(NamedTuple):
     """What one sees."""
 
     rule: str | None = "gecko"
-    """The shipped rule that acts; None: `policy`."""
+    """The shipped rule that acts; None: `policies`."""
 
-    policy: type[Policy] = SpreadPolicy
-    """What acts where no rule does."""
+    policies: tuple[Callable[[Any], Callable[[Any], Any]], ...] = (SpreadPolicy,)
+    """What acts in each row where no rule does, made for its environment."""
 
 
 def film_steps(last: int) -> list[int]:
@@ -96,6 +98,14 @@ FILMS = {
         caption="An episode of the shipped rule `duck`, while the camera goes round.",
         rule="duck",
     ),
+    "Gardener2D": Film(
+        steps=(0, 4, 8, 16, 24, 32),
+        rows=({}, {}, {}),
+        caption="The same weather three times: nobody does anything, `ScriptedGardener` pushes, "
+        "`GradientGardener` plans.",
+        rule=None,
+        policies=(StillGardener, ScriptedGardener, GradientGardener),
+    ),
 }
 """By the names of the environments."""
 
@@ -110,9 +120,7 @@ def film_path(registration: Registration) -> Path:
     return picture_path(registration).with_suffix(".webp")
 
 
-def film_episode(
-    registration: Registration, film: Film, keywords: dict[str, Any], size: int
-) -> dict[int, Frame]:
+def film_episode(registration: Registration, film: Film, row: int, size: int) -> dict[int, Frame]:
     """Return the pictures of one episode, uint8, shape [size, size, 3], by step."""
     last = max(film.steps)
     env = gymnasium.make(
@@ -121,9 +129,9 @@ def film_episode(
         render_mode="rgb_array",
         render_size=size,
         success_loss=0.0,
-        **keywords,
+        **film.rows[row],
     )
-    policy = film.policy(env) if film.rule is None else RulePolicy(load_rule(film.rule), env)
+    policy = film.policies[row](env) if film.rule is None else RulePolicy(load_rule(film.rule), env)
     observation, _ = env.reset(seed=SEED)
     shown = {*film.steps, *film_steps(last)}
     frames = {}
@@ -143,11 +151,12 @@ def caption(keywords: dict[str, Any], step: int) -> str:
 
 def main(names: list[str]) -> None:
     """Draw the pictures and films of the environments, all of them if none is named."""
-    for registration in ENVIRONMENTS:
+    for registration in (*ENVIRONMENTS, *GARDENS):
         if names and registration.name not in names:
             continue
         film = FILMS[registration.name]
-        strips = [film_episode(registration, film, row, PICTURE_SIZE) for row in film.rows]
+        rows = range(len(film.rows))
+        strips = [film_episode(registration, film, row, PICTURE_SIZE) for row in rows]
         write_filmstrip(
             picture_path(registration),
             [frames[step] for frames in strips for step in film.steps],
@@ -155,7 +164,7 @@ def main(names: list[str]) -> None:
             columns=len(film.steps),
         )
         size = FILM_SIZE[len(film.rows)]
-        worlds = [film_episode(registration, film, row, size) for row in film.rows]
+        worlds = [film_episode(registration, film, row, size) for row in rows]
         steps = film_steps(max(film.steps))
         write_webp(
             film_path(registration),

@@ -11,14 +11,13 @@ from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import Start
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.envs.core.worlds import total
-from npa_envs.envs.morphogenesis2d import Morphogenesis2DEnvConfig, PictureTask
+from npa_envs.envs.grown import GrownConfig, GrownTask
+from npa_envs.envs.morphogenesis2d import PictureTask
 from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.rule.files import load_rule, shipped_rules
-from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
+from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.checks import check_fraction, check_positive
 from npa_envs.tasks.damage import damage_worlds
-from npa_envs.world.randomness import Purpose, WorldRandom
-from npa_envs.world.rollout import rollout
+from npa_envs.world.randomness import WorldRandom
 
 RANDOM_DAMAGE = "random"
 """Each episode draws its kind of damage."""
@@ -37,12 +36,10 @@ PICTURE = "picture"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Regeneration2DEnvConfig(Morphogenesis2DEnvConfig):
+class Regeneration2DEnvConfig(GrownConfig):
     """What 2D regeneration can be told besides."""
 
-    seed_pool: int = 4
-    """Episodes start from one of so many grown worlds, made once; 0: from a new one each time,
-    which takes `grow_steps` steps of the rule."""
+    without_rule = f", or rule={shown(PICTURE)} to start from the target's own points"
 
     episode_steps: int = 128
     """As elsewhere; it equals the registered `max_episode_steps`."""
@@ -59,9 +56,6 @@ class Regeneration2DEnvConfig(Morphogenesis2DEnvConfig):
     """What grows the worlds: a shipped rule, a rule's file, or "picture" to start from the target's
     own points with blank hidden states; None: the shipped rule with the target's name."""
 
-    grow_steps: int = 256
-    """Steps of the rule from the seed to the grown world."""
-
     healed_share: float = 0.8
     """The episode ends in success once so much of what the damage added to the loss is gone, unless
     `success_loss` is given (dimensionless, in (0, 1])."""
@@ -73,33 +67,30 @@ class Regeneration2DEnvConfig(Morphogenesis2DEnvConfig):
         if self.damage not in kinds:
             hint = suggest(self.damage, kinds)
             raise NPAError(f"damage must be a known kind, got {shown(self.damage)}: {hint}")
-        check_positive(self, int, "grow_steps")
         check_fraction(self, "healed_share")
         if self.damage_size is not None:
             check_positive(self, float, "damage_size")
 
 
-class RegenerationTask(PictureTask[Regeneration2DEnvConfig]):
+class RegenerationTask(GrownTask[Regeneration2DEnvConfig]):
     """A grown picture, damaged."""
 
     config_type = Regeneration2DEnvConfig
 
     def __init__(self, config: Regeneration2DEnvConfig, device: torch.device) -> None:
         super().__init__(config, device)
-        self._rule = None if config.rule == PICTURE else self._load_rule()
+        self._drawn = config.rule == PICTURE
+        if not self._drawn:
+            _ = self.rule
 
     def seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
         """Return grown worlds, not damaged yet."""
-        x, s = super().seed(random)
-        if self._rule is None:
-            return self._picture_worlds(x, s)
-        grown = [self._grow(x[k : k + 1], s[k : k + 1], random, k) for k in range(len(x))]
-        return torch.cat([x for x, _ in grown]), torch.cat([s for _, s in grown])
+        return self._picture_worlds(random) if self._drawn else super().seed(random)
 
     @property
     def start_is_short(self) -> bool:
         """Whether a start takes few operations: not where it grows a world."""
-        return self._rule is None or self.config.seed_pool > 0
+        return self._drawn or super().start_is_short
 
     def start(self, random: WorldRandom) -> Start:
         """Return damaged worlds; they are healed once their loss is near the undamaged one."""
@@ -125,46 +116,13 @@ class RegenerationTask(PictureTask[Regeneration2DEnvConfig]):
     def _loss(self, x: Tensor, s: Tensor) -> Tensor:
         return total(torch.stack(list(self.losses(x, s).values())))
 
-    @torch.no_grad()
-    def _grow(self, x: Tensor, s: Tensor, random: WorldRandom, k: int) -> tuple[Tensor, Tensor]:
-        """Grow world k alone: a rule's products change in the last bit with the batch's size."""
-        assert self._rule is not None, "worlds of the target's points are not grown"
-        return rollout(
-            self._rule,
-            x,
-            s,
-            self.config.grow_steps,
-            eps=self.config.eps,
-            box=self.config.box,
-            update_prob=self.config.update_prob,
-            generator=random.take(slice(k, k + 1)).beside(Purpose.GROWTH),
-        )
-
-    def _picture_worlds(self, x: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+    def _picture_worlds(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
+        x, s = PictureTask.seed(self, random)
         points, colours = self.goal.target.points, self.goal.target.colours
         # The target's points are about as many as the particles: some stand twice, or are left out.
         chosen = torch.linspace(0, len(points) - 1, x.shape[1], device=x.device).round().long()
         s[..., -3:] = colours[chosen] - COLOUR_OFFSET
         return points[chosen].expand_as(x).clone(), s
-
-    def _load_rule(self) -> NPARule:
-        config = self.config
-        if config.rule is None and config.target not in (known := shipped_rules("morphogenesis2d")):
-            raise NPAError(
-                "rule must say what grows the worlds, as no shipped rule grows "
-                f"{shown(config.target)} "
-                f"({', '.join(known)}): give rule='PATH', or rule={shown(PICTURE)} to start "
-                "from the target's own points"
-            )
-        rule = load_rule(config.rule or config.target, device=self.device)
-        wanted = {"space_dim": 2, "state_dim": config.state_dim, "static": False}
-        for name, value in wanted.items():
-            if getattr(rule, name) != value:
-                raise NPAError(
-                    f"rule must have {name}={value} like the world, got {getattr(rule, name)}: "
-                    "choose another rule, or the same state_dim"
-                )
-        return rule
 
 
 class Regeneration2DEnv(NPAEnv):

@@ -48,12 +48,15 @@ ENVIRONMENTS = (
     ),
     Registration("npa/Morphogenesis3D-v0", "npa_envs.envs.morphogenesis3d", "Morphogenesis3D", 128),
 )
-"""All of them. A change of behaviour is a new version of the id."""
+"""Where an action has a row for each particle. A change of behaviour is a new version of the id."""
+
+GARDENS = (Registration("npa/Gardener2D-v0", "npa_envs.envs.gardener2d", "Gardener2D", 32),)
+"""Where a trained rule runs the particles, and an action says what few brushes do."""
 
 
 def register_environments() -> None:
     """Put the table into Gymnasium's registry; what is there already is left as it is."""
-    for environment in ENVIRONMENTS:
+    for environment in (*ENVIRONMENTS, *GARDENS):
         if environment.id not in gymnasium.registry:
             gymnasium.register(
                 environment.id,

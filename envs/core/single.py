@@ -14,13 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.envs.core.screen import Screen
-from npa_envs.envs.core.spaces import (
-    action_space,
-    action_tensor,
-    number_tensor,
-    observation_space,
-    to_output,
-)
+from npa_envs.envs.core.spaces import Rows, number_tensor, to_output
 from npa_envs.envs.core.task import EnvTask
 from npa_envs.envs.core.vector import check_options, plain_seed, world_keys
 from npa_envs.envs.core.worlds import Worlds, reason
@@ -120,6 +114,12 @@ class NPAEnv(gymnasium.Env[Any, Any]):
     task_type: ClassVar[type[EnvTask[Any]]]
     """What the environment is about."""
 
+    worlds_type: ClassVar[type[Worlds]] = Worlds
+    """What moves the particles."""
+
+    form_type: ClassVar[type[Rows]] = Rows
+    """How the world is seen and acted upon."""
+
     metadata: ClassVar[dict[str, Any]] = {  # type: ignore[misc]
         "render_modes": ["rgb_array", "human"],
         "render_fps": 25,
@@ -128,10 +128,11 @@ class NPAEnv(gymnasium.Env[Any, Any]):
     def __init__(self, **keywords: Any) -> None:
         self.config = self.task_type.config_type.from_keywords(keywords)
         self.render_mode = self.config.render_mode
-        self.worlds = Worlds(self.task_type, self.config, 1)
+        self.worlds = self.worlds_type(self.task_type, self.config, 1)
         self.task = self.worlds.task
-        self.observation_space = observation_space(self.worlds.physics, self.config.particle_count)
-        self.action_space = action_space(self.worlds.physics, self.config.particle_count)
+        self.form = self.form_type(self.worlds.physics, self.config)
+        self.observation_space = self.form.observation_space
+        self.action_space = self.form.action_space
         self._world = torch.zeros(1, dtype=torch.int64, device=self.task.device)
         self._keyed_from: np.random.Generator | None = None
         self._started = False
@@ -172,7 +173,8 @@ class NPAEnv(gymnasium.Env[Any, Any]):
             observation = self.worlds.perceive()
         self._started = True
         self._show()
-        return self._out(observation[0]), self._losses(self.worlds.report.numbers[:, 0].tolist())
+        info = self._losses(self.worlds.report.numbers[:, 0].tolist()) | self._extras("reset")
+        return self.form.seen(observation[0]), info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Apply an action and perceive.
@@ -192,10 +194,9 @@ class NPAEnv(gymnasium.Env[Any, Any]):
         if not self._started:
             raise NPAError("step needs a world: call reset first")
         worlds, config = self.worlds, self.config
-        shape = (config.particle_count, worlds.physics.action_dim)
-        checked = action_tensor("action", action, shape, "env.action_space", "[N, A] = ")
+        checked = self.form.action(action, None)
         with worlds.here():
-            endings, observation = worlds.step(checked[None])
+            endings, observation = worlds.step(checked)
             diverged = bool(endings[0] & DIVERGED)
             ending = int(worlds.guarded(endings, observation)[0])
         ended, late = ending & (SUCCESS | DIVERGED) != 0, ending & TIME_LIMIT != 0
@@ -207,11 +208,12 @@ class NPAEnv(gymnasium.Env[Any, Any]):
             info["reason"] = reason(ending)
         if worlds.particle_reward is not None:
             info["particle_reward"] = self._out(worlds.particle_reward[0].clone())
+        info |= self._extras("reset", "step")
         if config.reward == "sparse":
             paid = ended or late or int(worlds.elapsed[0]) == config.episode_steps
             self._unpaid_steps = 0 if paid else self._unpaid_steps + 1
         self._show()
-        return self._out(observation[0]), numbers[0], ended, late, info
+        return self.form.seen(observation[0]), numbers[0], ended, late, info
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return the world's picture, shape [R, R, 3], in the mode "rgb_array"."""
@@ -250,7 +252,14 @@ class NPAEnv(gymnasium.Env[Any, Any]):
             self.worlds.place(self._world, start)
             observation = self.worlds.perceive()
         self._show()
-        return self._out(observation[0])
+        return self.form.seen(observation[0])
+
+    def _extras(self, *when: str) -> dict[str, Any]:
+        told = {name: value for own in when for name, value in self.worlds.extras(own).items()}
+        return {
+            name: self._out(value[0].clone()) if value.ndim > 1 else value[0].item()
+            for name, value in told.items()
+        }
 
     def _losses(self, numbers: list[float]) -> dict[str, Any]:
         parts = {f"loss_{n}": numbers[2 + k] for k, n in enumerate(self.worlds.part_names)}

@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Space
 from torch import Tensor
 
+from npa_envs.envs.core.config import WorldConfig
 from npa_envs.errors import NPAError
 from npa_envs.world.actions import Physics
 
@@ -22,6 +23,45 @@ def observation_space(physics: Physics, particle_count: int) -> Box:
 def action_space(physics: Physics, particle_count: int) -> Box:
     """Return the space of a world's actions: float32, shape [N, A], in [-1, 1]."""
     return Box(-1.0, 1.0, (particle_count, physics.action_dim), np.float32)
+
+
+class Rows:
+    """How most worlds are seen and acted upon: one row for each particle.
+
+    Args:
+        physics: The worlds' constants.
+        config: The environment's configuration.
+    """
+
+    def __init__(self, physics: Physics, config: WorldConfig) -> None:
+        count = config.particle_count
+        self.observation_space: Space[Any] = observation_space(physics, count)
+        """Of a world."""
+        self.action_space: Space[Any] = action_space(physics, count)
+        """Of a world."""
+        self._shape = (count, physics.action_dim)
+        self._output = config.output
+
+    def action(self, action: Any, world_count: int | None) -> Tensor:
+        """Return actions as worlds take them, float32, shape [B, N, A].
+
+        Args:
+            action: What the caller gave.
+            world_count: Worlds B; None: the caller has a single one, and gave [N, A].
+
+        Raises:
+            NPAError: It is no array of numbers, or has another shape.
+        """
+        if world_count is None:
+            return action_tensor("action", action, self._shape, "env.action_space", "[N, A] = ")[
+                None
+            ]
+        shape = (world_count, *self._shape)
+        return action_tensor("action", action, shape, "env.action_space", "[B, N, A] = ")
+
+    def seen(self, observation: Tensor) -> Any:
+        """Return observations of worlds, or of one, as they are handed out."""
+        return to_output(observation, self._output)
 
 
 def to_output(tensor: Tensor, output: str) -> Any:

@@ -16,12 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.envs.core.screen import Screen
-from npa_envs.envs.core.spaces import (
-    action_space,
-    action_tensor,
-    observation_space,
-    to_output,
-)
+from npa_envs.envs.core.spaces import Rows, to_output
 from npa_envs.envs.core.task import EnvTask
 from npa_envs.envs.core.worlds import FLAGS, Report, Worlds, reason
 from npa_envs.errors import NPAError, shown, suggest
@@ -62,6 +57,12 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
     task_type: ClassVar[type[EnvTask[Any]]]
     """What the environment is about."""
 
+    worlds_type: ClassVar[type[Worlds]] = Worlds
+    """What moves the particles."""
+
+    form_type: ClassVar[type[Rows]] = Rows
+    """How the worlds are seen and acted upon."""
+
     metadata: dict[str, Any] = {  # noqa: RUF012 (each instance gets a dictionary of its own)
         "render_modes": ["rgb_array", "human"],
         "render_fps": 25,
@@ -88,11 +89,11 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
         self.config = self.task_type.config_type.from_keywords(keywords)
         self.render_mode = self.config.render_mode
         self.num_envs = num_envs
-        self.worlds = Worlds(self.task_type, self.config, num_envs, episode_steps)
+        self.worlds = self.worlds_type(self.task_type, self.config, num_envs, episode_steps)
         self.task = self.worlds.task
-        physics, count = self.worlds.physics, self.config.particle_count
-        self.single_observation_space = observation_space(physics, count)
-        self.single_action_space = action_space(physics, count)
+        self.form = self.form_type(self.worlds.physics, self.config)
+        self.single_observation_space = self.form.observation_space
+        self.single_action_space = self.form.action_space
         self.copies = copy
         """Whether what is handed out stays as it is after the next step."""
         self._started = False
@@ -151,7 +152,8 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
         which = np.zeros(self.num_envs, dtype=bool)
         which[chosen] = True
         numbers = self._numbers(self.worlds.report.copy())
-        return self._out(observation), self._losses(numbers, self._mask(which))
+        infos = self._losses(numbers, self._mask(which)) | self._extras("reset", self._mask(which))
+        return self.form.seen(observation), infos
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Apply an action to each world and perceive.
@@ -169,8 +171,7 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
         """
         if not self._started:
             raise NPAError("step needs worlds: call reset first")
-        shape = (self.num_envs, self.config.particle_count, self.worlds.physics.action_dim)
-        action = action_tensor("action", actions, shape, "env.action_space", "[B, N, A] = ")
+        action = self.form.action(actions, self.num_envs)
         with self.worlds.here():
             return self._step(action)
 
@@ -206,14 +207,14 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
                 final_observation = observation.clone()
             self.worlds.restart(np.flatnonzero(ended), observation)
             _, _, infos = self._report(~ended, copy=self.copies)
-            infos |= {"final_obs": self._out(final_observation), "_final_obs": which}
+            infos |= {"final_obs": self.form.seen(final_observation), "_final_obs": which}
             infos |= {"final_info": final_infos, "_final_info": self._mask(ended)}
         else:
             self._ended = ended
             if ended.any():
                 infos |= {"reason": REASONS[endings], "_reason": self._mask(ended)}
         self._show()
-        return self._out(observation), numbers[0], flags[0], flags[1], infos
+        return self.form.seen(observation), numbers[0], flags[0], flags[1], infos
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return a picture of each world, shape [R, R, 3], in the mode "rgb_array"."""
@@ -261,7 +262,7 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
             self.worlds.place(chosen, start)
             observation = self.worlds.perceive(self._buffer)
         self._show()
-        return self._out(observation)
+        return self.form.seen(observation)
 
     def _report(
         self, stepped: NDArray[np.bool_] | None, *, copy: bool
@@ -278,7 +279,7 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
         numbers, flags = self._numbers(report), list(self._out(report.endings))
         everyone = self._out(report.everyone if copy else report.everyone.clone())
         which = everyone if stepped is None else self._mask(stepped)
-        infos = self._losses(numbers, everyone)
+        infos = self._losses(numbers, everyone) | self._extras("reset", everyone, copy=copy)
         improvements = numbers[2 + len(worlds.part_names) :]
         own = {f"reward_{n}": v for n, v in zip(worlds.part_names, improvements, strict=True)}
         own |= dict(zip(FLAGS, flags[2:], strict=True))
@@ -287,7 +288,13 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
             own["particle_reward"] = self._out(shares.clone() if copy else shares)
         for name, value in own.items():
             infos[name], infos[f"_{name}"] = value, which
-        return numbers, flags, infos
+        return numbers, flags, infos | self._extras("step", which, copy=copy)
+
+    def _extras(self, when: str, which: Any, *, copy: bool = True) -> dict[str, Any]:
+        infos: dict[str, Any] = {}
+        for name, value in self.worlds.extras(when).items():
+            infos[name], infos[f"_{name}"] = self._out(value.clone() if copy else value), which
+        return infos
 
     def _losses(self, numbers: list[Any], which: Any) -> dict[str, Any]:
         infos = {"loss": numbers[1], "_loss": which}

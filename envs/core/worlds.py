@@ -441,6 +441,10 @@ class Worlds(Batch):
             endings=self._endings,
         )
 
+    def extras(self, when: str) -> dict[str, Tensor]:
+        """Return what infos tell besides, shape [B, ...] each: since a "reset", or of a "step"."""
+        return {}
+
     def told(self) -> list[float]:
         """Return the numbers of a single world's report after a step."""
         numbers: list[float] = self._host_numbers[:, 0].tolist()

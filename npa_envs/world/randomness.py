@@ -32,6 +32,8 @@ class Purpose(enum.IntEnum):
     """A policy acts at random."""
     SPECIES = 4
     """Particles are told apart."""
+    GOAL = 5
+    """What an episode is to come to."""
 
 
 class WorldRandom:

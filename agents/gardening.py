@@ -1,0 +1,226 @@
+"""Gardeners: policies that use brushes on living worlds, scripted and by the world's gradient."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from npa_envs.agents.policies import unwrapped
+from npa_envs.envs.garden.brushwork import PLACE, Columns
+from npa_envs.envs.garden.task import GardenTask
+from npa_envs.errors import NPAError, shown
+from npa_envs.tasks.checks import is_real
+from npa_envs.world.randomness import Purpose, WorldRandom
+
+
+class BrushPolicy:
+    """A policy of a garden, for arrays and tensors alike; subclasses say what brushes do.
+
+    Args:
+        env: A garden, single or vector, whose actions are "box".
+
+    Raises:
+        NPAError: It is none, or has other actions.
+    """
+
+    def __init__(self, env: Any) -> None:
+        inner = unwrapped(env)
+        self.worlds = inner.worlds
+        self.task = self.worlds.task
+        if not isinstance(self.task, GardenTask) or self.task.config.actions != "box":
+            raise NPAError(
+                f"env must be a garden with actions='box', got {type(self.task).__name__}: make it "
+                "with gymnasium.make('npa/Gardener2D-v0')"
+            )
+        self._seen = inner.form.seen_dim
+        self.config = self.task.config
+        self.columns = Columns.of(self.config)
+
+    def __call__(self, observation: Any) -> Any:
+        """Return what brushes do, shape [K, W], or [B, K, W] where B worlds are seen.
+
+        Policies look at the worlds of their environment, not at the observation.
+        """
+        seen = observation["observation"] if isinstance(observation, dict) else observation
+        action = self.act(self.worlds.world_count)
+        action = action if seen.ndim > self._seen else action[0]
+        return action if isinstance(seen, Tensor) else action.cpu().numpy()
+
+    def act(self, world_count: int) -> Tensor:
+        """Return what brushes do in the environment's worlds, float32, shape [B, K, W]."""
+        raise NotImplementedError
+
+    def still(self, world_count: int) -> Tensor:
+        """Return actions that do nothing."""
+        shape = (world_count, self.config.brush_count, self.columns.width)
+        return torch.zeros(shape, device=self.task.device)
+
+
+class StillGardener(BrushPolicy):
+    """Leave the worlds to their rule."""
+
+    def act(self, world_count: int) -> Tensor:
+        """Return zeros."""
+        return self.still(world_count)
+
+
+class RandomGardener(BrushPolicy):
+    """Act at random, uniformly over the action space.
+
+    Args:
+        env: A garden.
+        seed: Of the sequence of actions, at least 0; one more for each further world.
+    """
+
+    def __init__(self, env: Any, seed: int = 0) -> None:
+        super().__init__(env)
+        self._seed = seed
+        self._random: WorldRandom | None = None
+
+    def act(self, world_count: int) -> Tensor:
+        """Return numbers from [-1, 1)."""
+        if self._random is None or self._random.world_count != world_count:
+            seeds = range(self._seed, self._seed + world_count)
+            self._random = WorldRandom(seeds, device=self.task.device).beside(Purpose.POLICY)
+        self._random.advance()
+        return 2.0 * self._random.uniform(self.config.brush_count, self.columns.width) - 1.0
+
+
+class ScriptedGardener(BrushPolicy):
+    """Push particles up the slope of what lacks: from where there are too many to where too few.
+
+    It sees the coarse picture alone. What lacks to the target's density is blurred; its slope says
+    where to push and how far. Each brush goes where most is to be pushed furthest and no brush
+    before it has been.
+
+    Args:
+        env: A garden whose brushes push.
+        gain: How far to push for a slope (dimensionless).
+        width: Standard deviation of the blur [length units].
+
+    Raises:
+        NPAError: `env` is no garden, its brushes do not push, or a number is not positive.
+    """
+
+    def __init__(self, env: Any, gain: float = 0.75, width: float = 0.2) -> None:
+        super().__init__(env)
+        if "push" not in self.config.tools:
+            raise NPAError(f"env must have brushes that push, got tools={self.config.tools}")
+        self._gain, self._width = checked_positive("gain", gain), checked_positive("width", width)
+        size = self.config.picture_size
+        steps = (2.0 * torch.arange(size, device=self.task.device) + 1.0) / size - 1.0
+        # Rows of the picture go from the bottom up.
+        up, across = torch.meshgrid(steps, steps, indexing="ij")
+        self._cells = torch.stack((across.flatten(), up.flatten()), dim=-1)
+        away = self._cells[:, None] - self._cells
+        square = away.square().sum(dim=-1)
+        radius = self.config.brush_radius
+        self._held = (1.0 - square / radius**2).clamp_min(0.0).square()
+        blur = (-0.5 * square / width**2).exp()
+        self._slope = -4.0 * away * (blur / blur.sum(dim=1).max())[..., None]
+        target = self.task.goal.target_picture[None, ..., 3]
+        self._target = F.avg_pool2d(target, self.config.resolution // size).flatten(1)
+
+    def act(self, world_count: int) -> Tensor:
+        """Return what the brushes do about the coarse picture as it is."""
+        density = self.task.coarse(self.worlds.x, self.worlds.s)[:, 3].flatten(1)
+        lack, action = self._target - density, self.still(world_count)
+        way = torch.einsum("bq,pqd->bpd", lack, self._slope)
+        move = self._gain * way / self.config.push_length
+        worth = move.norm(dim=-1) * (density @ self._held)
+        everyone = torch.arange(world_count, device=lack.device)
+        for brush in range(self.config.brush_count):
+            cell = worth.argmax(dim=1)
+            action[:, brush, PLACE] = self._cells[cell]
+            action[:, brush, self.columns.push] = move[everyone, cell].clamp(-1.0, 1.0)
+            worth = worth * (1.0 - self._held[cell]).clamp_min(0.0)
+        return action
+
+
+def checked_positive(name: str, value: Any) -> float:
+    """Return what the caller calls so, a positive number.
+
+    Raises:
+        NPAError: It is none.
+    """
+    if not is_real(value) or value <= 0.0:
+        raise NPAError(f"{name} must be positive and finite, got {shown(value)}: try 0.2")
+    return float(value)
+
+
+class GradientGardener(BrushPolicy):
+    """Plan by the gradient of what worlds are worth, through brushes, rule and picture.
+
+    In each step it copies the worlds and improves a plan for the next `horizon` steps by Adam,
+    with draws of its own: it knows the state of the world, the rule and the target, and nothing of
+    the damage to come. It begins with what `ScriptedGardener` would do and with the rest of its
+    last plan, and does the first step of whichever plan is best.
+
+    Args:
+        env: A garden.
+        horizon: Steps of a plan.
+        iterations: Gradient steps on each plan.
+        learning_rate: Of Adam (dimensionless).
+        seed: Of its own draws, at least 0.
+
+    Raises:
+        NPAError: `env` is no garden.
+    """
+
+    def __init__(
+        self,
+        env: Any,
+        horizon: int = 2,
+        iterations: int = 12,
+        learning_rate: float = 0.1,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(env)
+        self._scripted = ScriptedGardener(env)
+        self._horizon, self._iterations = horizon, iterations
+        self._learning_rate = learning_rate
+        self._seed = seed
+        self._random: WorldRandom | None = None
+
+    def act(self, world_count: int) -> Tensor:
+        """Return the first step of the plan, for the worlds as they are."""
+        if self._random is None or self._random.world_count != world_count:
+            seeds = range(self._seed, self._seed + world_count)
+            self._random = WorldRandom(seeds, device=self.task.device).beside(Purpose.POLICY)
+        self._random.advance()
+        first = self._scripted.act(world_count)
+        plan = torch.stack([first] + [self.still(world_count)] * (self._horizon - 1))
+        plan[1:, ..., PLACE] = first[..., PLACE]
+        plan = plan.requires_grad_()
+        optimizer = torch.optim.Adam([plan], lr=self._learning_rate)
+        best = plan.detach().clone()
+        highest = torch.full((world_count,), -torch.inf, device=self.task.device)
+        for _ in range(self._iterations):
+            worth = self.worth(plan)
+            with torch.no_grad():
+                better = worth > highest
+                highest = torch.where(better, worth, highest)
+                best = torch.where(better[:, None, None], plan, best)
+            optimizer.zero_grad()
+            (-worth.sum()).backward()
+            optimizer.step()
+            with torch.no_grad():
+                plan.clamp_(-1.0, 1.0)
+        return best[0].detach()
+
+    @torch.enable_grad()
+    def worth(self, plan: Tensor) -> Tensor:
+        """Return what the worlds earn in the steps of a plan, [T, B, K, W], summed, [B]."""
+        worlds, task = self.worlds, self.task
+        x, s = worlds.x.detach(), worlds.s.detach()
+        assert self._random is not None, "act has made the draws"
+        random = self._random.beside(Purpose.POLICY)
+        earned = torch.zeros(x.shape[0], device=x.device)
+        for action in plan:
+            x, s = task.tended(x, s, action, random)
+            loss = sum(task.losses(x, s).values())
+            earned = earned + task.earned(x, s, loss, worlds.marks)
+        return earned

@@ -1,0 +1,90 @@
+"""What the environments of living worlds are made of."""
+
+from __future__ import annotations
+
+from npa_envs.envs.core.single import NPAEnv
+from npa_envs.envs.core.vector import NPAVectorEnv
+from npa_envs.envs.garden.forms import Brushes
+from npa_envs.envs.garden.worlds import LivingWorlds
+
+
+class GardenEnv(NPAEnv):
+    """One living world as a Gymnasium environment; subclasses name the task.
+
+    The sections below belong to the docstring of every subclass, after what it says there of its
+    own; where there is none, that of `NPAEnv` does.
+
+    ## Observation space
+
+    | `observe` | Observed | Unit |
+    |---|---|---|
+    | `"picture"` | a coarse picture, [4 G²] with G = `picture_size` | dimensionless |
+    | `"moments"` | means over all particles, [5 + 3C] | lengths, dimensionless |
+
+    A picture is red, green, blue, then density, each row by row. Moments are the means of x and y;
+    then, about that place, of x², x y, y², of each state, of x times each state, and of y times
+    each state.
+
+    The picture spans [-1, 1] × [-1, 1], rows from the bottom up, and goes along with the particles:
+    their mean is moved onto the target's. Colours are sums over particles, as the density is.
+    `observe_error=True` adds four channels: the target's picture less this one. Numbers are clipped
+    to ±8.
+
+    ## Action space
+
+    With `actions="box"`, `Box(-1, 1, (K, W), float32)`: one row for each of K = `brush_count`
+    brushes. All of them are used in each step, one after the other, and then the rule runs for
+    `rule_steps` steps. Zeros do nothing.
+
+    | Columns | Action a | An action of 1 is | Effect where the brush holds w of a particle |
+    |---|---|---|---|
+    | 2 | where the brush is, along x and y | 1 length | none |
+    | 2, of `"push"` | how far to push | `push_length` | x ← x + w `push_length` a |
+    | 1, of `"erase"` | how much to erase | all of it | s ← s − w max(a, 0) s |
+    | 1 a channel, of `"inject"` | what to inject | `state_scale` | s ← s + w `state_scale` a |
+    | 1, of `"rate"` | how fast to live | twice as fast | steps of the rule count 1 + w a times |
+
+    Columns of tools that `tools` leaves out are not there; `"inject"` has one for each of
+    `inject_channels`. Places are counted from where the middle
+    of the picture is. w = (1 − r²)² at r brush radii from the brush, 0 outside:
+    `npa_envs.world.brushes.softness`. Rates of several brushes add up and are clipped to [0, 2].
+    Entries are clipped to [-1, 1]. A number that is not finite raises `NPAError` and leaves the
+    world as it was. Worlds are differentiable in all numbers of all brushes, but for the correction
+    of moments that [perception](../mathematics.md#perception) holds constant:
+    `env.unwrapped.task.lived(x, s, action, random)`.
+
+    With `actions="discrete"`, `MultiDiscrete` with four numbers for each brush: its place along x
+    and along y, among `place_count` each; its tool, which is nothing, a push in one of eight
+    directions, erase, inject each channel up or down, stop, quicken, as far as there are such
+    tools; and its strength, among `strength_count`.
+
+    ## Info
+
+    | Key | In | Value |
+    |---|---|---|
+    | `loss` | reset, step | L as it is now: how far the picture is from the target's |
+    | `loss_density`, `loss_colour` | reset, step | the parts of the loss |
+    | `reward_density`, `reward_colour` | step | how much each part fell in this step |
+    | `success`, `diverged` | step | whether it did so in this step, bool |
+    | `reason` | last step | why the episode ended, see above; None for worlds that go on |
+
+    ## Vectorized environment
+
+    `gym.make_vec(id, num_envs=B)` makes B worlds that one call steps together, on the CPU or, with
+    `device="cuda"`, on a GPU. Observations, actions, rewards and flags have B in front. World k
+    after `reset(seed=s)` is the single environment after `reset(seed=s + k)`, bit for bit, for
+    every B. On a CPU worlds are stepped one after the other: a batch saves no time there.
+
+    All else is as for the other environments: `output="torch"`, `autoreset_mode`, `reset_mask`,
+    `particles()` and `place_particles(x, s)`.
+    """
+
+    worlds_type = LivingWorlds
+    form_type = Brushes
+
+
+class GardenVectorEnv(NPAVectorEnv):
+    """B living worlds, stepped together; subclasses name the task."""
+
+    worlds_type = LivingWorlds
+    form_type = Brushes

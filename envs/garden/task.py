@@ -1,0 +1,165 @@
+"""Living worlds: a rule runs them, and an agent touches them."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import ClassVar, TypeVar
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from npa_envs import world_mean
+from npa_envs.envs.core.task import Start
+from npa_envs.envs.garden.brushwork import brushed
+from npa_envs.envs.garden.config import GardenConfig
+from npa_envs.envs.grown import GrownTask
+from npa_envs.errors import NPAError
+from npa_envs.world.randomness import WorldRandom
+from npa_envs.world.rollout import rollout
+
+SEEN_LIMIT = 8.0
+"""What is seen is clipped to plus and minus this (dimensionless, or length units)."""
+
+Config = TypeVar("Config", bound=GardenConfig)
+
+
+class GardenTask(GrownTask[Config]):
+    """A grown picture that goes on living; everything here is differentiable in the brushes.
+
+    Raises:
+        NPAError: There is no such rule, or it is one of other worlds.
+    """
+
+    config_type = GardenConfig
+
+    def __init__(self, config: Config, device: torch.device) -> None:
+        super().__init__(config, device)
+        wanted = {
+            "alpha": config.alpha,
+            "eps0": config.eps0,
+            "moment_inverse": config.moment_inverse,
+        }
+        for name, value in wanted.items():
+            if getattr(self.rule, name) != value:
+                raise NPAError(
+                    f"{name} must be the rule's, {getattr(self.rule, name)}, got {value}: give "
+                    f"{name}={getattr(self.rule, name)!r}, or another rule"
+                )
+        self.rule.requires_grad_(False)
+
+    def lived(
+        self,
+        x: Tensor,
+        s: Tensor,
+        action: Tensor,
+        random: WorldRandom,
+        *,
+        detach_positions: bool = False,
+    ) -> tuple[Tensor, Tensor]:
+        """Return worlds after a step of the environment; differentiable.
+
+        Arguments are those of `tended`.
+        """
+        tended = self.tended(x, s, action, random, detach_positions=detach_positions)
+        return self.struck(*tended, random)
+
+    def tended(
+        self,
+        x: Tensor,
+        s: Tensor,
+        action: Tensor,
+        random: WorldRandom,
+        *,
+        detach_positions: bool = False,
+    ) -> tuple[Tensor, Tensor]:
+        """Return worlds after brushes and the rule's steps, before what befalls them.
+
+        Args:
+            x: Positions [length units], shape [B, N, 2].
+            s: States, dimensionless, shape [B, N, C].
+            action: What the brushes do, shape [B, K, W].
+            random: One stream a world; advanced by `rule_steps`.
+            detach_positions: Leave out the gradient by what particles perceive of where others
+                are, as training does.
+        """
+        run = partial(self._run, random=random, detach_positions=detach_positions)
+        x, s, rate = brushed(x, s, action, self.middle(x), self.config)
+        if rate is None:
+            x, s = run(x, s, self.config.rule_steps)
+        else:
+            for _ in range(self.config.rule_steps):
+                new_x, new_s = run(x, s, 1)
+                x, s = x + rate * (new_x - x), s + rate * (new_s - s)
+        return x, s
+
+    def struck(self, x: Tensor, s: Tensor, random: WorldRandom) -> tuple[Tensor, Tensor]:
+        """Return worlds with what befalls them at the end of a step; by default nothing."""
+        return x, s
+
+    def _run(
+        self, x: Tensor, s: Tensor, steps: int, *, random: WorldRandom, detach_positions: bool
+    ) -> tuple[Tensor, Tensor]:
+        config = self.config
+        return rollout(
+            self.rule,
+            x,
+            s,
+            steps,
+            eps=config.eps,
+            box=config.box,
+            update_prob=config.update_prob,
+            dt=config.dt,
+            position_noise=config.position_noise,
+            detach_positions=detach_positions,
+            generator=random,
+        )
+
+    def middle(self, x: Tensor) -> Tensor:
+        """Return what brushes' places are counted from: the mean, less the target's, [B, 2]."""
+        return world_mean(x) - self.goal.target.points.mean(dim=0)
+
+    mark_count: ClassVar[int]
+    """Numbers that a world keeps of its start, M."""
+
+    def marked(self, start: Start, loss: Tensor, random: WorldRandom) -> Tensor:
+        """Return what worlds keep of their start, shape [B, M]; `loss` is theirs, [B]."""
+        raise NotImplementedError
+
+    def earned(self, x: Tensor, s: Tensor, loss: Tensor, marks: Tensor) -> Tensor:
+        """Return what worlds are worth in a step, [B], of loss [B] and marks [B, M]."""
+        raise NotImplementedError
+
+    def told(self, x: Tensor, s: Tensor, loss: Tensor, marks: Tensor) -> dict[str, Tensor]:
+        """Return what infos tell of worlds besides, shape [B, ...] each."""
+        return {}
+
+    def observe(self, x: Tensor, s: Tensor, loss: Tensor, marks: Tensor) -> Tensor:
+        """Return what is seen of worlds, shape [B, O]."""
+        seen = self.moments(x, s) if self.config.observe == "moments" else self.coarse(x, s)
+        seen = seen.flatten(1)
+        return seen.clamp(-SEEN_LIMIT, SEEN_LIMIT)
+
+    def coarse(self, x: Tensor, s: Tensor) -> Tensor:
+        """Return coarse pictures, red, green, blue, density, shape [B, 4, G, G].
+
+        Each is the mean over pixels of the picture that the loss compares. With `observe_error`
+        four channels more are what it lacks to the target's.
+        """
+        picture, target = self.goal.picture(x, s), self.goal.target_picture
+        if self.config.observe_error:
+            picture = torch.cat((picture, target - picture), dim=-1)
+        pixels = self.config.resolution // self.config.picture_size
+        return F.avg_pool2d(picture.permute(0, 3, 1, 2), pixels)
+
+    def moments(self, x: Tensor, s: Tensor) -> Tensor:
+        """Return means of 1, x, y, x², x y, y² and of each state with 1, x, y, [B, 5 + 3 C].
+
+        The first two are the mean position [length units]; all others are about it.
+        """
+        mean = world_mean(x)
+        away = x - mean[:, None]
+        across, up = away[..., :1], away[..., 1:]
+        seconds = torch.cat((across * across, across * up, up * up), dim=-1)
+        told = torch.cat((seconds, s, across * s, up * s), dim=-1)
+        return torch.cat((mean, world_mean(told)), dim=-1)

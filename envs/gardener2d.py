@@ -1,0 +1,139 @@
+"""`npa/Gardener2D-v0`: a gardener keeps a living picture whole in bad weather."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from npa_envs.envs.core.task import Start
+from npa_envs.envs.garden.config import GardenConfig
+from npa_envs.envs.garden.environments import GardenEnv, GardenVectorEnv
+from npa_envs.envs.garden.task import GardenTask
+from npa_envs.tasks.checks import check_fraction, check_non_negative, check_positive
+from npa_envs.tasks.damage import random_particle
+from npa_envs.world.brushes import erase_state, push
+from npa_envs.world.randomness import Purpose, WorldRandom
+
+LEAST_RISE = 0.1
+"""Turning grey counts as at least this share more of a picture's loss (dimensionless)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gardener2DEnvConfig(GardenConfig):
+    """What befalls the picture."""
+
+    episode_steps: int = 32
+    """As elsewhere; it equals the registered `max_episode_steps`."""
+
+    position_noise: float = 0.002
+    """Standard deviation of the noise added to every position in a step of the rule
+    [length units]."""
+
+    gust_chance: float = 1.0
+    """Probability of a gust in a step: particles around a random one are carried along in a random
+    direction (dimensionless)."""
+
+    gust_radius: float = 0.3
+    """Radius within which a gust carries particles along, softly [length units]."""
+
+    gust_length: float = 0.4
+    """How far it carries those in its middle [length units]."""
+
+    blight_chance: float = 0.5
+    """Probability that states around a random particle are erased in a step (dimensionless)."""
+
+    blight_radius: float = 0.3
+    """Radius within which they are erased [length units]."""
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        super().__post_init__()
+        for name in ("gust_chance", "blight_chance"):
+            if getattr(self, name) != 0.0:
+                check_fraction(self, name)
+        check_positive(self, float, "gust_radius", "blight_radius")
+        check_non_negative(self, "gust_length")
+
+
+class GardenerTask(GardenTask[Gardener2DEnvConfig]):
+    """A picture in bad weather."""
+
+    config_type = Gardener2DEnvConfig
+    mark_count = 2
+
+    def struck(self, x: Tensor, s: Tensor, random: WorldRandom) -> tuple[Tensor, Tensor]:
+        """Return worlds after a gust and a blight, drawn beside the rule's own draws."""
+        config, draws = self.config, random.beside(Purpose.DAMAGE)
+        chance, angle = draws.uniform(2), 2.0 * math.pi * draws.uniform(1)
+        centre = random_particle(x, draws)
+        happens = (chance[:, :1] < config.gust_chance).to(x.dtype)
+        move = config.gust_length * happens * torch.cat((angle.cos(), angle.sin()), dim=1)
+        box = None if config.box is None else (config.box,) * 2
+        x = push(x, centre=centre, move=move, radius=config.gust_radius, box=box)
+        # A ball outside of the world erases nothing.
+        centre = random_particle(x, draws)
+        happens = chance[:, 1] < config.blight_chance
+        radius = torch.where(happens, config.blight_radius, -1.0)
+        return x, erase_state(x, s, centre=centre, radius=radius, box=box)
+
+    def marked(self, start: Start, loss: Tensor, random: WorldRandom) -> Tensor:
+        """Return the loss of the whole picture, and how much it rises if all of it turns grey."""
+        parts = self.losses(start.x, torch.zeros_like(start.s))
+        grey = sum(parts.values(), torch.zeros_like(loss))
+        # Worlds that have not grown are as bad as grey ones.
+        return torch.stack((loss, (grey - loss).maximum(LEAST_RISE * loss)), dim=1)
+
+    def earned(self, x: Tensor, s: Tensor, loss: Tensor, marks: Tensor) -> Tensor:
+        """Return how whole worlds are: 1 as at their start, 0 as bad as grey, shape [B]."""
+        whole, rise = marks.unbind(dim=1)
+        return (1.0 - (loss - whole) / rise).clamp(-1.0, 1.0)
+
+
+class Gardener2DEnv(GardenEnv):
+    """Keep a living picture whole in bad weather.
+
+    ## Description
+
+    A trained rule has grown a picture from N particles and goes on running them. Again and again a
+    gust carries some of them away, a blight erases the states of others, and noise shakes them all.
+    The rule heals a part of it, too slowly. The agent helps from outside, as a gardener does: in
+    each step it has a few brushes that push particles, erase or change their states, or let them
+    live slower or faster. It sees a coarse picture.
+
+    `npa_envs.agents.gardening` has gardeners to compare with: `StillGardener` does nothing,
+    `ScriptedGardener` pushes particles to where the picture lacks some, and `GradientGardener`
+    plans by the gradient of the reward through brushes, rule and picture.
+
+    ## Reward
+
+    Worlds are compared with the target as in `npa/Morphogenesis2D-v0`, by a loss L. The reward is
+    1 − (L − L₀) / (L₁ − L₀), clipped to [-1, 1]. L₀ is the loss at the episode's start, of the
+    whole picture. L₁ is what it would be if all states were erased, grey, and at least 1.1 L₀. So 1
+    is a whole picture, 0 one as bad as a grey one, and a return is at most the number of steps.
+
+    | `reward` | Reward of step t |
+    |---|---|
+    | `"dense"` | this, of the world after the step |
+    | `"sparse"` | 0, and this in the last step |
+
+    ## Starting state
+
+    The rule has grown a world for `grow_steps` steps from a disk of blank particles; it is whole.
+    With the default `seed_pool=16` there are sixteen grown worlds, made at the first reset, which
+    takes some seconds on a CPU. The weather is drawn anew for each episode.
+
+    ## Episode end
+
+    `success_loss` is None by default: a gardener's work has no end.
+    """
+
+    task_type = GardenerTask
+
+
+class Gardener2DVectorEnv(GardenVectorEnv):
+    """Worlds of `Gardener2DEnv`, batched on one device; its docstring describes both."""
+
+    task_type = GardenerTask

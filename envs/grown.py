@@ -1,0 +1,102 @@
+"""Worlds that a trained rule has grown: what healing, gardening and shepherding begin with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar, TypeVar
+
+import torch
+from torch import Tensor
+
+from npa_envs.envs.morphogenesis2d import Morphogenesis2DEnvConfig, PictureTask
+from npa_envs.errors import NPAError, shown
+from npa_envs.rule.files import load_rule, shipped_rules
+from npa_envs.rule.rule import NPARule
+from npa_envs.tasks.checks import check_positive
+from npa_envs.world.randomness import Purpose, WorldRandom
+from npa_envs.world.rollout import rollout
+
+
+@dataclass(frozen=True, kw_only=True)
+class GrownConfig(Morphogenesis2DEnvConfig):
+    """What grown worlds can be told besides."""
+
+    without_rule: ClassVar[str] = ""
+    """What else than a rule can be given, as the end of an error's message."""
+
+    seed_pool: int = 4
+    """Episodes start from one of so many grown worlds, made once; 0: from a new one each time,
+    which takes `grow_steps` steps of the rule."""
+
+    rule: str | None = None
+    """What grows the worlds: a shipped rule or a rule's file; None: the shipped rule with the
+    target's name."""
+
+    grow_steps: int = 256
+    """Steps of the rule from the seed to the grown world."""
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        super().__post_init__()
+        check_positive(self, int, "grow_steps")
+
+
+Config = TypeVar("Config", bound=GrownConfig)
+
+
+class GrownTask(PictureTask[Config]):
+    """Pictures that a rule has grown."""
+
+    config_type = GrownConfig
+
+    @cached_property
+    def rule(self) -> NPARule:
+        """What grows them.
+
+        Raises:
+            NPAError: There is no such rule, or it is one of other worlds.
+        """
+        return _load_rule(self.config, self.device)
+
+    @property
+    def start_is_short(self) -> bool:
+        """Whether a start takes few operations: not where it grows a world."""
+        return self.config.seed_pool > 0
+
+    def seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
+        """Return grown worlds."""
+        x, s = super().seed(random)
+        grown = [self._grow(x[k : k + 1], s[k : k + 1], random, k) for k in range(len(x))]
+        return torch.cat([x for x, _ in grown]), torch.cat([s for _, s in grown])
+
+    @torch.no_grad()
+    def _grow(self, x: Tensor, s: Tensor, random: WorldRandom, k: int) -> tuple[Tensor, Tensor]:
+        """Grow world k alone: a rule's products change in the last bit with the batch's size."""
+        return rollout(
+            self.rule,
+            x,
+            s,
+            self.config.grow_steps,
+            eps=self.config.eps,
+            box=self.config.box,
+            update_prob=self.config.update_prob,
+            generator=random.take(slice(k, k + 1)).beside(Purpose.GROWTH),
+        )
+
+
+def _load_rule(config: GrownConfig, device: torch.device) -> NPARule:
+    if config.rule is None and config.target not in (known := shipped_rules("morphogenesis2d")):
+        raise NPAError(
+            "rule must say what grows the worlds, as no shipped rule grows "
+            f"{shown(config.target)} ({', '.join(known)}): give rule='PATH'{config.without_rule}"
+        )
+    rule = load_rule(config.rule or config.target, device=device)
+    wanted = {"space_dim": 2, "state_dim": config.state_dim, "static": False}
+    for name, value in wanted.items():
+        if getattr(rule, name) != value:
+            raise NPAError(
+                f"rule must have {name}={value} like the world, got {getattr(rule, name)}: "
+                "choose another rule, or the same state_dim"
+            )
+    return rule

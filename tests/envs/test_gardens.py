@@ -1,0 +1,260 @@
+"""Living worlds: brushes, weather, spaces, seeds; tests run over the table of gardens."""
+
+import pickle
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from small_envs import assert_batch_of_singles, assert_same
+
+import npa_envs
+from npa_envs.envs.garden.brushwork import Columns, brushed
+from npa_envs.errors import DivergedError, NPAError
+from npa_envs.registration import GARDENS
+
+IDS = [environment.id for environment in GARDENS]
+GARDENER = IDS[0]
+SMALL = {
+    "particle_count": 61,
+    "eps": 0.2,
+    "resolution": 16,
+    "picture_size": 8,
+    "render_size": 24,
+    "seed_pool": 3,
+    "grow_steps": 4,
+    "rule_steps": 2,
+}
+FORMS = ({}, {"actions": "discrete"}, {"observe": "moments", "tools": ("push",)})
+every_id = pytest.mark.parametrize("name", IDS)
+every_form = pytest.mark.parametrize("form", FORMS, ids=("picture", "discrete", "moments"))
+
+
+@pytest.fixture(autouse=True)
+def _no_screen(monkeypatch):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+
+
+def make(name, **keywords):
+    return gymnasium.make(name, **(SMALL | keywords))
+
+
+def make_vec(name, world_count, **keywords):
+    return gymnasium.make_vec(
+        name, world_count, vectorization_mode="vector_entry_point", **(SMALL | keywords)
+    )
+
+
+def sampled(env, count, seed=0):
+    """Actions of one world or of many."""
+    env.action_space.seed(seed)
+    return [env.action_space.sample() for _ in range(count)]
+
+
+@every_id
+@every_form
+def test_gymnasium_and_sb3_find_nothing_to_complain_of(name, form):
+    checker = pytest.importorskip("stable_baselines3.common.env_checker")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(make(name, **form).unwrapped)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        checker.check_env(make(name, **form))
+    # Pictures are no images of bytes, and brushes are rows: it advises to flatten both.
+    assert [str(w.message) for w in caught if "flatten" not in str(w.message)] == []
+
+
+@every_id
+@every_form
+def test_vector_equals_single_over_autoresets(name, form, device):
+    keywords = {"max_episode_steps": 4, "device": str(device)} | form
+    if "actions" not in form:
+        keywords |= {"reward": "sparse"}
+    envs = make_vec(name, 3, **keywords)
+    singles = [make(name, **keywords) for _ in range(3)]
+    reasons, _ = assert_batch_of_singles(envs, singles, sampled(envs, 10))
+    assert reasons == {None, "time limit"}
+
+
+@every_id
+def test_gymnasiums_own_batches_of_single_worlds_agree(name):
+    ours = make_vec(name, 2, max_episode_steps=3)
+    theirs = gymnasium.vector.SyncVectorEnv(
+        [lambda: make(name, max_episode_steps=3)] * 2,
+        autoreset_mode=ours.metadata["autoreset_mode"],
+    )
+    assert ours.observation_space == theirs.observation_space
+    assert ours.action_space == theirs.action_space
+    assert_same(ours.reset(seed=0)[0], theirs.reset(seed=0)[0])
+    for action in sampled(ours, 7):
+        left, right = ours.step(action), theirs.step(action)
+        assert_same(left[:4], right[:4])
+        for key, value in right[4].items():
+            if not isinstance(value, dict):
+                assert_same(list(left[4][key]), list(value), key)
+
+
+@every_id
+def test_an_episode_follows_from_its_seed_and_survives_pickling(name):
+    env, other = make(name), make(name)
+    actions = sampled(env, 4)
+    first = [env.reset(seed=5), *(env.step(action) for action in actions)]
+    again = [other.reset(seed=5), *(other.step(action) for action in actions)]
+    assert_same(first, again)
+    copied = pickle.loads(pickle.dumps(env.unwrapped))
+    assert_same(env.unwrapped.step(actions[0]), copied.step(actions[0]))
+    other.reset(seed=6)
+    assert other.step(actions[0])[4]["loss"] != first[1][4]["loss"]
+
+
+@every_id
+def test_masked_reset_leaves_other_worlds_alone(name):
+    envs, others = (make_vec(name, 3) for _ in range(2))
+    actions = sampled(envs, 2)
+    for batch in (envs, others):
+        batch.reset(seed=0)
+        batch.step(actions[0])
+    envs.reset(seed=9, options={"reset_mask": np.array([False, True, False])})
+    left, right = envs.step(actions[1]), others.step(actions[1])
+    assert np.array_equal(left[4]["loss"][[0, 2]], right[4]["loss"][[0, 2]])
+    assert left[4]["loss"][1] != right[4]["loss"][1]
+
+
+@every_id
+def test_bad_actions_are_clear_errors_and_change_nothing(name):
+    env, other = make(name), make(name)
+    env.reset(seed=0)
+    other.reset(seed=0)
+    action = sampled(env, 1)[0]
+    with pytest.raises(NPAError, match=r"action must be real numbers of shape \[K, W\]"):
+        env.unwrapped.step(action[:1])
+    with pytest.raises(DivergedError, match="action must be finite, got nan at world 0"):
+        env.unwrapped.step(np.where(action == action[0, 0], np.nan, action).astype(np.float32))
+    assert_same(env.step(action), other.step(action))
+    chosen = make(name, actions="discrete")
+    chosen.reset(seed=0)
+    with pytest.raises(NPAError, match="action must choose below"):
+        chosen.unwrapped.step(np.full(16, 99))
+    with pytest.raises(NPAError, match="whole numbers of shape"):
+        chosen.unwrapped.step(np.zeros(16, np.float32))
+
+
+@pytest.mark.parametrize(
+    ("keywords", "message"),
+    [
+        ({"tools": ("pull",)}, "tools must be some of"),
+        ({"tools": ("rate", "push")}, "in the order of"),
+        ({"inject_channels": (16,)}, r"inject_channels must lie in \[-16, 15\]"),
+        ({"inject_channels": (-1, 15)}, "inject_channels must be different"),
+        ({"picture_size": 7}, "picture_size must divide resolution = 16"),
+        ({"actions": "discreet"}, "did you mean 'discrete'"),
+        ({"reward": "particle"}, "reward must be a known word"),
+        ({"alpha": 0.25}, "alpha must be the rule's, 0.5, got 0.25"),
+        ({"target": "ring"}, "no shipped rule grows 'ring'"),
+        ({"brush_radius": 0.0}, "brush_radius must be a finite number greater than 0"),
+    ],
+)
+def test_bad_keywords_are_clear_errors(keywords, message):
+    with pytest.raises(NPAError, match=message):
+        make(GARDENER, **keywords)
+
+
+def brush(config, **numbers):
+    """The row of one brush at the middle, for a world."""
+    row, columns = torch.zeros(1, 1, Columns.of(config).width), Columns.of(config)
+    for tool, values in numbers.items():
+        row[..., getattr(columns, tool)] = torch.tensor(values)
+    return row
+
+
+def test_brushes_do_what_the_documentation_says():
+    config = make(GARDENER).unwrapped.config
+    x = torch.tensor([[[0.0, 0.0], [0.15, 0.0], [0.5, 0.0]]])
+    s, middle = torch.ones(1, 3, 16), torch.zeros(1, 2)
+    held = torch.tensor([1.0, 0.5625, 0.0])
+    moved, same, rate = brushed(x, s, brush(config, push=(0.0, 0.5)), middle, config)
+    assert torch.allclose(moved - x, torch.stack((0.0 * held, 0.15 * held), dim=-1)[None])
+    assert torch.equal(same, s)
+    assert torch.equal(rate, torch.ones(1, 3, 1))
+    _, erased, _ = brushed(x, s, brush(config, erase=0.5), middle, config)
+    assert torch.allclose(erased[0, :, 0], 1.0 - 0.5 * held)
+    _, kept, _ = brushed(x, s, brush(config, erase=-1.0), middle, config)
+    assert torch.equal(kept, s)
+    _, dosed, _ = brushed(x, s, brush(config, inject=(1.0, 0.0, -0.5)), middle, config)
+    assert torch.allclose(dosed[0, :, -3], 1.0 + 0.5 * held)
+    assert torch.allclose(dosed[0, :, -1], 1.0 - 0.25 * held)
+    assert torch.equal(dosed[..., :-3], s[..., :-3])
+    _, _, rate = brushed(x, s, brush(config, rate=-1.0), middle, config)
+    assert torch.allclose(rate[0, :, 0], 1.0 - held)
+
+
+def test_a_world_that_is_stopped_stays_as_it_is():
+    env = make(GARDENER, brush_radius=1e3, gust_chance=0.0, blight_chance=0.0, position_noise=0.0)
+    env.reset(seed=0)
+    x, s = env.unwrapped.particles()
+    action = np.zeros(env.action_space.shape, np.float32)
+    env.step(action)
+    assert not torch.equal(env.unwrapped.particles()[0], x)
+    env.unwrapped.place_particles(x, s)
+    action[0, -1] = -1.0
+    _, reward, *_ = env.step(action)
+    assert torch.allclose(env.unwrapped.particles()[0], x, atol=1e-5)
+    assert torch.allclose(env.unwrapped.particles()[1], s, atol=1e-5)
+    assert reward == pytest.approx(1.0, abs=1e-3)
+
+
+def test_the_whole_world_is_differentiable_by_every_number_of_a_brush():
+    """The directional derivative is that of differences, weather included.
+
+    Perception stops the gradient of its correction of moments, by definition: it is left out here.
+    """
+    env = make(GARDENER, particle_count=96, blight_chance=0.0).unwrapped
+    env.reset(seed=1)
+    task, worlds = env.task, env.worlds
+    x, s = (part.double() for part in (worlds.x, worlds.s))
+    task.rule.double()
+    task.rule.moment_correction = False
+    generator = torch.Generator().manual_seed(0)
+    shape = (1, *env.action_space.shape)
+    action = torch.rand(shape, generator=generator, dtype=torch.float64) - 0.2
+
+    def worth(action):
+        new_x, new_s = task.lived(x, s, action, npa_envs.WorldRandom([4]))
+        return (torch.cat((new_x, new_s), dim=-1) * weights).sum()
+
+    weights = torch.rand((1, 96, 18), generator=generator, dtype=torch.float64)
+    given = action.clone().requires_grad_()
+    (slope,) = torch.autograd.grad(worth(given), given)
+    columns = Columns.of(env.config)
+    for column in range(columns.width):
+        assert float(slope[0, :, column].abs().sum()) > 0.0, column
+    way = torch.rand(shape, generator=generator, dtype=torch.float64) - 0.5
+    step = 1e-6
+    difference = (worth(action + step * way) - worth(action - step * way)) / (2.0 * step)
+    assert float((slope * way).sum()) == pytest.approx(float(difference), rel=1e-4)
+
+
+def test_weather_comes_as_often_as_it_is_told_to():
+    still = {"position_noise": 0.0, "brush_radius": 1e3, "gust_length": 0.3}
+    for chances, expected in (((1.0, 0.0), (1, 0)), ((0.0, 1.0), (0, 1)), ((0.0, 0.0), (0, 0))):
+        env = make(GARDENER, gust_chance=chances[0], blight_chance=chances[1], **still)
+        env.reset(seed=0)
+        x, s = env.unwrapped.particles()
+        task = env.unwrapped.task
+        new_x, new_s = task.struck(x[None], s[None], npa_envs.WorldRandom([3]))
+        assert bool((new_x != x).any()) == bool(expected[0])
+        assert bool((new_s != s).any()) == bool(expected[1])
+
+
+def test_the_reward_is_one_for_a_whole_picture_and_zero_for_a_grey_one():
+    env = make(GARDENER, particle_count=256, eps=0.1, grow_steps=48, rule_steps=8, seed_pool=1)
+    _, info = env.reset(seed=0)
+    worlds, task = env.unwrapped.worlds, env.unwrapped.task
+    grey = sum(task.losses(worlds.x, torch.zeros_like(worlds.s)).values())
+    assert grey > 1.2 * info["loss"]
+    losses = torch.cat((grey, torch.tensor([info["loss"], info["loss"] - 1.0, 1e3])))
+    earned = task.earned(worlds.x, worlds.s, losses, worlds.marks.expand(4, -1))
+    assert torch.allclose(earned, torch.tensor([0.0, 1.0, 1.0, -1.0]), atol=1e-5)
