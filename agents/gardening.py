@@ -204,8 +204,7 @@ class GradientGardener(BrushPolicy):
                 better = worth > highest
                 highest = torch.where(better, worth, highest)
                 best = torch.where(better[:, None, None], plan, best)
-            optimizer.zero_grad()
-            (-worth.sum()).backward()
+            (plan.grad,) = torch.autograd.grad(-worth.sum(), plan)
             optimizer.step()
             with torch.no_grad():
                 plan.clamp_(-1.0, 1.0)

@@ -48,7 +48,7 @@ Config = TypeVar("Config", bound=GrownConfig)
 class GrownTask(PictureTask[Config]):
     """Pictures that a rule has grown."""
 
-    config_type = GrownConfig
+    config_type: ClassVar[type[GrownConfig]] = GrownConfig
 
     @cached_property
     def rule(self) -> NPARule:

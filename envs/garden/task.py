@@ -31,7 +31,7 @@ class GardenTask(GrownTask[Config]):
         NPAError: There is no such rule, or it is one of other worlds.
     """
 
-    config_type = GardenConfig
+    config_type: ClassVar[type[GardenConfig]] = GardenConfig
 
     def __init__(self, config: Config, device: torch.device) -> None:
         super().__init__(config, device)
