@@ -64,16 +64,6 @@ def test_species_have_spaces_of_their_own_sizes_and_the_state_shows_all():
     assert env.state_space.contains(env.state())
 
 
-def test_species_start_in_disks_in_a_row():
-    env = make(species_count=3, particle_counts=(40, 40, 40), seed_distance=1.0, seed_radius=0.2)
-    env.reset(seed=0)
-    x, s = env.particles()
-    for k, middle in enumerate((-1.0, 0.0, 1.0)):
-        offset = x[40 * k : 40 * (k + 1)] - torch.tensor([middle, 0.0])
-        assert 0.15 < float(offset.norm(dim=1).max()) <= 0.2 + 1e-6
-    assert float(s.abs().max()) == 0.0
-
-
 def test_a_species_that_is_removed_is_gone():
     env = make(species_count=3, deaths=((1, 2),), update_prob=1.0)
     env.reset(seed=0)
@@ -298,27 +288,6 @@ def test_what_needs_a_world_says_so():
         env.action_space("species_9")
     env.close()
     env.close()
-
-
-def test_species_are_told_apart_where_asked_for():
-    keywords = {"particle_counts": (40, 24), "seed_distance": 0.1}
-    shared = multispecies_v0.parallel_env("mixing", **keywords)
-    telling = multispecies_v0.parallel_env("mixing", perception="per_species", **keywords)
-    width = shared.observation_space("species_0").shape[1]
-    assert telling.observation_space("species_0").shape == (40, width + 2 * 3)
-    seen, _ = shared.reset(seed=3)
-    told, _ = telling.reset(seed=3)
-    x = telling.particles()[0][None]
-    fields = npa_envs.species_fields(x, (40, 24), eps=0.1)
-    for agent, rows in (("species_0", slice(0, 40)), ("species_1", slice(40, 64))):
-        assert telling.observation_space(agent).contains(told[agent])
-        np.testing.assert_array_equal(told[agent][:, :width], seen[agent])
-        densities = told[agent][:, width : width + 2]
-        np.testing.assert_allclose(densities, fields.rho[0, rows] / 64, rtol=1e-5)
-        gradient = fields.drho[0, rows] / 64
-        length = gradient.norm(dim=-1, keepdim=True).clamp_min(1e-30)
-        scaled = (torch.log1p(length) * gradient / length).flatten(1)
-        np.testing.assert_allclose(told[agent][:, width + 2 :], scaled, rtol=1e-4, atol=1e-5)
 
 
 def test_a_species_that_is_gone_leaves_nothing_to_perceive():

@@ -16,7 +16,6 @@ from crowds import (
 
 from npa_envs.envs.multi.worlds import Account
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
-from npa_envs.tasks.targets.points import load_target
 
 
 def splat_loss(target, x, s, count):
@@ -54,18 +53,6 @@ def test_a_species_is_paid_for_the_mean_of_its_particles_and_a_team_for_that_of_
     own = {"species_0": -HALF_WAY, "species_1": -0.5 * HALF_WAY}
     team = dict.fromkeys(own, -0.75 * HALF_WAY)
     assert rewards == pytest.approx(own if reward == "individual" else team, abs=1e-6)
-
-
-def test_species_that_walk_through_each_other_mix_and_part_again():
-    env = make(particle_count=200, eps=0.1, update_prob=1.0, max_cycles=16)
-    _, infos = env.reset(seed=0)
-    assert min(info["loss"] for info in infos.values()) > 0.9
-    actions = still(env)
-    actions["species_0"][:, 0], actions["species_1"][:, 0] = 0.5, -0.5
-    losses = [np.mean([info["loss"] for info in env.step(actions)[-1].values()]) for _ in range(16)]
-    # The disks are 0.4 apart, and come 0.05 nearer in a step.
-    assert losses[7] == min(losses) < 0.25
-    assert losses[-1] > 0.9
 
 
 def test_entropy_weighs_neighbours_by_their_volumes():
@@ -154,24 +141,6 @@ def test_what_the_invaded_gain_the_invaders_lose(species_count):
         assert sum(rewards.values()) == pytest.approx(0.0, abs=1e-15)
 
 
-def test_symbiosis_reaches_its_target_together_only():
-    count = load_target("heart", point_count=64).point_count
-    env = make("symbiosis", target="heart", particle_count=count)
-    env.reset(seed=0)
-    goal = env.worlds.task.goals[0].target
-    s = torch.zeros(count, 16)
-    s[:, -3:] = goal.colours - 0.5
-    env.place_particles(goal.points, s)
-    _, _, _, _, infos = env.step(still(env))
-    assert infos["species_0"]["loss"] == pytest.approx(0.0, abs=1e-6)
-    half = env.action_space("species_0").shape[0]
-    x = goal.points.clone()
-    x[half:] = 3.0
-    env.place_particles(x, s)
-    _, _, _, _, infos = env.step(still(env))
-    assert infos["species_0"]["loss"] > 0.1
-
-
 def test_all_of_a_symbiosis_are_paid_alike():
     env = make("symbiosis", target="heart", species_count=3)
     env.reset(seed=0)
@@ -180,29 +149,6 @@ def test_all_of_a_symbiosis_are_paid_alike():
     gain = splat_loss("heart", x0, s0, 41) - splat_loss("heart", *env.particles(), 41)
     assert list(rewards.values()) == pytest.approx([gain] * 3, abs=1e-6)
     assert gain != 0.0
-
-
-@pytest.mark.parametrize("task", ["mixing", "segregation"])
-def test_swapping_species_and_their_actions_swaps_all_that_comes_out(task):
-    env, swapped = (make(task, particle_count=40, update_prob=1.0) for _ in range(2))
-    other = {"species_0": "species_1", "species_1": "species_0"}
-    for e in (env, swapped):
-        e.reset(seed=0)
-    x, s = env.particles()
-    swapped.place_particles(x.roll(20, 0), s.roll(20, 0))
-    generator = np.random.default_rng(0)
-    for _ in range(5):
-        actions = drawn(env, generator)
-        outcome = env.step(actions)
-        mirrored = swapped.step({other[agent]: action for agent, action in actions.items()})
-        for mine, theirs in zip(env.particles(), swapped.particles(), strict=True):
-            assert torch.equal(mine.roll(20, 0), theirs)
-        for agent in actions:
-            seen, there = outcome[0][agent], mirrored[0][other[agent]]
-            # Sums over neighbours run by their indices, which are others.
-            np.testing.assert_allclose(seen, there, rtol=1e-4, atol=1e-5)
-            assert outcome[1][agent] == pytest.approx(mirrored[1][other[agent]], abs=1e-6)
-    assert outcome[1]["species_0"] != outcome[1]["species_1"]
 
 
 def test_leaving_the_world_never_pays():

@@ -96,19 +96,6 @@ def test_the_mixing_index_of_known_worlds():
         mixing_index(pair, [2], eps=0.1)
 
 
-def test_a_rule_out_of_reach_of_the_other_is_what_it_is_alone():
-    """Its densities are divided by its own particles, and it draws what it draws alone."""
-    encounters = Encounters(settings(distances=(30.0,), ratios=(0.5, 0.25)), device=CPU)
-    rows, _ = encounters.meet(organism(), organism("b", seed=1))
-    assert [found.ratio for found in rows] == [0.5, 0.25]
-    for found in rows:
-        assert found.together == pytest.approx(found.alone, rel=1e-4)
-        assert found.change == pytest.approx(1.0, rel=1e-4)
-        assert found.displacement < 1e-4
-        assert found.mixing == 0.0
-        assert found.verdict == "undisturbed"
-
-
 def test_a_rule_within_reach_is_measured_by_its_own_particles():
     encounters = Encounters(settings(distances=(0.0, 0.3)), device=CPU)
     rows, _ = encounters.meet(organism(), organism("b", seed=1))

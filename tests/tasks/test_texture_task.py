@@ -79,15 +79,6 @@ def test_loss_ignores_which_particle_is_which_and_where_the_world_lies(loss):
     torch.testing.assert_close(task.metric(moved, s), value, rtol=1e-9, atol=0.0)
 
 
-def test_parts_and_metric_are_the_losses_of_colours_and_of_densities():
-    task = Texture(dataclasses.replace(SMALL, colour_weight=2.0, density_weight=3.0))
-    x, s = worlds(task, 2)
-    colour, density = task.texture_losses(x, s)
-    _, parts = task.loss(x, s, torch.zeros(2, 300))
-    assert (parts["colour"], parts["density"]) == (colour.mean(), density.mean())
-    torch.testing.assert_close(task.metric(x, s), 2.0 * colour + 3.0 * density)
-
-
 @pytest.mark.parametrize("loss", ["patch_swd", "filter_swd"])
 def test_shares_average_to_the_loss_and_tell_what_a_particle_changes(loss):
     task = Texture(dataclasses.replace(SMALL, loss=loss))

@@ -22,18 +22,6 @@ from npa_envs.training import DivergedError, JsonlLog, load_config, override
 from npa_envs.training.run_folder import load_checkpoint
 
 
-def test_training_learns_the_circle(tmp_path):
-    config = circle_config(tmp_path, iterations=150, milestones=[100], log_interval=5)
-    config = override(config, learning_rate=3e-2, steps=(6, 12))
-    result = train(config)
-    log = log_of(tmp_path)
-    assert result.finished
-    assert result.iteration == 150
-    assert log[0]["distance"] > 0.1
-    # Seen over ten seeds: 0.0024 to 0.0047.
-    assert log[-1]["distance"] < 0.01
-
-
 def test_training_starts_from_an_initial_rule_of_its_shape(tmp_path):
     first = train(circle_config(tmp_path / "first", iterations=3))
     path = tmp_path / "first" / "rule.safetensors"
@@ -110,11 +98,6 @@ def test_log_has_terms_rate_steps_and_time(tmp_path):
     for record in records:
         whole = record["distance"] + 0.01 * record["state"] + 0.001 * record["motion"]
         assert record["loss"] == pytest.approx(whole, rel=1e-5)
-
-
-def test_rollout_steps_cover_the_whole_range_and_no_more(tmp_path):
-    train(circle_config(tmp_path, iterations=80, steps=[2, 5], milestones=[]))
-    assert {record["steps"] for record in log_of(tmp_path)} == {2, 3, 4}
 
 
 class WatchedTask(CircleTask):

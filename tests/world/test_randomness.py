@@ -240,17 +240,6 @@ def test_the_mask_of_a_step_is_the_streams_first_draw(device):
     assert torch.equal((moved != x).any(dim=-1), mask == 1)
 
 
-def test_balls_and_choices_of_a_world_do_not_depend_on_the_batch(space_dim, device):
-    random = WorldRandom(range(5), device=device)
-    together = uniform_ball(5, 333, space_dim, 0.2, generator=random, device=device)
-    chosen = random_particle(together, random)
-    for seed in range(5):
-        single = WorldRandom(seed, device=device)
-        ball = uniform_ball(1, 333, space_dim, 0.2, generator=single, device=device)
-        assert torch.equal(ball[0], together[seed])
-        assert torch.equal(random_particle(ball, single)[0], chosen[seed])
-
-
 def test_points_of_a_ball_are_uniform_in_it(space_dim, device):
     random = WorldRandom(range(4), device=device)
     points = uniform_ball(

@@ -105,20 +105,6 @@ def test_species_out_of_reach_see_themselves_as_alone(told_apart, device):
     assert (own[0] - shared[0]).abs().max() > 1e-4
 
 
-@pytest.mark.parametrize("worldwise", [False, True])
-def test_each_species_has_its_own_update_probability(worldwise, device):
-    rules = [make_rule(device, seed=k, static=True) for k in range(3)]
-    x, s = make_world(device, 1500)
-    generator = npa_envs.WorldRandom([1, 2], device=device) if worldwise else seeded(device)
-    _, after = npa_envs.rollout_species(
-        rules, x, s, 1, counts=[500] * 3, update_prob=(0.2, 0.8, 1.0), generator=generator
-    )
-    shares = [float(part.any(dim=-1).double().mean()) for part in (after != s).split(500, dim=1)]
-    assert shares[0] == pytest.approx(0.2, abs=0.05)
-    assert shares[1] == pytest.approx(0.8, abs=0.05)
-    assert shares[2] == 1.0
-
-
 def test_a_species_that_sleeps_stays_where_it_is_and_leaves_others_their_updates(device):
     rules = [make_rule(device), make_rule(device, seed=1)]
     x, s = make_world(device)
@@ -213,7 +199,7 @@ def test_a_rule_that_tells_species_apart_perceives_more_and_says_so():
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("perception", ["shared", "per_species"])
-def test_devices_agree_and_a_rollout_can_be_captured(perception):
+def test_devices_agree(perception):
     told = 0 if perception == "shared" else 2
     options = {"counts": [1000, 500], "perception": perception, "update_prob": (0.5, 0.3)}
     x, s = make_world("cpu", 1500)
@@ -225,13 +211,6 @@ def test_devices_agree_and_a_rollout_can_be_captured(perception):
         with torch.no_grad():
             results.append(npa_envs.rollout_species(rules, *worlds, 4, generator=random, **options))
     assert_near(*results, 1e-10)
-    random = npa_envs.WorldRandom([1, 2], device="cuda")
-    x, s = x.cuda(), s.cuda()
-    graph = torch.cuda.CUDAGraph()
-    with torch.no_grad(), torch.cuda.graph(graph):
-        captured = npa_envs.rollout_species(rules, x, s, 4, generator=random, **options)
-    graph.replay()
-    assert_near(captured, results[0], 1e-10)
 
 
 @pytest.mark.parametrize(
