@@ -13,7 +13,7 @@ import re
 import sys
 from itertools import zip_longest
 from pathlib import Path
-from textwrap import dedent, indent
+from textwrap import dedent, fill, indent
 from typing import Any
 from unittest.mock import patch
 
@@ -124,7 +124,9 @@ class CommandHelp(SphinxDirective):
             contextlib.suppress(SystemExit),
         ):
             main([*self.arguments, "--help"])
-        text = printed.getvalue().strip()
+        # Descriptions come as one line each, whatever the terminal's width.
+        lines = printed.getvalue().strip().splitlines()
+        text = "\n".join(fill(line, 88) if len(line) > 88 else line for line in lines)
         if not text:
             raise self.error(f"npa-envs {' '.join(self.arguments)} --help prints nothing")
         return [nodes.literal_block(text, text, language="text")]
