@@ -7,13 +7,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from npa_envs.errors import NPAError
 from npa_envs.render import (
     to_uint8,
     turntable_frames,
@@ -35,6 +36,12 @@ if TYPE_CHECKING:
 SCREEN = 256
 """Least pixels on each side of a film whose resolution is not asked for."""
 
+Style = Literal["splats", "points"]
+"""How large particles are drawn: as in training, or so small that they stand apart."""
+
+POINT_SIZE = 0.35
+"""Size of a particle among "points", as a share of its size in training."""
+
 FRAME_COUNT = 150
 """Frames of a film whose pace is not asked for, without those of damage."""
 
@@ -45,6 +52,9 @@ EARLY_STEPS = (0, 16, 32, 64, 128)
 @dataclass
 class Film:
     """Frames of one world."""
+
+    background: str = "white"
+    """What lies behind the particles: a colour name or "#rrggbb"."""
 
     frames: list[NDArray[np.uint8]] = field(default_factory=list)
     """Pictures, uint8, shape [R, R, 3] each."""
@@ -76,7 +86,7 @@ class Film:
             self.marked.append(len(self.frames))
         if step is not None:
             self.steps[len(self.frames)] = step
-        self.frames.append(to_uint8(task.picture(x, s)[0]))
+        self.frames.append(to_uint8(task.picture(x, s)[0], self.background))
         self.captions.append(caption)
 
     def strip(self, count: int = 10) -> tuple[list[NDArray[np.uint8]], list[str]]:
@@ -161,7 +171,14 @@ def frame_steps(steps: int) -> int:
 
 
 def large_task(
-    task: PictureTask, source: str, rule: NPARule, device: torch.device, **world: Any
+    task: PictureTask,
+    source: str,
+    rule: NPARule,
+    device: torch.device,
+    *,
+    resolution: int | None = None,
+    style: Style = "splats",
+    **world: Any,
 ) -> PictureTask:
     """Return a rule's task with pictures that are large enough to be seen.
 
@@ -170,14 +187,22 @@ def large_task(
         source: What the rule was loaded from.
         rule: The rule.
         device: Where the task keeps its target.
+        resolution: Pixels on each side; None: as trained, but at least `SCREEN`.
+        style: "splats" are as large as in training, "points" stand apart.
         world: What was said of the rule's world, as `task_of_rule` takes it.
 
     Raises:
-        NPAError: As for `task_of_rule`.
+        NPAError: As for `task_of_rule`, or particles of this task have one size.
     """
-    if len(task.target_picture) >= SCREEN:
-        return task
-    return task_of_rule(source, rule, device, **world, resolution=SCREEN).task
+    told = dict(world)
+    if resolution is not None or len(task.target_picture) < SCREEN:
+        told["resolution"] = SCREEN if resolution is None else resolution
+    if style == "points":
+        sigma = getattr(getattr(task, "config", None), "sigma", None)
+        if sigma is None:
+            raise NPAError("style must be 'splats' for clouds that never move, got 'points'")
+        told["sigma"] = POINT_SIZE * sigma
+    return task if told == world else task_of_rule(source, rule, device, **told).task
 
 
 def write_film(film: Film, folder: Path, name: str, *, fps: float = 25.0) -> list[Path]:
@@ -191,12 +216,31 @@ def write_film(film: Film, folder: Path, name: str, *, fps: float = 25.0) -> lis
     write_gif(paths[0], film.frames, fps)
     write_mp4(paths[1], film.frames, fps)
     rows = math.ceil(len(strip) / 8)
-    write_filmstrip(paths[2], strip, captions, columns=math.ceil(len(strip) / rows))
+    columns = math.ceil(len(strip) / rows)
+    write_filmstrip(paths[2], strip, captions, columns=columns, background=film.background)
     return paths
 
 
-def write_solid(task: ViewTask, x: Tensor, s: Tensor, folder: Path) -> list[Path]:
+def write_solid(
+    task: ViewTask,
+    x: Tensor,
+    s: Tensor,
+    folder: Path,
+    *,
+    shown: ViewTask | None = None,
+    resolution: int = SCREEN,
+    background: str = "white",
+) -> list[Path]:
     """Write a grown 3D world as a turntable and as files for other programs; return the files.
+
+    Args:
+        task: The task, for the files.
+        x: Positions [length units], shape [1, N, 3].
+        s: States (dimensionless), shape [1, N, C].
+        folder: Where to write to.
+        shown: The task that draws the turntable; None: `task`.
+        resolution: Pixels on each side of the turntable.
+        background: What lies behind the particles.
 
     Raises:
         NPAError: A file cannot be written.
@@ -204,7 +248,13 @@ def write_solid(task: ViewTask, x: Tensor, s: Tensor, folder: Path) -> list[Path
     names = ("turntable.gif", "points.ply", "gaussians.ply", "cloud.splat")
     paths = [folder / name for name in names]
     with torch.no_grad():
-        frames = turntable_frames(lambda cameras: task.views(x, s, cameras), device=x.device)
+        drawn = task if shown is None else shown
+        frames = turntable_frames(
+            lambda cameras: drawn.views(x, s, cameras),
+            resolution=resolution,
+            background=background,
+            device=x.device,
+        )
         looks = task.gaussians(s)
     write_gif(paths[0], frames, fps=20.0)
     write_points(paths[1], x, looks)

@@ -40,7 +40,11 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "interact": ("interact gecko heart", "interact --quick"),
     "list": ("list",),
     "robustness": ("robustness heart --quick", "robustness --device cuda --out results"),
-    "rollout": ("rollout gecko --damage 300:cut 500:erase --steps 700", "rollout runs/heart"),
+    "rollout": (
+        "rollout gecko --damage 300:cut 500:erase --steps 700",
+        "rollout runs/heart",
+        "rollout gecko --resolution 512 --style points --background black",
+    ),
     "stress": ("stress --quick", "stress --only geometry --out results"),
     "view": ("view gecko", "view runs/heart", "view npa/Texture-v0 --policy dots"),
     "warmup": ("warmup", "warmup --device cuda --space-dims 2 3"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -41,6 +41,13 @@ class RolloutOptions(RuleOptions):
     resolution: int | None = None
     """Pixels on each side of the film; default: as trained, but at least 256."""
 
+    style: Literal["splats", "points"] = "splats"
+    """Particles as large as in training, or points that stand apart; for those 512 pixels are
+    better."""
+
+    background: str = "white"
+    """What lies behind them: a colour name such as black, or "#rrggbb"."""
+
     every: int | None = None
     """Steps between two frames; default: as many as make about 150 frames."""
 
@@ -58,9 +65,11 @@ class RolloutOptions(RuleOptions):
                 raise NPAError(f"{name} must be at least 1, got {value}")
         if not 0 <= self.seed < 2**63:
             raise NPAError(f"seed must be in [0, 2^63), got {self.seed}: try 0")
+        from npa_envs.render.colours import background_colour
         from npa_envs.render.film import GIF_HIGHEST_RATE, check_rate
 
         check_rate(self.fps, highest=GIF_HIGHEST_RATE)
+        background_colour(self.background)
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -68,7 +77,15 @@ def main(arguments: Sequence[str]) -> int:
     options = parse_options(RolloutOptions, "rollout", arguments)
     import torch
 
-    from npa_envs.cli.film import film_world, frame_steps, large_task, write_film, write_solid
+    from npa_envs.cli.film import (
+        SCREEN,
+        Film,
+        film_world,
+        frame_steps,
+        large_task,
+        write_film,
+        write_solid,
+    )
     from npa_envs.measure.quality import measure
     from npa_envs.rule.files import load_rule
     from npa_envs.tasks.base import ViewTask, seed_worlds, task_toward
@@ -89,11 +106,12 @@ def main(arguments: Sequence[str]) -> int:
     source = rule_of(options.rule)
     rule = load_rule(source, device=device).float()
     world = options.world()
-    trained = task_of_rule(source, rule, device, **world, resolution=options.resolution)
-    # Drawn large enough to be seen; measured as trained, so that the figures can be compared.
-    task = shown = trained.task
-    if options.resolution is None:
-        shown = large_task(task, source, rule, device, **world)
+    trained = task_of_rule(source, rule, device, **world)
+    # Drawn as asked for; measured as trained, so that the figures can be compared.
+    task = trained.task
+    shown = large_task(
+        task, source, rule, device, resolution=options.resolution, style=options.style, **world
+    )
     folder = writable_folder(options.out)
     generator = torch.Generator(device).manual_seed(options.seed)
     x, s, goal = seed_worlds(task, 1, generator=generator, device=device)
@@ -108,6 +126,7 @@ def main(arguments: Sequence[str]) -> int:
             generator=generator,
             damages=damages,
             every=options.every or frame_steps(options.steps),
+            film=Film(background=options.background),
             progress=bar.advance,
             stop=stop.is_set,
         )
@@ -123,8 +142,16 @@ def main(arguments: Sequence[str]) -> int:
         vote = int(majority(task.outputs(s)))
         print(f"most particles say {vote}; the cloud is a {int(goal)}")
     paths = write_film(film, folder, "growth", fps=options.fps)
-    if isinstance(task, ViewTask):
-        paths += write_solid(task, x, s, folder)
+    if isinstance(task, ViewTask) and isinstance(shown, ViewTask):
+        paths += write_solid(
+            task,
+            x,
+            s,
+            folder,
+            shown=shown,
+            resolution=options.resolution or SCREEN,
+            background=options.background,
+        )
     for path in paths:
         print(f"wrote {path}")
     return 0

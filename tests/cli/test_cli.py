@@ -393,6 +393,7 @@ def test_a_mistake_is_refused_in_one_line_and_nothing_is_written(
         (["train", *TINY, "--iters", "3"], "--iters"),
         (["rollout", "gecko", "--fps", "51"], "fps must be in [0.1, 50], got 51"),
         (["rollout", "gecko", "--fps", "nan"], "fps must be in"),
+        (["rollout", "gecko", "--background", "mauvish"], "background must be"),
         (["rollout", "gecko", "--seed", "-1"], "seed must be in [0, 2^63), got -1"),
         (["rollout", "gecko", "--seed", str(2**63)], "seed must be in"),
     ],
@@ -469,6 +470,39 @@ def test_rollout_notices_before_the_first_step_that_it_cannot_write(
     monkeypatch.setattr("npa_envs.cli.film.rollout", lambda *_, **__: pytest.fail("a step ran"))
     words = ["rollout", rule, "--steps", "9", "--out", str(tmp_path)]
     assert "out must be a folder that can be written to" in error_of(capsys, words)
+
+
+def test_a_film_to_share_has_the_style_and_the_background_that_were_asked_for(
+    tmp_path, rule, capsys
+):
+    words = ["rollout", rule, "--steps", "8", "--every", "4", "--no-progress"]
+    given = {
+        "plain": [],
+        "large": ["--resolution", "96", "--background", "#102030"],
+        "points": ["--resolution", "96", "--background", "#102030", "--style", "points"],
+    }
+    told, last = {}, {}
+    for name, more in given.items():
+        assert main([*words, *more, "--out", str(tmp_path / name)]) == 0
+        told[name] = capsys.readouterr().out.splitlines()[0]
+        with Image.open(tmp_path / name / "growth.gif") as film:
+            film.seek(film.n_frames - 1)
+            last[name] = np.asarray(film.convert("RGB")).astype(int)
+    # Drawn as asked for, measured as trained.
+    assert told["plain"] == told["large"] == told["points"]
+    assert (last["plain"][0, 0] > 250).all()
+    bare = {name: np.abs(last[name] - (16, 32, 48)).max(axis=-1) < 12 for name in last}
+    assert last["points"].shape == (96, 96, 3)
+    assert bare["large"][0, 0]
+    assert not bare["plain"].any()
+    assert (~bare["points"]).mean() < 0.7 * (~bare["large"]).mean()
+    with Image.open(tmp_path / "points" / "growth-filmstrip.png") as strip:
+        assert strip.getpixel((0, 0)) == (16, 32, 48)
+
+
+def test_films_that_cannot_be_drawn_are_refused(rule, capsys):
+    message = error_of(capsys, ["rollout", "digits", "--style", "points"])
+    assert "style must be 'splats' for clouds that never move" in message
 
 
 def test_rollout_makes_about_150_frames(tmp_path, rule):
