@@ -76,10 +76,8 @@ class TextureTask(GoalTask[TextureEnvConfig]):
     def losses(self, x: Tensor, s: Tensor) -> Mapping[str, Tensor]:
         """Return the weighted losses of each world's colour image and of its density image."""
         colour, density = self.goal.texture_losses(x, s)
-        return {
-            "colour": self.config.colour_weight * colour,
-            "density": self.config.density_weight * density,
-        }
+        colour_weight, density_weight = self.goal.weights()
+        return {"colour": colour_weight * colour, "density": density_weight * density}
 
     @property
     def pixel_size(self) -> float:
@@ -110,7 +108,8 @@ class TextureEnv(NPAEnv):
     `resolution` pixels. The texture loss ignores where things lie. It compares how patches of
     several sizes (`"patch_swd"`), answers of random filters (`"filter_swd"`), or features of VGG16
     (`"vgg_ot"`) are distributed. The loss L is `colour_weight` times the loss of the colour image
-    plus `density_weight` times the loss of the density image. 0 is the same texture. Formulas:
+    plus `density_weight` times the loss of the density image. 0 is the same texture. Joint losses
+    such as `"patch_ot"` see both images at once. Their part of the density is 0. Formulas:
     [textures](../mathematics.md#textures).
 
     A particle's own reward says how much its part of the picture makes the texture better or worse,
@@ -133,8 +132,8 @@ class TextureEnv(NPAEnv):
 
     ## Vectorized environment
 
-    With `loss="vgg_ot"` and `reward="particle"`, particles' own rewards may depend in their last
-    bits on the number of worlds. Nothing else does.
+    With `reward="particle"` and `loss="vgg_ot"` or a joint loss but `"joint_swd"`, particles' own
+    rewards may depend in their last bits on the number of worlds. Nothing else does.
     """
 
     task_type = TextureTask

@@ -236,6 +236,13 @@ class Texture(ParticleTask[TextureConfig]):
         """
         return self._compare(self.picture(x - x[:, :1].detach(), s))
 
+    def weights(self) -> tuple[float, float]:
+        """Return what both parts of `texture_losses` are multiplied by; joint losses are weighted
+        as they are."""
+        if is_joint(self.config.loss):
+            return 1.0, 1.0
+        return self.config.colour_weight, self.config.density_weight
+
     def metric(self, x: Tensor, s: Tensor) -> Tensor:
         """Return each world's texture loss, colour and density weighted, shape [B]."""
         return self._weighted(*self.texture_losses(x, s))
@@ -304,9 +311,8 @@ class Texture(ParticleTask[TextureConfig]):
         return torch.cat((colour_scale * colour_image(channels), density_scale * density), dim=-3)
 
     def _weighted(self, colour: Tensor, density: Tensor) -> Tensor:
-        if self._losses[1] is None:
-            return colour
-        return self.config.colour_weight * colour + self.config.density_weight * density
+        colour_weight, density_weight = self.weights()
+        return colour_weight * colour + density_weight * density
 
     @cached_property
     def _losses(self) -> tuple[TextureLoss, TextureLoss | None]:
