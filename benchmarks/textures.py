@@ -131,18 +131,25 @@ def run(arguments: argparse.Namespace) -> None:
     for name, trainer in zip(names, trainers, strict=True):
         begun = time.perf_counter()
         rule = trainer._cycle.average.rule(trainer.rule)
-        task: Any = trainer.task
+        told_task = trainer.config.task
+        if arguments.particles:
+            told_task = told_task.with_particle_count(arguments.particles)
+        task = Texture(told_task, device=arguments.device)
         tables, strip = measured(rule, task, arguments.steps, arguments.device, seeds)
         Image.fromarray(strip).save(out / f"strip-{name}.png")
         line = {"name": name, "iterations": trainer.iteration, "seconds": seconds, **tables}
-        line |= {"together": len(trainers), "metric": task.metric_name, "fields": changes}
+        line |= {
+            "together": len(trainers),
+            "particles": told_task.particle_count,
+            "fields": changes,
+        }
         with (out / "runs.jsonl").open("a") as file:
             file.write(json.dumps(line) + "\n")
         print(f"{name:24s} {told(tables)}  {time.perf_counter() - begun:.1f} s", flush=True)
     for name in arguments.rules:
         rule = load_rule(name, device=arguments.device).float()
-        task = task_of_rule(name, rule, torch.device(arguments.device)).task
-        tables, strip = measured(rule, task, arguments.steps, arguments.device, seeds)
+        trained: Any = task_of_rule(name, rule, torch.device(arguments.device)).task
+        tables, strip = measured(rule, trained, arguments.steps, arguments.device, seeds)
         Image.fromarray(strip).save(out / f"strip-{name}-shipped.png")
         with (out / "runs.jsonl").open("a") as file:
             file.write(json.dumps({"name": f"{name}-shipped", **tables}) + "\n")
@@ -219,6 +226,7 @@ def main() -> None:
     parser.add_argument("--preset", default="paper")
     parser.add_argument("--fields", default="{}", help="fields to change, as JSON")
     parser.add_argument("--iterations", type=int, default=120, help="of particles without a rule")
+    parser.add_argument("--particles", type=int, help="that rules are measured with")
     parser.add_argument("--rules", nargs="*", default=[], help="shipped rules to judge as well")
     parser.add_argument("--label", default="")
     parser.add_argument("--steps", type=int, nargs="+", default=[64, 512, 4096])
