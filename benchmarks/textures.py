@@ -2,12 +2,13 @@
 
 `run` trains rules, several side by side on one GPU, each on a stream of its own, and judges them as
 `npa-envs evaluate --judge` does, with seeds that training never saw. Every finished rule is a line
-of JSON, with its file and a strip of pictures; `report` prints the table. `particles` asks
-what a loss is worth without any rule: positions and colours of grey particles follow its slope.
+of JSON, with its file and a strip of pictures. `particles` asks what a loss is worth without any
+rule: positions and colours of grey particles follow its slope. `report` prints a table, and
+`figures` draws the strips of several runs as one picture.
 
     python benchmarks/textures.py particles --out OUT
     python benchmarks/textures.py run --device cuda --out OUT --losses patch_swd patch_ot
-    python benchmarks/textures.py report OUT
+    python benchmarks/textures.py report --out OUT --steps 64 512 2048
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from PIL import Image
 from npa_envs.measure.judge import Judge, JudgeRow
 from npa_envs.measure.quality import evaluate
 from npa_envs.measure.tables import as_objects
-from npa_envs.render.colours import to_uint8
+from npa_envs.render import to_uint8, write_filmstrip
 from npa_envs.rule.files import load_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.texture import Texture
@@ -204,6 +205,35 @@ def particles(arguments: argparse.Namespace) -> None:
         Image.fromarray(strip).save(out / f"particles-{target}.png")
 
 
+def frames_of(strip: Path) -> list[np.ndarray[Any, Any]]:
+    """Return the pictures of a strip: the target, and a world after each number of steps."""
+    picture = np.asarray(Image.open(strip).convert("RGB"))
+    return list(np.split(picture, picture.shape[1] // picture.shape[0], axis=1))
+
+
+def figures(arguments: argparse.Namespace) -> None:
+    """Draw each target with what its rule has grown, or with what each loss has brought."""
+    captions, frames = [], []
+    for target in arguments.targets:
+        found = [
+            arguments.out / f"strip-{target}-{loss}{arguments.label}.png"
+            for loss in arguments.losses
+        ]
+        captions.append(target)
+        frames.append(frames_of(found[0])[0])
+        if len(found) > 1:
+            captions += arguments.losses
+            frames += [frames_of(strip)[1 + arguments.steps.index(512)] for strip in found]
+            continue
+        for step in (64, 512, 4096):
+            captions.append(f"step {step}")
+            frames.append(frames_of(found[0])[1 + arguments.steps.index(step)])
+        captions.append("step 4096, 2 x 2")
+        frames.append(np.tile(frames[-1], (2, 2, 1))[::2, ::2])
+    columns = len(frames) // len(arguments.targets)
+    write_filmstrip(arguments.figure, frames, captions, columns=columns)
+
+
 def report(arguments: argparse.Namespace) -> None:
     """Print the ratios of all runs as a table."""
     print("| run | iterations | " + " | ".join(str(step) for step in arguments.steps) + " |")
@@ -218,13 +248,14 @@ def report(arguments: argparse.Namespace) -> None:
 def main() -> None:
     """Read the arguments and do what they say."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("what", choices=("run", "particles", "report"))
+    parser.add_argument("what", choices=("run", "particles", "report", "figures"))
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--runs", type=Path, default=Path("runs"))
     parser.add_argument("--losses", nargs="+", default=["patch_ot"])
     parser.add_argument("--targets", nargs="+", default=["hearts", "bubbles", "stripes"])
     parser.add_argument("--preset", default="paper")
     parser.add_argument("--fields", default="{}", help="fields to change, as JSON")
+    parser.add_argument("--figure", type=Path, default=Path("figure.png"))
     parser.add_argument("--iterations", type=int, default=120, help="of particles without a rule")
     parser.add_argument("--particles", type=int, help="that rules are measured with")
     parser.add_argument("--rules", nargs="*", default=[], help="shipped rules to judge as well")
@@ -233,7 +264,9 @@ def main() -> None:
     parser.add_argument("--longest", type=float, default=1e9, help="seconds of training")
     parser.add_argument("--device", default="cpu")
     arguments = parser.parse_args()
-    {"run": run, "particles": particles, "report": report}[arguments.what](arguments)
+    {"run": run, "particles": particles, "report": report, "figures": figures}[arguments.what](
+        arguments
+    )
 
 
 if __name__ == "__main__":

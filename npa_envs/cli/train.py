@@ -42,7 +42,7 @@ class TrainOptions:
 
     preset: str = ""
     """Configuration to start from: `paper`, `fast` (minutes on a CPU), `tiny` (seconds), or for
-    morphogenesis2d `best` (minutes on a GPU); `npa-envs list` has their sizes and times. By
+    pictures and textures `best` (minutes on a GPU); `npa-envs list` has their sizes and times. By
     default `best` on CUDA where the task has it, else `fast`."""
 
     target: str = ""
