@@ -60,12 +60,10 @@ def read_config(text: Any, suffix: Any) -> None:
 
 FILES: dict[str, tuple[str, Callable[[Path], Any]]] = {
     ".png": ("picture", lambda path: load_target(path, point_count=50)),
-    ".jpg": ("picture", lambda path: load_texture(path, resolution=8)),
-    ".webp": ("picture", lambda path: load_texture(path, resolution=8)),
-    ".gif": ("picture", lambda path: load_texture(path, resolution=8)),
-    ".bmp": ("picture", lambda path: load_texture(path, resolution=8)),
-    ".tiff": ("picture", lambda path: load_texture(path, resolution=8)),
-    ".ppm": ("picture", lambda path: load_texture(path, resolution=8)),
+    **{
+        f".{suffix}": ("picture", lambda path: load_texture(path, resolution=8))
+        for suffix in ("jpg", "webp", "gif", "bmp", "tiff", "ppm")
+    },
     ".safetensors": ("rule", npa_envs.load_rule),
     ".pth": ("state dict", npa_envs.load_rule),
     ".json": ("configuration", lambda path: load_config(path, preset("tiny"))),

@@ -11,7 +11,6 @@ import npa_envs
 from npa_envs.agents import (
     RandomPolicy,
     SpreadPolicy,
-    interface_of,
 )
 from npa_envs.agents.learning import Budget, Problem, RuleSet, train
 from npa_envs.envs import multispecies_v0, particles_v0
@@ -82,14 +81,6 @@ def test_every_environment_is_a_problem_with_rules_that_fit(name):
     )
     assert {rule.update_dim for rule in rules} == {problem.interface.action_dim}
     assert problem.new_rules(0).spans[-1].stop == problem.particle_count
-
-
-@pytest.mark.parametrize("problem", [heart(), digits(), species(perception="per_species")])
-def test_a_problems_interface_is_that_of_its_environment(problem):
-    envs = problem.make_envs(2)
-    observation, _ = envs.reset(seed=0)
-    assert interface_of(envs) == problem.interface
-    assert observation.shape == (2, 48, problem.interface.perception_dim)
 
 
 def test_rows_are_paid_where_that_is_asked_for():
@@ -218,17 +209,6 @@ def test_files_keep_rules_bit_for_bit(tmp_path):
     # Each is an ordinary rule's file.
     first = npa_envs.load_rule(paths[0])
     assert torch.equal(first.hidden.weight, rules.rules[0].hidden.weight)
-
-
-def test_new_rules_follow_from_their_seed_alone():
-    torch.manual_seed(1)
-    ours, before = RuleSet.new(species(), 3), torch.random.get_rng_state()
-    theirs = RuleSet.new(species(), 3)
-    assert same_rules(ours, theirs)
-    assert torch.equal(before, torch.random.get_rng_state())
-    assert not same_rules(ours, RuleSet.new(species(), 4))
-    first, second = ours
-    assert not torch.equal(first.hidden.weight, second.hidden.weight)
 
 
 def test_a_shipped_rule_fits_where_the_world_is_like_its_own():

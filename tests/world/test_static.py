@@ -139,20 +139,6 @@ def test_a_module_in_the_rules_place_is_run(device):
     assert_equals_rebuilding(rule, x, s)
 
 
-def test_inputs_may_be_strided_and_gradients_absent(device):
-    rule = static_rule(device, torch.float32)
-    x, s = random_world(2, 60, 2, 5, dtype=torch.float32, device=device)
-    strided_x = x.transpose(0, 1).contiguous().transpose(0, 1)
-    strided_s = s.transpose(1, 2).contiguous().transpose(1, 2)
-    values = outcome(rule, strided_x, strided_s)
-    assert torch.equal(values[1], outcome(rule, x, s)[1])
-    with torch.no_grad():
-        generator = torch.Generator(device).manual_seed(3)
-        _, states = npa_envs.rollout(rule, x, s, STEPS, eps=0.3, generator=generator)
-    assert not states.requires_grad
-    assert torch.equal(states, values[1])
-
-
 def test_a_compiled_rollout_equals_the_eager_one(device):
     rule = static_rule(device, torch.float32)
     x, s = random_world(1, 40, 2, 5, dtype=torch.float32, device=device)
@@ -177,25 +163,3 @@ def test_warmup_leaves_nothing_to_compile(device):
     for update_prob in (0.5, 1.0):
         outcome(rule, x, s, update_prob=update_prob)
     assert not {(kernel.module.name, kernel.key) for kernel, _ in launch.launched - warm}
-
-
-def test_other_streams_give_the_same(device):
-    if device.type != "cuda":
-        pytest.skip("streams are CUDA's")
-    rule = static_rule(device, torch.float32)
-    x, s = random_world(2, 3000, 2, 5, dtype=torch.float32, device=device)
-    generator = torch.Generator(device)
-
-    def states():
-        with torch.no_grad():
-            return npa_envs.rollout(rule, x, s, 20, eps=0.1, box=1.4, generator=generator)[1]
-
-    generator.manual_seed(3)
-    expected = states()
-    stream = torch.cuda.Stream()
-    stream.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(stream):
-        generator.manual_seed(3)
-        beside = states()
-    torch.cuda.current_stream().wait_stream(stream)
-    assert torch.equal(beside, expected)

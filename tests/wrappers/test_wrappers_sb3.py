@@ -12,7 +12,6 @@ from small_envs import assert_same
 from wrapped_envs import ACTIONS, STEPS, policy
 
 import npa_envs
-from npa_envs.agents.learning import Problem
 from npa_envs.envs import multispecies_v0, particles_v0
 from npa_envs.errors import NPAError
 from npa_envs.wrappers import VectorDamageEvents, VectorNormalizePerception, VectorSpeciesTags
@@ -185,27 +184,6 @@ def test_ppo_learns_on_the_rows():
 
 
 # Worlds as rows
-
-
-def test_species_stand_one_after_the_other_in_a_world():
-    problem = Problem(
-        env_id="npa/Mixing-v0",
-        keywords={"particle_counts": [3, 5], "eps": 0.3, "state_dim": 4},
-        episode_steps=2,
-    )
-    rows, envs = WorldVecEnv(problem.make_envs(2)), problem.make_envs(2)
-    rows.seed(1)
-    seen, (observation, _) = rows.reset(), envs.reset(seed=1)
-    np.testing.assert_array_equal(seen, observation.numpy())
-    actions = np.random.default_rng(0).uniform(-1, 1, (2, *rows.action_space.shape))
-    actions = actions.astype(np.float32)
-    for _ in range(2):
-        seen, rewards, done, infos = rows.step(actions)
-        observation, paid, *_, told = envs.step(observation.new_tensor(actions))
-        np.testing.assert_array_equal(seen, observation.numpy())
-        np.testing.assert_array_equal(rewards, paid.numpy())
-    assert done.all()
-    np.testing.assert_array_equal(infos[1]["terminal_observation"], told["final_obs"][1].numpy())
 
 
 # Particles of several species as rows

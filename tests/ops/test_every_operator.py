@@ -1,8 +1,11 @@
-"""Second derivatives are right or refused; they never vanish."""
+"""What holds of every differentiable operator: however it is asked, it answers the same.
+
+Second derivatives are right or refused; they never vanish.
+"""
 
 import pytest
 import torch
-from worlds import lively_rule, random_world
+from worlds import assert_same, lively_rule, random_world
 
 import npa_envs
 from npa_envs import reference
@@ -33,9 +36,43 @@ OPERATORS = {
     "a picture": lambda x, s: splat(x[..., :2], s[..., :3], resolution=16, pixel_size=0.1),
     "a picture of Gaussians": picture_of_gaussians,
 }
+every_operator = pytest.mark.parametrize("name", OPERATORS)
 
 
-@pytest.mark.parametrize("name", OPERATORS)
+def outcome(name, x, s):
+    """A value, and the gradient of its sum by the states, as given in memory."""
+    s = s.detach().requires_grad_()
+    value = OPERATORS[name](x, s)
+    return value.detach(), *torch.autograd.grad(value.sum(), s)
+
+
+@every_operator
+def test_memory_graphs_and_streams_change_nothing(name, device):
+    x, s = random_world(2, 31, 3, 5, dtype=torch.float32, device=device)
+    expected = outcome(name, x, s)
+    strided = [value.permute(2, 1, 0).contiguous().permute(2, 1, 0) for value in (x, s)]
+    assert_same(outcome(name, *strided), expected)
+    leaf = s.clone().requires_grad_()
+    value = OPERATORS[name](x, leaf)
+    # The cotangent of a sum has strides of zero; this one has none.
+    cotangent = torch.ones_like(value).contiguous()
+    for _ in range(2):
+        bars = torch.autograd.grad(value, leaf, cotangent, retain_graph=True)
+        assert_same((value.detach(), *bars), expected)
+    with torch.no_grad():
+        quiet = OPERATORS[name](x, leaf)
+    assert quiet.grad_fn is None
+    assert torch.equal(quiet, expected[0])
+    if device.type == "cuda":
+        stream = torch.cuda.Stream()
+        stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(stream):
+            beside = outcome(name, x, s)
+        torch.cuda.current_stream().wait_stream(stream)
+        assert_same(beside, expected)
+
+
+@every_operator
 def test_a_second_derivative_is_refused_however_the_first_is_asked_for(name, device):
     x, s = random_world(1, 31, 3, 5, dtype=torch.float32, device=device)
     s.requires_grad_()
