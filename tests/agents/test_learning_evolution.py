@@ -1,6 +1,5 @@
 """Evolution: many candidates at once are each candidate by itself, and their mean gets better."""
 
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +10,6 @@ from learning_problems import digits, heart, species
 from npa_envs.agents import evaluate_policy
 from npa_envs.agents.learning import Budget, Problem, RuleSet, train
 from npa_envs.agents.learning.evolution import Population, costs, fitness
-from npa_envs.errors import MissingDependencyError
 
 GROWTH = {"eps": 0.2, "eps0": 0.2, "colour_weight": 20.0, "resolution": 32, "state_scale": 0.1}
 SMALL = {
@@ -133,9 +131,3 @@ def test_a_start_is_the_first_mean_and_stays_as_it_is():
     assert np.array_equal(Population(start).vector(), before)
     far = np.abs(Population(trained.rules).vector() - before) / Population(start).scales()
     assert 0.0 < far.max() < 0.1
-
-
-def test_a_missing_library_is_named_with_its_cure(monkeypatch):
-    monkeypatch.setitem(sys.modules, "cma", None)
-    with pytest.raises(MissingDependencyError, match=r"pip install 'npa-envs\[evolution\]'"):
-        train("evolution", PROBLEMS["growth"], Budget(particle_steps=1), 0)

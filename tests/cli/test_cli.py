@@ -369,6 +369,12 @@ def test_a_quick_encounter_is_of_two_rules(tmp_path, capsys, monkeypatch):
         ("rollout RULE --out FILE/inside", "out must be a folder"),
         ("rollout 3D --out OUT", "got space_dim=3"),
         ("evaluate UNTOLD --no-progress", "give --target"),
+        ("robustness hart", "unknown rule 'hart': did you mean 'heart'"),
+        ("robustness --seed-count 0", "seed_count must be at least 1, got 0"),
+        ("robustness --max-seconds 0", "max_seconds must be positive, got 0"),
+        ("stress --only tim", "unknown check 'tim'"),
+        ("stress --max-seconds 0", "max_seconds must be positive, got 0"),
+        ("stress --threads 0", "threads must be at least 1, got 0"),
     ],
 )
 def test_a_mistake_is_refused_in_one_line_and_nothing_is_written(

@@ -13,17 +13,6 @@ from npa_envs.envs import multispecies_v0
 from npa_envs.errors import NPAError
 
 
-def test_a_window_without_a_screen_warns_and_goes_on(monkeypatch):
-    monkeypatch.setenv("SDL_VIDEODRIVER", "not a driver")
-    env = make(render_mode="human")
-    with pytest.warns(UserWarning, match="there is no screen"):
-        env.reset(seed=0)
-    _, rewards, *_ = env.step(drawn(env, np.random.default_rng(0)))
-    assert rewards["species_0"] != 0.0
-    assert env.render() is None
-    env.close()
-
-
 def test_turns_lead_to_the_same_world_as_acting_at_once():
     together, turns = make(), multispecies_v0.env(**small("mixing"))
     together.reset(seed=3)

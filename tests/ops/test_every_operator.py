@@ -3,6 +3,8 @@
 Second derivatives are right or refused; they never vanish.
 """
 
+from dataclasses import replace
+
 import pytest
 import torch
 from worlds import assert_same, lively_rule, random_world
@@ -15,8 +17,10 @@ from npa_envs.ops.pictures.cameras import orbit
 
 def picture_of_gaussians(x, s):
     scales, quaternions = torch.full_like(x, 0.1), torch.ones_like(s[..., :4])
-    opacities, cameras = torch.ones_like(x[..., 0]), orbit(1, width=16, height=16)
-    cameras = cameras.to(x.device)
+    opacities, cameras = torch.ones_like(x[..., 0]), orbit(1, width=16, height=16).to(x.device)
+    if not x.is_contiguous():
+        turned = cameras.world_to_camera.mT.contiguous().mT
+        cameras = replace(cameras, world_to_camera=turned)
     return render_gaussians(x, scales, quaternions, opacities, s[..., :3], cameras).image
 
 

@@ -5,7 +5,16 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from learning_problems import heart
+
+from npa_envs.agents.learning import Budget, train
+from npa_envs.errors import MissingDependencyError
+from npa_envs.render import Window, write_mp4
+from npa_envs.tasks.morphogenesis3d import MultiScaleSimilarity
+from npa_envs.tasks.targets.clouds import load_pictures
+from npa_envs.tasks.targets.meshes import load_mesh
 
 PACKAGE = """
 import sys, torch
@@ -120,3 +129,28 @@ def test_folders_that_kernels_are_compiled_in_are_removed_without_a_warning() ->
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert "ResourceWarning" not in done.stderr
     assert not Path(done.stdout.splitlines()[-1]).exists()
+
+
+FRAME, ONE_STEP = np.zeros((4, 4, 3), np.uint8), Budget(particle_steps=1)
+EXTRA = r"pip install 'npa-envs\[{}\]'"
+
+
+@pytest.mark.parametrize(
+    ("library", "cure", "call"),
+    [
+        ("cma", EXTRA.format("evolution"), lambda _: train("evolution", heart(), ONE_STEP, 0)),
+        ("sklearn.datasets", EXTRA.format("points"), lambda _: load_pictures("digits")),
+        ("torchvision.datasets", "pip install torchvision", lambda _: load_pictures("mnist")),
+        ("trimesh", EXTRA.format("meshes"), load_mesh),
+        ("pytorch_msssim.ssim", EXTRA.format("views"), lambda _: MultiScaleSimilarity(64, 4)),
+        ("pygame", EXTRA.format("human"), lambda _: Window("a world", 32)),
+        ("imageio_ffmpeg", r"pip install 'imageio\[ffmpeg\]'", lambda p: write_mp4(p, [FRAME])),
+    ],
+)
+def test_a_missing_library_is_named_with_its_cure(library, cure, call, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, library, None)
+    film, mesh = tmp_path / "film.mp4", tmp_path / "mesh.glb"
+    mesh.touch()
+    with pytest.raises(MissingDependencyError, match=cure):
+        call(film if library == "imageio_ffmpeg" else mesh)
+    assert not film.exists()

@@ -7,7 +7,7 @@ import warnings
 import numpy as np
 import pytest
 
-from npa_envs.errors import MissingDependencyError, NPAError
+from npa_envs.errors import NPAError
 from npa_envs.render import Window
 
 pygame = pytest.importorskip("pygame")
@@ -121,12 +121,6 @@ def test_without_a_screen_it_warns_once_and_does_nothing(monkeypatch, driver):
         window.close()
         window.close()
     assert window.closed
-
-
-def test_without_pygame_the_error_names_the_extra(monkeypatch):
-    monkeypatch.setitem(sys.modules, "pygame", None)
-    with pytest.raises(MissingDependencyError, match=r"pip install 'npa-envs\[human\]'"):
-        Window("a world", 32)
 
 
 def test_pygame_starts_with_the_first_window_and_without_a_banner():

@@ -8,7 +8,7 @@ import pytest
 import torch
 from small_digits import COUNTS, idx, pictures, write_idx
 
-from npa_envs.errors import MissingDependencyError, NPAError
+from npa_envs.errors import NPAError
 from npa_envs.tasks.targets.clouds import (
     _farthest_points,
     load_clouds,
@@ -67,19 +67,6 @@ def test_data_that_are_not_there_are_clear_errors(tmp_path, folder):
         (tmp_path / name).write_bytes(idx(np.zeros((3, 2), np.uint8)))
     with pytest.raises(NPAError, match=r"must hold pictures \[M, H, W\].*got \[3, 2\]"):
         load_pictures(str(tmp_path))
-
-
-@pytest.mark.parametrize(
-    ("data", "module", "cure"),
-    [
-        ("digits", "sklearn.datasets", r"pip install 'npa-envs\[points\]'"),
-        ("mnist", "torchvision.datasets", "pip install torchvision"),
-    ],
-)
-def test_a_missing_package_is_named_with_its_command(data, module, cure, monkeypatch):
-    monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(MissingDependencyError, match=cure):
-        load_pictures(data)
 
 
 def test_mnist_is_what_torchvision_has_and_never_downloaded(monkeypatch):

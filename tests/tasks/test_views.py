@@ -2,14 +2,13 @@
 
 import json
 import math
-import sys
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
-from npa_envs.errors import MissingDependencyError, NPAError
+from npa_envs.errors import NPAError
 from npa_envs.ops import Cameras, orbit
 from npa_envs.tasks.morphogenesis3d import MultiScaleSimilarity, ViewSchedule, blurred
 from npa_envs.tasks.targets.meshes import (
@@ -304,20 +303,6 @@ def test_similarity_has_finite_gradients_also_where_pictures_are_opposites(side)
     ahead, behind = (similarity(found.detach() + h * way, wanted) for h in (1e-6, -1e-6))
     # Up to 4e-8 was seen, 1.6e-7 over other draws.
     assert float((gradient * way).sum()) == pytest.approx(float(ahead - behind) / 2e-6, rel=2e-6)
-
-
-@pytest.mark.parametrize(
-    ("module", "extra", "call"),
-    [
-        ("trimesh", "meshes", lambda folder: load_mesh(folder / "a.glb")),
-        ("pytorch_msssim.ssim", "views", lambda folder: MultiScaleSimilarity(64, 4)),
-    ],
-)
-def test_a_missing_library_is_named_with_its_cure(tmp_path, monkeypatch, module, extra, call):
-    monkeypatch.setitem(sys.modules, module, None)
-    (tmp_path / "a.glb").write_bytes(b"")
-    with pytest.raises(MissingDependencyError, match=rf"pip install 'npa-envs\[{extra}\]'"):
-        call(tmp_path)
 
 
 def test_blur_is_a_gaussian_and_none_at_zero():
