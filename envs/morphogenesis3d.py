@@ -52,7 +52,7 @@ class Morphogenesis3DEnvConfig(EnvConfig):
     """Views from all sides that the loss compares, at most."""
 
     opacity: float = 0.5
-    """Opacity of a particle, in (0, 1); with a read-out, where that is 0."""
+    """Opacity of a particle, in (0, 1); with a read-out, its opacity where the read-out is 0."""
 
     def __post_init__(self) -> None:
         """Check every field."""

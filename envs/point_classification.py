@@ -48,7 +48,8 @@ class PointClassificationEnvConfig(EnvConfig):
     """Which pictures: "train" or "test", which are never varied."""
 
     rule: str = ""
-    """Rule whose read-out tells classes from states, a file; empty: the last channels are them."""
+    """File of the rule whose read-out tells classes from states; empty: the last channels are the
+    classes."""
 
     def __post_init__(self) -> None:
         """Check every field."""

@@ -53,12 +53,13 @@ class Regeneration2DEnvConfig(GrownConfig):
     [length units]; None: 0.3, 0.1, 0.2 and 0.05."""
 
     rule: str | None = None
-    """What grows the worlds: a shipped rule, a rule's file, or "picture" to start from the target's
-    own points with blank hidden states; None: the shipped rule with the target's name."""
+    """What grows the worlds: a shipped rule, or a rule's file; None: the shipped rule with the
+    target's name. "picture" starts from the target's own points instead, with blank hidden
+    states."""
 
     healed_share: float = 0.8
-    """The episode ends in success once so much of what the damage added to the loss is gone, unless
-    `success_loss` is given (dimensionless, in (0, 1])."""
+    """The episode ends in success once this share of what the damage added to the loss is gone,
+    unless `success_loss` is given (dimensionless, in (0, 1])."""
 
     def __post_init__(self) -> None:
         """Check every field."""

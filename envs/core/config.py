@@ -108,7 +108,7 @@ class WorldConfig:
     """Where the worlds live: "cpu", "cuda" or "cuda:1"."""
 
     output: Output = "numpy"
-    """Arrays that come out: "numpy", or "torch" tensors on the device."""
+    """Type of the returned arrays: "numpy", or "torch" tensors on the device."""
 
     render_mode: str | None = None
     """None, "rgb_array" or "human" (a window, with pygame)."""
@@ -263,7 +263,7 @@ class EnvConfig(WorldConfig):
     taken_by_make = ("max_episode_steps",)
 
     on_divergence: OnDivergence = "terminate"
-    """What becomes of a world that diverges, besides `info["diverged"]`: "terminate" ends its
+    """What happens to a world that diverges, besides `info["diverged"]`: "terminate" ends its
     episode; "reset" starts it anew within the episode; "raise" is an error that names the particle;
     "ignore" goes on with its numbers held at the limits."""
 
@@ -278,7 +278,8 @@ class EnvConfig(WorldConfig):
     """The episode ends in success once the loss is at most this; None: the task's own choice."""
 
     seed_pool: int = 0
-    """Episodes start from one of so many worlds, made once; 0: from a fresh one each time."""
+    """Number of worlds, made once, that episodes start from; 0: each episode starts from a fresh
+    one."""
 
     def __post_init__(self) -> None:
         """Check every field; as `WorldConfig`."""

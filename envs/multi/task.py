@@ -59,7 +59,7 @@ class SpeciesConfig(WorldConfig):
     perceive the density and the density gradient of each species."""
 
     on_divergence: OnDivergence = "terminate"
-    """What becomes of an agent all of whose particles have diverged: "terminate" takes it out of
+    """What happens to an agent once all of its particles have diverged: "terminate" takes it out of
     the world; "raise" is an error that names it; "ignore" lets it go on, held at the limits."""
 
     seed_radius: float = 0.2
@@ -72,7 +72,8 @@ class SpeciesConfig(WorldConfig):
     """Pairs (species, step): the species is removed at the end of that step."""
 
     reward: Reward = "individual"
-    """"individual": each agent is paid for its own improvement; "team": for the mean of all."""
+    """"individual": each agent is paid for its own improvement; "team": each gets the mean of
+    all."""
 
     max_cycles: int = 256
     """Steps after which the episode is cut off for all."""

@@ -40,7 +40,7 @@ class Morphogenesis2DConfig(GrowthConfig):
     """About how many opaque pixels the target is resampled to; as many as there are particles."""
 
     keep_background: bool = False
-    """The picture's whole rectangle is grown, white where it is transparent: for photographs."""
+    """Grow the picture's whole rectangle, white where it is transparent: for photographs."""
 
     damage_radius: float = 0.1
     """Radius of the disk whose state is erased in worlds from the pool [length units]; 0: none."""
@@ -58,8 +58,8 @@ class Morphogenesis2DConfig(GrowthConfig):
     """Weight of the colour term against the density term inside the splat loss (dimensionless)."""
 
     blur_levels: int = 0
-    """How often pictures are blurred and halved to be compared once more: particles far from where
-    they are missing are drawn there by the coarse ones. The loss is the mean of all."""
+    """How often pictures are blurred, halved and compared once more. Coarse pictures draw particles
+    from afar to where some are missing. The loss is the mean of all comparisons."""
 
     drift_weight: float = 0.0
     """Weight of the centroids' distance from the origin, where worlds begin (per length unit)."""

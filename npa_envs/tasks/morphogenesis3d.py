@@ -67,10 +67,10 @@ class Morphogenesis3DConfig(GrowthConfig):
     """Views of the target to measure by, at most; none of them is trained with."""
 
     views_per_iteration: int = 4
-    """Training views that a loss looks at: others in each iteration."""
+    """Training views that a loss looks at; each iteration takes other ones."""
 
     view_seed: int = 0
-    """What views and backgrounds are drawn from, iteration by iteration."""
+    """Seed that the views and backgrounds of each iteration are drawn from."""
 
     sigma: float = 0.02
     """Standard deviation of a round particle [length units]."""
@@ -85,7 +85,7 @@ class Morphogenesis3DConfig(GrowthConfig):
     """Standard deviation of the blur that targets begin with [pixels]; 0: none."""
 
     blur_iterations: int = 1000
-    """Iterations in which the blur goes, evenly; the paper's share is a twentieth of all."""
+    """Iterations over which the blur falls evenly to none; in the paper a twentieth of all."""
 
     view_weight: float = 2.0
     """Weight of the loss of the views (dimensionless)."""

@@ -44,10 +44,10 @@ class PointClassificationConfig(TaskConfig):
     """Where torchvision keeps "mnist"."""
 
     class_count: int = 10
-    """Classes that there are."""
+    """Number of classes."""
 
     sample_seed: int = 0
-    """What the places are drawn from that farthest points are chosen among, once."""
+    """Seed of the places among which the farthest points are chosen, drawn once."""
 
     rotation: float = 0.0
     """Fresh clouds are turned by up to this, either way [degrees]."""
@@ -56,11 +56,11 @@ class PointClassificationConfig(TaskConfig):
     """Fresh clouds are stretched and sheared by up to this share (dimensionless)."""
 
     jitter: float = 0.0
-    """Standard deviation of what is added to fresh clouds' coordinates [length units]."""
+    """Standard deviation of the noise on fresh clouds' coordinates [length units]."""
 
     mutated_share: float = 0.0
-    """Share of the worlds from the pool that become other clouds, with their states as they are,
-    where the run has `damage`."""
+    """Share of the worlds from the pool that become other clouds and keep their states, if the run
+    has `damage`."""
 
     particle_count: int = 512
     """Particles in a world, N: points of a cloud."""

@@ -50,7 +50,7 @@ class TextureConfig(TaskConfig):
     "vgg_ot", or the sum of some, such as "patch_ot+joint_swd"."""
 
     loss_seed: int = 0
-    """What the loss draws its directions, filters and positions from, once."""
+    """Seed that the loss draws its directions, filters and positions from, once."""
 
     vgg_weights: str = ""
     """File of VGG16's weights for "vgg_ot"; empty: torch's usual folder of downloads."""

@@ -58,7 +58,7 @@ class TrainConfig(Generic[TaskConfigT]):
     """Optimiser steps in one repeat."""
 
     repeats: int = 3
-    """How often the schedule runs; rule and pool go on, the optimiser starts afresh."""
+    """How often the schedule runs. Rule and pool go on; the optimiser starts afresh."""
 
     world_count: int = 8
     """Worlds in a batch, B."""
@@ -73,8 +73,8 @@ class TrainConfig(Generic[TaskConfigT]):
     """AdamW's learning rate at the start of each repeat."""
 
     schedule: Schedule = "milestones"
-    """How the learning rate falls in a repeat: at `milestones`, or along half a "cosine" to a
-    hundredth, whatever the length of the repeat."""
+    """How the learning rate falls in a repeat: at `milestones`, or by "cosine", along half a cosine
+    to a hundredth, whatever the length of the repeat."""
 
     milestones: tuple[int, ...] = (2_000, 4_000, 6_000, 8_000)
     """Iterations of a repeat after which the learning rate is multiplied by `decay`."""
@@ -86,23 +86,23 @@ class TrainConfig(Generic[TaskConfigT]):
     """AdamW's weight decay."""
 
     average: float = 0.0
-    """The rule that is kept is a running mean of the weights, which keeps this share of itself in
-    an iteration, less in the first ones; 0: the weights as they are."""
+    """Share in [0, 1) that the kept rule, a running mean of the weights, keeps of itself in an
+    iteration (less in the first ones). 0: the weights themselves are kept."""
 
     normalise_gradients: bool = True
     """Every parameter's gradient is divided by its own norm before the optimiser's step."""
 
     seed_interval: int = 16
-    """The first world of every this-many-th batch is a fresh seed; 1: of every batch."""
+    """Every so many batches, the first world of the batch is a fresh seed. 1: in every batch."""
 
     fresh_share: float = 0.0
-    """Share of the worlds of such a batch that are fresh seeds, at least one of them."""
+    """Share of fresh seeds in a batch that has any; at least one world."""
 
     lifetimes: tuple[int, int] = (0, 0)
-    """Steps that worlds of the pool live until a fresh seed takes their place: from the least, in
-    the pool's first place, to the most, in its last, evenly in their logarithm. A batch has a world
-    of each of B equal sections, so that there are young and old ones in it. (0, 0): fresh seeds
-    come by `seed_interval` instead."""
+    """Steps that a world of the pool lives until a fresh seed takes its place: the least, in the
+    pool's first place, and the most, in its last; evenly in the logarithm between them. A batch has
+    one world from each of B equal sections of the pool, so it holds young and old worlds. (0, 0):
+    fresh seeds come by `seed_interval` instead."""
 
     ageing_steps: int = 0
     """Steps that worlds of the longer-lived half of the pool's places are run without gradients,
@@ -116,8 +116,8 @@ class TrainConfig(Generic[TaskConfigT]):
     """Worlds from the pool are damaged before the rollout, so that the rule learns to heal."""
 
     damage_share: float = 1.0
-    """Share of the pool's places whose worlds are damaged: the first ones, which with `lifetimes`
-    are those of the shortest; all other worlds are left to themselves for all their lives."""
+    """Share of the pool's places whose worlds are damaged: the first places, which with `lifetimes`
+    are those of the shortest lives. All other worlds are never damaged."""
 
     runaway_limit: float = 10.0
     """A world with |x| or |s| above this, or not finite, is replaced by a seed in the pool."""
@@ -132,7 +132,8 @@ class TrainConfig(Generic[TaskConfigT]):
     """Precision of the worlds and of the rule."""
 
     memory: Memory = "store"
-    """What the backward pass reads: all stored, two steps in three recomputed, all but one."""
+    """What the backward pass reads: "store" keeps all steps, "recompute" computes two steps in
+    three again, "minimal" all but the last."""
 
     cuda_graph: bool = True
     """On CUDA, capture an iteration: rollout and gradients as one graph per number of steps."""
