@@ -137,16 +137,6 @@ THIRD: Fields = SECOND | {
 }
 """The third candidate: fewer seeds, older worlds, and only worlds of short lives are damaged."""
 
-FOURTH: Fields = THIRD | {
-    "lifetimes": (128, 32_768),
-    "pool_size": 32,
-    "ageing_steps": 512,
-    "loose_weight": 30.0,
-    "damage_radius": 0.2,
-    "damage_share": 0.5,
-}
-"""The fourth candidate: old worlds that age quickly, and loose particles drawn back."""
-
 FIFTH: Fields = THIRD | {
     "lifetimes": (128, 32_768),
     "pool_size": 32,
@@ -156,14 +146,25 @@ FIFTH: Fields = THIRD | {
 }
 """The fifth candidate: a rule that has learned to grow and to last learns another picture."""
 
-SIXTH: Fields = FIFTH | {"lifetimes": (32, 32_768), "loose_weight": 3.0}
-"""The sixth candidate: more seeds, and a tenth of the pull on loose particles."""
+SEVENTH: Fields = {
+    **STRAYS,
+    "seed_interval": 1,
+    "fresh_share": 0.5,
+    "pool_size": 64,
+    "steps": (32, 64),
+    "schedule": "cosine",
+    "learning_rate": 2e-3,
+    "initial_rule": "heart",
+}
+"""What serves `fast`, in large: half of the worlds are seeds, and none grows old. Never run."""
 
 FAST_BEFORE: Fields = {
     **NO_STRAYS,
     "learning_rate": 2e-3,
     "schedule": "milestones",
     "milestones": (1500, 2100),
+    "seed_interval": 2,
+    "initial_rule": "",
 }
 """The preset `fast` as it was when its arms were compared, laid over what it is."""
 
@@ -182,20 +183,16 @@ FAST_SECOND: Fields = FAST_FIRST | {"average": 0.0, "blur_levels": 0, "damage_sh
 FAST_STRAYS: Fields = STRAYS | {"stray_share": 1e-3}
 """As `STRAYS`, of fewer particles."""
 
-FAST_FOURTH: Fields = {
+FAST_FIFTH: Fields = {
     **FAST_STRAYS,
     "learning_rate": 4e-3,
     "schedule": "cosine",
-    "loose_weight": 30.0,
+    "initial_rule": "gecko-512",
 }
-"""The preset `fast` after the third round, which draws loose particles back."""
+"""The preset `fast` after the third round, which begins with a rule that has learned a gecko."""
 
-FAST_SIXTH: Fields = FAST_FOURTH | {
-    "loose_weight": 0.0,
-    "learning_rate": 2e-3,
-    "seed_interval": 1,
-}
-"""Half of the worlds are seeds; begins with a rule that has learned another picture."""
+FAST_SIXTH: Fields = FAST_FIFTH | {"seed_interval": 1}
+"""Half of the worlds are seeds: the preset `fast`."""
 
 ARMS: Mapping[str, Fields] = {
     "paper": {},
@@ -224,19 +221,11 @@ ARMS: Mapping[str, Fields] = {
     "third": THIRD,
     "third, no strays": THIRD | NO_STRAYS,
     "third, lifetimes from 64": THIRD | {"lifetimes": (64, 32_768)},
-    "fourth": FOURTH,
-    "fourth, no ageing": FOURTH | {"ageing_steps": 0},
-    "fourth, ageing 2048": FOURTH | {"ageing_steps": 2048},
-    "fourth, no loose": FOURTH | {"loose_weight": 0.0},
-    "fourth, pool 64": FOURTH | {"pool_size": 64},
-    "fourth, damage 0.1": FOURTH | {"damage_radius": 0.1, "damage_share": 0.25},
-    "fourth, none thrown": FOURTH | {"stray_share": 0.0},
-    "fourth, rate 2e-3": FOURTH | {"learning_rate": 2e-3},
-    "sixth": SIXTH,
     "fifth": FIFTH,
     "fifth, untrained": FIFTH | {"initial_rule": ""},
     "fifth, no ageing": FIFTH | {"ageing_steps": 0},
     "fifth, rate 5e-4": FIFTH | {"learning_rate": 5e-4},
+    "seventh": SEVENTH,
 }
 """Arms of `full` and `small`: what each changes of the preset `paper`."""
 
@@ -274,26 +263,13 @@ FAST_ARMS: Mapping[str, Fields] = {
         "steps": (24, 40),
         "iterations": 1800,
     },
-    "fourth": FAST_FOURTH,
-    "fourth, no loose": FAST_FOURTH | {"loose_weight": 0.0},
-    "fourth, none thrown": FAST_FOURTH | {"stray_share": 0.0},
-    "fourth, none thrown, share 0.5": FAST_FOURTH | {"stray_share": 0.0, "damage_share": 0.5},
-    "fourth, 1 world": FAST_FOURTH | {"world_count": 1, "seed_interval": 4, "iterations": 4800},
-    "fourth, steps 12 to 24": FAST_FOURTH | {"steps": (12, 24), "iterations": 3200},
-    "fourth, ageing": {
-        **FAST_FOURTH,
-        "lifetimes": (48, 4096),
-        "pool_size": 16,
-        "ageing_steps": 128,
-        "damage_share": 0.5,
-    },
-    "fourth, rate 3e-3": FAST_FOURTH | {"learning_rate": 3e-3},
+    "fifth": FAST_FIFTH,
+    "fifth, rate 2e-3": FAST_FIFTH | {"learning_rate": 2e-3},
     "sixth": FAST_SIXTH,
-    "sixth, rate 4e-3": FAST_SIXTH | {"learning_rate": 4e-3},
-    "fifth": FAST_FOURTH | {"loose_weight": 0.0},
-    "fifth, rate 2e-3": FAST_FOURTH | {"loose_weight": 0.0, "learning_rate": 2e-3},
+    "sixth, rate 2e-3": FAST_SIXTH | {"learning_rate": 2e-3},
+    "sixth, untrained": FAST_SIXTH | {"initial_rule": ""},
 }
-"""Arms of `fast`: what each changes of it as it was; the preset is the cosine with strays now."""
+"""Arms of `fast`: what each changes of it as it was; the preset is the sixth now."""
 
 
 @dataclass(frozen=True)
@@ -613,16 +589,18 @@ def table(runs: Sequence[Mapping[str, Any]], size: str) -> str:
         if run["size"] == size:
             arms.setdefault(run["arm"], []).append(run)
     steps = [n for n in REPORTED if any(_loss(r, n) is not None for a in arms.values() for r in a)]
-    head = ["arm", "runs", *map(str, steps), "worst from 128", "healed"]
+    head = ["arm", "runs", "iterations", *map(str, steps), "worst from 128", "healed"]
     lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
     for arm, own in arms.items():
-        cells = [arm, str(len(own))]
+        lengths = sorted({run["iterations"] for run in own})
+        cells = [arm, str(len(own)), " to ".join(map(str, {lengths[0]: 0, lengths[-1]: 0}))]
         for step in steps:
             losses = [loss for run in own if (loss := _loss(run, step)) is not None]
             cells.append(f"{statistics.fmean(losses):.3f}" if losses else "")
         worst = max((_loss(r, n) or 0.0 for r in own for n in steps if n >= 128), default=0.0)
         rows = [row for run in own for row in run["healing"]]
-        share = sum(r["worlds_healed"] for r in rows) / sum(r["world_count"] for r in rows)
+        count = max(sum(r["world_count"] for r in rows), 1)
+        share = sum(r["worlds_healed"] for r in rows) / count
         lines.append(f"| {' | '.join([*cells, f'{worst:.3f}', f'{share:.0%}'])} |")
     return "\n".join(lines)
 

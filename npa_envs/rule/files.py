@@ -88,13 +88,22 @@ def shipped_rules(task: str | None = None) -> dict[str, Path]:
     return {name: path for name, path in rules.items() if rule_metadata(path).get("task") == task}
 
 
+def first_rules() -> dict[str, Path]:
+    """Return the rules that runs of presets begin with: name -> file, sorted by name.
+
+    They have learned one picture in small worlds, and are not shipped to be looked at.
+    """
+    folder = Path(__file__).resolve().parent / "first"
+    return {path.stem: path for path in sorted(folder.glob("*.safetensors"))}
+
+
 def load_rule(source: str | Path, *, device: str | torch.device = "cpu") -> NPARule:
     """Load a rule: a shipped one by name, or a file in our format or one of the authors'.
 
     Args:
-        source: The name of a shipped rule (`shipped_rules()`), or the path of a `.safetensors`
-            file that `save_rule` wrote, of the authors' state dict (`.pth`, `.pt`; no code in it
-            is run), or of their web demo's collection: `"models.json#name"`.
+        source: The name of a rule (`shipped_rules()`, `first_rules()`), or the path of a
+            `.safetensors` file that `save_rule` wrote, of the authors' state dict (`.pth`, `.pt`;
+            no code in it is run), or of their web demo's collection: `"models.json#name"`.
         device: Where the weights go: "cpu", "cuda", "cuda:1", or torch's own device.
 
     Returns:
@@ -216,8 +225,9 @@ def _locate(source: str | Path) -> tuple[Path, str | None]:
             "source must be the name of a shipped rule or the path of a file that ends in "
             f"{suffixes}, got '': names: {', '.join(known)}"
         )
-    if text in known:
-        return known[text], None
+    named = known | first_rules()
+    if text in named:
+        return named[text], None
     base, mark, name = text.rpartition("#")
     path, inner = (Path(base), name) if mark and base.endswith(".json") else (Path(text), None)
     if path.suffix in _SUFFIXES:

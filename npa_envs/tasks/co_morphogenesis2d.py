@@ -196,7 +196,9 @@ def _beside(
     species = (alone.task, dataclasses.replace(alone.task, target=neighbour))
     run = {field.name: getattr(alone, field.name) for field in dataclasses.fields(alone)}
     run["task"] = CoMorphogenesis2DConfig(species=species, distance=DISTANCE)
-    return JointTrainConfig(**run | {"out": Path("runs/co_morphogenesis2d")})
+    # As many rules as there are species would have to be named.
+    run |= {"initial_rule": "", "out": Path("runs/co_morphogenesis2d")}
+    return JointTrainConfig(**run)
 
 
 CO_MORPHOGENESIS2D_PRESETS: Mapping[str, JointTrainConfig[CoMorphogenesis2DConfig]] = {

@@ -64,10 +64,6 @@ class Morphogenesis2DConfig(GrowthConfig):
     drift_weight: float = 0.0
     """Weight of the centroids' distance from the origin, where worlds begin (per length unit)."""
 
-    loose_weight: float = 0.0
-    """Weight of the particles' mean distance from the target, beyond a pixel and up to ε (per
-    length unit): what rests beside the picture is drawn back, which the splat loss cannot do."""
-
     def __post_init__(self) -> None:
         """Check every field; raise NPAError where one has a wrong type or lies out of its range."""
         super().__post_init__()
@@ -81,7 +77,6 @@ class Morphogenesis2DConfig(GrowthConfig):
             )
         check_positive(self, float, "sigma")
         check_non_negative(self, "splat_weight", "colour_weight", "drift_weight")
-        check_non_negative(self, "loose_weight")
 
     def with_particle_count(self, particle_count: int) -> Morphogenesis2DConfig:
         """Return the same task with another number of particles, and of the target's points."""
@@ -129,9 +124,6 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         self._target_mean = self.target.points.mean(dim=0)
         self.target_picture = self._splat(self.target.points[None], self.target.colours[None])[0]
         """Its picture: rgb sums and density, dimensionless, shape [R, R, 4]."""
-        self._nearest = None
-        if self.config.loose_weight > 0.0:
-            self._nearest = _nearest_points(self.target, self.config.resolution)
 
     def picture(self, x: Tensor, s: Tensor, *, centred: bool = True) -> Tensor:
         """Return each world's picture: colour sums and density, dimensionless, shape [B, R, R, 4].
@@ -201,18 +193,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         if self.config.drift_weight > 0.0:
             drift = world_mean(x).square().sum(dim=-1).add(1e-12).sqrt().mean()
             terms["drift"] = self.config.drift_weight, drift
-        if self._nearest is not None:
-            terms["loose"] = self.config.loose_weight, self._distance(x, self._nearest).mean()
         return terms
-
-    def _distance(self, x: Tensor, nearest: Tensor) -> Tensor:
-        """Return how far particles are from the target, beyond a pixel and up to ε, [B, N]."""
-        x, pixel = self._centred(x), self.target.pixel_size
-        side = len(nearest)
-        cell = (x.detach() / pixel + 0.5 * side).floor().clamp(0, side - 1).long()
-        away = x - nearest[cell[..., 1], cell[..., 0]].to(x)
-        distance: Tensor = away.square().sum(dim=-1).add(1e-12).sqrt() - pixel
-        return distance.clamp(0.0, self.config.eps)
 
     def particle_shares(self, x: Tensor, s: Tensor) -> Tensor:
         """Return each particle's share of its world's splat loss, times N; [B, N].
@@ -254,17 +235,6 @@ def _errors(difference: Tensor) -> tuple[Tensor, Tensor]:
     red, green, blue = _growth(difference[..., :3]).unbind(dim=-1)
     colour = (red + green + blue) / 3.0
     return density, colour * torch.exp(-density.detach())
-
-
-def _nearest_points(target: PointTarget, resolution: int) -> Tensor:
-    """Return the target's point nearest to the centre of each pixel, shape [R, R, 2], row y."""
-    points, pixel = target.points, target.pixel_size
-    places = (torch.arange(resolution, device=points.device) + 0.5 * (1 - resolution)) * pixel
-    rows = []
-    for y in places:
-        row = torch.stack((places, y.expand_as(places)), dim=-1)
-        rows.append(points[torch.cdist(row, points).argmin(dim=1)])
-    return torch.stack(rows)
 
 
 def _halved(picture: Tensor) -> Tensor:
@@ -315,7 +285,7 @@ MORPHOGENESIS2D_PRESETS: Mapping[str, Morphogenesis2DTrainConfig] = {
         damage_share=0.25,
         out=_OUT,
     ),
-    # A few particles that see far, in worlds that start from seeds often.
+    # A few particles that see far; half of the worlds are seeds: docs/recipes.md.
     "fast": fast_run(
         Morphogenesis2DConfig(
             target_point_count=512,
@@ -332,7 +302,8 @@ MORPHOGENESIS2D_PRESETS: Mapping[str, Morphogenesis2DTrainConfig] = {
         steps=(16, 32),
         learning_rate=4e-3,
         schedule="cosine",
-        seed_interval=2,
+        seed_interval=1,
+        initial_rule="gecko-512",
         picture_interval=200,
         out=_OUT,
     ),

@@ -49,7 +49,8 @@ class TrainConfig(Generic[TaskConfigT]):
     """The task's own configuration."""
 
     initial_rule: str = ""
-    """Start from this rule, a shipped one's name or a file, instead of random weights."""
+    """Start from this rule, a name or a file, instead of random weights; '': from these. The preset
+    `fast` of morphogenesis2d starts from `gecko-512`, which has grown a gecko in its worlds."""
 
     moment_inverse: MomentInverse = "threshold"
     """How the rule's state gradients are corrected: "threshold", the paper's, or "smooth"."""

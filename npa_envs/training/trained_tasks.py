@@ -11,7 +11,7 @@ import torch
 
 from npa_envs.errors import NPAError
 from npa_envs.files import parse_json
-from npa_envs.rule.files import rule_metadata, shipped_rules
+from npa_envs.rule.files import first_rules, rule_metadata, shipped_rules
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import PictureTask, task_for_rule
 from npa_envs.tasks.point_classification import PointClassification
@@ -54,7 +54,7 @@ def task_of_rule(
     Raises:
         NPAError: The rule does not fit the task, or a field is wrong.
     """
-    path = shipped_rules().get(source, Path(source))
+    path = (shipped_rules() | first_rules()).get(source, Path(source))
     metadata = rule_metadata(path) if path.suffix == ".safetensors" else {}
     task_name = metadata.get("task", "morphogenesis2d")
     entry = task_entry(task_name)

@@ -356,7 +356,8 @@ def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
     if wrong:
         raise NPAError(
             f"initial_rule must be a rule of the task's shape, but {shown(source)} differs in "
-            f"{', '.join(wrong)}: change those fields, or start from another rule"
+            f"{', '.join(wrong)}: change those fields, start from another rule, or from random "
+            "weights (initial_rule='')"
         )
     rule.moment_inverse = config.moment_inverse
     return rule

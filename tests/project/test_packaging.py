@@ -69,6 +69,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_wheel_holds_every_source_file_the_rules_and_the_license(site: Path) -> None:
     sources = [p for kind in ("*.py", "*.cuh") for p in (ROOT / "npa_envs").rglob(kind)]
     sources += (ROOT / "npa_envs/rule/shipped").glob("*.*")
+    sources += (ROOT / "npa_envs/rule/first").glob("*.*")
     sources += (ROOT / "npa_envs/web/page").glob("*.*")
     mapped = [p for name in MAPPED_PACKAGES for p in (ROOT / name).rglob("*.py")]
     expected = {"py.typed", *(p.relative_to(ROOT / "npa_envs").as_posix() for p in sources)}

@@ -97,32 +97,3 @@ def test_the_distance_of_the_centroid_from_where_worlds_begin_is_paid_for():
         pull.sum(1), moved.mean(1) / moved.mean(1).norm(dim=-1), rtol=1e-5, atol=1e-6
     )
     assert "drift" not in Morphogenesis2D(SMALL, device="cpu").loss(x, s, still)[1]
-
-
-def test_particles_beside_the_target_are_drawn_to_it_and_those_in_it_or_far_away_are_not():
-    task = Morphogenesis2D(replace(SMALL, loose_weight=2.0), device="cpu")
-    generator = torch.Generator().manual_seed(0)
-    x = (2.4 * torch.rand(2, 400, 2, generator=generator) - 1.2).requires_grad_()
-    s, still = torch.zeros(2, 400, SMALL.state_dim), torch.zeros(2, 400)
-    total, parts = task.loss(x, s, still)
-    assert float((total - Morphogenesis2D(SMALL).loss(x, s, still)[0]).detach()) == pytest.approx(
-        2.0 * float(parts["loose"].detach()), rel=1e-4
-    )
-    points, pixel = task.target.points, task.target.pixel_size
-    centred = x.detach() - x.detach().mean(1, keepdim=True) + points.mean(0)
-    away = torch.cdist(centred, points.expand(2, -1, -1)).amin(-1)
-    exact = (away - pixel).clamp(0.0, SMALL.eps)
-    # A table of the nearest points, one for each pixel, is exact within a pixel's half diagonal.
-    assert float(parts["loose"].detach()) == pytest.approx(float(exact.mean()), abs=0.1 * pixel)
-    (pull,) = torch.autograd.grad(parts["loose"], x)
-    # All particles are centred together: what the others' mean adds is the same for each.
-    pull = 800.0 * (pull - pull.median(dim=1, keepdim=True).values)
-    beside = (away > 2.0 * pixel) & (away < 0.9 * SMALL.eps)
-    assert beside.sum() > 10
-    nearest = points[torch.cdist(centred, points.expand(2, -1, -1)).argmin(-1)]
-    outward = torch.nn.functional.normalize(centred - nearest, dim=-1)
-    assert float((pull * outward).sum(-1)[beside].min()) > 0.3
-    assert not pull[away > SMALL.eps + 2.0 * pixel].any()
-    there = points[None].clone()
-    still = torch.zeros(1, len(points))
-    assert not task.loss(there, torch.zeros(1, len(points), SMALL.state_dim), still)[1]["loose"]

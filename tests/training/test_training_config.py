@@ -10,6 +10,8 @@ import pytest
 import torch
 
 from npa_envs.errors import NPAError
+from npa_envs.rule.files import load_rule
+from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
 from npa_envs.training import (
     TASKS,
@@ -21,6 +23,7 @@ from npa_envs.training import (
     task_entry,
 )
 from npa_envs.training.overrides import completed
+from npa_envs.training.trainer import initial_rule
 
 PAPER = preset("paper")
 
@@ -223,8 +226,20 @@ def test_presets_of_two_species_have_the_schedule_of_one(name):
     assert together.task.species[0] == alone.task
     assert together.task.distance == 0.8
     for field in dataclasses.fields(TrainConfig):
-        if field.name not in ("task", "out"):
+        if field.name not in ("task", "out", "initial_rule"):
             assert getattr(together, field.name) == getattr(alone, field.name)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_what_presets_begin_with_is_there_and_fits(task):
+    for config in TASKS[task].presets.values():
+        if config.initial_rule:
+            own = TASKS[task].make(config.task, torch.device("cpu"))
+            rule = initial_rule(config, own.make_rule(torch.Generator().manual_seed(0)))
+            assert rule.weight_count == load_rule(config.initial_rule).weight_count
+            with pytest.raises(NPAError, match=r"or from random weights \(initial_rule=''\)"):
+                initial_rule(config, NPARule(2, 5, 7))
+    assert bool(preset("fast", task).initial_rule) == (task == "morphogenesis2d")
 
 
 def test_mappings_are_laid_over_the_species_that_are_there_and_more_over_the_last():
