@@ -49,7 +49,6 @@ def compiled_once():
 
 @pytest.fixture(scope="session")
 def device(request):
-    """Device of the numerical tests."""
     chosen = torch.device(request.config.getoption("--device"))
     if chosen.type == "cuda" and not torch.cuda.is_available():
         pytest.fail("--device cuda was asked for, and this machine has no CUDA device")

@@ -15,7 +15,6 @@ PICTURES = ("co_morphogenesis", "invasion", "symbiosis")
 
 
 def small(task: str, **keywords: Any) -> dict[str, Any]:
-    """Keywords of a small world."""
     fields: dict[str, Any] = {"eps": 0.3, "max_cycles": 6, "render_size": 24}
     if "particle_counts" not in keywords:
         fields["particle_count"] = 41
@@ -32,12 +31,10 @@ def few(task: str, **keywords: Any) -> dict[str, Any]:
 
 
 def still(env: Any) -> dict[str, Any]:
-    """Actions that change nothing."""
     return {a: np.zeros(env.action_space(a).shape, np.float32) for a in env.agents}
 
 
 def drawn(env: Any, generator: np.random.Generator) -> dict[str, Any]:
-    """Random actions."""
     return {
         a: generator.uniform(-1, 1, env.action_space(a).shape).astype(np.float32)
         for a in env.agents
@@ -45,7 +42,6 @@ def drawn(env: Any, generator: np.random.Generator) -> dict[str, Any]:
 
 
 def make(task: str = "mixing", **keywords: Any) -> MultiSpeciesEnv:
-    """A small world of several species."""
     return multispecies_v0.parallel_env(**small(task, **keywords))
 
 

@@ -409,7 +409,6 @@ def test_a_gpu_is_kept_busy_where_neither_memory_nor_budget_forbids(monkeypatch)
 
 @pytest.fixture(scope="module")
 def taught():
-    """Rules that were trained by gradient."""
     budget = Budget(particle_steps=4 * ROUND)
     return train("gradient", HEART, budget, 0, entries=1, evaluation_seeds=SEEDS).rules
 

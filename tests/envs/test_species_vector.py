@@ -37,7 +37,6 @@ def batch(task="mixing", world_count=3, autoreset_mode="same-step", **keywords):
 
 
 def drawn(envs, generator):
-    """Random actions of all species in all worlds."""
     return {
         agent: generator.uniform(-1, 1, space.shape).astype(np.float32)
         for agent, space in envs.action_spaces.items()
@@ -45,7 +44,6 @@ def drawn(envs, generator):
 
 
 def still(envs):
-    """Actions that change nothing."""
     return {agent: np.zeros(s.shape, np.float32) for agent, s in envs.action_spaces.items()}
 
 

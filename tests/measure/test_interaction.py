@@ -192,8 +192,6 @@ def rules_metadata(folder):
 
 
 class TestCommand:
-    """`npa-envs interact`."""
-
     @pytest.fixture
     def rules(self, tmp_path_factory):
         folder = tmp_path_factory.mktemp("rules")

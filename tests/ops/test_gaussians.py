@@ -180,7 +180,6 @@ def frontal(width, height, focal=50.0, dtype=torch.float64, device="cpu"):
 
 
 def single(mean, *, scale=(0.1, 0.1, 0.1), opacity=0.5, colour=(1.0, 0.5, 0.25), **options):
-    """Return one Gaussian."""
     options = {"dtype": torch.float64, **options}
     return [
         torch.tensor(values, **options)[None, None]

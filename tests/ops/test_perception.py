@@ -208,7 +208,6 @@ def test_rows_are_right_however_many_threads_share_them(
 
 
 def adjoints(x, s, bars, box=None):
-    """Perception, and its gradients by both."""
     x, s = x.clone().requires_grad_(), s.clone().requires_grad_()
     z = npa_envs.perceive(x, s, 0.2, box=box, detach_positions=False)
     return z.detach(), *torch.autograd.grad(z, (x, s), bars)

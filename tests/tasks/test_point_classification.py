@@ -248,11 +248,9 @@ def test_particles_learn_to_say_what_they_form(trained):
     config = json.loads((trained.folder / "config.json").read_text())
     task = PointClassification(PointClassificationConfig(**config["task"])).on("test")
     (row,) = accuracies(rule, task, checkpoints=(16,))
-    print("MEASURED", row)
     assert row.majority >= 0.9
     assert row.particle >= 0.85
     changes = {(row.change, row.steps): row for row in changes_of_mind(rule, task, steps=(0, 16))}
-    print("MEASURED", changes["all mutated", 0], changes["all mutated", 16])
     assert changes["all mutated", 0].majority_before >= 0.9
     assert changes["all mutated", 16].majority >= 0.7
     assert changes["all mutated", 16].majority > changes["upper half mutated", 16].majority

@@ -105,8 +105,6 @@ class TestTask:
 
 
 class TestRun:
-    """`train_together`."""
-
     def test_all_species_correct_gradients_as_the_run_is_told(self, tmp_path):
         config = run_config(tmp_path / "run", iterations=1, moment_inverse="smooth")
         for given in (None, CoMorphogenesis2D(pair()).make_rules(torch.Generator())):

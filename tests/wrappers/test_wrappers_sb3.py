@@ -302,7 +302,6 @@ def test_tensors_give_the_same_rows(device):
 
 
 def rows_of(adapter, envs, **keywords):
-    """An adapter that has been reset."""
     rows = adapter(envs(), **keywords)
     rows.reset()
     return rows

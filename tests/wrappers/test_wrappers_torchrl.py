@@ -1,6 +1,5 @@
 """Batches of worlds in TorchRL; skipped where it is missing."""
 
-import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -146,21 +145,3 @@ def test_what_is_refused():
     some[1, :5] = True
     with pytest.raises(NPAError, match="_reset must choose all particles of a world or none"):
         env.reset(TensorDict({"_reset": some}, batch_size=[2, 64]))
-
-
-@pytest.mark.parametrize("id", IDS)
-def test_torchrls_own_environment_of_gymnasium_takes_an_id(id):
-    keywords = {"particle_count": 61, "max_episode_steps": 3}
-    env = torchrl.GymEnv(id, **keywords)
-    torchrl.check_env_specs(env)
-    env.set_seed(5)
-    rolled = env.rollout(7, break_when_any_done=False)
-    plain = gymnasium.make(id, **keywords)
-    plain.reset(seed=5)
-    # TorchRL resets to set the seed, and again to begin.
-    observation, _ = plain.reset()
-    for t in range(3):
-        assert np.array_equal(rolled["observation"][t].numpy(), observation)
-        observation, reward, *_ = plain.step(rolled["action"][t].numpy())
-        assert rolled["next", "reward"][t].item() == np.float32(reward)
-    assert rolled["next", "done"].flatten().tolist() == [k % 3 == 2 for k in range(7)]
