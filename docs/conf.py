@@ -89,9 +89,21 @@ def add_menus(_: Sphinx, name: str, source: list[str]) -> None:
             source[0] += f"\n```{{toctree}}\n:hidden:\n{caption}\n{listed}\n```\n"
 
 
-def as_restructured_text(*event: Any) -> None:
+SET_ASIDE: dict[str, list[str]] = {}
+"""Docstrings of attributes by their names, while Napoleon is at work."""
+
+
+def put_back(
+    _: Sphinx, _kind: str, name: str, _object: Any, _options: Any, lines: list[str]
+) -> None:
+    """Return an attribute its docstring."""
+    lines += SET_ASIDE.pop(name, [])
+
+
+def as_restructured_text(
+    _: Sphinx, kind: str, name: str, _object: Any, _options: Any, lines: list[str]
+) -> None:
     """Turn a docstring from Markdown to what Sphinx reads, and leave out what its page shows."""
-    lines: list[str] = event[-1]
     text = "\n".join(lines).split("\n## ")[0]
     blocks = re.split(r"^ *```(\w+)\n(.*?)^ *```$", text, flags=re.MULTILINE | re.DOTALL)
     parts = []
@@ -103,6 +115,10 @@ def as_restructured_text(*event: Any) -> None:
         if code:
             parts.append(f".. code-block:: {language}\n\n{indent(dedent(code), '   ')}")
     lines[:] = "".join(parts).split("\n")
+    if kind in {"attribute", "data", "property"}:
+        # Napoleon would take what stands before a colon in the first line for a type.
+        SET_ASIDE[name] = lines[:]
+        lines.clear()
 
 
 class CommandHelp(SphinxDirective):
@@ -136,4 +152,6 @@ def setup(app: Sphinx) -> None:
     """Tell Sphinx of what is made here."""
     app.add_directive("command-help", CommandHelp)
     app.connect("source-read", add_menus)
+    # Napoleon's own priority is 500.
     app.connect("autodoc-process-docstring", as_restructured_text, priority=100)
+    app.connect("autodoc-process-docstring", put_back, priority=900)
