@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
-from gymnasium.wrappers import FlattenObservation
 from small_envs import IDS, assert_same, make, make_vec, small
 
 import npa_envs
@@ -50,19 +49,6 @@ def test_gymnasium_finds_nothing_to_complain_of(name):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(make(name).unwrapped)
-
-
-@every_id
-def test_sb3_finds_nothing_to_complain_of_in_flat_observations(name):
-    checker = pytest.importorskip("stable_baselines3.common.env_checker")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        checker.check_env(FlattenObservation(make(name)))
-    # As they are, [N, P], they pass with the one advice to flatten them.
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        checker.check_env(make(name))
-    assert [str(w.message) for w in caught if "flatten the observation" not in str(w.message)] == []
 
 
 @every_id
@@ -441,23 +427,6 @@ def test_memory_that_is_counted_is_what_worlds_take():
     from npa_envs.envs.core.memory import free_bytes
 
     assert 2**26 < free_bytes(torch.device("cpu")) < 2**44
-
-
-def test_a_forked_worker_steps_after_its_parent_did():
-    """Torch's threads are gone after a fork; worlds of 1024 particles would wait for them."""
-    program = (
-        "import torch; torch.set_num_threads(2)\n"
-        "import gymnasium, npa_envs\n"
-        "name = 'npa/Morphogenesis2D-v0'\n"
-        "env = gymnasium.make(name); env.reset(seed=0); env.step(env.action_space.sample() * 0)\n"
-        "envs = gymnasium.make_vec(name, 2, vectorization_mode='async',\n"
-        "                          vector_kwargs={'context': 'fork'})\n"
-        "print(envs.reset(seed=0)[0].shape); envs.close()\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, timeout=120
-    )
-    assert done.stdout == "(2, 1024, 66)\n", done.stderr
 
 
 def test_pictures_with_a_read_out_show_what_it_says():

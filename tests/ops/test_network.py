@@ -4,7 +4,6 @@ import pytest
 import torch
 from worlds import assert_same, relative_error
 
-import npa_envs
 from npa_envs.rule.rule import NPARule, fold_weights
 
 # Norms of errors over norms of answers, against float64; beside, the worst measured on an H200.
@@ -199,13 +198,3 @@ def test_a_compiled_network_equals_the_eager_one(rule, device):
     got = torch.autograd.grad(compiled(rows), list(rule.parameters()))
     want = torch.autograd.grad(squares(rows), list(rule.parameters()))
     assert_same(got, want)
-
-
-def test_rollout_of_a_world_is_the_same_alone_and_in_a_batch(rule, device):
-    needs_cuda(device)
-    x = torch.rand(40, 1024, 2, device=device) - 0.5
-    s = torch.randn(40, 1024, 16, device=device) * 0.1
-    with torch.no_grad():
-        batch = npa_envs.rollout(rule, x, s, 3, update_prob=1.0)
-        alone = npa_envs.rollout(rule, x[7:8], s[7:8], 3, update_prob=1.0)
-    assert_same([value[7:8] for value in batch], alone)

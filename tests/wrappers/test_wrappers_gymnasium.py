@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from gymnasium import spaces, wrappers
-from gymnasium.vector import AsyncVectorEnv
 from gymnasium.wrappers import vector
 from wrapped_envs import ACTIONS, STEPS, batched, single
 
@@ -58,21 +57,6 @@ def test_record_video(tmp_path):
         env.step(actions(step))
     env.close()
     assert [path.suffix for path in tmp_path.glob("*.mp4")] == [".mp4"]
-
-
-@pytest.mark.slow
-def test_async_vector_env_gives_what_the_batched_one_gives():
-    # Spawned: processes forked from one in which torch has threads may hang.
-    env = AsyncVectorEnv([single, single], context="spawn")
-    ours = batched(2)
-    try:
-        np.testing.assert_array_equal(env.reset(seed=5)[0], ours.reset(seed=5)[0])
-        for step in range(3):
-            expected, seen = env.step(actions(step, 2)), ours.step(actions(step, 2))
-            np.testing.assert_array_equal(expected[0], seen[0])
-            np.testing.assert_allclose(expected[1], seen[1])
-    finally:
-        env.close()
 
 
 def test_partial_resets_pass_through_gymnasiums_statistics():

@@ -1,7 +1,5 @@
 """Rows of Stable-Baselines3: particles, worlds and particles of species; SuperSuit's as well."""
 
-import warnings
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -18,7 +16,6 @@ from npa_envs.wrappers import VectorDamageEvents, VectorNormalizePerception, Vec
 
 sb3 = pytest.importorskip("stable_baselines3")
 from stable_baselines3.common.monitor import Monitor  # noqa: E402
-from stable_baselines3.common.vec_env import VecMonitor  # noqa: E402
 
 from npa_envs.wrappers import (  # noqa: E402
     ParticleVecEnv,
@@ -167,20 +164,6 @@ def test_wrappers_beneath_are_seen():
     assert rows.observation_space.shape == (69,)
     seen = rows.reset()
     np.testing.assert_array_equal(seen[:, 66:].argmax(axis=1), envs.species.reshape(-1))
-
-
-def test_ppo_learns_on_the_rows():
-    rows = VecMonitor(ParticleVecEnv(batched()))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        options = {"n_steps": 4, "batch_size": 128, "n_epochs": 1, "seed": 0, "device": "cpu"}
-        model = sb3.PPO("MlpPolicy", rows, **options)
-        model.learn(2 * STEPS * 64)
-    assert model.num_timesteps == 2 * STEPS * 64
-    assert len(model.ep_info_buffer) == 100
-    assert model.ep_info_buffer[0]["l"] == STEPS
-    for weights in model.policy.parameters():
-        assert weights.isfinite().all()
 
 
 # Worlds as rows
