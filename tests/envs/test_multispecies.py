@@ -9,7 +9,7 @@ from crowds import TASKS, drawn, make, placed, small, still
 from small_envs import assert_same
 
 import npa_envs
-from npa_envs.envs import multispecies_v0
+from npa_envs.envs import multispecies_v0, particles_v0
 from npa_envs.errors import NPAError
 
 
@@ -188,9 +188,8 @@ def test_a_copy_by_pickle_goes_on_alike():
     assert_same(env.reset(), copy.reset())
 
 
-@pytest.mark.parametrize(
-    ("keywords", "message"),
-    [
+REFUSED = {
+    multispecies_v0.parallel_env: [
         ({"task": "mixin"}, "task must be a known word, got 'mixin': did you mean 'mixing'"),
         ({"task": 3}, "task must be a known word, got 3"),
         ({"species_count": 0}, "species_count must be a whole number of at least 1, got 0"),
@@ -223,10 +222,31 @@ def test_a_copy_by_pickle_goes_on_alike():
         ({"perception": "own"}, r"perception must be a known word, got 'own'"),
         ({"on_divergence": "reset"}, "on_divergence must be a known word, got 'reset'"),
     ],
+    multispecies_v0.batched: [
+        ({"world_count": 0}, "world_count must be a whole number of at least 1, got 0"),
+        ({"autoreset_mode": "next-step"}, "autoreset_mode must be 'same-step' or 'disabled'"),
+        ({"autoreset_mode": "never"}, "autoreset_mode must be a known word, got 'never'"),
+        ({"eps": -1.0}, "eps must be a finite number greater than 0"),
+        ({"num_envs": 3}, "unexpected keyword argument 'num_envs'"),
+        ({"world_count": 10**7, "particle_count": 10**4}, "particle_count is too large"),
+    ],
+    particles_v0.parallel_env: [
+        ({"particle_count": 513}, "particle_count must be at most 512 .* got 513"),
+        ({"particle_counts": (500, 20)}, "particle_count must be at most 512 .* got 520"),
+        ({"species_count": 0}, "species_count must be a whole number of at least 1"),
+        ({"task": "mixin"}, "did you mean 'mixing'"),
+        ({"particles": 4}, "unexpected keyword argument 'particles': did you mean"),
+    ],
+}
+
+
+@pytest.mark.parametrize(
+    ("make", "keywords", "message"),
+    [(make, *row) for make in REFUSED for row in REFUSED[make]],
 )
-def test_a_wrong_configuration_is_refused(keywords, message):
+def test_a_wrong_configuration_is_refused(make, keywords, message):
     with pytest.raises(NPAError, match=message):
-        multispecies_v0.parallel_env(**keywords)
+        make(**keywords)
 
 
 @pytest.mark.parametrize(

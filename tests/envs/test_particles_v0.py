@@ -95,28 +95,10 @@ def test_particles_of_a_removed_species_end_together():
     assert all(rewards.values())
 
 
-@pytest.mark.parametrize(
-    ("keywords", "message"),
-    [
-        ({"particle_count": 513}, "particle_count must be at most 512 .* got 513"),
-        ({"particle_counts": (500, 20)}, "particle_count must be at most 512 .* got 520"),
-        ({"species_count": 0}, "species_count must be a whole number of at least 1"),
-        ({"task": "mixin"}, "did you mean 'mixing'"),
-        ({"particles": 4}, "unexpected keyword argument 'particles': did you mean"),
-    ],
-)
-def test_a_wrong_configuration_is_refused(keywords, message):
-    with pytest.raises(NPAError, match=message):
-        particles_v0.parallel_env(**keywords)
-
-
 def test_a_wrong_action_is_refused():
     env = make()
     env.reset(seed=0)
-    actions = still(env)
-    del actions["particle_2"], actions["particle_3"], actions["particle_4"], actions["particle_5"]
-    with pytest.raises(NPAError, match="got none for particle_2, particle_3, particle_4 and 1"):
-        env.step(actions)
-    actions = still(env) | {"particle_7": np.zeros((1, 18))}
+    with pytest.raises(NPAError, match="got none for particle_0, particle_1, particle_2 and 6"):
+        env.step({})
     with pytest.raises(NPAError, match=r"'particle_7'\] must be real numbers of shape \(18,\)"):
-        env.step(actions)
+        env.step(still(env) | {"particle_7": np.zeros((1, 18))})

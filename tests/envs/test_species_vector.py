@@ -220,22 +220,6 @@ def test_pictures_are_those_of_the_single_worlds():
     envs.close()
 
 
-@pytest.mark.parametrize(
-    ("keywords", "message"),
-    [
-        ({"world_count": 0}, "world_count must be a whole number of at least 1, got 0"),
-        ({"autoreset_mode": "next-step"}, "autoreset_mode must be 'same-step' or 'disabled'"),
-        ({"autoreset_mode": "never"}, "autoreset_mode must be a known word, got 'never'"),
-        ({"eps": -1.0}, "eps must be a finite number greater than 0"),
-        ({"num_envs": 3}, "unexpected keyword argument 'num_envs'"),
-        ({"world_count": 10**7, "particle_count": 10**4}, "particle_count is too large"),
-    ],
-)
-def test_a_wrong_configuration_is_refused(keywords, message):
-    with pytest.raises(NPAError, match=message):
-        multispecies_v0.batched(**keywords)
-
-
 def test_telling_species_apart_needs_memory_of_its_own(monkeypatch):
     # 64 worlds of 41 particles: P is 66, and 8 species append 24 numbers, of which 4 copies live.
     free = memory.needed_bytes(64, 41, batch().worlds.physics, torch.device("cpu"))
