@@ -1,5 +1,6 @@
 """The documentation is true: pages are current, tables name what is there, code runs."""
 
+import contextlib
 import importlib.util
 import re
 import sys
@@ -17,7 +18,7 @@ from small_envs import assert_batch_of_singles
 
 import npa_envs
 from npa_envs.agents.learning import METHODS, Budget, train
-from npa_envs.cli import COMMANDS
+from npa_envs.cli import COMMANDS, main
 from npa_envs.envs import multispecies_v0, particles_v0
 from npa_envs.envs.multi import TASKS as TABLE
 from npa_envs.ops.backend import Request, describe
@@ -118,6 +119,33 @@ def test_the_reference_of_commands_has_every_command_and_task():
     asked = re.findall(r"^```\{command-help\} (.+)$", text, re.MULTILINE)
     assert asked == re.findall(r"^##+ (.+)$", text, re.MULTILINE)
     assert sorted(asked) == sorted([*COMMANDS, *(f"train {name}" for name in TRAINED)])
+
+
+def commands_of_pages() -> dict[tuple[str, ...], set[str]]:
+    """Return the options that blocks of shell give to each command, by command and task."""
+    asked: dict[tuple[str, ...], set[str]] = {}
+    for path in TEXTS:
+        for block in re.findall(r"^ *```(?:sh|bash)\n(.*?)^ *```", path.read_text(), re.M | re.S):
+            for line in re.sub(r"\\\n", " ", block).splitlines():
+                words = re.sub(r"#.*| > .*", "", line).replace(".venv/bin/", "").split()
+                if words[:1] != ["npa-envs"] or len(words) < 2 or words[1].startswith("-"):
+                    continue
+                command = tuple(words[1:3]) if words[1] == "train" else (words[1],)
+                names = {word.partition("=")[0] for word in words if word.startswith("-")}
+                asked.setdefault(command, set()).update(names)
+    return asked
+
+
+def test_commands_in_blocks_of_shell_have_the_options_that_they_are_given(capsys):
+    asked = commands_of_pages()
+    assert len(asked) > 12
+    for command, options in asked.items():
+        if "TASK" in command:
+            continue
+        with contextlib.suppress(SystemExit):
+            main([*command, "--help"])
+        told = set(re.findall(r"(?<![\w-])--?[\w-]+", capsys.readouterr().out))
+        assert options <= told, command
 
 
 @pytest.mark.parametrize(
