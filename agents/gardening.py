@@ -11,6 +11,7 @@ from torch import Tensor
 from npa_envs.agents.policies import unwrapped
 from npa_envs.envs.garden.brushwork import PLACE, Columns
 from npa_envs.envs.garden.task import GardenTask
+from npa_envs.envs.shepherd2d import ShepherdTask
 from npa_envs.errors import NPAError, shown
 from npa_envs.tasks.checks import is_real
 from npa_envs.world.randomness import Purpose, WorldRandom
@@ -140,6 +141,49 @@ class ScriptedGardener(BrushPolicy):
         return action
 
 
+class ScriptedShepherd(BrushPolicy):
+    """Push from a ring of places: all the way to the goal, around, or outwards, as it asks for.
+
+    Args:
+        env: `npa/Shepherd2D-v0`, whose brushes push.
+        gain: Share of what is missing to the goal that is done in a step (dimensionless).
+        ring: Distance of the places from the middle of the picture [length units].
+
+    Raises:
+        NPAError: `env` is another one, its brushes do not push, or a number is not positive.
+    """
+
+    def __init__(self, env: Any, gain: float = 0.3, ring: float = 0.4) -> None:
+        super().__init__(env)
+        if not isinstance(self.task, ShepherdTask) or "push" not in self.config.tools:
+            raise NPAError(
+                f"env must be npa/Shepherd2D-v0 with brushes that push, got "
+                f"{type(self.task).__name__} with tools={self.config.tools}"
+            )
+        self._gain = checked_positive("gain", gain)
+        angle = 2.0 * torch.pi * (torch.arange(self.config.brush_count) + 0.5)
+        angle = angle / self.config.brush_count
+        places = torch.stack((angle.cos(), angle.sin()), dim=1).to(self.task.device)
+        self._places = checked_positive("ring", ring) * places
+
+    def act(self, world_count: int) -> Tensor:
+        """Return pushes towards the goals of the worlds as they are."""
+        worlds, action = self.worlds, self.still(world_count)
+        achieved = self.task.achieved(worlds.x, worlds.s, worlds.marks)
+        missing = (self.task.desired(worlds.marks) - achieved)[:, None, :2]
+        if self.config.aim == "move":
+            way = missing.expand(-1, len(self._places), -1)
+        elif self.config.aim == "reshape":
+            way = missing * self._places
+        else:
+            around = torch.stack((-self._places[:, 1], self._places[:, 0]), dim=1)
+            way = missing[..., 1:] * around
+        action[..., PLACE] = self._places
+        push = self._gain * way / self.config.push_length
+        action[..., self.columns.push] = push.clamp(-1.0, 1.0)
+        return action
+
+
 def checked_positive(name: str, value: Any) -> float:
     """Return what the caller calls so, a positive number.
 
@@ -156,11 +200,11 @@ class GradientGardener(BrushPolicy):
 
     In each step it copies the worlds and improves a plan for the next `horizon` steps by Adam,
     with draws of its own: it knows the state of the world, the rule and the target, and nothing of
-    the damage to come. It begins with what `ScriptedGardener` would do and with the rest of its
-    last plan, and does the first step of whichever plan is best.
+    the damage to come. It begins with what `ScriptedGardener` or `ScriptedShepherd` would do, and
+    does the first step of the best plan that it has seen.
 
     Args:
-        env: A garden.
+        env: A garden whose brushes push, with dense rewards.
         horizon: Steps of a plan.
         iterations: Gradient steps on each plan.
         learning_rate: Of Adam (dimensionless).
@@ -179,7 +223,8 @@ class GradientGardener(BrushPolicy):
         seed: int = 0,
     ) -> None:
         super().__init__(env)
-        self._scripted = ScriptedGardener(env)
+        shepherd = isinstance(self.task, ShepherdTask)
+        self._scripted = ScriptedShepherd(env) if shepherd else ScriptedGardener(env)
         self._horizon, self._iterations = horizon, iterations
         self._learning_rate = learning_rate
         self._seed = seed

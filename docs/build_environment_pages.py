@@ -35,6 +35,7 @@ from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.spaces import Rows
 from npa_envs.envs.core.vector import NPAVectorEnv
+from npa_envs.envs.garden.environments import GardenEnv
 from npa_envs.registration import ENVIRONMENTS, GARDENS, Registration
 
 DOCS = Path(__file__).resolve().parent
@@ -69,7 +70,9 @@ def resolved_sections(env_class: type) -> dict[str, str]:
     shared = sections(NPAEnv)
     order = [name for name in (first | shared) if name]
     if env_class.form_type is not Rows:
-        first, shared = {}, shared | sections(env_class.__mro__[1])
+        # Living worlds pay otherwise; all else that they do not say is said of all environments.
+        del shared["Reward"]
+        first, shared = {}, shared | sections(GardenEnv)
     found = {"": own[""]}
     for heading in order:
         parts = own.get(heading) or first.get(heading), shared.get(heading)

@@ -19,7 +19,12 @@ from films import FPS, IMAGES, STILL, Frame
 
 from npa_envs import load_rule
 from npa_envs.agents import RulePolicy, SpreadPolicy
-from npa_envs.agents.gardening import GradientGardener, ScriptedGardener, StillGardener
+from npa_envs.agents.gardening import (
+    GradientGardener,
+    ScriptedGardener,
+    ScriptedShepherd,
+    StillGardener,
+)
 from npa_envs.registration import ENVIRONMENTS, GARDENS, Registration
 from npa_envs.render import write_filmstrip, write_webp
 
@@ -105,6 +110,13 @@ FILMS = {
         "`GradientGardener` plans.",
         rule=None,
         policies=(StillGardener, ScriptedGardener, GradientGardener),
+    ),
+    "Shepherd2D": Film(
+        steps=(0, 4, 8, 16, 24, 32),
+        rows=({"aim": "move"}, {"aim": "turn", "target": "gecko"}, {"aim": "reshape"}),
+        caption="`ScriptedShepherd` moves a heart, turns a gecko and reshapes a heart.",
+        rule=None,
+        policies=(ScriptedShepherd, ScriptedShepherd, ScriptedShepherd),
     ),
 }
 """By the names of the environments."""

@@ -11,14 +11,11 @@ from torch import Tensor
 from npa_envs.envs.core.task import Start
 from npa_envs.envs.garden.config import GardenConfig
 from npa_envs.envs.garden.environments import GardenEnv, GardenVectorEnv
-from npa_envs.envs.garden.task import GardenTask
+from npa_envs.envs.garden.task import GardenTask, lost_share, marks_of_whole
 from npa_envs.tasks.checks import check_fraction, check_non_negative, check_positive
 from npa_envs.tasks.damage import random_particle
 from npa_envs.world.brushes import erase_state, push
 from npa_envs.world.randomness import Purpose, WorldRandom
-
-LEAST_RISE = 0.1
-"""Turning grey counts as at least this share more of a picture's loss (dimensionless)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,15 +78,11 @@ class GardenerTask(GardenTask[Gardener2DEnvConfig]):
 
     def marked(self, start: Start, loss: Tensor, random: WorldRandom) -> Tensor:
         """Return the loss of the whole picture, and how much it rises if all of it turns grey."""
-        parts = self.losses(start.x, torch.zeros_like(start.s))
-        grey = sum(parts.values(), torch.zeros_like(loss))
-        # Worlds that have not grown are as bad as grey ones.
-        return torch.stack((loss, (grey - loss).maximum(LEAST_RISE * loss)), dim=1)
+        return marks_of_whole(self, start, loss)
 
     def earned(self, x: Tensor, s: Tensor, loss: Tensor, marks: Tensor) -> Tensor:
         """Return how whole worlds are: 1 as at their start, 0 as bad as grey, shape [B]."""
-        whole, rise = marks.unbind(dim=1)
-        return (1.0 - (loss - whole) / rise).clamp(-1.0, 1.0)
+        return (1.0 - lost_share(loss, marks)).clamp(-1.0, 1.0)
 
 
 class Gardener2DEnv(GardenEnv):

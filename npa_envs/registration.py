@@ -50,7 +50,10 @@ ENVIRONMENTS = (
 )
 """Where an action has a row for each particle. A change of behaviour is a new version of the id."""
 
-GARDENS = (Registration("npa/Gardener2D-v0", "npa_envs.envs.gardener2d", "Gardener2D", 32),)
+GARDENS = (
+    Registration("npa/Gardener2D-v0", "npa_envs.envs.gardener2d", "Gardener2D", 32),
+    Registration("npa/Shepherd2D-v0", "npa_envs.envs.shepherd2d", "Shepherd2D", 32),
+)
 """Where a trained rule runs the particles, and an action says what few brushes do."""
 
 

@@ -51,6 +51,13 @@ def assert_same(left: Any, right: Any, where: str = "") -> None:
         assert np.array_equal(*arrays), where
 
 
+def world_of(batched: Any, k: int) -> Any:
+    """Return what is world k's of an array, or of each array of a dictionary."""
+    if isinstance(batched, dict):
+        return {name: value[k] for name, value in batched.items()}
+    return batched[k]
+
+
 def assert_info_equal(infos, k, info):
     for name, value in info.items():
         assert np.array_equal(infos[name][k], value), name
@@ -67,14 +74,14 @@ def assert_batch_of_singles(
     observations, infos = envs.reset(seed=40)
     for k, env in enumerate(singles):
         observation, info = env.reset(seed=40 + k)
-        assert np.array_equal(observations[k], observation)
+        assert_same(world_of(observations, k), observation)
         assert_info_equal(infos, k, info)
     reasons, diverged, over = set(), 0, [False] * len(singles)
     for action in actions:
         observations, rewards, terminations, truncations, infos = envs.step(action)
         for k, env in enumerate(singles):
             if over[k] and mode == "next-step":
-                assert np.array_equal(observations[k], env.reset()[0])
+                assert_same(world_of(observations, k), env.reset()[0])
                 over[k] = False
                 continue
             observation, reward_k, terminated, truncated, info = env.step(action[k])
@@ -85,12 +92,12 @@ def assert_batch_of_singles(
             reasons.add(info.get("reason"))
             if over[k] and mode == "same-step":
                 assert infos["_final_obs"][k]
-                assert np.array_equal(infos["final_obs"][k], observation)
+                assert_same(world_of(infos["final_obs"], k), observation)
                 assert_info_equal(infos["final_info"], k, info)
                 observation, info = env.reset()
                 assert not infos["_success"][k]
             elif "_final_obs" in infos:
                 assert not infos["_final_obs"][k]
-            assert np.array_equal(observations[k], observation)
+            assert_same(world_of(observations, k), observation)
             assert_info_equal(infos, k, info)
     return reasons, diverged

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 from gymnasium.spaces import Box, Space
+from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.envs.core.config import WorldConfig
@@ -62,6 +63,10 @@ class Rows:
     def seen(self, observation: Tensor) -> Any:
         """Return observations of worlds, or of one, as they are handed out."""
         return to_output(observation, self._output)
+
+    def last_seen(self, observation: Tensor, ended: NDArray[np.bool_]) -> Any:
+        """Return worlds' last observations, [B, ...], where some, bool, [B], have ended."""
+        return self.seen(observation)
 
 
 def to_output(tensor: Tensor, output: str) -> Any:

@@ -207,7 +207,10 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
                 final_observation = observation.clone()
             self.worlds.restart(np.flatnonzero(ended), observation)
             _, _, infos = self._report(~ended, copy=self.copies)
-            infos |= {"final_obs": self.form.seen(final_observation), "_final_obs": which}
+            infos |= {
+                "final_obs": self.form.last_seen(final_observation, ended),
+                "_final_obs": which,
+            }
             infos |= {"final_info": final_infos, "_final_info": self._mask(ended)}
         else:
             self._ended = ended

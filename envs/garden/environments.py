@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.envs.garden.forms import Brushes
@@ -80,11 +82,11 @@ class GardenEnv(NPAEnv):
     """
 
     worlds_type = LivingWorlds
-    form_type = Brushes
+    form_type: ClassVar[type[Brushes]] = Brushes
 
 
 class GardenVectorEnv(NPAVectorEnv):
     """B living worlds, stepped together; subclasses name the task."""
 
     worlds_type = LivingWorlds
-    form_type = Brushes
+    form_type: ClassVar[type[Brushes]] = Brushes

@@ -122,6 +122,9 @@ class GardenTask(GrownTask[Config]):
     mark_count: ClassVar[int]
     """Numbers that a world keeps of its start, M."""
 
+    pays_each_step: ClassVar[bool] = False
+    """Whether a sparse reward is one of each step all the same."""
+
     def marked(self, start: Start, loss: Tensor, random: WorldRandom) -> Tensor:
         """Return what worlds keep of their start, shape [B, M]; `loss` is theirs, [B]."""
         raise NotImplementedError
@@ -163,3 +166,24 @@ class GardenTask(GrownTask[Config]):
         seconds = torch.cat((across * across, across * up, up * up), dim=-1)
         told = torch.cat((seconds, s, across * s, up * s), dim=-1)
         return torch.cat((mean, world_mean(told)), dim=-1)
+
+
+LEAST_RISE = 0.1
+"""Turning grey counts as at least this share more of a picture's loss (dimensionless)."""
+
+
+def marks_of_whole(task: GardenTask[Config], start: Start, loss: Tensor) -> Tensor:
+    """Return the loss of whole pictures, and how much it rises if they turn grey, shape [B, 2]."""
+    grey = sum(task.losses(start.x, torch.zeros_like(start.s)).values(), torch.zeros_like(loss))
+    # Worlds that have not grown are as bad as grey ones.
+    return torch.stack((loss, (grey - loss).maximum(LEAST_RISE * loss)), dim=1)
+
+
+def lost_share(loss: Tensor, marks: Tensor) -> Tensor:
+    """Return what share of pictures is lost: 0 of whole ones, 1 of grey ones, shape [B].
+
+    Args:
+        loss: Their losses, shape [B].
+        marks: What `marks_of_whole` gave, and maybe more, shape [B, M].
+    """
+    return (loss - marks[:, 0]) / marks[:, 1]

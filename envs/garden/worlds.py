@@ -107,7 +107,7 @@ class LivingWorlds(Worlds):
     def _rewards(self) -> Tensor:
         """Return what worlds earn in this step, shape [B]."""
         earned = self.task.earned(self.x, self.s, self.loss, self.marks)
-        if self.task.config.reward == "dense":
+        if self.task.config.reward == "dense" or self.task.pays_each_step:
             return earned
         last = self.report.endings[0] | self.report.endings[1]
         if self.episode_steps is None:
