@@ -199,7 +199,7 @@ def perceive_species(
     """Perceive neighbourhoods as `perceive`, and of each species its own density and gradient.
 
     z = [what `perceive` returns ; c^D ρ_k / N (K) ; L(c^(1+D) ∇ρ_k / N) (K x D, species-major)].
-    Through what is appended no gradient flows.
+    No gradient flows through the added entries.
 
     Args:
         x: Particle positions [length units], shape [B, N, D], species after species.

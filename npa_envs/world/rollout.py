@@ -522,21 +522,23 @@ def rollout(
         position_noise: Standard deviation of the noise added to every position in each step
             [length units].
         detach_positions: Perception does not back-propagate into positions (the paper's choice).
-        memory: "store" what the backward pass reads, or "recompute" it from the worlds of two steps
-            in three: about half the memory, two thirds of a forward pass more time. "minimal"
-            recomputes all but the last: least memory, a forward pass more. Same gradients.
-        generator: Source of the masks and the noise, on x's device; default: torch's global one.
-            A `WorldRandom` advances by one step before each step's draws, so that every world
-            draws what it would draw alone.
-        on_divergence: What is done about worlds whose numbers become infinite or NaN: "ignore", at
-            no cost (the next call refuses such positions), or "raise": look after each step, on the
-            device, and wait for it once, at the end.
+        memory: "store" keeps what the backward pass reads. "recompute" computes two steps in three
+            again: about half the memory, and two thirds of a forward pass more time. "minimal"
+            recomputes all but the last step: least memory, and a forward pass more time. Gradients
+            are the same.
+        generator: Source of the masks and the noise, on x's device; default: torch's global one. A
+            `WorldRandom` advances by one step before the draws of each step, so that every world
+            draws the same numbers as alone.
+        on_divergence: What to do if numbers of a world become infinite or NaN. "ignore" costs
+            nothing; the next call refuses such positions. "raise" checks each step on the device,
+            and waits for the result once, at the end.
         keep_every: Return the worlds after every so many steps, a divisor of `steps`: the
             trajectory. Results have one more dimension at the front, of size steps / keep_every.
-        cuda_graph: On CUDA, replay calls that repeat instead of launching their kernels one by one:
-            a tenth of the host's time, the same numbers. "auto" records plain rules, from the third
-            call with the same shapes and options on; True also rules with a network of their own,
-            whose Python code then runs no more; False none. See docs/performance.md.
+        cuda_graph: On CUDA, replay repeated calls instead of launching their kernels one by one.
+            The host then needs a tenth of the time, and the numbers are the same. "auto" records
+            plain rules, from the third call with the same shapes and options on. True also records
+            rules with a network of their own, whose Python code then no longer runs. False records
+            nothing. See docs/performance.md.
         return_path_length: Also return how far each particle travelled.
 
     Returns:

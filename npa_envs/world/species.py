@@ -125,14 +125,14 @@ def rollout_species(
 ) -> tuple[Tensor, Tensor] | tuple[Tensor, Tensor, Tensor]:
     """Run several rules in one world; differentiable, and particle i stays particle i.
 
-    Each step is that of `rollout`, with one perception pass for the particles of all species; then
-    each species' rule updates its own particles. A species' rule reads its neighbours' states
-    whatever their species, as in the paper (arXiv 2601.16096). With one species this is `rollout`,
-    and with several that have one rule it is `rollout` of all particles, up to rounding.
+    Each step is that of `rollout`: one perception pass for the particles of all species, then each
+    species' rule updates its own particles. As in the paper (arXiv 2601.16096), a rule reads the
+    states of all neighbours, whatever their species. With one species this is `rollout`. With
+    several species of the same rule it is `rollout` of all particles, up to rounding.
 
-    What rules perceive of densities is divided by the particles of the whole world. A rule that was
-    trained alone then sees less of itself the more others there are, however far away;
-    `density_counts=counts` lets it see itself as it does alone.
+    Perceived densities are divided by the number of particles in the whole world. So for a rule
+    that was trained alone, foreign particles lower the density that it perceives, however far away
+    they are. With `density_counts=counts` each species divides by its own number, as it does alone.
 
     Args:
         rules: One rule for each species; dtype and device of x. They agree in space dimension,
@@ -151,12 +151,12 @@ def rollout_species(
         position_noise: Standard deviation of the noise added to every position in each step
             [length units].
         generator: Source of the masks and the noise, on x's device; default: torch's global one.
-            With one `update_prob` it gives what it gives `rollout`.
+            With one `update_prob` it draws the same numbers as in `rollout`.
         detach_positions: Perception does not back-propagate into positions (the paper's choice).
         perception: "shared", or "per_species" for rules made with `species_count`: they also
             perceive the density and the density gradient of each species, as `perceive_species`
             gives them.
-        density_counts: What each species divides densities and their gradients by, positive;
+        density_counts: Number that each species divides densities and their gradients by, positive;
             default: N, the particles of the world, for all.
         memory: What the backward pass reads is stored or recomputed, as in `rollout`.
         on_divergence: "ignore" worlds that diverge, or "raise" at the end, as in `rollout`.
