@@ -93,7 +93,6 @@ class EnvironmentWorld(Live):
         """Return the event "world"."""
         physics, task = self._inner.worlds.physics, self._inner.task
         box, dimension = physics.box, physics.space_dim
-        moving = ["push", "clump", "cut"] if physics.moving else []
         return {
             "type": "world",
             "title": self._title,
@@ -109,7 +108,7 @@ class EnvironmentWorld(Live):
             "species": [],
             "shows": self._shows(),
             "show": self.show,
-            "tools": moving,
+            "tools": [*(("push", "clump", "cut") if physics.moving else ()), "inject"],
             "damages": list(DAMAGE_SIZES) if physics.moving else ["erase"],
             "settings": self._settings(),
             "capabilities": ["step", "reset", "film", "loss"],

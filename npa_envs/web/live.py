@@ -19,7 +19,7 @@ from torch import Tensor
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.tasks.checks import is_real, is_whole
 from npa_envs.tasks.damage import DAMAGE_SIZES
-from npa_envs.world.brushes import clump, cut, push
+from npa_envs.world.brushes import clump, cut, inject, push, state_around
 
 MOST_STEPS = 64
 """Steps from frame to frame, at most."""
@@ -29,6 +29,9 @@ LOSS_SHARE = 0.1
 
 CLUMP_RATE = 0.25
 """Share of its distance that a particle loses to the brush `clump` of strength 1 in one message."""
+
+INJECT_RATE = 0.5
+"""Share of the way to a state that the brush `inject` of strength 1 goes in one message."""
 
 FARTHEST = 1e4
 """Largest coordinate that a message may name [length units]."""
@@ -232,6 +235,8 @@ class Touch(NamedTuple):
     """Radius of the brush [length units]."""
     strength: float
     """From 0 to 1, dimensionless."""
+    source: Tensor
+    """Where the brush `inject` takes the state from [length units], shape [1, D]."""
     view: Tensor | None
     """In 3D the unit vector towards the viewer, shape [1, D], where it is known."""
 
@@ -243,22 +248,23 @@ class Touch(NamedTuple):
             NPAError: A tool or a number is missing or wrong.
         """
         tool = message.get("tool")
-        tools = ("erase", "push", "clump", "cut", "graft", "add")
+        tools = ("erase", "push", "clump", "cut", "inject", "graft", "add")
         if tool not in tools:
             raise NPAError(f"unknown tool {shown(tool)}: {suggest(tool, tools)}")
         at = _checked_vector("at", message.get("at"), x)
         move = _checked_vector("move", message.get("move", [0.0] * x.shape[2]), x)
         radius = Range(1e-4, LARGEST_RADIUS).checked("radius", message.get("radius"))
         strength = Range(0.0, 1.0).checked("strength", message.get("strength", 1.0))
+        source = _checked_vector("source", message.get("source", message.get("at")), x)
         view = message.get("view")
         toward = None if view is None else _checked_vector("view", view, x)
-        return cls(str(tool), at, move, radius, strength, toward)
+        return cls(str(tool), at, move, radius, strength, source, toward)
 
 
 def brushed(
     x: Tensor, s: Tensor, touch: Touch, box: tuple[float, ...] | None
 ) -> tuple[Tensor, Tensor]:
-    """Return worlds after a brush that keeps all particles: push, clump or cut.
+    """Return worlds after a brush that keeps all particles: push, clump, cut or inject.
 
     Raises:
         NPAError: It is another brush.
@@ -279,9 +285,14 @@ def brushed(
                 x, s, centre=touch.at + half, normal=across(touch.move, touch.view), along=half,
                 gap=touch.radius, box=box,
             )  # fmt: skip
+        case "inject":
+            told: dict[str, Any] = {"radius": touch.radius, "box": box}
+            state, holds = state_around(x, s, centre=touch.source, **told)
+            strength = INJECT_RATE * touch.strength * holds.to(x.dtype)
+            return x, inject(x, s, centre=touch.at, state=state, strength=strength, **told)
     raise NPAError(
         f"this world keeps its particles, so that the brush {shown(touch.tool)} does nothing: take "
-        "push, clump or cut"
+        "push, clump, cut or inject"
     )
 
 

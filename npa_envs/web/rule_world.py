@@ -160,7 +160,7 @@ class RuleWorld(Live):
         elif isinstance(task, PointClassification):
             half_width, centre = 0.6, [0.5] * self.dimension
         alike = [name for name in self._choices if self._may_join(name)]
-        tools = ["erase", "push", "clump", "cut", "graft", "add"]
+        tools = ["erase", "push", "clump", "cut", "inject", "graft", "add"]
         if self.main.rule.static:
             tools.remove("add")
         return {

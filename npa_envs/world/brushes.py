@@ -166,6 +166,29 @@ def inject(
     return s + share * softness(x, centre=centre, radius=radius, box=box) * (state[:, None] - s)
 
 
+def state_around(
+    x: Tensor, s: Tensor, *, centre: Tensor, radius: float | Tensor, box: Sides = None
+) -> tuple[Tensor, Tensor]:
+    """Return the mean state that a soft brush holds, [B, C], and whether it holds any, bool, [B].
+
+    Args:
+        x: Particle positions [length units], shape [B, N, D].
+        s: Particle states (dimensionless), shape [B, N, C].
+        centre: Where the brush is in each world [length units], shape [B, D].
+        radius: Radius of the brush [length units], a number or a tensor of shape [B].
+        box: Sides of the periodic box [length units], or None.
+
+    Raises:
+        NPAError: A wrong shape or dtype, or a radius that is negative or not finite.
+    """
+    check_world(x, s)
+    share = softness(x, centre=centre, radius=radius, box=box)
+    total = share.sum(dim=1)
+    holds = total > 0
+    mean = (share * s).sum(dim=1) / torch.where(holds, total, torch.ones_like(total))
+    return mean, holds[:, 0]
+
+
 def erase_state(
     x: Tensor, s: Tensor, *, centre: Tensor, radius: float | Tensor, box: Sides = None
 ) -> Tensor:

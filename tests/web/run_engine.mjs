@@ -39,6 +39,10 @@ const acts = {
     if (name === "push") brushes.push(x, dimension, at, move, radius, strength, box);
     if (name === "clump") brushes.clump(x, dimension, at, radius, strength, box);
     if (name === "cut") brushes.cut(x, dimension, at, normal, radius, along, box);
+    if (name === "inject") {
+      const state = brushes.stateAround(x, s, dimension, move, radius, box);
+      if (state !== null) brushes.inject(x, s, dimension, at, radius, state, strength, box);
+    }
     const inside = brushes.insideBall(x, dimension, at, radius, box);
     return { x: text(x), s: text(s), inside };
   },

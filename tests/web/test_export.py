@@ -142,7 +142,7 @@ def test_two_species_step_as_in_python(run: Run, density_counts: tuple[int, int]
 
 
 @pytest.mark.parametrize(("dimension", "box"), [(2, None), (2, (0.6, 0.5)), (3, None)])
-@pytest.mark.parametrize("name", ["erase", "push", "clump", "cut", "cut for ever"])
+@pytest.mark.parametrize("name", ["erase", "push", "clump", "cut", "cut for ever", "inject"])
 def test_brushes_are_those_of_python(run: Run, name: str, dimension: int, box: Box) -> None:
     x, s = scattered(200, dimension, 4, box)
     at, move = x.new_full((1, dimension), 0.2), x.new_tensor([[0.05, -0.1, 0.2][:dimension]])
@@ -156,6 +156,10 @@ def test_brushes_are_those_of_python(run: Run, name: str, dimension: int, box: B
             want_x = brushes.push(x, move=move, strength=0.7, **told)
         case "clump":
             want_x, _ = brushes.clump(x, s, factor=0.7, **told)
+        case "inject":
+            state, holds = brushes.state_around(x, s, **(told | {"centre": move}))
+            assert holds.all()
+            want_s = brushes.inject(x, s, state=state, strength=0.7, **told)
         case "cut":
             want_x, _ = brushes.cut(
                 x, s, centre=at, normal=move.flip(1), gap=0.15, along=along, box=box
@@ -166,7 +170,7 @@ def test_brushes_are_those_of_python(run: Run, name: str, dimension: int, box: B
         normal=move.flip(1)[0].tolist(), along=None if along is None else along[0].tolist(),
     )  # fmt: skip
     assert float((unpacked(got["x"], x.shape) - want_x).abs().max()) < 1e-6
-    assert torch.equal(unpacked(got["s"], s.shape), want_s)
+    assert float((unpacked(got["s"], s.shape) - want_s).abs().max()) < 1e-6
     assert not (torch.equal(want_x, x) and torch.equal(want_s, s))
     inside = brushes.inside_ball(want_x, **told)[0]
     assert got["inside"] == inside.nonzero()[:, 0].tolist()
@@ -216,6 +220,24 @@ def test_the_rubber_takes_particles_away_and_the_others_go_on(
     assert len(live(run, settings, rubber, ADVANCE)["species"]) == 300 - int(near.sum())
     everything = dict(rubber, radius=9)
     assert last(live(run, settings, everything, ADVANCE, ADVANCE), "frame")["colours"] == []
+
+
+def test_a_state_is_injected_where_the_pointer_is(run: Run, settings: dict[str, Any]) -> None:
+    pause = {"type": "play", "on": False}
+    told = {"type": "brush", "tool": "inject", "at": [0.1, 0], "radius": 0.08, "strength": 1}
+    before = live(run, settings, *[ADVANCE] * 9, pause)
+    x, s = unpacked(before["x"], (1, 300, 2)), unpacked(before["s"], (1, 300, 16))
+    after = live(run, settings, *[ADVANCE] * 9, pause, told | {"source": [-0.1, 0]})
+    where = {"radius": 0.08}
+    state, _ = brushes.state_around(x, s, centre=x.new_tensor([[-0.1, 0.0]]), **where)
+    want = brushes.inject(
+        x, s, centre=x.new_tensor([[0.1, 0.0]]), state=state, strength=0.5, **where
+    )
+    assert float((unpacked(after["s"], s.shape) - want).abs().max()) < 1e-5
+    assert float((want - s).abs().max()) > 0.01
+    nobody = live(run, settings, *[ADVANCE] * 9, pause, told | {"source": [5, 5]})
+    assert nobody["s"] == before["s"]
+    assert nobody["errors"] == after["errors"] == []
 
 
 def test_species_are_grafted_and_added_where_rules_agree(

@@ -152,6 +152,24 @@ def test_clump_and_cut_move_particles(world):
     assert float(world.x[..., 1].abs().min()) >= 0.025 - 1e-6
 
 
+def test_a_state_is_injected_elsewhere(world):
+    world.s[..., 0] = (world.x[..., 0] < 0).to(world.s)
+    x, s = world.x.clone(), world.s.clone()
+    there = {"at": [0.1, 0.0], "radius": 0.08, "strength": 1.0}
+    world.handle(brush("inject", source=[-0.1, 0.0], **there))
+    gained = world.s[0, :, 0] - s[0, :, 0]
+    inside = np.linalg.norm(x[0].numpy() - [0.1, 0.0], axis=1) < 0.08
+    assert float(gained[inside].max()) > 0.3
+    assert float(gained[~inside].abs().max()) == 0.0
+    assert torch.equal(world.x, x)
+    after = world.s.clone()
+    world.handle(brush("inject", source=[5.0, 5.0], **there))
+    assert torch.equal(world.s, after)
+    # Without a source, particles become like those around them.
+    world.handle(brush("inject", at=[0.0, 0.0], radius=0.2, strength=1.0))
+    assert float(world.s[..., 0].std()) < float(after[..., 0].std())
+
+
 def test_grafts_follow_the_other_rule(world):
     assert world.handle(brush("graft", rule="heart", radius=0.15))
     told = world.describe()
@@ -266,6 +284,7 @@ def test_the_loss_is_computed_only_where_it_is_wanted(world):
         (brush("erase", at="00"), "at must be 2 finite numbers"),
         (brush("erase", radius=-1), "radius must be a number in"),
         (brush("push", move=[1e9, 0.0]), "move must be 2 finite numbers"),
+        (brush("inject", source=[0.0]), "source must be 2 finite numbers"),
         (brush("push", strength=2), "strength must be a number in"),
         (brush("graft", rule="worm"), "unknown rule 'worm'"),
         (brush("graft", rule="duck"), "duck cannot live in a world of gecko"),
@@ -537,6 +556,11 @@ def test_hands_reach_into_environments(episodes):
     assert (after - before)[:, 0].max() > 0.05
     episodes.handle({"type": "damage", "name": "noise"})
     assert not np.array_equal(episodes.frame().positions, after)
+    x, states = episodes._inner.particles()
+    states[:, 0] = x[:, 0]
+    episodes._place(x[None], states[None])
+    episodes.handle(brush("inject", source=[0.1, 0.0], radius=0.2, strength=1.0))
+    assert not torch.equal(episodes._inner.particles()[1], states)
     with pytest.raises(NPAError, match="keeps its particles, so that the brush 'erase'"):
         episodes.handle(brush("erase"))
     episodes.handle({"type": "set", "name": "loss", "value": True})

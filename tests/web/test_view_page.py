@@ -115,6 +115,33 @@ def test_the_world_moves_the_brush_erases_and_a_slider_changes_eps(shown, tmp_pa
     assert page.complaints == []
 
 
+def test_a_state_is_carried_from_where_one_pressed_to_where_one_drags(shown):
+    page, world = shown()
+    page.run("document.getElementById('play').click()")
+    page.wait("!document.page.world.playing")
+    # The page knows before the world does, which may be within a step.
+    deadline = time.monotonic() + 20
+    while world.playing and time.monotonic() < deadline:
+        time.sleep(0.05)
+    s = torch.zeros_like(world.s)
+    s[..., 0] = (world.x[..., 0] < 0).to(s)
+    world.s = s
+    page.run("document.querySelector('[data-tool=inject]').click()")
+    page.run("document.getElementById('strength').value = 1")
+    page.drag([place_of(page, x, 0.0) for x in (-0.15, 0.0, 0.15, 0.15)])
+    deadline = time.monotonic() + 20
+    middle = (world.x[0] - torch.tensor([0.15, 0.0])).norm(dim=-1) < 0.04
+    assert middle.any()
+    while float(world.s[0, middle, 0].mean()) < 0.2 and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert float(world.s[0, middle, 0].mean()) > 0.2
+    # The brush of 0.1 was never there.
+    far = world.x[0, :, 1].abs() > 0.11
+    assert far.any()
+    assert torch.equal(world.s[0, far], s[0, far])
+    assert page.complaints == []
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("painter", ["canvas", "webgl2"])
 def test_what_is_erased_heals(shown, painter):
@@ -141,7 +168,7 @@ def test_what_is_erased_heals(shown, painter):
 def test_every_tool_and_every_show_works(shown):
     page, _ = shown(count=512)
     page.wait(f"{FRAME}.step > 20")
-    for tool in ("push", "clump", "cut", "graft", "add"):
+    for tool in ("push", "clump", "cut", "inject", "graft", "add"):
         page.run(f"document.querySelector('[data-tool={tool}]').click()")
         page.drag([place_of(page, x, 0.0) for x in (-0.2, -0.1, 0.0, 0.1, 0.2)])
         time.sleep(0.3)

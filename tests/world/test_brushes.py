@@ -16,6 +16,7 @@ from npa_envs.world.brushes import (
     push,
     removed,
     softness,
+    state_around,
 )
 
 BOX = (2.0, 3.0)
@@ -106,6 +107,19 @@ def test_inject_draws_states_towards_the_given_one():
     assert torch.equal(after[outside], s[outside])
     with pytest.raises(NPAError, match=r"state must have shape \[B, C\] = \(1, 3\)"):
         inject(x, s, centre=x[:, 4], radius=0.5, state=state[:, :2])
+
+
+def test_the_state_around_a_place_is_the_mean_of_what_a_soft_brush_holds():
+    x, s = worlds()
+    centre = places(x)
+    share = softness(x, centre=centre, radius=0.9)
+    mean, holds = state_around(x, s, centre=centre, radius=0.9)
+    torch.testing.assert_close(mean, (share * s).sum(1) / share.sum(1))
+    assert holds.tolist() == [True, True]
+    centre[1] = 50.0
+    mean, holds = state_around(x, s, centre=centre, radius=0.9)
+    assert holds.tolist() == [True, False]
+    assert float(mean[1].abs().max()) == 0.0
 
 
 def test_a_cut_with_ends_opens_only_between_them():

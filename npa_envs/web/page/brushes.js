@@ -37,9 +37,35 @@ export function eraseState(x, s, dimension, centre, radius, box) {
 // Carries particles along with a movement, those in the middle by `strength` of it.
 export function push(x, dimension, centre, move, radius, strength, box) {
   forEach(x, dimension, centre, box, (i, _, square) => {
-    const share = radius > 0 ? strength * Math.max(0, 1 - square / (radius * radius)) ** 2 : 0;
+    const share = strength * softness(square, radius);
     for (let d = 0; d < dimension; d++) x[i * dimension + d] += share * move[d];
   });
+}
+
+// The mean state that a soft brush holds, or null where it holds nobody.
+export function stateAround(x, s, dimension, centre, radius, box) {
+  const channels = (s.length / x.length) * dimension, mean = new Float64Array(channels);
+  let total = 0;
+  forEach(x, dimension, centre, box, (i, _, square) => {
+    const share = softness(square, radius);
+    total += share;
+    for (let c = 0; c < channels; c++) mean[c] += share * s[i * channels + c];
+  });
+  return total > 0 ? mean.map((sum) => sum / total) : null;
+}
+
+// Draws states towards a given one, those in the middle by `strength` of the way.
+export function inject(x, s, dimension, centre, radius, state, strength, box) {
+  const channels = state.length;
+  forEach(x, dimension, centre, box, (i, _, square) => {
+    const share = strength * softness(square, radius);
+    for (let c = 0; c < channels; c++) s[i * channels + c] += share * (state[c] - s[i * channels + c]);
+  });
+}
+
+// How much a soft brush holds of a particle at a distance of which the square is given.
+function softness(square, radius) {
+  return radius > 0 ? Math.max(0, 1 - square / (radius * radius)) ** 2 : 0;
 }
 
 // Takes particles nearer to the centre by a share `factor` of their distance.

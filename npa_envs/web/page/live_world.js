@@ -1,7 +1,7 @@
 // The world behind the exported page: what its messages do, and the frames that it shows. Messages and
 // events are those of page.js, and what they do is what RuleWorld of npa_envs/web/live.py does.
 
-import { clump, cut, eraseState, insideBall, push } from "./brushes.js";
+import { clump, cut, eraseState, inject, insideBall, push, stateAround } from "./brushes.js";
 import { Colouring, Look } from "./colours.js";
 import { fastestKernels } from "./kernels_simd.js";
 import { padded, Physics, prepareRule, wrap } from "./physics.js";
@@ -13,6 +13,7 @@ const FRAMES_AHEAD = 2;
 
 // Numbers of npa_envs/web/live.py and npa_envs/tasks/damage.py.
 const CLUMP_RATE = 0.25;
+const INJECT_RATE = 0.5;
 const CLUMP_FACTOR = 0.9;
 const SEED_SHARE = 0.5;
 const LEAST_SEED = 16;
@@ -225,7 +226,7 @@ export class LiveWorld {
   }
 
   // What a hand does at a place: page.js says what the parts of a message are.
-  brush({ tool, at, move, radius, strength, rule, view }) {
+  brush({ tool, at, move, radius, strength, source, rule, view }) {
     const { dimension, box } = this;
     const { x, s, species } = this.world;
     if (tool === "erase") {
@@ -239,6 +240,9 @@ export class LiveWorld {
       const half = move.map((part) => part / 2);
       const normal = dimension === 2 ? [-move[1], move[0]] : cross(view ?? [0, 0, 1], move);
       cut(x, dimension, at.map((part, d) => part + half[d]), normal, radius, half, box);
+    } else if (tool === "inject") {
+      const state = stateAround(x, s, dimension, source ?? at, radius, box);
+      if (state !== null) inject(x, s, dimension, at, radius, state, INJECT_RATE * strength, box);
     } else if (tool === "graft") {
       const inside = insideBall(x, dimension, at, radius, box);
       const number = this.speciesOf(rule, this.full);

@@ -13,13 +13,14 @@
 //   {type: "reset", seed}              a fresh world; without seed the next one
 //   {type: "set", name, value}         name: a key of the world's `settings`, or "rule", "show",
 //                                      "loss" (true while its plot is seen: else it is not computed)
-//   {type: "brush", tool, at, move, radius, strength, rule?, view?}
-//                                      tool: erase | push | clump | cut | graft | add
-//                                      at, move: [x, y] or [x, y, z] [length units]; push and clump
-//                                      come again and again while the pointer is down, cut once, at
-//                                      its end: the line from `at` to `at + move`, of half-width
-//                                      `radius`; strength in [0, 1]; rule: of graft and add, a name
-//                                      of `rules`; view: in 3D the unit vector towards the viewer
+//   {type: "brush", tool, at, move, radius, strength, source?, rule?, view?}
+//                                      tool: erase | push | clump | cut | inject | graft | add
+//                                      at, move: [x, y] or [x, y, z] [length units]; push, clump and
+//                                      inject come again and again while the pointer is down, cut
+//                                      once, at its end: the line from `at` to `at + move`, of
+//                                      half-width `radius`; strength in [0, 1]; source: of inject,
+//                                      where the state comes from; rule: of graft and add, a name of
+//                                      `rules`; view: in 3D the unit vector towards the viewer
 //   {type: "damage", name}             one of the world's `damages`, at a random place
 //   {type: "drawn"}                    the page has drawn a frame and is ready for another. An engine
 //                                      has at most two frames on the way: a page that is slow or
@@ -66,6 +67,7 @@ const TOOLS = {
   push: ["Pull with the pointer", "M12 20c-4 0-6-3-7-7 2-1 3 0 4 2V6a1.4 1.4 0 0 1 3 0v5a1.4 1.4 0 0 1 3 0v1a1.4 1.4 0 0 1 3 0v3c0 3-2 5-6 5z"],
   clump: ["Clump", "M4 4l5 5M20 4l-5 5M4 20l5-5M20 20l-5-5M9 6v3H6M15 6v3h3M9 18v-3H6M15 18v-3h3"],
   cut: ["Cut along a line", "M5 19L19 5M6 8a2 2 0 1 0 0-.1M16 18a2 2 0 1 0 0-.1M8 9l8 8"],
+  inject: ["Inject: the state of where you press spreads to where you drag", "M4 20l3-1 8-8-2-2-8 8zM12 8l4 4M14 10l3-4a1.8 1.8 0 0 1 3 0 1.8 1.8 0 0 1-1 3l-4 2"],
   graft: ["Graft: particles take another rule", "M12 21v-9M12 12c0-5 3-7 8-7 0 5-3 7-8 7zM12 15c0-4-3-6-8-6 0 4 3 6 8 6z"],
   add: ["Add a seed of another rule", "M12 4a8 8 0 1 0 .1 0M12 8v8M8 12h8"],
 };
@@ -462,10 +464,12 @@ class Page {
     const at = camera.position(...place, width, height, near).slice(0, dimension);
     const move = camera.movement(...pixels, width, height, near).slice(0, dimension);
     const wrapped = box ? at.map((v, k) => v - box[k] * Math.round(v / box[k])) : at;
+    if (stroke) stroke.source ??= wrapped;
     const message = {
       type: "brush", tool: this.tool, at: wrapped, move,
       radius: this.radius(), strength: +$("strength").value,
     };
+    if (this.tool === "inject") message.source = stroke?.source ?? wrapped;
     if (this.tool === "graft" || this.tool === "add") message.rule = $("other").value;
     if (dimension === 3) message.view = camera.axes[2];
     this.send(message);
