@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from types import NoneType
 from typing import Literal, NamedTuple, Protocol, overload
 
 import torch
@@ -25,6 +27,7 @@ from npa_envs.ops.perceive import Terms, perceive_rows
 from npa_envs.ops.static import StaticRows, StaticWorlds, prepare_static, static_rows
 from npa_envs.ops.update import update_particles
 from npa_envs.rule.rule import FoldedRule, NPARule, check_rule
+from npa_envs.world.cuda_graph import Beside
 from npa_envs.world.divergence import DivergenceWatch, OnDivergence, make_watch
 from npa_envs.world.prepared import Network, PreparedSteps, may_prepare, run_prepared
 from npa_envs.world.randomness import Randomness, WorldRandom, check_generator
@@ -40,6 +43,9 @@ FEWEST_STATIC = 3
 
 ROWS_TOGETHER = 2**24
 """Rows of static worlds that are given together, at most, if they are of several steps."""
+
+MOST_AHEAD = 4
+"""Steps whose draws a recording makes beside the steps before them, at most: these take memory."""
 
 OVERFLOW_LOG_PROBABILITY = 34.5
 """Row capacities hold with probability 1 - exp(-34.5), about 1 - 1e-15, for each step."""
@@ -112,8 +118,27 @@ def checked_options(
             f"the rule must share dtype and device with x, got {weight.dtype} on {weight.device} "
             f"and {x.dtype} on {x.device}: move it with rule.to(x)"
         )
-    radius = checked_eps("eps", rule.eps0 if eps is None else eps, x.dtype)
-    check_scale(radius, rule.eps0, rule.space_dim, x.dtype)
+    given = (eps, box, update_prob, dt, position_noise, detach_positions)
+    # Numbers of other types may change, and tensors are no keys.
+    plain = all(type(value) in (float, int, bool, NoneType) for value in given)
+    known = plain and not torch.compiler.is_compiling()
+    check = _known_numbers if known else _checked_numbers
+    return check(rule.space_dim, rule.eps0, x.dtype, *given)
+
+
+def _checked_numbers(
+    space_dim: int,
+    eps0: float,
+    dtype: torch.dtype,
+    eps: float | None,
+    box: Box,
+    update_prob: float,
+    dt: float,
+    position_noise: float,
+    detach_positions: bool,
+) -> StepOptions:
+    radius = checked_eps("eps", eps0 if eps is None else eps, dtype)
+    check_scale(radius, eps0, space_dim, dtype)
     update_prob = checked_number("update_prob", update_prob)
     dt = checked_number("dt", dt)
     position_noise = checked_number("position_noise", position_noise)
@@ -124,8 +149,11 @@ def checked_options(
     if not (math.isfinite(position_noise) and position_noise >= 0.0):
         raise NPAError(f"position_noise must be finite and not negative, got {position_noise}")
     detach_positions = checked_flag("detach_positions", detach_positions)
-    sides = checked_box(box, rule.space_dim, radius)
+    sides = checked_box(box, space_dim, radius)
     return StepOptions(radius, sides, update_prob, dt, position_noise, detach_positions)
+
+
+_known_numbers = functools.lru_cache(maxsize=256, typed=True)(_checked_numbers)
 
 
 def draw_step(x: Tensor, options: StepOptions, generator: Randomness | None) -> Draws:
@@ -146,6 +174,35 @@ def draw_step(x: Tensor, options: StepOptions, generator: Randomness | None) -> 
         noise = torch.randn(x.shape, dtype=x.dtype, device=x.device, generator=generator)
         noise *= options.position_noise
     return Draws(mask, noise)
+
+
+def drawn_steps(draw: Callable[[], Draws], like: Tensor, steps: int) -> Iterator[Draws]:
+    """Yield what each of some steps draws, in the same order everywhere.
+
+    In a CUDA graph some steps' draws are made while the steps before them run.
+
+    Args:
+        draw: Returns what the next step draws.
+        like: A tensor on the worlds' device.
+        steps: Number of steps.
+    """
+    # Asked in this order: a compiler cannot trace what a stream does.
+    recording = not torch.compiler.is_compiling() and like.is_cuda
+    if not (recording and torch.cuda.is_current_stream_capturing()):
+        for _ in range(steps):
+            yield draw()
+        return
+    beside = Beside(like.device)
+    ready, rest = [draw()], steps - 1
+    while rest > 0:
+        # Their memory comes from steps that are over by then: these streams take turns in it.
+        count = min(3 * len(ready), MOST_AHEAD, rest)
+        with beside.aside():
+            coming = [draw() for _ in range(count)]
+        yield from ready
+        beside.join()
+        ready, rest = coming, rest - count
+    yield from ready
 
 
 def rule_terms(rule: NPARule) -> Terms:
@@ -198,14 +255,17 @@ class RuleStep(NamedTuple):
 
     def draws(self, x: Tensor, steps: int, generator: Randomness | None) -> Iterator[Draws]:
         """Draw each step's update mask and position noise."""
+        if self.static is None:
+            yield from drawn_steps(lambda: draw_step(x, self.options, generator), x, steps)
+            return
         # The rows of static worlds are given some steps at a time, in few launches.
         total = x.shape[0] * x.shape[1]
-        together = 1 if self.static is None else max(min(16, ROWS_TOGETHER // total), 1)
+        together = max(min(16, ROWS_TOGETHER // total), 1)
         for first in range(0, steps, together):
             count = min(together, steps - first)
             drawn = [draw_step(x, self.options, generator) for _ in range(count)]
             masks = [draws.mask for draws in drawn if draws.mask is not None]
-            if self.static is not None and masks:
+            if masks:
                 capacity = row_capacity(total, self.options.update_prob)
                 rows = static_rows(self.static, x.detach(), masks, capacity)
                 drawn = [Draws(None, None, own) for own in rows]
