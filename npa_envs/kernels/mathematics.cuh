@@ -34,10 +34,16 @@ __device__ inline float within(float value, float limit)
     return fminf(fmaxf(value, -limit), limit);
 }
 
+// 1 - r^2 / eps^2, 0 beyond eps and of what is not a number.
+__device__ inline float falloff_within(float squared, float inverse_squared_eps)
+{
+    return __saturatef(fmaf(-squared, inverse_squared_eps, 1.0f));
+}
+
 // Smoothing kernel W up to its norm, 0 beyond its support.
 __device__ inline float smoothing(float squared, float inverse_squared_eps)
 {
-    const float falloff = __saturatef(fmaf(-squared, inverse_squared_eps, 1.0f));
+    const float falloff = falloff_within(squared, inverse_squared_eps);
     return falloff * falloff * falloff;
 }
 
@@ -50,15 +56,36 @@ __device__ inline float spiky_factor(float squared, float inverse_eps)
     return near * near * inverse;
 }
 
-// L(v) / v of the logarithmic scaling, from v . v: log(1 + |v|) / |v|.
+// log(value) of a value of at least 1, one unit in the last place off at most.
+__device__ inline float log_above_one(float value)
+{
+    const int bits = __float_as_int(value);
+    const int exponent = (bits - 0x3f2aaaab) & 0xff800000;
+    const float rest = __int_as_float(bits - exponent) - 1.0f;
+    const float square = rest * rest;
+    float even = fmaf(square, -0.130310059f, -0.121483512f);
+    float odd = fmaf(square, 0.140869141f, 0.139814854f);
+    even = fmaf(even, square, -0.166846126f);
+    odd = fmaf(odd, square, 0.200120345f);
+    float series = fmaf(odd, rest, fmaf(even, square, -0.249996200f));
+    series = fmaf(fmaf(series, rest, 0.333331972f), rest, -0.5f);
+    series = fmaf(series, square, rest);
+    return fmaf((float)exponent, 0.693147182f * 0x1p-23f, series);
+}
+
+// L(v) / v of the logarithmic scaling, from v . v: log(1 + |v|) / |v|. Without branches: those of
+// several vectors overlap.
 __device__ inline float log_scale_of_square(float squared)
 {
-    float length, inverse;
-    asm("sqrt.rn.f32 %0, %1;" : "=f"(length) : "f"(squared));
-    const float one_plus = 1.0f + length;
-    const float excess = one_plus - 1.0f;
-    asm("rcp.rn.f32 %0, %1;" : "=f"(inverse) : "f"(excess));
-    return excess > 0.0f ? logf(one_plus) * inverse : 1.0f;
+    float inverse, quotient;
+    asm("rsqrt.approx.ftz.f32 %0, %1;" : "=f"(inverse) : "f"(squared + 1e-37f));
+    float length = squared * inverse;
+    length = fmaf(fmaf(-length, length, squared), 0.5f * inverse, length);
+    // Of what is shorter, 1 comes out up to rounding.
+    const float excess = fmaxf((1.0f + length) - 1.0f, 0x1p-23f);
+    asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(quotient) : "f"(excess));
+    quotient = fmaf(fmaf(-excess, quotient, 1.0f), quotient, quotient);
+    return log_above_one(1.0f + excess) * quotient;
 }
 
 // |L| / (exp|L| - 1), given exp(-|L|); by its series below 1.

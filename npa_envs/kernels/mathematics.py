@@ -227,6 +227,11 @@ def make_log_scale_pull(vector: type) -> Any:
 
 
 @native.func_native()
+def falloff_within(squared: wp.float32, inverse_squared_eps: wp.float32) -> wp.float32:
+    """1 - r^2 / eps^2 on CUDA, 0 beyond eps and of what is not a number."""
+
+
+@native.func_native()
 def log_scale_of_square(squared: wp.float32) -> wp.float32:
     """L(v) / v on CUDA, from v . v: log(1 + |v|) / |v|."""
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.kernels.access import CUDA_LANES, WARP
-from npa_envs.kernels.cuda.density import listed_density
+from npa_envs.kernels.cuda.density import LIST_BLOCK, listed_density
 from npa_envs.kernels.cuda.perceive import listed_perception
 from npa_envs.kernels.portable.density import density_kernels
 from npa_envs.kernels.portable.perceive import perception_kernels
@@ -139,6 +139,7 @@ def list_neighbours(
         records,
         steps.view(-1),
         lengths,
+        block_dim=LIST_BLOCK,
     )
     no_gradient = positions.new_empty(0, plan.space_dim, dtype=torch.float64)
     return Densities(particles, no_gradient, NeighbourLists(listing, steps, lengths, records))

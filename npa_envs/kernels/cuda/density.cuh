@@ -2,40 +2,60 @@
 
 namespace npa {
 
-// Each thread's entries lie a block's width apart; ROOM: entries that a thread has room for.
-template <int ROOM, int BLOCK> __device__ inline unsigned list_address()
+// A thread has a column of words, a block's width apart, with two entries each: no two threads of a
+// warp share a bank. ROOM: entries that a thread has room for; behind it lies room for those of one
+// look at candidates, before the list is cut off.
+template <int ROOM, int MANY, int BLOCK> __device__ inline unsigned list_address()
 {
-    __shared__ unsigned short lists[ROOM * BLOCK];
+    __shared__ ushort2 lists[(ROOM / 2 + 1 + MANY) * BLOCK];
     return (unsigned)__cvta_generic_to_shared(lists + threadIdx.x);
 }
 
-// As assembly, so that loads of global memory may be moved ahead of it, and without branches.
-template <int ROOM, int BLOCK>
-__device__ inline unsigned append_step(unsigned first, unsigned place, float weight, int step)
+// Where the next entry goes, and how far it is from there to the one after it.
+using ListEnd = wp::vec_t<2, unsigned>;
+
+template <int BLOCK> __device__ inline ListEnd list_end_of(unsigned address, int entries)
 {
-    asm volatile(
-        "{ .reg .pred near, kept;\n"
-        "setp.gt.f32 near, %1, 0f00000000;\n"
-        "setp.lt.and.u32 kept, %0, %2, near;\n"
-        "@kept st.shared.u16 [%0], %3;\n"
-        "@near add.u32 %0, %0, %4; }"
-        : "+r"(place)
-        : "f"(weight), "r"(first + 2 * BLOCK * ROOM), "h"((short)step), "n"(2 * BLOCK));
-    return place;
+    return ListEnd(address + 4 * BLOCK * (entries / 2), 2);
 }
 
-// Where a row's list begins: 32 rows lie together, first entries first.
+// As assembly, so that loads of global memory may be moved ahead of it, and without branches.
+template <int BLOCK>
+__device__ inline ListEnd append_step(ListEnd end, float weight, int step)
+{
+    asm volatile(
+        "{ .reg .pred near;\n"
+        "setp.gt.f32 near, %2, 0f00000000;\n"
+        "@near st.shared.u16 [%0], %3;\n"
+        "@near add.u32 %0, %0, %1;\n"
+        "@near sub.u32 %1, %4, %1; }"
+        : "+r"(end.c[0]), "+r"(end.c[1])
+        : "f"(weight), "h"((short)step), "n"(4 * BLOCK));
+    return end;
+}
+
+// What is too long ends behind its room, wherever further entries went.
+template <int ROOM, int BLOCK> __device__ inline ListEnd cut_off(unsigned address, ListEnd end)
+{
+    end.c[0] = min(end.c[0], address + 4 * BLOCK * (ROOM / 2 + 1));
+    return end;
+}
+
+// Where a row's list begins: 32 rows lie together, their first two entries first.
 template <int CAPACITY> __device__ inline size_t place_of_list(int row)
 {
-    return (size_t)(row / 32) * (32 * CAPACITY) + row % 32;
+    return (size_t)(row / 32) * (32 * CAPACITY) + row % 32 * 2;
 }
+
+__device__ inline int place_of_entry(int entry) { return entry / 2 * 64 + entry % 2; }
 
 // Each lane's entries follow those of the lanes before it.
 template <int ROOM, int BLOCK, int CAPACITY, int LANES>
 __device__ inline int leave_list(
-    unsigned first, unsigned place, int row, const wp::array_t<wp::int16>& lists)
+    unsigned address, ListEnd list_end, int row, const wp::array_t<wp::int16>& lists)
 {
-    int length = (place - first) / (2 * BLOCK);
+    const unsigned bytes = list_end.c[0] - address;
+    int length = bytes / (4 * BLOCK) * 2 + bytes / 2 % 2;
     if (length > ROOM) length = CAPACITY + 1;
     int end = length;
     #pragma unroll
@@ -46,18 +66,34 @@ __device__ inline int leave_list(
     const int total = LANES > 1 ? __shfl_sync(~0u, end, LANES - 1, LANES) : length;
     if (row < 0 || total > CAPACITY) return total;
     short* to = lists.data + place_of_list<CAPACITY>(row);
+    if (LANES == 1) {
+        // With an entry behind the last one, which nobody reads, where their number is odd.
+        for (int pair = 0; pair < (length + 1) / 2; ++pair) {
+            int steps;
+            asm volatile("ld.shared.u32 %0, [%1];" : "=r"(steps) : "r"(address + 4 * BLOCK * pair));
+            *reinterpret_cast<int*>(to + 64 * pair) = steps;
+        }
+        return total;
+    }
     for (int entry = 0; entry < length; ++entry) {
         short step;
-        asm volatile("ld.shared.u16 %0, [%1];" : "=h"(step) : "r"(first + 2 * BLOCK * entry));
-        to[32 * (end - length + entry)] = step;
+        const unsigned from = address + 4 * BLOCK * (entry / 2) + 2 * (entry % 2);
+        asm volatile("ld.shared.u16 %0, [%1];" : "=h"(step) : "r"(from));
+        to[place_of_entry(end - length + entry)] = step;
     }
     return total;
 }
 
+// Two steps of a row's list, of the entries 2 pair and 2 pair + 1, as one word; of a pair that lists
+// have no room for, those of another one.
 template <int CAPACITY>
-__device__ inline int step_at(const wp::array_t<wp::int16>& lists, int row, int entry)
+__device__ inline int steps_at(const wp::array_t<wp::int16>& lists, int row, int pair)
 {
-    return lists.data[place_of_list<CAPACITY>(row) + 32 * entry];
+    const short* from = lists.data + place_of_list<CAPACITY>(row);
+    from += 64 * min(pair, CAPACITY / 2 - 1);
+    return *reinterpret_cast<const int*>(from);
 }
+
+__device__ inline int step_of(int steps, int entry) { return (short)(steps >> 16 * entry); }
 
 }  // namespace npa

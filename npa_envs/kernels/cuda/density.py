@@ -2,8 +2,8 @@
 
 One thread of a particle finds its neighbours with far fewer instructions than several that must
 agree on where they are in a list. A list holds the steps to neighbours in the sorted order, in 16
-bits. It is gathered in fast memory and left in an array: 32 particles together, first entries
-first. It has room for so many; of a longer one, only the length is known.
+bits. It is gathered in fast memory and left in an array: 32 particles together, their first two
+entries first. It has room for so many; of a longer one, only the length is known.
 """
 
 import functools
@@ -12,7 +12,6 @@ import warp as wp
 
 from npa_envs.kernels import native
 from npa_envs.kernels.access import (
-    CUDA_BLOCK,
     as_word,
     load_integer,
     make_lane_sum,
@@ -20,10 +19,16 @@ from npa_envs.kernels.access import (
     make_wide_store,
 )
 from npa_envs.kernels.domain import domain_types, kernel_module
-from npa_envs.kernels.mathematics import smoothing_falloff, smoothing_of
+from npa_envs.kernels.mathematics import falloff_within, smoothing_of
 
-AHEAD, SHARED_AHEAD = 3, 5
+AHEAD, SHARED_AHEAD = 6, 5
 """Candidates that a thread looks at together: alone with a particle, and one of several lanes."""
+
+LIST_BLOCK = 64
+"""Threads of a block, few: one has fast memory for the lists of all of them."""
+
+CUDA_REGISTERS = 80
+"""Registers of a thread: told of none, the compiler takes half as many and loads one by one."""
 
 RECORD = wp.types.vector(4, wp.float32)
 """What perception reads of a neighbour: position, volume, and in 2D where its state is."""
@@ -34,12 +39,15 @@ LONGEST_STEP = wp.constant(2**15 - 1)
 SHARE_OF_LIST = 2
 """A lane of several has room for so many times its share of a list."""
 
-LIST_BYTES = 2 * CUDA_BLOCK
-"""Bytes from one entry of a list to the next while it is made."""
+LIST_END = wp.types.vector(2, wp.uint32)
+"""Where the next entry of a list goes, and how far it is from there to the one after it."""
 
 BLOCK = 4096
 """Candidates whose weights are summed before they are added to the others: of a million summed one
 after the other, too much is rounded away."""
+
+SLACK = 1.0 + 1e-5
+"""Cells are left out beyond this much more than eps^2, whatever was rounded on the way."""
 
 store_record = make_wide_store(RECORD, wp.float32)
 
@@ -74,17 +82,21 @@ def listed_density(
     positions_ahead = wp.types.matrix((many, space_dim), scalar)
     room = min(capacity, SHARE_OF_LIST * capacity // lanes)
 
-    @native.func_native(room, CUDA_BLOCK)
+    @native.func_native(room, many, LIST_BLOCK)
     def list_address() -> wp.uint32: ...
 
-    @native.func_native(room, CUDA_BLOCK)
-    def append_step(
-        first: wp.uint32, place: wp.uint32, weight: wp.float32, step: wp.int32
-    ) -> wp.uint32: ...
+    @native.func_native(LIST_BLOCK)
+    def list_end_of(address: wp.uint32, entries: wp.int32) -> LIST_END: ...
 
-    @native.func_native(room, CUDA_BLOCK, capacity, lanes)
+    @native.func_native(LIST_BLOCK)
+    def append_step(end: LIST_END, weight: wp.float32, step: wp.int32) -> LIST_END: ...
+
+    @native.func_native(room, LIST_BLOCK)
+    def cut_off(address: wp.uint32, end: LIST_END) -> LIST_END: ...
+
+    @native.func_native(room, LIST_BLOCK, capacity, lanes)
     def leave_list(
-        first: wp.uint32, place: wp.uint32, row: wp.int32, lists: wp.array(dtype=wp.int16)
+        address: wp.uint32, list_end: LIST_END, row: wp.int32, lists: wp.array(dtype=wp.int16)
     ) -> wp.int32: ...
 
     @wp.func
@@ -94,11 +106,32 @@ def listed_density(
         if wp.static(periodic):
             nearest = periodic_image(domain, nearest)
         squared = wp.dot(nearest, nearest)
-        return wp.max(smoothing_falloff(squared, domain.inverse_squared_eps), scalar(0.0))
+        return falloff_within(squared, domain.inverse_squared_eps)
+
+    @wp.func
+    def cells_beyond(within_cell: vector, line: wp.int32):
+        """How many of the five cells of a line nobody near lies in: the first ones, the last ones.
+
+        `within_cell` is where the particle lies in its cell, in parts of it; lines count from 0,
+        the particle's own is 2.
+        """
+        across = wp.where(
+            line < 2, within_cell[1] + scalar(1 - line), scalar(line - 2) - within_cell[1]
+        )
+        across = wp.where(line == 2, scalar(0.0), across)
+        along = wp.sqrt(wp.max(scalar(wp.static(4.0 * SLACK)) - across * across, scalar(0.0)))
+        first = wp.int32(wp.floor(within_cell[0] - along))
+        last = wp.int32(wp.floor(within_cell[0] + along))
+        return wp.max(first + 2, 0), wp.max(2 - last, 0)
 
     topic = "listed_density" + "_in_box" * periodic + f"_{capacity}" + "_of_rows" * masked
 
-    @wp.kernel(enable_backward=False, module=kernel_module(topic, space_dim, scalar, 0, lanes))
+    @wp.kernel(
+        enable_backward=False,
+        module=kernel_module(topic, space_dim, scalar, 0, lanes),
+        cuda_max_registers=CUDA_REGISTERS,
+        grid_stride=False,
+    )
     def compute_density(
         domain: Domain,
         starts: wp.array(dtype=wp.int32),
@@ -133,15 +166,24 @@ def listed_density(
             row = load_integer(row_of, load_integer(source, k))
         row = wp.where(inside and row < list_lengths.shape[0], row, wp.int32(-1))
         list_begin = list_address()
-        list_end = list_begin
-        if row < 0:
-            # As if it were full.
-            list_end = list_begin + wp.uint32(wp.static(LIST_BYTES * capacity))
+        # Of a particle without a row as if it were too long.
+        list_end = list_end_of(list_begin, wp.where(row < 0, wp.static(room + 2), 0))
         far = wp.bool(False)
         earlier = scalar(0.0)
         total = scalar(0.0)
-        for segment in range(segment_count(domain, cell)):
+        segments = segment_count(domain, cell)
+        within_cell = vector()
+        if wp.static(flat and not periodic):
+            for d in range(wp.static(space_dim)):
+                scaled = wp.float64(position[d]) * domain.cell_scale[d]
+                within_cell[d] = scalar(scaled - wp.floor(scaled))
+        for segment in range(segments):
             first, last = segment_cells(domain, cell, segment)
+            # Five lines of five cells each, none of them wrapped around the grid.
+            if wp.static(flat and not periodic) and segments == 5 and domain.reach == 2:
+                before, behind = cells_beyond(within_cell, segment)
+                first += before
+                last -= behind
             begin = load_integer(starts, base + first)
             end = load_integer(starts, base + last)
             far = far or (begin < end and wp.max(k - begin, end - k) > LONGEST_STEP)
@@ -162,8 +204,9 @@ def listed_density(
                     for a in range(wp.static(many)):
                         step = j + a * wp.static(lanes) - k
                         falloff = falloff_at(domain, ahead[a] - position)
-                        list_end = append_step(list_begin, list_end, falloff, step)
+                        list_end = append_step(list_end, falloff, step)
                         total += smoothing_of(falloff, scalar(1.0))
+                    list_end = cut_off(list_begin, list_end)
                     j += wp.static(many * lanes)
                 if crowded:
                     earlier += total
@@ -177,8 +220,9 @@ def listed_density(
                     candidate = j + a * wp.static(lanes)
                     falloff = falloff_at(domain, ahead[a] - position)
                     falloff = wp.where(candidate < end, falloff, scalar(0.0))
-                    list_end = append_step(list_begin, list_end, falloff, candidate - k)
+                    list_end = append_step(list_end, falloff, candidate - k)
                     total += smoothing_of(falloff, scalar(1.0))
+                list_end = cut_off(list_begin, list_end)
         # A particle always sees itself: a position that is not finite would otherwise have rho 0.
         total = wp.max(add_scalar(earlier + total), scalar(1.0))
         length = leave_list(list_begin, list_end, row, lists)
@@ -205,10 +249,15 @@ def listed_density(
 
 
 @functools.cache
-def make_step_at(capacity: int) -> wp.Function:
-    """Return a Warp function that reads a step of a row's list, as the density pass leaves it."""
+def make_steps_at(capacity: int) -> wp.Function:
+    """Return a Warp function that reads two steps of a row's list, as the density pass left it."""
 
     @native.func_native(capacity)
-    def step_at(lists: wp.array(dtype=wp.int16), row: wp.int32, entry: wp.int32) -> wp.int32: ...
+    def steps_at(lists: wp.array(dtype=wp.int16), row: wp.int32, pair: wp.int32) -> wp.int32: ...
 
-    return step_at
+    return steps_at
+
+
+@native.func_native()
+def step_of(steps: wp.int32, entry: wp.int32) -> wp.int32:
+    """The first or the second of two steps."""

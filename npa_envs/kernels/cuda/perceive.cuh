@@ -13,6 +13,25 @@ template <int BYTES, int LANES, int BLOCK> __device__ inline unsigned slot_addre
     return (unsigned)__cvta_generic_to_shared(slots + threadIdx.x / LANES * BYTES);
 }
 
+// Where a part of the first state lies. The compiler shall take it as it is: with the part's number
+// added for each state, it takes two instructions more.
+template <typename Share>
+__device__ inline unsigned long long part_address(const wp::array_t<Share>& states, int part)
+{
+    size_t address = __cvta_generic_to_global(states.data + part);
+    asm volatile("" : "+l"(address));
+    return address;
+}
+
+template <typename Share>
+__device__ inline Share part_of_state(unsigned long long address, int part_count, int number)
+{
+    Share result;
+    address += (unsigned long long)(unsigned)number * (unsigned)(sizeof(Share) * part_count);
+    load_chunks<chunk_bytes(sizeof(Share))>(result, __cvta_global_to_generic(address));
+    return result;
+}
+
 // Four words of an entry lie together: in 2D the last is its number; in 3D numbers follow all.
 template <int DIMS, int ENTRIES> __device__ inline int* number_place(unsigned slot, int entry)
 {

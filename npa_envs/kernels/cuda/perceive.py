@@ -26,7 +26,7 @@ from npa_envs.kernels.access import (
     share_type,
     thread_number,
 )
-from npa_envs.kernels.cuda.density import RECORD, make_step_at
+from npa_envs.kernels.cuda.density import RECORD, make_steps_at, step_of
 from npa_envs.kernels.domain import domain_types, kernel_module
 from npa_envs.kernels.mathematics import (
     inverse_root,
@@ -38,14 +38,18 @@ from npa_envs.kernels.mathematics import (
     within,
 )
 
-CUDA_REGISTERS, TEAM_REGISTERS = 80, 96
-"""Registers of a thread of the perception pass, of one team and of several."""
+CUDA_REGISTERS, TEAM_REGISTERS = {2: 80, 3: 96}, 128
+"""Registers of a thread of the perception pass: of one team, by dimension, and of several."""
 
-AHEAD = 2
-"""Listed neighbours that a lane asks for together."""
+PAIR = 2
+"""Listed neighbours that a lane weighs together: their steps are one word."""
+
+TOGETHER = 4
+"""Weighed neighbours whose states are asked for together; a slot's number divides by it."""
 
 SLOT_ENTRIES = 32
-"""Neighbours that a slot has room for; longer neighbourhoods are summed in several rounds."""
+"""Neighbours that a slot has room for; longer neighbourhoods are summed in several rounds. A pair
+for every lane, some times over."""
 
 load_record = make_wide_load(RECORD, wp.float32)
 
@@ -109,17 +113,18 @@ def listed_perception(
     topic += "_in_box" * periodic + "_grouped" * grouped
     topic += f"_{capacity}" + "_for_adjoint" * for_adjoint + "_by_place" * by_place
     module = kernel_module(topic, space_dim, scalar, width, lanes)
-    registers = CUDA_REGISTERS if teams == 1 else TEAM_REGISTERS
-    load_share = make_wide_load(share, scalar)
+    registers = CUDA_REGISTERS[space_dim] if teams == 1 else TEAM_REGISTERS
     load_vector = make_wide_load(vector, scalar)
     add_vector = make_lane_sum(vector, scalar, lanes, whole_warps=True)
     add_square = make_lane_sum(square, scalar, lanes, whole_warps=True)
     add_wide = make_lane_sum(wide, wp.float64, lanes, whole_warps=True)
     add_share = make_lane_sum(share, scalar, lanes, whole_warps=True, stride=team)
     add_gradient = make_lane_sum(share_gradient, scalar, lanes, whole_warps=True, stride=team)
-    step_at = make_step_at(capacity)
-    places_ahead = wp.types.vector(AHEAD, wp.int32)
-    records_ahead = wp.types.matrix((AHEAD, 4), scalar)
+    steps_at = make_steps_at(capacity)
+    entries_together = wp.types.matrix((TOGETHER, space_dim + 2), scalar)
+    states_together = wp.types.matrix((TOGETHER, share_width), scalar)
+    places_of_pair = wp.types.vector(PAIR, wp.int32)
+    records_of_pair = wp.types.matrix((PAIR, 4), scalar)
     corrected = make_corrected(space_dim, scalar, share_width, moment_inverse)
     stage_share, stage_rows = make_stage(share), make_stage(share_rows)
     entry_type = wp.types.vector(space_dim + 2, wp.float32)
@@ -129,6 +134,11 @@ def listed_perception(
 
     @native.func_native(slot_bytes, lanes, CUDA_BLOCK)
     def slot_address() -> wp.uint32: ...
+    @native.func_native()
+    def part_address(states: wp.array(dtype=share), part: wp.int32) -> wp.uint64: ...
+
+    @native.func_native(share)
+    def part_of_state(address: wp.uint64, part_count: wp.int32, number: wp.int32) -> share: ...
 
     @native.func_native(space_dim, SLOT_ENTRIES, lanes)
     def append_number(
@@ -156,36 +166,43 @@ def listed_perception(
         rows: wp.array(dtype=wp.float32, ndim=2),
     ): ...
 
+    @wp.struct
+    class Centre:
+        """What the weights of all pairs of a row begin with: converted once, not for each pair."""
+
+        position: vector
+        precise: wide
+        inverse_eps: wp.float64
+
     @wp.func
     def padded(count: wp.int32):
         """A number of neighbours rounded up to a multiple of the lanes."""
         return (count + wp.static(lanes - 1)) & ~wp.int32(wp.static(lanes - 1))
 
     @wp.func
-    def spiky_wide(domain: Domain, centre: vector, neighbour: vector, squared: scalar):
-        """Spiky factor and distance vector of a pair in float64."""
+    def spiky_wide(domain: Domain, centre: Centre, neighbour: vector, squared: scalar):
+        """Spiky factor, up to its norm, and distance vector of a pair in float64."""
         r = wide()
         start = squared
         for d in range(wp.static(space_dim)):
-            r[d] = wp.float64(neighbour[d]) - wp.float64(centre[d])
+            r[d] = wp.float64(neighbour[d]) - centre.precise[d]
         if wp.static(periodic):
             for d in range(wp.static(space_dim)):
-                images = wp.round((neighbour[d] - centre[d]) * domain.inverse_box[d])
+                images = wp.round((neighbour[d] - centre.position[d]) * domain.inverse_box[d])
                 r[d] -= wp.float64(images) * wp.float64(domain.box[d])
             start = scalar(wp.dot(r, r))
         exact = wp.dot(r, r)
         apart = wp.where(start > scalar(0.0), inverse_root(start), scalar(0.0))
-        return spiky_factor_wide(exact, apart, domain.inverse_eps, domain.spiky_norm), r
+        return spiky_factor_wide(exact, apart, centre.inverse_eps, wp.float64(1.0)), r
 
     @wp.func
     def weigh(
         domain: Domain,
         state_place: wp.array(dtype=wp.int32),
-        part_count: wp.int32,
         slot: wp.uint32,
         entry: wp.int32,
         j: wp.int32,
-        position: vector,
+        centre: Centre,
         record: RECORD,
         counts: wp.bool,
         kernel_sum: vector,
@@ -205,23 +222,23 @@ def listed_perception(
         for d in range(wp.static(space_dim)):
             neighbour[d] = record[d]
         volume = wp.where(counts, record[wp.static(space_dim)], scalar(0.0))
-        offset = neighbour - position
+        offset = neighbour - centre.position
         if wp.static(periodic):
             offset = periodic_image(domain, offset)
         squared = wp.dot(offset, offset)
         weight = smoothing(squared, domain.inverse_squared_eps, volume * domain.smoothing_norm)
-        factor, r = spiky_wide(domain, position, neighbour, squared)
+        factor, r = spiky_wide(domain, centre, neighbour, squared)
         density_gradient += factor * r
         weighted = vector()
         if wp.static(state_gradient):
-            weighted = (volume * scalar(factor)) * offset
+            weighted = (volume * domain.spiky_norm * scalar(factor)) * offset
             if wp.static(for_adjoint):
                 kernel_sum += weighted
             if wp.static(moment_correction):
                 for row in range(wp.static(space_dim)):
                     for column in range(row, wp.static(space_dim)):
                         moment[row, column] += offset[row] * weighted[column]
-        put_entry(slot, entry, weight, weighted, number * part_count)
+        put_entry(slot, entry, weight, weighted, number)
         return kernel_sum, moment, density_gradient
 
     @wp.func
@@ -229,13 +246,12 @@ def listed_perception(
         domain: Domain,
         records: wp.array(dtype=RECORD),
         state_place: wp.array(dtype=wp.int32),
-        part_count: wp.int32,
         lane: wp.int32,
         slot: wp.uint32,
         begin: wp.int32,
         count: wp.int32,
         k: wp.int32,
-        position: vector,
+        centre: Centre,
         kernel_sum: vector,
         moment: square,
         density_gradient: wide,
@@ -248,11 +264,10 @@ def listed_perception(
             kernel_sum, moment, density_gradient = weigh(
                 domain,
                 state_place,
-                part_count,
                 slot,
                 entry,
                 j,
-                position,
+                centre,
                 load_record(records, j),
                 listed,
                 kernel_sum,
@@ -268,56 +283,52 @@ def listed_perception(
         records: wp.array(dtype=RECORD),
         lists: wp.array(dtype=wp.int16),
         state_place: wp.array(dtype=wp.int32),
-        part_count: wp.int32,
         lane: wp.int32,
         slot: wp.uint32,
         row: wp.int32,
         begin: wp.int32,
-        count: wp.int32,
+        length: wp.int32,
         k: wp.int32,
-        position: vector,
+        centre: Centre,
+        steps: wp.int32,
         kernel_sum: vector,
         moment: square,
         density_gradient: wide,
     ):
-        """Weigh `count` neighbours of a list from its entry `begin` on.
+        """Weigh neighbours of a list from its entry `begin` on, as many as a slot has room for.
 
-        Several are asked for before the first is used.
+        The steps of a lane's next pair are asked for before those it has are used.
         """
-        for first in range(lane, padded(count), wp.static(lanes * AHEAD)):
-            places = places_ahead()
-            ahead = records_ahead()
-            for a in range(wp.static(AHEAD)):
-                entry = first + wp.static(lanes) * a
-                places[a] = k
-                if entry < count:
-                    places[a] = k + step_at(lists, row, begin + entry)
-            for a in range(wp.static(AHEAD)):
-                ahead[a] = load_record(records, places[a])
-            for a in range(wp.static(AHEAD)):
-                entry = first + wp.static(lanes) * a
-                if entry < padded(count):
-                    kernel_sum, moment, density_gradient = weigh(
-                        domain,
-                        state_place,
-                        part_count,
-                        slot,
-                        entry,
-                        places[a],
-                        position,
-                        ahead[a],
-                        entry < count,
-                        kernel_sum,
-                        moment,
-                        density_gradient,
-                    )
+        end = begin + padded(wp.clamp(length - begin, 0, wp.static(SLOT_ENTRIES)))
+        for first in range(begin + wp.static(PAIR) * lane, end, wp.static(PAIR * lanes)):
+            places = places_of_pair()
+            found = records_of_pair()
+            for a in range(wp.static(PAIR)):
+                places[a] = k + wp.where(first + a < length, step_of(steps, a), wp.int32(0))
+            for a in range(wp.static(PAIR)):
+                found[a] = load_record(records, places[a])
+            steps = steps_at(lists, row, (first >> 1) + wp.static(lanes))
+            for a in range(wp.static(PAIR)):
+                kernel_sum, moment, density_gradient = weigh(
+                    domain,
+                    state_place,
+                    slot,
+                    first + a - begin,
+                    places[a],
+                    centre,
+                    found[a],
+                    first + a < length,
+                    kernel_sum,
+                    moment,
+                    density_gradient,
+                )
         meet_warp()
-        return kernel_sum, moment, density_gradient
+        return steps, kernel_sum, moment, density_gradient
 
     @wp.func
     def add_states(
-        states: wp.array(dtype=share),
-        part: wp.int32,
+        states: wp.uint64,
+        part_count: wp.int32,
         first: wp.int32,
         slot: wp.uint32,
         count: wp.int32,
@@ -326,16 +337,23 @@ def listed_perception(
         gradient: share_gradient,
     ):
         """Add states of weighed neighbours, this team's from `first` on, to the long sums."""
-        for entry in range(first, padded(count), wp.static(teams)):
-            packed = entry_at(slot, entry)
-            place = as_number(packed[wp.static(space_dim + 1)])
-            state = load_share(states, place + part)
-            blur += packed[0] * state
-            if wp.static(state_gradient):
-                difference = state - own
-                for d in range(wp.static(space_dim)):
-                    for c in range(wp.static(share_width)):
-                        gradient[d, c] += packed[d + 1] * difference[c]
+        for entry in range(first, padded(count), wp.static(teams * TOGETHER)):
+            packed = entries_together()
+            found = states_together()
+            for a in range(wp.static(TOGETHER)):
+                weighed = entry_at(slot, entry + a * wp.static(teams))
+                for n in range(wp.static(space_dim + 2)):
+                    packed[a, n] = weighed[n]
+            for a in range(wp.static(TOGETHER)):
+                number = as_number(packed[a, wp.static(space_dim + 1)])
+                found[a] = part_of_state(states, part_count, number)
+            for a in range(wp.static(TOGETHER)):
+                blur += packed[a, 0] * found[a]
+                if wp.static(state_gradient):
+                    difference = found[a] - own
+                    for d in range(wp.static(space_dim)):
+                        for c in range(wp.static(share_width)):
+                            gradient[d, c] += packed[a, d + 1] * difference[c]
         meet_warp()
         return blur, gradient
 
@@ -353,7 +371,9 @@ def listed_perception(
                     result[c * wp.static(space_dim) + d] = along[d]
         return result
 
-    @wp.kernel(enable_backward=False, module=module, cuda_max_registers=registers)
+    @wp.kernel(
+        enable_backward=False, module=module, cuda_max_registers=registers, grid_stride=False
+    )
     def perceive(
         domain: Domain,
         state_dim: wp.int32,
@@ -418,8 +438,14 @@ def listed_perception(
         own_place = k
         if state_place.shape[0] > 0:
             own_place = load_integer(state_place, k)
-        own = load_share(states, own_place * part_count + part)
+        parts = part_address(states, part)
+        own = part_of_state(parts, part_count, own_place)
         position = load_vector(sorted_positions, k)
+        centre = Centre()
+        centre.position = position
+        for d in range(wp.static(space_dim)):
+            centre.precise[d] = wp.float64(position[d])
+        centre.inverse_eps = wp.float64(domain.inverse_eps)
         list_number = safe_row
         if wp.static(by_place):
             list_number = k
@@ -427,26 +453,29 @@ def listed_perception(
         searching = length > wp.static(capacity)
         length = wp.where(searching, wp.int32(0), length)
         longest = largest_in_warp(length)
+        steps = steps_at(lists, list_number, lane)
         for first_entry in range(0, longest, wp.static(SLOT_ENTRIES)):
-            fetched = wp.clamp(length - first_entry, 0, wp.static(SLOT_ENTRIES))
-            kernel_sum, moment, wide_sum = weigh_listed(
+            steps, kernel_sum, moment, wide_sum = weigh_listed(
                 domain,
                 records,
                 lists,
                 state_place,
-                part_count,
                 lane,
                 slot,
                 list_number,
                 first_entry,
-                fetched,
+                length,
                 k,
-                position,
+                centre,
+                steps,
                 kernel_sum,
                 moment,
                 wide_sum,
             )
-            blur, gradient = add_states(states, part, first, slot, fetched, own, blur, gradient)
+            fetched = wp.clamp(length - first_entry, 0, wp.static(SLOT_ENTRIES))
+            blur, gradient = add_states(
+                parts, part_count, first, slot, fetched, own, blur, gradient
+            )
         base = wp.int32(0)
         cell = cell_vector()
         segments = wp.int32(0)
@@ -496,20 +525,19 @@ def listed_perception(
                 domain,
                 records,
                 state_place,
-                part_count,
                 lane,
                 slot,
                 begin,
                 count,
                 k,
-                position,
+                centre,
                 kernel_sum,
                 moment,
                 wide_sum,
             )
-            blur, gradient = add_states(states, part, first, slot, count, own, blur, gradient)
+            blur, gradient = add_states(parts, part_count, first, slot, count, own, blur, gradient)
             begin = count & wp.static(lanes - 1)
-        wide_sum = add_wide(wide_sum)
+        wide_sum = wp.float64(domain.spiky_norm) * add_wide(wide_sum)
         if wp.static(teams > 1):
             blur = add_share(blur)
             gradient = add_gradient(gradient)
