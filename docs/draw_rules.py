@@ -2,7 +2,8 @@
 
     python docs/draw_rules.py
 
-It takes some minutes on a CPU. Draw anew when a rule changes.
+It takes some minutes on a CPU. Draw anew when a rule changes. What textures grow is drawn by
+`benchmarks/textures.py figures`.
 """
 
 from __future__ import annotations
@@ -63,19 +64,6 @@ def pictures() -> Shots:
     return shots
 
 
-def textures() -> Shots:
-    """Return the target, three moments, and the last one as two by two tiles of each texture."""
-    steps = (64, 256, 1024)
-    shots: Shots = []
-    for name in shipped_rules("texture"):
-        task, worlds = grown(name, steps)
-        shots.append((name, to_uint8(task.target_picture)))
-        frames = [to_uint8(task.picture(x, s)[0]) for x, s in worlds]
-        shots += [(f"step {step}", frame) for step, frame in zip(steps, frames, strict=True)]
-        shots.append(("step 1024, 2 x 2", np.tile(frames[-1], (2, 2, 1))[::2, ::2]))
-    return shots
-
-
 @torch.no_grad()
 def things() -> Shots:
     """Return held-out views of each target above what its rule has grown at step 128."""
@@ -94,7 +82,7 @@ def things() -> Shots:
 
 def main() -> None:
     """Draw all pictures."""
-    for name, draw in (("2d", pictures), ("textures", textures), ("3d", things)):
+    for name, draw in (("2d", pictures), ("3d", things)):
         captions, frames = zip(*draw(), strict=True)
         write_filmstrip(IMAGES / f"rules_{name}.png", frames, captions, columns=5)
 

@@ -20,7 +20,7 @@ def main() -> None:
     """Draw the picture."""
     names = builtin_textures()
     tiles = [to_uint8(load_texture(name, resolution=RESOLUTION).picture) for name in names]
-    write_filmstrip(PICTURE, [np.tile(tile, (2, 2, 1)) for tile in tiles], list(names))
+    write_filmstrip(PICTURE, [np.tile(tile, (2, 2, 1)) for tile in tiles], list(names), columns=3)
 
 
 if __name__ == "__main__":

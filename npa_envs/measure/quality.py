@@ -596,8 +596,8 @@ def scores(name: str) -> dict[str, Any]:
 
     Returns:
         `command`, `commit`, `date`, `machine`, `metric` (what the loss is), and tables, lists of
-        rows by column: `growth` with `step`, `loss`, `psnr` [dB] and others, and for some rules
-        `healing`; of a rule that classifies `accuracy` and `changes`.
+        rows by column: `growth` with `step`, `loss`, `psnr` [dB] and others, for some rules
+        `healing`, for textures `judge`; of a rule that classifies `accuracy` and `changes`.
 
     Raises:
         NPAError: There is no such rule.
@@ -622,6 +622,9 @@ def score_line(measured: Mapping[str, Any]) -> str:
     rows = [row for row in measured["growth"] if row["step"] in SCORED_STEPS]
     if measured["metric"] == "view loss":
         return f"PSNR of held-out views {_at_steps(rows, 'psnr', '.1f', ' dB')}"
+    if "judge" in measured:
+        judged = [row for row in measured["judge"] if row["step"] in SCORED_STEPS]
+        return f"judge's ratio {_at_steps(judged, 'ratio', '.2g', '')}"
     return f"{measured['metric']} {_at_steps(rows, 'loss', '.3g', '')}"
 
 

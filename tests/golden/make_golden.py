@@ -34,11 +34,12 @@ SEEDS = {"gecko": 1, "dots": 5, "duck": 6, "digits": 3}
 
 def grow(name: str) -> dict[str, np.ndarray]:
     """Return two worlds of a shipped rule after some steps from the seed of its task."""
-    rule = npa_envs.load_rule(name)
+    rule = scenes.rule_named(name)
     # As many particles as are stored fill a smaller ball.
     fields = {"seed_radius": 0.25} if rule.space_dim == 3 else {}
     count = PARTICLES[name]
-    task = task_of_rule(name, rule, torch.device("cpu"), particle_count=count, **fields).task
+    source = str(scenes.KEPT_RULES.get(name, name))
+    task = task_of_rule(source, rule, torch.device("cpu"), particle_count=count, **fields).task
     used = {"eps": task.eps, "box": task.box}
     assert used == scenes.RULES[name], f"{name} is run with {used}"
     generator = torch.Generator().manual_seed(SEEDS[name])

@@ -31,6 +31,15 @@ RULES: dict[str, dict[str, Any]] = {
 }
 """Shipped rules with the radius [length units] and the box of the task of each."""
 
+KEPT_RULES = {"dots": GOLDEN.with_name("dots.safetensors")}
+"""Rules that are no longer shipped as they were when their worlds were stored."""
+
+
+def rule_named(name: str) -> npa_envs.NPARule:
+    """Return the rule whose world is stored under a name."""
+    return npa_envs.load_rule(KEPT_RULES.get(name, name))
+
+
 KEPT = 512
 """Numbers kept of an array; of more, every so-manyth."""
 
@@ -110,7 +119,7 @@ def grown(name: str, steps: int) -> Arrays:
     """Some steps of a shipped rule from its stored world."""
 
     def scene(dtype: torch.dtype) -> Arrays:
-        rule, (x, s) = npa_envs.load_rule(name).to(dtype), stored_world(name, dtype)
+        rule, (x, s) = rule_named(name).to(dtype), stored_world(name, dtype)
         x, s, path = npa_envs.rollout(
             rule,
             x,
@@ -136,7 +145,7 @@ def differentiated(name: str, steps: int, **options: Any) -> Arrays:
     """A few steps of a shipped rule, and gradients by the worlds and all weights."""
 
     def scene(dtype: torch.dtype) -> Arrays:
-        rule, (x, s) = npa_envs.load_rule(name).to(dtype), stored_world(name, dtype)
+        rule, (x, s) = rule_named(name).to(dtype), stored_world(name, dtype)
         x.requires_grad_()
         s.requires_grad_()
         after_x, after_s, path = npa_envs.rollout(
