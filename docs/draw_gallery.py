@@ -100,13 +100,16 @@ FILMS = {
 }
 """What the films of a task's rules show."""
 
+QUALITY = {"texture": 40}
+"""Quality of their pictures, where it is not the usual: noise all over is long to tell."""
+
 
 def main(names: list[str]) -> None:
     """Draw the films of the rules, all of them if none is named."""
     for task, film in FILMS.items():
         for name in shipped_rules(task):
             if name in names or not names:
-                write_webp(FOLDER / f"{name}.webp", film(name), FPS)
+                write_webp(FOLDER / f"{name}.webp", film(name), FPS, quality=QUALITY.get(task, 50))
 
 
 if __name__ == "__main__":
