@@ -271,6 +271,10 @@ class EnvConfig(WorldConfig):
     """"dense": each step's improvement of the loss; "sparse": minus the loss at the episode's end;
     "particle": as dense, with each particle's own share in `info["particle_reward"]`."""
 
+    tell_updated: bool = False
+    """Tell in `info["updated"]` which particles the step updated; the others ignored their action,
+    so that learners can leave their likelihoods out."""
+
     episode_steps: int = 256
     """Length of an episode where reward is "sparse" and there is no `max_episode_steps`."""
 
@@ -285,6 +289,8 @@ class EnvConfig(WorldConfig):
         """Check every field; as `WorldConfig`."""
         super().__post_init__()
         check_positive(self, int, "episode_steps")
+        if not isinstance(self.tell_updated, bool):
+            raise NPAError(f"tell_updated must be True or False, got {shown(self.tell_updated)}")
         if self.success_loss is not None:
             check_non_negative(self, "success_loss")
         if not is_whole(self.seed_pool) or self.seed_pool < 0:

@@ -68,6 +68,7 @@ class NPAEnv(gymnasium.Env[Any, Any]):
     | `success`, `diverged` | step | whether it did so in this step, bool |
     | `reason` | last step | why the episode ended, see above; None for worlds that go on |
     | `particle_reward` | step, where `reward="particle"` | each particle's own reward, shape [N] |
+    | `updated` | step, where `tell_updated=True` | which particles it updated, bool, shape [N] |
 
     ## Rendering
 

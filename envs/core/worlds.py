@@ -443,6 +443,8 @@ class Worlds(Batch):
 
     def extras(self, when: str) -> dict[str, Tensor]:
         """Return what infos tell besides, shape [B, ...] each: since a "reset", or of a "step"."""
+        if when == "step" and self.task.config.tell_updated:
+            return {"updated": self._actions.updated()}
         return {}
 
     def told(self) -> list[float]:

@@ -93,6 +93,8 @@ class GardenConfig(GrownConfig):
                 f"picture_size must divide resolution = {self.resolution}, got "
                 f"{self.picture_size}: try {self.resolution // 2}"
             )
+        if self.tell_updated:
+            raise NPAError("tell_updated must be False, as actions do not belong to particles")
         self._check_tools()
         if not isinstance(self.observe_error, bool):
             raise NPAError(f"observe_error must be True or False, got {shown(self.observe_error)}")

@@ -177,6 +177,7 @@ class Actions:
         self._random = random
         self._diverged = diverged
         self._mask = self._noise = None
+        self._everyone = torch.ones((), dtype=torch.bool, device=x.device).expand(x.shape[:2])
         if physics.update_prob < 1.0:
             self._mask = torch.zeros(x.shape[:2], dtype=torch.uint8, device=x.device)
         if physics.position_noise > 0.0:
@@ -205,6 +206,12 @@ class Actions:
         if self._noise is not None:
             noise = random.normal(*self._noise.shape[1:], dtype=self._noise.dtype)
             self._noise.copy_(noise * physics.position_noise)
+
+    def updated(self) -> Tensor:
+        """Return which particles what was drawn last updates, bool, shape [B, N]."""
+        if self._mask is None:
+            return self._everyone
+        return self._mask.bool()
 
     def apply(self, action: Tensor) -> None:
         """Apply actions with what was drawn last.

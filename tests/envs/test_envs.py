@@ -224,6 +224,30 @@ def test_action_moves_masked_particles_by_the_documented_amount():
     assert torch.equal(new_s[~moved], s[~moved])
 
 
+@every_id
+@pytest.mark.parametrize("update_prob", [0.5, 1.0])
+def test_info_tells_which_particles_the_step_updated(name, update_prob, device):
+    given = {"tell_updated": True, "update_prob": update_prob, "device": str(device)}
+    envs = make_vec(name, 2, **given, max_episode_steps=3)
+    env = make(name, **given, max_episode_steps=3)
+    envs.reset(seed=4)
+    env.reset(seed=4)
+    seen = []
+    for action in actions(env, 7, scale=0.2):
+        before = env.unwrapped.particles()[1]
+        *_, over, info = env.step(action)
+        after = env.unwrapped.particles()[1]
+        assert torch.equal((after != before).any(-1).cpu(), torch.from_numpy(info["updated"]))
+        *_, infos = envs.step(np.stack([action, action]))
+        told = infos["final_info"] if over else infos
+        assert np.array_equal(told["updated"][0], info["updated"])
+        seen.append(info["updated"])
+        if over:
+            env.reset()
+    share = np.mean(seen)
+    assert share == 1.0 if update_prob == 1.0 else 0.35 < share < 0.65
+
+
 def test_seed_pool_repeats_its_starts():
     env = make(IDS[0], seed_pool=3)
     starts = {env.reset(seed=seed)[0].tobytes() for seed in range(20)}

@@ -226,7 +226,8 @@ def test_a_page_lists_the_arguments_with_their_defaults(registration, builder):
 
 @pytest.mark.parametrize("registration", ENVIRONMENTS, ids=lambda row: row.name)
 def test_a_page_lists_the_keys_of_info(registration):
-    keywords = {"reward": "particle", "success_loss": 1e6, **small(registration.name)}
+    keywords = {"reward": "particle", "success_loss": 1e6, "tell_updated": True}
+    keywords |= small(registration.name)
     if registration.name == "Regeneration2D":
         keywords["rule"] = "picture"
     env = gym.make(registration.id, **keywords)
