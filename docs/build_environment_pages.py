@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import json
 import re
 import sys
 import typing
@@ -36,7 +37,7 @@ from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.spaces import Rows
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.envs.garden.environments import GardenEnv
-from npa_envs.registration import ENVIRONMENTS, GARDENS, Registration
+from npa_envs.registration import ENVIRONMENTS, GARDENS, SMALL, Registration
 
 DOCS = Path(__file__).resolve().parent
 PAGES = DOCS / "environments"
@@ -100,6 +101,18 @@ def argument_tables(config_type: type[EnvConfig]) -> str:
     return "\n\n".join(tables)
 
 
+def small_forms(registration: Registration) -> str:
+    """Return what ids with other keywords there are of an environment, Markdown."""
+    told = ""
+    for small in SMALL:
+        if small.name == registration.name:
+            given = ", ".join(
+                f"`{name}={json.dumps(value)}`" for name, value in small.keywords.items()
+            )
+            told += f"\n\n`{small.id}` is the same environment with {given}."
+    return told
+
+
 def task_bases(config_type: type[EnvConfig]) -> list[type]:
     """Return the classes of a configuration below the one that all environments share."""
     return [cls for cls in config_type.__mro__ if issubclass(cls, EnvConfig) and cls != EnvConfig]
@@ -161,6 +174,7 @@ def page(registration: Registration) -> str:
         for heading, space in spaces.items():
             text[heading] = numbered_columns(text[heading], letters, space.shape[1])
     text["Arguments"] += "\n\n" + argument_tables(task.config_type)
+    text["Arguments"] += small_forms(registration)
     text["Vectorized environment"] += "\n\n" + vector_table()
     facts = table(
         ("", "By default"),

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Self, get_args
+from typing import Literal, Self, get_args
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from npa_envs import world_mean
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.task import GoalTask, Start
@@ -28,12 +29,16 @@ from npa_envs.tasks.point_classification import (
 from npa_envs.tasks.targets.clouds import Split
 from npa_envs.world.randomness import WorldRandom
 
+Score = Literal["error", "cross_entropy", "accuracy"]
+
 
 @dataclass(frozen=True, kw_only=True)
 class PointClassificationEnvConfig(EnvConfig):
     """Adds the clouds and the loss of `PointClassificationConfig`, which explains them."""
 
     task_config_type = PointClassificationConfig
+
+    words = EnvConfig.words | {"score": get_args(Score)}
 
     particle_count: int = PointClassificationConfig.particle_count
     data: str = PointClassificationConfig.data
@@ -46,6 +51,14 @@ class PointClassificationEnvConfig(EnvConfig):
 
     split: Split = "train"
     """Which pictures: "train" or "test", which are never varied."""
+
+    score: Score = "error"
+    """What the loss is, overflow aside: "error", the mean squared error of what particles say;
+    "cross_entropy" of the probabilities softmax(`sharpness` × what they say); or "accuracy", the
+    share of particles that say another class most loudly."""
+
+    sharpness: float = 4.0
+    """How surely outputs are taken as probabilities, where score is "cross_entropy"."""
 
     rule: str = ""
     """File of the rule whose read-out tells classes from states; empty: the last channels are the
@@ -64,6 +77,7 @@ class PointClassificationEnvConfig(EnvConfig):
         if not isinstance(self.rule, str):
             raise NPAError(f"rule must be the path of a rule as a string, got {shown(self.rule)}")
         _ = self.goal
+        check_positive(self, float, "sharpness")
         check_positive(self, int, "state_dim", at_least=3 if self.rule else self.class_count)
 
     @property
@@ -107,13 +121,30 @@ class PointClassificationTask(GoalTask[PointClassificationEnvConfig]):
         return aimed
 
     def losses(self, x: Tensor, s: Tensor) -> Mapping[str, Tensor]:
-        """Return each world's mean squared error to its class, and its weighted overflow."""
+        """Return each world's loss of what it says of its class, and its weighted overflow."""
+        score = self.config.score
         overflow = self.config.overflow_weight * self.goal.overflow(s)
-        return {"error": self.goal.metric(x, s), "overflow": overflow}
+        if score == "error":
+            return {"error": self.goal.metric(x, s), "overflow": overflow}
+        return {score: world_mean(self._scores(s)[..., None])[:, 0], "overflow": overflow}
 
     def particle_losses(self, x: Tensor, s: Tensor) -> Tensor:
-        """Return each particle's own error and overflow."""
-        return self.goal.errors(s) + self.config.overflow_weight * self.goal.overflows(s)
+        """Return each particle's own loss and overflow."""
+        return self._scores(s) + self.config.overflow_weight * self.goal.overflows(s)
+
+    def accuracy(self, s: Tensor) -> Tensor:
+        """Return the share of each world's particles that say its class most loudly, [B]."""
+        return 1.0 - world_mean(self.goal.mistakes(s)[..., None])[:, 0]
+
+    def told(self, s: Tensor) -> dict[str, Tensor]:
+        """Return each world's class, int64, and accuracy, shape [B] each."""
+        return {"label": self.goal.wanted.clone(), "accuracy": self.accuracy(s)}
+
+    def _scores(self, s: Tensor) -> Tensor:
+        """Return the loss of what each particle says, [B, N]."""
+        if self.config.score == "cross_entropy":
+            return self.goal.cross_entropies(s, self.config.sharpness)
+        return self.goal.mistakes(s) if self.config.score == "accuracy" else self.goal.errors(s)
 
     def draw(self, x: Tensor, s: Tensor, steps: NDArray[np.int64]) -> NDArray[np.uint8]:
         """Return pictures of the unit square, with a margin, in colours of what particles say."""
@@ -187,7 +218,9 @@ class PointClassificationEnv(NPAEnv):
 
     The loss L is the mean squared difference of what all particles say and what they should say,
     plus `overflow_weight` times the mean of |s − clip(s, −1, 1)|. Blank states have
-    L = 1 / `class_count`.
+    L = 1 / `class_count`. With `score="cross_entropy"` or `"accuracy"` the first part is the mean
+    cross-entropy of softmax(`sharpness` × what particles say), or the share of particles that say
+    another class most loudly; ties go to the first class.
 
     A particle's own reward is how much its own loss fell.
 
@@ -206,6 +239,10 @@ class PointClassificationEnv(NPAEnv):
     |---|---|---|
     | `loss_error`, `loss_overflow` | reset, step | the parts of the loss |
     | `reward_error`, `reward_overflow` | step | how much each part improved in this step |
+    | `label` | reset, step | the digit's class, a whole number |
+    | `accuracy` | reset, step | the share of particles that say it most loudly |
+
+    With another `score` than "error" the first part is called so.
 
     ## Rendering
 

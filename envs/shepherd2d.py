@@ -128,7 +128,7 @@ class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
         worth: Tensor = self.paid(self.achieved(x, s, marks), self.desired(marks))
         return worth.to(torch.float32)
 
-    def told(self, x: Tensor, s: Tensor, loss: Tensor, marks: Tensor) -> dict[str, Tensor]:
+    def told_of(self, x: Tensor, s: Tensor, marks: Tensor) -> dict[str, Tensor]:
         """Return whether worlds are at their goals and whole, and what share is lost."""
         achieved, desired = self.achieved(x, s, marks), self.desired(marks)
         away = (achieved - desired)[:, :2].square().sum(dim=1).sqrt()

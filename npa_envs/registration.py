@@ -5,7 +5,9 @@ Entry points are strings: nothing of torch or Warp is imported before an environ
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import gymnasium
 
@@ -24,6 +26,9 @@ class Registration(NamedTuple):
 
     max_episode_steps: int
     """Steps after which an episode is truncated."""
+
+    keywords: Mapping[str, Any] = MappingProxyType({})
+    """Keywords of the classes, where they are not the usual ones."""
 
     @property
     def entry_point(self) -> str:
@@ -56,14 +61,45 @@ GARDENS = (
 )
 """Where a trained rule runs the particles, and an action says what few brushes do."""
 
+SMALL = (
+    Registration(
+        "npa/Gardener2DSmall-v0",
+        "npa_envs.envs.gardener2d",
+        "Gardener2D",
+        32,
+        MappingProxyType(
+            {
+                "particle_count": 256,
+                "tools": ("push",),
+                "brush_count": 1,
+                "brush_radius": 0.6,
+                "gust_chance": 0.5,
+                "gust_radius": 0.6,
+                "blight_chance": 0.25,
+                "picture_size": 8,
+            }
+        ),
+    ),
+    Registration(
+        "npa/Shepherd2DSmall-v0",
+        "npa_envs.envs.shepherd2d",
+        "Shepherd2D",
+        32,
+        MappingProxyType({"particle_count": 256}),
+    ),
+)
+"""Settings of environments with few particles and few numbers to act by, never changed under the
+same version."""
+
 
 def register_environments() -> None:
     """Put the table into Gymnasium's registry; what is there already is left as it is."""
-    for environment in (*ENVIRONMENTS, *GARDENS):
+    for environment in (*ENVIRONMENTS, *GARDENS, *SMALL):
         if environment.id not in gymnasium.registry:
             gymnasium.register(
                 environment.id,
                 entry_point=environment.entry_point,
                 vector_entry_point=environment.vector_entry_point,
                 max_episode_steps=environment.max_episode_steps,
+                kwargs=dict(environment.keywords),
             )

@@ -166,6 +166,10 @@ class EnvTask(WorldTask[Config]):
         """Return the named parts of each world's loss, shape [B] each; their sum is the loss."""
         raise NotImplementedError
 
+    def told(self, s: Tensor) -> dict[str, Tensor]:
+        """Return what infos tell of worlds besides, shape [B, ...] each; by default nothing."""
+        return {}
+
     def particle_losses(self, x: Tensor, s: Tensor) -> Tensor:
         """Return each particle's share of its world's loss, shape [B, N]; their mean is the loss.
 

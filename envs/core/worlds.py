@@ -443,9 +443,9 @@ class Worlds(Batch):
 
     def extras(self, when: str) -> dict[str, Tensor]:
         """Return what infos tell besides, shape [B, ...] each: since a "reset", or of a "step"."""
-        if when == "step" and self.task.config.tell_updated:
-            return {"updated": self._actions.updated()}
-        return {}
+        if when == "reset":
+            return self._aimed.told(self.s)
+        return {"updated": self._actions.updated()} if self.task.config.tell_updated else {}
 
     def told(self) -> list[float]:
         """Return the numbers of a single world's report after a step."""

@@ -133,7 +133,7 @@ class GardenTask(GrownTask[Config]):
         """Return what worlds are worth in a step, [B], of loss [B] and marks [B, M]."""
         raise NotImplementedError
 
-    def told(self, x: Tensor, s: Tensor, loss: Tensor, marks: Tensor) -> dict[str, Tensor]:
+    def told_of(self, x: Tensor, s: Tensor, marks: Tensor) -> dict[str, Tensor]:
         """Return what infos tell of worlds besides, shape [B, ...] each."""
         return {}
 

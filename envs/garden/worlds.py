@@ -124,4 +124,4 @@ class LivingWorlds(Worlds):
 
     def extras(self, when: str) -> dict[str, Tensor]:
         """Return what infos tell besides, shape [B, ...] each: since a "reset", or of a "step"."""
-        return self.task.told(self.x, self.s, self.loss, self.marks) if when == "reset" else {}
+        return self.task.told_of(self.x, self.s, self.marks) if when == "reset" else {}

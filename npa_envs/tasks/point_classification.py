@@ -253,12 +253,43 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
         Raises:
             NPAError: The classes have not been said by `toward`.
         """
-        if self._goal is None:
-            raise NPAError("the worlds' classes must be given first: task.toward(goal), int64 [B]")
         outputs = self.outputs(s)
         classes = torch.arange(self.config.class_count, device=s.device)
-        wanted = (self._goal[:, None] == classes).to(outputs.dtype)
+        wanted = (self.wanted[:, None] == classes).to(outputs.dtype)
         return channel_mean((outputs - wanted[:, None]).square())
+
+    @property
+    def wanted(self) -> Tensor:
+        """Classes of the worlds, int64, shape [B].
+
+        Raises:
+            NPAError: The classes have not been said by `toward`.
+        """
+        if self._goal is None:
+            raise NPAError("the worlds' classes must be given first: task.toward(goal), int64 [B]")
+        return self._goal
+
+    def mistakes(self, s: Tensor) -> Tensor:
+        """Return 1 for particles that say another class than their world's most loudly, [B, N].
+
+        Raises:
+            NPAError: The classes have not been said by `toward`.
+        """
+        return (self.outputs(s).argmax(dim=-1) != self.wanted[:, None]).to(s.dtype)
+
+    def cross_entropies(self, s: Tensor, sharpness: float) -> Tensor:
+        """Return each particle's cross-entropy of softmax(sharpness × outputs), [B, N].
+
+        Args:
+            s: States, dimensionless, shape [B, N, C].
+            sharpness: How surely outputs are taken as probabilities (dimensionless).
+
+        Raises:
+            NPAError: The classes have not been said by `toward`.
+        """
+        chances = torch.log_softmax(sharpness * self.outputs(s), dim=-1)
+        wanted = self.wanted[:, None, None].expand(*s.shape[:2], 1)
+        return -chances.gather(-1, wanted).squeeze(-1)
 
     def metric(self, x: Tensor, s: Tensor) -> Tensor:
         """Return each world's mean squared error, shape [B]."""
@@ -284,9 +315,7 @@ class PointClassification(ParticleTask[PointClassificationConfig]):
             NPAError: The classes have not been said by `toward`.
         """
         total, parts = super().loss(x, s, path_length)
-        assert self._goal is not None, "asked for by errors()"
-        right = self.outputs(s.detach()).argmax(-1) == self._goal[:, None]
-        return total, {**parts, "accuracy": right.to(s.dtype).mean().detach()}
+        return total, {**parts, "accuracy": 1.0 - self.mistakes(s.detach()).mean()}
 
     def picture(self, x: Tensor, s: Tensor) -> Tensor:
         """Return each world's picture, coloured by class: colour sums, density, [B, R, R, 4]."""

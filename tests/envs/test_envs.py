@@ -248,6 +248,40 @@ def test_info_tells_which_particles_the_step_updated(name, update_prob, device):
     assert share == 1.0 if update_prob == 1.0 else 0.35 < share < 0.65
 
 
+@pytest.mark.parametrize("score", ["error", "cross_entropy", "accuracy"])
+def test_digits_pay_the_score_that_is_asked_for_and_tell_class_and_accuracy(score):
+    name = "npa/PointClassification-v0"
+    given = {"score": score, "overflow_weight": 0.0, "max_episode_steps": 4, "update_prob": 1.0}
+    env, envs = make(name, **given), make_vec(name, 3, **given)
+    _, info = env.reset(seed=2)
+    envs.reset(seed=1)
+    label = info["label"]
+    for action in actions(env, 3):
+        _, _, _, _, info = env.step(action)
+        *_, infos = envs.step(np.stack([action] * 3))
+        assert info["label"] == label == infos["label"][1]
+        assert infos["accuracy"][1] == info["accuracy"]
+        assert infos["loss"][1] == info["loss"]
+        said = env.unwrapped.particles()[1][:, -10:].double()
+        right = (said.argmax(dim=1) == label).double().mean()
+        assert info["accuracy"] == pytest.approx(float(right), abs=1e-6)
+        expected = {
+            "error": (said - torch.eye(10)[label]).square().mean(),
+            "cross_entropy": -torch.log_softmax(4.0 * said, dim=1)[:, label].mean(),
+            "accuracy": 1.0 - right,
+        }[score]
+        assert info[f"loss_{score}"] == pytest.approx(float(expected), rel=1e-5)
+        # A policy that says the class loudly is right.
+    loud = np.zeros(env.action_space.shape, np.float32)
+    loud[:, -10 + label] = 1.0
+    before = info["loss"]
+    for _ in range(3):
+        env.unwrapped.step(loud)
+    _, _, _, _, info = env.unwrapped.step(loud)
+    assert info["accuracy"] > 0.9
+    assert score == "error" or info["loss"] < before
+
+
 def test_seed_pool_repeats_its_starts():
     env = make(IDS[0], seed_pool=3)
     starts = {env.reset(seed=seed)[0].tobytes() for seed in range(20)}

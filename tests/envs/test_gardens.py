@@ -1,7 +1,9 @@
 """Living worlds: brushes, weather, spaces, seeds; tests run over the table of gardens."""
 
 import pickle
+import re
 import warnings
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -14,6 +16,7 @@ import npa_envs
 from npa_envs.envs.garden.brushwork import Columns, brushed
 from npa_envs.errors import DivergedError, NPAError
 from npa_envs.registration import GARDENS
+from npa_envs.registration import SMALL as SMALL_FORMS
 
 IDS = [environment.id for environment in GARDENS]
 GARDENER, SHEPHERD = IDS
@@ -116,6 +119,19 @@ def test_an_episode_follows_from_its_seed_and_survives_pickling(name):
 
 
 @every_id
+def test_info_has_the_keys_that_the_page_lists(name):
+    page = Path(__file__).parents[2] / "docs" / "environments" / f"{name[4:-3]}.md"
+    section = page.read_text(encoding="utf-8").split("## Info\n")[1].split("\n## ")[0]
+    rows = [line.split("|")[1:3] for line in section.splitlines() if line.startswith("| `")]
+    listed = [(key, when) for keys, when in rows for key in re.findall("`([^`]+)`", keys)]
+    env = make(name, success_loss=1e6)
+    _, at_reset = env.reset(seed=0)
+    *_, at_step = env.step(env.action_space.sample())
+    assert sorted(key for key, when in listed if "reset" in when) == sorted(at_reset)
+    assert sorted(key for key, _ in listed) == sorted(at_step)
+
+
+@every_id
 def test_masked_reset_leaves_other_worlds_alone(name):
     envs, others = (make_vec(name, 3) for _ in range(2))
     actions = sampled(envs, 2)
@@ -147,9 +163,29 @@ def test_bad_actions_are_clear_errors_and_change_nothing(name):
         chosen.unwrapped.step(np.zeros(16, np.float32))
 
 
+@pytest.mark.parametrize("small", SMALL_FORMS, ids=lambda row: row.id)
+def test_a_small_form_is_the_environment_with_other_keywords(small):
+    quick = {"grow_steps": 4, "seed_pool": 1}
+    usual = small.id.replace("Small", "")
+    env = gymnasium.make(small.id, **quick)
+    other = gymnasium.make(usual, **(dict(small.keywords) | quick))
+    assert env.unwrapped.config == other.unwrapped.config
+    assert env.spec.max_episode_steps == other.spec.max_episode_steps == 32
+    batched = gymnasium.make_vec(small.id, 2, vectorization_mode="vector_entry_point", **quick)
+    assert batched.config == env.unwrapped.config
+    action = sampled(env, 1)[0]
+    again = gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(env.spec.to_json()))
+    for made in (env, other, again):
+        made.reset(seed=3)
+    first = env.step(action)
+    assert_same(first, other.step(action))
+    assert_same(first, again.step(action))
+
+
 @pytest.mark.parametrize(
     ("keywords", "message"),
     [
+        ({"tell_updated": True}, "actions do not belong to particles"),
         ({"tools": ("pull",)}, "tools must be some of"),
         ({"tools": ("rate", "push")}, "in the order of"),
         ({"inject_channels": (16,)}, r"inject_channels must lie in \[-16, 15\]"),
