@@ -427,8 +427,15 @@ def test_the_command_writes_pages_and_collections(
     assert torch.equal(
         load_rule(f"{collection}#gecko").output.weight, load_rule("gecko").output.weight
     )
-    assert main(["export-web", "-o", str(page)]) == 2
-    assert main(["export-web", "duck", "-o", str(collection)]) == 2
+    (tmp_path / "unfinished").mkdir()
+    capsys.readouterr()
+    for words, error in (
+        ([], "RULE"),
+        (["duck"], "runs rules with space_dim=2 only, 'duck' has 3"),
+        ([str(tmp_path / "unfinished")], "must hold the rule.safetensors of a run"),
+    ):
+        assert main(["export-web", *words, "-o", str(collection)]) == 2
+        assert error in capsys.readouterr().err
 
 
 def test_a_place_that_cannot_be_written_to_is_told_before_any_work(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import socket
+
 import pytest
 import torch
 
@@ -40,6 +42,9 @@ def test_a_rule_a_run_and_an_environment_are_told_apart(tmp_path):
     [
         (["worm"], "unknown rule 'worm'"),
         (["npa/Worm-v0"], "unknown environment 'npa/Worm-v0'"),
+        (["npa/Texture-v0", "--policy", "duck"], "the environment's space_dim, 2, got 3"),
+        (["npa/Texture-v0", "--policy", "digits"], "got one of static particles"),
+        (["nowhere.safetensors"], "the file 'nowhere.safetensors' does not exist"),
         (["gecko", "--policy", "random"], "policy is for environments"),
         (["gecko", "--threads", "0"], "threads must be in [1, 256], got 0"),
         (["gecko", "--port", "-1"], "port must be in [0, 65535], got -1"),
@@ -58,6 +63,23 @@ def test_an_unfinished_run_is_refused(tmp_path):
     (tmp_path / "log.jsonl").write_text("")
     with pytest.raises(NPAError, match="has not written its rules"):
         make(tmp_path)
+
+
+def test_half_written_rules_and_ports_in_use_are_told(capsys, tmp_path):
+    run = tmp_path / "run"
+    run.mkdir()
+    save_rule(load_rule("gecko"), run / "rule.safetensors")
+    whole = (run / "rule.safetensors").read_bytes()
+    (run / "config.json").write_text('{"particle_cou')
+    assert type(make(run)) is RunWorld
+    (run / "rule.safetensors").write_bytes(whole[: len(whole) // 2])
+    words = ["--no-browser", "--out", str(tmp_path)]
+    assert main(["view", str(run), "--port", "0", *words]) == 2
+    assert "this is no safetensors file, or a truncated one" in capsys.readouterr().err
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        assert main(["view", "gecko", "--port", port, *words]) == 2
+    assert f"port {port} of 127.0.0.1 cannot be bound" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0"])
