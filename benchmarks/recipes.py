@@ -156,7 +156,7 @@ SEVENTH: Fields = {
     "learning_rate": 2e-3,
     "initial_rule": "heart",
 }
-"""What serves `fast`, in large: half of the worlds are seeds, and none grows old. Never run."""
+"""What serves `fast`, in large: half of the worlds are seeds, and none grows old. Not run at full size."""
 
 FAST_BEFORE: Fields = {
     **NO_STRAYS,
@@ -226,6 +226,8 @@ ARMS: Mapping[str, Fields] = {
     "fifth, no ageing": FIFTH | {"ageing_steps": 0},
     "fifth, rate 5e-4": FIFTH | {"learning_rate": 5e-4},
     "seventh": SEVENTH,
+    "seventh, untrained, rate 3e-3": SEVENTH
+    | {"initial_rule": "", "learning_rate": 3e-3, "steps": (48, 50), "iterations": 1500},
 }
 """Arms of `full` and `small`: what each changes of the preset `paper`."""
 
