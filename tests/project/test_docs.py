@@ -396,6 +396,22 @@ def test_the_code_about_learning_runs(tmp_path, monkeypatch, capsys):
     assert [entry.particle_steps for entry in trained.log] == [0, 2000]
 
 
+def test_the_code_about_gardening_runs(capsys):
+    pytest.importorskip("stable_baselines3")
+    names = {}
+    for code in code_blocks(DOCS / "gardening.md"):
+        # Less of it: what is tested is that the calls are right.
+        assert "make" in code
+        code = code.replace('Small-v0"', 'Small-v0", grow_steps=4, seed_pool=1, rule_steps=1')
+        code = code.replace("0_000", "").replace("1_000", "8")
+        exec(compile(code, "gardening.md", "exec"), names)
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()[:2]] == [
+        "StillGardener", "ScriptedGardener",
+    ]  # fmt: skip
+    assert float(names["slope"].abs().max()) > 0.0
+    assert names["gardener"].num_timesteps == names["shepherd"].num_timesteps == 5
+
+
 def test_the_code_about_ppo_runs(capsys):
     pytest.importorskip("stable_baselines3")
     (block,) = [code for code in code_blocks(DOCS / "learning.md") if '"ppo_world"' in code]

@@ -1,0 +1,90 @@
+"""What gardeners and shepherds earn: nobody, at random, scripted, by the gradient; run with --help.
+
+    python benchmarks/gardens.py [--ids npa/Gardener2D-v0 ...] [--device cuda] [--output FILE]
+
+Episodes begin with the seeds of `npa_envs.agents.learning.problem.EVALUATION_SEEDS`, sixteen. Told
+are the mean reward of a step with its standard error over episodes and, of shepherds, how many
+creatures were at their goal and whole in the last step.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+
+import npa_envs  # noqa: F401 (registers the environments)
+from npa_envs.agents.gardening import (
+    GradientGardener,
+    RandomGardener,
+    ScriptedGardener,
+    ScriptedShepherd,
+    StillGardener,
+)
+from npa_envs.agents.learning.problem import EVALUATION_SEEDS
+from npa_envs.measure.record import script_facts, script_parser, write_record
+from npa_envs.registration import GARDENS, SMALL
+
+POLICIES = ("zero", "random", "scripted", "gradient")
+
+
+def measured(name: str, policy: str, device: str, count: int, steps: int | None) -> dict[str, Any]:
+    """Return what a policy earns in the first episodes of as many seeds."""
+    scripted = ScriptedShepherd if "Shepherd" in name else ScriptedGardener
+    makes = (StillGardener, RandomGardener, scripted, GradientGardener)
+    limit = steps or gymnasium.spec(name).max_episode_steps
+    env = gymnasium.make_vec(
+        name,
+        count,
+        vectorization_mode="vector_entry_point",
+        max_episode_steps=limit,
+        device=device,
+    )
+    act = dict(zip(POLICIES, makes, strict=True))[policy](env)
+    begun, earned = time.perf_counter(), np.zeros(count)
+    seen, _ = env.reset(seed=list(EVALUATION_SEEDS[:count]))
+    for _ in range(limit):
+        seen, rewards, _, _, infos = env.step(act(seen))
+        earned += rewards / limit
+    row = {
+        "id": name,
+        "policy": policy,
+        "reward": float(earned.mean()),
+        "error": float(earned.std(ddof=1) / math.sqrt(count)) if count > 1 else None,
+        "episodes": count,
+        "steps": limit,
+        "seconds": time.perf_counter() - begun,
+    }
+    if "is_success" in infos["final_info"]:
+        row["success"] = float(np.mean(infos["final_info"]["is_success"]))
+    return row
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Measure, print and write."""
+    parser = script_parser((__doc__ or "").split("\n")[0])
+    known = [row.id for row in (*GARDENS, *SMALL)]
+    parser.add_argument("--ids", nargs="+", default=known, choices=known)
+    parser.add_argument("--policies", nargs="+", default=POLICIES, choices=POLICIES)
+    parser.add_argument("--episodes", type=int, default=len(EVALUATION_SEEDS))
+    parser.add_argument("--steps", type=int, help="of an episode; default: the registered ones")
+    given = parser.parse_args(arguments)
+    torch.set_num_threads(given.threads)
+    rows = []
+    for name in given.ids:
+        for policy in given.policies:
+            row = measured(name, policy, given.device, given.episodes, given.steps)
+            rows.append(row)
+            success = f", success {row['success']:.2f}" if "success" in row else ""
+            error = "" if row["error"] is None else f" ± {row['error']:.3f}"
+            print(f"{name} {policy}: {row['reward']:.3f}{error}{success}", flush=True)
+    if given.output is not None:
+        write_record(given.output, {**script_facts(given), "rows": rows})
+
+
+if __name__ == "__main__":
+    main()
