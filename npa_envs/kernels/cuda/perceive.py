@@ -38,7 +38,7 @@ from npa_envs.kernels.mathematics import (
     within,
 )
 
-CUDA_REGISTERS, TEAM_REGISTERS = {2: 80, 3: 96}, 128
+CUDA_REGISTERS, TEAM_REGISTERS = {2: 80, 3: 112}, 128
 """Registers of a thread of the perception pass: of one team, by dimension, and of several."""
 
 PAIR = 2
