@@ -405,22 +405,25 @@ HEALING = {"damage": "cut", "damage_size": 0.3, "world_count": 6, "max_episode_s
 
 
 @pytest.mark.parametrize(
-    ("environment", "keywords", "scripted", "standard_errors", "factor"),
+    ("environment", "keywords", "scripted", "standard_errors", "factor", "share", "left"),
     [
         (
             MORPHOGENESIS,
             {"world_count": 4, "max_episode_steps": 64},
             (RandomPolicy, ZeroPolicy, SpreadPolicy, PaintPolicy),
             10.0,
-            1.2,
+            1.0,
+            0.5,
+            0.1,
         ),
-        (REGENERATION, HEALING, (RandomPolicy, ZeroPolicy, MendPolicy), 4.0, 1.5),
+        (REGENERATION, HEALING, (RandomPolicy, ZeroPolicy, MendPolicy), 4.0, 1.5, 1.0, 1.0),
     ],
 )
 def test_the_shipped_rule_does_far_better_than_anything_scripted(
-    gecko, environment, keywords, scripted, standard_errors, factor
+    gecko, environment, keywords, scripted, standard_errors, factor, share, left
 ):
-    """By so many standard errors of the gaps between returns from the same seeds."""
+    """By so many standard errors of the gaps between returns from the same seeds, and by factors
+    of returns and of final losses; of the loss at the start so much is left."""
     envs = make_vector(environment, **keywords)
     seeds = range(envs.num_envs)
     rule = evaluate_policy(envs, RulePolicy(gecko, envs), seeds)
@@ -429,3 +432,5 @@ def test_the_shipped_rule_does_far_better_than_anything_scripted(
         gaps = rule.returns - other.returns
         assert gaps.mean() > standard_errors * gaps.std(ddof=1) / np.sqrt(len(gaps))
         assert rule.mean_return > factor * other.mean_return
+        assert rule.final_losses.mean() < share * other.final_losses.mean()
+    assert rule.final_losses.mean() < left * rule.start_losses.mean()

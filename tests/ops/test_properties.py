@@ -74,10 +74,13 @@ def modulo(w, positions):
 
 
 @every(some())
-def test_perception_follows_the_order_of_particles(w):
+def test_fields_and_perception_follow_the_order_of_particles(w):
     clear_of_threshold(w)
     order = w.permutation()
-    moved = perceive(w, w.x[:, order], w.s[:, order])
+    moved = fields_of(w.ordered(order))
+    for value, answer, allowed in zip(moved, fields_of(w), allowances(w), strict=True):
+        within(value, answer[:, order], allowed[:, order])
+    moved = perceive(w.ordered(order))
     within(moved, perceive(w)[:, order], perception_allowance(w)[:, order])
 
 
@@ -114,6 +117,8 @@ def test_fields_scale_with_lengths_bit_for_bit(drawn):
     powers = (-dim, 0, -1, 0, -1, -1 - dim)
     for value, answer, power in zip(fields_of(w.scaled(factor)), fields_of(w), powers, strict=True):
         assert torch.equal(value, answer * factor**power)
+    # Perceived at a larger radius than it was trained at, a larger world looks the same.
+    assert torch.equal(perceive(w.scaled(factor)), perceive(w))
 
 
 @every(some())

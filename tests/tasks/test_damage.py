@@ -84,19 +84,6 @@ def test_random_particle_is_one_of_its_own_world(world):
         assert (x[b] == chosen[b]).all(dim=-1).any()
 
 
-def test_damage_is_differentiable():
-    x = torch.randn(2, 9, 2, dtype=torch.float64, requires_grad=True)
-    s = torch.randn(2, 9, 3, dtype=torch.float64, requires_grad=True)
-    centre = torch.zeros(2, 2, dtype=torch.float64)
-    cleared = erase_state(x, s, centre=centre, radius=1.0)
-    (grad,) = torch.autograd.grad(cleared.sum(), s)
-    outside = (x.norm(dim=-1) > 1.0).double()
-    torch.testing.assert_close(grad, outside[..., None].expand_as(grad))
-    moved, _ = clump(x, s, centre=centre, radius=1.0, factor=0.75)
-    (grad,) = torch.autograd.grad(moved.sum(), x)
-    torch.testing.assert_close(grad, (0.25 + 0.75 * outside)[..., None].expand_as(grad))
-
-
 def test_wrong_arguments_are_clear_errors():
     x, s, centre = torch.zeros(2, 4, 2), torch.zeros(2, 4, 3), torch.zeros(2, 2)
     with pytest.raises(NPAError, match=r"add a world dimension with x\[None\]"):
