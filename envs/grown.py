@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar, TypeVar
+from typing import ClassVar, TypeVar, get_args
 
 import torch
 from torch import Tensor
@@ -14,8 +14,12 @@ from npa_envs.errors import NPAError, shown
 from npa_envs.rule.files import load_rule, shipped_rules
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.checks import check_positive
+from npa_envs.tasks.targets.clouds import Split
 from npa_envs.world.randomness import Purpose, WorldRandom
 from npa_envs.world.rollout import rollout
+
+FIRST_TEST_SEED = 1_000_000
+"""Pools have fewer worlds than this."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,6 +37,10 @@ class GrownConfig(Morphogenesis2DEnvConfig):
     """What grows the worlds: a shipped rule or a rule's file; None: the shipped rule with the
     target's name."""
 
+    split: Split = "train"
+    """Which grown worlds the pool holds: "train", or "test" for others that evaluate what was
+    learned. It needs a `seed_pool`: fresh worlds are told apart by the seeds of `reset`."""
+
     grow_steps: int = 256
     """Steps of the rule from the seed to the grown world."""
 
@@ -40,6 +48,13 @@ class GrownConfig(Morphogenesis2DEnvConfig):
         """Check every field."""
         super().__post_init__()
         check_positive(self, int, "grow_steps")
+        if self.split not in get_args(Split):
+            raise NPAError(f"split must be 'train' or 'test', got {shown(self.split)}")
+        if self.split == "test" and self.seed_pool == 0:
+            raise NPAError(
+                "split must be 'train' where seed_pool=0 grows each episode's world anew: evaluate "
+                "with other seeds of reset, or give seed_pool=4"
+            )
 
 
 Config = TypeVar("Config", bound=GrownConfig)
@@ -58,6 +73,11 @@ class GrownTask(PictureTask[Config]):
             NPAError: There is no such rule, or it is one of other worlds.
         """
         return _load_rule(self.config, self.device)
+
+    @property
+    def first_pool_seed(self) -> int:
+        """Seed of the first world of the pool, far from the other split's."""
+        return 0 if self.config.split == "train" else FIRST_TEST_SEED
 
     @property
     def start_is_short(self) -> bool:

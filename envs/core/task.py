@@ -204,11 +204,18 @@ class EnvTask(WorldTask[Config]):
             success = torch.full((len(start.x),), threshold, device=self.device)
         return start._replace(success_loss=success)
 
+    @property
+    def first_pool_seed(self) -> int:
+        """Seed of the first world of the pool; each of the others has one more."""
+        return 0
+
     def pool(self) -> Start:
         """Return the worlds that episodes start from, made when first asked for."""
         if self._pool is None:
             # Not the streams that episodes with these seeds go on with.
-            random = WorldRandom(range(self.config.seed_pool), device=self.device)
+            first = self.first_pool_seed
+            seeds = range(first, first + self.config.seed_pool)
+            random = WorldRandom(seeds, device=self.device)
             made = self.fresh(random.beside(Purpose.GROWTH))
             self._pool = self._as_start("fresh", made)
         return self._pool

@@ -288,6 +288,20 @@ def test_seed_pool_repeats_its_starts():
     assert len(starts) == 3
 
 
+def test_a_test_split_grows_other_worlds_than_those_to_learn_from():
+    name, given = "npa/Regeneration2D-v0", {"particle_count": 64, "grow_steps": 4, "seed_pool": 2}
+    train, same, test = (
+        gymnasium.make(name, **given, split=split).unwrapped.task.pool().x
+        for split in ("train", "train", "test")
+    )
+    assert torch.equal(train, same)
+    assert not any(torch.equal(old, new) for old in train for new in test)
+    with pytest.raises(NPAError, match="split must be 'train' where seed_pool=0"):
+        gymnasium.make(name, **(given | {"seed_pool": 0}), split="test")
+    with pytest.raises(NPAError, match="split must be 'train' or 'test', got 'eval'"):
+        gymnasium.make(name, **given, split="eval")
+
+
 def test_regeneration_starts_grown_and_damaged():
     grown = npa_envs.load_rule("gecko")
     env = gymnasium.make(
