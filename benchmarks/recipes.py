@@ -156,7 +156,7 @@ SEVENTH: Fields = {
     "learning_rate": 2e-3,
     "initial_rule": "heart",
 }
-"""What serves `fast`, in large: half of the worlds are seeds, none grows old. Not yet at full size."""
+"""What serves `fast`, in large: half of the worlds are seeds, none is old. Not yet at full size."""
 
 FAST_BEFORE: Fields = {
     **NO_STRAYS,
