@@ -29,6 +29,9 @@ WARP_UNITS = 32
 LAYER_REGISTERS, GRADIENT_REGISTERS = 168, 255
 """Registers of a thread of the two kinds of kernels."""
 
+WIDE, WIDE_REGISTERS = range(81, 97), 128
+"""Columns of rows, 3D's with 16 channels, that want more warps instead of registers, and those."""
+
 
 @functools.cache
 def two_layer_kernel(steps: int, tiles: int, mode: str) -> wp.Kernel:
@@ -49,6 +52,7 @@ def two_layer_kernel(steps: int, tiles: int, mode: str) -> wp.Kernel:
     multiple of 4 columns, outputs of 8 bytes and 2 columns; fragments begin at 16 bytes, too.
     """
     name = f"npa_envs.kernels.network_{mode}_{steps}_{tiles}"
+    registers = WIDE_REGISTERS if max(16 * steps, 8 * tiles) in WIDE else LAYER_REGISTERS
 
     @native.func_native(steps, tiles, mode.upper(), ROW_TARGET)
     def two_layers(
@@ -61,9 +65,7 @@ def two_layer_kernel(steps: int, tiles: int, mode: str) -> wp.Kernel:
         output: wp.array(dtype=wp.float32, ndim=2),
     ): ...
 
-    @wp.kernel(
-        enable_backward=False, module=native.module(name), cuda_max_registers=LAYER_REGISTERS
-    )
+    @wp.kernel(enable_backward=False, module=native.module(name), cuda_max_registers=registers)
     def network_layers(
         unit_count: wp.int32,
         rows: wp.array(dtype=wp.float32, ndim=2),
