@@ -354,10 +354,13 @@ class _Recording:
             (result, bar) for result, bar in zip(results, bars, strict=True) if result.requires_grad
         ]
         sources = [tensor for tensor, flag in zip(self._inputs, self._wanted, strict=False) if flag]
+        # A backward pass may be replayed twice. Freed as it goes, the graph would leave memory that
+        # it reads, such as the arranged weights of steps to recompute, to what comes after.
         gradients = torch.autograd.grad(
             [result for result, _ in pairs],
             sources,
             [bar for _, bar in pairs],
+            retain_graph=True,
             allow_unused=True,
             materialize_grads=True,
         )

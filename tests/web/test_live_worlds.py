@@ -158,7 +158,7 @@ def test_a_state_is_injected_elsewhere(world):
     there = {"at": [0.1, 0.0], "radius": 0.08, "strength": 1.0}
     world.handle(brush("inject", source=[-0.1, 0.0], **there))
     gained = world.s[0, :, 0] - s[0, :, 0]
-    inside = np.linalg.norm(x[0].numpy() - [0.1, 0.0], axis=1) < 0.08
+    inside = (x[0] - x.new_tensor([0.1, 0.0])).norm(dim=-1) < 0.08
     assert float(gained[inside].max()) > 0.3
     assert float(gained[~inside].abs().max()) == 0.0
     assert torch.equal(world.x, x)
