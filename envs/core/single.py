@@ -214,7 +214,8 @@ class NPAEnv(gymnasium.Env[Any, Any]):
             paid = ended or late or int(worlds.elapsed[0]) == config.episode_steps
             self._unpaid_steps = 0 if paid else self._unpaid_steps + 1
         self._show()
-        return self.form.seen(observation[0]), numbers[0], ended, late, info
+        seen = self.form.seen(worlds.told_observation(observation)[0])
+        return seen, numbers[0], ended, late, info
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return the world's picture, shape [R, R, 3], in the mode "rgb_array"."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -194,6 +194,12 @@ class Worlds(Batch):
         # Each world's ending, then whether the actions were finite.
         self._endings = torch.zeros(world_count + 1, dtype=torch.uint8, device=device)
         self._host_endings, self._host_numbers = self._for_host()
+        self._perceived: Tensor | None = None
+        """What is perceived, [B, N, P], where a step is one graph."""
+        self._host_perceived: Tensor | None = None
+        """The same of a single world that is handed out as arrays, in pinned memory."""
+        self._told_perceived = False
+        """Whether that is of the last step, after which no world began anew."""
         self._actions = Actions(
             self.x,
             self.s,
@@ -215,8 +221,9 @@ class Worlds(Batch):
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what only the next step needs, and which cannot be pickled."""
-        none = dict.fromkeys(("_surveyed", "_judgement", "_host_endings", "_host_numbers"))
-        return self.__dict__ | none
+        places = ("_host_endings", "_host_numbers", "_perceived", "_host_perceived")
+        none = dict.fromkeys(("_surveyed", "_judgement", *places))
+        return self.__dict__ | none | {"_told_perceived": False}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Make again what was left out."""
@@ -321,6 +328,7 @@ class Worlds(Batch):
         What is perceived in them is written into the observation of all, shape [B, N, P].
         """
         index = sent(worlds, self.x.device)
+        self._told_perceived = False
         paid, elapsed = self.report.copy(), self.elapsed.clone()
         own = None if self.particle_reward is None else self.particle_reward.clone()
         self.restart(worlds, observation)
@@ -376,6 +384,13 @@ class Worlds(Batch):
             # To copy actions takes less than to launch what one graph then does.
             self._actions.hold(action)
             self._act()
+            assert self._beside is not None, "it was CUDA just now"
+            assert self._perceived is not None, "it was perceived just now"
+            self._beside.mark()
+            self._told_perceived = self._host_perceived is not None
+            if out is not None:
+                return out.copy_(self._perceived)
+            return self._perceived if self._told_perceived else self._perceived.clone()
         else:
             self._draw()
             self._actions.apply(action)
@@ -387,16 +402,31 @@ class Worlds(Batch):
         return self._surveyed.perceive(out)
 
     def _act_and_look(self) -> None:
-        """Apply the actions that are held, and look."""
+        """Apply the actions that are held; judge the worlds and, beside that, perceive."""
         self._actions.draw()
         self._actions.apply_held()
-        self._judge_and_survey()
+        with self._judging_beside():
+            if self._perceived is None:
+                self._perceived = self.x.new_empty(*self.x.shape[:2], self.physics.perception_dim)
+                if self.world_count == 1 and self.task.config.output == "numpy":
+                    self._host_perceived = torch.empty_like(
+                        self._perceived, device="cpu", pin_memory=True
+                    )
+            survey_worlds(self.x, self.s, self.physics).perceive(self._perceived)
+            if self._host_perceived is not None:
+                self._host_perceived.copy_(self._perceived, non_blocking=True)
 
     def _judge_and_survey(self) -> None:
         """Judge the worlds and, beside that, sort them."""
+        with self._judging_beside():
+            self._surveyed = survey_worlds(self.x, self.s, self.physics)
+
+    @contextlib.contextmanager
+    def _judging_beside(self) -> Iterator[None]:
+        """Judge the worlds, on CUDA beside what is launched inside."""
         with contextlib.nullcontext() if self._beside is None else self._beside.aside():
             self._judge_worlds()
-        self._surveyed = survey_worlds(self.x, self.s, self.physics)
+        yield
         if self._beside is not None:
             self._beside.join()
 
@@ -446,6 +476,18 @@ class Worlds(Batch):
         if when == "reset":
             return self._aimed.told(self.s)
         return {"updated": self._actions.updated()} if self.task.config.tell_updated else {}
+
+    def told_observation(self, observation: Tensor) -> Tensor:
+        """Return what is perceived in a single world after a step, [1, N, P]: where it is told.
+
+        Of worlds that are handed out as arrays the host knows it by the end of the step.
+        """
+        told = self._host_perceived if self._told_perceived else None
+        if told is None:
+            return observation
+        # The next step writes over what is told. NumPy copies it in this thread: torch would wait
+        # for others to wake, which can take milliseconds.
+        return torch.from_numpy(told.numpy().copy())
 
     def told(self) -> list[float]:
         """Return the numbers of a single world's report after a step."""

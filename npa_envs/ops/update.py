@@ -319,12 +319,11 @@ class PreparedActions:
         self._step = (mask, noise, enabled, diverged)
         self._check: PreparedLaunch | None = None
         self._apply: PreparedLaunch | None = None
-        self._sent: _Sent | None = None
         _check_worlds(self._buffer, x, s, mask, noise, enabled, diverged, rules.moving)
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what cannot be pickled."""
-        return self.__dict__ | {"_check": None, "_apply": None, "_sent": None}
+        return self.__dict__ | {"_check": None, "_apply": None}
 
     def __call__(self, action: Tensor) -> None:
         """Apply actions.
@@ -352,11 +351,9 @@ class PreparedActions:
                 f"action must have shape {tuple(buffer.shape)}, got {tuple(action.shape)}"
             )
         if buffer.is_cuda and not action.is_cuda:
-            if self._sent is None:
-                self._sent = _Sent(buffer)
-            self._sent.send(action)
-        else:
-            buffer.copy_(action)
+            # The host would wait for a copy of memory that is not pinned.
+            action = action.to(buffer.dtype).pin_memory()
+        buffer.copy_(action, non_blocking=True)
 
     def apply_held(self) -> None:
         """Apply the actions held last; may be captured in a CUDA graph."""
@@ -386,26 +383,6 @@ class PreparedActions:
         launched = _launch_of(flat, x, s, self._rules, *self._step, aligned=aligned)
         apply = PreparedLaunch(*launched, changing=flat)
         return check, apply
-
-
-class _Sent:
-    """Copies from the host to a tensor of a device, for which the host does not wait.
-
-    Args:
-        tensor: Where they go.
-    """
-
-    def __init__(self, tensor: Tensor) -> None:
-        self._tensor = tensor
-        self._pinned = torch.empty_like(tensor, device="cpu", pin_memory=True)
-        self._gone = torch.cuda.Event()  # type: ignore[no-untyped-call]
-
-    def send(self, values: Tensor) -> None:
-        """Copy values of any dtype; they may change afterwards."""
-        self._gone.synchronize()
-        self._pinned.copy_(values)
-        self._tensor.copy_(self._pinned, non_blocking=True)
-        self._gone.record(torch.cuda.current_stream(self._tensor.device))
 
 
 def _launch_of(

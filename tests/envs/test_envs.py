@@ -549,3 +549,20 @@ def test_a_window_shows_worlds_side_by_side_and_closes_twice(name, world_count):
     assert env.render() is None
     env.close()
     env.close()
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("name", ["npa/Morphogenesis2D-v0", "npa/Gardener2D-v0"])
+def test_arrays_of_a_gpu_are_its_tensors_and_stay(name):
+    traces = []
+    for output in ("numpy", "torch"):
+        env = make(name, device="cuda", output=output)
+        trace = [env.reset(seed=3)]
+        space = env.action_space
+        space.seed(0)
+        trace += [env.step(space.sample()) for _ in range(5)]
+        copies = [np.array(seen) if output == "numpy" else seen.clone() for seen, *_ in trace]
+        trace += [env.step(space.sample()) for _ in range(2)]
+        assert_same(copies, [seen for seen, *_ in trace[:6]])
+        traces.append(trace)
+    assert_same(*traces)
