@@ -217,6 +217,11 @@ def rule_metadata(path: str | Path) -> dict[str, str]:
 
 def _locate(source: str | Path) -> tuple[Path, str | None]:
     """Find the file that `source` means, and the name after '#'."""
+    if not isinstance(source, str | os.PathLike):
+        raise NPAError(
+            f"source must be a rule's name or the path of its file, got {shown(source)}: "
+            "for example 'gecko'"
+        )
     text = str(source)
     known = shipped_rules()
     suffixes = ", ".join(_SUFFIXES)

@@ -124,8 +124,9 @@ def test_public_names_are_there(content: dict[str, Any]) -> None:
         added = set(signatures[name]) - set(expected)
         assert [own for own in signatures[name] if own not in added] == expected, name
         assert all("KEYWORD_ONLY" in own for own in added), name
-    assert names.ids() == content["ids"]
-    assert sorted(npa_envs.shipped_rules()) == content["rules"]
+    for kind, expected in content["ids"].items():
+        assert set(expected) <= set(names.ids()[kind]), kind
+    assert set(content["rules"]) <= set(npa_envs.shipped_rules())
 
 
 def test_documented_names_are_there(content: dict[str, Any]) -> None:

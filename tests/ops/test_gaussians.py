@@ -464,6 +464,7 @@ ONE = torch.zeros(1, 2, 3)
         ({"dilation": math.nan}, "dilation must be finite"),
         ({"pairs_per_particle": 0}, "pairs_per_particle must be at least 1"),
         ({"pairs_per_particle": 2**30}, "split the batch or lower pairs_per_particle"),
+        ({"pairs_per_particle": 10**5000}, "got pairs_per_particle=<int>"),
     ],
 )
 def test_what_does_not_fit_is_a_clear_error(change, message):

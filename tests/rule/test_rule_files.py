@@ -401,6 +401,12 @@ def test_what_can_be_no_path_is_refused_with_what_is_accepted(source: str | Path
     assert len(str(caught.value)) < 400 + len(", ".join(shipped_rules()))
 
 
+@pytest.mark.parametrize("source", [5, pytest.param(10**5000, id="long"), None])
+def test_what_is_neither_name_nor_path_is_refused(source: object) -> None:
+    with pytest.raises(NPAError, match=r"source must be a rule's name or the path .* for example"):
+        load_rule(source)
+
+
 def test_a_rule_is_loaded_on_to_a_device_that_is_there() -> None:
     with pytest.raises(NPAError, match="device must"):
         load_rule("gecko", device="cuda:99")

@@ -256,6 +256,11 @@ def test_points_of_a_ball_are_uniform_in_it(space_dim, device):
     assert float(points.mean(dim=(0, 1)).abs().max()) < SIGMAS * deviation
 
 
+def test_more_points_than_there_is_room_for_are_refused():
+    with pytest.raises(NPAError, match=r"coordinates must be at most .*, got <int>"):
+        uniform_ball(10**5000, 5, 2, 0.2)
+
+
 def test_damage_chooses_every_particle_about_equally_often(device):
     random = WorldRandom(range(50), device=device)
     x = torch.arange(10.0, device=device).view(1, 10, 1).expand(50, 10, 2).contiguous()

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, shown
 from npa_envs.kernels.pictures.blending import TILE_PIXELS, block_kernels, tile_kernels
 from npa_envs.kernels.pictures.gaussians import (
     CHANNELS,
@@ -498,12 +498,12 @@ def render_gaussians(
     if pairs_per_particle is None:
         pairs_per_particle = PAIRS_PER_PARTICLE if means.is_cuda else 0
     elif checked_count("pairs_per_particle", pairs_per_particle) < 1:
-        raise NPAError(f"pairs_per_particle must be at least 1, got {pairs_per_particle}")
+        raise NPAError(f"pairs_per_particle must be at least 1, got {shown(pairs_per_particle)}")
     images = means.shape[0] * cameras.count
     if images * means.shape[1] * pairs_per_particle > LARGEST_INDEX:
         raise NPAError(
             f"pairs must stay below {LARGEST_INDEX} in one batch, got pairs_per_particle="
-            f"{pairs_per_particle} for {images} pictures of {means.shape[1]} particles: "
+            f"{shown(pairs_per_particle)} for {images} pictures of {means.shape[1]} particles: "
             "split the batch or lower pairs_per_particle"
         )
     image, passing, overflow, _ = _Gaussians.apply(  # type: ignore[no-untyped-call]
