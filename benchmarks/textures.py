@@ -181,7 +181,7 @@ def particles(arguments: argparse.Namespace) -> None:
                 optimiser.param_groups[1]["lr"] = 0.03 * left
                 shift = torch.rand(1, 1, 2, generator=generator, device=device) * 2.0 * half
                 pictured = task.picture((x + shift + half) % (2.0 * half) - half, colour)
-                value = task._weighted(*task._compare(pictured)).sum()
+                value = task.weighted(*task.compare_pictures(pictured)).sum()
                 total = value + 10.0 * (colour.abs() - 0.5).relu().mean()
                 optimiser.zero_grad()
                 total.backward()

@@ -184,7 +184,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
         """The view that pictures show: red, green and blue times alpha, and alpha, dimensionless,
         shape [R, R, 4]; rows point up."""
         self._appearance = Appearance(config.sigma, config.anisotropy, config.opacity)
-        self._schedule = ViewSchedule(
+        self.schedule = ViewSchedule(
             len(target.training.pictures),
             config.views_per_iteration,
             seed=config.view_seed,
@@ -192,6 +192,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
             blur_iterations=config.blur_iterations,
             device=device,
         )
+        """Which views, how much blur and which backgrounds an iteration has."""
         self._rule: NPARule | None = None
 
     def for_rule(self, rule: NPARule) -> Morphogenesis3D:
@@ -217,7 +218,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
 
     def begin(self, iteration: int) -> None:
         """Choose the views, backgrounds and blur that `loss` sees from now on."""
-        self._schedule.begin(iteration)
+        self.schedule.begin(iteration)
 
     def gaussians(self, s: Tensor) -> Gaussians:
         """Return how particles look."""
@@ -263,7 +264,7 @@ class Morphogenesis3D(GrowthTask[Morphogenesis3DConfig]):
 
     def compare(self, x: Tensor, s: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss of the views of this iteration, weighted, and its parts."""
-        config, schedule = self.config, self._schedule
+        config, schedule = self.config, self.schedule
         gaussians = self.gaussians(s)
         chosen = some_views(self.target.training, schedule.index)
         wanted = blurred(chosen.pictures.to(x), schedule.sigma)

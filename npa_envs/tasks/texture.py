@@ -191,7 +191,7 @@ class Texture(ParticleTask[TextureConfig]):
 
     def picture(self, x: Tensor, s: Tensor) -> Tensor:
         """Return the picture of each world: colour sums and density, shape [B, R, R, 4]."""
-        return self._splat(x, s[..., -3:] + COLOUR_OFFSET)
+        return self.splat(x, s[..., -3:] + COLOUR_OFFSET)
 
     def drawing(self, number: int, *, shifted: bool = True) -> Tensor:
         """Return the target as particles draw it: a jittered lattice of them, with its colours.
@@ -216,7 +216,7 @@ class Texture(ParticleTask[TextureConfig]):
         shift = shifted * torch.rand(2, generator=generator, dtype=torch.float64)
         x = ((places[kept] + shift) % 1.0 - 0.5) * side
         colour = seen[kept, :3] / seen[kept, 3:]
-        return self._splat(x[None].to(self.target_picture), colour[None].to(self.target_picture))
+        return self.splat(x[None].to(self.target_picture), colour[None].to(self.target_picture))
 
     @cached_property
     def drawable(self) -> Tensor:
@@ -234,7 +234,7 @@ class Texture(ParticleTask[TextureConfig]):
         Raises:
             NPAError: The loss needs weights that are missing.
         """
-        return self._compare(self.picture(x - x[:, :1].detach(), s))
+        return self.compare_pictures(self.picture(x - x[:, :1].detach(), s))
 
     def weights(self) -> tuple[float, float]:
         """Return what both parts of `texture_losses` are multiplied by; joint losses are weighted
@@ -245,7 +245,7 @@ class Texture(ParticleTask[TextureConfig]):
 
     def metric(self, x: Tensor, s: Tensor) -> Tensor:
         """Return each world's texture loss, colour and density weighted, shape [B]."""
-        return self._weighted(*self.texture_losses(x, s))
+        return self.weighted(*self.texture_losses(x, s))
 
     def particle_shares(self, x: Tensor, s: Tensor) -> Tensor:
         """Return each particle's share of its world's texture loss, times N; [B, N].
@@ -257,10 +257,10 @@ class Texture(ParticleTask[TextureConfig]):
         blank = s.new_zeros(*s.shape[:2], 3).requires_grad_()
         with torch.enable_grad():
             picture = self.picture(x, s).requires_grad_()
-            loss = self._weighted(*self._compare(picture))
+            loss = self.weighted(*self.compare_pictures(picture))
             (slope,) = torch.autograd.grad(loss.sum(), picture)
             # The picture is linear in the colours: its pull-back sums over a particle's patch.
-            drawn = self._splat(x, blank)
+            drawn = self.splat(x, blank)
             (pulled,) = torch.autograd.grad(drawn, blank, slope, retain_graph=True)
             by_density = torch.zeros_like(slope)
             by_density[..., 0] = slope[..., 3]
@@ -272,7 +272,7 @@ class Texture(ParticleTask[TextureConfig]):
     def compare(self, x: Tensor, s: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the batch's texture loss, weighted, and its colour and density terms."""
         colour, density = (term.mean() for term in self.texture_losses(x, s))
-        return self._weighted(colour, density), {"colour": colour, "density": density}
+        return self.weighted(colour, density), {"colour": colour, "density": density}
 
     def penalties(
         self, x: Tensor, s: Tensor, path_length: Tensor
@@ -281,7 +281,8 @@ class Texture(ParticleTask[TextureConfig]):
         motion = self.config.motion_weight, path_length.mean()
         return {"motion": motion, **super().penalties(x, s, path_length)}
 
-    def _splat(self, x: Tensor, colour: Tensor) -> Tensor:
+    def splat(self, x: Tensor, colour: Tensor) -> Tensor:
+        """Return the picture of particles at x, [B, N, 2], in colours [B, N, 3]: [B, R, R, 4]."""
         half = 0.5 * self.config.box_size
         return periodic_splat(
             x,
@@ -293,24 +294,26 @@ class Texture(ParticleTask[TextureConfig]):
             hi=half,
         )
 
-    def _compare(self, picture: Tensor) -> tuple[Tensor, Tensor]:
+    def compare_pictures(self, picture: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the losses of pictures' colours and densities, [B] each."""
         compare_colours, compare_densities = self._losses
         channels = picture.movedim(-1, 1)
         if compare_densities is None:
-            joint = compare_colours(self._joint_image(channels))
+            joint = compare_colours(self.joint_image(channels))
             return joint, torch.zeros_like(joint)
         # One by one: the end of a tensor, which lies elsewhere in other batches, rounds otherwise.
         density = torch.stack([density_image(world) for world in channels[:, 3:]])
         return compare_colours(colour_image(channels)), compare_densities(density)
 
-    def _joint_image(self, channels: Tensor) -> Tensor:
+    def joint_image(self, channels: Tensor) -> Tensor:
         """Return colours and densities, shape [..., 4, R, R], each times the root of its weight."""
         density = (channels[..., 3:, :, :] + DENSITY_FLOOR) ** JOINT_POWER
         colour_scale = self.config.colour_weight**0.5
         density_scale = self.config.density_weight**0.5
         return torch.cat((colour_scale * colour_image(channels), density_scale * density), dim=-3)
 
-    def _weighted(self, colour: Tensor, density: Tensor) -> Tensor:
+    def weighted(self, colour: Tensor, density: Tensor) -> Tensor:
+        """Return the sum of both losses, each times its weight."""
         colour_weight, density_weight = self.weights()
         return colour_weight * colour + density_weight * density
 
@@ -320,7 +323,7 @@ class Texture(ParticleTask[TextureConfig]):
         config = self.config
         options = LossOptions(self.target.tiles, config.loss_seed, config.vgg_weights)
         if is_joint(config.loss):
-            drawable = self._joint_image(self.drawable.movedim(-1, 0))
+            drawable = self.joint_image(self.drawable.movedim(-1, 0))
             return make_texture_loss(config.loss, drawable, options), None
         target = self.target_picture.movedim(-1, 0)
         return (

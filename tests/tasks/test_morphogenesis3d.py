@@ -167,7 +167,7 @@ def test_loss_sees_the_views_of_its_iteration_before_their_backgrounds(task):
     later, parts = task.loss(x, s, far)
     assert float(first) != float(later)
     # No blur is left: by hand, over the training views that the schedule says.
-    schedule = task._schedule
+    schedule = task.schedule
     assert float(schedule.sigma) == 0.0
     chosen = some_views(task.target.training, schedule.index)
     found = task.views(x, s, chosen.cameras)

@@ -190,11 +190,11 @@ def test_mutated_worlds_keep_their_states(folder):
     assert_goals_fit(new_x, new_goal, task.clouds)
 
 
-def test_accuracies_are_those_of_a_rollout(task):
+def test_accuracies_are_those_of_a_rollout(task, device):
     task = task.on("test")
     rule = task.make_rule(random(3))
     sure = PointClassificationConfig(data=task.config.data, update_prob=1.0, **SMALL)
-    task = PointClassification(sure, device=task._device).on("test")
+    task = PointClassification(sure, device=device).on("test")
     with torch.no_grad():
         for parameter in rule.parameters():
             parameter.mul_(10.0)

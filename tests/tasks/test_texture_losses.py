@@ -63,7 +63,7 @@ def test_patch_distance_equals_plain_arithmetic(channels):
     target = texture("dots", 48, torch.float64)[:channels]
     image = noise(channels, 48, 48, dtype=torch.float64)
     descriptor = PatchDescriptor(target, seed=5)
-    directions = [d.numpy() for d in descriptor._directions]
+    directions = [d.numpy() for d in descriptor.directions]
     assert len(directions) == 3
     for d in directions:
         np.testing.assert_allclose(d.T @ d, np.eye(25 * channels), rtol=0.0, atol=1e-12)
@@ -82,13 +82,13 @@ def test_filter_distance_equals_plain_arithmetic():
     target = texture("grid", 24, torch.float64)
     image = noise(3, 24, 24, dtype=torch.float64)
     descriptor = FilterDescriptor(target, seed=2)
-    first, _ = descriptor._levels[0]
+    first, _ = descriptor.levels[0]
     torch.testing.assert_close(first.norm(dim=0), torch.ones(FILTERS).double())
     torch.testing.assert_close(first[:, 3:].sum(0), torch.zeros(FILTERS - 3).double())
 
     def tables(image):
         result = []
-        for level, (first, second) in zip(halves(image, 2), descriptor._levels, strict=True):
+        for level, (first, second) in zip(halves(image, 2), descriptor.levels, strict=True):
             signed = rolled_patches(level, 5) @ first.numpy()
             features = np.maximum(np.concatenate([signed, -signed], axis=1), 0.0)
             side = level.shape[-1]
@@ -155,7 +155,7 @@ def test_nothing_is_read_across_the_edges_of_a_target_that_does_not_tile():
     image = noise(3, 16, 16, dtype=torch.float64)
     descriptor = PatchDescriptor(image, seed=0)
     (found,) = descriptor(image[None], wrap=False, thinned=False)
-    every = rolled_patches(image.numpy(), 5) @ descriptor._directions[0].numpy()
+    every = rolled_patches(image.numpy(), 5) @ descriptor.directions[0].numpy()
     inside = every.reshape(16, 16, -1)[2:-2, 2:-2].reshape(144, -1)
     np.testing.assert_allclose(found[0].numpy(), inside, rtol=0.0, atol=1e-14)
 

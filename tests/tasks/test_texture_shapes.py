@@ -25,7 +25,7 @@ SMALL = TextureConfig(target="hearts", particle_count=300, resolution=24, hidden
 
 def target_of(name, resolution=48, dtype=torch.float64):
     task = Texture(TextureConfig(target=name, particle_count=1024, resolution=resolution))
-    return task._joint_image(task.drawable.movedim(-1, 0)).to(dtype)
+    return task.joint_image(task.drawable.movedim(-1, 0)).to(dtype)
 
 
 def noise(*shape, seed=0):
@@ -80,7 +80,7 @@ def test_random_filters_answer_as_sums_over_patches_do():
     image = noise(2, 16, 16)
     filters = RandomFilters(image, seed=1)
     fields = filters(image[None], wrap=True)[0]
-    kernel = torch.fft.irfft2(filters._waves.conj(), s=(16, 16))[40]
+    kernel = torch.fft.irfft2(filters.filter_waves.conj(), s=(16, 16))[40]
     by_hand = sum(
         kernel[channel, r, c] * image[channel].roll((-r, -c), (0, 1))
         for channel in range(2)
@@ -94,13 +94,13 @@ def test_random_filters_answer_as_sums_over_patches_do():
 def test_wavelets_share_out_all_waves_but_the_longest():
     filters = RectifiedWavelets(noise(1, 64, 64))
     # A wave and its opposite are one real wave: both halves of the plane count.
-    power = filters._bank.square().sum(0)
-    both = power + power.flip((0, 1)).roll((1, 1), (0, 1)) + filters._low.square()
+    power = filters.bank.square().sum(0)
+    both = power + power.flip((0, 1)).roll((1, 1), (0, 1)) + filters.low.square()
     waves = torch.fft.fftfreq(64, dtype=torch.float64)
     length = torch.hypot(waves[:, None], waves[None])
     middle = both[(length > 0.05) & (length < 0.3)]
     assert float(middle.min()) > 0.5 * float(middle.max())
-    assert float(filters._low[0, 0]) == pytest.approx(1.0)
+    assert float(filters.low[0, 0]) == pytest.approx(1.0)
     upright = noise(1, 64, 1).expand(1, 64, 64)
     fields = filters(upright[None], wrap=True)[0, 2:].reshape(4, 4, 4, 32, 32).mean(dim=(0, 3, 4))
     # Rows that differ, columns that do not: only waves up and down.
@@ -184,14 +184,16 @@ def test_joint_losses_weigh_colours_and_density(name):
     assert float(density) == 0.0
     assert torch.equal(task.metric(x, s), colour)
     # Right colours, but twice as dense: only the density tells, and only as much as it weighs.
-    image = task._joint_image(task.drawing(3).movedim(-1, 1))
+    image = task.joint_image(task.drawing(3).movedim(-1, 1))
     light = Texture(dataclasses.replace(SMALL, loss=name, colour_weight=4.0, density_weight=1e-12))
-    dense = light._joint_image(2.0 * task.drawing(3).movedim(-1, 1))
+    dense = light.joint_image(2.0 * task.drawing(3).movedim(-1, 1))
     assert float(dense[:, 3].max()) < 1e-5
     torch.testing.assert_close(
-        light._joint_image(task.drawing(3).movedim(-1, 1))[:, :3], 2.0 * image[:, :3]
+        light.joint_image(task.drawing(3).movedim(-1, 1))[:, :3], 2.0 * image[:, :3]
     )
-    worse = task._compare(2.0 * task.drawing(3))[0] - task._compare(task.drawing(3))[0]
+    worse = (
+        task.compare_pictures(2.0 * task.drawing(3))[0] - task.compare_pictures(task.drawing(3))[0]
+    )
     assert float(worse) > 0.0
 
 

@@ -87,14 +87,14 @@ def test_shares_average_to_the_loss_and_tell_what_a_particle_changes(loss):
     torch.testing.assert_close(shares.mean(1), task.metric(x, s), rtol=1e-9, atol=0.0)
     # The change of the loss where a particle is drawn a little more strongly, by differences: its
     # colours and its density grow by a share that a twin in the same place adds.
-    compare = task._compare
+    compare = task.compare_pictures
     places = x[:1] - x[:1, :1]
     colour = s[:1, :, -3:] + 0.5
     picture = task.picture(places, s[:1])
     values = []
     for k in (3, 40, 41):
-        twin = task._splat(places[:, k : k + 1], colour[:, k : k + 1])
-        ahead, behind = (task._weighted(*compare(picture + h * twin)) for h in (1e-7, -1e-7))
+        twin = task.splat(places[:, k : k + 1], colour[:, k : k + 1])
+        ahead, behind = (task.weighted(*compare(picture + h * twin)) for h in (1e-7, -1e-7))
         values.append(float(ahead - behind) / 2e-7)
     found = shares[0, [3, 40, 41]]
     assert float(found[0] - found[1]) == pytest.approx(300 * (values[0] - values[1]), rel=1e-4)

@@ -169,12 +169,13 @@ class RandomFilters:
             bank[..., :reach, :reach] = drawn / drawn.flatten(1).norm(dim=1)[:, None, None, None]
             banks.append(bank)
         self._reach = reach
-        self._waves = torch.fft.rfft2(torch.cat(banks).to(like)).conj()
+        self.filter_waves = torch.fft.rfft2(torch.cat(banks).to(like)).conj()
+        """The filters' conjugate Fourier transforms."""
 
     def __call__(self, images: Tensor, *, wrap: bool) -> Tensor:
         """Return the image's channels and the rectified answers at every second place."""
         waves = torch.fft.rfft2(images)
-        answers = torch.einsum("bkrc,fkrc->bfrc", waves, self._waves.to(waves))
+        answers = torch.einsum("bkrc,fkrc->bfrc", waves, self.filter_waves.to(waves))
         fields = torch.fft.irfft2(answers, s=images.shape[-2:]).relu()
         found = torch.cat((images, fields), dim=1)
         inside = images.shape[-1] - (0 if wrap else self._reach - 1)
@@ -223,14 +224,16 @@ class RectifiedWavelets:
                 bank.append(band * beside ** (TURNS - 1))
         low = torch.cos(0.5 * math.pi * (octave + count).clamp(0.0, 1.0))
         self._margin = side // 8
-        self._low = low.to(like)
-        self._bank = torch.stack(bank).to(like)
+        self.low = low.to(like)
+        """Gain of what is left beside all bands, by frequency."""
+        self.bank = torch.stack(bank).to(like)
+        """Gains of the oriented bands, by frequency."""
 
     def __call__(self, images: Tensor, *, wrap: bool) -> Tensor:
         """Return the image's channels, their blur, and the answers, at every second place."""
         waves = torch.fft.fft2(images)
-        blur = torch.fft.ifft2(waves * self._low).real
-        answers = torch.fft.ifft2(waves[:, :, None] * self._bank).flatten(1, 2)
+        blur = torch.fft.ifft2(waves * self.low).real
+        answers = torch.fft.ifft2(waves[:, :, None] * self.bank).flatten(1, 2)
         fields = [images, blur]
         for phase in range(PHASES):
             angle = 2.0 * math.pi * phase / PHASES

@@ -310,16 +310,17 @@ class PatchDescriptor:
     def __init__(self, like: Tensor, *, seed: int) -> None:
         generator = torch.Generator().manual_seed(seed)
         size = like.shape[0] * PATCH * PATCH
-        self._directions = [
+        self.directions = [
             orthogonal(size, size, generator).to(like) for _ in range(level_count(like.shape[-1]))
         ]
+        """Directions for each size of the image, columns of [K PATCH², K PATCH²]."""
 
     def __call__(self, images: Tensor, *, wrap: bool, thinned: bool) -> list[Tensor]:
         """Return the patches' coordinates, [B, M, K PATCH²] for each size."""
-        sizes = pyramid(images, len(self._directions))
+        sizes = pyramid(images, len(self.directions))
         return [
             products(patches(level, PATCH, stride=stride_of(level, thinned), wrap=wrap), direction)
-            for level, direction in zip(sizes, self._directions, strict=True)
+            for level, direction in zip(sizes, self.directions, strict=True)
         ]
 
 
@@ -337,7 +338,8 @@ class FilterDescriptor:
     def __init__(self, like: Tensor, *, seed: int) -> None:
         generator = torch.Generator().manual_seed(seed)
         channels, area = like.shape[0], PATCH * PATCH
-        self._levels: list[tuple[Tensor, Tensor]] = []
+        self.levels: list[tuple[Tensor, Tensor]] = []
+        """Filters of both layers, in columns, for each size of the image."""
         for _ in range(level_count(like.shape[-1])):
             first = torch.randn(channels * area, FILTERS, generator=generator, dtype=torch.float64)
             first -= first.mean(0)
@@ -345,13 +347,13 @@ class FilterDescriptor:
             means = torch.eye(channels, dtype=torch.float64).repeat_interleave(area, 0) / PATCH
             first[:, :channels] = means
             second = orthogonal(2 * FILTERS * SECOND_PATCH**2, 2 * FILTERS, generator)
-            self._levels.append((first.to(like), second.to(like)))
+            self.levels.append((first.to(like), second.to(like)))
 
     def __call__(self, images: Tensor, *, wrap: bool, thinned: bool) -> list[Tensor]:
         """Return the features of both layers, [B, M, 2 FILTERS] for each size and layer."""
         result = []
         for level, (first, second) in zip(
-            pyramid(images, len(self._levels)), self._levels, strict=True
+            pyramid(images, len(self.levels)), self.levels, strict=True
         ):
             signed = products(patches(level, PATCH, stride=1, wrap=wrap), first)
             features = torch.cat((signed, -signed), dim=2).relu()
