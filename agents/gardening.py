@@ -68,6 +68,22 @@ class StillGardener(BrushPolicy):
         return self.still(world_count)
 
 
+class _Draws:
+    """Random numbers of a policy, one sequence a world."""
+
+    def __init__(self, device: torch.device, seed: int) -> None:
+        self._device, self._seed = device, seed
+        self._random: WorldRandom | None = None
+
+    def next(self, world_count: int) -> WorldRandom:
+        """Return the source of the next step's numbers, from the start where worlds are others."""
+        if self._random is None or self._random.world_count != world_count:
+            seeds = range(self._seed, self._seed + world_count)
+            self._random = WorldRandom(seeds, device=self._device).beside(Purpose.POLICY)
+        self._random.advance()
+        return self._random
+
+
 class RandomGardener(BrushPolicy):
     """Act at random, uniformly over the action space.
 
@@ -78,16 +94,14 @@ class RandomGardener(BrushPolicy):
 
     def __init__(self, env: Any, seed: int = 0) -> None:
         super().__init__(env)
-        self._seed = seed
-        self._random: WorldRandom | None = None
+        self._draws = _Draws(self.task.device, seed)
 
     def act(self, world_count: int) -> Tensor:
         """Return numbers from [-1, 1)."""
-        if self._random is None or self._random.world_count != world_count:
-            seeds = range(self._seed, self._seed + world_count)
-            self._random = WorldRandom(seeds, device=self.task.device).beside(Purpose.POLICY)
-        self._random.advance()
-        return 2.0 * self._random.uniform(self.config.brush_count, self.columns.width) - 1.0
+        return (
+            2.0 * self._draws.next(world_count).uniform(self.config.brush_count, self.columns.width)
+            - 1.0
+        )
 
 
 class ScriptedGardener(BrushPolicy):
@@ -227,15 +241,11 @@ class GradientGardener(BrushPolicy):
         self._scripted = ScriptedShepherd(env) if shepherd else ScriptedGardener(env)
         self._horizon, self._iterations = horizon, iterations
         self._learning_rate = learning_rate
-        self._seed = seed
-        self._random: WorldRandom | None = None
+        self._draws = _Draws(self.task.device, seed)
 
     def act(self, world_count: int) -> Tensor:
         """Return the first step of the plan, for the worlds as they are."""
-        if self._random is None or self._random.world_count != world_count:
-            seeds = range(self._seed, self._seed + world_count)
-            self._random = WorldRandom(seeds, device=self.task.device).beside(Purpose.POLICY)
-        self._random.advance()
+        draws = self._draws.next(world_count)
         first = self._scripted.act(world_count)
         plan = torch.stack([first] + [self.still(world_count)] * (self._horizon - 1))
         plan[1:, ..., PLACE] = first[..., PLACE]
@@ -244,7 +254,7 @@ class GradientGardener(BrushPolicy):
         best = plan.detach().clone()
         highest = torch.full((world_count,), -torch.inf, device=self.task.device)
         for _ in range(self._iterations):
-            worth = self.worth(plan)
+            worth = self.worth(plan, draws)
             with torch.no_grad():
                 better = worth > highest
                 highest = torch.where(better, worth, highest)
@@ -256,12 +266,11 @@ class GradientGardener(BrushPolicy):
         return best[0].detach()
 
     @torch.enable_grad()
-    def worth(self, plan: Tensor) -> Tensor:
+    def worth(self, plan: Tensor, draws: WorldRandom) -> Tensor:
         """Return what the worlds earn in the steps of a plan, [T, B, K, W], summed, [B]."""
         worlds, task = self.worlds, self.task
         x, s = worlds.x.detach(), worlds.s.detach()
-        assert self._random is not None, "act has made the draws"
-        random = self._random.beside(Purpose.POLICY)
+        random = draws.beside(Purpose.POLICY)
         earned = torch.zeros(x.shape[0], device=x.device)
         for action in plan:
             x, s = task.tended(x, s, action, random)

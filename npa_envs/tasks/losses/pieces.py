@@ -40,6 +40,49 @@ def check_images(images: Tensor, shape: tuple[int, ...]) -> None:
         )
 
 
+def check_size(target: Tensor) -> None:
+    """Check that a target, [K, R, R], is large enough to be looked at.
+
+    Raises:
+        NPAError: It is too small.
+    """
+    if target.shape[-1] < SMALLEST:
+        raise NPAError(
+            f"resolution must be at least {SMALLEST} pixels, got {target.shape[-1]}: for example 64"
+        )
+
+
+class TextureDistance:
+    """The distance of images from a target; satisfies `TextureLoss`.
+
+    Args:
+        target: The texture (dimensionless), shape [K, R, R].
+    """
+
+    def __init__(self, target: Tensor) -> None:
+        self._shape = tuple(target.shape)
+
+    def __call__(self, images: Tensor) -> Tensor:
+        """Return the distance of each image (dimensionless), shape [B]; differentiable.
+
+        Without gradient images are compared one by one, so that no image depends on the others.
+
+        Args:
+            images: Pictures that tile (dimensionless), shape [B, K, R, R].
+
+        Raises:
+            NPAError: They have another shape than the target.
+        """
+        check_images(images, self._shape)
+        if len(images) > 1 and not (torch.is_grad_enabled() and images.requires_grad):
+            return torch.cat([self.compare(image[None]) for image in images])
+        return self.compare(images)
+
+    def compare(self, images: Tensor) -> Tensor:
+        """Return the distance of each of some checked images, [B]."""
+        raise NotImplementedError
+
+
 def level_count(resolution: int) -> int:
     """Return how many sizes an image is looked at in."""
     count = 1

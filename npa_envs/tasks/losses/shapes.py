@@ -11,11 +11,10 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from npa_envs.errors import NPAError
 from npa_envs.ops import world_mean
 from npa_envs.tasks.losses.pieces import (
-    SMALLEST,
-    check_images,
+    TextureDistance,
+    check_size,
     level_count,
     moment_distance,
     patches,
@@ -36,19 +35,7 @@ EVEN = 0.01
 """Variance that is added to the target's, so that an even target can be compared with, too."""
 
 
-def _one_by_one(images: Tensor) -> bool:
-    """Whether images are compared one by one, so that no image depends on the others."""
-    return len(images) > 1 and not (torch.is_grad_enabled() and images.requires_grad)
-
-
-def _check_size(target: Tensor) -> None:
-    if target.shape[-1] < SMALLEST:
-        raise NPAError(
-            f"resolution must be at least {SMALLEST} pixels, got {target.shape[-1]}: for example 64"
-        )
-
-
-class PatchTransport:
+class PatchTransport(TextureDistance):
     """Relaxed optimal transport of raw patches at several sizes; satisfies `TextureLoss`.
 
     At each size every patch of a world has a nearest patch of the target, and every one of the
@@ -66,8 +53,8 @@ class PatchTransport:
     """
 
     def __init__(self, target: Tensor, *, tiles: bool) -> None:
-        _check_size(target)
-        self._shape = tuple(target.shape)
+        check_size(target)
+        super().__init__(target)
         self._expected = []
         self._scales = []
         for level in pyramid(target[None], level_count(target.shape[-1])):
@@ -77,20 +64,8 @@ class PatchTransport:
             self._expected.append(rows)
             self._scales.append(1.0 / (spread + EVEN))
 
-    def __call__(self, images: Tensor) -> Tensor:
-        """Return the distance of each image (dimensionless), shape [B]; differentiable.
-
-        Without gradient images are compared one by one, so that no image depends on the others.
-
-        Args:
-            images: Pictures that tile (dimensionless), shape [B, K, R, R].
-
-        Raises:
-            NPAError: They have another shape than the target.
-        """
-        check_images(images, self._shape)
-        if _one_by_one(images):
-            return torch.cat([self(image[None]) for image in images])
+    def compare(self, images: Tensor) -> Tensor:
+        """Return the distance of each of some checked images, [B]."""
         total = images.new_zeros(len(images))
         levels = pyramid(images, len(self._expected))
         for level, expected, scale in zip(levels, self._expected, self._scales, strict=True):
@@ -249,7 +224,7 @@ SHIFTS = ((0, 0), (0, 2), (2, 0), (2, 2), (2, -2), (0, 5), (5, 0))
 """Places between two features whose products are averaged, rows and columns."""
 
 
-class GramMatrices:
+class GramMatrices(TextureDistance):
     """The distance of images from a target in how features go together; satisfies `TextureLoss`.
 
     It is the squared difference of the features' means and of the means of their products, relative
@@ -274,9 +249,9 @@ class GramMatrices:
         tiles: bool,
         shifts: tuple[tuple[int, int], ...] = ((0, 0),),
     ) -> None:
-        _check_size(target)
+        check_size(target)
+        super().__init__(target)
         self._features = features
-        self._shape = tuple(target.shape)
         self._shifts = shifts
         field = features(target[None], wrap=tiles)
         sizes = field.square().mean(dim=(0, 2, 3)).sqrt()
@@ -284,20 +259,8 @@ class GramMatrices:
         # Features move round the torus; where the target is none, a few products lie wrong.
         self._expected = self._statistics(field)
 
-    def __call__(self, images: Tensor) -> Tensor:
-        """Return the distance of each image (dimensionless), shape [B]; differentiable.
-
-        Without gradient images are compared one by one, so that no image depends on the others.
-
-        Args:
-            images: Pictures that tile (dimensionless), shape [B, K, R, R].
-
-        Raises:
-            NPAError: They have another shape than the target.
-        """
-        check_images(images, self._shape)
-        if _one_by_one(images):
-            return torch.cat([self(image[None]) for image in images])
+    def compare(self, images: Tensor) -> Tensor:
+        """Return the distance of each of some checked images, [B]."""
         found = self._statistics(self._features(images, wrap=True))
         return (found - self._expected).square().mean(1) / self._expected.square().mean()
 
@@ -312,7 +275,7 @@ class GramMatrices:
         return torch.cat(parts, dim=1)
 
 
-class FeatureTransport:
+class FeatureTransport(TextureDistance):
     """Relaxed optimal transport of features and their moments; satisfies `TextureLoss`.
 
     As `vgg_ot` (Kolkin, Salavon and Shakhnarovich 2019), of features that need no weights.
@@ -327,25 +290,13 @@ class FeatureTransport:
     """
 
     def __init__(self, target: Tensor, features: Features, *, tiles: bool) -> None:
-        _check_size(target)
+        check_size(target)
+        super().__init__(target)
         self._features = features
-        self._shape = tuple(target.shape)
         self._expected = self._rows(features(target[None], wrap=tiles))
 
-    def __call__(self, images: Tensor) -> Tensor:
-        """Return the distance of each image (dimensionless), shape [B]; differentiable.
-
-        Without gradient images are compared one by one, so that no image depends on the others.
-
-        Args:
-            images: Pictures that tile (dimensionless), shape [B, K, R, R].
-
-        Raises:
-            NPAError: They have another shape than the target.
-        """
-        check_images(images, self._shape)
-        if _one_by_one(images):
-            return torch.cat([self(image[None]) for image in images])
+    def compare(self, images: Tensor) -> Tensor:
+        """Return the distance of each of some checked images, [B]."""
         found = self._rows(self._features(images, wrap=True))
         return relaxed_transport(found, self._expected) + moment_distance(found, self._expected)
 

@@ -17,8 +17,9 @@ from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.files import check_torch_archive, home_path, open_regular
 from npa_envs.ops import world_mean
 from npa_envs.tasks.losses.pieces import (
-    SMALLEST,
+    TextureDistance,
     check_images,
+    check_size,
     level_count,
     moment_distance,
     orthogonal,
@@ -99,21 +100,15 @@ TEXTURE_LOSSES: Mapping[str, LossEntry] = {
     ),
     "patch_swd": LossEntry(
         "sliced Wasserstein distance of raw patches at several sizes",
-        lambda target, options: SlicedWasserstein(
-            target, PatchDescriptor(target, seed=options.seed), tiles=options.tiles
-        ),
+        lambda target, options: _sliced(PatchDescriptor, target, options),
     ),
     "filter_swd": LossEntry(
         "sliced Wasserstein distance of two layers of random filters",
-        lambda target, options: SlicedWasserstein(
-            target, FilterDescriptor(target, seed=options.seed), tiles=options.tiles
-        ),
+        lambda target, options: _sliced(FilterDescriptor, target, options),
     ),
     "joint_swd": LossEntry(
         "`patch_swd` of colours and density at once",
-        lambda target, options: SlicedWasserstein(
-            target, PatchDescriptor(target, seed=options.seed), tiles=options.tiles
-        ),
+        lambda target, options: _sliced(PatchDescriptor, target, options),
         joint=True,
     ),
     "patch_ot": LossEntry(
@@ -260,11 +255,7 @@ class SlicedWasserstein:
     """
 
     def __init__(self, target: Tensor, descriptor: Descriptor, *, tiles: bool) -> None:
-        _, height, _ = target.shape
-        if height < SMALLEST:
-            raise NPAError(
-                f"resolution must be at least {SMALLEST} pixels, got {height}: for example 64"
-            )
+        check_size(target)
         self._descriptor = descriptor
         self._shape = tuple(target.shape)
         with torch.no_grad():
@@ -295,6 +286,13 @@ class SlicedWasserstein:
             distance = world_mean(squares.flatten(1)[..., None])[:, 0]
             total = total + scale.to(distance) * distance
         return total
+
+
+def _sliced(
+    make: Callable[..., Descriptor], target: Tensor, options: LossOptions
+) -> SlicedWasserstein:
+    descriptor = make(target, seed=options.seed)
+    return SlicedWasserstein(target, descriptor, tiles=options.tiles)
 
 
 class PatchDescriptor:
@@ -382,7 +380,7 @@ VGG_SMALLEST = 32
 """Pixels along each side that leave the deepest layer more than one place."""
 
 
-class VGGTransport:
+class VGGTransport(TextureDistance):
     """The distance of images from a target; satisfies `TextureLoss`.
 
     For each layer it is the relaxed earth mover's distance under the cosine distance of features,
@@ -409,7 +407,7 @@ class VGGTransport:
                 f"resolution must be at least {VGG_SMALLEST} pixels for vgg_ot, got {height}: "
                 "for example 128"
             )
-        self._shape = tuple(target.shape)
+        super().__init__(target)
         self._features = VGGFeatures(load_vgg_weights(weights), VGG_LAYERS, target)
         generator = torch.Generator().manual_seed(seed)
         self._places: list[Tensor | None] = []
@@ -424,23 +422,8 @@ class VGGTransport:
                 self._places.append(chosen)
                 self._expected.append(_rows(field, chosen))
 
-    def __call__(self, images: Tensor) -> Tensor:
-        """Return the distance of each image (dimensionless), shape [B]; differentiable.
-
-        Without gradient images are compared one by one, so that no image depends on the others.
-
-        Args:
-            images: Pictures that tile (dimensionless), shape [B, K, R, R].
-
-        Raises:
-            NPAError: They have another shape than the target.
-        """
-        check_images(images, self._shape)
-        if torch.is_grad_enabled() and images.requires_grad:
-            return self._compare(images)
-        return torch.cat([self._compare(image[None]) for image in images])
-
-    def _compare(self, images: Tensor) -> Tensor:
+    def compare(self, images: Tensor) -> Tensor:
+        """Return the distance of each of some checked images, [B]."""
         total = images.new_zeros(len(images))
         layers = zip(self._features(images, wrap=True), self._places, self._expected, strict=True)
         for field, places, expected in layers:
