@@ -13,6 +13,7 @@ from typing import Any, get_type_hints
 import tyro
 
 from npa_envs.cli import INTERRUPTED
+from npa_envs.cli.launch import launch
 from npa_envs.cli.output import OutFolder, duration, parse_options
 from npa_envs.cli.report import Training, write_report
 from npa_envs.errors import NPAError
@@ -31,6 +32,7 @@ from npa_envs.training import (
     task_entry,
     train,
 )
+from npa_envs.training.ranks import Ranks, joined_ranks
 
 COMMON = ("target", "iterations", "device", "out")
 """Fields of configurations that stand among the most common options, where a task has them."""
@@ -61,8 +63,13 @@ class TrainOptions:
     config: Path | None = None
     """YAML, TOML or JSON file with field names and values, also `preset`; goes over the preset."""
 
+    gpus: int = 1
+    """GPUs that share the run, each with a process of its own; `--device cpu` shares out the CPU,
+    to try it. `torchrun --nproc-per-node=4 -m npa_envs train ...` does the same."""
+
     resume: bool = False
-    """Go on from the checkpoint in the folder `out`, with the configuration that lies there."""
+    """Go on from the checkpoint in the folder `out`, with the configuration that lies there.
+    `--resume auto`: if there is one; else begin."""
 
     overwrite: bool = False
     """Start anew although the folder `out` holds a run; the run's files are removed."""
@@ -94,10 +101,47 @@ def main(arguments: Sequence[str]) -> int:
             print(text)
             return 0
         raise NPAError(f"train needs a task first: {', '.join(TASKS)}")
-    task_name, rest = arguments[0], arguments[1:]
+    task_name = arguments[0]
     task_entry(task_name)
-    options, config = parse(task_name, starting_configuration(task_name, rest), rest)
-    return run(task_name, options, config, arguments)
+    with joined_ranks() as ranks:
+        asked = None
+        if ranks.first:
+            words = settled(task_name, arguments[1:])
+            asked = words, *parse(task_name, starting_configuration(task_name, words), words)
+        # The first process alone reads files, so that all of them train the same.
+        words, options, config = ranks.told(asked)
+        if options.gpus > 1 and not ranks.together:
+            return launch(options.gpus, ("train", task_name, *words), config.out)
+        return run(task_name, options, config, (task_name, *words), ranks)
+
+
+def settled(task_name: str, words: Sequence[str]) -> list[str]:
+    """Return the options with `--resume auto` decided, and with CUDA as the device of `--gpus`.
+
+    Raises:
+        NPAError: As for `starting_configuration`.
+    """
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    parser.add_argument("--gpus", type=int, default=1)
+    parser.add_argument("--device")
+    parser.add_argument("--resume", nargs="?", choices=("auto",))
+    try:
+        first, _ = parser.parse_known_args(words)
+    except argparse.ArgumentError as error:
+        raise NPAError(f"{error.argument_name}: {error.message}") from error
+    chosen = list(words)
+    if first.gpus > 1 and first.device is None:
+        chosen += ["--device", "cuda"]
+    if first.resume == "auto":
+        if "--resume=auto" in chosen:
+            chosen.remove("--resume=auto")
+        else:
+            place = chosen.index("--resume")
+            del chosen[place : place + 2]
+        _, config = parse(task_name, starting_configuration(task_name, chosen), chosen)
+        if RunFolder(config.out).checkpoint.exists():
+            chosen.append("--resume")
+    return chosen
 
 
 def starting_configuration(task_name: str, arguments: Sequence[str]) -> TrainConfig[Any]:
@@ -168,7 +212,7 @@ def parse(
         )
         task = _of_type(type(defaults.task), parsed.training.task)
         config = _of_type(type(defaults), parsed.training, task=task)
-        return parsed.common, override(
+        return _of_type(TrainOptions, parsed.common), override(
             config, **{name: getattr(parsed.common, name) for name in told}
         )
 
@@ -190,7 +234,11 @@ def _without(source: Any, names: Iterable[str]) -> Any:
 
 
 def run(
-    task_name: str, options: TrainOptions, config: TrainConfig[Any], words: Sequence[str]
+    task_name: str,
+    options: TrainOptions,
+    config: TrainConfig[Any],
+    words: Sequence[str],
+    ranks: Ranks,
 ) -> int:
     """Train, say where everything lies and how to go on, and return the exit code.
 
@@ -199,13 +247,19 @@ def run(
         options: How it runs.
         config: What it runs.
         words: The words after `npa-envs train`.
+        ranks: The processes that share it; the first one speaks for all.
     """
     if options.max_seconds is not None and not 0 < options.max_seconds < math.inf:
         raise NPAError(f"max_seconds must be positive and finite, got {options.max_seconds}")
     folder = RunFolder(config.out)
     resume_command = f"npa-envs train {task_name} --out {shlex.quote(str(config.out))} --resume"
+    if ranks.count > 1:
+        resume_command += f" --gpus {ranks.count}"
+        resume_command += " --device cpu" if config.device == "cpu" else ""
 
     def begun() -> None:
+        if not ranks.first:
+            return
         print("\n".join(announcement(task_name, options, config)))
         print(
             f"writing to {config.out}/ (Ctrl-C stops in order; {resume_command} goes on)",
@@ -225,6 +279,8 @@ def run(
     except KeyboardInterrupt:
         print(f"interrupted; the last checkpoint is {folder.checkpoint}\ngo on: {resume_command}")
         raise
+    if not ranks.first:
+        return INTERRUPTED if result.interrupted else 0
     rules = [folder.rule]
     meet = ""
     if isinstance(config, JointTrainConfig):
@@ -270,7 +326,7 @@ def announcement(
     named = options.preset or default_preset(task_name, config.device)
     source = f"preset {named}" if options.config is None else str(options.config)
     expected = task_entry(task_name).expected_seconds(config)
-    if expected is None:
+    if expected is None or options.gpus > 1:
         time = f"how long that takes on {config.device} the progress bar tells"
     else:
         time = f"about {duration(expected)} on a CPU that has little else to do"

@@ -26,7 +26,10 @@ from npa_envs.tasks.base import (
     task_toward,
 )
 from npa_envs.tasks.train_config import AGEING_BLOCK, TrainConfig
+from npa_envs.training.randomness import RunRandomness, registered, restart
+from npa_envs.training.ranks import Ranks
 from npa_envs.world.cuda_graph import Replayed, capture
+from npa_envs.world.randomness import Randomness, WorldRandom
 from npa_envs.world.rollout import Memory
 
 
@@ -40,6 +43,8 @@ class TrainingCycle:
         device: Where the worlds are.
         schedule: Randomness of the numbers of steps, on the CPU.
         rollout: The rollout to train through; None is the engine's.
+        ranks: The processes that share the run; None: this one alone.
+        by_world: Each world draws by itself, as several processes need it.
     """
 
     def __init__(
@@ -50,25 +55,51 @@ class TrainingCycle:
         device: torch.device,
         schedule: torch.Generator,
         rollout: Rollout | None = None,
+        *,
+        ranks: Ranks | None = None,
+        by_world: bool = False,
     ) -> None:
         self.task = task_for_rule(task, rule)
         """The task, as it is for worlds of this rule."""
         self._rule = rule
         self._config = config
         self._rollout: Rollout = npa_envs.world.rollout.rollout if rollout is None else rollout
-        worlds = torch.Generator(device).manual_seed(config.seed + 1)
-        masks = torch.Generator(device).manual_seed(config.seed + 2)
-        self.generators = {"schedule": schedule, "worlds": worlds, "masks": masks}
-        """Randomness of the steps' numbers, of the worlds, and of the update masks."""
-        x, s, goal = self._seeds(config.pool_size)
+        self._ranks = ranks = Ranks() if ranks is None else ranks
+        self._section = config.pool_size // config.world_count if by_world else config.pool_size
+        if by_world:
+            ranks.check(config)
+        places = ranks.places(config.pool_size, self._section)
+        old = places >= config.pool_size // 2
+        self.random = (
+            RunRandomness.by_world(config, device, schedule, ranks, places[old])
+            if by_world
+            else RunRandomness.of_batch(config, device, schedule)
+        )
+        """What the run draws from."""
+        self._places = places.to(device)
+        self._old = old.nonzero()[:, 0].to(device)
+        x, s, goal = self._seeds(len(places), self.random.pool)
         lifetimes = config.lifetimes if config.ages else None
-        self.pool = WorldPool(x, s, goal, runaway_limit=config.runaway_limit, lifetimes=lifetimes)
-        """Worlds that live on between batches."""
-        batch = x[: config.world_count], s[: config.world_count]
-        goals = None if goal is None else goal[: config.world_count]
+        self.pool = WorldPool(
+            x,
+            s,
+            goal,
+            runaway_limit=config.runaway_limit,
+            lifetimes=lifetimes,
+            places=places,
+            total=config.pool_size,
+        )
+        """Worlds of this process that live on between batches."""
+        numbers = ranks.places(config.world_count, 1)
+        self._fresh_count = int((numbers < config.fresh_count).sum())
+        count = len(numbers)
+        batch = x[:count], s[:count]
+        goals = None if goal is None else goal[:count]
         graphed = device.type == "cuda" and config.cuda_graph
         iteration = GraphedIteration if graphed else EagerIteration
-        self.batch = iteration(self.task, rule, config, *batch, masks, self._rollout, goal=goals)
+        self.batch = iteration(
+            self.task, rule, config, *batch, self.random.masks, self._rollout, goal=goals
+        )
         """Worlds before and after the last rollout, the loss and its gradients."""
         self.optimiser = RuleOptimiser(self.batch.parameters, config)
         """Changes the rule."""
@@ -76,12 +107,14 @@ class TrainingCycle:
         """The running mean of the weights, where the configuration asks for one."""
         self.meter = LossMeter(self.batch)
         """What happened since the last line of the log."""
-        self._index = torch.zeros(config.world_count, dtype=torch.int64, device=device)
+        self._index = torch.zeros(count, dtype=torch.int64, device=device)
         self._age = torch.zeros_like(self._index)
         self._steps = torch.zeros_like(self._index[0])
+        self._lost = torch.zeros_like(self._index[0])
         self._fresh_x, self._fresh_s = (torch.empty_like(t) for t in batch)
         self._fresh_goal = None if goals is None else torch.empty_like(goals)
-        self._grow_old = Replayed(self._age_worlds, device, worlds) if graphed else self._age_worlds
+        worlds, ageing = registered(self.random.worlds), registered(self.random.ageing)
+        self._grow_old = Replayed(self._age_worlds, device, ageing) if graphed else self._age_worlds
         self._draw = Replayed(self._draw_worlds, device, worlds) if graphed else self._draw_worlds
         self._keep = Replayed(self._keep_worlds, device) if graphed else self._keep_worlds
 
@@ -89,14 +122,15 @@ class TrainingCycle:
         """Train for one iteration, and return the steps of its rollout, T."""
         config, batch = self._config, self.batch
         lo, hi = config.steps
-        steps = int(torch.randint(lo, hi, (), generator=self.generators["schedule"]))
+        steps = int(torch.randint(lo, hi, (), generator=self.random.schedule))
         if isinstance(self.task, ScheduledTask):
             self.task.begin(iteration)
         for _ in range(config.ageing_at(iteration) // AGEING_BLOCK):
-            self._grow_old()
+            if len(self._old) > 0:
+                self._grow_old()
         self._draw()
         if not config.ages and iteration % config.seed_interval == 0:
-            self._begin_anew(config.fresh_count)
+            self._begin_anew(self._fresh_count)
         batch.run(steps)
         self.meter.begin(iteration + 1, steps)
         self._steps.fill_(steps)
@@ -106,37 +140,52 @@ class TrainingCycle:
         return steps
 
     def state_dict(self) -> dict[str, Any]:
-        """Return all that changes but the rule, for a checkpoint."""
+        """Return all that changes but the rule, for a checkpoint: of all processes, on the first."""
         return {
             "optimiser": self.optimiser.state_dict(),
-            "pool": {name: tensor for name, tensor in self._pooled() if tensor is not None},
+            "pool": {
+                name: self._ranks.collected(tensor, self._section)
+                for name, tensor in self._pooled()
+                if tensor is not None
+            },
             "meter": self.meter.state_dict(),
-            "random_states": {name: g.get_state() for name, g in self.generators.items()},
+            "random_states": self.random.state_dict(),
             **self.average.state_dict(),
         }
 
     def state_like(self, iteration: int) -> dict[str, Any]:
         """Return what `state_dict` has after so many iterations, with other numbers in it."""
         optimiser = {"state": self.optimiser.moments_like()} if iteration > 0 else {"state": {}}
-        return self.state_dict() | {"optimiser": optimiser}
+        whole = self._config.pool_size
+        pool = {
+            name: tensor[:1].expand(whole, *tensor.shape[1:])
+            for name, tensor in self._pooled()
+            if tensor is not None
+        }
+        return {
+            "optimiser": optimiser,
+            "pool": pool,
+            "meter": self.meter.state_dict(),
+            "random_states": self.random.state_dict(),
+            **self.average.state_dict(),
+        }
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from what `state_dict` returned; before the first iteration."""
+    def load_state_dict(self, state: dict[str, Any], iteration: int) -> None:
+        """Go on after so many iterations from what `state_dict` returned; before the first one."""
         self.optimiser.load_state_dict(state["optimiser"])
         for name, tensor in self._pooled():
             if tensor is not None:
-                tensor.copy_(state["pool"][name])
+                tensor.copy_(self._ranks.own(state["pool"][name], self._section))
         self.meter.load_state_dict(state["meter"])
         self.average.load_state_dict(state)
-        for name, generator in self.generators.items():
-            generator.set_state(state["random_states"][name])
+        self.random.load_state_dict(state["random_states"], iteration, self._config)
 
     @torch.no_grad()
     def _age_worlds(self) -> None:
-        """Run the longer-lived half of the pool for some steps, without gradients."""
-        pool, worlds = self.pool, self.generators["worlds"]
+        """Run the worlds of the longer-lived half of the pool for some steps, without gradients."""
+        pool, old, random = self.pool, self._old, self.random.ageing
         assert pool.age is not None, "made with lifetimes"
-        old = torch.arange(len(pool.x) // 2, len(pool.x), device=pool.x.device)
+        restart(random)
         x, s, goal = pool.read(old)
         x, s, _ = self._rollout(
             self._rule,
@@ -147,24 +196,25 @@ class TrainingCycle:
             box=self.task.box,
             update_prob=self.task.update_prob,
             memory=self._config.memory,
-            generator=worlds,
+            generator=random,
             return_path_length=True,
         )
-        fresh_x, fresh_s, fresh_goal = self._seeds(len(old))
+        fresh_x, fresh_s, fresh_goal = self._seeds(len(old), random)
         goals = None if goal is None or fresh_goal is None else (goal, fresh_goal)
         age = pool.age.index_select(0, old) + AGEING_BLOCK
-        self.meter.count_replaced(pool.write(old, x, s, fresh_x, fresh_s, goals, age))
+        self._lost += pool.write(old, x, s, fresh_x, fresh_s, goals, age).sum()
 
     @torch.no_grad()
     def _draw_worlds(self) -> None:
         """Fill the batch from the pool, and have seeds at hand."""
-        config, worlds = self._config, self.generators["worlds"]
-        self._index.copy_(self.pool.sample(config.world_count, worlds))
+        config, worlds = self._config, self.random.worlds
+        restart(worlds, self.random.masks)
+        self._index.copy_(self.pool.sample(len(self._index), worlds))
         x0, s0, goal = self.pool.read(self._index)
         if config.damage:
             x0, s0, goal = self._damaged(x0, s0, goal)
         # Drawn in every iteration, needed or not: nobody on the host knows which worlds run away.
-        fresh_x, fresh_s, fresh_goal = self._seeds(config.world_count)
+        fresh_x, fresh_s, fresh_goal = self._seeds(len(self._index), worlds)
         self._fresh_x.copy_(fresh_x)
         self._fresh_s.copy_(fresh_s)
         if self._fresh_goal is not None and fresh_goal is not None:
@@ -187,14 +237,14 @@ class TrainingCycle:
         self, x: Tensor, s: Tensor, goal: Tensor | None
     ) -> tuple[Tensor, Tensor, Tensor | None]:
         """Return worlds of the pool damaged, where they are in places of damaged ones."""
-        worlds, whole = self.generators["worlds"], (x, s, goal)
+        worlds, whole = self.random.worlds, (x, s, goal)
         if isinstance(self.task, GoalTask) and goal is not None:
             x, s, goal = self.task.damage_with_goals(x, s, goal, worlds)
         else:
             x, s = self.task.damage(x, s, worlds)
         share = self._config.damage_share
         if share < 1.0:
-            hit = self._index < share * self._config.pool_size
+            hit = self._places[self._index] < share * self._config.pool_size
             x, s = (
                 torch.where(hit[:, None, None], hurt, old)
                 for hurt, old in ((x, whole[0]), (s, whole[1]))
@@ -219,13 +269,19 @@ class TrainingCycle:
             goals = batch.goal, self._fresh_goal
         fresh = self._fresh_x, self._fresh_s
         age = self._age + self._steps if self._config.ages else None
-        replaced = self.pool.write(self._index, batch.x, batch.s, *fresh, goals, age)
-        self.meter.observe(replaced)
+        lost = self.pool.write(self._index, batch.x, batch.s, *fresh, goals, age).sum()
+        lost += self._lost
+        self._lost.zero_()
+        # From here on, all processes have the same numbers.
+        self._ranks.reduce([*batch.gradients, batch.terms], lost)
+        self.meter.observe(lost)
         self.optimiser.prepare_gradients()
 
-    def _seeds(self, world_count: int) -> tuple[Tensor, Tensor, Tensor | None]:
-        worlds, dtype = self.generators["worlds"], self._config.torch_dtype
-        x, s, goal = seed_worlds(self.task, world_count, generator=worlds, device=worlds.device)
+    def _seeds(
+        self, world_count: int, random: Randomness
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        dtype = self._config.torch_dtype
+        x, s, goal = seed_worlds(self.task, world_count, generator=random, device=random.device)
         return x.to(dtype), s.to(dtype), goal
 
     def _pooled(self) -> list[tuple[str, Tensor | None]]:
@@ -243,6 +299,9 @@ class WorldPool:
         runaway_limit: A world with a larger |x| or |s|, or one that is not finite, is not kept.
         lifetimes: Steps that the world in the first place lives, and that in the last, all others
             between; None: for ever.
+        places: Places of these worlds among those of all processes, int64, shape [W]; None: they
+            are all.
+        total: Worlds of all processes; None: W.
     """
 
     def __init__(
@@ -253,6 +312,8 @@ class WorldPool:
         *,
         runaway_limit: float,
         lifetimes: tuple[int, int] | None = None,
+        places: Tensor | None = None,
+        total: int | None = None,
     ) -> None:
         self.x = x
         """Positions [length units], shape [W, N, D]."""
@@ -266,22 +327,27 @@ class WorldPool:
         """Age at which the world of each place has lived, int64, shape [W], or None."""
         if lifetimes is not None:
             lo, hi = map(math.log, lifetimes)
-            logarithms = torch.linspace(lo, hi, len(x), dtype=torch.float64)
-            self.lifetime = logarithms.exp().round().to(x.device, torch.int64)
+            logarithms = torch.linspace(lo, hi, total or len(x), dtype=torch.float64)
+            own = logarithms if places is None else logarithms[places]
+            self.lifetime = own.exp().round().to(x.device, torch.int64)
         self._runaway_limit = runaway_limit
 
-    def sample(self, world_count: int, generator: torch.Generator) -> Tensor:
-        """Draw different worlds; where they have lifetimes, one of each of B equal sections.
+    def sample(self, world_count: int, generator: Randomness) -> Tensor:
+        """Draw different worlds: one of each of B equal sections.
+
+        From a generator and where they have no lifetimes, B of all worlds instead.
 
         Returns:
             Their indices, shape [B].
         """
+        size = len(self.x) // world_count
+        first = torch.arange(0, size * world_count, size, device=self.x.device)
+        if isinstance(generator, WorldRandom):
+            return first + generator.integers(size, 1)[:, 0]
         # The largest of random numbers: unlike randperm, one short kernel and no host copy.
         keys = torch.rand(len(self.x), generator=generator, device=self.x.device)
         if self.age is None:
             return keys.topk(world_count).indices
-        size = len(self.x) // world_count
-        first = torch.arange(0, size * world_count, size, device=self.x.device)
         return first + keys.view(world_count, size).argmax(dim=1)
 
     def ages_of(self, index: Tensor) -> tuple[Tensor, Tensor]:
@@ -350,7 +416,7 @@ class RolloutOptions(TypedDict):
     box: tuple[float, ...] | None
     update_prob: float
     memory: Memory
-    generator: torch.Generator
+    generator: Randomness
     return_path_length: Literal[True]
 
 
@@ -387,7 +453,7 @@ class EagerIteration:
         config: TrainConfig[Any],
         x: Tensor,
         s: Tensor,
-        generator: torch.Generator,
+        generator: Randomness,
         rollout: Rollout | None = None,
         *,
         goal: Tensor | None = None,
@@ -407,8 +473,9 @@ class EagerIteration:
         """The loss and then its named parts, shape [K]."""
         self.parameters = [p for p in rule.parameters() if p.requires_grad]
         """What the gradients are for."""
-        self._gradients = [torch.zeros_like(p) for p in self.parameters]
-        for parameter, buffer in zip(self.parameters, self._gradients, strict=True):
+        self.gradients = [torch.zeros_like(p) for p in self.parameters]
+        """Their `.grad`."""
+        for parameter, buffer in zip(self.parameters, self.gradients, strict=True):
             parameter.grad = buffer
         self._task = task
         self._rule = rule
@@ -444,7 +511,7 @@ class EagerIteration:
         gradients = torch.autograd.grad(
             total, self.parameters, allow_unused=True, materialize_grads=True
         )
-        for buffer, gradient in zip(self._gradients, gradients, strict=True):
+        for buffer, gradient in zip(self.gradients, gradients, strict=True):
             buffer.copy_(gradient)
         self.terms.copy_(torch.stack([total, *parts.values()]).detach())
         self.x.copy_(x.detach())
@@ -472,7 +539,7 @@ class GraphedIteration(EagerIteration):
                     lambda: self._forward_backward(steps),
                     self.x0.device,
                     pool=self._memory_pool,
-                    generator=self._generator,
+                    generator=registered(self._generator),
                     warm_up=None if self._graphs else self._warm_up,
                 )
             self._graphs[steps].replay()
@@ -480,9 +547,15 @@ class GraphedIteration(EagerIteration):
     def _warm_up(self) -> None:
         """Run eagerly once: load kernels and allocate workspaces, which no capture may do."""
         # A resumed run warms up again: the masks that follow must not depend on that.
-        state = self._generator.get_state()
+        generator = self._generator
+        if isinstance(generator, WorldRandom):
+            streams = generator.take(slice(None))
+            self._forward_backward(WARM_UP_STEPS)
+            generator.put(slice(None), streams)
+            return
+        state = generator.get_state()
         self._forward_backward(WARM_UP_STEPS)
-        self._generator.set_state(state)
+        generator.set_state(state)
 
 
 NORM_FLOOR = 1e-8
@@ -661,21 +734,17 @@ class LossMeter:
         """Take note of an iteration, before the optimiser changes the parameters.
 
         Args:
-            replaced: Which of its worlds left the pool, shape [B], bool.
+            replaced: Which of its worlds left the pool, shape [B], bool, or how many, shape [].
         """
         terms = self._iteration.terms
         self._sums += terms
-        self.count_replaced(replaced)
+        self._replaced += replaced.sum()
         # A comparison with NaN is false: one reduction finds both NaN and infinity.
         finite = torch.linalg.vector_norm(terms, math.inf) < math.inf
         first = ~finite & (self._bad[0] == NONE_YET)
         torch.where(first, self._now, self._bad, out=self._bad)
         for name, value in self._observed().items():
             torch.where(first, value, self._snapshot[name], out=self._snapshot[name])
-
-    def count_replaced(self, replaced: Tensor) -> None:
-        """Take note of worlds that left the pool, shape [W], bool."""
-        self._replaced += replaced.sum()
 
     def send(self) -> None:
         """Let the interval's numbers go to the host, and start the next interval."""

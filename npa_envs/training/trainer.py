@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -33,6 +33,7 @@ from npa_envs.tasks.base import GoalTask, Task, differing_fields, task_for_rule,
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.iteration import Rollout, TrainingCycle
 from npa_envs.training.overrides import config_to_dict
+from npa_envs.training.ranks import Ranks
 from npa_envs.training.run_folder import (
     JsonlLog,
     RunFolder,
@@ -80,6 +81,9 @@ class TrainResult:
 class Trainer:
     """Trains a rule on a task.
 
+    Where torch has a default group of processes, they train together: each has its share of the
+    pool and of the batch, and the first one reads and writes the run's files.
+
     Args:
         task: What to learn.
         config: How.
@@ -91,7 +95,8 @@ class Trainer:
     Raises:
         NPAError: There is no such device; the folder cannot be written to, holds a run already
             (without `resume` or `overwrite`), holds one of another task or configuration or a
-            damaged one, or another trainer is writing to it.
+            damaged one, or another trainer is writing to it. Several processes cannot share the
+            batch evenly, or lose each other.
     """
 
     def __init__(
@@ -116,29 +121,48 @@ class Trainer:
         self._board: Any = None
         self._seconds_before = 0.0
         self._started: float | None = None
-        content = self._open_folder(resume=resume, overwrite=overwrite)
+        self._ranks = ranks = Ranks.current()
+        content = None
+        if ranks.first:
+            content = self._open_folder(resume=resume, overwrite=overwrite)
+        content = ranks.told(content)
 
         device = check_device(config.device)
         # While the host waits for the numbers, a GPU would have nothing to do; a CPU has done all.
         self._log_late = device.type == "cuda"
         schedule = torch.Generator().manual_seed(config.seed)
         self.rule = self._make_rule(schedule).to(device, config.torch_dtype)
-        self._cycle = TrainingCycle(task, self.rule, config, device, schedule, rollout)
+        # A run that several processes have begun goes on as it was, if only one is left.
+        by_world = ranks.together or (
+            content is not None and content["random_states"].keys() == {"schedule"}
+        )
+        self._cycle = TrainingCycle(
+            task, self.rule, config, device, schedule, rollout, ranks=ranks, by_world=by_world
+        )
         self.pool = self._cycle.pool
-        rule_bytes = sum(p.nbytes for p in self.rule.parameters())
-        self.folder.prepare(self.pool.x.nbytes + self.pool.s.nbytes + 16 * rule_bytes)
-        with self.folder.locked():
-            self.folder.tidy()
+        if ranks.first:
+            rule_bytes = sum(p.nbytes for p in self.rule.parameters())
+            pool_bytes = ranks.count * (self.pool.x.nbytes + self.pool.s.nbytes)
+            self.folder.prepare(pool_bytes + 16 * rule_bytes)
+        with self._folder_locked():
+            if ranks.first:
+                self.folder.tidy()
             if content is not None:
                 self._restore(content)
-            elif overwrite:
-                self.folder.clear()
-            # Before the first checkpoint, which cannot be resumed without it.
-            write_text(self.folder.config, json.dumps(config_to_dict(config), indent=2) + "\n")
+            if ranks.first:
+                if content is None and overwrite:
+                    self.folder.clear()
+                # Before the first checkpoint, which cannot be resumed without it.
+                text = json.dumps(config_to_dict(config), indent=2)
+                write_text(self.folder.config, text + "\n")
             if content is None:
                 # From the start, so that a run killed early can be resumed, and a disk that is too
                 # full is noticed now.
                 self.save()
+
+    def _folder_locked(self) -> AbstractContextManager[None]:
+        """Return what keeps other runs out of the folder while the first process writes to it."""
+        return self.folder.locked() if self._ranks.first else nullcontext()
 
     def run(self, *, progress: bool = True, max_seconds: float | None = None) -> TrainResult:
         """Train until the end, or until Ctrl-C, SIGTERM or `max_seconds`; then save.
@@ -149,23 +173,28 @@ class Trainer:
 
         Raises:
             DivergedError: The loss is not finite.
-            NPAError: A file cannot be written; the last checkpoint is intact. Or another trainer
-                writes to the folder, or has done so since this one was made.
+            NPAError: A file cannot be written, or a process of several is lost; the last checkpoint
+                is intact. Or another trainer writes to the folder, or has done so since this one
+                was made.
         """
-        with self.folder.locked():
+        with self._folder_locked():
             return self._run(progress, max_seconds)
 
     def _run(self, progress: bool, max_seconds: float | None) -> TrainResult:
-        config, total = self.config, self.config.total_iterations
+        config, total, ranks = self.config, self.config.total_iterations, self._ranks
         start = self._started = time.perf_counter()
-        self._record = next(iter(self._log.records()[-1:]), {})
-        if config.tensorboard:
-            self._board = open_tensorboard(self.folder, self.iteration)
-        bar = tqdm(total=total, initial=self.iteration, disable=not progress, unit="it")
+        seconds = math.inf if max_seconds is None else max_seconds
+        if ranks.first:
+            self._record = next(iter(self._log.records()[-1:]), {})
+            if config.tensorboard:
+                self._board = open_tensorboard(self.folder, self.iteration)
+        visible = progress and ranks.first
+        bar = tqdm(total=total, initial=self.iteration, disable=not visible, unit="it")
         try:
-            with stop_flag() as stop:
-                while self.iteration < total and not stop.is_set():
-                    if max_seconds is not None and time.perf_counter() - start >= max_seconds:
+            with stop_flag(patient=ranks.together) as stop:
+                while self.iteration < total:
+                    asked = stop.is_set() or time.perf_counter() - start >= seconds
+                    if ranks.agree_to_stop(asked, self.iteration):
                         break
                     self.iterate()
                     # Of the iteration before: meanwhile the device has this one to do.
@@ -180,6 +209,7 @@ class Trainer:
                     if "loss" in self._record:
                         bar.set_postfix(loss=f"{self._record['loss']:.4g}", refresh=False)
                 self.save()
+                interrupted = ranks.any(stop.is_set())
         finally:
             bar.close()
             if self._board is not None:
@@ -189,7 +219,7 @@ class Trainer:
             rule=self._cycle.average.rule(self.rule),
             iteration=self.iteration,
             finished=self.iteration >= total,
-            interrupted=stop.is_set(),
+            interrupted=interrupted,
             record=self._record,
             folder=self.folder.path,
         )
@@ -204,12 +234,16 @@ class Trainer:
 
         Raises:
             DivergedError: The loss was not finite in an iteration before; nothing is written.
-            NPAError: A file cannot be written; the last checkpoint is intact.
+            NPAError: A file cannot be written, or several processes do not agree on the parameters;
+                the last checkpoint is intact.
         """
         self._finish_record()
         self._stop_if_diverged()
+        self._ranks.check_same(list(self.rule.parameters()))
         content: dict[str, Any] = {"iteration": self.iteration, "seconds": self._seconds()}
         content |= {"rule": self.rule.state_dict(), **self._cycle.state_dict()}
+        if not self._ranks.first:
+            return
         save_checkpoint(self.folder.checkpoint, self._origin() | content)
         self.folder.note_checkpoint()
         # A rule is passed on: where and on what it was trained is nobody's business.
@@ -273,7 +307,8 @@ class Trainer:
             "learning_rate": begun["learning_rate"],
             "seconds": round(self._seconds(), 3),
         }
-        self._log.append(self._record)
+        if self._ranks.first:
+            self._log.append(self._record)
         if self._board is not None:
             for name, value in self._record.items():
                 if name != "iteration":
@@ -281,6 +316,8 @@ class Trainer:
 
     def _write_picture(self) -> None:
         self._finish_record()
+        if not self._ranks.first:
+            return
         with torch.no_grad():
             picture = self._cycle.task.picture(self._cycle.batch.x, self._cycle.batch.s)
         # Worlds that have goals of their own have no picture in common.
@@ -297,7 +334,10 @@ class Trainer:
         if meter.bad_iteration() is None:
             return
         snapshot = meter.snapshot()
-        save_checkpoint(self.folder.diagnosis, self._origin() | snapshot)
+        for name in snapshot.keys() & {"x0", "s0", "x", "s", "goal"}:
+            snapshot[name] = self._ranks.collected(snapshot[name], section=1)
+        if self._ranks.first:
+            save_checkpoint(self.folder.diagnosis, self._origin() | snapshot)
         raise divergence_error(self.task, self.rule, snapshot, self.folder.diagnosis)
 
     def _open_folder(self, *, resume: bool, overwrite: bool) -> dict[str, Any] | None:
@@ -325,15 +365,20 @@ class Trainer:
         expected = {"rule": self.rule.state_dict(), **self._cycle.state_like(self.iteration)}
         # AdamW's groups are the configuration's, and not read.
         read = content | {"optimiser": {"state": content["optimiser"].get("state")}}
+        if self._ranks.together:
+            # The generators of a process alone are not read.
+            states = content["random_states"]
+            read["random_states"] = {name: states.get(name) for name in expected["random_states"]}
         check_content(read, expected, path)
         self._seconds_before = content["seconds"]
         self.rule.load_state_dict(content["rule"])
         try:
-            self._cycle.load_state_dict(content)
+            self._cycle.load_state_dict(content, self.iteration)
         except RuntimeError as error:
             # Only a generator itself knows whether a state is one of its own.
             raise unusable_checkpoint(path, f"random_states cannot be used ({error})") from error
-        self._log.truncate(self.iteration)
+        if self._ranks.first:
+            self._log.truncate(self.iteration)
 
 
 def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
@@ -364,10 +409,13 @@ def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
 
 
 @contextmanager
-def stop_flag() -> Iterator[threading.Event]:
+def stop_flag(*, patient: bool = False) -> Iterator[threading.Event]:
     """Within the block, the first SIGINT or SIGTERM sets the event; the next one acts as usual.
 
     In a thread other than the main one, where signals cannot be caught, it stays unset.
+
+    Args:
+        patient: The next ones do nothing: torchrun passes on what a terminal has sent already.
     """
     asked = threading.Event()
     if threading.current_thread() is not threading.main_thread():
@@ -380,6 +428,9 @@ def stop_flag() -> Iterator[threading.Event]:
             signal.signal(number, handler)
 
     def stop(number: int, frame: FrameType | None) -> None:
+        if patient:
+            asked.set()
+            return
         asked.set()
         print("\nstopping after this iteration; once more to stop at once", file=sys.stderr)
         give_back()

@@ -1,0 +1,116 @@
+"""Randomness of a training run: of the batch at once, or of each world by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from npa_envs.tasks.train_config import AGEING_BLOCK, TrainConfig
+from npa_envs.training.ranks import Ranks
+from npa_envs.world.randomness import Randomness, WorldRandom
+
+
+@dataclass(frozen=True)
+class RunRandomness:
+    """What a run draws from.
+
+    A process alone has one generator for all worlds and one for all masks. Where several share a
+    run, each world has streams of its own, which follow from the seed, the world's number among
+    those of all processes, and the iteration. So they are the same for any number of processes,
+    and nothing of them has to be kept.
+    """
+
+    schedule: torch.Generator
+    """Numbers of steps and first weights, on the CPU; the same on all processes."""
+    pool: Randomness
+    """The pool's first worlds."""
+    worlds: Randomness
+    """Which worlds a batch has, their damage, and fresh ones."""
+    masks: Randomness
+    """Update masks."""
+    ageing: Randomness
+    """Worlds that grow old without gradients."""
+
+    @classmethod
+    def of_batch(
+        cls, config: TrainConfig[Any], device: torch.device, schedule: torch.Generator
+    ) -> RunRandomness:
+        """Return the randomness of a process alone."""
+        worlds = torch.Generator(device).manual_seed(config.seed + 1)
+        masks = torch.Generator(device).manual_seed(config.seed + 2)
+        return cls(schedule, worlds, worlds, masks, worlds)
+
+    @classmethod
+    def by_world(
+        cls,
+        config: TrainConfig[Any],
+        device: torch.device,
+        schedule: torch.Generator,
+        ranks: Ranks,
+        ageing_places: Tensor,
+    ) -> RunRandomness:
+        """Return the randomness of worlds that several processes share.
+
+        Args:
+            config: The run's configuration.
+            device: Where the worlds are.
+            schedule: Randomness of the numbers of steps.
+            ranks: The processes.
+            ageing_places: Places in the whole pool of this process's worlds that grow old.
+        """
+        batch, pool = config.world_count, config.pool_size
+
+        def streams(purpose: int, total: int, places: Tensor) -> WorldRandom:
+            keys = np.random.default_rng((config.seed, purpose)).integers(
+                2**64, size=total, dtype=np.uint64
+            )
+            return WorldRandom.from_keys(torch.from_numpy(keys.view(np.int64))[places].to(device))
+
+        of_batch = ranks.places(batch, 1)
+        return cls(
+            schedule,
+            pool=streams(0, pool, ranks.places(pool, pool // batch)),
+            worlds=streams(1, batch, of_batch),
+            masks=streams(2, batch, of_batch),
+            ageing=streams(3, pool, ageing_places),
+        )
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return the states of all generators, for a checkpoint."""
+        named = {"schedule": self.schedule, "worlds": self.worlds, "masks": self.masks}
+        return {
+            name: source.get_state()
+            for name, source in named.items()
+            if isinstance(source, torch.Generator)
+        }
+
+    def load_state_dict(
+        self, states: Mapping[str, Tensor], iteration: int, config: TrainConfig[Any]
+    ) -> None:
+        """Go on after so many iterations from what `state_dict` returned."""
+        self.schedule.set_state(states["schedule"])
+        for name, source in (("worlds", self.worlds), ("masks", self.masks)):
+            if isinstance(source, torch.Generator):
+                source.set_state(states[name])
+            else:
+                source.episodes.fill_(iteration)
+        if isinstance(self.ageing, WorldRandom):
+            steps = sum(config.ageing_at(before) for before in range(iteration))
+            self.ageing.episodes.fill_(steps // AGEING_BLOCK)
+
+
+def restart(*sources: Randomness) -> None:
+    """Begin anew what worlds draw by themselves; a generator just goes on."""
+    for source in sources:
+        if isinstance(source, WorldRandom):
+            source.restart()
+
+
+def registered(source: Randomness) -> torch.Generator | None:
+    """Return what a CUDA graph has to know of: streams of worlds are tensors as all others."""
+    return source if isinstance(source, torch.Generator) else None

@@ -1,0 +1,232 @@
+"""Processes that train one rule together: each has a share of the pool and of the batch."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import os
+from collections.abc import Iterator, Sequence
+from typing import Any, TypeVar
+
+import torch
+import torch.distributed as dist
+from torch import Tensor
+
+from npa_envs.errors import NPAError, shown
+from npa_envs.tasks.train_config import TrainConfig
+
+ValueT = TypeVar("ValueT")
+
+AGREE_INTERVAL = 10
+"""Iterations from one question to all processes whether to stop to the next."""
+
+
+class Ranks:
+    """This process among those of a run.
+
+    Pool and batch are cut into as many sections as the batch has worlds. Section k belongs to
+    process k modulo their number. So each process has young and old worlds.
+
+    Args:
+        rank: Number of this process, from 0.
+        count: Number of processes, R.
+        together: They are those of torch's default group, even if there is only one.
+    """
+
+    def __init__(self, rank: int = 0, count: int = 1, *, together: bool = False) -> None:
+        self.rank = rank
+        """Number of this process, from 0."""
+        self.count = count
+        """Number of processes, R."""
+        self.together = together
+        """Whether they are torch's default group."""
+
+    @classmethod
+    def current(cls) -> Ranks:
+        """Return the processes of torch's default group, or this one alone where there is none."""
+        if dist.is_available() and dist.is_initialized():
+            return cls(dist.get_rank(), dist.get_world_size(), together=True)
+        return cls()
+
+    @property
+    def first(self) -> bool:
+        """Whether this is the process that reads and writes the run's files."""
+        return self.rank == 0
+
+    def check(self, config: TrainConfig[Any]) -> None:
+        """Check that a run can be shared.
+
+        Raises:
+            NPAError: The batch cannot be dealt out evenly, or the pool not among its worlds.
+        """
+        batch, pool = config.world_count, config.pool_size
+        if batch % self.count:
+            nearest = max(batch // self.count, 1) * self.count
+            raise NPAError(
+                f"world_count must be a multiple of the number of processes, got {batch} and "
+                f"{self.count}: set world_count={nearest}"
+            )
+        if pool % batch:
+            raise NPAError(
+                f"pool_size must be a multiple of world_count in a run of several processes, got "
+                f"{pool} and {batch}: set pool_size={pool // batch * batch}"
+            )
+
+    def places(self, total: int, section: int) -> Tensor:
+        """Return which of all worlds are this process's, on the CPU, int64, shape [total / R].
+
+        Args:
+            total: Worlds of all processes.
+            section: Worlds of a section.
+        """
+        return self.own(torch.arange(total), section)
+
+    def own(self, worlds: Tensor, section: int) -> Tensor:
+        """Return this process's share of all worlds.
+
+        Args:
+            worlds: One entry for each world of all processes, shape [total, ...].
+            section: Worlds of a section.
+        """
+        return worlds.unflatten(0, (-1, self.count, section))[:, self.rank].flatten(0, 1)
+
+    def collected(self, worlds: Tensor, section: int) -> Tensor:
+        """Return the worlds of all processes, on the CPU where there are several.
+
+        Args:
+            worlds: One entry for each world of this process, shape [n, ...].
+            section: Worlds of a section.
+
+        Returns:
+            Shape [n R, ...] on the first process; what the others get is of no use.
+        """
+        if self.count == 1:
+            return worlds
+        mine = worlds.detach().cpu().contiguous()
+        parts = [torch.empty_like(mine) for _ in range(self.count)] if self.first else None
+        with self._in_touch():
+            dist.gather(mine, parts)
+        if parts is None:
+            return mine
+        return torch.stack([part.unflatten(0, (-1, section)) for part in parts], 1).flatten(0, 2)
+
+    def told(self, value: ValueT) -> ValueT:
+        """Return what the first process gives, on all of them."""
+        if not self.together:
+            return value
+        given = [value]
+        with self._in_touch():
+            dist.broadcast_object_list(given)
+        return given[0]
+
+    def any(self, flag: bool) -> bool:
+        """Return whether the flag is set on any process."""
+        if not self.together:
+            return flag
+        asked = torch.tensor(int(flag))
+        with self._in_touch():
+            dist.all_reduce(asked, op=dist.ReduceOp.MAX)
+        return bool(asked)
+
+    def agree_to_stop(self, asked: bool, iteration: int) -> bool:
+        """Return whether to stop before an iteration, the same on all processes.
+
+        Args:
+            asked: This process was asked to.
+            iteration: Iterations done.
+        """
+        if self.together and iteration % AGREE_INTERVAL:
+            return False
+        return self.any(asked)
+
+    def reduce(self, means: Sequence[Tensor], total: Tensor) -> None:
+        """Replace numbers by their means, and one by its sum, over all processes, in place.
+
+        On CUDA the host waits for nothing, and this can be recorded in a graph.
+
+        Args:
+            means: Tensors of one dtype.
+            total: A count that their dtype holds exactly.
+        """
+        if not self.together:
+            return
+        flat = torch.cat([*(mean.reshape(-1) for mean in means), total.reshape(1).to(means[0])])
+        with self._in_touch():
+            dist.all_reduce(flat)
+        total.copy_(flat[-1])
+        flat /= self.count
+        for mean, part in zip(means, flat.split([*(m.numel() for m in means), 1])[:-1], strict=True):
+            mean.copy_(part.view(mean.shape))
+
+    def check_same(self, tensors: Sequence[Tensor]) -> None:
+        """Check that tensors are the same on all processes, bit for bit.
+
+        Raises:
+            NPAError: They are not.
+        """
+        if self.count == 1:
+            return
+        own = torch.cat([tensor.detach().reshape(-1).double().cpu() for tensor in tensors])
+        low, high = own.clone(), own.clone()
+        with self._in_touch():
+            dist.all_reduce(low, op=dist.ReduceOp.MIN)
+            dist.all_reduce(high, op=dist.ReduceOp.MAX)
+        differing = int((low != high).sum())
+        if differing:
+            raise NPAError(
+                f"the parameters must be the same on all {self.count} processes, but {differing} "
+                f"of {len(own)} differ, by at most {float((high - low).max()):.3g}: the last "
+                "checkpoint is intact; resume it, and look for a faulty device or for processes "
+                "with other versions of a library"
+            )
+
+    @contextlib.contextmanager
+    def _in_touch(self) -> Iterator[None]:
+        try:
+            yield
+        except RuntimeError as error:
+            if isinstance(error, torch.OutOfMemoryError):
+                raise
+            raise NPAError(
+                f"process {self.rank} of {self.count} has lost another one, which has ended or "
+                f"cannot be reached ({shown(error)}): the last checkpoint is intact; see what "
+                "the other process said, then resume"
+            ) from error
+
+
+@contextlib.contextmanager
+def joined_ranks() -> Iterator[Ranks]:
+    """Join the processes that torchrun has started beside this one, within the block.
+
+    Each of them sees one CUDA device, that of its number on its machine. To be called before
+    anything uses CUDA. Outside of torchrun, this process is alone.
+
+    Raises:
+        NPAError: The others cannot be reached.
+    """
+    if not dist.is_available() or not dist.is_torchelastic_launched():
+        yield Ranks()
+        return
+    _choose_device(int(os.environ["LOCAL_RANK"]))
+    backend = "cpu:gloo,cuda:nccl" if dist.is_nccl_available() else "gloo"
+    try:
+        dist.init_process_group(backend)
+    except RuntimeError as error:
+        raise NPAError(
+            f"the processes that torchrun starts must reach each other, but this one cannot "
+            f"({shown(error)}): see its options --rdzv-endpoint and --master-addr"
+        ) from error
+    yield Ranks.current()
+    # Not after an error: others may be gone. Recorded graphs hold on to the group.
+    gc.collect()
+    dist.destroy_process_group()
+
+
+def _choose_device(number: int) -> None:
+    """Let this process see one CUDA device of those that it would see, or none beyond them."""
+    # This asks the driver's manager, and does not start CUDA.
+    if torch.cuda.device_count() == 0:
+        return
+    seen = os.environ.get("CUDA_VISIBLE_DEVICES")
+    devices = [str(number)] if seen is None else seen.split(",")[number : number + 1]
+    os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(devices)
