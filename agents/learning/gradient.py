@@ -21,7 +21,7 @@ from npa_envs.rule.rule import FoldedRule, NPARule
 from npa_envs.tasks.base import Task
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.iteration import TrainingCycle
-from npa_envs.world.randomness import WorldRandom
+from npa_envs.world.randomness import Randomness, WorldRandom
 from npa_envs.world.rollout import Memory
 
 LONGEST = 96
@@ -251,7 +251,7 @@ class EpisodeTask:
         box: tuple[float, ...] | None,
         update_prob: float,
         memory: Memory,
-        generator: torch.Generator,
+        generator: Randomness,
         return_path_length: Literal[True],
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Run a set of rules as the environment would, differentiably; as `npa_envs.rollout`."""

@@ -62,7 +62,7 @@ def launch(count: int, words: Sequence[str], out: Path) -> int:
         name = signal.Signals(-failure.exitcode).name
         raise NPAError(
             f"process {rank} of {count} was ended by {name}, and the others with it (SIGKILL is "
-            f"often a lack of memory): the last checkpoint, {RunFolder(out).checkpoint}, is intact; "
-            "go on from it with --resume"
+            "often a lack of memory): the last checkpoint is intact, "
+            f"{RunFolder(out).checkpoint}; go on from it with --resume"
         ) from error
     return 0

@@ -109,7 +109,9 @@ def main(arguments: Sequence[str]) -> int:
             words = settled(task_name, arguments[1:])
             asked = words, *parse(task_name, starting_configuration(task_name, words), words)
         # The first process alone reads files, so that all of them train the same.
-        words, options, config = ranks.told(asked)
+        asked = ranks.told(asked)
+        assert asked is not None, "said by the first process"
+        words, options, config = asked
         if options.gpus > 1 and not ranks.together:
             return launch(options.gpus, ("train", task_name, *words), config.out)
         return run(task_name, options, config, (task_name, *words), ranks)

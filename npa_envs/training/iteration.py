@@ -140,7 +140,7 @@ class TrainingCycle:
         return steps
 
     def state_dict(self) -> dict[str, Any]:
-        """Return all that changes but the rule, for a checkpoint: of all processes, on the first."""
+        """Return all that changes but the rule, for a checkpoint; of all processes on the first."""
         return {
             "optimiser": self.optimiser.state_dict(),
             "pool": {
@@ -277,9 +277,7 @@ class TrainingCycle:
         self.meter.observe(lost)
         self.optimiser.prepare_gradients()
 
-    def _seeds(
-        self, world_count: int, random: Randomness
-    ) -> tuple[Tensor, Tensor, Tensor | None]:
+    def _seeds(self, world_count: int, random: Randomness) -> tuple[Tensor, Tensor, Tensor | None]:
         dtype = self._config.torch_dtype
         x, s, goal = seed_worlds(self.task, world_count, generator=random, device=random.device)
         return x.to(dtype), s.to(dtype), goal

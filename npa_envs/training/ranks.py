@@ -88,7 +88,8 @@ class Ranks:
             worlds: One entry for each world of all processes, shape [total, ...].
             section: Worlds of a section.
         """
-        return worlds.unflatten(0, (-1, self.count, section))[:, self.rank].flatten(0, 1)
+        dealt = worlds.view(-1, self.count, section, *worlds.shape[1:])
+        return dealt[:, self.rank].flatten(0, 1)
 
     def collected(self, worlds: Tensor, section: int) -> Tensor:
         """Return the worlds of all processes, on the CPU where there are several.
@@ -108,7 +109,8 @@ class Ranks:
             dist.gather(mine, parts)
         if parts is None:
             return mine
-        return torch.stack([part.unflatten(0, (-1, section)) for part in parts], 1).flatten(0, 2)
+        sections = [part.view(-1, section, *part.shape[1:]) for part in parts]
+        return torch.stack(sections, 1).flatten(0, 2)
 
     def told(self, value: ValueT) -> ValueT:
         """Return what the first process gives, on all of them."""
@@ -155,8 +157,10 @@ class Ranks:
             dist.all_reduce(flat)
         total.copy_(flat[-1])
         flat /= self.count
-        for mean, part in zip(means, flat.split([*(m.numel() for m in means), 1])[:-1], strict=True):
-            mean.copy_(part.view(mean.shape))
+        first = 0
+        for mean in means:
+            mean.copy_(flat[first : first + mean.numel()].view(mean.shape))
+            first += mean.numel()
 
     def check_same(self, tensors: Sequence[Tensor]) -> None:
         """Check that tensors are the same on all processes, bit for bit.

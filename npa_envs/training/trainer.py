@@ -336,9 +336,13 @@ class Trainer:
         snapshot = meter.snapshot()
         for name in snapshot.keys() & {"x0", "s0", "x", "s", "goal"}:
             snapshot[name] = self._ranks.collected(snapshot[name], section=1)
+        error = None
         if self._ranks.first:
             save_checkpoint(self.folder.diagnosis, self._origin() | snapshot)
-        raise divergence_error(self.task, self.rule, snapshot, self.folder.diagnosis)
+            error = divergence_error(self.task, self.rule, snapshot, self.folder.diagnosis)
+        error = self._ranks.told(error)
+        assert error is not None, "made by the first process"
+        raise error
 
     def _open_folder(self, *, resume: bool, overwrite: bool) -> dict[str, Any] | None:
         path = self.folder.checkpoint

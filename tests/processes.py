@@ -1,0 +1,53 @@
+"""Processes that share a training run, forked from the test's own."""
+
+import multiprocessing
+import os
+import traceback
+
+import torch.distributed as dist
+
+from npa_envs.errors import NPAError
+
+
+def on_ranks(count, function, folder):
+    """Run a function in each process of a group.
+
+    Returns:
+        By process: what it returned, the message of the NPAError that it raised, or its exit code.
+    """
+    # Forked, they need not load torch again.
+    context = multiprocessing.get_context("fork")
+    pipes = [context.Pipe(duplex=False) for _ in range(count)]
+    store = folder / f"store{len(list(folder.glob('store*')))}"
+    made = [
+        context.Process(target=_run, args=(rank, count, function, str(store), pipes[rank][1]))
+        for rank in range(count)
+    ]
+    for process in made:
+        process.start()
+    results = []
+    for process, (reader, writer) in zip(made, pipes, strict=True):
+        writer.close()
+        try:
+            results.append(reader.recv())
+        except EOFError:
+            process.join()
+            results.append(process.exitcode)
+        process.join()
+    return results
+
+
+def _run(rank, count, function, store, pipe):
+    os.environ["GLOO_SOCKET_IFNAME"] = "lo"
+    try:
+        dist.init_process_group(
+            "gloo", store=dist.FileStore(store, count), rank=rank, world_size=count
+        )
+        pipe.send(function())
+    except NPAError as error:
+        pipe.send(str(error))
+    except BaseException:
+        pipe.send(traceback.format_exc())
+    finally:
+        # What the fork has inherited is its parent's to clean up.
+        os._exit(0)

@@ -1,0 +1,210 @@
+"""Several processes that train one rule: the same curve for any number, and what ends them."""
+
+import os
+import signal
+
+import pytest
+import torch
+from processes import on_ranks
+from training_runs import log_of
+from worlds import assert_same
+
+from npa_envs.errors import NPAError
+from npa_envs.rule.files import load_rule
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
+from npa_envs.training import Trainer, override, preset
+from npa_envs.training.iteration import TrainingCycle
+from npa_envs.training.ranks import Ranks
+from npa_envs.training.run_folder import load_checkpoint
+
+PLAIN = {}
+"""The preset as it is."""
+
+LIVELY = {
+    "lifetimes": (4, 400),
+    "ageing_steps": 64,
+    "ageing_interval": 2,
+    "damage_share": 0.5,
+    "average": 0.9,
+    "world_count": 4,
+    "pool_size": 16,
+    "picture_interval": 2,
+}
+"""Worlds that age, are damaged in some places, and are replaced."""
+
+SEEDED = {"seed_interval": 2, "fresh_share": 0.7, "world_count": 4, "pool_size": 8}
+"""Batches with several fresh seeds."""
+
+
+def tiny(out, **fields):
+    fields = {"iterations": 5, "milestones": [2], "dtype": "float64", "steps": (3, 6)} | fields
+    return preset("tiny", out=out, particle_count=64, resolution=16, **fields)
+
+
+def trained(config, **options):
+    """What a process of a run does; the log is the first one's."""
+    trainer = Trainer(Morphogenesis2D(config.task), config, task_name="morphogenesis2d", **options)
+    return trainer.run(progress=False).interrupted
+
+
+@pytest.fixture(scope="module", autouse=True)
+def loaded_kernels(tmp_path_factory):
+    """Load once what each forked process would have to load by itself."""
+    folder = tmp_path_factory.mktemp("loaded")
+    assert not trained(tiny(folder / "alone", **LIVELY))
+    config = tiny(folder / "grouped", iterations=1, milestones=[1], **LIVELY)
+    TrainingCycle(
+        Morphogenesis2D(config.task),
+        Morphogenesis2D(config.task).make_rule(torch.Generator()).double(),
+        config,
+        torch.device("cpu"),
+        torch.Generator(),
+        by_world=True,
+    ).run(0)
+
+
+def assert_same_curve(folder, other):
+    ours, theirs = log_of(folder), log_of(other)
+    assert len(ours) == len(theirs) > 0
+    for one, two in zip(ours, theirs, strict=True):
+        assert one == pytest.approx(two, rel=1e-10, abs=1e-14)
+    rules = [load_rule(path / "rule.safetensors") for path in (folder, other)]
+    for one, two in zip(*(rule.parameters() for rule in rules), strict=True):
+        torch.testing.assert_close(one, two, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("fields", [PLAIN, LIVELY, SEEDED], ids=["plain", "lively", "seeded"])
+def test_two_processes_have_the_curve_of_one(tmp_path, fields):
+    for count in (1, 2):
+        config = tiny(tmp_path / str(count), **fields)
+        assert on_ranks(count, lambda c=config: trained(c), tmp_path) == [False] * count
+    assert_same_curve(tmp_path / "1", tmp_path / "2")
+    pools = [load_checkpoint(tmp_path / n / "checkpoint.pt")["pool"] for n in ("1", "2")]
+    assert pools[0].keys() == pools[1].keys()
+    for name in pools[0]:
+        torch.testing.assert_close(pools[0][name], pools[1][name], rtol=1e-9, atol=1e-12)
+
+
+def test_a_run_goes_on_with_another_number_of_processes(tmp_path):
+    whole, parts = (tiny(tmp_path / name, **LIVELY) for name in ("whole", "parts"))
+    on_ranks(1, lambda: trained(whole), tmp_path)
+    first = override(parts, iterations=5, checkpoint_interval=2)
+
+    def until_the_fourth():
+        trainer = Trainer(Morphogenesis2D(first.task), first, task_name="morphogenesis2d")
+        for _ in range(3):
+            trainer.iterate()
+        trainer.save()
+
+    assert on_ranks(2, until_the_fourth, tmp_path) == [None, None]
+    # Alone, outside of any group, and all the same as it was begun.
+    assert not trained(override(parts, checkpoint_interval=2), resume=True)
+    end = [load_checkpoint(tmp_path / name / "checkpoint.pt") for name in ("whole", "parts")]
+    for name in end[0]["rule"]:
+        torch.testing.assert_close(end[0]["rule"][name], end[1]["rule"][name])
+    # A run that one process has begun alone goes on with several.
+    alone = tiny(tmp_path / "alone", world_count=2, pool_size=8)
+    trained(alone)
+    longer = override(alone, repeats=2)
+    assert on_ranks(2, lambda: trained(longer, resume=True), tmp_path) == [False, False]
+    assert [record["iteration"] for record in log_of(tmp_path / "alone")] == list(range(1, 11))
+    # And one that several have begun knows its own randomness from then on.
+    saved = load_checkpoint(tmp_path / "alone" / "checkpoint.pt")
+    assert list(saved["random_states"]) == ["schedule"]
+
+
+def test_parameters_that_differ_are_refused_and_the_checkpoint_stays(tmp_path):
+    config = tiny(tmp_path / "run")
+
+    def drift():
+        trainer = Trainer(Morphogenesis2D(config.task), config, task_name="morphogenesis2d")
+        if not Ranks.current().first:
+            with torch.no_grad():
+                next(trainer.rule.parameters())[0, 0] += 0.5
+        trainer.iterate()
+        trainer.save()
+
+    for said in on_ranks(2, drift, tmp_path):
+        assert "parameters must be the same on all 2 processes, but " in said
+        assert "by at most 0.5" in said
+    assert load_checkpoint(tmp_path / "run" / "checkpoint.pt")["iteration"] == 0
+
+
+def test_a_lost_process_ends_the_others_and_the_run_goes_on_from_its_checkpoint(tmp_path):
+    config = tiny(tmp_path / "run", iterations=30, checkpoint_interval=2)
+
+    def lost():
+        trainer = Trainer(Morphogenesis2D(config.task), config, task_name="morphogenesis2d")
+        iterate = trainer.iterate
+
+        def dying():
+            if trainer.iteration == 5 and not Ranks.current().first:
+                os.kill(os.getpid(), signal.SIGKILL)
+            iterate()
+
+        trainer.iterate = dying
+        trainer.run(progress=False)
+
+    said, code = on_ranks(2, lost, tmp_path)
+    assert "process 0 of 2 has lost another one" in said
+    assert code == -signal.SIGKILL
+    assert load_checkpoint(tmp_path / "run" / "checkpoint.pt")["iteration"] == 4
+    assert trained(config, resume=True) is False
+    assert log_of(tmp_path / "run")[-1]["iteration"] == 30
+
+
+def test_all_processes_stop_after_the_same_iteration_where_one_is_asked_to(tmp_path):
+    config = tiny(tmp_path / "run", iterations=60)
+
+    def asked():
+        trainer = Trainer(Morphogenesis2D(config.task), config, task_name="morphogenesis2d")
+        iterate = trainer.iterate
+
+        def stopping():
+            if trainer.iteration == 3 and not Ranks.current().first:
+                # Twice: torchrun passes on what a terminal has sent already.
+                os.kill(os.getpid(), signal.SIGTERM)
+                os.kill(os.getpid(), signal.SIGTERM)
+            iterate()
+
+        trainer.iterate = stopping
+        return trainer.run(progress=False).interrupted, trainer.iteration
+
+    assert on_ranks(2, asked, tmp_path) == [(True, 10), (True, 10)]
+    assert load_checkpoint(tmp_path / "run" / "checkpoint.pt")["iteration"] == 10
+
+
+def test_worlds_of_all_processes_are_diagnosed_when_the_loss_is_not_finite(tmp_path):
+    config = tiny(tmp_path / "run", world_count=4, pool_size=8)
+
+    def diverge():
+        trainer = Trainer(Morphogenesis2D(config.task), config, task_name="morphogenesis2d")
+        if not Ranks.current().first:
+            trainer.pool.s[:] = 1e200
+        trainer.run(progress=False)
+
+    for said in on_ranks(2, diverge, tmp_path):
+        assert "loss must stay finite" in said
+        assert "worlds 1, 3 of the batch" in said
+    diagnosis = torch.load(tmp_path / "run" / "diverged.pt", weights_only=True)
+    assert diagnosis["x0"].shape[0] == 4
+
+
+def test_what_cannot_be_shared_out_is_refused():
+    assert Ranks(1, 4).places(16, 2).tolist() == [2, 3, 10, 11]
+    parts = [Ranks(rank, 4).own(torch.arange(16), 2) for rank in range(4)]
+    assert sorted(torch.cat(parts).tolist()) == list(range(16))
+    with pytest.raises(NPAError, match=r"multiple of the number of processes, got 6 and 4: .*=4"):
+        Ranks(0, 4).check(tiny("x", world_count=6, pool_size=12))
+    with pytest.raises(
+        NPAError, match=r"pool_size must be a multiple .* 10 and 4: set pool_size=8"
+    ):
+        Ranks(0, 4).check(tiny("x", world_count=4, pool_size=10))
+    # Alone, nothing is touched.
+    numbers = torch.ones(2)
+    alone = Ranks.current()
+    alone.reduce([numbers], numbers[0])
+    alone.check_same([numbers])
+    assert not alone.together
+    assert alone.collected(numbers, 1) is numbers
+    assert_same(numbers, torch.ones(2))
