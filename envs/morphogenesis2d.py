@@ -60,7 +60,7 @@ class PictureTask(GoalTask[Config]):
     @classmethod
     def extra_bytes(cls, config: Any, world_count: int) -> int:
         """Return about how much memory pool and pictures need [bytes]."""
-        copies = 4 if config.reward == "particle" else 1
+        copies = 4 if config.pays_particles else 1
         pictures = 16 * copies * world_count * config.resolution**2
         return super().extra_bytes(config, world_count) + int(pictures)
 

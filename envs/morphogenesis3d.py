@@ -94,7 +94,7 @@ class SolidTask(GoalTask[Morphogenesis3DEnvConfig]):
     def extra_bytes(cls, config: Any, world_count: int) -> int:
         """Return about how much memory pool and views need [bytes]."""
         view = PIXEL_BYTES * config.resolution**2 + SEEN_BYTES * config.particle_count
-        copies = 2 if config.reward == "particle" else 1
+        copies = 2 if config.pays_particles else 1
         views = copies * world_count * config.view_count * view
         return super().extra_bytes(config, world_count) + int(views)
 

@@ -132,6 +132,10 @@ class PointClassificationTask(GoalTask[PointClassificationEnvConfig]):
         """Return each particle's own loss and overflow."""
         return self._scores(s) + self.config.overflow_weight * self.goal.overflows(s)
 
+    def particle_gains(self, before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]) -> Tensor:
+        """Return how much each particle's own loss fell: nobody else's action changes it."""
+        return self.particle_losses(*before) - self.particle_losses(*after)
+
     def accuracy(self, s: Tensor) -> Tensor:
         """Return the share of each world's particles that say its class most loudly, [B]."""
         return 1.0 - world_mean(self.goal.mistakes(s)[..., None])[:, 0]

@@ -69,7 +69,7 @@ class TextureTask(GoalTask[TextureEnvConfig]):
     @classmethod
     def extra_bytes(cls, config: Any, world_count: int) -> int:
         """Return about how much memory pool and loss need [bytes]."""
-        copies = 4 if config.reward == "particle" else 1
+        copies = 4 if config.pays_particles else 1
         pictures = LOSS_BYTES * copies * world_count * config.resolution**2
         return super().extra_bytes(config, world_count) + int(pictures)
 

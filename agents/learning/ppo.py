@@ -24,7 +24,12 @@ from npa_envs.agents.learning.ppo_common import (
     first_rules,
     noise_left,
 )
-from npa_envs.agents.learning.problem import WORLDS_PER_SEED, Problem, world_seeds
+from npa_envs.agents.learning.problem import (
+    ROW_REWARDS,
+    WORLDS_PER_SEED,
+    Problem,
+    world_seeds,
+)
 from npa_envs.agents.learning.progress import Budget, Progress
 from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.envs.core.memory import free_bytes, needed_bytes
@@ -62,8 +67,13 @@ class PPOOptions(CommonOptions):
     ratio: Literal["particle", "world"] = "particle"
     """Each particle has a ratio of its own, or a world has one, of mean log-probabilities."""
 
-    credit: Literal["world", "particle"] = "world"
-    """Each particle is paid what its world is, or its own share."""
+    credit: Literal["world", "particle", "marginal"] = "world"
+    """Each particle is paid what its world is; its own share; or what its world would have lost
+    without its action."""
+
+    masked: bool = False
+    """Leave out of a round what particles did in steps that did not update them; several species
+    do not tell."""
 
     critic_width: int = 64
     """Units in a hidden layer of the critic."""
@@ -77,11 +87,12 @@ class PPOOptions(CommonOptions):
             check_positive(self, float, "clip")
         if self.worlds is not None:
             check_positive(self, int, "worlds")
-        for name in ("ratio", "credit"):
-            check_word(name, getattr(self, name), ("particle", "world"))
-        if self.ratio == "world" and self.credit == "particle":
+        check_word("ratio", self.ratio, ("particle", "world"))
+        check_word("credit", self.credit, ("world", *ROW_REWARDS))
+        if self.ratio == "world" and self.credit != "world":
             raise NPAError(
-                "credit='particle' needs ratio='particle': one ratio a world has one advantage"
+                f"credit={self.credit!r} needs ratio='particle': one ratio a world has one "
+                "advantage"
             )
 
     @property
@@ -134,7 +145,11 @@ class Learner:
     ) -> None:
         self.options, self.pace = options, options.pace(start)
         self.envs = problem.make_envs(
-            options.worlds, device=device, row_rewards=options.credit == "particle", copy=False
+            options.worlds,
+            device=device,
+            row_rewards=None if options.credit == "world" else options.credit,
+            tell_updated=options.masked,
+            copy=False,
         )
         self.generator = torch.Generator(device).manual_seed(seed)
         rules = first_rules(problem, seed, start)
@@ -210,6 +225,9 @@ class Learner:
             shared = self.options.credit == "world"
             memory.rewards[step].copy_(reward[:, None] if shared else own_rewards(infos))
             memory.acted[step].copy_(infos.get("acted", self._all_act))
+            if self.options.masked and "updated" in infos:
+                # Of worlds that began anew as well: it stands until the next step.
+                memory.acted[step].mul_(infos["updated"])
             # A species may end before its world does.
             gone = infos.get("particle_terminated", terminated[:, None])
             memory.terminated[step].copy_(terminated[:, None] | gone)

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from itertools import accumulate
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import gymnasium
 import numpy as np
@@ -45,6 +45,11 @@ EVALUATION_SEEDS = range(FIRST_EVALUATION_SEED, FIRST_EVALUATION_SEED + 16)
 
 TIME_LIMIT, LEFT = "time limit", "left the world"
 """Why species are cut off, and why they end where they diverge."""
+
+RowRewards = Literal["particle", "marginal"]
+"""Rewards of environments that pay each particle."""
+
+ROW_REWARDS = get_args(RowRewards)
 
 ELSEWHERE = {
     "num_envs": "it is a field of Problem",
@@ -97,9 +102,10 @@ class Problem:
         for name in self.keywords:
             if name in ELSEWHERE:
                 raise NPAError(f"keywords must not have {shown(name)}: {ELSEWHERE[name]}")
-        if self.keywords.get("reward") == "particle":
+        if (reward := self.keywords.get("reward")) in ROW_REWARDS:
             raise NPAError(
-                "keywords must not have reward='particle': ask make_envs for row_rewards=True"
+                f"keywords must not have reward={reward!r}: ask make_envs for "
+                f"row_rewards={reward!r}"
             )
         try:
             plain = json.loads(json.dumps(dict(self.keywords)))
@@ -199,7 +205,8 @@ class Problem:
         num_envs: int | None = None,
         *,
         device: str | torch.device = "cpu",
-        row_rewards: bool = False,
+        row_rewards: RowRewards | None = None,
+        tell_updated: bool = False,
         copy: bool = True,
     ) -> NPAVectorEnv | ConcatenatedSpeciesEnv:
         """Return worlds to act in, batched on a device; all that goes in and out are tensors there.
@@ -213,7 +220,11 @@ class Problem:
             num_envs: Worlds B; None: the problem's.
             device: Where they live.
             row_rewards: Let `infos["particle_reward"]`, [B, N], of each step have what each
-                particle is paid: its own share of the improvement, or what its species is paid.
+                particle is paid: "particle", its own share of the improvement, or "marginal", what
+                its world would have lost without its action. Of several species each particle is
+                paid what its species is, in any case.
+            tell_updated: Let `infos["updated"]`, [B, N], of each step tell whose actions took
+                effect. Several species do not tell.
             copy: Hand out new tensors; False: where possible the same ones in each step,
                 overwritten by the next.
 
@@ -234,7 +245,9 @@ class Problem:
                     "row_rewards needs the problem's reward to be 'dense', got "
                     f"{shown(given['reward'])}: leave it out of keywords"
                 )
-            given["reward"] = "particle"
+            given["reward"] = row_rewards
+        if tell_updated:
+            given["tell_updated"] = True
         envs: Any = gymnasium.make_vec(
             self.env_id,
             num_envs=count,

@@ -23,7 +23,7 @@ from npa_envs.tasks.checks import (
 from npa_envs.world.actions import MomentInverse, Physics
 
 Boundary = Literal["open", "periodic"]
-Reward = Literal["dense", "sparse", "particle"]
+Reward = Literal["dense", "sparse", "particle", "marginal"]
 Output = Literal["numpy", "torch"]
 OnDivergence = Literal["terminate", "reset", "raise", "ignore"]
 
@@ -269,7 +269,9 @@ class EnvConfig(WorldConfig):
 
     reward: Reward = "dense"
     """"dense": each step's improvement of the loss; "sparse": minus the loss at the episode's end;
-    "particle": as dense, with each particle's own share in `info["particle_reward"]`."""
+    "particle" and "marginal": as dense, with each particle's own reward in
+    `info["particle_reward"]`: how much its share of the loss fell, or what the world would have
+    lost without its action."""
 
     tell_updated: bool = False
     """Tell in `info["updated"]` which particles the step updated; the others ignored their action,
@@ -298,6 +300,11 @@ class EnvConfig(WorldConfig):
                 f"seed_pool must be a whole number of at least 0, got {shown(self.seed_pool)}: "
                 "0 makes a fresh start for each episode"
             )
+
+    @property
+    def pays_particles(self) -> bool:
+        """Whether each particle has a reward of its own."""
+        return self.reward in ("particle", "marginal")
 
     @classmethod
     def from_keywords(cls, keywords: dict[str, Any]) -> Self:

@@ -36,11 +36,18 @@ class NPAEnv(gymnasium.Env[Any, Any]):
     | `"dense"` | L before the step minus L after it |
     | `"sparse"` | 0, and minus L in the last step, also where that is a time limit |
     | `"particle"` | as dense; besides, `info["particle_reward"]` has each particle's own |
+    | `"marginal"` | likewise, of what the world would have lost without its action |
 
     Dense rewards telescope: their sum over an episode is L at its start minus L at its end. So the
     undiscounted return depends only on the first and the last world. The mean of all particles' own
     rewards is the dense reward, up to rounding. In a step that diverges, L counts as at least its
     value at the start, so diverging never pays. The parts in `info` are not changed by this.
+
+    With `"marginal"` a particle's own reward is N times what it changed in the step, times minus
+    the slope of L in the middle of the step: to second order its marginal contribution, averaged
+    over being the first and the last to act. What these rewards miss of the dense reward is shared
+    by all alike. A particle that was not updated earns nothing else. It pays for actions, where
+    `"particle"` also pays for what happens to a particle's pixels by the actions of others.
 
     ## Starting state
 
@@ -67,7 +74,7 @@ class NPAEnv(gymnasium.Env[Any, Any]):
     | `loss` | reset, step | L as it is now |
     | `success`, `diverged` | step | whether it did so in this step, bool |
     | `reason` | last step | why the episode ended, see above; None for worlds that go on |
-    | `particle_reward` | step, where `reward="particle"` | each particle's own reward, shape [N] |
+    | `particle_reward` | step, where particles are paid | each particle's own reward, shape [N] |
     | `updated` | step, where `tell_updated=True` | which particles it updated, bool, shape [N] |
 
     ## Rendering

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.envs.core.config import EnvConfig, WorldConfig
+from npa_envs.envs.core.credit import marginal_gains
 from npa_envs.errors import NPAError
 from npa_envs.render import draw_worlds
 from npa_envs.world.randomness import Purpose, WorldRandom
@@ -180,6 +181,30 @@ class EnvTask(WorldTask[Config]):
             f"{type(self).__name__} has no losses of single particles: choose reward='dense' or "
             "'sparse', or give it a particle_losses method"
         )
+
+    def particle_gains(self, before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]) -> Tensor:
+        """Return what each world would have lost without a particle's action, times N; [B, N].
+
+        By default from the gradient of `losses`, as `marginal_gains` says; a task whose particles
+        have losses of their own can be exact.
+
+        Args:
+            before: Positions and states before a step.
+            after: The same after it.
+
+        Raises:
+            NPAError: The losses have no gradient.
+        """
+        box = self.config.box
+        sides = None if box is None else (box,) * self.space_dim
+        gains = marginal_gains(self.losses, before, after, sides)
+        if gains is None:
+            raise NPAError(
+                f"the losses of {type(self).__name__} must be differentiable for "
+                "reward='marginal', but no gradient leads from them to positions or states: choose "
+                "'particle' or 'dense', or give it a particle_gains method"
+            )
+        return gains
 
     @property
     def start_is_short(self) -> bool:

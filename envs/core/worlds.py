@@ -25,6 +25,7 @@ from npa_envs.envs.core.answers import (
     starter,
 )
 from npa_envs.envs.core.config import EnvConfig, WorldConfig
+from npa_envs.envs.core.credit import settled
 from npa_envs.envs.core.memory import check_memory
 from npa_envs.envs.core.spaces import number_tensor
 from npa_envs.envs.core.task import EnvTask, Start, WorldTask
@@ -179,8 +180,10 @@ class Worlds(Batch):
         """Steps since the start of each episode, shape [B]."""
         self.particle_loss = zeros(count) if config.reward == "particle" else None
         """Each particle's share of the loss, shape [B, N], where rewards are shared out."""
-        self.particle_reward = zeros(count) if config.reward == "particle" else None
-        """Each particle's own reward of the last step, shape [B, N], likewise."""
+        self.particle_reward = zeros(count) if config.pays_particles else None
+        """Each particle's own reward of the last step, shape [B, N], where it has one."""
+        paid_by_action = config.reward == "marginal"
+        self._before = (self.x.clone(), self.s.clone()) if paid_by_action else None
         self._goal = zeros(dtype=torch.int64)
         self._aimed = self.task.toward(self._goal)
         self._start_loss = zeros()
@@ -310,9 +313,13 @@ class Worlds(Batch):
         still = torch.zeros_like(values)
         numbers = torch.cat((still[:1], total(values)[None], values, still))
         self.report.numbers.index_copy_(1, worlds, numbers)
-        if self.particle_loss is not None and self.particle_reward is not None:
+        if self.particle_loss is not None:
             shares = checked_shares(task, task.particle_losses(x, s), (len(x), x.shape[1]))
             self.particle_loss[worlds] = shares
+        if self._before is not None:
+            for kept, placed in zip(self._before, (x, s), strict=True):
+                kept.index_copy_(0, worlds, placed)
+        if self.particle_reward is not None:
             self.particle_reward.index_fill_(0, worlds, 0.0)
         self.report.endings.index_fill_(1, worlds, False)
 
@@ -437,24 +444,37 @@ class Worlds(Batch):
         parts = torch.stack(checked_losses(task, losses, self.world_count, self.part_names))
         if self._judgement is None:
             self._judgement = self._make_judgement()
-        if self.particle_loss is None or self.particle_reward is None:
+        if self.particle_reward is None:
             self._judgement(parts)
         else:
-            shares = task.particle_losses(self.x, self.s)
-            shares = checked_shares(task, shares, (self.world_count, self.particle_count))
-            own = self.particle_loss - shares
+            own = self._particle_gains(task)
             self._judgement(parts, (~torch.isfinite(own).all(dim=1)).byte())
+            if self._before is not None:
+                own = settled(own, self.reward)
             # Worlds that left their bounds are paid as a whole.
             whole = self._diverged.bool() & (self.task.config.on_divergence != "ignore")
             own = torch.where(whole[:, None], self.reward[:, None], own)
             happened = self._enabled.bool()
             self.particle_reward.copy_(torch.where(happened, own, self.particle_reward))
-            self.particle_loss.copy_(shares)
         if self._beside is not None:
             self._host_endings.copy_(self._endings, non_blocking=True)
             if self.world_count == 1:
                 self._host_numbers.copy_(self.report.numbers, non_blocking=True)
         self._enabled.fill_(1)
+
+    def _particle_gains(self, task: EnvTask[Any]) -> Tensor:
+        """Return what each particle has earned in a step, shape [B, N], and keep what it is now."""
+        shape = self.world_count, self.particle_count
+        if self._before is not None:
+            gains = checked_shares(task, task.particle_gains(self._before, (self.x, self.s)), shape)
+            for kept, now in zip(self._before, (self.x, self.s), strict=True):
+                kept.copy_(now)
+            return gains
+        assert self.particle_loss is not None, "particles are paid by shares or by actions"
+        shares = checked_shares(task, task.particle_losses(self.x, self.s), shape)
+        gains = self.particle_loss - shares
+        self.particle_loss.copy_(shares)
+        return gains
 
     def _make_judgement(self) -> PreparedJudgement:
         config = self.task.config

@@ -54,7 +54,7 @@ def test_json_keeps_a_problem(problem):
         ({"keywords": {"eps": -0.1}}, "eps must be"),
         ({"keywords": {"device": "cuda"}}, "given to train and make_envs"),
         ({"keywords": {"max_cycles": 3}}, "field episode_steps"),
-        ({"keywords": {"reward": "particle"}}, "row_rewards=True"),
+        ({"keywords": {"reward": "particle"}}, "row_rewards='particle'"),
         ({"keywords": {"box_size": {1, 2}}}, "JSON"),
         ({"keywords": [1]}, "keywords must map names"),
         ({"episode_steps": 0}, "episode_steps"),
@@ -86,13 +86,13 @@ def test_every_environment_is_a_problem_with_rules_that_fit(name):
 def test_rows_are_paid_where_that_is_asked_for():
     problem = heart()
     rules = wild_rules(problem).policy()
-    envs = problem.make_envs(row_rewards=True)
+    envs = problem.make_envs(row_rewards="particle")
     observation, _ = envs.reset(seed=0)
     _, reward, _, _, infos = envs.step(rules(observation))
     assert reward.abs().min() > 1e-3
     torch.testing.assert_close(infos["particle_reward"].mean(dim=1), reward, atol=1e-5, rtol=0.0)
     with pytest.raises(NPAError, match="row_rewards"):
-        heart(reward="sparse").make_envs(row_rewards=True)
+        heart(reward="sparse").make_envs(row_rewards="particle")
 
 
 # Sets of rules

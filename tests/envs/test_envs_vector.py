@@ -29,6 +29,7 @@ def batches(env, count, seed=0, scale=1.0):
     ("name", "changes"),
     [
         *((name, {"reward": "particle"}) for name in IDS),
+        *((name, {"reward": "marginal"}) for name in IDS),
         (IDS[0], {"reward": "dense"}),
         (IDS[0], {"reward": "sparse"}),
         (IDS[0], {"on_divergence": "reset", "autoreset_mode": "next-step"}),

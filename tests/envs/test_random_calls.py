@@ -114,7 +114,7 @@ class OneSpecies:
         fields = small_keywords(name) | world_fields(draw)
         fields |= {
             "position_limit": draw.choice((4.0, 1.5)),
-            "reward": draw.choice(("dense", "dense", "sparse", "particle")),
+            "reward": draw.choice(("dense", "dense", "sparse", "particle", "marginal")),
             "on_divergence": draw.choice(("terminate", "terminate", "reset", "raise", "ignore")),
             "seed_pool": draw.choice((0, 0, 2)),
             "success_loss": draw.choice((None, 0.0, 0.2)),
@@ -296,7 +296,7 @@ class OneSpecies:
         if not diverged:
             parts = [v for name, v in told.items() if name.startswith("loss_")]
             assert np.isclose(loss, sum(parts), rtol=1e-5, atol=1e-6)
-        if self.fields["reward"] == "particle":
+        if self.fields["reward"] in ("particle", "marginal"):
             own = host(told["particle_reward"])
             assert own.shape == (self.fields["particle_count"],)
             size = max(abs(self.loss[k]), abs(loss), np.abs(own).max())
