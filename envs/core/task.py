@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.envs.core.config import EnvConfig, WorldConfig
-from npa_envs.envs.core.credit import marginal_gains
 from npa_envs.errors import NPAError
 from npa_envs.render import draw_worlds
+from npa_envs.world.credit import marginal_gains
 from npa_envs.world.randomness import Purpose, WorldRandom
 
 AnyConfig = TypeVar("AnyConfig", bound=WorldConfig)

@@ -25,7 +25,6 @@ from npa_envs.envs.core.answers import (
     starter,
 )
 from npa_envs.envs.core.config import EnvConfig, WorldConfig
-from npa_envs.envs.core.credit import settled
 from npa_envs.envs.core.memory import check_memory
 from npa_envs.envs.core.spaces import number_tensor
 from npa_envs.envs.core.task import EnvTask, Start, WorldTask
@@ -41,6 +40,7 @@ from npa_envs.world.actions import (
     SurveyedWorlds,
     survey_worlds,
 )
+from npa_envs.world.credit import settled
 from npa_envs.world.cuda_graph import Beside, Replayed, WeakFunction, sent
 from npa_envs.world.divergence import LARGEST_REPORT, term_name
 from npa_envs.world.randomness import WorldRandom

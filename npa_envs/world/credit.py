@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 import torch
 from torch import Tensor
 
-from npa_envs import world_mean
+from npa_envs.ops import world_mean
 from npa_envs.ops.update import wrapped
 
 
