@@ -84,7 +84,7 @@ def turned(
     z = rings[:, :1] * np.cos(angle)
     y = np.broadcast_to(rings[:, 1:], x.shape)
     vertices = np.stack((x, y, z), axis=-1).reshape(-1, 3)
-    return Mesh(vertices, _grid_faces(len(rings), corners, closed=False), paint(vertices))
+    return Mesh(vertices, grid_faces(len(rings), corners, closed=False), paint(vertices))
 
 
 def ellipsoid(
@@ -199,7 +199,7 @@ def make_doughnut() -> Mesh:
     for k in range(18):
         row, column = (11 * k) % (2 * ROUND), ROUND // 4 + (7 * k) % 15 - 7
         colours[row : row + 3, column - 1 : column + 1] = hues[k % 4]
-    faces = _grid_faces(2 * ROUND, ROUND, closed=True)
+    faces = grid_faces(2 * ROUND, ROUND, closed=True)
     return Mesh(vertices.reshape(-1, 3), faces[:, ::-1].copy(), colours.reshape(-1, 3))
 
 
@@ -291,7 +291,7 @@ def _read_mesh(path: Path) -> Mesh:
     return Mesh(vertices, faces, colours)
 
 
-def _grid_faces(rows: int, columns: int, *, closed: bool) -> NDArray[np.int64]:
+def grid_faces(rows: int, columns: int, *, closed: bool) -> NDArray[np.int64]:
     """Return the triangles of a grid whose columns, and rows where `closed`, join up; [F, 3]."""
     row, column = np.meshgrid(
         np.arange(rows if closed else rows - 1), np.arange(columns), indexing="ij"

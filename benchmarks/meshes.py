@@ -1,0 +1,279 @@
+"""Recipes of 3D morphogenesis compared, and meshes that none of them was developed on.
+
+An arm is a recipe with one choice changed. `run` trains arms on meshes, one run after the other,
+and measures the rules as `npa-envs evaluate` does, on seeds that training never saw. Every finished
+run is a line of JSON with its rule and a picture: four held-out views of the target, and of one
+world after 128 steps and at the end. `draw` writes the unseen meshes as files, `report` prints the
+lines as a table.
+
+    python benchmarks/meshes.py draw --out MESHES
+    python benchmarks/meshes.py run --out OUT --device cuda --targets rocket --arms recipe
+    python benchmarks/meshes.py report --out OUT
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable, Mapping
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from npa_envs.files import write_text
+from npa_envs.measure.quality import evaluate
+from npa_envs.measure.record import current_commit, machine
+from npa_envs.measure.tables import as_objects
+from npa_envs.tasks.morphogenesis3d import Morphogenesis3D
+from npa_envs.tasks.targets.meshes import FloatArray, Mesh, ellipsoid, grid_faces, joined, turned
+from npa_envs.tasks.targets.views import Views, over, some_views
+from npa_envs.training import preset, train
+from npa_envs.world.recorded import release_recordings
+
+SEEDS = tuple(range(1_000_000, 1_000_008))
+"""Seeds of the worlds that rules are measured on."""
+
+STEPS = (32, 64, 128, 512, 2048)
+"""Steps at which they are measured."""
+
+Fields = Mapping[str, Any]
+
+RECIPE: Fields = {
+    "repeats": 1,
+    "iterations": 1000,
+    "state_dim": 24,
+    "seed_radius": 0.7,
+    "blur_sigma": 0.0,
+    "pool_size": 32,
+    "steps": (24, 40),
+    "schedule": "cosine",
+    "learning_rate": 1e-3,
+    "lifetimes": (64, 8192),
+    "damage_share": 0.25,
+    "stray_share": 5e-5,
+    "stray_weight": 10.0,
+    "damage_radius": 0.15,
+    "clump_radius": 0.2,
+    "cut_gap": 0.1,
+    "initial_rule": "duck",
+    "sigma": 0.012,
+    "opacity": 0.4,
+}
+"""The first candidate, laid over the preset `paper`: what 2D learned, and a rule that has grown."""
+
+ARMS: Mapping[str, Fields] = {
+    "recipe": {},
+    "untrained": {"initial_rule": "", "blur_sigma": 20.0, "blur_iterations": 300},
+    "blur": {"blur_sigma": 10.0, "blur_iterations": 300},
+    "rate 2e-3": {"learning_rate": 2e-3},
+    "half seeds": {"lifetimes": (0, 0), "seed_interval": 1, "fresh_share": 0.5},
+    "steps 16 to 32": {"steps": (16, 32), "iterations": 1300},
+    "2 worlds": {"world_count": 2, "iterations": 1700},
+    "sigma 0.02": {"sigma": 0.02, "opacity": 0.15},
+    "sigma 0.008": {"sigma": 0.008, "opacity": 0.6},
+    "no SSIM": {"ssim_weight": 0.0},
+}
+"""What each arm changes of `RECIPE`."""
+
+
+def make_knot() -> Mesh:
+    """Return a trefoil knot, a round tube whose colour goes once through all hues, with rings."""
+    t = np.linspace(0.0, 2.0 * np.pi, 480, endpoint=False)[:, None]
+    around = np.linspace(0.0, 2.0 * np.pi, 40, endpoint=False)
+    outward = np.concatenate((np.cos(2 * t), 0.0 * t, np.sin(2 * t)), axis=1)
+    upward = np.array([0.0, 1.0, 0.0])
+    # Away from the circle that the knot winds around; nearly across the knot's own way.
+    away = np.cos(3 * t) * outward + np.sin(3 * t) * upward
+    middle = 2.0 * outward + away
+    along = np.roll(middle, -1, axis=0) - np.roll(middle, 1, axis=0)
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    away -= (away * along).sum(axis=1, keepdims=True) * along
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    across = np.cross(along, away)
+    ring = (
+        np.cos(around)[None, :, None] * away[:, None]
+        + np.sin(around)[None, :, None] * across[:, None]
+    )
+    vertices = (middle[:, None] + 0.46 * ring).reshape(-1, 3)
+    hue = 0.5 + 0.45 * np.cos(t - np.array([[0.0, 2.1, 4.2]]))
+    ringed = np.where(np.sin(18.0 * t) > 0.6, 0.95, hue)
+    colours = np.repeat(ringed, len(around), axis=0)
+    return Mesh(vertices, grid_faces(len(t), len(around), closed=True), colours)
+
+
+def make_fish() -> Mesh:
+    """Return a clownfish: orange with white bands that are edged in black, fins and eyes."""
+    orange, white, black = (0.95, 0.45, 0.08), (0.96, 0.96, 0.94), (0.06, 0.06, 0.08)
+
+    def paint(ball: FloatArray) -> FloatArray:
+        along = 0.75 * ball[:, 2] + 0.06 * np.cos(2.5 * ball[:, 1])
+        colours = np.broadcast_to(orange, ball.shape).copy()
+        for place in (0.40, -0.05, -0.48):
+            colours[np.abs(along - place) < 0.11] = black
+            colours[np.abs(along - place) < 0.075] = white
+        return colours
+
+    tilt = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 120)
+    ball = turned([(float(np.cos(a)), float(np.sin(a))) for a in tilt], paint, corners=240)
+    parts = [Mesh(ball.vertices * (0.24, 0.42, 0.75), ball.faces, ball.colours)]
+    for up in (-0.16, 0.16):
+        tail = ellipsoid((0.0, 0.0, 0.0), (0.045, 0.14, 0.26), orange)
+        parts.append(_tilted(tail, -2.2 * up, (0.0, up, -0.92)))
+    parts.append(ellipsoid((0.0, 0.42, -0.08), (0.045, 0.16, 0.34), orange))
+    parts.append(ellipsoid((0.0, -0.40, -0.20), (0.045, 0.15, 0.18), orange))
+    for side in (-1.0, 1.0):
+        parts.append(ellipsoid((0.25 * side, -0.10, 0.20), (0.06, 0.10, 0.17), orange))
+        parts.append(ellipsoid((0.15 * side, 0.11, 0.56), (0.05, 0.07, 0.07), white))
+        parts.append(ellipsoid((0.18 * side, 0.11, 0.58), (0.035, 0.04, 0.04), black))
+    return joined(parts)
+
+
+def _tilted(mesh: Mesh, angle: float, centre: tuple[float, float, float]) -> Mesh:
+    """Return a mesh turned around the x axis by an angle, and moved."""
+    turn = np.array(
+        [
+            [1.0, 0.0, 0.0],
+            [0.0, np.cos(angle), np.sin(angle)],
+            [0.0, -np.sin(angle), np.cos(angle)],
+        ]
+    )
+    return Mesh(mesh.vertices @ turn + np.asarray(centre), mesh.faces, mesh.colours)
+
+
+UNSEEN: Mapping[str, Callable[[], Mesh]] = {"fish": make_fish, "knot": make_knot}
+"""Meshes that no recipe was developed on."""
+
+
+def ply(mesh: Mesh) -> str:
+    """Return a mesh as a PLY file's text, with a colour at each corner."""
+    shades: FloatArray = (255.0 * mesh.colours.clip(0.0, 1.0)).round()
+    lines = ["ply", "format ascii 1.0", f"element vertex {len(mesh.vertices)}"]
+    lines += [f"property float {axis}" for axis in "xyz"]
+    lines += [f"property uchar {channel}" for channel in ("red", "green", "blue")]
+    lines += [f"element face {len(mesh.faces)}", "property list uchar int vertex_indices"]
+    lines.append("end_header")
+    for place, shade in zip(mesh.vertices, shades, strict=True):
+        lines.append(" ".join([*(f"{v:.6f}" for v in place), *(f"{c:.0f}" for c in shade)]))
+    lines += [f"3 {a} {b} {c}" for a, b, c in mesh.faces]
+    return "\n".join(lines) + "\n"
+
+
+def draw(arguments: argparse.Namespace) -> None:
+    """Write the unseen meshes."""
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    for name, make in UNSEEN.items():
+        write_text(arguments.out / f"{name}.ply", ply(make()))
+
+
+def sheet(task: Morphogenesis3D, worlds: list[tuple[Tensor, Tensor]]) -> Image.Image:
+    """Return four held-out views of the target, and below it of each world's first."""
+    held_out: Views = task.target.held_out
+    chosen = torch.linspace(1, len(held_out.pictures) - 2, 4).long().to(held_out.pictures.device)
+    shown = some_views(held_out, chosen)
+    rows = [shown.pictures, *(task.views(x[:1], s[:1], shown.cameras)[0] for x, s in worlds)]
+    white = shown.pictures.new_ones(3)
+    pictures = [over(views, white).clamp(0.0, 1.0).cpu() for views in rows]
+    flat = torch.cat([torch.cat(list(views), dim=1) for views in pictures])
+    return Image.fromarray((255.0 * flat).round().byte().numpy())
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Train, measure and draw, one run after the other."""
+    out: Path = arguments.out
+    out.mkdir(parents=True, exist_ok=True)
+    begun = time.perf_counter()
+    for arm in arguments.arms:
+        for target in arguments.targets:
+            if time.perf_counter() - begun > arguments.seconds:
+                print(f"no time for {arm}, {target}", flush=True)
+                continue
+            one_run(arguments, arm, target)
+
+
+def one_run(arguments: argparse.Namespace, arm: str, target: str) -> None:
+    """Train an arm on a mesh, and write what became of it."""
+    out: Path = arguments.out
+    changes = {**RECIPE, **ARMS[arm], **json.loads(arguments.fields)}
+    changes = {k: tuple(v) if isinstance(v, list) else v for k, v in changes.items()}
+    name = f"{arm.replace(' ', '_')}-{Path(target).stem}{arguments.label}"
+    fixed = {"tensorboard": False, "picture_interval": 0, "checkpoint_interval": 10**9}
+    fixed |= {"target": target, "device": arguments.device, "out": arguments.runs / name}
+    config = preset("paper", "morphogenesis3d", **changes, **fixed, log_interval=100)
+    result = train(
+        config,
+        "morphogenesis3d",
+        overwrite=True,
+        progress=False,
+        max_seconds=arguments.longest,
+    )
+    task = Morphogenesis3D(config.task, device=arguments.device).for_rule(result.rule)
+    worlds = []
+
+    def watch(x: Tensor, s: Tensor, step: int) -> None:
+        if step in (128, arguments.steps[-1]):
+            worlds.append((x, s))
+
+    rows = evaluate(
+        result.rule,
+        task,
+        checkpoints=arguments.steps,
+        seeds=SEEDS[: arguments.seeds],
+        device=arguments.device,
+        watch=watch,
+    )
+    if arguments.device.startswith("cuda"):
+        release_recordings()
+    with torch.no_grad():
+        sheet(task, worlds).save(out / f"{name}.png")
+    seconds = result.record["seconds"]
+    line = {"arm": arm, "target": Path(target).stem, "fields": changes, "seconds": seconds}
+    line |= {"iterations": result.iteration, "growth": as_objects(rows)}
+    line |= {"commit": arguments.commit or current_commit(), "date": date.today().isoformat()}
+    line |= {"machine": machine(torch.device(arguments.device))}
+    with (out / "meshes.jsonl").open("a") as file:
+        file.write(json.dumps(line) + "\n")
+    (out / f"{name}.safetensors").write_bytes((config.out / "rule.safetensors").read_bytes())
+    told = "  ".join(f"{row.step}: {row.psnr:.2f}" for row in rows)
+    print(f"{name:32s} {result.iteration} in {seconds:.0f} s  {told}", flush=True)
+
+
+def report(arguments: argparse.Namespace) -> None:
+    """Print the PSNR of all runs as a table."""
+    print("| arm | mesh | iterations | seconds | " + " | ".join(map(str, arguments.steps)) + " |")
+    print("|---|---|---|---|" + "---|" * len(arguments.steps))
+    for text in (arguments.out / "meshes.jsonl").read_text().splitlines():
+        line = json.loads(text)
+        by_step = {row["step"]: row["psnr"] for row in line["growth"]}
+        cells = " | ".join(f"{by_step[s]:.1f}" if s in by_step else "" for s in arguments.steps)
+        first = f"| {line['arm']} | {line['target']} | {line['iterations']} |"
+        print(f"{first} {line['seconds']:.0f} | {cells} |")
+
+
+def main() -> None:
+    """Read the arguments and do what they say."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("what", choices=("draw", "run", "report"))
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--runs", type=Path, default=Path("runs"))
+    parser.add_argument("--targets", nargs="+", default=["rocket", "mushroom"])
+    parser.add_argument("--arms", nargs="+", choices=ARMS, default=["recipe"])
+    parser.add_argument("--fields", default="{}", help="fields to change in all arms, as JSON")
+    parser.add_argument("--label", default="", help="last part of the files' names")
+    parser.add_argument("--steps", type=int, nargs="+", default=list(STEPS))
+    parser.add_argument("--seeds", type=int, default=len(SEEDS), help="worlds to measure")
+    parser.add_argument("--longest", type=float, help="seconds of a run, at most")
+    parser.add_argument("--seconds", type=float, default=1e9, help="begin no run later")
+    parser.add_argument("--commit", help="what the lines name, where files are no checkout")
+    parser.add_argument("--device", default="cpu")
+    arguments = parser.parse_args()
+    {"draw": draw, "run": run, "report": report}[arguments.what](arguments)
+
+
+if __name__ == "__main__":
+    main()
