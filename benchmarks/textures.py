@@ -18,7 +18,7 @@ import contextlib
 import json
 import time
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -118,6 +118,7 @@ def run(arguments: argparse.Namespace) -> None:
             streams.append(torch.cuda.Stream() if arguments.device.startswith("cuda") else None)
             with on(streams[-1]):
                 task = Texture(config.task, device=arguments.device)
+                config = replace(config, task=task.config)
                 trainers.append(Trainer(task, config, task_name="texture", overwrite=True))
             names.append(name)
     print(f"made in {time.perf_counter() - started:.0f} s", flush=True)

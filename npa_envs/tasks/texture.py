@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -58,6 +58,10 @@ class TextureConfig(TaskConfig):
     eps: float = 0.2
     """Perception radius ε [length units]; the rule is trained at it, so it is also its ε0."""
 
+    see_across: bool = False
+    """Raise ε, where the target's things lie far apart, to twice the median gap between neighbours,
+    at most to 0.3: so that particles of one thing perceive the next."""
+
     alpha: float = 0.5
     """Largest displacement in one step, as a fraction of ε (dimensionless)."""
 
@@ -100,6 +104,9 @@ class TextureConfig(TaskConfig):
             )
 
 
+LARGEST_EPS = 0.3
+"""ε that `see_across` raises to, at most [length units]."""
+
 DENSITY_FLOOR = 1e-6
 """Density that empty places count as, so that the power has a slope there."""
 
@@ -138,7 +145,7 @@ class Texture(ParticleTask[TextureConfig]):
         target: TextureTarget | None = None,
         device: str | torch.device = "cpu",
     ) -> None:
-        self.config = config = config or TextureConfig()
+        config = config or TextureConfig()
         if target is None:
             target = load_texture(
                 config.target,
@@ -151,6 +158,11 @@ class Texture(ParticleTask[TextureConfig]):
                 f"target must have {config.resolution} x {config.resolution} pixels as "
                 f"config.resolution says, got {tuple(target.picture.shape)}: load it at that size"
             )
+        if config.see_across:
+            seen = min(2.0 * target.gap * config.box_size, LARGEST_EPS, 0.5 * config.box_size)
+            config = replace(config, see_across=False, eps=max(config.eps, seen))
+        self.config = config
+        """What was told; ε is the one that rules are trained at."""
         self.target = target
         """What worlds are to look like."""
         self.target_picture = target.picture.to(device)
@@ -366,7 +378,11 @@ TEXTURE_PRESETS: Mapping[str, TrainConfig[TextureConfig]] = {
     # Found by experiment: docs/textures.md. What is learned with 2048 particles holds for more.
     "best": TrainConfig(
         task=TextureConfig(
-            target="hearts", particle_count=2048, loss="patch_ot+joint_swd", motion_weight=0.02
+            target="hearts",
+            particle_count=2048,
+            see_across=True,
+            loss="patch_ot+joint_swd",
+            motion_weight=0.02,
         ),
         iterations=3200,
         repeats=1,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 from npa_envs.devices import check_device
@@ -77,6 +78,8 @@ def train(
             begun=begun,
         )
     task = entry.make(config.task, check_device(config.device))
+    # A task may settle what follows from its target; rule and checkpoint tell what was settled.
+    config = replace(config, task=getattr(task, "config", config.task))
     trainer = Trainer(task, config, task_name=task_name, resume=resume, overwrite=overwrite)
     begun()
     return trainer.run(progress=progress, max_seconds=max_seconds)

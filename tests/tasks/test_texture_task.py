@@ -7,8 +7,10 @@ import torch
 
 from npa_envs.cli import main
 from npa_envs.errors import NPAError
+from npa_envs.rule.files import load_rule
 from npa_envs.tasks.targets.textures import load_texture
 from npa_envs.tasks.texture import Texture, TextureConfig, colour_image, density_image
+from npa_envs.training import override, preset, train
 
 SMALL = TextureConfig(target="bubbles", particle_count=300, resolution=24, eps=0.3)
 
@@ -44,6 +46,19 @@ def test_all_particles_together_have_the_target_s_mean_density():
     expected = torch.full((2,), task.target.coverage)
     torch.testing.assert_close(picture[..., 3].mean((1, 2)), expected, rtol=1e-5, atol=0.0)
     assert 0.4 < task.target.coverage < 0.6
+
+
+def test_eps_is_raised_so_that_particles_see_across_gaps(tmp_path):
+    config = TextureConfig(target="hearts", resolution=48, particle_count=64, see_across=True)
+    told = Texture(config).config
+    assert told.eps == pytest.approx(0.3, abs=0.05)
+    assert Texture(told).config == told, "settled once"
+    assert Texture(dataclasses.replace(config, eps=0.5)).config.eps == 0.5, "never lowered"
+    assert Texture(dataclasses.replace(config, target="maze")).config.eps == 0.2, "no gaps"
+    # The rule's file tells at which it was trained.
+    tiny = preset("tiny", "texture", target="hearts", eps=0.1, see_across=True, out=tmp_path)
+    result = train(override(tiny, iterations=1, particle_count=32, steps=(1, 2)), "texture")
+    assert load_rule(tmp_path / "rule.safetensors").eps0 == result.rule.eps0 > 0.2
 
 
 def test_density_is_compared_as_its_tenth_root():

@@ -6,7 +6,7 @@ import torch
 from PIL import Image
 
 from npa_envs.errors import NPAError
-from npa_envs.tasks.targets.textures import PATTERNS, draw_pattern, load_texture
+from npa_envs.tasks.targets.textures import PATTERNS, TextureTarget, draw_pattern, load_texture
 
 
 def roughness(picture, dim):
@@ -117,3 +117,21 @@ def test_bad_pictures_are_refused(tmp_path):
     ):
         with pytest.raises(NPAError, match=message):
             load_texture(tmp_path / name)
+
+
+def test_gap_is_the_way_between_neighbouring_things():
+    # Dots of radius 0.09, a quarter of the side apart.
+    assert load_texture("dots", resolution=64).gap == pytest.approx(0.25 - 2 * 0.09, abs=1 / 64)
+    assert load_texture("stripes", resolution=32).gap == 0.0
+
+
+def test_gap_reaches_round_the_edges():
+    picture = torch.zeros(16, 16, 4)
+    picture[4:8, 0:2, 3] = 1.0
+    assert TextureTarget("one", picture, True).gap == 0.0
+    # Three empty columns lie between both round the edge, nine the other way.
+    picture[4:8, 11:13, 3] = 1.0
+    assert TextureTarget("two", picture, True).gap == 3 / 16
+    # Touching round the edge, both are one thing.
+    picture[4:8, 13:, 3] = 1.0
+    assert TextureTarget("joined", picture, True).gap == 0.0

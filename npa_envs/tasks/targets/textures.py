@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ import torch
 from numpy.typing import NDArray
 from PIL import ImageColor
 from torch import Tensor
+from torch.nn.functional import max_pool2d, pad
 
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.files import home_path
@@ -52,10 +54,53 @@ class TextureTarget:
         return float(self.picture[..., 3].double().mean())
 
     @property
+    def gap(self) -> float:
+        """Median way from a thing to the nearest other one, as a share of the square's side.
+
+        A thing is a patch of covered pixels that touch each other; things at opposite edges are
+        neighbours. Where fewer than two things are told apart there is no gap: 0.
+        """
+        covered = self.picture[..., 3] > COVERED
+        side = len(covered)
+        edge = covered & (_around(~covered) > 0.0)
+        owner, place = _things(covered)[edge], edge.nonzero().double()
+        gaps = []
+        for own in sorted(set(owner.tolist())):
+            way = place[owner == own][:, None] - place[owner != own]
+            if way.numel() == 0:
+                return 0.0
+            way -= side * (way / side).round()
+            # Between the middles of pixels that touch lies the side of one, and no gap.
+            gaps.append(max(0.0, float(way.square().sum(dim=-1).min()) ** 0.5 - 1.0))
+        return median(gaps) / side if gaps else 0.0
+
+    @property
     def mean_colour(self) -> Tensor:
         """Mean red, green and blue of what is covered (dimensionless), shape [3]."""
         sums = self.picture.double().sum(dim=(0, 1))
         return (sums[:3] / sums[3]).to(self.picture)
+
+
+COVERED = 0.5
+"""Density above which a pixel belongs to a thing."""
+
+
+def _things(covered: Tensor) -> Tensor:
+    """Return a number for the thing that each pixel belongs to, 0 where nothing is; [R, R]."""
+    numbers = torch.arange(1, covered.numel() + 1, dtype=torch.float64, device=covered.device)
+    number = numbers.view_as(covered) * covered
+    while True:
+        # The largest number of a thing spreads over all of it.
+        spread = _around(number) * covered
+        if torch.equal(spread, number):
+            return number
+        number = spread
+
+
+def _around(values: Tensor) -> Tensor:
+    """Return the largest of each pixel and the eight around it, round the edges, [R, R]."""
+    wrapped = pad(values.double()[None, None], (1, 1, 1, 1), mode="circular")
+    return max_pool2d(wrapped, kernel_size=3, stride=1)[0, 0]
 
 
 def builtin_textures() -> tuple[str, ...]:
