@@ -64,6 +64,8 @@ def evaluate_policy(env: Any, policy: Callable[[Any], Any], seeds: Iterable[int]
             `AsyncVectorEnv` of single ones; wrapped or not, in any autoreset mode, with
             `max_episode_steps`.
         policy: Maps observations, [B, N, P], to actions, [B, N, A]; B is 1 where `env` is single.
+            One that looks at worlds instead has `made_for(env)`, which returns the policy of an
+            environment.
         seeds: One for each episode, integers of at least 0.
 
     Raises:
@@ -88,6 +90,7 @@ def evaluate_policy(env: Any, policy: Callable[[Any], Any], seeds: Iterable[int]
         raise NPAError("seeds must hold at least one seed, got none: give seeds=range(8)")
     # Before the first episode, not in the midst of them.
     WorldRandom(given)
+    policy = policy_in(env, policy)
     single = isinstance(env, gymnasium.Env)
     count = 1 if single else env.num_envs
     run = _run_single if single else _run
@@ -96,6 +99,12 @@ def evaluate_policy(env: Any, policy: Callable[[Any], Any], seeds: Iterable[int]
     joined = [np.concatenate(column)[: len(given)] for column in zip(*ran, strict=True)]
     returns, start_losses, final_losses, steps, endings = joined
     return Episodes(returns, start_losses, final_losses, steps, tuple(endings.tolist()))
+
+
+def policy_in(env: Any, policy: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Return a policy for an environment: one that looks at worlds is made for those."""
+    make = getattr(policy, "made_for", None)
+    return policy if make is None else make(env)
 
 
 def _run(env: Any, policy: Callable[[Any], Any], seeds: list[int]) -> tuple[NDArray[Any], ...]:

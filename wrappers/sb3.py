@@ -340,18 +340,19 @@ class ParticleVecEnv(_EpisodeRows):
 class WorldVecEnv(_EpisodeRows):
     """The worlds of a vector environment as the rows of a Stable-Baselines3 `VecEnv`.
 
-    A row observes what all particles of its world perceive, shape [N, P], and gives all their
-    actions, [N, A]. Stable-Baselines3's own policies draw those from one Gaussian of N A columns,
-    which cannot learn: after the smallest update the ratio of two likelihoods is near zero or
-    beyond all bounds. Take a policy that means over particles instead of summing, such as
+    A row observes what is seen of its world, and acts on it: in gardens few numbers, elsewhere what
+    all particles perceive, shape [N, P], and all their actions, [N, A]. Stable-Baselines3's own
+    policies draw those of particles from one Gaussian of N A columns, which cannot learn: after the
+    smallest update the ratio of two likelihoods is near zero or beyond all bounds. For particles
+    take a policy that means over them instead of summing, such as
     `npa_envs.agents.learning.sb3.WorldRulePolicy`.
 
     Rows of a finished world have an info of their own, with `terminal_observation`,
     `TimeLimit.truncated` and, where there is one, `is_success`; the others share an empty one.
 
     Args:
-        env: A vector environment whose worlds are particles, [B, N, P] and [B, N, A], wrapped or
-            not, with same-step autoreset.
+        env: A vector environment whose observations and actions are boxes, wrapped or not, with
+            same-step autoreset.
 
     Raises:
         NPAError: The environment has other spaces, or another autoreset mode.
@@ -362,19 +363,19 @@ class WorldVecEnv(_EpisodeRows):
 
     def __init__(self, env: Any) -> None:
         spaces = [
-            _flat_float(getattr(env, name, None), name)
+            _float_box(getattr(env, name, None), name)
             for name in ("single_observation_space", "single_action_space")
         ]
         check_same_step(autoreset_mode(env))
         super().__init__(env, env.num_envs, 1, *spaces)
 
 
-def _flat_float(space: Any, name: str) -> Box:
-    """Return the space of a world's particles, a row of numbers for each."""
-    if not (isinstance(space, Box) and len(space.shape) == 2):
+def _float_box(space: Any, name: str) -> Box:
+    """Return the space of a world as the row that it is."""
+    if not isinstance(space, Box):
         raise NPAError(
-            f"{name} of env must be a box with a row for each particle, got {space}: make the "
-            "environment with gym.make_vec(..., vectorization_mode='vector_entry_point')"
+            f"{name} of env must be a box, got {space}: make the environment with "
+            "gym.make_vec(..., vectorization_mode='vector_entry_point'), or flatten what it sees"
         )
     return Box(space.low, space.high, dtype=np.float32)
 

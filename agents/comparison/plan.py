@@ -9,7 +9,7 @@ is the yardstick.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import PurePosixPath
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -141,8 +141,8 @@ class Plan:
     """Problems as JSON (`Problem.to_json`), by their names."""
     methods: Sequence[str]
     seeds: Sequence[int]
-    budgets: Mapping[Axis, float]
-    """Seconds or particle-steps that each run may take, by axis."""
+    budgets: Mapping[Axis, Mapping[str, float]]
+    """Seconds or particle-steps that each run may take, by axis and task."""
     options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     """Keyword options by method; others run with their defaults."""
     left_out: Collection[tuple[str, str]] = ()
@@ -163,11 +163,26 @@ class Plan:
             if (task, method) not in self.left_out
         ]
 
+    def part(self, number: int, count: int) -> list[Job]:
+        """Return the runs of one of `count` machines, numbered from 1.
+
+        All methods on a task from a seed are on one machine: some begin with what others learned.
+        """
+        groups = list(dict.fromkeys((job.axis, job.seed, job.task) for job in self.jobs()))
+        mine = set(groups[number - 1 :: count])
+        return [job for job in self.jobs() if (job.axis, job.seed, job.task) in mine]
+
+    def teacher(self, job: Job) -> Job | None:
+        """Return the run whose rules a run clones; None where it does not, or options name one."""
+        if job.method != "clone" or "teacher" in self.options.get("clone", {}):
+            return None
+        return replace(job, method="gradient")
+
     def facts(self, job: Job) -> dict[str, Any]:
         """Return what the figures of one of `jobs()` follow from, as JSON has it."""
         return {
             "problem": dict(self.tasks[job.task]),
-            "budget": self.budgets[job.axis],
+            "budget": self.budgets[job.axis][job.task],
             "options": dict(self.options.get(job.method, {})),
             "episodes": self.episodes,
             **self.settings,

@@ -31,7 +31,7 @@ import torch
 from numpy.typing import NDArray
 
 from npa_envs.agents.comparison.plan import Job, Plan
-from npa_envs.agents.evaluation import Episodes, evaluate_policy
+from npa_envs.agents.evaluation import Episodes, evaluate_policy, policy_in
 from npa_envs.agents.learning import method_options, train
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Budget, Entry
@@ -142,6 +142,8 @@ class Request:
     """What its figures follow from: problem, budget, options, episodes, and more."""
     threads: int = 1
     command: str = ""
+    teacher: str = ""
+    """Folder of the run whose rules are cloned, if any."""
 
     @classmethod
     def read(cls, folder: Path) -> Request:
@@ -211,6 +213,9 @@ def _learn(
 ) -> Episodes:
     """Learn, write what was learned, and return the held-out episodes."""
     problem, job, facts = request.problem, request.job, request.facts
+    options = dict(facts["options"])
+    if request.teacher:
+        options["teacher"] = request.teacher
     trained = train(
         job.method,
         problem,
@@ -218,10 +223,9 @@ def _learn(
         job.seed,
         device=device,
         on_entry=on_entry,
-        **facts["options"],
+        **options,
     )
-    if trained.rules is not None:
-        trained.rules.save(folder)
+    trained.save(folder)
     seeds = range(FIRST_TEST_SEED, FIRST_TEST_SEED + facts["episodes"])
     # Worlds of their own: what a method changed in its environment does not reach them.
     envs = problem.make_envs(min(len(seeds), problem.num_envs), device=device)
@@ -256,6 +260,7 @@ def final_picture(
         episode_steps=problem.episode_steps + 1,
     )
     envs = longer.make_envs(1, device=device)
+    policy = policy_in(envs, policy)
     observation, _ = envs.reset(seed=[seed])
     picture = _rendered(envs)
     for _ in range(problem.episode_steps):
@@ -393,11 +398,17 @@ def run_jobs(
     Raises:
         NPAError: The folder cannot be written to.
     """
-    waiting, ready = deque(jobs), deque[_Process]()
+    waiting, ready = list(jobs), deque[_Process]()
     running: dict[int, _Process] = {}
 
-    def start() -> _Process:
-        return _start(plan, waiting.popleft(), folder, places, command)
+    def start() -> _Process | None:
+        """Start the next process, if there is one that has nothing to wait for."""
+        ahead = {*waiting, *(one.job for one in (*ready, *running.values()))}
+        for job in waiting:
+            if plan.teacher(job) not in ahead:
+                waiting.remove(job)
+                return _start(plan, job, folder, places, command)
+        return None
 
     # What a killed comparison left of runs half-way.
     for job in jobs:
@@ -412,11 +423,14 @@ def run_jobs(
                 while ready:
                     ready.pop().end()
             for number in range(places.jobs):
-                if number not in running and (ready or waiting):
-                    running[number] = ready.popleft() if ready else start()
-                    running[number].go(places.device(number))
-            while places.ahead and waiting and len(ready) < places.jobs:
-                ready.append(start())
+                if number in running:
+                    continue
+                one = ready.popleft() if ready else start()
+                if one is not None:
+                    running[number] = one
+                    one.go(places.device(number))
+            while places.ahead and len(ready) < places.jobs and (one := start()) is not None:
+                ready.append(one)
             for number, one in list(running.items()):
                 if one.process.poll() is not None:
                     del running[number]
@@ -431,7 +445,9 @@ def _start(plan: Plan, job: Job, folder: Path, places: Places, command: str) -> 
     target = folder / job.folder
     part = target.parent / f".{target.name}.{secrets.token_hex(4)}"
     part.mkdir(parents=True)
-    request = Request(job, plan.facts(job), places.threads, command)
+    teacher = plan.teacher(job)
+    taught = "" if teacher is None else str(folder / teacher.folder)
+    request = Request(job, plan.facts(job), places.threads, command, taught)
     write_record(part / REQUEST, asdict(request))
     environment = os.environ | {"OMP_NUM_THREADS": str(places.threads)}
     with (part / OUTPUT).open("wb") as output:

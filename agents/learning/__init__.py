@@ -11,6 +11,7 @@ import inspect
 import pkgutil
 from collections.abc import Callable, Iterable
 from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
@@ -23,6 +24,7 @@ from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.tasks.checks import is_whole
 
 __all__ = [
+    "GARDEN_METHODS",
     "METHODS",
     "Budget",
     "Entry",
@@ -33,6 +35,7 @@ __all__ = [
     "Trained",
     "check_finite",
     "method_options",
+    "methods_for",
     "train",
 ]
 
@@ -51,6 +54,16 @@ METHODS: dict[str, str] = {
 rules and of all draws, `start` are rules to begin with, which are copied, or None. A method's
 options are further keyword arguments, or the fields of a dataclass which is the default of an
 argument `options`. Others may be added."""
+
+GARDEN_METHODS: dict[str, str] = {
+    "gradient": "npa_envs.agents.learning.gardeners:train_gradient",
+    "ppo_world": "npa_envs.agents.learning.garden_sb3:train_ppo",
+    "sac": "npa_envs.agents.learning.garden_sb3:train_sac",
+    "random": "npa_envs.agents.learning.gardeners:train_random",
+    "zero": "npa_envs.agents.learning.gardeners:train_zero",
+    "scripted": "npa_envs.agents.learning.gardeners:train_scripted",
+}
+"""The same for gardens, where a rule runs the particles: those that learn return policies."""
 
 REMOVED = {
     "ppo_rows": "take 'ppo_world', Stable-Baselines3's PPO with a likelihood a world, which in the "
@@ -73,6 +86,15 @@ class Trained(NamedTuple):
     """Maps observations, [B, N, P], to actions, [B, N, A], and a dict of agents' observations, of
     PettingZoo's parallel environments, to one of their actions: the rules' where there are some."""
 
+    def save(self, folder: str | Path) -> list[Path]:
+        """Write what was learned, if anything: rules' files, or the policy's own; return paths.
+
+        Raises:
+            NPAError: As for `RuleSet.save`.
+        """
+        save = getattr(self.policy if self.rules is None else self.rules, "save", None)
+        return [] if save is None else save(folder)
+
 
 def train(
     method: str,
@@ -90,7 +112,7 @@ def train(
     """Learn a problem by a method, within a budget.
 
     Args:
-        method: A name from `METHODS`.
+        method: A name from `methods_for(problem)`.
         problem: What is to be learned.
         budget: What may be spent.
         seed: Of everything that the method draws, from 0 to 99: runs with different seeds learn in
@@ -108,8 +130,8 @@ def train(
         DivergedError: The rules' weights have become infinite or NaN.
         MissingDependencyError: The method needs a library that is not installed.
     """
-    function = _function(method)
-    known = method_options(method)
+    function = _function(method, methods_for(problem))
+    known = _options_of(function)
     for name in options:
         if name not in known:
             raise NPAError(
@@ -138,17 +160,25 @@ def train(
     return Trained(None, progress.log, result)
 
 
+def methods_for(problem: Problem) -> dict[str, str]:
+    """Return the table of the methods that can learn a problem."""
+    return GARDEN_METHODS if problem.is_garden else METHODS
+
+
 def method_options(method: str) -> dict[str, Any]:
     """Return the options of a method, with their defaults.
 
     Args:
-        method: A name from `METHODS`.
+        method: A name from `METHODS`; one that is there for gardens alone, from `GARDEN_METHODS`.
 
     Raises:
         NPAError: There is no such method.
         MissingDependencyError: It needs a library that is not installed.
     """
-    function = _function(method)
+    return _options_of(_function(method, GARDEN_METHODS | METHODS))
+
+
+def _options_of(function: Callable[..., Any]) -> dict[str, Any]:
     declared = _declared(function)
     if declared is not None:
         return {field.name: getattr(declared, field.name) for field in fields(declared)}
@@ -164,12 +194,12 @@ def _declared(function: Callable[..., Any]) -> Any:
     return default if is_dataclass(default) else None
 
 
-def _function(method: str) -> Callable[..., Any]:
+def _function(method: str, table: dict[str, str]) -> Callable[..., Any]:
     if method in REMOVED:
         raise NPAError(f"method {shown(method)} is no more: {REMOVED[method]}")
-    if not isinstance(method, str) or method not in METHODS:
+    if not isinstance(method, str) or method not in table:
         raise NPAError(
-            f"method must be a known word, got {shown(method)}: {suggest(method, METHODS)}"
+            f"method must be a known word, got {shown(method)}: {suggest(method, table)}"
         )
-    function: Callable[..., Any] = pkgutil.resolve_name(METHODS[method])
+    function: Callable[..., Any] = pkgutil.resolve_name(table[method])
     return function

@@ -25,6 +25,7 @@ from npa_envs.devices import check_device
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.task import EnvTask
 from npa_envs.envs.core.vector import NPAVectorEnv, worlds_to_reset
+from npa_envs.envs.garden.task import GardenTask
 from npa_envs.envs.multi.task import SpeciesConfig, SpeciesTask
 from npa_envs.envs.multi.tasks import ENVIRONMENTS as SPECIES
 from npa_envs.envs.multi.tasks import task_type as species_task_type
@@ -128,6 +129,11 @@ class Problem:
         """Whether several species share a world."""
         return self.env_id in SPECIES
 
+    @property
+    def is_garden(self) -> bool:
+        """Whether a rule runs the particles, and an action says what few brushes do."""
+        return not self.is_species and issubclass(self.env_type.task_type, GardenTask)
+
     @cached_property
     def env_type(self) -> type[NPAVectorEnv]:
         """Class of the environment of many worlds, where one species is alone."""
@@ -153,7 +159,9 @@ class Problem:
     @cached_property
     def config(self) -> EnvConfig | SpeciesConfig:
         """The environment's configuration, on the CPU."""
-        given = dict(self.keywords)
+        # What an id is registered with counts, as for `gym.make`.
+        known = {} if self.is_species else gymnasium.spec(self.env_id).kwargs
+        given = {**known, **self.keywords}
         if self.is_species:
             given["max_cycles"] = self.episode_steps
         elif given.get("reward") == "sparse":

@@ -8,7 +8,7 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -56,15 +56,20 @@ class CompareOptions(MeasureOptions):
     """Folder for AXIS/TASK/METHOD/seed-K/, comparison.md, .json and .csv, and pictures
     (curves need the extra `bench`)."""
 
+    suite: Literal["npa-bench-v0"] | None = None
+    """Run a frozen benchmark, whose tasks, budgets, episodes and methods' options are its own, and
+    write a row for each method, OUT/rows/METHOD.json."""
+
     tasks: tuple[str, ...] = ()
-    """morphogenesis2d, regeneration2d, point_classification, mixing; default: all, or the
-    first when quick."""
+    """morphogenesis2d, regeneration2d, point_classification, mixing, or those of the suite, its ids
+    without npa/; default: all, or the first when quick."""
 
     methods: tuple[str, ...] = ()
-    """Methods of npa_envs.agents.learning; default: all but `clone`, which needs a teacher."""
+    """Methods of npa_envs.agents.learning; default: all but `clone`, which needs a teacher: the run
+    of `gradient` from the same seed, or options; of a suite: all of them."""
 
     seeds: int | None = None
-    """Seeds for each method and task: 0, 1, ...; default: 3, or 1 when quick."""
+    """Seeds for each method and task: 0, 1, ...; default: 3, 5 of a suite, or 1 when quick."""
 
     seconds: float | None = None
     """Compare for equal wall time: seconds that each run may learn. Its start and evaluations come
@@ -90,6 +95,10 @@ class CompareOptions(MeasureOptions):
     """Runs at once; default: one for each device. Those on one device share its time, which counts
     where wall time is equal: with --seconds, as many on each device."""
 
+    part: Annotated[str | None, tyro.conf.arg(metavar="K/N")] = None
+    """Run the K-th of N parts alone: a machine, or a task of a scheduler's array, takes one each,
+    all with the same --out on a shared disk."""
+
     max_seconds: float = math.inf
     """No run begins after so long; the next call goes on."""
 
@@ -97,6 +106,7 @@ class CompareOptions(MeasureOptions):
 def main(arguments: Sequence[str]) -> int:
     """Run what is missing, print and write; return 1 where a run failed."""
     options = parse_options(CompareOptions, "compare", arguments)
+    from npa_envs.agents.comparison.npa_bench import write_rows
     from npa_envs.agents.comparison.report import write_pictures, write_table
     from npa_envs.agents.comparison.run import Places, held_records, run_jobs
 
@@ -108,7 +118,8 @@ def main(arguments: Sequence[str]) -> int:
     # All are read first: a record of other settings is refused before any work is done.
     records = held_records(plan, folder)
     jobs = plan.jobs()
-    missing = [job for job in jobs if job not in records]
+    mine = plan.part(*_part(options.part))
+    missing = [job for job in mine if job not in records]
 
     def whole() -> list[RunRecord]:
         return [records[job] for job in jobs if job in records]
@@ -130,9 +141,12 @@ def main(arguments: Sequence[str]) -> int:
             written=written,
         )
     told = [write_table(plan, whole(), folder, command), *write_pictures(whole(), folder)]
+    if options.suite is not None:
+        rows = write_rows(plan, whole(), writable_folder(folder / "rows"), command)
+        told += [f"wrote {path}" for path in rows]
     failed = [record for record in whole() if record.status == "failed"]
     told += [f"{record.job} failed: {record.error}" for record in failed]
-    left = len(jobs) - len(records)
+    left = sum(job not in records for job in mine)
     told += [f"{left} runs are left: call again with the same options"] if left else []
     print("\n".join(told))
     return RUN_FAILED if failed else 0
@@ -148,6 +162,8 @@ def make_plan(options: CompareOptions) -> Plan:
     from npa_envs.agents.learning import METHODS, REMOVED
 
     check_numbers(options, seeds=1, episodes=1, jobs=1, threads=1)
+    if options.suite is not None:
+        return _suite_plan(options)
     if options.quick:
         told = {name: getattr(options, name) or few for name, few in QUICK.items()}
         options = replace(options, **told)
@@ -162,12 +178,54 @@ def make_plan(options: CompareOptions) -> Plan:
         tasks={name: json.loads(problem.to_json()) for name, problem in problems.items()},
         methods=methods,
         seeds=tuple(range(3 if options.seeds is None else options.seeds)),
-        budgets=_budgets(options),
+        budgets={axis: dict.fromkeys(tasks, held) for axis, held in _budgets(options).items()},
         options=_method_options(options.options, methods),
         left_out=() if options.methods else LEFT_OUT,
         episodes=options.episodes or (QUICK_EPISODES if options.quick else 32),
         settings=_settings(options),
     )
+
+
+def _suite_plan(options: CompareOptions) -> Plan:
+    """Return the plan of NPA-Bench, of which some tasks, methods and seeds may be chosen."""
+    from npa_envs.agents.comparison import npa_bench
+    from npa_envs.agents.comparison.plan import Plan
+    from npa_envs.agents.learning import methods_for
+
+    for name in ("seconds", "particle_steps", "episodes", "options"):
+        if getattr(options, name) not in (None, ()):
+            raise NPAError(
+                f"--{name.replace('_', '-')} must not be given with --suite, whose protocol is "
+                "frozen: leave it out, or compare without a suite"
+            )
+    quick = options.quick
+    tasks = chosen_names("task", options.tasks, npa_bench.TASKS)
+    if quick and not options.tasks:
+        tasks = tasks[:1]
+    methods = chosen_names("method", options.methods, npa_bench.METHODS)
+    problems = {name: npa_bench.problem_of(name) for name in tasks}
+    suited = {name: methods_for(problem) for name, problem in problems.items()}
+    return Plan(
+        tasks={name: json.loads(problem.to_json()) for name, problem in problems.items()},
+        methods=methods,
+        seeds=tuple(range(options.seeds or (1 if quick else npa_bench.LEAST_SEEDS))),
+        budgets={npa_bench.AXIS: {name: npa_bench.budget_of(name, quick=quick) for name in tasks}},
+        left_out=[
+            (task, method) for task in tasks for method in methods if method not in suited[task]
+        ],
+        episodes=QUICK_EPISODES if quick else npa_bench.EPISODES,
+        settings=_settings(options),
+    )
+
+
+def _part(words: str | None) -> tuple[int, int]:
+    """Return which part of how many is asked for; 1 of 1 where nothing is said."""
+    if words is None:
+        return 1, 1
+    number, mark, count = words.partition("/")
+    if not (mark and number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
+        raise NPAError(f"--part must be K/N with K from 1 to N, got {words!r}: --part 2/8")
+    return int(number), int(count)
 
 
 def _budgets(options: CompareOptions) -> dict[Axis, float]:

@@ -70,7 +70,7 @@ WRITE_PID = "import os; Path('{}', f'pid-{{os.getpid()}}').write_text(str(os.get
 
 def plan(**changes) -> Plan:
     fields = {"tasks": {"growth": {}}, "methods": ["one", "two"], "seeds": (0, 1)}
-    return Plan(**fields | {"budgets": {"seconds": 1.0}, "episodes": 2} | changes)
+    return Plan(**fields | {"budgets": {"seconds": {"growth": 1.0}}, "episodes": 2} | changes)
 
 
 def record(method: str, seed: int, returns=(), *, axis="seconds", status="done", **fields):
@@ -117,12 +117,30 @@ def is_alive(pid: int) -> bool:
 
 
 def test_every_method_runs_on_every_task_from_every_seed_in_every_budget():
-    jobs = plan(tasks={"a": {}, "b": {}}, budgets={"seconds": 1.0, "particle-steps": 9.0}).jobs()
+    jobs = plan(tasks={"a": {}, "b": {}}, budgets={"seconds": {}, "particle-steps": {}}).jobs()
     assert len(set(jobs)) == len(jobs) == 2 * 2 * 2 * 2
     assert [job.seed for job in jobs[:4]] == [0] * 4
     assert str(jobs[0].folder) == "seconds/a/one/seed-0"
     fewer = plan(tasks={"a": {}, "b": {}}, left_out={("b", "two")}).jobs()
     assert {(job.task, job.method) for job in fewer} == {("a", "one"), ("a", "two"), ("b", "one")}
+
+
+def test_parts_share_all_runs_and_leave_those_of_a_seed_and_task_together():
+    made = plan(tasks={"a": {}, "b": {}}, methods=["gradient", "clone"], seeds=(0, 1, 2))
+    parts = [made.part(number, 4) for number in (1, 2, 3, 4)]
+    assert sorted(str(job) for part in parts for job in part) == sorted(map(str, made.jobs()))
+    assert [len(part) for part in parts] == [4, 4, 2, 2]
+    for part in parts:
+        assert all(made.teacher(job) in part for job in part if job.method == "clone")
+    assert made.part(1, 1) == made.jobs()
+
+
+def test_a_clone_learns_from_the_gradient_of_its_seed_unless_options_name_a_teacher():
+    made = plan(methods=["clone", "gradient"])
+    clone, gradient = made.jobs()[:2]
+    assert (made.teacher(clone), made.teacher(gradient)) == (gradient, None)
+    told = plan(methods=["clone"], options={"clone": {"teacher": "heart"}})
+    assert told.teacher(clone) is None
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
@@ -141,7 +159,8 @@ def test_the_command_line_becomes_a_plan():
     )
     assert list(made.tasks) == list(PROBLEMS)
     assert list(made.methods) == [name for name in METHODS if name != "clone"]
-    assert made.budgets == {"seconds": 2.0, "particle-steps": 1e6}
+    assert made.budgets["seconds"] == dict.fromkeys(PROBLEMS, 2.0)
+    assert made.budgets["particle-steps"] == dict.fromkeys(PROBLEMS, 1e6)
     assert made.left_out == LEFT_OUT
     job = Job("particle-steps", "mixing", "evolution", 0)
     facts = made.facts(job)
@@ -237,6 +256,24 @@ def test_no_place_stays_free_while_a_process_waits(tmp_path, child):
     made, seen = plan(methods=["one"], seeds=(0, 1, 2, 3)), []
     run_jobs(made, made.jobs(), tmp_path, Places(("cuda:0", "cuda:1"), 2), written=seen.append)
     assert [one.job.seed for one in seen] == [1, 2, 3, 0]
+
+
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
+def test_a_run_that_clones_begins_when_its_teacher_is_over(tmp_path, child, device):
+    child(
+        "taught = request['teacher']\n"
+        "if not taught: time.sleep(0.5)\n"
+        "(folder / 'seen').write_text(str(bool(taught) and (Path(taught) / 'run.json').exists()))"
+    )
+    made, seen = plan(methods=["clone", "gradient"]), []
+    run_jobs(made, made.jobs(), tmp_path, Places((device,), jobs=4), written=seen.append)
+    order = [str(one.job.folder) for one in seen]
+    for job in made.jobs():
+        taught = (tmp_path / job.folder / "seen").read_text()
+        assert taught == str(job.method == "clone")
+        if job.method == "clone":
+            teacher = str(made.teacher(job).folder)
+            assert order.index(teacher) < order.index(str(job.folder))
 
 
 @pytest.mark.parametrize("waiting", [False, True])
@@ -409,9 +446,9 @@ def test_curves_have_a_line_for_each_point_of_each_run():
 @pytest.mark.parametrize(
     ("budgets", "at_once", "said"),
     [
-        ({"seconds": 1.0}, 3, True),
-        ({"seconds": 1.0}, 1, False),
-        ({"particle-steps": 9.0}, 3, False),
+        ({"seconds": {}}, 3, True),
+        ({"seconds": {}}, 1, False),
+        ({"particle-steps": {}}, 3, False),
     ],
 )
 def test_a_table_says_where_equal_wall_time_was_shared(budgets, at_once, said, tmp_path):

@@ -75,6 +75,27 @@ def builder():
 
 
 @pytest.fixture(scope="module")
+def bench():
+    """The script that makes the tables of NPA-Bench."""
+    pytest.importorskip("jsonschema")
+    pytest.importorskip("scipy")
+    sys.path.insert(0, str(DOCS))
+    try:
+        import build_npa_bench_page
+    finally:
+        sys.path.remove(str(DOCS))
+    return build_npa_bench_page
+
+
+def test_the_tables_of_the_benchmark_are_what_its_files_say(bench, tmp_path, capsys):
+    assert bench.main(["--check"]) == 0
+    text = (DOCS / bench.PAGE).read_text()
+    (tmp_path / bench.PAGE).write_text(text.replace("1e8", "2e8"))
+    assert bench.main(["--check"], tmp_path) == 1
+    assert "run python docs/build_npa_bench_page.py" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
 def gallery():
     """The script that makes the page of the rules."""
     sys.path.insert(0, str(DOCS))

@@ -78,7 +78,9 @@ LADDER = {
     "npa_envs.agents": rung(
         18, "torch numpy tqdm gymnasium pettingzoo stable_baselines3 cma", never=INSIDES
     ),
-    "npa_envs.agents.comparison": rung(19, "torch numpy PIL", never=INSIDES),
+    "npa_envs.agents.comparison": rung(
+        19, "torch numpy PIL scipy matplotlib jsonschema", never=INSIDES
+    ),
     "npa_envs.web": rung(20, "torch numpy gymnasium PIL starlette uvicorn", never=ORACLES),
     "npa_envs.cli": rung(21, "torch numpy tqdm tyro imageio_ffmpeg", never=ORACLES),
     "npa_envs.__main__": rung(22),

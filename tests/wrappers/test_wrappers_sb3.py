@@ -302,7 +302,7 @@ OTHER = {"others": {"species_1": still}}
         (lambda: ParticleVecEnv(wrapped_envs.single()), "vector_entry_point"),
         (
             lambda: WorldVecEnv(wrapped_envs.single()),
-            "single_observation_space of env must be a box with a row",
+            "single_observation_space of env must be a box",
         ),
         (
             lambda: rows_of(WorldVecEnv, batched).step(np.zeros((2, 63, ACTIONS), np.float32)),

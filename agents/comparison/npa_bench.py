@@ -1,0 +1,333 @@
+"""NPA-Bench v0: frozen problems and budgets, rows of results as JSON files, and their scores.
+
+A row is what one method reached: for each problem the returns of at least `LEAST_SEEDS` runs. It is
+a file, which anybody can write; `npa_bench_v0.schema.json` beside this module is its schema. Scores
+follow from the files alone: those of the methods `zero` and `gradient` are 0 and 1.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from npa_envs.agents.comparison.plan import Axis, Plan
+from npa_envs.agents.comparison.run import RunRecord
+from npa_envs.agents.learning.problem import Problem
+from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
+from npa_envs.files import read_json
+from npa_envs.measure.record import write_record
+
+NAME = "npa-bench-v0"
+
+AXIS: Axis = "particle-steps"
+"""What is equal for all methods."""
+
+METHODS = (
+    "gradient", "shac", "ppo", "ppo_world", "sac", "evolution", "clone", "scripted", "random",
+    "zero",
+)  # fmt: skip
+"""What is run; a method that has nothing for a problem is left out there."""
+
+EPISODES = 32
+"""Held-out episodes that tell what a run has reached."""
+
+LEAST_SEEDS = 5
+"""Runs of a method on a problem, at least, from different seeds."""
+
+EXCESS = 1.1
+"""A run may take so many times its budget, as the last iteration is not cut off."""
+
+SCHEMA = Path(__file__).with_name("npa_bench_v0.schema.json")
+
+NOTHING, YARDSTICK = "zero", "gradient"
+"""Methods whose mean returns have the scores 0 and 1."""
+
+
+class Entry(NamedTuple):
+    """A problem: episodes, worlds to learn in, the hidden layer of new rules, and the budget."""
+
+    episode_steps: int
+    num_envs: int
+    hidden_dim: int
+    particle_steps: int
+
+
+PARTICLES: Mapping[str, Entry] = {}
+"""Problems in which an action has a row for each particle, by their ids."""
+
+GARDENS: Mapping[str, Entry] = {
+    # 48 828 steps of worlds, of 8 steps of the rule each.
+    "npa/Gardener2DSmall-v0": Entry(32, 64, 64, 100_000_000),
+    "npa/Shepherd2DSmall-v0": Entry(32, 64, 64, 100_000_000),
+}
+"""Problems in which a rule runs the particles; in particle-steps the rule's steps count."""
+
+GROUPS: Mapping[str, Mapping[str, Entry]] = {"particles": PARTICLES, "gardens": GARDENS}
+
+ENTRIES: Mapping[str, Entry] = {**PARTICLES, **GARDENS}
+"""All problems by their ids. Nothing of them ever changes; others make another version."""
+
+QUICK_SHARE = 1e-3
+"""Share of the budgets that quick runs have: they say nothing but that it runs."""
+
+
+def task_name(env_id: str) -> str:
+    """Return what runs of a problem are called: its id without "npa/"."""
+    return env_id.removeprefix("npa/")
+
+
+TASKS = {task_name(env_id): env_id for env_id in ENTRIES}
+"""Ids by the names of tasks."""
+
+
+def problem_of(task: str) -> Problem:
+    """Return the problem of a name of `TASKS`.
+
+    Raises:
+        NPAError: There is no such task.
+    """
+    if task not in TASKS:
+        raise NPAError(f"unknown task {shown(task)} of {NAME}: {suggest(task, TASKS)}")
+    entry = ENTRIES[TASKS[task]]
+    return Problem(
+        env_id=TASKS[task],
+        episode_steps=entry.episode_steps,
+        num_envs=entry.num_envs,
+        hidden_dim=entry.hidden_dim,
+    )
+
+
+def budget_of(task: str, *, quick: bool = False) -> float:
+    """Return the particle-steps that a run may learn from."""
+    return ENTRIES[TASKS[task]].particle_steps * (QUICK_SHARE if quick else 1.0)
+
+
+# Rows: what methods reached
+
+
+@dataclass(frozen=True)
+class Run:
+    """What one run reached."""
+
+    env_id: str
+    seed: int
+    particle_steps: float
+    """What it learned from."""
+    mean_return: float
+    """Mean return of the held-out episodes; NaN where it diverged."""
+    curve: tuple[tuple[float, float], ...] = ()
+    """Particle-steps, and the mean return of other held-out episodes after them."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """What a method reached."""
+
+    method: str
+    runs: tuple[Run, ...]
+    about: str = ""
+    """What the method is, in a sentence."""
+
+    def returns(self, env_id: str) -> NDArray[np.float64]:
+        """Return the mean returns of its runs on a problem, in the order of their seeds."""
+        found = sorted((run for run in self.runs if run.env_id == env_id), key=lambda r: r.seed)
+        return np.array([run.mean_return for run in found])
+
+
+def write_rows(plan: Plan, records: Sequence[RunRecord], folder: Path, command: str) -> list[Path]:
+    """Write a file for each method of a plan, METHOD.json, and return the paths.
+
+    Raises:
+        NPAError: A file cannot be written.
+    """
+    paths = []
+    for method in dict.fromkeys(record.job.method for record in records):
+        some = [r for r in records if r.job.method == method and r.status != "failed"]
+        if some:
+            paths.append(folder / f"{method}.json")
+            facts = {name: plan.settings[name] for name in ("machine", "commit", "versions")}
+            row = {
+                "benchmark": NAME,
+                "method": method,
+                "options": dict(plan.options.get(method, {})),
+                "command": command,
+                "date": max(record.date for record in some),
+                **facts,
+                "runs": [_run_object(record) for record in some],
+            }
+            write_record(paths[-1], row)
+    return paths
+
+
+def _run_object(record: RunRecord) -> dict[str, Any]:
+    points = record.curve
+    return {
+        "id": TASKS[record.job.task],
+        "seed": record.job.seed,
+        "particle_steps": points[-1].particle_steps if points else 0,
+        "seconds": round(points[-1].seconds, 2) if points else 0.0,
+        "returns": [round(value, 5) for value in record.returns],
+        "curve": [[point.particle_steps, round(point.mean_return, 5)] for point in points],
+    }
+
+
+def read_row(path: Path) -> Row:
+    """Return a row from its file.
+
+    Raises:
+        NPAError: It does not follow the schema or the rules of the benchmark.
+        MissingDependencyError: jsonschema is not installed.
+    """
+    try:
+        import jsonschema
+    except ImportError as error:
+        raise MissingDependencyError(
+            "rows are checked by jsonschema, which is not installed: pip install 'npa-envs[bench]'"
+        ) from error
+    held = read_json(path)
+    try:
+        jsonschema.validate(held, json.loads(SCHEMA.read_text("utf-8")))
+    except jsonschema.ValidationError as error:
+        raise NPAError(
+            f"{path.name} must follow {SCHEMA.name}, but at {error.json_path} {error.message}"
+        ) from error
+    runs = tuple(_read_run(run) for run in held["runs"])
+    row = Row(held["method"], runs, held.get("about", ""))
+    _check_row(row, path.name)
+    return row
+
+
+def _read_run(held: Mapping[str, Any]) -> Run:
+    returns = [math.nan if value is None else float(value) for value in held["returns"]]
+    mean = sum(returns) / len(returns) if returns else math.nan
+    curve = tuple((at, value) for at, value in held["curve"] if value is not None)
+    return Run(held["id"], held["seed"], held["particle_steps"], mean, curve)
+
+
+def _check_row(row: Row, name: str) -> None:
+    """Check what a schema cannot say; raises NPAError."""
+    for env_id in dict.fromkeys(run.env_id for run in row.runs):
+        if env_id not in ENTRIES:
+            raise NPAError(f"{name} has runs of {env_id}, no problem of {NAME}: leave them out")
+        some = [run for run in row.runs if run.env_id == env_id]
+        seeds = {run.seed for run in some}
+        if len(seeds) < len(some) or len(seeds) < LEAST_SEEDS:
+            raise NPAError(
+                f"{name} must have runs of {env_id} from at least {LEAST_SEEDS} seeds, each once, "
+                f"got {sorted(run.seed for run in some)}: run the missing ones"
+            )
+        most = EXCESS * ENTRIES[env_id].particle_steps
+        for run in some:
+            if run.particle_steps > most:
+                raise NPAError(
+                    f"{name} must take at most {most:.3g} particle-steps on {env_id}, got "
+                    f"{run.particle_steps:.3g} from seed {run.seed}: learn from fewer"
+                )
+
+
+def read_rows(folder: Path) -> dict[str, Row]:
+    """Return all rows of a folder by their methods.
+
+    Raises:
+        NPAError: As for `read_row`; or two files are of one method.
+    """
+    rows: dict[str, Row] = {}
+    for path in sorted(folder.glob("*.json")):
+        row = read_row(path)
+        if row.method in rows:
+            raise NPAError(f"{path.name} is a second row of {row.method!r}: name the method anew")
+        rows[row.method] = row
+    return rows
+
+
+# Scores
+
+
+class Score(NamedTuple):
+    """An interquartile mean of normalised returns, with its 95 % interval."""
+
+    middle: float
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        return f"{self.middle:.2f} [{self.low:.2f}, {self.high:.2f}]"
+
+
+def normalised(rows: Mapping[str, Row], method: str, env_id: str) -> NDArray[np.float64]:
+    """Return the score of each run: (R − R_zero) / (R_gradient − R_zero) of mean returns R.
+
+    R_zero and R_gradient are means over their runs. A run that diverged has the score 0.
+
+    Raises:
+        NPAError: There are no runs of `zero` or `gradient`, or the gradient is no better.
+    """
+    ends = []
+    for name in (NOTHING, YARDSTICK):
+        values = rows[name].returns(env_id) if name in rows else np.array([])
+        if not np.isfinite(values).any():
+            raise NPAError(f"scores of {env_id} need runs of {name!r}: run them")
+        ends.append(float(np.nanmean(values)))
+    nothing, yardstick = ends
+    if not yardstick > nothing:
+        raise NPAError(f"scores of {env_id} need {YARDSTICK} to be better than {NOTHING}")
+    scores = (rows[method].returns(env_id) - nothing) / (yardstick - nothing)
+    return np.nan_to_num(scores, nan=0.0)
+
+
+def interquartile_mean(*samples: NDArray[np.float64], axis: int = -1) -> Any:
+    """Return the mean of the middle half of all samples together, along an axis."""
+    from scipy.stats import trim_mean
+
+    return trim_mean(np.concatenate(samples, axis=axis), 0.25, axis=axis)
+
+
+def score(samples: Sequence[NDArray[np.float64]], seed: int = 0) -> Score:
+    """Return the interquartile mean of scores, and its interval by bootstrap within problems.
+
+    Seeds are drawn anew within each problem, 2000 times, and percentiles taken: stratified
+    bootstrap (Agarwal et al., arXiv 2108.13264).
+
+    Args:
+        samples: Scores of the runs on each problem.
+        seed: Of the draws.
+
+    Raises:
+        MissingDependencyError: SciPy is not installed.
+    """
+    try:
+        from scipy.stats import bootstrap
+    except ImportError as error:
+        raise MissingDependencyError(
+            "scores need SciPy, which is not installed: pip install 'npa-envs[bench]'"
+        ) from error
+    middle = float(interquartile_mean(*samples))
+    if all(np.ptp(values) == 0.0 for values in samples):
+        return Score(middle, middle, middle)
+    found = bootstrap(
+        samples,
+        interquartile_mean,
+        n_resamples=2000,
+        method="percentile",
+        rng=np.random.default_rng(seed),
+    )
+    low, high = found.confidence_interval
+    return Score(middle, float(low), float(high))
+
+
+def scores_in(
+    rows: Mapping[str, Row], method: str, env_ids: Iterable[str]
+) -> dict[str, NDArray[np.float64]]:
+    """Return the scores of a method on those of some problems that it has runs of."""
+    return {
+        env_id: normalised(rows, method, env_id)
+        for env_id in env_ids
+        if len(rows[method].returns(env_id))
+    }

@@ -1,0 +1,223 @@
+"""Stable-Baselines3's SAC and PPO in gardens, as they come: a row for each world."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium.spaces import flatten_space
+from gymnasium.vector import VectorWrapper
+from numpy.typing import NDArray
+from torch import Tensor
+
+from npa_envs.agents.learning.gardeners import check_no_start
+from npa_envs.agents.learning.problem import Problem, world_seeds
+from npa_envs.agents.learning.progress import Progress
+from npa_envs.agents.learning.rules import RuleSet
+from npa_envs.errors import MissingDependencyError
+from npa_envs.tasks.checks import check_fraction, check_positive
+from npa_envs.wrappers.sb3 import WorldVecEnv, on_host
+
+try:
+    from stable_baselines3 import PPO, SAC
+    from stable_baselines3.common.callbacks import BaseCallback
+except ImportError as error:
+    raise MissingDependencyError(
+        "SAC and PPO in gardens need Stable-Baselines3: pip install 'npa-envs[sb3]'"
+    ) from error
+
+FILE = "policy.zip"
+"""What `GardenPolicy.save` writes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GardenOptions:
+    """What both algorithms are told; all that is not said is as Stable-Baselines3 has it."""
+
+    gamma: float = 0.9
+    """Discount of a reward one step later (dimensionless)."""
+
+    learning_rate: float = 1e-3
+    """Adam's."""
+
+    def __post_init__(self) -> None:
+        """Check every field; raises NPAError."""
+        check_fraction(self, "gamma")
+        check_positive(self, float, "learning_rate")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SACOptions(GardenOptions):
+    """Options of `train_sac`."""
+
+    learning_starts: int = 1000
+    """Steps of worlds before the first gradient step."""
+
+    world_steps: int = 4
+    """Steps of worlds for each gradient step, as nearly as the number of worlds allows."""
+
+    def __post_init__(self) -> None:
+        """Check every field; raises NPAError."""
+        super().__post_init__()
+        check_positive(self, int, "learning_starts", "world_steps")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PPOOptions(GardenOptions):
+    """Options of `train_ppo`."""
+
+    steps: int = 32
+    """Steps of each world in a round."""
+
+    batch_size: int = 128
+    """Steps of worlds in a minibatch."""
+
+    def __post_init__(self) -> None:
+        """Check every field; raises NPAError."""
+        super().__post_init__()
+        check_positive(self, int, "steps", "batch_size")
+
+
+SAC_DEFAULTS, PPO_DEFAULTS = SACOptions(), PPOOptions()
+
+
+def train_sac(
+    problem: Problem,
+    progress: Progress,
+    seed: int,
+    *,
+    device: torch.device,
+    start: RuleSet | None = None,
+    options: SACOptions = SAC_DEFAULTS,
+) -> GardenPolicy:
+    """Return what SAC (Haarnoja et al., arXiv 1801.01290) finds within a budget.
+
+    Raises:
+        NPAError: There are rules to start from.
+    """
+    told = {
+        "learning_starts": options.learning_starts,
+        "gradient_steps": max(1, problem.num_envs // options.world_steps),
+    }
+    return _learned(SAC, told, problem, progress, seed, device, start, options)
+
+
+def train_ppo(
+    problem: Problem,
+    progress: Progress,
+    seed: int,
+    *,
+    device: torch.device,
+    start: RuleSet | None = None,
+    options: PPOOptions = PPO_DEFAULTS,
+) -> GardenPolicy:
+    """Return what PPO (Schulman et al., arXiv 1707.06347) finds within a budget; as `train_sac`."""
+    told = {"n_steps": options.steps, "batch_size": options.batch_size}
+    return _learned(PPO, told, problem, progress, seed, device, start, options)
+
+
+def _learned(
+    algorithm: Any,
+    told: dict[str, int],
+    problem: Problem,
+    progress: Progress,
+    seed: int,
+    device: torch.device,
+    start: RuleSet | None,
+    options: GardenOptions,
+) -> GardenPolicy:
+    check_no_start(start)
+    env = WorldVecEnv(FlatObservations(problem.make_envs(device=device)))
+    model = algorithm(
+        "MlpPolicy",
+        env,
+        gamma=options.gamma,
+        learning_rate=options.learning_rate,
+        seed=seed,
+        device=device,
+        **told,
+    )
+    # Stable-Baselines3 would begin with worlds seed, seed + 1, and so on.
+    env.seed(world_seeds(seed, problem.num_envs)[0])
+    policy = GardenPolicy(model)
+    model.learn(sys.maxsize, AccountCallback(progress, policy))
+    env.close()
+    return policy
+
+
+class AccountCallback(BaseCallback):
+    """Keeps a learner's account while Stable-Baselines3 learns, and stops it in time."""
+
+    def __init__(self, progress: Progress, policy: GardenPolicy) -> None:
+        super().__init__()
+        self._progress, self._policy = progress, policy
+        problem = progress.problem
+        rule_steps: int = getattr(problem.config, "rule_steps", 1)
+        self._step = problem.num_envs * problem.particle_count * rule_steps
+
+    def _on_training_start(self) -> None:
+        self._progress.start(self._policy)
+
+    def _on_step(self) -> bool:
+        """Take down a step of all worlds, and return whether to go on."""
+        self._progress.advance(self._step)
+        self._progress.look(self._policy)
+        return not self._progress.over
+
+    def _on_training_end(self) -> None:
+        self._progress.look(self._policy, force=True)
+
+
+class GardenPolicy:
+    """A model of Stable-Baselines3, without noise, as the policy of a garden.
+
+    Args:
+        model: It; the policy follows while it learns.
+    """
+
+    def __init__(self, model: Any) -> None:
+        self.model = model
+
+    def __call__(self, observation: Any) -> NDArray[np.float32]:
+        """Return actions of worlds, shape [B, K, W], for what is seen of them, [B, ...]."""
+        (seen,) = on_host(flat(observation))
+        action, _ = self.model.predict(seen, deterministic=True)
+        return np.asarray(action)
+
+    def save(self, folder: str | Path) -> list[Path]:
+        """Write the model as Stable-Baselines3 does, `policy.zip`, and return its path."""
+        path = Path(folder) / FILE
+        self.model.save(path)
+        return [path]
+
+
+class FlatObservations(VectorWrapper[Any, Any, Any]):
+    """A garden that hands out tensors, whose observations are rows of numbers, goals among them."""
+
+    def __init__(self, env: Any) -> None:
+        super().__init__(env)
+        self.single_observation_space = flatten_space(env.single_observation_space)
+
+    def reset(self, **told: Any) -> tuple[Any, dict[str, Any]]:
+        """Reset worlds, and return rows, shape [B, O]."""
+        observation, infos = self.env.reset(**told)
+        return flat(observation), infos
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Step worlds, and return rows, shape [B, O], and what else there is."""
+        observation, *rest, infos = self.env.step(actions)
+        if "final_obs" in infos:
+            infos = {**infos, "final_obs": flat(infos["final_obs"])}
+        return flat(observation), *rest, infos
+
+
+def flat(observation: Any) -> Tensor:
+    """Return what is seen of worlds as rows, shape [B, O]; dictionaries in their keys' order."""
+    if isinstance(observation, dict):
+        # As Gymnasium's space of dictionaries sorts them.
+        return torch.cat([flat(observation[name]) for name in sorted(observation)], dim=1)
+    return torch.as_tensor(observation).flatten(1)

@@ -1,0 +1,163 @@
+"""Write the tables of NPA-Bench, `docs/npa_bench.md`, from the rows' files.
+
+    python docs/build_npa_bench_page.py          write the tables and the curves' picture
+    python docs/build_npa_bench_page.py --check  fail where the page is not current
+
+Rows are the files of `benchmarks/results/npa_bench_v0/`, each of which is checked. Tables stand
+between marks in the page; all else in it is written by hand.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+from page_parts import table, write_or_check
+
+from npa_envs.agents.comparison.npa_bench import (
+    ENTRIES,
+    GROUPS,
+    METHODS,
+    Row,
+    problem_of,
+    read_rows,
+    score,
+    scores_in,
+    task_name,
+)
+from npa_envs.measure.plots import draw_band, legend_of, new_figure, png
+from npa_envs.measure.tables import NONE
+
+DOCS = Path(__file__).resolve().parent
+ROWS = DOCS.parent / "benchmarks" / "results" / "npa_bench_v0"
+PAGE = "npa_bench.md"
+PICTURE = DOCS / "images" / "npa_bench.png"
+PANELS = 3
+"""Panels side by side."""
+
+
+def problems() -> str:
+    """Return the table of the problems, Markdown."""
+    lines = []
+    for env_id, entry in ENTRIES.items():
+        count = problem_of(task_name(env_id)).particle_count
+        steps = f"{entry.particle_steps:.0e}".replace("e+0", "e")
+        line = (count, entry.episode_steps, entry.num_envs, entry.hidden_dim, steps)
+        lines.append((f"`{env_id}`", *map(str, line)))
+    heads = ("Id", "Particles", "Steps", "Worlds", "Hidden units", "Particle-steps of a run")
+    return table(heads, lines)
+
+
+def ranked(rows: dict[str, Row]) -> list[str]:
+    """Return the methods: the library's own in their order, then all others by name."""
+    return sorted(rows, key=lambda name: (METHODS.index(name) if name in METHODS else 99, name))
+
+
+def scored(rows: dict[str, Row], group: str) -> str:
+    """Return the scores of all methods on a group of problems, Markdown."""
+    ids = [env_id for env_id in GROUPS[group] if len(rows["gradient"].returns(env_id))]
+    lines = []
+    for method in ranked(rows):
+        found = scores_in(rows, method, ids)
+        if found:
+            cells = [str(score([found[env_id]])) if env_id in found else NONE for env_id in ids]
+            together = str(score(list(found.values()))) if len(found) == len(ids) else NONE
+            lines.append((f"`{method}`", *cells, together))
+    heads = ("Method", *(f"`{task_name(env_id)}`" for env_id in ids), "All")
+    return table(heads, lines) if lines else ""
+
+
+def returned(rows: dict[str, Row]) -> str:
+    """Return the mean returns with their standard errors over seeds, Markdown."""
+    ids = [env_id for env_id in ENTRIES if any(len(row.returns(env_id)) for row in rows.values())]
+    lines = []
+    for method in ranked(rows):
+        cells = []
+        for env_id in ids:
+            values = rows[method].returns(env_id)
+            values = values[np.isfinite(values)]
+            told = NONE
+            if len(values):
+                told = f"{values.mean():.3f} ± {values.std(ddof=1) / len(values) ** 0.5:.3f}"
+            cells.append(told)
+        lines.append((f"`{method}`", *cells))
+    return table(("Method", *(f"`{task_name(env_id)}`" for env_id in ids)), lines)
+
+
+def described(rows: dict[str, Row]) -> str:
+    """Return what the files say of their methods, Markdown."""
+    lines = []
+    for method in ranked(rows):
+        runs = rows[method].runs
+        lines.append((f"`{method}`", rows[method].about or "of this library", str(len(runs))))
+    return table(("Method", "What it is", "Runs"), lines)
+
+
+def parts(rows: dict[str, Row]) -> dict[str, str]:
+    """Return what stands between the marks of the page, by their names."""
+    made = {"problems": problems()}
+    if rows:
+        made |= {name: scored(rows, name) for name in GROUPS}
+        made |= {"returns": returned(rows), "methods": described(rows)}
+    return made
+
+
+def page(text: str, rows: dict[str, Row]) -> str:
+    """Return a page with its tables made anew."""
+    for name, made in parts(rows).items():
+        mark = rf"(<!-- made: {name} -->\n).*?(<!-- end -->)"
+        assert len(re.findall(mark, text, re.DOTALL)) == 1, f"{PAGE} has one mark {name}"
+        text = re.sub(
+            mark, lambda found, made=made: f"{found[1]}{made}\n{found[2]}", text, flags=re.S
+        )
+    return text
+
+
+def curves(rows: dict[str, Row]) -> bytes:
+    """Return the learning curves of all problems as a PNG file; bands are standard errors."""
+    ids = [env_id for env_id in ENTRIES if any(len(row.returns(env_id)) for row in rows.values())]
+    lines = -(-len(ids) // PANELS)
+    figure, grid = new_figure(lines, PANELS, (11.0, 3.2 * lines))
+    for panel, env_id in zip(grid.flat, ids, strict=False):
+        for number, method in enumerate(ranked(rows)):
+            draw_method(panel, rows[method], env_id, f"C{number}")
+        panel.set_title(task_name(env_id), fontsize=9, loc="left")
+        panel.set(xlabel="particle-steps", ylabel="return")
+        panel.grid(alpha=0.3)
+    for panel in list(grid.flat)[len(ids) :]:
+        panel.set_axis_off()
+    legend_of(figure, grid[0][0], "right center", fontsize=8)
+    return png(figure)
+
+
+def draw_method(panel: object, row: Row, env_id: str, colour: str) -> None:
+    """Draw the mean curve of a method; a dashed line where it does not learn."""
+    found = [run.curve for run in row.runs if run.env_id == env_id and run.curve]
+    if not found:
+        panel.plot([], [], color=colour, label=row.method)
+        return
+    if max(len(curve) for curve in found) == 1:
+        panel.axhline(
+            np.mean([c[0][1] for c in found]), color=colour, ls="--", lw=1.0, label=row.method
+        )
+        return
+    across = np.linspace(0.0, min(curve[-1][0] for curve in found), 64)
+    values = np.stack([np.interp(across, *zip(*curve, strict=True)) for curve in found])
+    middle = values.mean(axis=0)
+    error = values.std(axis=0, ddof=1) / len(values) ** 0.5
+    draw_band(panel, across, (middle - error, middle, middle + error), colour, row.method, lw=1.3)
+
+
+def main(arguments: list[str] | None = None, folder: Path = DOCS) -> int:
+    """Write or check the page; return the exit status."""
+    rows = read_rows(ROWS)
+    made = {PAGE: page((folder / PAGE).read_text(encoding="utf-8"), rows)}
+    if rows and "--check" not in (sys.argv[1:] if arguments is None else arguments):
+        PICTURE.write_bytes(curves(rows))
+    return write_or_check(folder, made, [PAGE], __doc__, arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

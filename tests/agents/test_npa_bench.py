@@ -1,0 +1,181 @@
+"""NPA-Bench: rows are files that anybody can write, and scores follow from them alone."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from npa_envs.agents.comparison import npa_bench
+from npa_envs.agents.comparison.npa_bench import (
+    ENTRIES,
+    Row,
+    Run,
+    normalised,
+    read_row,
+    read_rows,
+    score,
+    scores_in,
+    write_rows,
+)
+from npa_envs.agents.comparison.plan import Job
+from npa_envs.agents.comparison.run import Point, RunRecord
+from npa_envs.agents.learning import methods_for
+from npa_envs.cli.compare import CompareOptions, make_plan
+from npa_envs.errors import NPAError
+
+pytest.importorskip("jsonschema")
+pytest.importorskip("scipy")
+
+FIRST, SECOND = list(ENTRIES)[:2]
+
+
+def row(method: str, *means: float, env_id: str = FIRST) -> Row:
+    return Row(method, tuple(Run(env_id, k, 0.0, mean) for k, mean in enumerate(means)))
+
+
+def suite(**changes):
+    return make_plan(CompareOptions(suite="npa-bench-v0", commit="c0ffee", **changes))
+
+
+def records(plan, status="done"):
+    """A record of each of a plan's runs: its seed is what it returned."""
+    return [
+        RunRecord(
+            job=job,
+            facts=plan.facts(job),
+            status=status,
+            returns=(float(job.seed),) * plan.episodes,
+            curve=(Point(0.0, 0.0, -1.0, 0.1, 1.0), Point(2.0, 1000.0, 0.5, 0.1, 1.0)),
+            date="2026-01-02",
+        )
+        for job in plan.jobs()
+    ]
+
+
+def test_the_suite_is_every_method_on_all_that_it_can_learn_within_the_frozen_budgets():
+    made = suite()
+    assert set(made.tasks) == set(npa_bench.TASKS)
+    assert (list(made.seeds), made.episodes) == ([0, 1, 2, 3, 4], 32)
+    for task, env_id in npa_bench.TASKS.items():
+        assert made.budgets["particle-steps"][task] == ENTRIES[env_id].particle_steps
+        problem = npa_bench.problem_of(task)
+        ran = {job.method for job in made.jobs() if job.task == task}
+        assert ran <= methods_for(problem).keys()
+        assert {"zero", "gradient", "random", "ppo_world"} <= ran
+        assert ("sac" in ran) == problem.is_garden
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"seconds": 1.0}, "--seconds must not be given with --suite"),
+        ({"particle_steps": 1.0}, "--particle-steps must not"),
+        ({"episodes": 3}, "--episodes must not"),
+        ({"options": ("sac.gamma=0.5",)}, "--options must not"),
+        ({"tasks": ("Gardener2DSmall-v1",)}, "did you mean 'Gardener2DSmall-v0'"),
+        ({"methods": ("sacc",)}, "did you mean 'sac'"),
+    ],
+)
+def test_a_frozen_protocol_cannot_be_changed(changes, words):
+    with pytest.raises(NPAError, match=words):
+        suite(**changes)
+
+
+# Rows
+
+
+def test_rows_come_back_from_their_files(tmp_path):
+    made = suite(methods=("zero", "random"))
+    (first, second) = write_rows(made, records(made), tmp_path, "it")
+    assert (first.name, second.name) == ("random.json", "zero.json")
+    rows = read_rows(tmp_path)
+    assert list(rows) == ["random", "zero"]
+    for env_id in ENTRIES:
+        assert rows["zero"].returns(env_id).tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
+    assert rows["zero"].runs[0].curve == ((0.0, -1.0), (1000.0, 0.5))
+    held = json.loads(first.read_text())
+    assert (held["commit"], held["command"], held["date"]) == ("c0ffee", "it", "2026-01-02")
+
+
+def test_a_run_that_failed_is_in_no_row_and_one_that_diverged_has_no_returns(tmp_path):
+    made = suite(methods=("zero",))
+    some = records(made)
+    some[0] = RunRecord(job=some[0].job, facts={}, status="failed")
+    (path,) = write_rows(made, some, tmp_path, "it")
+    assert len(json.loads(path.read_text())["runs"]) == len(some) - 1
+    some[0] = RunRecord(job=some[0].job, facts={}, status="diverged", date="2026-01-01")
+    write_rows(made, some, tmp_path, "it")
+    found = read_row(path)
+    assert math.isnan(next(run for run in found.runs if run.seed == some[0].job.seed).mean_return)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda held: held.pop("machine"), "'machine' is a required property"),
+        (lambda held: held.update(extra=1), "Additional properties"),
+        (lambda held: held.update(benchmark="npa-bench-v1"), "was expected"),
+        (lambda held: held["runs"][0].update(returns=[1.0]), r"\$.runs\[0\].returns"),
+        (lambda held: held["runs"][0].update(returns=["a"] * 32), "is not of type"),
+        (lambda held: held["runs"][0].update(id="npa/Other-v0"), "no problem of npa-bench-v0"),
+        (lambda held: held["runs"].pop(), "from at least 5 seeds"),
+        (lambda held: held["runs"][0].update(seed=1), "each once"),
+        (lambda held: held["runs"][0].update(particle_steps=1e12), "at most"),
+    ],
+)
+def test_a_row_that_breaks_a_rule_is_refused(tmp_path, change, words):
+    made = suite(methods=("zero",))
+    (path,) = write_rows(made, records(made), tmp_path, "it")
+    held = json.loads(path.read_text())
+    change(held)
+    path.write_text(json.dumps(held))
+    with pytest.raises(NPAError, match=words):
+        read_row(path)
+
+
+def test_a_method_has_one_row(tmp_path):
+    made = suite(methods=("zero",))
+    (path,) = write_rows(made, records(made), tmp_path, "it")
+    (tmp_path / "again.json").write_bytes(path.read_bytes())
+    with pytest.raises(NPAError, match="second row of 'zero'"):
+        read_rows(tmp_path)
+
+
+# Scores
+
+
+def test_scores_count_from_nothing_to_the_gradient():
+    rows = {
+        "zero": row("zero", 1.0, 1.0),
+        "gradient": row("gradient", 2.0, 4.0),
+        "ppo": row("ppo", 2.0, 1.0, 5.0, math.nan),
+    }
+    assert normalised(rows, "ppo", FIRST).tolist() == [0.5, 0.0, 2.0, 0.0]
+    assert normalised(rows, "gradient", FIRST).mean() == 1.0
+    assert list(scores_in(rows, "ppo", ENTRIES)) == [FIRST]
+    with pytest.raises(NPAError, match="need runs of 'gradient'"):
+        normalised({"zero": rows["zero"], "ppo": rows["ppo"]}, "ppo", FIRST)
+    with pytest.raises(NPAError, match="better than zero"):
+        normalised({**rows, "gradient": rows["zero"]}, "ppo", FIRST)
+
+
+def test_the_middle_of_scores_leaves_out_the_quarters_at_both_ends():
+    found = score([np.array([0.0, 1.0, 2.0, 3.0]), np.array([4.0, 5.0, 6.0, 100.0])])
+    assert found.middle == 3.5
+    assert 1.0 < found.low < found.middle < found.high < 36.0
+    assert score([np.array([0.5, 0.5])]) == (0.5, 0.5, 0.5)
+    assert str(score([np.array([0.5, 0.5])])) == "0.50 [0.50, 0.50]"
+
+
+def test_an_interval_shrinks_with_the_number_of_seeds_and_holds_the_mean():
+    draws = np.random.default_rng(0).normal(0.6, 0.1, 400)
+    few, many = score([draws[:10]]), score([draws])
+    assert many.high - many.low < 0.4 * (few.high - few.low)
+    assert many.low < 0.6 < many.high
+
+
+def test_the_runs_of_a_task_are_called_by_its_id():
+    assert str(Job("particle-steps", npa_bench.task_name(FIRST), "sac", 3).folder) == (
+        f"particle-steps/{FIRST.removeprefix('npa/')}/sac/seed-3"
+    )
