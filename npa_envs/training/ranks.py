@@ -40,6 +40,7 @@ class Ranks:
         """Number of processes, R."""
         self.together = together
         """Whether they are torch's default group."""
+        self._parent = os.getppid()
 
     @classmethod
     def current(cls) -> Ranks:
@@ -137,9 +138,12 @@ class Ranks:
             asked: This process was asked to.
             iteration: Iterations done.
         """
-        if self.together and iteration % AGREE_INTERVAL:
+        if not self.together:
+            return asked
+        if iteration % AGREE_INTERVAL:
             return False
-        return self.any(asked)
+        # Whoever started them would end them; where that one was killed, they end by themselves.
+        return self.any(asked or os.getppid() != self._parent)
 
     def reduce(self, means: Sequence[Tensor], total: Tensor) -> None:
         """Replace numbers by their means, and one by its sum, over all processes, in place.

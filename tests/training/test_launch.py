@@ -1,0 +1,116 @@
+"""`npa-envs train --gpus`, killed: whatever ends, the checkpoint can be read and nothing is left."""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from npa_envs.training.run_folder import load_checkpoint
+
+INTERVAL = 5
+"""Iterations between two checkpoints."""
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs Linux's /proc"),
+]
+
+
+def started(out, *options):
+    """A run on two processes that would go on for hours, if need be from its checkpoint."""
+    command = [sys.executable, "-m", "npa_envs", "train", "morphogenesis2d", "--preset", "tiny"]
+    command += ["--gpus", "2", "--device", "cpu", "--resume", "auto", "--out", str(out)]
+    command += ["--iterations", "1000000", "--checkpoint-interval", str(INTERVAL), "--no-progress"]
+    return subprocess.Popen(
+        [*command, *options], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+
+
+def children(pid):
+    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+def alive(pid):
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def last_iteration(out):
+    log = out / "log.jsonl"
+    lines = log.read_text().splitlines() if log.exists() else []
+    return json.loads(lines[-1])["iteration"] if lines else 0
+
+
+def wait_until(condition, seconds=60):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "this took too long"
+        time.sleep(0.05)
+
+
+def grown(run, out, start):
+    """Wait until a run has gone some way beyond an iteration; return its processes."""
+    wait_until(lambda: run.poll() is not None or last_iteration(out) > start + INTERVAL)
+    assert run.poll() is None, run.stdout.read()
+    return children(run.pid)
+
+
+def check_left(out, workers, before):
+    """Nothing of a run that has ended is left but a checkpoint of late."""
+    wait_until(lambda: not any(map(alive, workers)))
+    saved = load_checkpoint(out / "checkpoint.pt")["iteration"]
+    assert saved >= last_iteration(out) - INTERVAL > before - INTERVAL
+    return saved
+
+
+def test_a_killed_process_ends_the_run_which_goes_on_from_its_checkpoint(tmp_path):
+    out, chance, saved = tmp_path / "run", random.Random(0), 0
+    for _ in range(10):
+        run = started(out)
+        workers = grown(run, out, saved)
+        time.sleep(chance.random())
+        os.kill(chance.choice(workers), signal.SIGKILL)
+        begun = time.monotonic()
+        said, _ = run.communicate(timeout=60)
+        assert time.monotonic() - begun < 60
+        assert run.returncode == 2
+        assert "of 2 was ended by SIGKILL" in said
+        assert "go on from it with --resume" in said
+        saved = check_left(out, workers, saved)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_to_the_launcher_saves_what_was_learned(tmp_path, number):
+    run = started(tmp_path / "run")
+    workers = grown(run, tmp_path / "run", 0)
+    run.send_signal(number)
+    said, _ = run.communicate(timeout=60)
+    assert run.returncode == 130
+    assert "stopped at iteration" in said
+    assert "--resume --gpus 2 --device cpu" in said
+    saved = check_left(tmp_path / "run", workers, 0)
+    assert saved == last_iteration(tmp_path / "run")
+
+
+def test_processes_whose_launcher_was_killed_save_and_end(tmp_path):
+    run = started(tmp_path / "run")
+    workers = grown(run, tmp_path / "run", 0)
+    run.kill()
+    saved = check_left(tmp_path / "run", workers, 0)
+    assert saved == last_iteration(tmp_path / "run")
+
+
+def test_a_mistake_is_told_once_and_ends_all(tmp_path):
+    run = started(tmp_path / "run", "--world-count", "3")
+    said, _ = run.communicate(timeout=60)
+    assert run.returncode == 2
+    assert "world_count must be a multiple of the number of processes, got 3 and 2" in said
+    assert "Traceback" not in said
