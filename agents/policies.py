@@ -419,13 +419,13 @@ def bounded_update(rule: NPARule, observation: Tensor) -> tuple[Tensor, Tensor]:
     """
     weight = rule.hidden.weight
     rows = perceived(rule, observation.to(weight.device, weight.dtype))
-    if rule.is_plain():
+    network = rule.network()
+    if network is not None:
         # The very products of a rollout: a rule amplifies rounding from step to step.
-        folded = rule.folded()
-        padded = rows.new_zeros(len(rows), folded.row_width)
+        padded = rows.new_zeros(len(rows), network.row_width)
         padded[:, : rule.perception_dim] = rows
         padded[:, rule.perception_dim] = 1.0
-        update = folded(padded)[:, : rule.update_dim]
+        update = network(padded)[:, : rule.update_dim]
     else:
         update = rule(rows)
     return bounded(rule, update)

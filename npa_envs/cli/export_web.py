@@ -40,7 +40,8 @@ class ExportOptions:
 def main(arguments: Sequence[str]) -> int:
     """Write what the words after `npa-envs export-web` ask for; return 0."""
     options = parse_options(ExportOptions, "export-web", arguments)
-    from npa_envs.rule.files import load_rule, save_demo_json, shipped_rules
+    from npa_envs.rule.authors import save_demo_json
+    from npa_envs.rule.files import load_rule, shipped_rules
     from npa_envs.web.export import export_web
     from npa_envs.web.rule_world import name_of
 

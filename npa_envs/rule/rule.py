@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from typing import Any, NamedTuple, TypedDict
+from typing import Any, NamedTuple, Protocol, TypedDict
 
 import torch
 from torch import Tensor, nn
@@ -15,6 +15,7 @@ from npa_envs.ops.checks import (
     checked_moment_inverse,
     checked_positive,
 )
+from npa_envs.ops.equivariance import VectorForm, invariants, read_rows, steer_rows, steered
 from npa_envs.ops.network import ArrangedWeights, arrange_weights, run_network
 
 COLOUR_OFFSET = 0.5
@@ -32,6 +33,9 @@ LARGEST_DIM = 65536
 
 OUTPUT_BLOCKS = 4
 """The sum over hidden units is taken in this many blocks."""
+
+MIXED_VECTORS = 8
+"""Mixed vectors of an equivariant rule where nothing is said."""
 
 
 class NamedAlways(TypedDict):
@@ -55,6 +59,9 @@ class RuleHyperParameters(NamedAlways, total=False):
 
     species_count: int
     moment_inverse: MomentInverse
+    equivariant: bool
+    chiral: bool
+    mixed_vectors: int
 
 
 class NPARule(nn.Module):
@@ -63,6 +70,13 @@ class NPARule(nn.Module):
     z is a particle's perception vector and y = [δ (D) ; Δs (C)] its update (no δ if
     `static`).
     Source: arXiv 2601.16096, section 3; the same network for every particle and every step.
+
+    An equivariant rule knows no direction: with every start that is turned, all that follows is
+    turned. It mixes the gradients that it perceives, u = mixing^T v, and its network reads the
+    states and the products of pairs of mixed vectors. In place of δ it gives gates g, and
+    δ = Σ relu(g_a) steering_a u_a. Rules of the authors' web demo are like this. Without `chiral`
+    a rule of 2D worlds does not tell left from right either. With it, it also reads u_a × u_b, and
+    has gates for the vectors turned by 90 degrees.
 
     Args:
         space_dim: Space dimension D, 2 or 3.
@@ -81,9 +95,13 @@ class NPARule(nn.Module):
             besides; 0: it does not tell them apart. Others are run by `npa_envs.rollout_species`.
         moment_inverse: How the moment matrix is inverted for the correction: "threshold", the
             paper's, or "smooth", as in `npa_envs.perceive`.
+        equivariant: The rule knows no direction.
+        chiral: An equivariant rule of 2D worlds tells left from right.
+        mixed_vectors: Mixed vectors of an equivariant rule, at least 1.
 
     Raises:
-        NPAError: A dimension or a length is out of range, or `moment_inverse` is another word.
+        NPAError: A dimension or a length is out of range, `moment_inverse` is another word, or what
+            is asked of an equivariant rule does not go together.
     """
 
     def __init__(
@@ -102,9 +120,13 @@ class NPARule(nn.Module):
         density_gradient: bool = True,
         species_count: int = 0,
         moment_inverse: MomentInverse = "threshold",
+        equivariant: bool = False,
+        chiral: bool = False,
+        mixed_vectors: int = MIXED_VECTORS,
     ) -> None:
         super().__init__()
-        sizes = (space_dim, state_dim, hidden_dim, readout_dim, readout_hidden_dim, species_count)
+        widths = (state_dim, hidden_dim, readout_dim, readout_hidden_dim, mixed_vectors)
+        sizes = (space_dim, *widths, species_count)
         if any(isinstance(size, bool) or not isinstance(size, int) for size in sizes):
             raise NPAError(f"dimensions of a rule must be integers, got {shown(sizes)}")
         if space_dim not in (2, 3):
@@ -113,7 +135,8 @@ class NPARule(nn.Module):
             raise NPAError(
                 f"dimensions of a rule must be at most {LARGEST_DIM}, got {shown(sizes)}"
             )
-        for name, value in (("state_dim", state_dim), ("hidden_dim", hidden_dim)):
+        positive = {"state_dim": state_dim, "hidden_dim": hidden_dim}
+        for name, value in (positive | {"mixed_vectors": mixed_vectors}).items():
             if value < 1:
                 raise NPAError(f"{name} must be at least 1, got {shown(value)}")
         if readout_dim < 0 or (readout_dim > 0 and readout_hidden_dim < 1):
@@ -136,9 +159,13 @@ class NPARule(nn.Module):
         self.state_gradient = checked_flag("state_gradient", state_gradient)
         self.density_gradient = checked_flag("density_gradient", density_gradient)
         self.species_count = species_count
+        self.equivariant = checked_flag("equivariant", equivariant)
+        self.chiral = checked_flag("chiral", chiral)
+        self.mixed_vectors = mixed_vectors
+        self._check_equivariance()
 
-        self.hidden = nn.Linear(self.perception_dim, hidden_dim)
-        self.output = nn.Linear(hidden_dim, self.update_dim, bias=False)
+        self.hidden = nn.Linear(self.input_dim, hidden_dim)
+        self.output = nn.Linear(hidden_dim, self.output_dim, bias=False)
         self.readout = (
             nn.Sequential(
                 nn.Linear(state_dim, readout_hidden_dim),
@@ -151,6 +178,53 @@ class NPARule(nn.Module):
         for module in self.modules():
             if isinstance(module, nn.Linear):
                 nn.init.xavier_uniform_(module.weight, gain=INIT_GAIN)
+        if self.equivariant:
+            vectors = self.vector_form
+            mixing = torch.empty(vectors.perceived, vectors.mixed)
+            self.mixing = nn.Parameter(nn.init.xavier_uniform_(mixing))
+            steering = torch.empty(1, 0 if self.static else vectors.gate_count)
+            self.steering = nn.Parameter(nn.init.xavier_uniform_(steering)[0])
+
+    def _check_equivariance(self) -> None:
+        if not self.equivariant:
+            if self.chiral:
+                raise NPAError("chiral is for equivariant rules: give equivariant=True as well")
+            return
+        if self.chiral and self.space_dim != 2:
+            raise NPAError(
+                f"chiral needs space_dim=2, where vectors can be turned by 90 degrees, got "
+                f"{self.space_dim}: leave it out"
+            )
+        if self.species_count:
+            raise NPAError(
+                f"an equivariant rule perceives all species alike, got species_count="
+                f"{self.species_count}: leave one of the two out"
+            )
+        if not (self.state_gradient or self.density_gradient):
+            raise NPAError(
+                "an equivariant rule needs vectors to perceive, got state_gradient=False and "
+                "density_gradient=False: leave one of them out"
+            )
+
+    @property
+    def vector_form(self) -> VectorForm:
+        """How an equivariant rule reads the perception vector."""
+        vectors = self.state_dim * self.state_gradient + self.density_gradient
+        return VectorForm(
+            self.space_dim, 2 * self.state_dim, vectors, self.mixed_vectors, self.chiral
+        )
+
+    @property
+    def input_dim(self) -> int:
+        """Inputs of the hidden layer: P, or the scalars and products of an equivariant rule."""
+        return self.vector_form.input_dim if self.equivariant else self.perception_dim
+
+    @property
+    def output_dim(self) -> int:
+        """Outputs of the network: A, or of an equivariant rule a number for each gate, then Δs."""
+        if not self.equivariant or self.static:
+            return self.update_dim
+        return self.vector_form.gate_count + self.state_dim
 
     @property
     def perception_dim(self) -> int:
@@ -178,14 +252,27 @@ class NPARule(nn.Module):
         Returns:
             Updates [δ (D) ; Δs (C)], dimensionless, shape [..., A]; δ is not yet bounded.
         """
+        if self.equivariant:
+            return self._update_by_invariants(perception)
         update: Tensor = self.output(torch.relu(self.hidden(perception)))
         return update
+
+    def _update_by_invariants(self, perception: Tensor) -> Tensor:
+        """Map perception vectors to raw updates by what stays the same in a turned world."""
+        mixed, inputs = invariants(perception, self.mixing, self.vector_form)
+        output: Tensor = self.output(torch.relu(self.hidden(inputs)))
+        return output if self.static else steered(output, mixed, self.steering, self.vector_form)
 
     def is_plain(self) -> bool:
         """Return whether the rule is just its two layers, so that `folded` may stand in for it.
 
-        A rule that overrides the network, has hooks, or whose layers were replaced is not.
+        A rule that overrides the network, has hooks, or whose layers were replaced is not, nor is
+        an equivariant one.
         """
+        return not self.equivariant and self._is_unchanged()
+
+    def _is_unchanged(self) -> bool:
+        """Return whether the rule's network is the one that it was made with."""
         hidden, output = self.hidden, self.output
         return (
             type(self).forward is NPARule.forward
@@ -196,11 +283,26 @@ class NPARule(nn.Module):
             and not any(map(_is_hooked, (self, hidden, output)))
         )
 
+    def has_network(self) -> bool:
+        """Return whether `network` stands in for the rule: plain or equivariant, as it was made."""
+        return self.is_plain() or (self.equivariant and self._is_unchanged())
+
+    def network(self) -> Network | None:
+        """Return what maps rows of perception to updates; None: the module that the rule is."""
+        if self.is_plain():
+            return self.folded()
+        return FoldedInvariants.of(self) if self.has_network() else None
+
+    def network_weights(self) -> list[Tensor]:
+        """Return the parameters of the network, without those of the read-out."""
+        weights = [self.hidden.weight, self.hidden.bias, self.output.weight]
+        return [*weights, self.mixing, self.steering] if self.equivariant else weights
+
     def folded(self) -> FoldedRule:
         """Return the weights as two plain products, differentiable in the parameters."""
-        padding = -(self.perception_dim + 1) % FOLD
+        padding = -(self.input_dim + 1) % FOLD
         weight = torch.cat((self.hidden.weight, self.hidden.bias[:, None]), dim=1)
-        output_weight = nn.functional.pad(self.output.weight, (0, 0, 0, -self.update_dim % FOLD))
+        output_weight = nn.functional.pad(self.output.weight, (0, 0, 0, -self.output_dim % FOLD))
         hidden_weight = nn.functional.pad(weight, (0, padding))
         return fold_weights(hidden_weight, output_weight)
 
@@ -229,6 +331,7 @@ class NPARule(nn.Module):
         seen += ["where they change"] * self.state_gradient
         seen += ["where particles stand denser"] * self.density_gradient
         seen += [f"{self.species_count} species apart"] * (self.species_count > 0)
+        seen += ["no direction"] * self.equivariant
         done = "changes its state" if self.static else "moves and changes its state"
         rows = {
             "a particle perceives": f"{', '.join(seen)}: {self.perception_dim} numbers",
@@ -274,6 +377,10 @@ class NPARule(nn.Module):
             made["species_count"] = self.species_count
         if self.moment_inverse != "threshold":
             made["moment_inverse"] = self.moment_inverse
+        if self.equivariant:
+            made["equivariant"] = True
+            made["chiral"] = self.chiral
+            made["mixed_vectors"] = self.mixed_vectors
         return made
 
 
@@ -329,6 +436,21 @@ class _TwoLayers(torch.autograd.Function):
         return rows_bar, hidden_bar.T @ rows, update_bar.T @ hidden
 
 
+class Network(Protocol):
+    """What maps rows of perception to updates."""
+
+    @property
+    def row_width(self) -> int:
+        """Columns of a row."""
+
+    @property
+    def update_width(self) -> int:
+        """Columns of an update, A'."""
+
+    def __call__(self, rows: Tensor) -> Tensor:
+        """Map rows [z | 1 | 0], shape [K, row_width], to raw updates [y | 0], shape [K, A']."""
+
+
 class FoldedRule(NamedTuple):
     """A rule's weights as two plain products: the bias is one more column of the first.
 
@@ -350,6 +472,11 @@ class FoldedRule(NamedTuple):
         """Columns of a row of perception: P + 1, rounded up to a multiple of `FOLD`."""
         return self.hidden_weight.shape[1]
 
+    @property
+    def update_width(self) -> int:
+        """Columns of an update, A'."""
+        return self.output_weight.shape[0]
+
     def __call__(self, rows: Tensor) -> Tensor:
         """Map rows [z | 1 | 0], shape [K, row_width], to raw updates [y | 0], shape [K, A']."""
         if self.arranged is not None and self.joined is not None:
@@ -359,6 +486,45 @@ class FoldedRule(NamedTuple):
             return _blocked_product(hidden, self.output_weight)
         update: Tensor = _TwoLayers.apply(rows, self.hidden_weight, self.output_weight)  # type: ignore[no-untyped-call]
         return update
+
+
+class FoldedInvariants(NamedTuple):
+    """An equivariant rule's weights: two plain products between mixtures and gates."""
+
+    products: FoldedRule
+    """The products, whose rows are scalars and products of mixed vectors."""
+    mixing: Tensor
+    """Weights of the mixtures."""
+    steering: Tensor
+    """How far a gate of 1 moves along its vector."""
+    form: VectorForm
+    """What of a row is a vector."""
+    row_width: int
+    """Columns of a row of perception: P + 1, rounded up to a multiple of `FOLD`."""
+    update_width: int
+    """Columns of an update, A'."""
+
+    @classmethod
+    def of(cls, rule: NPARule) -> FoldedInvariants:
+        """Return the weights of an equivariant rule, differentiable in them."""
+        width = rule.perception_dim + 1
+        update_width = rule.update_dim + -rule.update_dim % FOLD
+        return cls(
+            rule.folded(),
+            rule.mixing,
+            rule.steering,
+            rule.vector_form,
+            width + -width % FOLD,
+            update_width,
+        )
+
+    def __call__(self, rows: Tensor) -> Tensor:
+        """Map rows [z | 1 | 0], shape [K, row_width], to raw updates [y | 0], shape [K, A']."""
+        mixed, inputs = read_rows(rows, self.mixing, self.form, self.products.row_width)
+        output = self.products(inputs)
+        if len(self.steering) == 0:
+            return output
+        return steer_rows(output, mixed, self.steering, self.update_width)
 
 
 def fold_weights(hidden_weight: Tensor, output_weight: Tensor) -> FoldedRule:

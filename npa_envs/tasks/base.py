@@ -339,5 +339,5 @@ def untrained_rule(generator: torch.Generator, **hyper_parameters: Any) -> NPARu
 
 def differing_fields(given: NPARule, wanted: NPARule) -> list[str]:
     """Return the names of the hyper-parameters in which a rule differs from one of a task."""
-    own = wanted.hyper_parameters()
-    return [name for name, value in given.hyper_parameters().items() if value != own.get(name)]
+    own, other = wanted.hyper_parameters(), given.hyper_parameters()
+    return [name for name in own | other if own.get(name) != other.get(name)]

@@ -57,6 +57,17 @@ def check_fraction(config: object, *names: str) -> None:
         _require(is_real(value) and 0 < value <= 1, config, name, "lie in (0, 1]", 0.5)
 
 
+def check_flag(config: object, *names: str) -> None:
+    """Check that fields are True or False.
+
+    Raises:
+        NPAError: A field is neither.
+    """
+    for name in names:
+        value = getattr(config, name)
+        _require(isinstance(value, bool), config, name, "be True or False", False)
+
+
 def check_text(config: object, name: str, what: str) -> None:
     """Check that a field is text and not empty.
 

@@ -82,7 +82,12 @@ class GrowthTask(ParticleTask[GrowthConfigT]):
         config = self.config
         terms = {"motion": (config.motion_weight, path_length.mean())}
         terms |= super().penalties(x, s, path_length)
-        terms["bound"] = config.bound_weight, (x - x.clamp(-1.0, 1.0)).abs().mean()
+        inside = self.bounded(x)
+        terms["bound"] = config.bound_weight, (inside - inside.clamp(-1.0, 1.0)).abs().mean()
         if config.stray_weight > 0.0:
-            terms["stray"] = config.stray_weight, stray_motion(x, path_length)
+            terms["stray"] = config.stray_weight, stray_motion(inside, path_length)
         return terms
+
+    def bounded(self, x: Tensor) -> Tensor:
+        """Return what should lie in [-1, 1], of positions [B, N, D]: their coordinates."""
+        return x

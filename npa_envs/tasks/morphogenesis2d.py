@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +16,7 @@ from npa_envs.errors import NPAError
 from npa_envs.ops import splat, world_mean
 from npa_envs.ops.pictures.losses import picture_losses
 from npa_envs.rule.rule import COLOUR_OFFSET
-from npa_envs.tasks.checks import check_non_negative, check_positive, check_text
+from npa_envs.tasks.checks import check_flag, check_non_negative, check_positive, check_text
 from npa_envs.tasks.growth import GrowthConfig, GrowthTask
 from npa_envs.tasks.targets.images import LARGEST_POINT_COUNT
 from npa_envs.tasks.targets.points import PointTarget, load_target
@@ -64,6 +65,16 @@ class Morphogenesis2DConfig(GrowthConfig):
     drift_weight: float = 0.0
     """Weight of the centroids' distance from the origin, where worlds begin (per length unit)."""
 
+    equivariant: bool = False
+    """The rule knows no direction, and each world is compared at the angle that suits it best."""
+
+    chiral: bool = True
+    """An equivariant rule tells left from right. Without, a mirrored picture is as good."""
+
+    angles: int = 16
+    """Angles that are tried first for an equivariant rule's world, evenly spread. Sixteen more near
+    the best of them are tried next: 1/39 of the step between the first ones remains."""
+
     def __post_init__(self) -> None:
         """Check every field; raise NPAError where one has a wrong type or lies out of its range."""
         super().__post_init__()
@@ -77,11 +88,22 @@ class Morphogenesis2DConfig(GrowthConfig):
             )
         check_positive(self, float, "sigma")
         check_non_negative(self, "splat_weight", "colour_weight", "drift_weight")
+        check_flag(self, "equivariant", "chiral")
+        check_positive(self, int, "angles", at_least=4)
 
     def with_particle_count(self, particle_count: int) -> Morphogenesis2DConfig:
         """Return the same task with another number of particles, and of the target's points."""
         return replace(self, particle_count=particle_count, target_point_count=particle_count)
 
+
+FINER = (-0.6, -0.2, 0.2, 0.6)
+"""Angles near the best one that are tried next, in steps of those tried before."""
+
+FINER_STEP = 0.4
+"""The step between them, likewise."""
+
+FINER_TIMES = 4
+"""How often that is done."""
 
 UNOWNED = 0.05
 """Density that belongs to nobody when a pixel's error is shared out among particles."""
@@ -122,6 +144,8 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         self.target = target.to(device)
         """What is to be grown."""
         self._target_mean = self.target.points.mean(dim=0)
+        radius = float((self.target.points - self._target_mean).norm(dim=1).max())
+        self._reach = max(1.0, radius)
         self.target_picture = self._splat(self.target.points[None], self.target.colours[None])[0]
         """Its picture: rgb sums and density, dimensionless, shape [R, R, 4]."""
 
@@ -131,9 +155,10 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         Args:
             x: Positions [length units], shape [B, N, 2].
             s: States, dimensionless, shape [B, N, C].
-            centred: Move each world's mean to the target's, as the loss does.
+            centred: Move each world's mean to the target's, and turn worlds of an equivariant rule,
+                as the loss does.
         """
-        return self._splat(self._centred(x) if centred else x, s[..., -3:] + COLOUR_OFFSET)
+        return self._splat(self._placed(x, s) if centred else x, s[..., -3:] + COLOUR_OFFSET)
 
     def splat_errors(self, x: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return each pixel's density error and colour error, dimensionless, shape [B, R, R] each.
@@ -152,15 +177,9 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         picture is kept.
         """
         if not (torch.is_grad_enabled() and (x.requires_grad or s.requires_grad)):
-            return picture_losses(
-                x,
-                s,
-                self.target_picture,
-                goal=self._target_mean,
-                shift=COLOUR_OFFSET,
-                pixel_size=self.target.pixel_size,
-                sigma=self.config.sigma,
-            )
+            if self.config.equivariant:
+                x = turned(x, self.best_turn(x, s))
+            return self._picture_losses(x, s)
         density, colour = self.splat_errors(x, s)
         return _pixel_mean(density), _pixel_mean(colour)
 
@@ -185,6 +204,22 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         total = self.config.splat_weight * (density + self.config.colour_weight * colour)
         return total, {"density": density, "colour": colour}
 
+    @property
+    def rule_shape(self) -> dict[str, Any]:
+        """What `NPARule` takes besides the channels, the hidden width and ε0."""
+        config = self.config
+        known = {"equivariant": True, "chiral": config.chiral} if config.equivariant else {}
+        return super().rule_shape | known
+
+    def bounded(self, x: Tensor) -> Tensor:
+        """Return positions, or where no direction is known radii; what lies in [-1, 1] is inside.
+
+        A circle that holds the target at every angle then stands for the square.
+        """
+        if not self.config.equivariant:
+            return x
+        return x.square().sum(dim=-1, keepdim=True).add(1e-12).sqrt() / self._reach
+
     def penalties(
         self, x: Tensor, s: Tensor, path_length: Tensor
     ) -> dict[str, tuple[float, Tensor]]:
@@ -207,7 +242,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
             errors = density + self.config.colour_weight * colour
         blank = x.new_zeros(*x.shape[:2], 3).requires_grad_()
         with torch.enable_grad():
-            picture = self._splat(self._centred(x.detach()), blank)
+            picture = self._splat(self._placed(x.detach(), s), blank)
             owned = errors / (picture[..., 3].detach() + UNOWNED)
             # The picture is linear in the colours: its pull-back sums over a particle's patch.
             (pulled,) = torch.autograd.grad(picture[..., 0], blank, owned)
@@ -215,7 +250,61 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         unowned = _pixel_mean(UNOWNED * owned)
         return pulled[..., 0] * (x.shape[1] / pixel_count) + unowned[:, None]
 
-    def _centred(self, x: Tensor) -> Tensor:
+    @torch.no_grad()
+    def best_turn(self, x: Tensor, s: Tensor) -> Tensor:
+        """Return the turn of each world around its mean that brings it closest to the target.
+
+        Angles are tried evenly spread, and then finer near the best. Where the rule is not chiral
+        mirrored worlds are tried too.
+
+        Args:
+            x: Positions [length units], shape [B, N, 2].
+            s: States, dimensionless, shape [B, N, C].
+
+        Returns:
+            Matrices, shape [B, 2, 2]; without gradient.
+        """
+        config = self.config
+        step = 2.0 * math.pi / config.angles
+        tried = torch.arange(config.angles, device=x.device, dtype=x.dtype) * step
+        handed = torch.ones_like(tried)
+        if not config.chiral:
+            tried, handed = tried.repeat(2), torch.cat((handed, -handed))
+        angle, hand = (values.expand(len(x), -1) for values in (tried, handed))
+        for number in range(FINER_TIMES + 1):
+            best = self._closest(x, s, turns(angle, hand))
+            angle, hand = angle.gather(1, best), hand.gather(1, best)
+            if number < FINER_TIMES:
+                near = torch.tensor(FINER, device=x.device, dtype=x.dtype) * step
+                angle, hand = angle + near, hand.expand(-1, len(FINER))
+                step *= FINER_STEP
+        return turns(angle, hand)[:, 0]
+
+    def _closest(self, x: Tensor, s: Tensor, tried: Tensor) -> Tensor:
+        """Return which of the turns [B, K, 2, 2] brings each world closest, shape [B, 1]."""
+        world_count, count = tried.shape[:2]
+        every = x[:, None].expand(-1, count, -1, -1).flatten(0, 1)
+        colours = s[:, None, :, -3:].expand(-1, count, -1, -1).flatten(0, 1)
+        density, colour = self._picture_losses(turned(every, tried.flatten(0, 1)), colours)
+        losses = density + self.config.colour_weight * colour
+        return losses.view(world_count, count).argmin(dim=1, keepdim=True)
+
+    def _picture_losses(self, x: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the density and colour losses of worlds as they lie, shape [B] each."""
+        return picture_losses(
+            x,
+            s,
+            self.target_picture,
+            goal=self._target_mean,
+            shift=COLOUR_OFFSET,
+            pixel_size=self.target.pixel_size,
+            sigma=self.config.sigma,
+        )
+
+    def _placed(self, x: Tensor, s: Tensor) -> Tensor:
+        """Return positions where they are compared with the target."""
+        if self.config.equivariant:
+            x = turned(x, self.best_turn(x, s))
         return x - world_mean(x)[:, None] + self._target_mean.to(x)
 
     def _splat(self, x: Tensor, colour: Tensor) -> Tensor:
@@ -226,6 +315,20 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
             pixel_size=self.target.pixel_size,
             sigma=self.config.sigma,
         )
+
+
+def turns(angle: Tensor, hand: Tensor) -> Tensor:
+    """Return turns by angles [rad], of worlds mirrored where `hand` is -1; shape [..., 2, 2]."""
+    cos, sin = angle.cos(), angle.sin()
+    return torch.stack((cos, -sin * hand, sin, cos * hand), dim=-1).view(*angle.shape, 2, 2)
+
+
+def turned(x: Tensor, turn: Tensor) -> Tensor:
+    """Return worlds [B, N, 2] turned around the origin by matrices [B, 2, 2]."""
+    (a, b), (c, d) = (row.unbind(dim=-1) for row in turn.to(x)[:, None].unbind(dim=-2))
+    u, v = x.unbind(dim=-1)
+    # Written out: the order of torch's own batched products may depend on the batch.
+    return torch.stack((a * u + b * v, c * u + d * v), dim=-1)
 
 
 def _errors(difference: Tensor) -> tuple[Tensor, Tensor]:

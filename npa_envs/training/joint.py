@@ -96,6 +96,8 @@ class _JointTrainer(Trainer):
                 f"rules must be one for each of {len(made)} species, got {len(self._given)}"
             )
         for number, (rule, own) in enumerate(zip(self._given, made, strict=True)):
+            if rule.moment_inverse == "threshold":
+                own.moment_inverse = "threshold"
             wrong = differing_fields(rule, own)
             if wrong:
                 raise NPAError(

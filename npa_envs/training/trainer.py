@@ -27,7 +27,7 @@ from npa_envs.errors import DivergedError, NPAError, shown
 from npa_envs.files import write_bytes, write_text
 from npa_envs.render.colours import to_uint8
 from npa_envs.render.film import encode_frame
-from npa_envs.rule.files import load_rule, save_rule
+from npa_envs.rule.files import first_rules, load_rule, save_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import GoalTask, Task, differing_fields, task_for_rule, task_toward
 from npa_envs.tasks.train_config import TrainConfig
@@ -388,6 +388,9 @@ class Trainer:
 def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
     """Return the rule that a run starts from, with the configuration's `moment_inverse`.
 
+    An equivariant rule starts from random weights where the configuration names a first rule, which
+    knows directions, as presets do.
+
     Args:
         config: The run's configuration.
         untrained: The task's own rule, whose shape the rule must have.
@@ -397,10 +400,12 @@ def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
             another `moment_inverse` than the paper's and the configuration's.
     """
     untrained.moment_inverse = config.moment_inverse
-    if not config.initial_rule:
+    if not config.initial_rule or (untrained.equivariant and config.initial_rule in first_rules()):
         return untrained
     source = config.initial_rule
     rule = load_rule(source)
+    if rule.moment_inverse == "threshold":
+        rule.moment_inverse = config.moment_inverse
     wrong = differing_fields(rule, untrained)
     if wrong:
         raise NPAError(
@@ -408,7 +413,6 @@ def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
             f"{', '.join(wrong)}: change those fields, start from another rule, or from random "
             "weights (initial_rule='')"
         )
-    rule.moment_inverse = config.moment_inverse
     return rule
 
 

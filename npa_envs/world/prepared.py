@@ -11,13 +11,14 @@ from __future__ import annotations
 import collections
 import threading
 from collections.abc import Callable, Hashable, Iterable
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.utils._python_dispatch import is_in_torch_dispatch_mode
 
 from npa_envs.ops.launch import LaunchTape
+from npa_envs.rule.rule import Network
 from npa_envs.world.recorded import LAUNCHED_FIRST, Worlds
 
 LARGEST_TOTAL = 4096
@@ -25,17 +26,6 @@ LARGEST_TOTAL = 4096
 
 MOST_KINDS = 32
 """Kinds of calls that are remembered."""
-
-
-class Network(Protocol):
-    """What maps rows of perception to updates."""
-
-    @property
-    def row_width(self) -> int:
-        """Columns of a row."""
-
-    def __call__(self, rows: Tensor) -> Tensor:
-        """Map rows, [K, row_width], to updates, [K, A']."""
 
 
 Advance = Callable[[Network, Worlds, Tensor | None], Worlds]
@@ -47,13 +37,13 @@ class _Stand:
 
     def __init__(self, tape: LaunchTape, row_width: int, update_width: int) -> None:
         self.row_width = row_width
+        self.update_width = update_width
         self._tape = tape
-        self._update_width = update_width
 
     def __call__(self, rows: Tensor) -> Tensor:
         self.rows = rows
         self.split = len(self._tape)
-        self.updates = rows.new_zeros(len(rows), self._update_width)
+        self.updates = rows.new_zeros(len(rows), self.update_width)
         return self.updates
 
 

@@ -179,13 +179,12 @@ def _form(rule: NPARule, plain: bool) -> tuple[Hashable, list[Tensor]]:
     """Return what a recording depends on of a rule besides its weights, and what these are."""
     if not plain:
         return weakref.ref(rule), [*rule.parameters(), *rule.buffers()]
-    hidden = rule.hidden
-    return rule_form(rule), [hidden.weight, hidden.bias, rule.output.weight]
+    return rule_form(rule), rule.network_weights()
 
 
 def _twin(rule: NPARule, like: Tensor) -> NPARule:
     """Return a rule of the same form with memory of its own for its weights."""
-    if not rule.is_plain():
+    if not rule.has_network():
         return copy.deepcopy(rule)
     form = rule.hyper_parameters() | {"readout_dim": 0, "readout_hidden_dim": 0}
     # Without drawing first weights.
@@ -250,7 +249,7 @@ class _Recording:
         """When the worlds to begin with are there."""
         self._call = call
         self._rules = [_twin(rule, x) for rule in rules]
-        weights = [weight for rule in self._rules for weight in _form(rule, rule.is_plain())[1]]
+        weights = [weight for rule in self._rules for weight in _form(rule, rule.has_network())[1]]
         own = [
             torch.empty(value.shape, dtype=value.dtype, device=value.device)
             for value in (x, s, self.no_path)
@@ -518,7 +517,7 @@ def _run_recorded(
         generator: Source of the draws.
         asked: The caller asks for a recording.
     """
-    plain = [rule.is_plain() for rule in rules]
+    plain = [rule.has_network() for rule in rules]
     if not (asked or all(plain)):
         return None
     forms, weights = zip(*map(_form, rules, plain), strict=True)

@@ -26,10 +26,10 @@ from npa_envs.ops.checks import (
 from npa_envs.ops.perceive import Terms, perceive_rows
 from npa_envs.ops.static import StaticRows, StaticWorlds, prepare_static, static_rows
 from npa_envs.ops.update import update_particles
-from npa_envs.rule.rule import FoldedRule, NPARule, check_rule
+from npa_envs.rule.rule import Network, NPARule, check_rule
 from npa_envs.world.cuda_graph import Beside
 from npa_envs.world.divergence import DivergenceWatch, OnDivergence, make_watch
-from npa_envs.world.prepared import Network, PreparedSteps, may_prepare, run_prepared
+from npa_envs.world.prepared import PreparedSteps, may_prepare, run_prepared
 from npa_envs.world.randomness import Randomness, WorldRandom, check_generator
 from npa_envs.world.recorded import CudaGraph, Worlds, check_cuda_graph, rule_form, run_call
 
@@ -247,7 +247,7 @@ class RuleStep(NamedTuple):
     """The step of one rule: perceive the active particles, run the network, update."""
 
     rule: NPARule
-    folded: Network | None
+    network: Network | None
     """The rule's weights as they are run; None: it runs as the module that it is."""
     options: StepOptions
     static: StaticWorlds | None = None
@@ -288,7 +288,7 @@ class RuleStep(NamedTuple):
             s,
             mask=mask,
             row_capacity=count,
-            row_width=rule.perception_dim if self.folded is None else self.folded.row_width,
+            row_width=rule.perception_dim if self.network is None else self.network.row_width,
             eps=options.eps,
             eps0=rule.eps0,
             box=options.box,
@@ -298,7 +298,7 @@ class RuleStep(NamedTuple):
         )
         return Worlds(
             *update_particles(
-                rule(perception) if self.folded is None else self.folded(perception),
+                rule(perception) if self.network is None else self.network(perception),
                 x if noise is None else x + noise,
                 s,
                 path_length,
@@ -383,16 +383,16 @@ class RolloutCall(NamedTuple):
         """Launch the rollout of one rule."""
         (rule,) = rules
         # Any other rule runs as the module that it is.
-        folded = rule.folded() if rule.is_plain() else None
+        network = rule.network()
         static = _prepare_static(rule, worlds.x, self.steps, self.options)
-        if folded is not None and static is None and watch is None and may_prepare(worlds):
-            prepared = self._run_prepared(rule, folded, worlds, generator)
+        if network is not None and static is None and watch is None and may_prepare(worlds):
+            prepared = self._run_prepared(rule, network, worlds, generator)
             if prepared is not None:
                 return prepared
         if static is not None:
             worlds = Worlds(*map(static.sort, worlds))
         return run_steps(
-            RuleStep(rule, folded, self.options, static),
+            RuleStep(rule, network, self.options, static),
             worlds,
             self.steps,
             generator=generator,
@@ -402,7 +402,7 @@ class RolloutCall(NamedTuple):
         )
 
     def _run_prepared(
-        self, rule: NPARule, folded: FoldedRule, worlds: Worlds, generator: Randomness | None
+        self, rule: NPARule, network: Network, worlds: Worlds, generator: Randomness | None
     ) -> Worlds | None:
         """Run the rollout by prepared steps; None where it is to be launched."""
         options, steps, every = self.options, self.steps, self.keep_every or self.steps
@@ -415,14 +415,14 @@ class RolloutCall(NamedTuple):
             return step.advance(*worlds, mask, None, None)
 
         def make() -> PreparedSteps:
-            widths = folded.row_width, folded.output_weight.shape[0]
+            widths = network.row_width, network.update_width
             return PreparedSteps(advance, worlds, *widths, options.update_prob < 1.0)
 
         def run(prepared: PreparedSteps) -> list[Worlds]:
-            draws = RuleStep(rule, folded, options).draws(x, steps, generator)
+            draws = RuleStep(rule, network, options).draws(x, steps, generator)
             with torch.autocast("cpu", enabled=False):
                 return prepared.run(
-                    folded, worlds, (draw.mask for draw in draws), lambda done: done % every == 0
+                    network, worlds, (draw.mask for draw in draws), lambda done: done % every == 0
                 )
 
         key = (options, rule_form(rule), x.shape, s.shape[2], x.dtype)

@@ -15,7 +15,7 @@ from npa_envs.ops.perceive import perceive_rows
 from npa_envs.ops.species import checked_counts, perceive_by_species
 from npa_envs.ops.static import StaticRows
 from npa_envs.ops.update import update_particles
-from npa_envs.rule.rule import FoldedRule, NPARule
+from npa_envs.rule.rule import Network, NPARule
 from npa_envs.world.divergence import DivergenceWatch, OnDivergence, make_watch
 from npa_envs.world.randomness import Randomness, WorldRandom, check_generator
 from npa_envs.world.recorded import CudaGraph, Worlds, check_cuda_graph, run_call
@@ -334,7 +334,7 @@ class Species(NamedTuple):
     """One species of checked worlds."""
 
     rule: NPARule
-    folded: FoldedRule | None
+    network: Network | None
     """The rule's weights as they are run; None where it runs as the module that it is."""
     first: int
     """Its first particle in a world."""
@@ -393,7 +393,7 @@ class Community(NamedTuple):
         if not self.told_apart:
             # A folded rule's own row: a one follows the perception vector, then zeros.
             shared_width = max(
-                own.folded.row_width if own.folded else shared_dim for own in species
+                own.network.row_width if own.network else shared_dim for own in species
             )
         perception, active = perceive_rows(
             x.detach() if options.detach_positions else x,
@@ -478,7 +478,7 @@ def make_community(
         species.append(
             Species(
                 rule=rule,
-                folded=rule.folded() if rule.is_plain() else None,
+                network=rule.network(),
                 first=first,
                 end=first + count,
                 update_prob=own.update_prob,
@@ -559,14 +559,14 @@ def _recounted_by_species(appended: Tensor, species_count: int, ratio: float) ->
 def _update_of(own: Species, z: Tensor) -> Tensor:
     """Return a species' raw updates, [R, A] or wider, for its rows of perception."""
     rule = own.rule
-    if own.folded is None:
+    if own.network is None:
         update: Tensor = rule(z[:, : rule.perception_dim])
     else:
-        if z.shape[1] < own.folded.row_width:
+        if z.shape[1] < own.network.row_width:
             one = z.new_ones(len(z), 1)
-            rest = z.new_zeros(len(z), own.folded.row_width - rule.perception_dim - 1)
+            rest = z.new_zeros(len(z), own.network.row_width - rule.perception_dim - 1)
             z = torch.cat((z[:, : rule.perception_dim], one, rest), dim=1)
-        update = own.folded(z)
+        update = own.network(z)
     if rule.static or own.reach_share == 1.0:
         return update
     # The displacement r q δ / (1 + |δ|), with this share q of the common reach r, is that of

@@ -91,6 +91,7 @@ WILD = {
     "no density gradient": wild_rule(density_gradient=False),
     "no gradients": wild_rule(state_gradient=False, density_gradient=False),
     "not plain": wild_rule(kind=Replaced),
+    "equivariant": wild_rule(equivariant=True, chiral=True),
     "other radius": wild_rule(eps0=0.15, alpha=0.3),
 }
 

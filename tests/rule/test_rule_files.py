@@ -15,13 +15,8 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.rule.files import (
-    load_rule,
-    rule_metadata,
-    save_demo_json,
-    save_rule,
-    shipped_rules,
-)
+from npa_envs.rule.authors import save_demo_json
+from npa_envs.rule.files import load_rule, rule_metadata, save_rule, shipped_rules
 from npa_envs.rule.rule import NPARule
 
 RULES: dict[str, Callable[[], NPARule]] = {
@@ -151,7 +146,7 @@ def write_ours(path: Path, change: Callable[[dict, dict], None]) -> None:
 
 
 BAD_HEADERS: dict[str, tuple[Callable[[dict, dict], Any], str]] = {
-    "unknown version": (lambda h, w: h.update(version="2"), "version must be 1, got '2'.*upgrade"),
+    "unknown version": (lambda h, w: h.update(version="3"), "must be 1 or 2, got '3'.*upgrade"),
     "another format": (lambda h, w: h.update(format="llama"), "format must be 'npa-envs rule'"),
     "no format": (lambda h, w: h.pop("format"), "format must be 'npa-envs rule', got None"),
     "a missing key": (lambda h, w: h.pop("alpha"), "lacks 'alpha'"),
@@ -437,6 +432,7 @@ def test_a_collection_gives_each_of_its_rules_back(tmp_path: Path, channels: int
         (NPARule(2, 4, 8, static=True), "static=False only"),
         (NPARule(moment_inverse="smooth"), "moment_inverse='threshold' only"),
         (NPARule(species_count=2), "species_count=0 only"),
+        (NPARule(equivariant=True), "equivariant=False only"),
     ],
 )
 def test_a_collection_refuses_rules_that_the_demo_would_run_as_others(tmp_path, rule, message):

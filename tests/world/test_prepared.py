@@ -63,6 +63,14 @@ def test_prepared_rollouts_are_the_launched_ones(options, dtype):
     assert_same(ready, launched)
 
 
+def test_equivariant_rules_are_prepared_too():
+    rule, (x, s) = make_rule(equivariant=True, chiral=True), worlds()
+    launched = [run(rule, x, s, seed=seed) for seed in (3, 4)]
+    ready = [run(rule, x, s, seed=seed) for seed in (3, 4)]
+    assert len(steps_ready()) == 1
+    assert_same(ready, launched)
+
+
 def test_weights_are_read_anew_and_results_stay():
     rules = [make_rule(seed=seed) for seed in range(3)]
     starts = [worlds(seed=seed) for seed in range(3)]

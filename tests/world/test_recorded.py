@@ -109,6 +109,8 @@ def test_a_recorded_rollout_is_the_launched_one(options, gradients):
         (torch.float32, 3, {}),
         (torch.float32, 2, {"static": True}),
         (torch.float32, 2, {"moment_inverse": "smooth"}),
+        (torch.float32, 2, {"equivariant": True, "chiral": True}),
+        (torch.float64, 3, {"equivariant": True}),
         (torch.float32, 2, {"readout_dim": 3, "readout_hidden_dim": 4}),
     ],
     ids=str,

@@ -1,0 +1,210 @@
+"""Rules that know no direction, beside plain rules of the same recipe.
+
+`train` trains on each target a plain rule, an equivariant one that tells left from right and one
+that does not, side by side on one device; `measure` runs the rules on seeds that training never
+saw: losses at the best angle over the steps, and what becomes of grown creatures that are turned by
+90 degrees; `time` takes the time of a step. Each writes what it found to OUT as it goes.
+
+    python benchmarks/directions.py train --device cuda --out OUT
+    python benchmarks/directions.py measure --device cuda --out OUT
+    python benchmarks/directions.py time --device cuda --out OUT
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import statistics
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from recipes import SECOND, SIZES, train_side_by_side
+from torch import Tensor
+
+import npa_envs
+from npa_envs.measure.record import machine, write_record
+from npa_envs.rule.files import save_rule
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, turned, turns
+from npa_envs.training import preset
+from npa_envs.world.randomness import WorldRandom
+
+TARGETS = ("gecko", "heart", "octopus")
+"""What is learned."""
+
+KINDS: Mapping[str, Mapping[str, Any]] = {
+    "plain": {},
+    "chiral": {"equivariant": True},
+    "mirrored": {"equivariant": True, "chiral": False},
+}
+"""Rules: plain, equivariant, and equivariant without telling left from right."""
+
+SEEDS = tuple(range(1000, 1008))
+"""Seeds of the worlds that rules are measured on."""
+
+STEPS = (64, 128, 256, 512, 1024, 2048)
+"""Steps at which they are measured."""
+
+GROWN, AFTER = 512, 256
+"""Steps before creatures are turned, and after."""
+
+
+def train(arguments: argparse.Namespace) -> None:
+    """Train all rules side by side."""
+    configs, names = [], []
+    for target in arguments.targets:
+        for kind in arguments.kinds:
+            fields = {**SECOND, **SIZES[arguments.size], **KINDS[kind], "target": target}
+            if arguments.iterations:
+                fields["iterations"] = arguments.iterations
+            fields |= {"repeats": 1, "tensorboard": False, "picture_interval": 0}
+            fields |= {"checkpoint_interval": 10**9, "device": arguments.device}
+            out = arguments.out / "runs" / f"{target}-{kind}"
+            configs.append(preset("paper", **fields, out=out))
+            names.append(f"{target}-{kind}")
+    trainers, seconds = train_side_by_side(configs, arguments.longest)
+    for name, trainer in zip(names, trainers, strict=True):
+        rule = trainer._cycle.average.rule(trainer.rule)
+        save_rule(rule, arguments.out / f"{name}.safetensors")
+        told = {"iterations": trainer.iteration, "seconds_together": round(seconds, 1)}
+        told["config"] = json.loads((trainer.config.out / "config.json").read_text("utf-8"))
+        told["config"] = {k: v for k, v in told["config"].items() if k not in ("out", "device")}
+        (arguments.out / f"{name}.json").write_text(json.dumps(told, indent=2) + "\n", "utf-8")
+
+
+def tasks_of(config: Mapping[str, Any], device: str) -> tuple[Morphogenesis2D, Morphogenesis2D]:
+    """Return the task of a run, and the same with worlds compared at the best angle."""
+    run = preset("paper", **config)
+    task = Morphogenesis2D(run.task, device=device)
+    blind = replace(run.task, equivariant=True, chiral=run.task.chiral or not run.task.equivariant)
+    return task, Morphogenesis2D(blind, device=device)
+
+
+@torch.no_grad()
+def measured(rule: npa_envs.NPARule, config: Mapping[str, Any], device: str) -> dict[str, Any]:
+    """Return losses over the steps, and those of creatures turned by 90 degrees."""
+    task, blind = tasks_of(config, device)
+    random = WorldRandom(SEEDS, device=device)
+    x, s = task.seed(len(SEEDS), generator=random, device=device)
+    found: dict[str, Any] = {"upright": {}, "best_angle": {}}
+    done, grown = 0, (x, s)
+    for steps in STEPS:
+        x, s = run_on(rule, task, x, s, steps - done, random)
+        done = steps
+        found["best_angle"][steps] = blind.metric(x, s).tolist()
+        if not task.config.equivariant:
+            found["upright"][steps] = task.metric(x, s).tolist()
+        if steps == GROWN:
+            grown = x, s
+    quarter = turns(torch.tensor(0.5 * math.pi), torch.ones(())).to(x)
+    x, s = grown
+    tall = turned(x, quarter.expand(len(x), 2, 2))
+    for name, start in (("left_alone", x), ("turned", tall)):
+        # The same masks for both.
+        after = run_on(rule, task, start, s, AFTER, WorldRandom(SEEDS, device=device))
+        found[name] = blind.metric(*after).tolist()
+        found[f"{name}_angle"] = angles(blind.best_turn(*after))
+    return found
+
+
+def run_on(
+    rule: npa_envs.NPARule, task: Morphogenesis2D, x: Tensor, s: Tensor, steps: int, random: Any
+) -> tuple[Tensor, Tensor]:
+    """Run a rule in the worlds of its task."""
+    return npa_envs.rollout(
+        rule, x, s, steps, eps=task.eps, update_prob=task.update_prob, generator=random
+    )
+
+
+def angles(turn: Tensor) -> list[float]:
+    """Return the angle of each turn [degrees]."""
+    found: list[float] = torch.rad2deg(torch.atan2(turn[:, 1, 0], turn[:, 0, 0])).tolist()
+    return found
+
+
+def measure(arguments: argparse.Namespace) -> None:
+    """Measure all rules that lie in the folder."""
+    found = {}
+    for path in sorted(arguments.out.glob("*.safetensors")):
+        told = json.loads(path.with_suffix(".json").read_text("utf-8"))
+        rule = npa_envs.load_rule(path, device=arguments.device)
+        found[path.stem] = {
+            "iterations": told["iterations"],
+            **measured(rule, told["config"], arguments.device),
+        }
+        row = found[path.stem]
+        means = {step: round(statistics.mean(row["best_angle"][step]), 4) for step in STEPS}
+        print(path.stem, means, "turned", round(ratio(row), 3), flush=True)
+        write_record(
+            arguments.out / "directions.json",
+            {"machine": machine(torch.device(arguments.device)), "rules": found},
+        )
+
+
+def ratio(row: Mapping[str, Sequence[float]]) -> float:
+    """Return the loss of turned creatures over that of those left alone."""
+    return statistics.mean(row["turned"]) / statistics.mean(row["left_alone"])
+
+
+def time_steps(arguments: argparse.Namespace) -> None:
+    """Take the time of a step of each kind of rule, with gradients and without."""
+    found: dict[str, dict[str, float]] = {}
+    device, steps = torch.device(arguments.device), arguments.steps
+    for count in arguments.particles:
+        side = 0.7 * math.sqrt(count / 4096)
+        x = (torch.rand(8, count, 2, device=device) * 2.0 - 1.0) * side
+        s = torch.zeros(8, count, 16, device=device)
+        for kind, fields in KINDS.items():
+            known = {"chiral": kind == "chiral"} if fields else {}
+            options = {"equivariant": True, **known} if fields else {}
+            rule = npa_envs.NPARule(**options).to(device)
+            row = found[f"8 x {count}, {kind}"] = {}
+            for name, backward in (("inference", False), ("training", True)):
+                row[name] = seconds_of(rule, x, s, steps, backward) / steps * 1e6
+                print(count, kind, name, round(row[name], 1), "µs a step", flush=True)
+    write_record(
+        arguments.out / "directions_time.json", {"machine": machine(device), "steps": found}
+    )
+
+
+def seconds_of(rule: npa_envs.NPARule, x: Tensor, s: Tensor, steps: int, backward: bool) -> float:
+    """Return the median time of a rollout [s]."""
+    times = []
+    for _ in range(12):
+        if x.is_cuda:
+            torch.cuda.synchronize()
+        begun = time.perf_counter()
+        with torch.set_grad_enabled(backward):
+            after = npa_envs.rollout(rule, x, s, steps)
+            if backward:
+                sum(part.sum() for part in after).backward()  # type: ignore[union-attr]
+        if x.is_cuda:
+            torch.cuda.synchronize()
+        times.append(time.perf_counter() - begun)
+    return statistics.median(times[5:])
+
+
+def main() -> None:
+    """Do what the command line asks for."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("command", choices=("train", "measure", "time"))
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--targets", nargs="+", default=TARGETS)
+    parser.add_argument("--kinds", nargs="+", default=tuple(KINDS))
+    parser.add_argument("--size", default="small")
+    parser.add_argument("--iterations", type=int, default=0)
+    parser.add_argument("--longest", type=float, default=math.inf)
+    parser.add_argument("--particles", nargs="+", type=int, default=(4096,))
+    parser.add_argument("--steps", type=int, default=64)
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    {"train": train, "measure": measure, "time": time_steps}[arguments.command](arguments)
+
+
+if __name__ == "__main__":
+    main()

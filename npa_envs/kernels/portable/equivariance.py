@@ -1,0 +1,244 @@
+"""Vectors of equivariant rules: mixtures, products that stay the same in turned worlds, steering.
+
+`npa_envs/ops/equivariance.py` has the formulas. Each thread makes a number or a vector of a row.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from npa_envs.kernels.cpu import ELEMENTS, in_ranges
+from npa_envs.kernels.domain import domain_types, kernel_module
+
+
+@functools.cache
+def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
+    """Return the kernels of one variant."""
+    vector = domain_types(space_dim, scalar).vector
+    numbers = wp.array(dtype=scalar, ndim=2)
+    vectors = wp.array(dtype=vector, ndim=2)
+    module = kernel_module("equivariance", space_dim, scalar)
+    planar = space_dim == 2
+
+    @wp.func
+    def turned(u: vector):
+        """Return a vector turned by 90 degrees, in 2D."""
+        result = vector()
+        if wp.static(planar):
+            result[0] = -u[1]
+            result[1] = u[0]
+        return result
+
+    @wp.func
+    def pair_of(number: wp.int32, first: wp.int32, count: wp.int32):
+        """Return the pair (a, b), b >= a + first, that has a number among those of `count`."""
+        a = wp.int32(0)
+        rest = number
+        while rest >= count - first - a:
+            rest -= count - first - a
+            a += 1
+        return a, a + first + rest
+
+    @wp.func
+    def place_of(a: wp.int32, b: wp.int32, first: wp.int32, count: wp.int32):
+        """Return the number of a pair (a, b), b >= a + first."""
+        return a * (count - first) - a * (a - 1) / 2 + b - a - first
+
+    @in_ranges(ELEMENTS)
+    @wp.kernel(enable_backward=False, module=module)
+    def mix_vectors(
+        range_start: wp.int32,
+        scalars: wp.int32,
+        rows: numbers,
+        mixing: numbers,
+        # outputs
+        mixed: vectors,
+    ):
+        """Mix the vectors of each row."""
+        t = range_start + wp.tid()
+        count = mixing.shape[1]
+        row = t / count
+        a = t - row * count
+        total = vector()
+        for i in range(mixing.shape[0]):
+            weight = mixing[i, a]
+            for d in range(wp.static(space_dim)):
+                total[d] += weight * rows[row, scalars + i * wp.static(space_dim) + d]
+        mixed[row, a] = total
+
+    @in_ranges(ELEMENTS)
+    @wp.kernel(enable_backward=False, module=module)
+    def write_inputs(
+        range_start: wp.int32,
+        scalars: wp.int32,
+        one: wp.int32,
+        chiral: wp.int32,
+        rows: numbers,
+        mixed: vectors,
+        # outputs
+        inputs: numbers,
+    ):
+        """Write scalars, products, what is at column `one` of a row, and zeros."""
+        t = range_start + wp.tid()
+        width = inputs.shape[1]
+        row = t / width
+        column = t - row * width
+        count = mixed.shape[1]
+        pairs = count * (count + 1) / 2
+        crosses = chiral * (pairs - count)
+        value = scalar(0.0)
+        if column < scalars:
+            value = rows[row, column]
+        elif column < scalars + pairs:
+            a, b = pair_of(column - scalars, 0, count)
+            value = wp.dot(mixed[row, a], mixed[row, b])
+        elif column < scalars + pairs + crosses:
+            a, b = pair_of(column - scalars - pairs, 1, count)
+            value = wp.dot(turned(mixed[row, a]), mixed[row, b])
+        elif column == scalars + pairs + crosses:
+            value = rows[row, one]
+        inputs[row, column] = value
+
+    @in_ranges(ELEMENTS)
+    @wp.kernel(enable_backward=False, module=module)
+    def pull_back_products(
+        range_start: wp.int32,
+        scalars: wp.int32,
+        chiral: wp.int32,
+        mixed: vectors,
+        inputs_bar: numbers,
+        # changed in place
+        mixed_bar: vectors,
+    ):
+        """Add what the products pull at each mixed vector."""
+        t = range_start + wp.tid()
+        count = mixed.shape[1]
+        row = t / count
+        a = t - row * count
+        crosses = scalars + count * (count + 1) / 2
+        total = mixed_bar[row, a]
+        for b in range(count):
+            other = mixed[row, b]
+            bar = inputs_bar[row, scalars + place_of(wp.min(a, b), wp.max(a, b), 0, count)]
+            if a == b:
+                bar += bar
+            total += bar * other
+            if chiral != 0 and a != b:
+                cross = crosses + place_of(wp.min(a, b), wp.max(a, b), 1, count)
+                bar = inputs_bar[row, cross]
+                if a < b:
+                    bar = -bar
+                total += bar * turned(other)
+        mixed_bar[row, a] = total
+
+    @in_ranges(ELEMENTS)
+    @wp.kernel(enable_backward=False, module=module)
+    def pull_back_rows(
+        range_start: wp.int32,
+        scalars: wp.int32,
+        mixing: numbers,
+        inputs_bar: numbers,
+        mixed_bar: vectors,
+        # outputs
+        rows_bar: numbers,
+    ):
+        """Write the cotangent of each row; that of its one and zeros is zero."""
+        t = range_start + wp.tid()
+        width = rows_bar.shape[1]
+        row = t / width
+        column = t - row * width
+        value = scalar(0.0)
+        if column < scalars:
+            value = inputs_bar[row, column]
+        else:
+            i = (column - scalars) / wp.static(space_dim)
+            d = column - scalars - i * wp.static(space_dim)
+            if i < mixing.shape[0]:
+                for a in range(mixing.shape[1]):
+                    value += mixing[i, a] * mixed_bar[row, a][d]
+        rows_bar[row, column] = value
+
+    @in_ranges(ELEMENTS)
+    @wp.kernel(enable_backward=False, module=module)
+    def steer(
+        range_start: wp.int32,
+        gate_count: wp.int32,
+        output: numbers,
+        mixed: vectors,
+        steering: wp.array(dtype=scalar),
+        # outputs
+        update: numbers,
+    ):
+        """Write the updates of gates and state changes; what is beyond these is zero."""
+        t = range_start + wp.tid()
+        width = update.shape[1]
+        row = t / width
+        column = t - row * width
+        count = mixed.shape[1]
+        value = scalar(0.0)
+        place = column - wp.static(space_dim) + gate_count
+        if column < wp.static(space_dim):
+            for g in range(gate_count):
+                gate = wp.max(output[row, g], scalar(0.0)) * steering[g]
+                if g < count:
+                    value += gate * mixed[row, g][column]
+                else:
+                    value += gate * turned(mixed[row, g - count])[column]
+        elif place < output.shape[1]:
+            value = output[row, place]
+        update[row, column] = value
+
+    @in_ranges(ELEMENTS)
+    @wp.kernel(enable_backward=False, module=module)
+    def pull_back_steering(
+        range_start: wp.int32,
+        gate_count: wp.int32,
+        output: numbers,
+        mixed: vectors,
+        steering: wp.array(dtype=scalar),
+        update_bar: numbers,
+        # outputs
+        output_bar: numbers,
+        mixed_bar: vectors,
+        steering_shares: numbers,
+    ):
+        """Write cotangents of a row's outputs and mixed vectors, and its share of steering's."""
+        t = range_start + wp.tid()
+        width = output.shape[1]
+        row = t / width
+        column = t - row * width
+        count = mixed.shape[1]
+        value = scalar(0.0)
+        if column < gate_count:
+            pull = vector()
+            for d in range(wp.static(space_dim)):
+                pull[d] = update_bar[row, d]
+            gate = output[row, column]
+            u = mixed[row, column % count]
+            if column >= count:
+                u = turned(u)
+            along = wp.dot(u, pull)
+            if gate > scalar(0.0):
+                value = steering[column] * along
+            steering_shares[row, column] = wp.max(gate, scalar(0.0)) * along
+            if column < count:
+                total = wp.max(gate, scalar(0.0)) * steering[column] * pull
+                if gate_count > count:
+                    other = wp.max(output[row, count + column], scalar(0.0))
+                    total -= other * steering[count + column] * turned(pull)
+                mixed_bar[row, column] = total
+        else:
+            place = column - gate_count + wp.static(space_dim)
+            if place < update_bar.shape[1]:
+                value = update_bar[row, place]
+        output_bar[row, column] = value
+
+    return SimpleNamespace(
+        mix_vectors=mix_vectors,
+        write_inputs=write_inputs,
+        pull_back_products=pull_back_products,
+        pull_back_rows=pull_back_rows,
+        steer=steer,
+        pull_back_steering=pull_back_steering,
+    )

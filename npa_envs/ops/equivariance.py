@@ -1,0 +1,308 @@
+"""What equivariant rules make of perceived vectors: products that stay the same in turned worlds.
+
+v are a particle's perceived gradients, u = mixing^T v some mixtures of them. A turn of the world
+turns all of them and leaves u_a · u_b as it is, in 2D also u_a × u_b, whose sign changes in a
+mirror. Each formula stands here twice: in plain torch, for any tensors (`invariants`, `steered`),
+and as kernels with hand-written adjoints, for the rows of a rollout (`read_rows`, `steer_rows`).
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from npa_envs.kernels.portable.equivariance import equivariance_kernels
+from npa_envs.ops.launch import launch, scalar_type
+from npa_envs.ops.opaque import once_differentiable, opaque
+
+
+class VectorForm(NamedTuple):
+    """How the perception vector is made of scalars and vectors, and what is made of these."""
+
+    space_dim: int
+    """Space dimension D."""
+    scalars: int
+    """Entries of the perception vector before the first vector."""
+    perceived: int
+    """Vectors in it, D numbers each."""
+    mixed: int
+    """Mixed vectors."""
+    chiral: bool
+    """Whether left is told from right."""
+
+    @property
+    def perception_dim(self) -> int:
+        """Length of the perception vector."""
+        return self.scalars + self.perceived * self.space_dim
+
+    @property
+    def product_count(self) -> int:
+        """Products u_a · u_b of pairs a <= b, and, where chiral, u_a × u_b of pairs a < b."""
+        pairs = self.mixed * (self.mixed + 1) // 2
+        return pairs + self.chiral * (pairs - self.mixed)
+
+    @property
+    def input_dim(self) -> int:
+        """Scalars and products."""
+        return self.scalars + self.product_count
+
+    @property
+    def gate_count(self) -> int:
+        """Gates: one for each mixed vector, and, where chiral, for each turned by 90 degrees."""
+        return self.mixed * (1 + self.chiral)
+
+
+def invariants(perception: Tensor, mixing: Tensor, form: VectorForm) -> tuple[Tensor, Tensor]:
+    """Return mixed vectors, and the numbers that stay the same in a turned world.
+
+    Args:
+        perception: Perception vectors, dimensionless, shape [..., P].
+        mixing: Weights of the mixtures, shape [perceived, mixed].
+        form: What is where.
+
+    Returns:
+        Mixed vectors u, shape [..., mixed, D], and scalars and products, shape [..., input_dim].
+    """
+    shape = (*perception.shape[:-1], form.perceived, form.space_dim)
+    vectors = perception[..., form.scalars :].reshape(shape)
+    mixed = mixing.T @ vectors
+    a, b = torch.triu_indices(form.mixed, form.mixed, device=mixed.device)
+    products = [(mixed[..., a, :] * mixed[..., b, :]).sum(dim=-1)]
+    if form.chiral:
+        a, b = torch.triu_indices(form.mixed, form.mixed, 1, device=mixed.device)
+        products.append((_turned(mixed)[..., a, :] * mixed[..., b, :]).sum(dim=-1))
+    return mixed, torch.cat((perception[..., : form.scalars], *products), dim=-1)
+
+
+def steered(output: Tensor, mixed: Tensor, steering: Tensor, form: VectorForm) -> Tensor:
+    """Return raw updates [δ (D) ; Δs] of gates and state changes: δ = Σ relu(g_a) steering_a u_a.
+
+    Args:
+        output: Gates and then state changes, dimensionless, shape [..., gate_count + C].
+        mixed: Mixed vectors u, shape [..., mixed, D].
+        steering: How far a gate of 1 moves along its vector, dimensionless, shape [gate_count].
+        form: What is where.
+    """
+    gates = torch.relu(output[..., : form.gate_count]) * steering
+    along = torch.cat((mixed, _turned(mixed)), dim=-2) if form.chiral else mixed
+    direction = (along * gates[..., None]).sum(dim=-2)
+    return torch.cat((direction, output[..., form.gate_count :]), dim=-1)
+
+
+def _turned(vectors: Tensor) -> Tensor:
+    """Return vectors [..., 2] turned by 90 degrees."""
+    x, y = vectors.unbind(dim=-1)
+    return torch.stack((-y, x), dim=-1)
+
+
+def _kernels(like: Tensor, space_dim: int) -> Any:
+    return equivariance_kernels(space_dim, scalar_type(like.dtype))
+
+
+@opaque("npa::read_rows")
+def _read_rows(
+    rows: Tensor, mixing: Tensor, width: int, space_dim: int, scalars: int, chiral: bool
+) -> tuple[Tensor, Tensor]:
+    perceived, count = mixing.shape
+    mixed = rows.new_empty(len(rows), count, space_dim)
+    inputs = rows.new_empty(len(rows), width)
+    kernels, device = _kernels(rows, space_dim), rows.device
+    launch(kernels.mix_vectors, len(rows) * count, device, scalars, rows, mixing, mixed)
+    launch(
+        kernels.write_inputs,
+        len(rows) * width,
+        device,
+        scalars,
+        scalars + perceived * space_dim,
+        int(chiral),
+        rows,
+        mixed,
+        inputs,
+    )
+    return mixed, inputs
+
+
+@_read_rows.register_fake
+def _(
+    rows: Tensor, mixing: Tensor, width: int, space_dim: int, *rest: Any
+) -> tuple[Tensor, Tensor]:
+    mixed = rows.new_empty(rows.shape[0], mixing.shape[1], space_dim)
+    return mixed, rows.new_empty(rows.shape[0], width)
+
+
+@opaque("npa::read_rows_backward")
+def _read_rows_backward(
+    mixed: Tensor,
+    mixing: Tensor,
+    mixed_bar: Tensor,
+    inputs_bar: Tensor,
+    width: int,
+    scalars: int,
+    chiral: bool,
+) -> tuple[Tensor, Tensor]:
+    count, mixed_count, space_dim = mixed.shape
+    total, rows_bar = mixed_bar.clone(), mixed.new_empty(count, width)
+    kernels, device = _kernels(mixed, space_dim), mixed.device
+    launch(
+        kernels.pull_back_products,
+        count * mixed_count,
+        device,
+        scalars,
+        int(chiral),
+        mixed,
+        inputs_bar,
+        total,
+    )
+    launch(
+        kernels.pull_back_rows, count * width, device, scalars, mixing, inputs_bar, total, rows_bar
+    )
+    return total, rows_bar
+
+
+@_read_rows_backward.register_fake
+def _(
+    mixed: Tensor, mixing: Tensor, mixed_bar: Tensor, inputs_bar: Tensor, width: int, *rest: Any
+) -> tuple[Tensor, Tensor]:
+    return torch.empty_like(mixed), mixed.new_empty(mixed.shape[0], width)
+
+
+@opaque("npa::steer_rows")
+def _steer_rows(
+    output: Tensor, mixed: Tensor, steering: Tensor, gate_count: int, width: int
+) -> Tensor:
+    update = output.new_empty(len(output), width)
+    kernel = _kernels(output, mixed.shape[2]).steer
+    launch(kernel, update.numel(), output.device, gate_count, output, mixed, steering, update)
+    return update
+
+
+@_steer_rows.register_fake
+def _(output: Tensor, mixed: Tensor, steering: Tensor, gate_count: int, width: int) -> Tensor:
+    return output.new_empty(output.shape[0], width)
+
+
+@opaque("npa::steer_rows_backward")
+def _steer_rows_backward(
+    output: Tensor, mixed: Tensor, steering: Tensor, update_bar: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    gate_count = len(steering)
+    output_bar, mixed_bar = torch.empty_like(output), torch.empty_like(mixed)
+    shares = output.new_empty(len(output), gate_count)
+    launch(
+        _kernels(output, mixed.shape[2]).pull_back_steering,
+        output.numel(),
+        output.device,
+        gate_count,
+        output,
+        mixed,
+        steering,
+        update_bar,
+        output_bar,
+        mixed_bar,
+        shares,
+    )
+    return output_bar, mixed_bar, shares
+
+
+@_steer_rows_backward.register_fake
+def _(output: Tensor, mixed: Tensor, steering: Tensor, *rest: Any) -> tuple[Tensor, ...]:
+    shares = output.new_empty(output.shape[0], steering.shape[0])
+    return torch.empty_like(output), torch.empty_like(mixed), shares
+
+
+class _ReadRows(torch.autograd.Function):
+    """Mixed vectors and invariants of rows."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, rows: Tensor, mixing: Tensor, width: int, form: VectorForm
+    ) -> tuple[Tensor, Tensor]:
+        found: tuple[Tensor, Tensor] = _read_rows(
+            rows, mixing, width, form.space_dim, form.scalars, form.chiral
+        )
+        ctx.form = form
+        ctx.save_for_backward(rows, mixing, found[0])
+        return found
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, mixed_bar: Tensor, inputs_bar: Tensor) -> tuple[Tensor | None, ...]:
+        rows, mixing, mixed = ctx.saved_tensors
+        form: VectorForm = ctx.form
+        total, rows_bar = _read_rows_backward(
+            mixed,
+            mixing,
+            mixed_bar.contiguous(),
+            inputs_bar.contiguous(),
+            rows.shape[1],
+            form.scalars,
+            form.chiral,
+        )
+        mixing_bar = None
+        if ctx.needs_input_grad[1]:
+            # One product for all pairs of axes, of which those of an axis with itself count.
+            pairs = rows[:, form.scalars : form.perception_dim].T @ total.flatten(1).view(
+                len(rows), -1
+            )
+            axes = pairs.view(form.perceived, form.space_dim, form.mixed, form.space_dim)
+            mixing_bar = axes.diagonal(dim1=1, dim2=3).sum(dim=-1)
+        return rows_bar, mixing_bar, None, None
+
+
+class _SteerRows(torch.autograd.Function):
+    """Updates of gates, mixed vectors and state changes."""
+
+    @staticmethod
+    def forward(ctx: Any, output: Tensor, mixed: Tensor, steering: Tensor, width: int) -> Tensor:
+        ctx.save_for_backward(output, mixed, steering)
+        update: Tensor = _steer_rows(output, mixed, steering, len(steering), width)
+        return update
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, update_bar: Tensor) -> tuple[Tensor | None, ...]:
+        output, mixed, steering = ctx.saved_tensors
+        output_bar, mixed_bar, shares = _steer_rows_backward(
+            output, mixed, steering, update_bar.contiguous()
+        )
+        return output_bar, mixed_bar, shares.sum(dim=0), None
+
+
+def read_rows(rows: Tensor, mixing: Tensor, form: VectorForm, width: int) -> tuple[Tensor, Tensor]:
+    """Return what `invariants` does of rows, followed by the rows' own one and by zeros.
+
+    Args:
+        rows: Rows of perception [z | 1 | 0], shape [K, row_width].
+        mixing: Weights of the mixtures, shape [perceived, mixed].
+        form: What is where.
+        width: Columns of the result, more than `form.input_dim`.
+
+    Returns:
+        Mixed vectors, shape [K, mixed, D], and [scalars | products | 1 | 0], shape [K, width].
+    """
+    tensors = rows.contiguous(), mixing.contiguous()
+    if not (torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)):
+        return _read_rows(*tensors, width, form.space_dim, form.scalars, form.chiral)
+    found: tuple[Tensor, Tensor] = _ReadRows.apply(*tensors, width, form)  # type: ignore[no-untyped-call]
+    return found
+
+
+def steer_rows(output: Tensor, mixed: Tensor, steering: Tensor, width: int) -> Tensor:
+    """Return what `steered` does, followed by zeros.
+
+    Args:
+        output: Gates and state changes [g | Δs | 0], dimensionless, shape [K, any].
+        mixed: Mixed vectors, shape [K, mixed, D].
+        steering: How far a gate of 1 moves along its vector, shape [gate_count].
+        width: Columns of the result.
+
+    Returns:
+        Raw updates [δ | Δs | 0], dimensionless, shape [K, width].
+    """
+    tensors = output.contiguous(), mixed, steering.contiguous()
+    if not (torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)):
+        return _steer_rows(*tensors, len(steering), width)
+    update: Tensor = _SteerRows.apply(*tensors, width)  # type: ignore[no-untyped-call]
+    return update

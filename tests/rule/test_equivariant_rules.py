@@ -1,0 +1,340 @@
+"""Rules that know no direction: turned starts, kernels, files, and who runs such rules."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from test_rule_files import assert_same_rule, pack
+from worlds import assert_near, lively_rule, random_world, relative_error
+
+import npa_envs
+from npa_envs.cli import main
+from npa_envs.rule.files import rule_metadata
+from npa_envs.rule.rule import NPARule
+
+KINDS = {
+    "2D": {"space_dim": 2},
+    "chiral": {"space_dim": 2, "chiral": True},
+    "3D": {"space_dim": 3},
+    "smooth": {"space_dim": 2, "moment_inverse": "smooth"},
+    "without states' gradients": {"space_dim": 3, "state_gradient": False},
+    "without the density's": {"space_dim": 2, "chiral": True, "density_gradient": False},
+}
+
+
+def equivariant(device="cpu", dtype=torch.float64, **options):
+    """Return a rule of five channels that moves its particles."""
+    options = {"equivariant": True, "mixed_vectors": 3, "gain": 4.0, **options}
+    return lively_rule(device, dtype, eps0=0.3, **options)
+
+
+def turns_of(space_dim, count=16):
+    """Return rotations, shape [count, D, D], in float64."""
+    matrices = torch.randn(count, space_dim, space_dim, generator=torch.Generator().manual_seed(5))
+    q, r = torch.linalg.qr(matrices.double())
+    q = q * r.diagonal(dim1=1, dim2=2).sign()[:, None]
+    q[:, 0] *= torch.linalg.det(q).sign()[:, None]
+    return q
+
+
+@torch.no_grad()
+def stepped(rule, x, s, steps=1):
+    generator = torch.Generator(x.device).manual_seed(3)
+    return npa_envs.rollout(rule, x, s, steps, generator=generator, cuda_graph=False)
+
+
+def largest_difference(rule, x, s, turn):
+    """Return how far a turned world ends from where the world, turned afterwards, ends."""
+    turn = turn.to(x.device)
+    x, s = x.double(), s.double()
+    after = stepped(rule, x.to(rule.hidden.weight), s.to(rule.hidden.weight))
+    other = stepped(rule, (x @ turn.T).to(rule.hidden.weight), s.to(rule.hidden.weight))
+    differences = other[0].double() - after[0].double() @ turn.T, other[1] - after[1]
+    return max(float(difference.abs().max()) for difference in differences)
+
+
+@pytest.mark.parametrize(("dtype", "bound"), [(torch.float32, 1e-5), (torch.float64, 1e-12)])
+@pytest.mark.parametrize("kind", KINDS)
+def test_turned_starts_stay_turned(kind, dtype, bound, device):
+    options = KINDS[kind]
+    rule = equivariant(device, dtype, **options)
+    x, s = random_world(1, 160, options["space_dim"], 5, dtype=torch.float64, device=device)
+    s = s.clamp(-1.0, 1.0)
+    after = stepped(rule, x.to(dtype), s.to(dtype))
+    assert float((after[0] - x).norm(dim=-1).mean()) > 1e-3
+    worst = [largest_difference(rule, x, s, turn) for turn in turns_of(options["space_dim"])]
+    assert max(worst) < bound
+
+
+def test_plain_rules_and_mirrors_tell_where_it_ends():
+    x, s = random_world(1, 160, 2, 5, dtype=torch.float64, device="cpu")
+    plain = lively_rule("cpu", eps0=0.3)
+    assert largest_difference(plain, x, s, turns_of(2)[0]) > 1e-3
+    mirror = torch.tensor([[1.0, 0.0], [0.0, -1.0]], dtype=torch.float64)
+    assert largest_difference(equivariant(), x, s, mirror) < 1e-12
+    assert largest_difference(equivariant(chiral=True), x, s, mirror) > 1e-3
+
+
+@pytest.mark.parametrize("static", [False, True])
+@pytest.mark.parametrize("kind", KINDS)
+def test_kernels_of_rows_are_the_formulas(kind, static, device):
+    rule = equivariant(device, static=static, **KINDS[kind])
+    network = rule.network()
+    z = torch.randn(50, rule.perception_dim, generator=torch.Generator().manual_seed(2)).double()
+    rows = torch.nn.functional.pad(z, (0, network.row_width - rule.perception_dim))
+    rows[:, rule.perception_dim] = 1.0
+    rows = rows.to(device)
+    found = []
+    for run, wide in ((network, rows), (rule, rows[:, : rule.perception_dim])):
+        wide = wide.clone().requires_grad_()
+        update = run(wide)[:, : rule.update_dim]
+        weights = rule.network_weights()[: 4 if static else 5]
+        bar = torch.linspace(-1.0, 1.0, update.numel(), device=device).double().view_as(update)
+        gradients = torch.autograd.grad(update, (wide, *weights), bar)
+        by_rows = gradients[0][:, : rule.perception_dim]
+        found.append([update.detach(), by_rows, *gradients[1:]])
+    for ours, theirs in zip(*found, strict=True):
+        assert relative_error(ours, theirs) < 1e-13
+
+
+@pytest.mark.parametrize("kind", ["chiral", "3D"])
+def test_gradients_are_what_differences_say(kind):
+    options = KINDS[kind]
+    # The correction is a stopped gradient, of which differences know nothing.
+    rule = equivariant(moment_correction=False, seed=1, **options)
+    x, s = random_world(1, 60, options["space_dim"], 5, dtype=torch.float64, device="cpu")
+    leaves = [s, *rule.network_weights()]
+
+    def loss():
+        generator = torch.Generator().manual_seed(3)
+        found = npa_envs.rollout(rule, x, s, 3, generator=generator, detach_positions=False)
+        return sum((part * part).sum() for part in found)
+
+    s.requires_grad_()
+    gradients = torch.autograd.grad(loss(), leaves)
+    for leaf, gradient in zip(leaves, gradients, strict=True):
+        way = torch.randn(leaf.shape, generator=torch.Generator().manual_seed(1)).double()
+        ends = []
+        for side in (1e-7, -2e-7):
+            with torch.no_grad():
+                leaf += side * way
+                ends.append(float(loss()))
+        with torch.no_grad():
+            leaf += 1e-7 * way
+        difference = (ends[0] - ends[1]) / 2e-7
+        assert difference == pytest.approx(float((gradient * way).sum()), rel=1e-4, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"equivariant": torch.ones(2)}, "equivariant must be True or False"),
+        ({"chiral": True}, "chiral is for equivariant rules: give equivariant=True"),
+        ({"equivariant": True, "chiral": True, "space_dim": 3}, "chiral needs space_dim=2"),
+        ({"equivariant": True, "species_count": 2}, "perceives all species alike"),
+        ({"equivariant": True, "mixed_vectors": 0}, "mixed_vectors must be at least 1, got 0"),
+        (
+            {"equivariant": True, "state_gradient": False, "density_gradient": False},
+            "needs vectors to perceive",
+        ),
+    ],
+)
+def test_what_does_not_go_together_is_refused(options, message):
+    with pytest.raises(npa_envs.NPAError, match=message):
+        NPARule(**options)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("kind", KINDS)
+def test_files_give_rules_back_and_say_that_older_versions_cannot_run_them(tmp_path, kind, dtype):
+    rule, path = equivariant(dtype=dtype, **KINDS[kind]), tmp_path / "rule.safetensors"
+    npa_envs.save_rule(rule, path)
+    assert_same_rule(npa_envs.load_rule(path), rule)
+    assert rule_metadata(path)["version"] == "2"
+    npa_envs.save_rule(NPARule(), path)
+    assert rule_metadata(path)["version"] == "1"
+    assert "equivariant" not in rule_metadata(path)
+
+
+# The authors' formats.
+
+
+def authors_rule(seed=0, state_dim=3, mixed=2, hidden_dim=5):
+    """Return the tensors of a rule by the names of the authors' state dict."""
+    generator = torch.Generator().manual_seed(seed)
+    inputs, outputs = 2 * state_dim + mixed * (mixed + 1) // 2, state_dim + mixed
+    shapes = {
+        "model.W_hidden": (state_dim + 1, mixed),
+        "model.W_out": (mixed, 1),
+        "model.mlp.0.weight": (hidden_dim, inputs),
+        "model.mlp.0.bias": (hidden_dim,),
+        "model.mlp.2.weight": (outputs, hidden_dim),
+        "model.mlp.2.bias": (outputs,),
+    }
+    state = {name: torch.randn(shape, generator=generator) for name, shape in shapes.items()}
+    return state | {"eps0": torch.tensor(0.1), "N0": torch.tensor(4096), "alpha": torch.tensor(0.5)}
+
+
+def authors_update(state, z):
+    """Return [δ ; Δs] of perception vectors, written out pair by pair."""
+    mixing, steering = state["model.W_hidden"], state["model.W_out"]
+    channels, mixed = mixing.shape[0] - 1, mixing.shape[1]
+    vectors = z[:, 2 * channels :].view(len(z), channels + 1, 2)
+    u = [sum(mixing[i, a] * vectors[:, i] for i in range(channels + 1)) for a in range(mixed)]
+    products = [(u[a] * u[b]).sum(-1) for a in range(mixed) for b in range(a, mixed)]
+    inputs = torch.cat((z[:, : 2 * channels], torch.stack(products, dim=1)), dim=1)
+    hidden = torch.relu(inputs @ state["model.mlp.0.weight"].T + state["model.mlp.0.bias"])
+    y = hidden @ state["model.mlp.2.weight"].T + state["model.mlp.2.bias"]
+    gates = torch.relu(y[:, channels:])
+    delta = sum(u[a] * gates[:, a : a + 1] * steering[a, 0] for a in range(mixed))
+    return torch.cat((delta, y[:, :channels]), dim=1)
+
+
+def padded(tensor):
+    return torch.nn.functional.pad(tensor, (0, -tensor.shape[-1] % 4))
+
+
+def demo_tensors(state):
+    """Return the tensors as the web demo has them: padded, the mixtures' weights four times."""
+    return {
+        "W_hidden": state["model.W_hidden"].repeat_interleave(4, dim=-1),
+        "W_out": state["model.W_out"].repeat_interleave(4, dim=-1),
+        "w1.weight": padded(state["model.mlp.0.weight"]),
+        "w1.bias": padded(state["model.mlp.0.bias"]),
+        "w2.weight": padded(state["model.mlp.2.weight"]),
+        "w2.bias": padded(state["model.mlp.2.bias"]),
+    }
+
+
+def packed(tensors, stacked=False):
+    first = (lambda t: t) if stacked else (lambda t: t.numpy())
+    entry = {name: pack(first(tensor)) for name, tensor in tensors.items()}
+    return entry | {"eps0": 0.10000000149011612, "N0": 4096, "alpha": 0.5}
+
+
+def stack_of(rules):
+    tensors = [demo_tensors(state) for state in rules]
+    return packed({name: torch.stack([t[name] for t in tensors]) for name in tensors[0]})
+
+
+def assert_runs_as(rule, state):
+    z = torch.randn(30, rule.perception_dim, generator=torch.Generator().manual_seed(8))
+    assert (rule.space_dim, rule.eps0, rule.alpha) == (2, 0.1, 0.5)
+    assert relative_error(rule(z), authors_update(state, z)) < 1e-6
+
+
+def test_the_authors_equivariant_rules_run_as_theirs(tmp_path):
+    rules = [authors_rule(seed) for seed in range(3)]
+    torch.save(rules[0], tmp_path / "npa.pth")
+    assert_runs_as(npa_envs.load_rule(tmp_path / "npa.pth"), rules[0])
+    path = tmp_path / "models.json"
+    path.write_text(
+        json.dumps({name: packed(demo_tensors(rules[k])) for k, name in enumerate("ab")})
+    )
+    assert_runs_as(npa_envs.load_rule(f"{path}#b"), rules[1])
+    path.write_text(json.dumps(stack_of(rules)))
+    for number, state in enumerate(rules):
+        assert_runs_as(npa_envs.load_rule(f"{path}#{number}"), state)
+
+
+def plain_stack(rules):
+    """Return plain rules as a stack."""
+    outputs = [torch.cat((rule.output.weight[2:], rule.output.weight[:2])).T for rule in rules]
+    tensors = {
+        "w1.weight": torch.stack([padded(rule.hidden.weight) for rule in rules]),
+        "w1.bias": torch.stack([rule.hidden.bias for rule in rules]),
+        "w2.weight.T": torch.stack([padded(output) for output in outputs]),
+    }
+    return packed({name: tensor.detach() for name, tensor in tensors.items()})
+
+
+def test_stacks_of_plain_rules_are_told_apart_by_numbers(tmp_path):
+    torch.manual_seed(0)
+    rules, path = [NPARule(2, 5, 8) for _ in range(3)], tmp_path / "models_digits.json"
+    path.write_text(json.dumps(plain_stack(rules)))
+    for number, rule in enumerate(rules):
+        assert_same_rule(npa_envs.load_rule(f"{path}#{number}"), rule)
+    with pytest.raises(npa_envs.NPAError, match="stack of 3 rules without names: add #0 to #2"):
+        npa_envs.load_rule(path)
+    for wrong in ("3", "-1", "lizard", ""):
+        with pytest.raises(npa_envs.NPAError, match=f"got #{wrong}: give #0 to #2"):
+            npa_envs.load_rule(f"{path}#{wrong}")
+    path.write_text(json.dumps(plain_stack(rules[:1])))
+    assert_same_rule(npa_envs.load_rule(path), rules[0])
+
+
+def ones(*shape):
+    return pack(np.ones(shape))
+
+
+BAD_ENTRIES = {
+    "a missing tensor": (lambda e: e.pop("w2.bias"), "lacks 'w2.bias'"),
+    "fewer mixtures": (
+        lambda e: e.update(W_out=pack(torch.ones(1, 4).numpy())),
+        "must have the sh",
+    ),
+    "few inputs": (lambda e: e.update({"w1.weight": pack(torch.ones(5, 8).numpy())}), "must have"),
+    "no channels": (lambda e: e.update(W_hidden=ones(1, 8)), "must have the"),
+    "NaN": (lambda e: e.update({"w1.bias": pack(torch.full((5,), math.nan).numpy())}), "finite"),
+    "no radius": (lambda e: e.pop("eps0"), "eps0 must be a finite number, got None"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_ENTRIES)
+def test_wrong_files_of_equivariant_rules_are_refused(tmp_path, case):
+    change, message = BAD_ENTRIES[case]
+    entry, path = packed(demo_tensors(authors_rule())), tmp_path / "models.json"
+    change(entry)
+    path.write_text(json.dumps({"mine": entry}))
+    with pytest.raises(npa_envs.NPAError, match=f"cannot load a rule from .*: .*{message}"):
+        npa_envs.load_rule(path)
+
+
+def test_wrong_stacks_and_state_dicts_are_refused(tmp_path):
+    stack, path = stack_of([authors_rule(0), authors_rule(1)]), tmp_path / "models.json"
+    stack["w2.bias"] = ones(1, 8)
+    path.write_text(json.dumps(stack))
+    with pytest.raises(npa_envs.NPAError, match=r"w2\.bias must be of as many rules as w1\.weight"):
+        npa_envs.load_rule(f"{path}#1")
+    state = authors_rule()
+    del state["model.W_out"]
+    torch.save(state, tmp_path / "npa.pth")
+    with pytest.raises(npa_envs.NPAError, match=r"missing: \['model.W_out'\]"):
+        npa_envs.load_rule(tmp_path / "npa.pth")
+
+
+# Who runs such rules.
+
+
+def test_species_of_both_kinds_share_a_world():
+    rules = [equivariant(seed=1), lively_rule("cpu", eps0=0.3, seed=2)]
+    x, s = random_world(2, 60, 2, 5, dtype=torch.float64, device="cpu")
+    runs = []
+    for one in (rules[0], Unfolded(rules[0])):
+        generator = torch.Generator().manual_seed(3)
+        with torch.no_grad():
+            found = npa_envs.rollout_species(
+                [one, rules[1]], x, s, 4, counts=(30, 30), generator=generator
+            )
+        runs.append(found)
+    assert_near(runs[0], runs[1], 1e-12)
+
+
+class Unfolded(NPARule):
+    """The same rule, run as the module that it is."""
+
+    def __init__(self, rule):
+        vars(self).update(vars(rule))
+
+    def forward(self, perception):
+        return super().forward(perception)
+
+
+def test_pages_and_collections_refuse_what_they_cannot_run(tmp_path):
+    path = tmp_path / "mine.safetensors"
+    npa_envs.save_rule(NPARule(equivariant=True), path)
+    for out in ("page.html", "models.json"):
+        assert main(["export-web", str(path), "--out", str(tmp_path / out)]) != 0
+        assert not (tmp_path / out).exists()

@@ -1,0 +1,144 @@
+"""The loss of 2D morphogenesis that is blind to turns: the best angle counts."""
+
+import json
+import math
+
+import pytest
+import torch
+
+from npa_envs.cli import main
+from npa_envs.errors import NPAError
+from npa_envs.rule.files import load_rule, rule_metadata
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig, turned, turns
+from npa_envs.training import preset
+
+SMALL = {"target": "octopus", "target_point_count": 300, "particle_count": 300, "resolution": 48}
+ANGLES = (0.0, 0.5 * math.pi, 1.234, 3.0)
+
+
+def task_of(**fields):
+    return Morphogenesis2D(Morphogenesis2DConfig(**{"equivariant": True, **SMALL, **fields}))
+
+
+def grown(task, dtype=torch.float64):
+    """Return one world that is the target, moved aside, and mirrored if the first letter is F."""
+    x = task.target.points[None].to(dtype) + 0.1
+    s = torch.zeros(1, x.shape[1], 16, dtype=dtype)
+    s[..., -3:] = task.target.colours.to(dtype) - 0.5
+    return x, s
+
+
+def turn_of(angle, hand=1.0):
+    return turns(torch.tensor([angle]).double(), torch.tensor([hand]).double())
+
+
+def test_a_turned_target_is_recognised_and_a_plain_loss_sees_another():
+    task, plain = task_of(), task_of(equivariant=False)
+    x, s = grown(task)
+    for angle in ANGLES:
+        other = turned(x, turn_of(angle))
+        found = task.best_turn(other, s)
+        assert found.det().item() == pytest.approx(1.0)
+        back = torch.atan2(found[0, 1, 0], found[0, 0, 0]).item()
+        assert abs(math.remainder(back + angle, 2.0 * math.pi)) < math.radians(0.4)
+        assert task.metric(other, s).item() < 0.06
+        if angle > 0.0:
+            assert plain.metric(other, s).item() > 0.3
+    assert plain.metric(x, s).item() < 1e-6
+
+
+def test_mirrored_worlds_are_as_good_where_the_rule_is_not_chiral():
+    x, s = grown(task_of())
+    # The gecko is no mirror image of itself, turned or not.
+    gecko = {"target": "gecko"}
+    x, s = grown(task_of(**gecko))
+    other = turned(x, turn_of(0.7, -1.0))
+    both, one = task_of(chiral=False, **gecko), task_of(**gecko)
+    assert both.best_turn(other, s).det().item() == pytest.approx(-1.0)
+    assert both.metric(other, s).item() < 0.06 < 0.2 < one.metric(other, s).item()
+
+
+def test_each_world_is_turned_as_it_is_alone():
+    task = task_of()
+    x, s = grown(task)
+    x = torch.cat([turned(x, turn_of(angle)) for angle in ANGLES])
+    s = s.expand(len(x), -1, -1).contiguous()
+    together = task.metric(x, s)
+    alone = torch.cat([task.metric(x[k : k + 1], s[k : k + 1]) for k in range(len(x))])
+    assert torch.equal(together, alone)
+    # What has a gradient is compared at the same angle.
+    assert torch.allclose(task.metric(x.requires_grad_(), s).detach(), together, rtol=1e-6)
+
+
+def test_the_gradient_is_that_at_the_angle_chosen():
+    task, plain = task_of(), task_of(equivariant=False)
+    x, s = grown(task)
+    x = turned(x, turn_of(1.0)) + 0.02 * torch.randn(
+        x.shape, generator=torch.Generator().manual_seed(1)
+    )
+    (ours,) = torch.autograd.grad(task.metric(leaf := x.clone().requires_grad_(), s).sum(), leaf)
+    turn = task.best_turn(x, s)
+    upright = turned(x, turn).requires_grad_()
+    (theirs,) = torch.autograd.grad(plain.metric(upright, s).sum(), upright)
+    assert torch.allclose(ours, turned(theirs, turn.mT), atol=1e-12)
+
+
+def test_penalties_know_no_direction_either():
+    task = task_of(stray_weight=1.0, bound_weight=1.0)
+    generator = torch.Generator().manual_seed(0)
+    x = torch.randn(2, 300, 2, generator=generator).double()
+    path = torch.rand(2, 300, generator=generator).double()
+    s = torch.zeros(2, 300, 16).double()
+    turn = turn_of(0.8).expand(2, 2, 2)
+    terms, others = (task.penalties(y, s, path) for y in (x, turned(x, turn)))
+    for name, (weight, term) in terms.items():
+        assert torch.allclose(term, others[name][1]), name
+        assert weight >= 0.0
+    assert terms["bound"][1] > 0.0
+    assert terms["stray"][1] > 0.0
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"equivariant": "yes"}, "equivariant must be True or False, got 'yes'"),
+        ({"chiral": 1}, "chiral must be True or False, got 1"),
+        ({"angles": 3}, "angles must be a whole number of at least 4, got 3"),
+    ],
+)
+def test_what_is_no_choice_is_refused(fields, message):
+    with pytest.raises(NPAError, match=message):
+        task_of(**fields)
+
+
+def test_a_rule_without_direction_is_trained_measured_and_exported_from_the_command_line(
+    tmp_path, capsys
+):
+    out = str(tmp_path / "run")
+    words = ["train", "morphogenesis2d", "--preset", "tiny", "--equivariant", "--no-progress"]
+    words += ["--iterations", "3", "--milestones", "2", "--no-report", "--out", out]
+    assert main(words) == 0
+    path = tmp_path / "run" / "rule.safetensors"
+    rule = load_rule(path)
+    assert (rule.equivariant, rule.chiral, rule.mixed_vectors) == (True, True, 8)
+    told = json.loads(rule_metadata(path)["config"])
+    assert told["task"]["equivariant"]
+    assert main([*words[:-2], "--out", out, "--resume"]) == 0
+    capsys.readouterr()
+    assert main(["evaluate", str(path), "--checkpoints", "4", "--no-progress"]) == 0
+    assert "splat loss" in capsys.readouterr().out
+    assert main(["export-web", str(path), "--out", str(tmp_path / "page.html")]) == 2
+    assert "is equivariant: watch it with npa-envs view" in capsys.readouterr().err
+
+
+def test_presets_that_begin_with_a_first_rule_begin_untrained(tmp_path):
+    from npa_envs.training.trainer import initial_rule
+
+    config = preset("fast", equivariant=True)
+    assert config.initial_rule
+    untrained = Morphogenesis2D(config.task).make_rule(torch.Generator().manual_seed(0))
+    assert initial_rule(config, untrained) is untrained
+    other = preset("fast", equivariant=True, initial_rule="gecko", hidden_dim=128)
+    untrained = Morphogenesis2D(other.task).make_rule(torch.Generator().manual_seed(0))
+    with pytest.raises(NPAError, match=r"differs in .*equivariant"):
+        initial_rule(other, untrained)
