@@ -2,26 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from npa_envs.agents.policies import unwrapped
-from npa_envs.envs.garden.brushwork import PLACE, Columns
-from npa_envs.envs.garden.task import GardenTask
+from npa_envs.envs.garden.brushwork import Columns, grid_places
+from npa_envs.envs.garden.task import GardenTask, Lacking
 from npa_envs.envs.shepherd2d import ShepherdTask
 from npa_envs.errors import NPAError, shown
 from npa_envs.tasks.checks import is_real
 from npa_envs.world.randomness import Purpose, WorldRandom
+
+FREE_PLACES = 8
+"""Places on each side of the grid from which scripts choose where free brushes go."""
 
 
 class BrushPolicy:
     """A policy of a garden, for arrays and tensors alike; subclasses say what brushes do.
 
     Args:
-        env: A garden, single or vector, whose actions are "box".
+        env: A garden, single or vector, whose actions are numbers: "grid" or "free".
 
     Raises:
         NPAError: It is none, or has other actions.
@@ -31,14 +34,16 @@ class BrushPolicy:
         inner = unwrapped(env)
         self.worlds = inner.worlds
         self.task = self.worlds.task
-        if not isinstance(self.task, GardenTask) or self.task.config.actions != "box":
+        if not isinstance(self.task, GardenTask) or self.task.config.actions == "discrete":
             raise NPAError(
-                f"env must be a garden with actions='box', got {type(self.task).__name__}: make it "
-                "with gymnasium.make('npa/Gardener2D-v0')"
+                f"env must be a garden with actions='grid' or 'free', got "
+                f"{type(self.task).__name__}: make it with gymnasium.make('npa/Gardener2D-v0')"
             )
         self._seen = inner.form.seen_dim
         self.config = self.task.config
         self.columns = Columns.of(self.config)
+        self.shape = inner.form.rows_shape
+        """Of what the brushes of a world do, (K, W)."""
 
     def __call__(self, observation: Any) -> Any:
         """Return what brushes do, shape [K, W], or [B, K, W] where B worlds are seen.
@@ -56,8 +61,7 @@ class BrushPolicy:
 
     def still(self, world_count: int) -> Tensor:
         """Return actions that do nothing."""
-        shape = (world_count, self.config.brush_count, self.columns.width)
-        return torch.zeros(shape, device=self.task.device)
+        return torch.zeros(world_count, *self.shape, device=self.task.device)
 
 
 class StillGardener(BrushPolicy):
@@ -98,76 +102,74 @@ class RandomGardener(BrushPolicy):
 
     def act(self, world_count: int) -> Tensor:
         """Return numbers from [-1, 1)."""
-        return (
-            2.0 * self._draws.next(world_count).uniform(self.config.brush_count, self.columns.width)
-            - 1.0
-        )
+        return 2.0 * self._draws.next(world_count).uniform(*self.shape) - 1.0
 
 
 class ScriptedGardener(BrushPolicy):
-    """Push particles up the slope of what lacks: from where there are too many to where too few.
+    """Push particles to the side on which they lack, and from places with too many to others.
 
-    It sees the coarse picture alone. What lacks to the target's density is blurred; its slope says
-    where to push and how far. Each brush goes where most is to be pushed furthest and no brush
-    before it has been.
+    What it does on a grid is linear in what is seen there. Brushes that can go anywhere go where
+    most is to be pushed furthest and no brush before them is.
 
     Args:
         env: A garden whose brushes push.
-        gain: How far to push for a slope (dimensionless).
-        width: Standard deviation of the blur [length units].
+        gain: How far to push for what lacks at a place (dimensionless).
+        share: How far to push towards neighbouring places for what lacks there (dimensionless).
+        width: How far away neighbours are, as a standard deviation [length units].
 
     Raises:
         NPAError: `env` is no garden, its brushes do not push, or a number is not positive.
     """
 
-    def __init__(self, env: Any, gain: float = 0.75, width: float = 0.2) -> None:
+    def __init__(self, env: Any, gain: float = 0.5, share: float = 0.6, width: float = 0.4) -> None:
         super().__init__(env)
         if "push" not in self.config.tools:
             raise NPAError(f"env must have brushes that push, got tools={self.config.tools}")
-        self._gain, self._width = checked_positive("gain", gain), checked_positive("width", width)
-        size = self.config.picture_size
-        steps = (2.0 * torch.arange(size, device=self.task.device) + 1.0) / size - 1.0
-        # Rows of the picture go from the bottom up.
-        up, across = torch.meshgrid(steps, steps, indexing="ij")
-        self._cells = torch.stack((across.flatten(), up.flatten()), dim=-1)
-        away = self._cells[:, None] - self._cells
-        square = away.square().sum(dim=-1)
-        radius = self.config.brush_radius
-        self._held = (1.0 - square / radius**2).clamp_min(0.0).square()
-        blur = (-0.5 * square / width**2).exp()
-        self._slope = -4.0 * away * (blur / blur.sum(dim=1).max())[..., None]
-        target = self.task.goal.target_picture[None, ..., 3]
-        self._target = F.avg_pool2d(target, self.config.resolution // size).flatten(1)
+        self._gain = checked_positive("gain", gain)
+        self._lacking = self.task.lacking
+        if self.config.actions == "free":
+            fine = replace(self.config, place_count=FREE_PLACES)
+            places = grid_places(fine, self.task.device)
+            self._lacking = Lacking(places, self.task.goal.target, fine)
+        places = self._lacking.places
+        away = places[None] - places[:, None]
+        near = (-0.5 * away.square().sum(dim=-1) / checked_positive("width", width) ** 2).exp()
+        self._ways = checked_positive("share", share) * near[..., None] * away
 
     def act(self, world_count: int) -> Tensor:
-        """Return what the brushes do about the coarse picture as it is."""
-        density = self.task.coarse(self.worlds.x, self.worlds.s)[:, 3].flatten(1)
-        lack, action = self._target - density, self.still(world_count)
-        way = torch.einsum("bq,pqd->bpd", lack, self._slope)
-        move = self._gain * way / self.config.push_length
-        worth = move.norm(dim=-1) * (density @ self._held)
+        """Return what the brushes do about the worlds as they are."""
+        worlds, action = self.worlds, self.still(world_count)
+        lack = self._lacking(worlds.x, worlds.s, self.task.middle(worlds.x))
+        move = self._gain * lack[..., 1:3] + torch.einsum("bq,pqd->bpd", lack[..., 0], self._ways)
+        move = move.clamp(-1.0, 1.0)
+        if self.config.actions == "grid":
+            action[..., self.columns.push] = move
+            return action
+        places, worth = self._lacking.places, move.norm(dim=-1)
         everyone = torch.arange(world_count, device=lack.device)
-        for brush in range(self.config.brush_count):
-            cell = worth.argmax(dim=1)
-            action[:, brush, PLACE] = self._cells[cell]
-            action[:, brush, self.columns.push] = move[everyone, cell].clamp(-1.0, 1.0)
-            worth = worth * (1.0 - self._held[cell]).clamp_min(0.0)
+        for brush in range(len(action[0])):
+            place = worth.argmax(dim=1)
+            action[:, brush, self.columns.place] = places[place]
+            action[:, brush, self.columns.push] = move[everyone, place]
+            apart = (places - places[place][:, None]).norm(dim=-1) >= self.config.brush_radius
+            worth = worth * apart
         return action
 
 
 class ScriptedShepherd(BrushPolicy):
-    """Push from a ring of places: all the way to the goal, around, or outwards, as it asks for.
+    """Push everywhere: all the way to the goal, around, or outwards, as it asks for.
 
     Args:
         env: `npa/Shepherd2D-v0`, whose brushes push.
         gain: Share of what is missing to the goal that is done in a step (dimensionless).
-        ring: Distance of the places from the middle of the picture [length units].
+        ring: Distance from the middle of the picture at which brushes stand that can go anywhere
+            [length units].
 
     Raises:
         NPAError: `env` is another one, its brushes do not push, or a number is not positive.
     """
 
-    def __init__(self, env: Any, gain: float = 0.3, ring: float = 0.4) -> None:
+    def __init__(self, env: Any, gain: float = 1.0, ring: float = 0.4) -> None:
         super().__init__(env)
         if not isinstance(self.task, ShepherdTask) or "push" not in self.config.tools:
             raise NPAError(
@@ -175,10 +177,12 @@ class ScriptedShepherd(BrushPolicy):
                 f"{type(self.task).__name__} with tools={self.config.tools}"
             )
         self._gain = checked_positive("gain", gain)
-        angle = 2.0 * torch.pi * (torch.arange(self.config.brush_count) + 0.5)
-        angle = angle / self.config.brush_count
-        places = torch.stack((angle.cos(), angle.sin()), dim=1).to(self.task.device)
-        self._places = checked_positive("ring", ring) * places
+        self._places = self.task.lacking.places
+        ring = checked_positive("ring", ring)
+        if self.config.actions == "free":
+            count = self.config.brush_count
+            angle = 2.0 * torch.pi * (torch.arange(count, device=self.task.device) + 0.5) / count
+            self._places = ring * torch.stack((angle.cos(), angle.sin()), dim=1)
 
     def act(self, world_count: int) -> Tensor:
         """Return pushes towards the goals of the worlds as they are."""
@@ -192,7 +196,8 @@ class ScriptedShepherd(BrushPolicy):
         else:
             around = torch.stack((-self._places[:, 1], self._places[:, 0]), dim=1)
             way = missing[..., 1:] * around
-        action[..., PLACE] = self._places
+        if self.config.actions == "free":
+            action[..., self.columns.place] = self._places
         push = self._gain * way / self.config.push_length
         action[..., self.columns.push] = push.clamp(-1.0, 1.0)
         return action
@@ -248,7 +253,7 @@ class GradientGardener(BrushPolicy):
         draws = self._draws.next(world_count)
         first = self._scripted.act(world_count)
         plan = torch.stack([first] + [self.still(world_count)] * (self._horizon - 1))
-        plan[1:, ..., PLACE] = first[..., PLACE]
+        plan[1:, ..., self.columns.place] = first[..., self.columns.place]
         plan = plan.requires_grad_()
         optimizer = torch.optim.Adam([plan], lr=self._learning_rate)
         best = plan.detach().clone()

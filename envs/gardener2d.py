@@ -81,8 +81,8 @@ class GardenerTask(GardenTask[Gardener2DEnvConfig]):
         return marks_of_whole(self, start, loss)
 
     def earned(self, x: Tensor, s: Tensor, loss: Tensor, marks: Tensor) -> Tensor:
-        """Return how whole worlds are: 1 as at their start, 0 as bad as grey, shape [B]."""
-        return (1.0 - lost_share(loss, marks)).clamp(-1.0, 1.0)
+        """Return how good worlds are: 1 as at their start, 0 as bad as grey, shape [B]."""
+        return (1.0 - lost_share(loss, marks)).clamp_min(-1.0)
 
 
 class Gardener2DEnv(GardenEnv):
@@ -92,20 +92,21 @@ class Gardener2DEnv(GardenEnv):
 
     A trained rule has grown a picture from N particles and goes on running them. Again and again a
     gust carries some of them away, a blight erases the states of others, and noise shakes them all.
-    The rule heals a part of it, too slowly. The agent helps from outside, as a gardener does: in
-    each step it has a few brushes that push particles, erase or change their states, or let them
-    live slower or faster. It sees a coarse picture.
+    The rule heals a part of it, too slowly. The agent helps from outside, as a gardener does: it
+    has brushes on a grid, which push particles; with other `tools` they erase or change states or
+    let particles live slower or faster. It sees what lacks at each place of the grid.
 
     `npa_envs.agents.gardening` has gardeners to compare with: `StillGardener` does nothing,
-    `ScriptedGardener` pushes particles to where the picture lacks some, and `GradientGardener`
-    plans by the gradient of the reward through brushes, rule and picture.
+    `ScriptedGardener` pushes particles to where the picture lacks some, linearly in what it sees,
+    and `GradientGardener` plans by the gradient of the reward through brushes, rule and picture.
 
     ## Reward
 
     Worlds are compared with the target as in `npa/Morphogenesis2D-v0`, by a loss L. The reward is
-    1 − (L − L₀) / (L₁ − L₀), clipped to [-1, 1]. L₀ is the loss at the episode's start, of the
-    whole picture. L₁ is what it would be if all states were erased, grey, and at least 1.1 L₀. So 1
-    is a whole picture, 0 one as bad as a grey one, and a return is at most the number of steps.
+    1 − (L − L₀) / (L₁ − L₀), and at least -1. L₀ is the loss at the episode's start, of the picture
+    that the rule has grown. L₁ is what it would be if all states were erased, grey, and at least
+    1.1 L₀. So 1 is a picture as good as the rule's, 0 one as bad as a grey one; a picture nearer to
+    the target than the rule's is worth more than 1.
 
     | `reward` | Reward of step t |
     |---|---|

@@ -15,7 +15,7 @@ from torch import Tensor
 from npa_envs import world_mean
 from npa_envs.envs.core.spaces import to_output
 from npa_envs.envs.core.task import Start
-from npa_envs.envs.garden.config import GardenConfig, GardenReward, Observe
+from npa_envs.envs.garden.config import GardenConfig, GardenReward
 from npa_envs.envs.garden.environments import GardenEnv, GardenVectorEnv
 from npa_envs.envs.garden.forms import Brushes
 from npa_envs.envs.garden.task import SEEN_LIMIT, GardenTask, lost_share, marks_of_whole
@@ -40,13 +40,13 @@ class Shepherd2DEnvConfig(GardenConfig):
     reward: GardenReward = "dense"
     """"dense": minus the distance to the goal; "sparse": 0 at the goal and -1 elsewhere."""
 
-    tools: tuple[str, ...] = ("push",)
+    place_count: int = 3
 
-    observe: Observe = "moments"
+    place_reach: float = 0.6
 
-    push_length: float = 0.15
+    brush_radius: float = 0.4
 
-    brush_radius: float = 0.5
+    push_length: float = 0.1
 
     aim: Aim = "move"
     """What is asked for: to "move" the mean of all particles to a place, to "turn" the creature's
@@ -238,8 +238,9 @@ class Shepherd2DEnv(_GoalReward, GardenEnv):
     ## Description
 
     A trained rule has grown a picture, a creature, from N particles and goes on running them. The
-    agent has a few brushes that push; with other `tools` it can do what a gardener does. It is to
-    bring the creature to a goal. Whoever pushes too hard tears it; the rule heals what it can.
+    agent has brushes on a grid that goes along with the creature; they push, and with other `tools`
+    do what a gardener's can. It is to bring the creature to a goal. Whoever pushes too hard tears
+    it; the rule heals what it can.
 
     Observations are those of goal-conditioned environments: a dictionary with a goal that was
     achieved and one that is desired, and `compute_reward` for goals other than the episode's own.
@@ -252,7 +253,7 @@ class Shepherd2DEnv(_GoalReward, GardenEnv):
 
     | Key | Shape | Value |
     |---|---|---|
-    | `observation` | [5 + 3C], or [4 G²] where `observe="picture"` | what is seen of the world |
+    | `observation` | [6 P²], or as `observe` says | what is seen of the world |
     | `achieved_goal` | [3] | what the creature has come to, and the share that it has lost |
     | `desired_goal` | [3] | what it is to come to, and `lost_limit` |
 

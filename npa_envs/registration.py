@@ -70,13 +70,9 @@ SMALL = (
         MappingProxyType(
             {
                 "particle_count": 256,
-                "tools": ("push",),
-                "brush_count": 1,
-                "brush_radius": 0.6,
                 "gust_chance": 0.5,
                 "gust_radius": 0.6,
                 "blight_chance": 0.25,
-                "picture_size": 8,
             }
         ),
     ),
@@ -85,7 +81,9 @@ SMALL = (
         "npa_envs.envs.shepherd2d",
         "Shepherd2D",
         32,
-        MappingProxyType({"particle_count": 256}),
+        MappingProxyType(
+            {"particle_count": 256, "place_count": 2, "place_reach": 0.4, "brush_radius": 0.6}
+        ),
     ),
 )
 """Settings of environments with few particles and few numbers to act by, never changed under the

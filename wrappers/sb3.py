@@ -7,7 +7,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 import torch
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Space
 from gymnasium.vector import VectorWrapper
 from numpy.typing import NDArray
 from torch import Tensor
@@ -65,8 +65,8 @@ class RowVecEnv(VecEnv):
         env: Any,
         world_count: int,
         row_count: int,
-        observation_space: Box,
-        action_space: Box,
+        observation_space: Space[Any],
+        action_space: Space[Any],
     ) -> None:
         self.vector_env = env
         """The environment whose particles these are."""
@@ -241,10 +241,10 @@ class _EpisodeRows(RowVecEnv):
     pays_particles = True
     """Whether rows are paid what their particles are, where that is known."""
 
-    def reset(self) -> NDArray[np.float32]:
+    def reset(self) -> Any:
         """Start episodes in all worlds and return the rows' observations, shape [B R, ...]."""
         observations, _ = self.begin()
-        return self._as_rows(on_host(observations)[0])
+        return self._shown(observations)
 
     def step_wait(self) -> RowSteps:
         """Step all worlds.
@@ -260,15 +260,19 @@ class _EpisodeRows(RowVecEnv):
         actions = self.taken_actions().reshape(self.world_count, *shape)
         observations, rewards, terminations, truncations, infos = self.vector_env.step(actions)
         own = own_rewards(infos) if self.pays_particles else None
-        shown, paid, ended, cut = on_host(
-            observations, rewards if own is None else own, terminations, truncations
-        )
+        paid, ended, cut = on_host(rewards if own is None else own, terminations, truncations)
         if own is None:
             paid = np.repeat(paid, self.row_count)
         done = ended | cut
         told = self._ends(np.flatnonzero(done), cut & ~ended, infos)
         paid = paid.reshape(self.num_envs).astype(np.float32, copy=False)
-        return self._as_rows(shown), paid, np.repeat(done, self.row_count), told
+        return self._shown(observations), paid, np.repeat(done, self.row_count), told
+
+    def _shown(self, observations: Any) -> Any:
+        """Return observations of all worlds, or of some, as those of their rows."""
+        if isinstance(observations, Mapping):
+            return dict(zip(observations, on_host(*observations.values()), strict=True))
+        return self._as_rows(on_host(observations)[0])
 
     def _as_rows(self, values: NDArray[Any]) -> NDArray[Any]:
         return values.reshape(-1, *(self.observation_space.shape or ()))
@@ -280,17 +284,27 @@ class _EpisodeRows(RowVecEnv):
         if not len(worlds):
             return [self.nothing] * self.num_envs
         count = self.row_count
-        success, last = infos["final_info"].get("success"), None
+        final_info, last = infos["final_info"], None
+        success = final_info.get("is_success", final_info.get("success"))
         if self.bootstrap:
-            # Of the worlds that are over alone, as all are much to copy.
-            final = as_tensor(infos["final_obs"])
-            last = self._as_rows(on_host(final[torch.from_numpy(worlds).to(final.device)])[0])
+            last = self._last(infos["final_obs"], worlds)
         return self.infos(
             (worlds[:, None] * count + np.arange(count)).reshape(-1),
             truncated=cut[worlds].repeat(count) if self.bootstrap else None,
             last=last,
             success=None if success is None else on_host(success)[0][worlds].repeat(count),
         )
+
+    def _last(self, final: Any, worlds: NDArray[np.int64]) -> Any:
+        """Return the last observations of worlds that are over, one for each of their rows."""
+        if isinstance(final, Mapping):
+            shown = {name: values[worlds] for name, values in self._shown(final).items()}
+            return [{name: rows[k] for name, rows in shown.items()} for k in range(len(worlds))]
+        if not isinstance(final, Tensor) and final.dtype == object:
+            return list(final[worlds])
+        # Of the worlds that are over alone, as all are much to copy.
+        rows = as_tensor(final)
+        return self._shown(rows[torch.from_numpy(worlds).to(rows.device)])
 
 
 class ParticleVecEnv(_EpisodeRows):
@@ -340,44 +354,39 @@ class ParticleVecEnv(_EpisodeRows):
 class WorldVecEnv(_EpisodeRows):
     """The worlds of a vector environment as the rows of a Stable-Baselines3 `VecEnv`.
 
-    A row observes what is seen of its world, and acts on it: in gardens few numbers, elsewhere what
-    all particles perceive, shape [N, P], and all their actions, [N, A]. Stable-Baselines3's own
-    policies draw those of particles from one Gaussian of N A columns, which cannot learn: after the
-    smallest update the ratio of two likelihoods is near zero or beyond all bounds. For particles
-    take a policy that means over them instead of summing, such as
-    `npa_envs.agents.learning.sb3.WorldRulePolicy`.
+    A row is a world. Of a living world, such as `npa/Gardener2D-v0`, it observes and gives few
+    numbers, and Stable-Baselines3's own policies learn; dictionaries are kept.
+
+    Where actions belong to particles a row observes what all of them perceive, shape [N, P], and
+    gives all their actions, [N, A]. Stable-Baselines3's own policies draw those from one Gaussian
+    of N A columns, which cannot learn: after the smallest update the ratio of two likelihoods is
+    near zero or beyond all bounds. Take a policy that means over particles instead of summing, such
+    as `npa_envs.agents.learning.sb3.WorldRulePolicy`.
 
     Rows of a finished world have an info of their own, with `terminal_observation`,
     `TimeLimit.truncated` and, where there is one, `is_success`; the others share an empty one.
 
     Args:
-        env: A vector environment whose observations and actions are boxes, wrapped or not, with
-            same-step autoreset.
+        env: A vector environment, wrapped or not, with same-step autoreset.
 
     Raises:
-        NPAError: The environment has other spaces, or another autoreset mode.
+        NPAError: The environment is a single one, or has another autoreset mode.
         MissingDependencyError: Stable-Baselines3 is not installed (on import).
     """
 
     pays_particles = False
 
     def __init__(self, env: Any) -> None:
-        spaces = [
-            _float_box(getattr(env, name, None), name)
-            for name in ("single_observation_space", "single_action_space")
+        spaces: list[Any] = [
+            getattr(env, name, None) for name in ("single_observation_space", "single_action_space")
         ]
+        if None in spaces:
+            raise NPAError(
+                f"env must hold many worlds, got {env}: make it with "
+                "gym.make_vec(..., vectorization_mode='vector_entry_point')"
+            )
         check_same_step(autoreset_mode(env))
         super().__init__(env, env.num_envs, 1, *spaces)
-
-
-def _float_box(space: Any, name: str) -> Box:
-    """Return the space of a world as the row that it is."""
-    if not isinstance(space, Box):
-        raise NPAError(
-            f"{name} of env must be a box, got {space}: make the environment with "
-            "gym.make_vec(..., vectorization_mode='vector_entry_point'), or flatten what it sees"
-        )
-    return Box(space.low, space.high, dtype=np.float32)
 
 
 SpeciesPolicy = Callable[[Any], Any]

@@ -7,19 +7,18 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from npa_envs import world_mean
 from npa_envs.envs.garden.config import GardenConfig
-from npa_envs.world.brushes import inject, push, softness
-
-PLACE = slice(0, 2)
-"""Columns of a brush that say where it is."""
+from npa_envs.world.brushes import softness
 
 DIRECTIONS = ((1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1))
 """Ways in which a brush of the "discrete" form pushes."""
 
 
 class Columns(NamedTuple):
-    """Where the numbers of each tool are in a brush's row; empty for tools that it lacks."""
+    """Where the numbers of each tool are in a brush's row; empty for what it lacks."""
 
+    place: slice
     push: slice
     erase: slice
     inject: slice
@@ -28,13 +27,40 @@ class Columns(NamedTuple):
 
     @classmethod
     def of(cls, config: GardenConfig) -> Columns:
-        """Return the columns of a configuration's brushes."""
-        widths = {"push": 2, "erase": 1, "inject": len(config.inject_channels), "rate": 1}
-        first, found = PLACE.stop, {}
-        for tool, width in widths.items():
-            found[tool] = slice(first, first + (width if tool in config.tools else 0))
-            first = found[tool].stop
+        """Return the columns of a configuration's brushes; those of a grid stay where they are."""
+        widths = {"place": 0 if config.actions == "grid" else 2}
+        widths |= {"push": 2, "erase": 1, "inject": len(config.inject_channels), "rate": 1}
+        first, found = 0, {}
+        for name, width in widths.items():
+            found[name] = slice(first, first + (width * (name in ("place", *config.tools))))
+            first = found[name].stop
         return cls(**found, width=first)
+
+
+def grid_places(config: GardenConfig, device: torch.device | None = None) -> Tensor:
+    """Return the places of the grid [length units], row by row from the bottom up, shape [P, 2]."""
+    share = torch.arange(config.place_count, device=device) / (config.place_count - 1)
+    steps = config.place_reach * (2.0 * share - 1.0)
+    up, across = torch.meshgrid(steps, steps, indexing="ij")
+    return torch.stack((across.flatten(), up.flatten()), dim=-1)
+
+
+def holds(x: Tensor, places: Tensor, config: GardenConfig) -> Tensor:
+    """Return how much soft brushes hold of each particle, dimensionless, shape [B, K, N].
+
+    Args:
+        x: Positions [length units], shape [B, N, 2].
+        places: Where brushes are [length units], shape [B, K, 2].
+        config: Says how large they are.
+    """
+    spread = x[:, None].expand(-1, places.shape[1], -1, -1)
+    held = softness(
+        spread.flatten(0, 1),
+        centre=places.flatten(0, 1),
+        radius=config.brush_radius,
+        box=None if config.box is None else (config.box,) * 2,
+    )
+    return held.view(spread.shape[:3])
 
 
 def brushed(
@@ -42,12 +68,13 @@ def brushed(
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """Return worlds after their brushes have been used; differentiable in all of them.
 
-    One brush comes after the other; each pushes, erases, then injects.
+    All brushes are used at once: what a particle feels of them adds up.
 
     Args:
         x: Positions [length units], shape [B, N, 2].
         s: States, dimensionless, shape [B, N, C].
-        action: Rows of brushes, in [-1, 1], shape [B, K, W], as `Columns` says.
+        action: Rows of brushes, in [-1, 1], shape [B, K, W], as `Columns` says; on a grid K is a
+            multiple of its places.
         middle: What places are counted from [length units], shape [B, 2].
         config: Says how large and how strong brushes are.
 
@@ -55,32 +82,26 @@ def brushed(
         Positions, states, and each particle's rate, the share of its rule's steps that it makes,
         dimensionless, shape [B, N, 1]; None where no tool sets it.
     """
-    columns = Columns.of(config)
-    box = None if config.box is None else (config.box,) * 2
-    radius = config.brush_radius
-    rate = torch.ones_like(x[..., :1]) if "rate" in config.tools else None
-    channels = [channel % config.state_dim for channel in config.inject_channels]
-    for row in action.clamp(-1.0, 1.0).unbind(dim=1):
-        centre = middle + row[:, PLACE]
-        if "push" in config.tools:
-            move = config.push_length * row[:, columns.push]
-            x = push(x, centre=centre, move=move, radius=radius, box=box)
-        if "erase" in config.tools:
-            strength = row[:, columns.erase].squeeze(1).clamp_min(0.0)
-            blank = s.new_zeros(len(s), s.shape[2])
-            s = inject(x, s, centre=centre, radius=radius, state=blank, strength=strength, box=box)
-        if "inject" in config.tools or rate is not None:
-            held = softness(x, centre=centre, radius=radius, box=box)
-            if "inject" in config.tools:
-                dose = config.state_scale * row[:, None, columns.inject] * held
-                s = s.index_add(2, _index(channels, s), dose)
-            if rate is not None:
-                rate = rate + row[:, None, columns.rate] * held
-    return x, s, None if rate is None else rate.clamp(0.0, 2.0)
-
-
-def _index(channels: list[int], s: Tensor) -> Tensor:
-    return torch.tensor(channels, device=s.device)
+    columns, action = Columns.of(config), action.clamp(-1.0, 1.0)
+    places = action[..., columns.place]
+    if config.actions == "grid":
+        places = grid_places(config, x.device).to(x)
+        # Several hands, each with a brush at every place.
+        places = places.repeat(action.shape[1] // len(places), 1)
+    held = holds(x, middle[:, None] + places, config)
+    doses = held[..., None] * action[:, :, None]
+    # Torch's own sums may change in the last bit with the number of worlds.
+    felt = len(doses[0]) * world_mean(doses.flatten(2)).view(*x.shape[:2], columns.width)
+    if "push" in config.tools:
+        x = x + config.push_length * felt[..., columns.push]
+    if "erase" in config.tools:
+        s = s * (1.0 - felt[..., columns.erase].clamp(0.0, 1.0))
+    if "inject" in config.tools:
+        channels = [channel % config.state_dim for channel in config.inject_channels]
+        index = torch.tensor(channels, device=s.device)
+        s = s.index_add(2, index, config.state_scale * felt[..., columns.inject])
+    rate = (1.0 + felt[..., columns.rate]).clamp(0.0, 2.0) if "rate" in config.tools else None
+    return x, s, rate
 
 
 def tool_table(config: GardenConfig) -> Tensor:
@@ -110,4 +131,4 @@ def tool_table(config: GardenConfig) -> Tensor:
     if "rate" in config.tools:
         add(columns.rate, (-1.0,))
         add(columns.rate, (1.0,))
-    return torch.stack(rows)[:, PLACE.stop :]
+    return torch.stack(rows)[:, columns.place.stop :]

@@ -10,8 +10,8 @@ from npa_envs.envs.grown import GrownConfig
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.tasks.checks import check_positive, is_whole
 
-Actions = Literal["box", "discrete"]
-Observe = Literal["picture", "moments"]
+Actions = Literal["grid", "free", "discrete"]
+Observe = Literal["grid", "picture", "moments"]
 GardenReward = Literal["dense", "sparse"]
 
 TOOLS = ("push", "erase", "inject", "rate")
@@ -47,34 +47,39 @@ class GardenConfig(GrownConfig):
     rule_steps: int = 8
     """Steps of the rule in one step of the environment."""
 
-    brush_count: int = 4
-    """Brushes of the agent, K; all of them are used in each step."""
-
-    brush_radius: float = 0.3
+    brush_radius: float = 0.6
     """Radius of a brush, which is soft: full strength in its middle, none at its edge
     [length units]."""
 
-    tools: tuple[str, ...] = TOOLS
+    tools: tuple[str, ...] = ("push",)
     """What brushes can do: some of "push", "erase", "inject" and "rate", in this order."""
 
-    push_length: float = 0.3
+    push_length: float = 0.15
     """How far a push of 1 moves a particle in the middle of a brush [length units]."""
 
     inject_channels: tuple[int, ...] = (-3, -2, -1)
     """State channels that brushes inject; the last three are the colour."""
 
-    actions: Actions = "box"
-    """Form of actions: "box", numbers; or "discrete", a place on a grid, a tool and a strength for
-    each brush, as Gymnasium's MultiDiscrete."""
+    actions: Actions = "grid"
+    """Form of actions: "grid", a brush at each place of a grid; "free", brushes whose places are
+    numbers too; or "discrete", a place of the grid, a tool and a strength for each brush, as
+    Gymnasium's MultiDiscrete."""
 
-    place_count: int = 8
-    """Places on each side of the grid, where actions are "discrete"."""
+    place_count: int = 4
+    """Places on each side of the grid."""
+
+    place_reach: float = 0.75
+    """How far the outermost places of the grid are from its middle along x and y [length units]."""
+
+    brush_count: int = 1
+    """Brushes K where actions are "free" or "discrete"; all of them are used in each step."""
 
     strength_count: int = 3
     """Strengths from which to choose, where actions are "discrete"."""
 
-    observe: Observe = "picture"
-    """What is seen: "picture", a coarse one; or "moments", of positions and states."""
+    observe: Observe = "grid"
+    """What is seen: "grid", what lacks at each place of the grid; "picture", a coarse one; or
+    "moments", of positions and states."""
 
     picture_size: int = 16
     """Pixels on each side of the picture that is seen; it divides `resolution`."""
@@ -87,7 +92,7 @@ class GardenConfig(GrownConfig):
         super().__post_init__()
         check_positive(self, int, "rule_steps", "brush_count", "strength_count", "picture_size")
         check_positive(self, int, "place_count", at_least=2)
-        check_positive(self, float, "brush_radius", "push_length")
+        check_positive(self, float, "brush_radius", "push_length", "place_reach")
         if self.resolution % self.picture_size:
             raise NPAError(
                 f"picture_size must divide resolution = {self.resolution}, got "

@@ -20,45 +20,53 @@ class GardenEnv(NPAEnv):
 
     | `observe` | Observed | Unit |
     |---|---|---|
+    | `"grid"` | what lacks at each place of a grid, [6 P²] with P = `place_count` | dimensionless |
     | `"picture"` | a coarse picture, [4 G²] with G = `picture_size` | dimensionless |
     | `"moments"` | means over all particles, [5 + 3C] | lengths, dimensionless |
 
-    A picture is red, green, blue, then density, each row by row. Moments are the means of x and y;
-    then, about that place, of x², x y, y², of each state, of x times each state, and of y times
-    each state.
+    The grid has P × P places, row by row from the bottom up, from −`place_reach` to `place_reach`
+    along x and y. It goes along with the particles: places are counted from where the middle of the
+    picture is. Six numbers belong to each: what a brush there would hold of the target less what it
+    holds now. These are the number of particles; the same with their places along x and y from the
+    brush, in brush radii, so they say towards which side particles lack; and red, green and blue.
+    The first is 2 and the others are 4 where a brush lacks as many particles as one holds at an
+    average place of the target.
 
-    The picture spans [-1, 1] × [-1, 1], rows from the bottom up, and goes along with the particles:
-    their mean is moved onto the target's. Colours are sums over particles, as the density is.
-    `observe_error=True` adds four channels: the target's picture less this one. Numbers are clipped
-    to ±8.
+    The picture is red, green, blue, then density, each row by row; it spans [-1, 1] × [-1, 1], rows
+    from the bottom up, and goes along with the particles likewise. Colours are sums over particles,
+    as the density is. `observe_error=True` adds four channels: the target's picture less this one.
+
+    Moments are the means of x and y; then, about that place, of x², x y, y², of each state, of x
+    times each state, and of y times each state. Numbers are clipped to ±8.
 
     ## Action space
 
-    With `actions="box"`, `Box(-1, 1, (K, W), float32)`: one row for each of K = `brush_count`
-    brushes. All of them are used in each step, one after the other, and then the rule runs for
-    `rule_steps` steps. Zeros do nothing.
+    With `actions="grid"`, `Box(-1, 1, (P², W), float32)`: a brush stands at each place of the grid,
+    and its row says what it does. All are used at once, what a particle feels of them adds up, and
+    then the rule runs for `rule_steps` steps. Zeros do nothing.
 
     | Columns | Action a | An action of 1 is | Effect where the brush holds w of a particle |
     |---|---|---|---|
-    | 2 | where the brush is, along x and y | 1 length | none |
     | 2, of `"push"` | how far to push | `push_length` | x ← x + w `push_length` a |
-    | 1, of `"erase"` | how much to erase | all of it | s ← s − w max(a, 0) s |
+    | 1, of `"erase"` | how much to erase | all of it | s ← s − w a s |
     | 1 a channel, of `"inject"` | what to inject | `state_scale` | s ← s + w `state_scale` a |
     | 1, of `"rate"` | how fast to live | twice as fast | steps of the rule count 1 + w a times |
 
-    Columns of tools that `tools` leaves out are not there; `"inject"` has one for each of
-    `inject_channels`. Places are counted from where the middle
-    of the picture is. w = (1 − r²)² at r brush radii from the brush, 0 outside:
-    `npa_envs.world.brushes.softness`. Rates of several brushes add up and are clipped to [0, 2].
-    Entries are clipped to [-1, 1]. A number that is not finite raises `NPAError` and leaves the
-    world as it was. Worlds are differentiable in all numbers of all brushes, but for the correction
-    of moments that [perception](../mathematics.md#perception) holds constant:
+    Columns of tools that `tools` leaves out are not there; the default has `"push"` alone.
+    `"inject"` has one for each of `inject_channels`. w = (1 − r²)² at r brush radii from the brush,
+    0 outside: `npa_envs.world.brushes.softness`. What is erased is clipped to [0, 1] of a state,
+    rates to [0, 2]. Entries are clipped to [-1, 1]. A number that is not finite raises `NPAError`
+    and leaves the world as it was. Worlds are differentiable in all numbers of all brushes, but for
+    the correction of moments that [perception](../mathematics.md#perception) holds constant:
     `env.unwrapped.task.lived(x, s, action, random)`.
 
-    With `actions="discrete"`, `MultiDiscrete` with four numbers for each brush: its place along x
-    and along y, among `place_count` each; its tool, which is nothing, a push in one of eight
-    directions, erase, inject each channel up or down, stop, quicken, as far as there are such
-    tools; and its strength, among `strength_count`.
+    With `actions="free"`, `Box(-1, 1, (K, 2 + W), float32)`: there are K = `brush_count` brushes,
+    and two columns more in front say where each is used, along x and y [length units].
+
+    With `actions="discrete"`, `MultiDiscrete` with four numbers for each of K brushes: its place
+    on the grid along x and along y; its tool, which is nothing, a push in one of eight directions,
+    erase, inject each channel up or down, stop, quicken, as far as there are such tools; and its
+    strength, among `strength_count`.
 
     ## Info
 

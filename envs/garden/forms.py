@@ -10,9 +10,9 @@ from gymnasium.spaces import Box, MultiDiscrete, Space
 from torch import Tensor
 
 from npa_envs.envs.core.spaces import Rows, action_tensor, number_tensor
-from npa_envs.envs.garden.brushwork import PLACE, Columns, tool_table
+from npa_envs.envs.garden.brushwork import Columns, grid_places, tool_table
 from npa_envs.envs.garden.config import GardenConfig
-from npa_envs.envs.garden.task import SEEN_LIMIT
+from npa_envs.envs.garden.task import SEEN_AT_A_PLACE, SEEN_LIMIT
 from npa_envs.errors import NPAError, shown
 from npa_envs.world.actions import Physics
 
@@ -32,11 +32,13 @@ class Brushes(Rows):
         self.observation_space: Space[Any] = space
         self.seen_dim = len(space.shape)
         """Dimensions of what is seen of one world."""
-        width = Columns.of(config).width
-        self._shape = (config.brush_count, width)
+        on_grid = config.actions == "grid"
+        count = config.place_count**2 if on_grid else config.brush_count
+        self.rows_shape = (count, Columns.of(config).width)
+        """Of the rows of a world's brushes, (K, W)."""
         self._tools = tool_table(config)
         self._choices = [config.place_count] * 2 + [len(self._tools), config.strength_count]
-        self.action_space: Space[Any] = Box(-1.0, 1.0, self._shape, np.float32)
+        self.action_space: Space[Any] = Box(-1.0, 1.0, self.rows_shape, np.float32)
         if config.actions == "discrete":
             self.action_space = MultiDiscrete(self._choices * config.brush_count)
 
@@ -48,10 +50,10 @@ class Brushes(Rows):
         """
         batch = () if world_count is None else (world_count,)
         letters = "" if world_count is None else "B, "
-        if self._config.actions == "box":
-            shape = (*batch, *self._shape)
+        if self._config.actions != "discrete":
+            shape = (*batch, *self.rows_shape)
             rows = action_tensor("action", action, shape, "env.action_space", f"[{letters}K, W] = ")
-            return rows.view(-1, *self._shape)
+            return rows.view(-1, *self.rows_shape)
         brushes = self._config.brush_count
         wanted = (*batch, 4 * brushes)
         chosen = number_tensor("action", action)
@@ -72,14 +74,17 @@ class Brushes(Rows):
     def _rows(self, chosen: Tensor) -> Tensor:
         """Return the rows of brushes that choices mean, shape [B, K, W]."""
         config, tools = self._config, self._tools.to(chosen.device)
-        places = (2.0 * chosen[..., PLACE] + 1.0) / config.place_count - 1.0
+        across, up = chosen[..., 0], chosen[..., 1]
+        places = grid_places(config, chosen.device)[up * config.place_count + across]
         strength = (chosen[..., 3:] + 1.0) / config.strength_count
         return torch.cat((places, strength * tools[chosen[..., 2]]), dim=-1)
 
 
 def observed(config: GardenConfig) -> Box:
     """Return the space of what is seen of a world."""
-    shape: tuple[int, ...] = (5 + 3 * config.state_dim,)
-    if config.observe == "picture":
-        shape = ((8 if config.observe_error else 4) * config.picture_size**2,)
-    return Box(-SEEN_LIMIT, SEEN_LIMIT, shape, np.float32)
+    counts = {
+        "grid": SEEN_AT_A_PLACE * config.place_count**2,
+        "picture": (8 if config.observe_error else 4) * config.picture_size**2,
+        "moments": 5 + 3 * config.state_dim,
+    }
+    return Box(-SEEN_LIMIT, SEEN_LIMIT, (counts[config.observe],), np.float32)

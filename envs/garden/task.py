@@ -11,17 +11,66 @@ from torch import Tensor
 
 from npa_envs import world_mean
 from npa_envs.envs.core.task import Start
-from npa_envs.envs.garden.brushwork import brushed
+from npa_envs.envs.garden.brushwork import brushed, grid_places, holds
 from npa_envs.envs.garden.config import GardenConfig
 from npa_envs.envs.grown import GrownTask
 from npa_envs.errors import NPAError
+from npa_envs.rule.rule import COLOUR_OFFSET
+from npa_envs.tasks.targets.points import PointTarget
 from npa_envs.world.randomness import WorldRandom
 from npa_envs.world.rollout import rollout
 
 SEEN_LIMIT = 8.0
 """What is seen is clipped to plus and minus this (dimensionless, or length units)."""
 
+SEEN_AT_A_PLACE = 6
+"""Numbers that are seen at a place of the grid."""
+
+SEEN_SCALES = (2.0, 4.0, 4.0, 4.0, 4.0, 4.0)
+"""Of these numbers (dimensionless): they make them about as large as one another."""
+
 Config = TypeVar("Config", bound=GardenConfig)
+
+
+class Lacking:
+    """What lacks to a target at some places, as soft brushes there would hold it.
+
+    Args:
+        places: Where [length units], shape [P, 2].
+        target: The target, whose places they are.
+        config: Says how large brushes are.
+    """
+
+    def __init__(self, places: Tensor, target: PointTarget, config: GardenConfig) -> None:
+        self.places, self._config = places, config
+        self._scale = torch.ones(SEEN_AT_A_PLACE, device=places.device)
+        none = places.new_zeros(1, 2)
+        wanted = self._held(target.points[None], target.colours[None] - COLOUR_OFFSET, none)
+        self._scale = torch.tensor(SEEN_SCALES, device=places.device) / wanted[..., 0].mean()
+        self._wanted = self._scale * wanted
+
+    def __call__(self, x: Tensor, s: Tensor, middle: Tensor) -> Tensor:
+        """Return how many particles lack, towards which side, and colours, [B, P, 6].
+
+        Numbers are dimensionless: of all particles, of their places along x and y from the brush in
+        brush radii, and of their red, green and blue. They are `SEEN_SCALES` times what a brush
+        holds, as multiples of the particles that one holds at an average place of the target.
+
+        Args:
+            x: Positions [length units], shape [B, N, 2].
+            s: States, dimensionless, shape [B, N, C].
+            middle: What places are counted from [length units], shape [B, 2].
+        """
+        return self._wanted - self._held(x, s[..., -3:], middle)
+
+    def _held(self, x: Tensor, colour: Tensor, middle: Tensor) -> Tensor:
+        places = middle[:, None] + self.places
+        away = (x[:, None] - places[:, :, None]) / self._config.brush_radius
+        colours = colour[:, None].expand(-1, len(self.places), -1, -1)
+        told = torch.cat((torch.ones_like(away[..., :1]), away, colours), dim=-1)
+        told = told * holds(x, places, self._config)[..., None]
+        mean = world_mean(told.transpose(1, 2).flatten(2))
+        return self._scale * mean.view(len(x), len(self.places), SEEN_AT_A_PLACE)
 
 
 class GardenTask(GrownTask[Config]):
@@ -47,6 +96,8 @@ class GardenTask(GrownTask[Config]):
                     f"{name}={getattr(self.rule, name)!r}, or another rule"
                 )
         self.rule.requires_grad_(False)
+        self.lacking = Lacking(grid_places(config, device), self.goal.target, config)
+        """What lacks at the places of the grid."""
 
     def lived(
         self,
@@ -139,7 +190,10 @@ class GardenTask(GrownTask[Config]):
 
     def observe(self, x: Tensor, s: Tensor, loss: Tensor, marks: Tensor) -> Tensor:
         """Return what is seen of worlds, shape [B, O]."""
-        seen = self.moments(x, s) if self.config.observe == "moments" else self.coarse(x, s)
+        if self.config.observe == "grid":
+            seen = self.lacking(x, s, self.middle(x))
+        else:
+            seen = self.moments(x, s) if self.config.observe == "moments" else self.coarse(x, s)
         seen = seen.flatten(1)
         return seen.clamp(-SEEN_LIMIT, SEEN_LIMIT)
 

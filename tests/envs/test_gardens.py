@@ -13,7 +13,7 @@ from gymnasium.utils.env_checker import check_env
 from small_envs import assert_batch_of_singles, assert_same
 
 import npa_envs
-from npa_envs.envs.garden.brushwork import Columns, brushed
+from npa_envs.envs.garden.brushwork import Columns, brushed, grid_places
 from npa_envs.errors import DivergedError, NPAError
 from npa_envs.registration import GARDENS
 from npa_envs.registration import SMALL as SMALL_FORMS
@@ -30,9 +30,14 @@ SMALL = {
     "grow_steps": 4,
     "rule_steps": 2,
 }
-FORMS = ({}, {"actions": "discrete"}, {"observe": "moments", "tools": ("push",)})
+TOOLS = ("push", "erase", "inject", "rate")
+FORMS = (
+    {"tools": TOOLS},
+    {"actions": "discrete", "observe": "picture", "tools": TOOLS},
+    {"actions": "free", "brush_count": 3, "observe": "moments"},
+)
 every_id = pytest.mark.parametrize("name", IDS)
-every_form = pytest.mark.parametrize("form", FORMS, ids=("picture", "discrete", "moments"))
+every_form = pytest.mark.parametrize("form", FORMS, ids=("grid", "discrete", "free"))
 
 
 @pytest.fixture(autouse=True)
@@ -158,9 +163,9 @@ def test_bad_actions_are_clear_errors_and_change_nothing(name):
     chosen = make(name, actions="discrete")
     chosen.reset(seed=0)
     with pytest.raises(NPAError, match="action must choose below"):
-        chosen.unwrapped.step(np.full(16, 99))
+        chosen.unwrapped.step(np.full(4, 99))
     with pytest.raises(NPAError, match="whole numbers of shape"):
-        chosen.unwrapped.step(np.zeros(16, np.float32))
+        chosen.unwrapped.step(np.zeros(4, np.float32))
 
 
 @pytest.mark.parametrize("small", SMALL_FORMS, ids=lambda row: row.id)
@@ -195,6 +200,8 @@ def test_a_small_form_is_the_environment_with_other_keywords(small):
         ({"reward": "particle"}, "reward must be a known word"),
         ({"alpha": 0.25}, "alpha must be the rule's, 0.5, got 0.25"),
         ({"target": "ring"}, "no shipped rule grows 'ring'"),
+        ({"actions": "box"}, "actions must be a known word"),
+        ({"place_count": 1}, "place_count must be"),
         ({"brush_radius": 0.0}, "brush_radius must be a finite number greater than 0"),
     ],
 )
@@ -211,8 +218,11 @@ def brush(config, **numbers):
     return row
 
 
+FREE = {"actions": "free", "tools": TOOLS, "brush_radius": 0.3, "push_length": 0.3}
+
+
 def test_brushes_do_what_the_documentation_says():
-    config = make(GARDENER).unwrapped.config
+    config = make(GARDENER, **FREE).unwrapped.config
     x = torch.tensor([[[0.0, 0.0], [0.15, 0.0], [0.5, 0.0]]])
     s, middle = torch.ones(1, 3, 16), torch.zeros(1, 2)
     held = torch.tensor([1.0, 0.5625, 0.0])
@@ -232,8 +242,48 @@ def test_brushes_do_what_the_documentation_says():
     assert torch.allclose(rate[0, :, 0], 1.0 - held)
 
 
+def test_brushes_stand_on_the_grid_and_what_they_do_adds_up():
+    config = make(GARDENER, place_count=3, place_reach=0.5, brush_radius=0.6).unwrapped.config
+    places = grid_places(config)
+    assert places.tolist() == [[a, b] for b in (-0.5, 0.0, 0.5) for a in (-0.5, 0.0, 0.5)]
+    x, s = torch.tensor([[[1.0, 1.2], [1.25, 1.0]]]), torch.zeros(1, 2, 16)
+    middle = torch.tensor([[1.0, 1.0]])
+    everywhere = torch.tensor([0.4, -0.2]).expand(1, 9, 2)
+    moved, _, _ = brushed(x, s, everywhere, middle, config)
+    square = (x[0][:, None] - middle - places).square().sum(dim=-1)
+    held = (1.0 - square / 0.36).clamp_min(0.0).square().sum(dim=1)
+    assert torch.allclose(moved - x, 0.15 * held[None, :, None] * everywhere[0, 0], atol=1e-6)
+
+
+def test_what_lacks_is_seen_where_it_lacks():
+    env = make(GARDENER, particle_count=256, eps=0.1, resolution=32)
+    env.reset(seed=0)
+    task, target = env.unwrapped.task, env.unwrapped.task.goal.target
+    whole = torch.cat((torch.zeros(256, 13), target.colours - 0.5), dim=1)
+    seen = env.unwrapped.place_particles(target.points, whole)
+    assert np.abs(seen).max() < 1e-3
+    # Half of what is around one place goes to another, colours are lost at a third.
+    places = grid_places(env.unwrapped.config)
+    moved, grey = target.points.clone(), whole.clone()
+    left, right = 5, 6
+    near = (moved - places[left]).norm(dim=1) < 0.3
+    moved[near] += places[right] - places[left]
+    lack = task.lacking(moved[None], grey[None], torch.zeros(1, 2))[0]
+    assert lack[left, 0] > 0.5
+    assert lack[right, 0] < -0.5
+    assert lack[left, 0] == pytest.approx(float(lack[:, 0].max()))
+    # From the place beside it, they lack on the other side.
+    assert lack[right, 1] < -0.1
+    grey[:, -3:] = -0.5
+    lack = task.lacking(target.points[None], grey[None], torch.zeros(1, 2))[0]
+    assert float(lack[:, :3].abs().max()) < 1e-3
+    assert bool((lack[:, 3:] >= 0.0).all())
+    assert float(lack[:, 3].max()) > 0.5
+
+
 def test_a_world_that_is_stopped_stays_as_it_is():
-    env = make(GARDENER, brush_radius=1e3, gust_chance=0.0, blight_chance=0.0, position_noise=0.0)
+    calm = {"gust_chance": 0.0, "blight_chance": 0.0, "position_noise": 0.0}
+    env = make(GARDENER, **(FREE | {"brush_radius": 1e3} | calm))
     env.reset(seed=0)
     x, s = env.unwrapped.particles()
     action = np.zeros(env.action_space.shape, np.float32)
@@ -252,7 +302,9 @@ def test_the_whole_world_is_differentiable_by_every_number_of_a_brush():
 
     Perception stops the gradient of its correction of moments, by definition: it is left out here.
     """
-    env = make(GARDENER, particle_count=96, blight_chance=0.0).unwrapped
+    env = make(
+        GARDENER, particle_count=96, blight_chance=0.0, **(FREE | {"brush_count": 4})
+    ).unwrapped
     env.reset(seed=1)
     task, worlds = env.task, env.worlds
     x, s = (part.double() for part in (worlds.x, worlds.s))
@@ -351,7 +403,7 @@ def test_hindsight_experience_replay_runs_as_it_is():
 
 
 def test_weather_comes_as_often_as_it_is_told_to():
-    still = {"position_noise": 0.0, "brush_radius": 1e3, "gust_length": 0.3}
+    still = {"position_noise": 0.0, "gust_length": 0.3}
     for chances, expected in (((1.0, 0.0), (1, 0)), ((0.0, 1.0), (0, 1)), ((0.0, 0.0), (0, 0))):
         env = make(GARDENER, gust_chance=chances[0], blight_chance=chances[1], **still)
         env.reset(seed=0)
@@ -370,4 +422,5 @@ def test_the_reward_is_one_for_a_whole_picture_and_zero_for_a_grey_one():
     assert grey > 1.2 * info["loss"]
     losses = torch.cat((grey, torch.tensor([info["loss"], info["loss"] - 1.0, 1e3])))
     earned = task.earned(worlds.x, worlds.s, losses, worlds.marks.expand(4, -1))
-    assert torch.allclose(earned, torch.tensor([0.0, 1.0, 1.0, -1.0]), atol=1e-5)
+    better = 1.0 + 1.0 / float(grey - info["loss"])
+    assert torch.allclose(earned, torch.tensor([0.0, 1.0, better, -1.0]), rtol=1e-4, atol=1e-5)

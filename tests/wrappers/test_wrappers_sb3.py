@@ -79,6 +79,40 @@ def test_rows_of_finished_worlds_alone_have_infos_and_a_terminal_observation():
     assert [bool(info) for info in infos] == done.tolist()
 
 
+@pytest.mark.parametrize("output", ["numpy", "torch"])
+@pytest.mark.parametrize("name", ["npa/Gardener2DSmall-v0", "npa/Shepherd2DSmall-v0"])
+def test_living_worlds_are_rows_too_and_their_dictionaries_are_kept(name, output):
+    given = {"grow_steps": 4, "rule_steps": 1, "seed_pool": 1, "max_episode_steps": 2}
+    envs = [
+        gym.make_vec(name, 3, vectorization_mode="vector_entry_point", output=way, **given)
+        for way in (output, "numpy")
+    ]
+    rows, plain = WorldVecEnv(envs[0]), envs[1]
+    rows.seed(1)
+
+    def assert_shown(seen, wanted):
+        if not isinstance(wanted, dict):
+            seen, wanted = {"all": seen}, {"all": wanted}
+        assert set(seen) == set(wanted)
+        for key, values in wanted.items():
+            np.testing.assert_array_equal(seen[key], values)
+
+    assert_shown(rows.reset(), plain.reset(seed=1)[0])
+    plain.action_space.seed(0)
+    for _ in range(5):
+        actions = plain.action_space.sample()
+        seen, paid, done, infos = rows.step(actions)
+        wanted, rewards, _, late, told = plain.step(actions)
+        assert_shown(seen, wanted)
+        np.testing.assert_allclose(paid, rewards, rtol=1e-6)
+        assert done.tolist() == late.tolist()
+        for k in np.flatnonzero(done):
+            assert infos[k]["TimeLimit.truncated"] is True
+            assert_shown(infos[k]["terminal_observation"], told["final_obs"][k])
+            final = told["final_info"]
+            assert infos[k]["is_success"] == final.get("is_success", final["success"])[k]
+
+
 @pytest.mark.parametrize("adapter", [ParticleVecEnv, WorldVecEnv])
 def test_success_is_no_time_limit(adapter):
     rows = adapter(batched(success_loss=1e6))
@@ -302,7 +336,7 @@ OTHER = {"others": {"species_1": still}}
         (lambda: ParticleVecEnv(wrapped_envs.single()), "vector_entry_point"),
         (
             lambda: WorldVecEnv(wrapped_envs.single()),
-            "single_observation_space of env must be a box",
+            "env must hold many worlds",
         ),
         (
             lambda: rows_of(WorldVecEnv, batched).step(np.zeros((2, 63, ACTIONS), np.float32)),

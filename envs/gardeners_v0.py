@@ -1,0 +1,178 @@
+"""Two gardeners with opposed aims, the way PettingZoo has it: `parallel_env`, `env`, `raw_env`.
+
+Importing this module registers `npa/Gardeners-v0` with PettingZoo (1.27 or newer).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+import pettingzoo
+import torch
+from gymnasium.spaces import Box, Space
+from gymnasium.wrappers import TimeLimit
+from numpy.typing import NDArray
+from torch import Tensor
+
+from npa_envs.envs.garden.forms import Brushes
+from npa_envs.envs.gardener2d import Gardener2DEnv
+from npa_envs.envs.multi.parallel import Outcome, in_turns, register
+from npa_envs.errors import NPAError, shown, suggest
+
+AGENTS = ("keeper_0", "raider_0")
+
+
+class _BothHands(Brushes):
+    """Brushes of both gardeners, used at once; what is seen is the same for both."""
+
+    def action(self, action: Any, world_count: int | None) -> Tensor:
+        """Return the rows of all brushes, shape [B, 2 K, W], of both gardeners' actions."""
+        both = [super(_BothHands, self).action(action[agent], world_count) for agent in AGENTS]
+        return torch.cat(both, dim=1)
+
+
+class _SharedGarden(Gardener2DEnv):
+    form_type = _BothHands
+
+
+class GardenersEnv(pettingzoo.ParallelEnv):  # type: ignore[misc]
+    """Two gardeners at one living picture: the keeper keeps it whole, the raider spoils it.
+
+    The world is that of `npa/Gardener2D-v0` without weather. Both see what its agent sees and have
+    the brushes that it has; all brushes are used at once, and what particles feel of them adds up.
+    The keeper is paid what a gardener is, and the raider minus that, so rewards sum to zero. After
+    `max_cycles` steps both are truncated; a world that diverges terminates both. Infos are those of
+    `npa/Gardener2D-v0`, the same for both.
+
+    Args:
+        max_cycles: Steps of an episode.
+        config: Fields of the configuration of `npa/Gardener2D-v0`; gusts and blights come where
+            their chances are given.
+
+    Raises:
+        NPAError: A name is unknown, or a value wrong.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {
+        "name": "gardeners_v0",
+        "is_parallelizable": True,
+        **Gardener2DEnv.metadata,
+    }
+
+    def __init__(self, max_cycles: int = 32, **config: Any) -> None:
+        calm = {"gust_chance": 0.0, "blight_chance": 0.0}
+        self._garden = _SharedGarden(**(calm | config))
+        self._episodes = TimeLimit(self._garden, max_cycles)
+        self.render_mode = self._garden.render_mode
+        self.possible_agents = list(AGENTS)
+        self.agents: list[str] = []
+        self.observation_spaces = dict.fromkeys(AGENTS, self._garden.observation_space)
+        self.action_spaces = dict.fromkeys(AGENTS, self._garden.action_space)
+
+    def observation_space(self, agent: str) -> Space[Any]:
+        """Return the space of what an agent sees, the same object each time.
+
+        Raises:
+            NPAError: There is no such agent.
+        """
+        return self.observation_spaces[_known(agent)]
+
+    def action_space(self, agent: str) -> Space[Any]:
+        """Return the space of an agent's actions, the same object each time.
+
+        Raises:
+            NPAError: There is no such agent.
+        """
+        return self.action_spaces[_known(agent)]
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+        """Start an episode.
+
+        Args:
+            seed: Begin the sequence of episodes that belongs to this number; without it the
+                sequence goes on.
+            options: Not used.
+
+        Returns:
+            What both see, and the loss with its parts.
+        """
+        seen, info = self._episodes.reset(seed=seed)
+        self.agents = list(AGENTS)
+        return _for_both(seen), {agent: dict(info) for agent in AGENTS}
+
+    def step(self, actions: Mapping[str, Any]) -> Outcome:
+        """Use all brushes, let the rule run, and judge.
+
+        Args:
+            actions: One for each agent, as its action space says.
+
+        Returns:
+            Observations, rewards, terminations, truncations and infos of both.
+
+        Raises:
+            NPAError: The episode is over, an action is missing or wanted by nobody, or it has
+                another shape; the world is then as it was.
+            DivergedError: An action is not finite; the world is then as it was.
+        """
+        if not self.agents and not actions:
+            return {}, {}, {}, {}, {}
+        if not self.agents or set(actions) != set(self.agents):
+            raise NPAError(
+                f"actions must be given for the agents {self.agents}, got some for "
+                f"{shown(list(actions))}: call reset where there are none"
+            )
+        seen, earned, ended, late, info = self._episodes.step(actions)
+        if ended or late:
+            self.agents = []
+        return (
+            _for_both(seen),
+            {"keeper_0": float(earned), "raider_0": -float(earned)},
+            dict.fromkeys(AGENTS, ended),
+            dict.fromkeys(AGENTS, late),
+            {agent: dict(info) for agent in AGENTS},
+        )
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Return the world's picture, shape [R, R, 3], in the mode "rgb_array"."""
+        return self._garden.render()
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        self._garden.close()
+
+
+def _known(agent: str) -> str:
+    if agent not in AGENTS:
+        raise NPAError(
+            f"agent must be one of {AGENTS}, got {shown(agent)}: {suggest(agent, AGENTS)}"
+        )
+    return agent
+
+
+def _for_both(seen: Any) -> dict[str, Any]:
+    # Each its own: what one agent does to what it sees is nothing to the other.
+    copied = seen.clone if isinstance(seen, Tensor) else seen.copy
+    return {agent: copied() for agent in AGENTS}
+
+
+def parallel_env(max_cycles: int = 32, **config: Any) -> GardenersEnv:
+    """Return the environment in which both act at once; arguments are those of `GardenersEnv`."""
+    return GardenersEnv(max_cycles, **config)
+
+
+def raw_env(max_cycles: int = 32, **config: Any) -> Any:
+    """Return `parallel_env` with agents that act in turn, and the world after the raider."""
+    return in_turns(parallel_env(max_cycles, **config))
+
+
+def env(max_cycles: int = 32, **config: Any) -> Any:
+    """Return `raw_env` with actions that are numbers clipped into their spaces."""
+    both = parallel_env(max_cycles, **config)
+    return in_turns(both, clips=isinstance(both.action_space("keeper_0"), Box))
+
+
+register("npa/Gardeners-v0", __name__, {})

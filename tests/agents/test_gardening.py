@@ -1,0 +1,92 @@
+"""Gardeners and shepherds: scripts help and are simple; the gradient's plans are worth more."""
+
+import gymnasium
+import numpy as np
+import pytest
+
+import npa_envs
+from npa_envs.agents.gardening import (
+    GradientGardener,
+    RandomGardener,
+    ScriptedGardener,
+    ScriptedShepherd,
+    StillGardener,
+)
+from npa_envs.errors import NPAError
+
+GARDENER, SHEPHERD = "npa/Gardener2DSmall-v0", "npa/Shepherd2DSmall-v0"
+QUICK = {"seed_pool": 2, "grow_steps": 128}
+
+
+def make_vec(name, world_count, **keywords):
+    return gymnasium.make_vec(
+        name, world_count, vectorization_mode="vector_entry_point", **(QUICK | keywords)
+    )
+
+
+def earned(envs, policy, steps):
+    """Mean reward of a step."""
+    seen, _ = envs.reset(seed=0)
+    total = 0.0
+    for _ in range(steps):
+        seen, rewards, *_ = envs.step(policy(seen))
+        total += float(np.mean(rewards)) / steps
+    return total
+
+
+@pytest.mark.parametrize(
+    ("name", "make", "keywords"),
+    [
+        (GARDENER, ScriptedGardener, {}),
+        (GARDENER, ScriptedGardener, {"actions": "free", "push_length": 0.3}),
+        (SHEPHERD, ScriptedShepherd, {}),
+        (SHEPHERD, ScriptedShepherd, {"aim": "reshape"}),
+    ],
+)
+def test_scripts_do_better_than_nobody_and_nobody_than_chance(name, make, keywords):
+    envs = make_vec(name, 2, rule_steps=4, **keywords)
+    still, chance, scripted = (
+        earned(envs, policy(envs), 12) for policy in (StillGardener, RandomGardener, make)
+    )
+    assert scripted > still + 0.1
+    assert still > chance
+
+
+def test_what_a_scripted_gardener_does_is_linear_in_what_is_seen():
+    envs = make_vec(GARDENER, 8, rule_steps=1)
+    policy = ScriptedGardener(envs, gain=0.05, share=0.05)
+    seen, done = [], []
+    observation, _ = envs.reset(seed=0)
+    for _ in range(14):
+        action = policy(observation)
+        seen.append(observation)
+        done.append(action.reshape(len(action), -1))
+        observation, *_ = envs.step(np.zeros_like(action))
+    seen, done = np.concatenate(seen), np.concatenate(done)
+    fitted, *_ = np.linalg.lstsq(seen[:100], done[:100], rcond=None)
+    np.testing.assert_allclose(seen[100:] @ fitted, done[100:], atol=1e-3)
+
+
+def test_a_plan_by_the_gradient_is_worth_more_than_the_script_that_it_begins_with():
+    envs = make_vec(GARDENER, 2, rule_steps=2)
+    envs.reset(seed=1)
+    for _ in range(3):
+        envs.step(np.zeros(envs.action_space.shape, np.float32))
+    planner, script = GradientGardener(envs, horizon=1, iterations=8), ScriptedGardener(envs)
+    planned, scripted = (
+        planner.worth(policy.act(2)[None], npa_envs.WorldRandom([7, 8])).detach()
+        for policy in (planner, script)
+    )
+    assert bool((planned > scripted).all())
+
+
+def test_gardeners_need_a_garden_whose_brushes_are_numbers():
+    with pytest.raises(NPAError, match="env must be a garden with actions='grid' or 'free'"):
+        StillGardener(make_vec(GARDENER, 2, actions="discrete"))
+    with pytest.raises(NPAError, match="env must have brushes that push"):
+        ScriptedGardener(make_vec(GARDENER, 2, tools=("erase",)))
+    with pytest.raises(NPAError, match="env must be npa/Shepherd2D-v0"):
+        ScriptedShepherd(make_vec(GARDENER, 2))
+    for given in ({"gain": 0.0}, {"share": -1.0}, {"width": float("nan")}):
+        with pytest.raises(NPAError, match=f"{next(iter(given))} must be positive"):
+            ScriptedGardener(make_vec(GARDENER, 2), **given)
