@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -24,7 +24,11 @@ class CloneOptions:
 
     teacher: Source | Sequence[Source] | RuleSet | None = None
     """A rule, a shipped rule's name or a file, for all species or one for each, or a set of rules;
-    it must be given."""
+    it must be given, or a dataset."""
+
+    dataset: str | None = None
+    """A dataset of Minari, by its id, to learn from instead: nobody acts, and the particle-steps
+    that count are those learned from."""
 
     student_share: float = 0.5
     """Share of the worlds in which the student acts, in [0, 1]; 0: plain cloning."""
@@ -82,28 +86,22 @@ def train(
     errors lead it to where the teacher never comes.
 
     Raises:
-        NPAError: There is no teacher, or it does not fit the problem.
+        NPAError: There is no teacher and no dataset, or both, or one does not fit the problem.
         DivergedError: The rules' weights are not finite.
+        MissingDependencyError: Datasets need Minari, which is not installed.
     """
-    teacher = _teacher(problem, options.teacher).to(device).policy()
     rules = starting_rules(problem, seed, device, start)
-    student, envs = rules.policy(), problem.make_envs(device=device)
     generator = torch.Generator(device).manual_seed(seed)
     optimiser = torch.optim.Adam(
         rules.parameters(), lr=options.learning_rate, fused=device.type == "cuda"
     )
-    observation, _ = envs.reset(seed=world_seeds(seed, problem.num_envs))
-    some = Demonstrations(options.kept_steps * problem.num_envs, observation, teacher(observation))
-    taught = problem.num_envs - round(options.student_share * problem.num_envs)
+    if options.dataset is None:
+        collect, some = _taught(problem, rules, seed, device, options)
+    else:
+        collect, some = None, _recorded(problem, device, options)
 
     def iteration() -> int:
-        nonlocal observation
-        for _ in range(options.collect_steps):
-            action = teacher(observation)
-            some.add(observation, action)
-            if taught < problem.num_envs:
-                action[taught:] = student(observation[taught:])
-            observation, *_ = envs.step(action)
+        steps = options.updates * options.batch_worlds if collect is None else collect()
         rate = annealed(options.learning_rate, options.last_rate, progress.share)
         for group in optimiser.param_groups:
             group["lr"] = rate
@@ -112,14 +110,57 @@ def train(
             optimiser.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
             optimiser.step()
-        return options.collect_steps * problem.num_envs * problem.particle_count
+        return steps * problem.particle_count
 
     return progress.run(rules, iteration)
 
 
+def _taught(
+    problem: Problem, rules: RuleSet, seed: int, device: torch.device, options: CloneOptions
+) -> tuple[Callable[[], int], Demonstrations]:
+    """Return what goes on in worlds and counts their steps, and what was seen there."""
+    teacher = _teacher(problem, options.teacher).to(device).policy()
+    student, envs = rules.policy(), problem.make_envs(device=device)
+    observation, _ = envs.reset(seed=world_seeds(seed, problem.num_envs))
+    some = Demonstrations(options.kept_steps * problem.num_envs, observation, teacher(observation))
+    taught = problem.num_envs - round(options.student_share * problem.num_envs)
+
+    def collect() -> int:
+        nonlocal observation
+        for _ in range(options.collect_steps):
+            action = teacher(observation)
+            some.add(observation, action)
+            if taught < problem.num_envs:
+                action[taught:] = student(observation[taught:])
+            observation, *_ = envs.step(action)
+        return options.collect_steps * problem.num_envs
+
+    return collect, some
+
+
+def _recorded(problem: Problem, device: torch.device, options: CloneOptions) -> Demonstrations:
+    """Return what a dataset holds, on a device."""
+    from npa_envs.wrappers.minari import read_pairs
+
+    if options.teacher is not None:
+        raise NPAError("teacher must be None where a dataset is given: it holds what was done")
+    assert options.dataset is not None, "asked for by the caller"
+    seen, done = read_pairs(options.dataset)
+    interface, count = problem.interface, problem.particle_count
+    wanted = (count, interface.perception_dim), (count, interface.action_dim)
+    if (seen.shape[1:], done.shape[1:]) != wanted:
+        raise NPAError(
+            f"dataset must hold observations and actions of shapes {wanted}, got "
+            f"{tuple(seen.shape[1:])} and {tuple(done.shape[1:])}: record it in this problem"
+        )
+    some = Demonstrations(len(seen), seen.to(device), done.to(device))
+    some.add(seen.to(device), done.to(device))
+    return some
+
+
 def _teacher(problem: Problem, source: Source | Sequence[Source] | RuleSet | None) -> RuleSet:
     if source is None:
-        raise NPAError("teacher must be given to clone: for example teacher='heart'")
+        raise NPAError("teacher must be given to clone, or a dataset: for example teacher='heart'")
     return RuleSet.of(problem, list(source) if isinstance(source, RuleSet) else source)
 
 

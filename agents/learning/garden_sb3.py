@@ -18,7 +18,7 @@ from npa_envs.agents.learning.gardeners import check_no_start
 from npa_envs.agents.learning.problem import Problem, world_seeds
 from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rules import RuleSet
-from npa_envs.errors import MissingDependencyError
+from npa_envs.errors import MissingDependencyError, NPAError, shown
 from npa_envs.tasks.checks import check_fraction, check_positive
 from npa_envs.wrappers.sb3 import WorldVecEnv, on_host
 
@@ -30,8 +30,8 @@ except ImportError as error:
         "SAC and PPO in gardens need Stable-Baselines3: pip install 'npa-envs[sb3]'"
     ) from error
 
-FILE = "policy.zip"
-"""What `GardenPolicy.save` writes."""
+ALGORITHMS = {"sac": SAC, "ppo": PPO}
+"""By the names of the files that `GardenPolicy.save` writes, without ".zip"."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,10 +189,22 @@ class GardenPolicy:
         return np.asarray(action)
 
     def save(self, folder: str | Path) -> list[Path]:
-        """Write the model as Stable-Baselines3 does, `policy.zip`, and return its path."""
-        path = Path(folder) / FILE
+        """Write the model as Stable-Baselines3 does, `sac.zip` or `ppo.zip`; return the path."""
+        path = Path(folder) / f"{type(self.model).__name__.lower()}.zip"
         self.model.save(path)
         return [path]
+
+    @classmethod
+    def load(cls, path: str | Path, device: str | torch.device = "cpu") -> GardenPolicy:
+        """Return what `save` wrote; Stable-Baselines3 unpickles it, so trust who made the file.
+
+        Raises:
+            NPAError: The file is not called as `save` calls it, or is missing.
+        """
+        name = Path(path).stem
+        if name not in ALGORITHMS or not Path(path).is_file():
+            raise NPAError(f"path must be of a file sac.zip or ppo.zip, got {shown(str(path))}")
+        return cls(ALGORITHMS[name].load(path, device=device))
 
 
 class FlatObservations(VectorWrapper[Any, Any, Any]):

@@ -159,6 +159,7 @@ class Problem:
     @cached_property
     def config(self) -> EnvConfig | SpeciesConfig:
         """The environment's configuration, on the CPU."""
+        config_type = self.task_type.config_type
         # What an id is registered with counts, as for `gym.make`.
         known = {} if self.is_species else gymnasium.spec(self.env_id).kwargs
         given = {**known, **self.keywords}
@@ -166,7 +167,7 @@ class Problem:
             given["max_cycles"] = self.episode_steps
         elif given.get("reward") == "sparse":
             given["episode_steps"] = self.episode_steps
-        return self.task_type.config_type.from_keywords(given)
+        return config_type.from_keywords(given)
 
     @property
     def physics(self) -> Physics:

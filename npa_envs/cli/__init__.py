@@ -20,6 +20,7 @@ COMMANDS = {
     "stress": "hard cases, what is expected of each, and where things break",
     "robustness": "what rules bear and what they heal: losses and recovery times over many seeds",
     "compare": "reinforcement learning, evolution and the gradient on the same tasks",
+    "record": "episodes of a policy as a dataset of Minari",
     "list": "tasks, presets, environments, built-in targets, losses, shipped rules",
     "warmup": "compile the kernels ahead of time",
     "doctor": "what is broken, slow or missing on this machine, and the cure",
@@ -100,6 +101,8 @@ def _dispatch(words: list[str]) -> int:
             from npa_envs.cli.robustness import main as command
         case "compare":
             from npa_envs.cli.compare import main as command
+        case "record":
+            from npa_envs.cli.record import main as command
         case "list":
             from npa_envs.cli.listing import main as command
         case "warmup":

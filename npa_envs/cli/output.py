@@ -40,6 +40,11 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "export-web": ("export-web gecko heart -o page.html", "export-web --gallery -o gallery.html"),
     "interact": ("interact gecko heart", "interact --quick"),
     "list": ("list",),
+    "record": (
+        "record npa/Morphogenesis2D-v0 --policy gecko --options target=gecko "
+        "--dataset npa/gecko-v0",
+        "record npa/Gardener2DSmall-v0 --policy scripted --dataset npa/gardener/scripted-v0",
+    ),
     "robustness": ("robustness heart --quick", "robustness --device cuda --out results"),
     "rollout": (
         "rollout gecko --damage 300:cut 500:erase --steps 700",

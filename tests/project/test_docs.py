@@ -316,6 +316,27 @@ def test_the_other_code_about_own_environments_runs_as_it_says(ring, monkeypatch
     assert last == pytest.approx(float(told[2]), abs=2e-3)
 
 
+def test_the_code_about_datasets_runs(tmp_path, monkeypatch):
+    pytest.importorskip("minari")
+    pytest.importorskip("h5py")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    small = ["target=heart", "particle_count=32", "eps=0.3", "eps0=0.1", "resolution=16"]
+    words = ["record", "npa/Morphogenesis2D-v0", "--policy", "heart", "--episodes", "2"]
+    words += ["--dataset", "npa/heart/shipped-v0", "--no-progress", "--options", *small]
+    assert main(words) == 0
+    first, second = code_blocks(DOCS / "datasets.md")
+    names = {}
+    exec(first, names)
+    observation, _ = names["env"].reset(seed=0)
+    assert np.array_equal(observation, names["episode"].observations[0])
+    told = ", ".join(word.replace("=", '": ', 1) for word in small).replace("heart", '"heart"')
+    told = '{"' + told.replace(", ", ', "') + "}"
+    second = second.replace('{"target": "heart"}', told).replace("200_000", "5_000")
+    second = second.replace("episode_steps=256", "episode_steps=2")
+    exec(second, names)
+    assert names["clone"].rules is not None
+
+
 @pytest.mark.parametrize(
     "page", ["training", "textures", "point_classification", "morphogenesis3d"]
 )

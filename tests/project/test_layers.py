@@ -72,7 +72,8 @@ LADDER = {
     "npa_envs.envs": rung(16, "torch numpy gymnasium pettingzoo", never=INSIDES),
     "npa_envs.wrappers": rung(
         17,
-        "torch numpy gymnasium pettingzoo stable_baselines3 ray torchrl tensordict rsl_rl",
+        "torch numpy gymnasium pettingzoo stable_baselines3 ray torchrl tensordict rsl_rl minari "
+        "h5py",
         never=INSIDES,
     ),
     "npa_envs.agents": rung(

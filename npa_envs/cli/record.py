@@ -1,0 +1,161 @@
+"""`npa-envs record`: episodes of a policy as a dataset of Minari."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from npa_envs.cli.output import (
+    RunOptions,
+    StepBar,
+    check_numbers,
+    parse_options,
+    rule_of,
+    writable_folder,
+)
+from npa_envs.errors import NPAError
+
+if TYPE_CHECKING:
+    from npa_envs.agents.learning import Problem
+
+FIRST_CHOICE_SEED = 2**31
+"""Of the episode that says nothing but that a policy runs."""
+
+LEARNS_NOTHING = ("zero", "random", "scripted")
+"""Policies that need no file."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordOptions(RunOptions):
+    """Write episodes of a policy as a dataset of Minari, to learn from without the environment.
+
+    `minari.load_dataset` reads it; `npa_envs.agents.learning.train("clone", ..., dataset=ID)`
+    learns from it.
+    """
+
+    env: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ENV")]
+    """Id of an environment of one species, such as npa/Morphogenesis2D-v0."""
+
+    dataset: Annotated[str, tyro.conf.arg(metavar="ID")]
+    """What the dataset is called: NAMESPACE/NAME-v0."""
+
+    policy: str = "random"
+    """What acts: "zero", "random", "scripted", or a rule that fits: a shipped one, a file, or the
+    folder of a run. In gardens also "gradient", or a run's sac.zip or ppo.zip."""
+
+    episodes: int = 16
+    """Episodes to record, each from a seed of its own."""
+
+    first_seed: int = 0
+    """The first one's seed; the others follow."""
+
+    worlds: int = 16
+    """Worlds that run at the same time."""
+
+    options: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = ()
+    """Keywords of the environment, values as JSON or plain text: target=heart."""
+
+    root: Path | None = None
+    """Folder of datasets; default: Minari's own, which MINARI_DATASETS_PATH names."""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Record and write."""
+    options = parse_options(RecordOptions, "record", arguments)
+    check_numbers(options, episodes=1, worlds=1)
+    from npa_envs.agents.evaluation import policy_in
+    from npa_envs.wrappers.minari import ROOT, record_episodes, spec_of, write_dataset
+
+    problem = problem_of(options)
+    envs: Any = problem.make_envs(device=options.device)
+    policy = policy_in(envs, policy_of(options, problem))
+    # Datasets are not to tell where on which machine they were written.
+    words = ["ROOT" if word == str(options.root) else word for word in arguments]
+    seeds = range(options.first_seed, options.first_seed + options.episodes)
+    returns: list[float] = []
+    if options.root is not None:
+        os.environ[ROOT] = str(writable_folder(options.root).resolve())
+    with StepBar(options.episodes, show=options.progress, unit="episode") as bar:
+
+        def episodes() -> Iterator[Any]:
+            for episode in record_episodes(envs, policy, seeds):
+                returns.append(float(sum(episode.rewards)))
+                yield episode
+                bar.advance(1)
+
+        folder = write_dataset(
+            options.dataset,
+            spec_of(problem.env_id, dict(problem.keywords), problem.episode_steps),
+            episodes(),
+            algorithm=options.policy,
+            description=shlex.join(["npa-envs", "record", *words]),
+        )
+    print(f"{options.episodes} episodes, mean return {sum(returns) / len(returns):.3f}: {folder}")
+    return 0
+
+
+def problem_of(options: RecordOptions) -> Problem:
+    """Return the environment with its keywords.
+
+    Raises:
+        NPAError: There is no such environment, or it has several species or no such keyword.
+    """
+    from npa_envs.agents.learning import Problem
+    from npa_envs.registration import ENVIRONMENTS, GARDENS, SMALL
+
+    keywords: dict[str, Any] = {}
+    for word in options.options:
+        name, mark, value = word.partition("=")
+        if not mark:
+            raise NPAError(f"options must be NAME=VALUE, got {word!r}: target=heart")
+        try:
+            keywords[name] = json.loads(value)
+        except ValueError:
+            keywords[name] = value
+    limits = {known.id: known.max_episode_steps for known in (*ENVIRONMENTS, *GARDENS, *SMALL)}
+    worlds = min(options.worlds, options.episodes)
+    problem = Problem(
+        env_id=options.env,
+        keywords=keywords,
+        episode_steps=limits.get(options.env, 1),
+        num_envs=worlds,
+    )
+    if problem.is_species:
+        raise NPAError(
+            f"env must be of one species, as Minari keeps one agent's episodes, got {options.env}"
+        )
+    return problem
+
+
+def policy_of(options: RecordOptions, problem: Problem) -> Callable[[Any], Any]:
+    """Return what acts.
+
+    Raises:
+        NPAError: There is no such policy, or it does not fit.
+    """
+    from npa_envs.agents.learning import Budget, RuleSet, train
+
+    known = (*LEARNS_NOTHING, "gradient") if problem.is_garden else LEARNS_NOTHING
+    if options.policy in known:
+        # What learns nothing is only chosen, by seeds that are not recorded.
+        told = {"entries": 1, "evaluation_seeds": [FIRST_CHOICE_SEED], "device": options.device}
+        return train(options.policy, problem, Budget(particle_steps=10**12), 0, **told).policy
+    source = options.policy
+    if source.endswith(".zip") and problem.is_garden:
+        from npa_envs.agents.learning.garden_sb3 import GardenPolicy
+
+        return GardenPolicy.load(source, options.device)
+    if problem.is_garden:
+        raise NPAError(
+            f"policy must be one of {known} or a file sac.zip or ppo.zip, got {source!r}"
+        )
+    if not (Path(source) / "rule-0.safetensors").is_file():
+        source = rule_of(source)
+    return RuleSet.of(problem, source).to(options.device).policy()

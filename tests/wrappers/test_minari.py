@@ -1,0 +1,149 @@
+"""Datasets of Minari: episodes as they were, to be played again and to be learned from."""
+
+import numpy as np
+import pytest
+from learning_problems import heart, wild_rules
+
+from npa_envs.agents import evaluate_policy
+from npa_envs.agents.learning import Budget, Problem, RuleSet, train
+from npa_envs.cli import main
+from npa_envs.errors import NPAError
+
+minari = pytest.importorskip("minari")
+pytest.importorskip("h5py")
+from npa_envs.wrappers.minari import (  # noqa: E402 (it needs Minari)
+    ROOT,
+    read_pairs,
+    record_episodes,
+    spec_of,
+    write_dataset,
+)
+
+
+@pytest.fixture(autouse=True)
+def root(tmp_path, monkeypatch):
+    monkeypatch.setenv(ROOT, str(tmp_path))
+    return tmp_path
+
+
+def recorded(problem, rules, name="npa/test-v0", seeds=range(5)):
+    spec = spec_of(problem.env_id, dict(problem.keywords), problem.episode_steps)
+    episodes = record_episodes(problem.make_envs(), rules.policy(), seeds)
+    write_dataset(name, spec, episodes, algorithm="wild", description="a test")
+    return minari.load_dataset(name)
+
+
+def test_a_recorded_episode_is_what_happened_and_can_be_played_again():
+    problem = heart(episode_steps=3)
+    rules = wild_rules(problem)
+    dataset = recorded(problem, rules)
+    expected = evaluate_policy(problem.make_envs(), rules.policy(), range(5))
+    assert (dataset.total_episodes, dataset.total_steps) == (5, 15)
+    env = dataset.recover_environment()
+    for k, episode in enumerate(dataset.iterate_episodes()):
+        assert episode.rewards.sum() == pytest.approx(expected.returns[k], abs=1e-5)
+        assert episode.infos["loss"][0] == pytest.approx(expected.start_losses[k])
+        assert episode.infos["loss"][-1] == pytest.approx(expected.final_losses[k])
+        assert episode.truncations.tolist() == [False, False, True]
+        seen = [env.reset(seed=k)[0]]
+        seen += [env.step(action)[0] for action in episode.actions]
+        assert np.array_equal(np.stack(seen), episode.observations)
+
+
+def test_pairs_are_all_that_was_seen_with_what_was_done_then():
+    problem = heart(episode_steps=3)
+    rules = wild_rules(problem)
+    recorded(problem, rules)
+    seen, done = read_pairs("npa/test-v0")
+    assert seen.shape == (15, problem.particle_count, problem.interface.perception_dim)
+    assert (rules.policy()(seen) - done).abs().max() < 1e-5
+
+
+def test_a_dataset_is_written_whole_or_not_at_all(root):
+    problem = heart(episode_steps=2)
+    rules = wild_rules(problem)
+
+    def broken():
+        yield from record_episodes(problem.make_envs(), rules.policy(), range(2))
+        raise KeyboardInterrupt
+
+    spec = spec_of(problem.env_id, dict(problem.keywords), 2)
+    with pytest.raises(KeyboardInterrupt):
+        write_dataset("npa/test-v0", spec, broken(), algorithm="wild", description="a test")
+    assert not list(root.iterdir())
+    recorded(problem, rules)
+    with pytest.raises(NPAError, match="'npa/test-v0' exists already"):
+        recorded(problem, rules)
+    with pytest.raises(NPAError, match="there is no dataset 'npa/other-v0'"):
+        read_pairs("npa/other-v0")
+    with pytest.raises(NPAError, match="could not be written"):
+        recorded(problem, rules, "no version")
+    assert not list(root.glob(".*"))
+
+
+def test_rules_learn_from_a_dataset_without_a_world(monkeypatch):
+    problem = heart(episode_steps=4)
+    teacher = wild_rules(problem)
+    recorded(problem, teacher)
+    told = {"dataset": "npa/test-v0", "batch_worlds": 4, "updates": 8}
+    steps = 4 * 8 * problem.particle_count
+    trained = train("clone", problem, Budget(particle_steps=60 * steps), 0, entries=1, **told)
+    seen, done = read_pairs("npa/test-v0")
+    error = (trained.policy(seen) - done).square().mean() / done.var()
+    assert error < 0.1
+    assert trained.log[-1].particle_steps == 60 * steps
+    with pytest.raises(NPAError, match="teacher must be None where a dataset is given"):
+        train("clone", problem, Budget(particle_steps=1), 0, teacher=list(teacher), **told)
+    other = heart(particle_count=32)
+    with pytest.raises(NPAError, match="record it in this problem"):
+        train("clone", other, Budget(particle_steps=1), 0, **told)
+
+
+@pytest.mark.parametrize(
+    ("env", "policy", "shape"),
+    [("Morphogenesis2D", "zero", None), ("Shepherd2DSmall", "random", {"desired_goal"})],
+)
+def test_the_command_records_any_policy(root, capsys, env, policy, shape):
+    words = f"record npa/{env}-v0 --policy {policy} --episodes 3 --worlds 2 --no-progress".split()
+    small = ["particle_count=32", "resolution=16", "eps=0.3"] if shape is None else []
+    small = [*small, "seed_pool=1"] if small == [] else small
+    words += ["--dataset", f"npa/{policy}-v0", "--options", *small, "--root", str(root)]
+    assert main(words) == 0
+    assert "3 episodes, mean return" in capsys.readouterr().out
+    dataset = minari.load_dataset(f"npa/{policy}-v0")
+    assert dataset.total_episodes == 3
+    assert str(root) not in dataset.storage.metadata["description"]
+    first = dataset[0].observations
+    assert shape is None or shape <= first.keys()
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ("npa/Morphogenesis2D-v1", "did you mean 'npa/Morphogenesis2D-v0'"),
+        ("npa/Mixing-v0", "must be of one species"),
+        ("npa/Morphogenesis2D-v0 --options target", "NAME=VALUE"),
+        ("npa/Morphogenesis2D-v0 --episodes 0", "episodes must be at least 1"),
+        ("npa/Gardener2DSmall-v0 --policy heart", "policy must be one of"),
+    ],
+)
+def test_what_cannot_be_recorded_is_told(words, told, capsys):
+    assert main(["record", *words.split(), "--dataset", "npa/test-v0"]) == 2
+    assert told in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_clone_of_a_dataset_reaches_its_teachers_return():
+    small = {"target": "heart", "particle_count": 64, "eps": 0.2, "eps0": 0.2, "state_dim": 4}
+    problem = Problem(
+        env_id="npa/Morphogenesis2D-v0",
+        keywords={**small, "state_scale": 0.1, "seed_radius": 0.4},
+        episode_steps=16,
+    )
+    teacher = train("gradient", problem, Budget(particle_steps=500_000), 0, entries=1)
+    recorded(problem, teacher.rules, seeds=range(32))
+    clone = train(
+        "clone", problem, Budget(particle_steps=500_000), 1, entries=1, dataset="npa/test-v0"
+    )
+    assert isinstance(clone.rules, RuleSet)
+    assert clone.log[-1].mean_return >= 0.95 * teacher.log[-1].mean_return > 0.8

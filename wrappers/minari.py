@@ -1,0 +1,242 @@
+"""Episodes as datasets of Minari: written from any policy, read as tensors to learn from.
+
+Minari keeps datasets below the folder that the variable `MINARI_DATASETS_PATH` names, by default
+`~/.minari/datasets`.
+"""
+
+from __future__ import annotations
+
+import os
+import secrets
+import shutil
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.envs.registration import EnvSpec
+from torch import Tensor
+
+from npa_envs.errors import MissingDependencyError, NPAError, shown
+from npa_envs.wrappers.base import as_tensor, autoreset_mode, check_same_step, vector_env
+
+try:
+    import h5py  # noqa: F401
+    import minari
+    from minari.data_collector import EpisodeBuffer
+    from minari.namespace import create_namespace, list_local_namespaces
+    from minari.storage import get_dataset_path
+except ImportError as error:
+    raise MissingDependencyError(
+        "datasets of episodes need Minari: pip install 'npa-envs[minari]'"
+    ) from error
+
+ROOT = "MINARI_DATASETS_PATH"
+"""Variable that names the folder of all datasets."""
+
+
+def record_episodes(
+    env: Any, policy: Callable[[Any], Any], seeds: Sequence[int]
+) -> Iterator[EpisodeBuffer]:
+    """Run one episode from each seed, and yield each as Minari takes it.
+
+    An episode is the first one after a reset with its seed. It has T + 1 observations, T actions,
+    rewards, terminations and truncations, and the info `loss`, of T + 1 numbers.
+
+    Args:
+        env: A vector environment of this package with same-step autoreset, which ends its episodes;
+            as many episodes run at a time as it has worlds.
+        policy: Maps observations, [B, ...], to actions, [B, ...].
+        seeds: One for each episode.
+
+    Raises:
+        NPAError: The environment is another one, or there are no seeds.
+    """
+    vector_env(env, "record_episodes")
+    check_same_step(autoreset_mode(env))
+    given = list(seeds)
+    if not given:
+        raise NPAError("seeds must hold at least one seed, got none: give seeds=range(8)")
+    for first in range(0, len(given), env.num_envs):
+        batch = given[first : first + env.num_envs]
+        # All worlds take part; what those beyond the last seed do is not kept.
+        yield from _recorded(env, policy, [*batch, *batch[-1:] * (env.num_envs - len(batch))])[
+            : len(batch)
+        ]
+
+
+def _recorded(env: Any, policy: Callable[[Any], Any], seeds: list[int]) -> list[EpisodeBuffer]:
+    """Return the first episode of each world after a reset with its seed."""
+    observation, infos = env.reset(seed=seeds)
+    seen, losses = [_host(observation)], [_host(infos["loss"])]
+    done: list[dict[str, Any]] = []
+    lengths = np.zeros(len(seeds), np.int64)
+    last: list[Any] = [None] * len(seeds)
+    while not lengths.all():
+        action = _clipped(env, policy(observation))
+        observation, reward, terminated, truncated, infos = env.step(action)
+        step = {"actions": action, "rewards": reward}
+        step |= {"terminations": terminated, "truncations": truncated}
+        done.append({name: _host(value) for name, value in step.items()})
+        over = (done[-1]["terminations"] | done[-1]["truncations"]) & (lengths == 0)
+        loss = _host(infos["loss"])
+        if over.any():
+            final = _host(infos["final_obs"])
+            loss = np.where(over, _host(infos["final_info"]["loss"]), loss)
+            for k in np.flatnonzero(over):
+                last[k] = _of_world(final, k)
+                lengths[k] = len(done)
+        seen.append(_host(observation))
+        losses.append(loss)
+    episodes = []
+    for k, length in enumerate(lengths.tolist()):
+        steps = {name: np.stack([step[name][k] for step in done[:length]]) for name in done[0]}
+        shown_to = [*(_of_world(one, k) for one in seen[:length]), last[k]]
+        told = {"loss": np.array([loss[k] for loss in losses[: length + 1]], np.float64)}
+        buffer: Any = EpisodeBuffer(
+            seed=seeds[k], observations=_stacked(shown_to), infos=told, **steps
+        )
+        episodes.append(buffer)
+    return episodes
+
+
+def _clipped(env: Any, action: Any) -> Any:
+    """Return actions within the space, as environments take them anyway."""
+    if isinstance(env.single_action_space, gymnasium.spaces.Box):
+        return action.clip(-1.0, 1.0)
+    return action
+
+
+def _host(value: Any) -> Any:
+    """Return what tensors and arrays hold as new arrays; of dictionaries likewise."""
+    if isinstance(value, dict):
+        return {name: _host(part) for name, part in value.items()}
+    return value.cpu().numpy().copy() if isinstance(value, Tensor) else np.array(value)
+
+
+def _of_world(observation: Any, k: int) -> Any:
+    """Return what is seen of one world."""
+    if isinstance(observation, dict):
+        return {name: part[k] for name, part in observation.items()}
+    return observation[k]
+
+
+def _stacked(seen: list[Any]) -> Any:
+    if isinstance(seen[0], dict):
+        return {name: _stacked([one[name] for one in seen]) for name in seen[0]}
+    return np.stack(seen)
+
+
+def write_dataset(
+    dataset_id: str,
+    spec: EnvSpec,
+    episodes: Iterator[EpisodeBuffer],
+    *,
+    algorithm: str,
+    description: str,
+) -> Path:
+    """Write episodes as a dataset, whole or not at all, and return its folder.
+
+    Args:
+        dataset_id: What `minari.load_dataset` takes, "NAMESPACE/NAME-v0".
+        spec: Of the single environment: `dataset.recover_environment()` makes it anew.
+        episodes: From `record_episodes`.
+        algorithm: What acted.
+        description: What the dataset is.
+
+    Raises:
+        NPAError: There is such a dataset, the id is none, or files cannot be written.
+    """
+    target = get_dataset_path(dataset_id)
+    if target.exists():
+        raise NPAError(
+            f"dataset {shown(dataset_id)} exists already, in {shown(str(target))}: give another "
+            "version, -v1, or delete it"
+        )
+    root = get_dataset_path()
+    part = root / f".{secrets.token_hex(6)}"
+    try:
+        part.mkdir()
+        with _DatasetsIn(part), warnings.catch_warnings():
+            # It asks for authors, an address and a place of code.
+            warnings.simplefilter("ignore", UserWarning)
+            made = minari.create_dataset_from_buffers(
+                dataset_id,
+                [next(episodes)],
+                env=spec,
+                algorithm_name=algorithm,
+                description=description,
+            )
+            for episode in episodes:
+                made.update_dataset_from_buffer([episode])
+        namespace = dataset_id.rpartition("/")[0]
+        if namespace and namespace not in list_local_namespaces():
+            create_namespace(namespace)
+        os.replace(part / dataset_id, target)
+    except (OSError, ValueError) as error:
+        raise NPAError(
+            f"dataset {shown(dataset_id)} could not be written ({shown(error)}): give an id such "
+            "as npa/heart/expert-v0, and a folder with room for it"
+        ) from error
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+    return target
+
+
+class _DatasetsIn:
+    """A block in which Minari's datasets lie in a folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def __enter__(self) -> None:
+        self._before = os.environ.get(ROOT)
+        os.environ[ROOT] = str(self._folder)
+
+    def __exit__(self, *_: object) -> None:
+        if self._before is None:
+            del os.environ[ROOT]
+        else:
+            os.environ[ROOT] = self._before
+
+
+def spec_of(env_id: str, keywords: dict[str, Any], episode_steps: int) -> EnvSpec:
+    """Return what Gymnasium makes an environment of, with keywords and a limit of its steps."""
+    spec = deepcopy(gymnasium.spec(env_id))
+    spec.kwargs = {**spec.kwargs, **keywords}
+    spec.max_episode_steps = episode_steps
+    spec.vector_entry_point = None
+    return spec
+
+
+def read_pairs(dataset_id: str) -> tuple[Tensor, Tensor]:
+    """Return all observations of a dataset with what was done then, on the CPU.
+
+    Returns:
+        Observations, float32, shape [W, ...], and actions, shape [W, ...], of W steps.
+
+    Raises:
+        NPAError: There is no such dataset, or observations are no arrays.
+    """
+    try:
+        dataset = minari.load_dataset(dataset_id)
+    except (FileNotFoundError, ValueError) as error:
+        raise NPAError(
+            f"there is no dataset {shown(dataset_id)} in {shown(str(get_dataset_path()))}: record "
+            "one with npa-envs record, or set MINARI_DATASETS_PATH"
+        ) from error
+    seen, done = [], []
+    for episode in dataset.iterate_episodes():
+        if not isinstance(episode.observations, np.ndarray):
+            raise NPAError(
+                f"dataset {shown(dataset_id)} must hold arrays, got observations of "
+                f"{type(episode.observations).__name__}"
+            )
+        # The last observation is one that nobody acted on.
+        seen.append(as_tensor(episode.observations[:-1]))
+        done.append(as_tensor(episode.actions))
+    return torch.cat(seen).float(), torch.cat(done).float()
