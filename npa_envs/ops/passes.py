@@ -16,6 +16,9 @@ from npa_envs.ops.backend import Listing
 from npa_envs.ops.launch import launch
 from npa_envs.ops.sort import Plan, SortedWorlds, density_scale
 
+LISTS_TOGETHER = 32
+"""Neighbour lists that lie together."""
+
 
 class Terms(NamedTuple):
     """Which groups of the perception vector a rule reads: the others are not computed."""
@@ -137,7 +140,7 @@ def list_neighbours(
         ordered.row_of,
         particles,
         records,
-        steps.view(-1),
+        steps,
         lengths,
         block_dim=LIST_BLOCK,
     )
@@ -179,8 +182,10 @@ def perception_launch(
     destination: Tensor | None = None,
     limit: float = 0.0,
     row_kernel_sum: Tensor | None = None,
+    first_row: int = 0,
+    row_count: int | None = None,
 ) -> tuple[Any, ...]:
-    """Return what to give to `launch` so that it writes the perception of each row.
+    """Return what to give to `launch` so that it writes the perception of each row, or of some.
 
     Args:
         plan: Plan of the call.
@@ -193,16 +198,23 @@ def perception_launch(
         destination: Row of `out` for each row, int32, shape [K]; default: its own.
         limit: Entries are clipped to plus and minus this; 0: they are not.
         row_kernel_sum: Where to write the rows' sums of v K, shape [K, D], for the adjoint.
+        first_row: What is written into the first row of `out`, a multiple of `LISTS_TOGETHER`.
+        row_count: Rows to write, where they are not all.
     """
-    row_place = ordered.row_place if plan.masked else None
+    some = row_count is not None
+    row_count = plan.row_capacity if row_count is None else row_count
+    row_place = ordered.row_place[first_row:] if plan.masked or some else None
     numbers = (
         plan.state_dim,
         int(terms.density_gradient),
         scale,
         density_scale(scale, plan.space_dim, plan.particle_count),
-        plan.row_base,
+        plan.row_base + first_row,
     )
     lists = densities.lists
+    if lists is not None and some:
+        shifted = lists.steps[first_row // LISTS_TOGETHER :], lists.lengths[first_row:]
+        lists = lists._replace(steps=shifted[0], lengths=shifted[1])
     if lists is not None:
         capacity, _, teams = lists.listing
         kernel = listed_perception(
@@ -218,7 +230,7 @@ def perception_launch(
             teams,
             lists.by_place,
         )
-        threads = plan.row_capacity * plan.group_count * CUDA_LANES * teams
+        threads = row_count * plan.group_count * CUDA_LANES * teams
         source = ordered.states if states is None else states
         return (
             kernel,
@@ -226,7 +238,7 @@ def perception_launch(
             out.device,
             plan.domain,
             *numbers,
-            plan.row_capacity,
+            row_count,
             plan.group_count,
             limit,
             ordered.starts,
@@ -237,7 +249,7 @@ def perception_launch(
             None if states is None else ordered.source,
             row_place,
             destination,
-            lists.steps.view(-1),
+            lists.steps,
             lists.lengths,
             out,
             row_kernel_sum,
@@ -245,7 +257,7 @@ def perception_launch(
     listed = densities.listed
     return (
         portable_kernels(plan, terms, listed is not None).perceive,
-        (plan.row_capacity, plan.group_count),
+        (row_count, plan.group_count),
         out.device,
         plan.domain,
         plan.particle_count,

@@ -503,6 +503,61 @@ def perceive_rows(
     return perception, Rows(row_of, row_source, starts, row_base)
 
 
+ROWS_TOGETHER = 2**22
+"""Rows that are perceived before they are mapped to updates, where they need not be kept."""
+
+
+def update_some_at_a_time(
+    x: Tensor,
+    s: Tensor,
+    mask: Tensor | None,
+    network: Callable[[Tensor], Tensor],
+    options: PerceptionOptions,
+) -> tuple[Tensor, Rows]:
+    """Map the perception of huge worlds to updates, `ROWS_TOGETHER` rows at a time.
+
+    All rows of perception together would take most of the memory. The numbers are those that
+    `perceive_rows` and the network give. Not differentiable.
+
+    Args:
+        x: Positions [length units], shape [B, N, D].
+        s: States, dimensionless, shape [B, N, C].
+        mask: Which particles are active, uint8, shape [B, N]; None: all.
+        network: Maps rows of perception [K, row_width] to updates [K, A'], row by row.
+        options: What `perceive_rows` is asked for.
+
+    Returns:
+        Updates, dimensionless, shape [row_capacity, A'], and which particles they stand for.
+    """
+    x, s = x.detach().contiguous(), s.detach().contiguous()
+    row_capacity, row_width, eps, scale, box, terms = options
+    plan = make_plan(x, x.shape, s.shape[2], row_capacity, mask is not None, eps, box)
+    ordered = sort_worlds(plan, x, s, mask)
+    densities = compute_densities(plan, ordered, terms, plan.listing, with_particles=False)
+    perception = x.new_empty(min(ROWS_TOGETHER, row_capacity), row_width)
+    updates = None
+    for first in range(0, row_capacity, ROWS_TOGETHER):
+        some = perception[: min(ROWS_TOGETHER, row_capacity - first)]
+        launch(
+            *perception_launch(
+                plan,
+                ordered,
+                densities,
+                terms,
+                scale,
+                some,
+                first_row=first,
+                row_count=len(some),
+            )
+        )
+        mapped = network(some)
+        if updates is None:
+            updates = mapped.new_empty(row_capacity, mapped.shape[1])
+        updates[first : first + len(some)] = mapped
+    assert updates is not None, "worlds have particles"
+    return updates, Rows(ordered.row_of, ordered.row_source, ordered.starts, plan.row_base)
+
+
 # For environments: every particle, in the caller's order, clipped, without gradients.
 
 

@@ -23,7 +23,12 @@ from npa_envs.ops.checks import (
     checked_flag,
     checked_number,
 )
-from npa_envs.ops.perceive import Terms, perceive_rows
+from npa_envs.ops.perceive import (
+    PerceptionOptions,
+    Terms,
+    perceive_rows,
+    update_some_at_a_time,
+)
 from npa_envs.ops.static import StaticRows, StaticWorlds, prepare_static, static_rows
 from npa_envs.ops.update import update_particles
 from npa_envs.rule.rule import Network, NPARule, check_rule
@@ -43,6 +48,9 @@ FEWEST_STATIC = 3
 
 ROWS_TOGETHER = 2**24
 """Rows of static worlds that are given together, at most, if they are of several steps."""
+
+ROWS_KEPT = 2**23
+"""Rows of perception that are kept for the network all together, at most."""
 
 MOST_AHEAD = 4
 """Steps whose draws a recording makes beside the steps before them, at most: these take memory."""
@@ -282,23 +290,34 @@ class RuleStep(NamedTuple):
     ) -> Worlds:
         """Return the worlds after one step with these draws."""
         rule, options = self.rule, self.options
+        network = rule if self.network is None else self.network
+        width = rule.perception_dim if self.network is None else self.network.row_width
         count = len(rows.row_source) if rows is not None else row_count(mask, x, options)
-        perception, active = perceive_rows(
-            x.detach() if options.detach_positions else x,
-            s,
-            mask=mask,
-            row_capacity=count,
-            row_width=rule.perception_dim if self.network is None else self.network.row_width,
-            eps=options.eps,
-            eps0=rule.eps0,
-            box=options.box,
-            terms=rule_terms(rule),
-            static=self.static,
-            static_rows=rows,
-        )
+        huge = count > ROWS_KEPT and not torch.is_grad_enabled() and self.static is None
+        if huge and not torch.compiler.is_compiling():
+            sides = None if options.box is None else list(options.box)
+            asked = PerceptionOptions(
+                count, width, options.eps, options.eps / rule.eps0, sides, rule_terms(rule)
+            )
+            update, active = update_some_at_a_time(x, s, mask, network, asked)
+        else:
+            perception, active = perceive_rows(
+                x.detach() if options.detach_positions else x,
+                s,
+                mask=mask,
+                row_capacity=count,
+                row_width=width,
+                eps=options.eps,
+                eps0=rule.eps0,
+                box=options.box,
+                terms=rule_terms(rule),
+                static=self.static,
+                static_rows=rows,
+            )
+            update = network(perception)
         return Worlds(
             *update_particles(
-                rule(perception) if self.network is None else self.network(perception),
+                update,
                 x if noise is None else x + noise,
                 s,
                 path_length,

@@ -1,4 +1,4 @@
-"""`npa-envs train --gpus`, killed: whatever ends, the checkpoint can be read and nothing is left."""
+"""`npa-envs train --gpus`, killed: the checkpoint can always be read, and nothing is left."""
 
 import json
 import os

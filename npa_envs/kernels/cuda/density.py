@@ -96,7 +96,10 @@ def listed_density(
 
     @native.func_native(room, LIST_BLOCK, capacity, lanes)
     def leave_list(
-        address: wp.uint32, list_end: LIST_END, row: wp.int32, lists: wp.array(dtype=wp.int16)
+        address: wp.uint32,
+        list_end: LIST_END,
+        row: wp.int32,
+        lists: wp.array(dtype=wp.int16, ndim=3),
     ) -> wp.int32: ...
 
     @wp.func
@@ -143,7 +146,7 @@ def listed_density(
         # outputs
         particles: wp.array(dtype=particle),
         records: wp.array(dtype=RECORD),
-        lists: wp.array(dtype=wp.int16),
+        lists: wp.array(dtype=wp.int16, ndim=3),
         list_lengths: wp.array(dtype=wp.int32),
     ):
         """Write every particle's record, and the list of each row's neighbours.
@@ -253,7 +256,9 @@ def make_steps_at(capacity: int) -> wp.Function:
     """Return a Warp function that reads two steps of a row's list, as the density pass left it."""
 
     @native.func_native(capacity)
-    def steps_at(lists: wp.array(dtype=wp.int16), row: wp.int32, pair: wp.int32) -> wp.int32: ...
+    def steps_at(
+        lists: wp.array(dtype=wp.int16, ndim=3), row: wp.int32, pair: wp.int32
+    ) -> wp.int32: ...
 
     return steps_at
 

@@ -281,7 +281,7 @@ def listed_perception(
     def weigh_listed(
         domain: Domain,
         records: wp.array(dtype=RECORD),
-        lists: wp.array(dtype=wp.int16),
+        lists: wp.array(dtype=wp.int16, ndim=3),
         state_place: wp.array(dtype=wp.int32),
         lane: wp.int32,
         slot: wp.uint32,
@@ -392,7 +392,7 @@ def listed_perception(
         state_place: wp.array(dtype=wp.int32),
         row_place: wp.array(dtype=wp.int32),
         row_destination: wp.array(dtype=wp.int32),
-        lists: wp.array(dtype=wp.int16),
+        lists: wp.array(dtype=wp.int16, ndim=3),
         list_lengths: wp.array(dtype=wp.int32),
         # outputs
         perception: wp.array(dtype=scalar, ndim=2),
