@@ -94,7 +94,15 @@ class Evaluation(BaseCallback):
 
 
 def learned(
-    seed: int, *, name: str, method: str, steps: int, every: int, worlds: int, device: str, out: Path
+    seed: int,
+    *,
+    name: str,
+    method: str,
+    steps: int,
+    every: int,
+    worlds: int,
+    device: str,
+    out: Path,
 ) -> list[dict[str, Any]]:
     """Return the evaluations of one seed."""
     torch.set_num_threads(1)

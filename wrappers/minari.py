@@ -87,13 +87,13 @@ def _recorded(env: Any, policy: Callable[[Any], Any], seeds: list[int]) -> list[
         if over.any():
             final = _host(infos["final_obs"])
             loss = np.where(over, _host(infos["final_info"]["loss"]), loss)
-            for k in np.flatnonzero(over):
+            for k in np.flatnonzero(over).tolist():
                 last[k] = _of_world(final, k)
                 lengths[k] = len(done)
         seen.append(_host(observation))
         losses.append(loss)
     episodes = []
-    for k, length in enumerate(lengths.tolist()):
+    for k, length in enumerate(map(int, lengths)):
         steps = {name: np.stack([step[name][k] for step in done[:length]]) for name in done[0]}
         shown_to = [*(_of_world(one, k) for one in seen[:length]), last[k]]
         told = {"loss": np.array([loss[k] for loss in losses[: length + 1]], np.float64)}
@@ -151,7 +151,7 @@ def write_dataset(
     Raises:
         NPAError: There is such a dataset, the id is none, or files cannot be written.
     """
-    target = get_dataset_path(dataset_id)
+    target: Path = get_dataset_path(dataset_id)
     if target.exists():
         raise NPAError(
             f"dataset {shown(dataset_id)} exists already, in {shown(str(target))}: give another "

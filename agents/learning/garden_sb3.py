@@ -9,10 +9,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from gymnasium.spaces import flatten_space
-from gymnasium.vector import VectorWrapper
+from gymnasium.spaces import Dict
 from numpy.typing import NDArray
-from torch import Tensor
 
 from npa_envs.agents.learning.gardeners import check_no_start
 from npa_envs.agents.learning.problem import Problem, world_seeds
@@ -30,7 +28,7 @@ except ImportError as error:
         "SAC and PPO in gardens need Stable-Baselines3: pip install 'npa-envs[sb3]'"
     ) from error
 
-ALGORITHMS = {"sac": SAC, "ppo": PPO}
+ALGORITHMS: dict[str, type[SAC] | type[PPO]] = {"sac": SAC, "ppo": PPO}
 """By the names of the files that `GardenPolicy.save` writes, without ".zip"."""
 
 
@@ -41,7 +39,7 @@ class GardenOptions:
     gamma: float = 0.9
     """Discount of a reward one step later (dimensionless)."""
 
-    learning_rate: float = 1e-3
+    learning_rate: float = 3e-4
     """Adam's."""
 
     def __post_init__(self) -> None:
@@ -73,7 +71,7 @@ class PPOOptions(GardenOptions):
     steps: int = 32
     """Steps of each world in a round."""
 
-    batch_size: int = 128
+    batch_size: int = 64
     """Steps of worlds in a minibatch."""
 
     def __post_init__(self) -> None:
@@ -131,14 +129,16 @@ def _learned(
     options: GardenOptions,
 ) -> GardenPolicy:
     check_no_start(start)
-    env = WorldVecEnv(FlatObservations(problem.make_envs(device=device)))
+    env = WorldVecEnv(problem.make_envs(device=device))
+    has_goals = isinstance(env.observation_space, Dict)
     model = algorithm(
-        "MlpPolicy",
+        "MultiInputPolicy" if has_goals else "MlpPolicy",
         env,
         gamma=options.gamma,
         learning_rate=options.learning_rate,
         seed=seed,
-        device=device,
+        # Worlds may be on a GPU; networks are so small that a core is as fast.
+        device="cpu",
         **told,
     )
     # Stable-Baselines3 would begin with worlds seed, seed + 1, and so on.
@@ -184,7 +184,11 @@ class GardenPolicy:
 
     def __call__(self, observation: Any) -> NDArray[np.float32]:
         """Return actions of worlds, shape [B, K, W], for what is seen of them, [B, ...]."""
-        (seen,) = on_host(flat(observation))
+        seen: Any = observation
+        if isinstance(observation, dict):
+            seen = dict(zip(observation, on_host(*observation.values()), strict=True))
+        else:
+            (seen,) = on_host(observation)
         action, _ = self.model.predict(seen, deterministic=True)
         return np.asarray(action)
 
@@ -195,7 +199,7 @@ class GardenPolicy:
         return [path]
 
     @classmethod
-    def load(cls, path: str | Path, device: str | torch.device = "cpu") -> GardenPolicy:
+    def load(cls, path: str | Path) -> GardenPolicy:
         """Return what `save` wrote; Stable-Baselines3 unpickles it, so trust who made the file.
 
         Raises:
@@ -204,32 +208,4 @@ class GardenPolicy:
         name = Path(path).stem
         if name not in ALGORITHMS or not Path(path).is_file():
             raise NPAError(f"path must be of a file sac.zip or ppo.zip, got {shown(str(path))}")
-        return cls(ALGORITHMS[name].load(path, device=device))
-
-
-class FlatObservations(VectorWrapper[Any, Any, Any]):
-    """A garden that hands out tensors, whose observations are rows of numbers, goals among them."""
-
-    def __init__(self, env: Any) -> None:
-        super().__init__(env)
-        self.single_observation_space = flatten_space(env.single_observation_space)
-
-    def reset(self, **told: Any) -> tuple[Any, dict[str, Any]]:
-        """Reset worlds, and return rows, shape [B, O]."""
-        observation, infos = self.env.reset(**told)
-        return flat(observation), infos
-
-    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Step worlds, and return rows, shape [B, O], and what else there is."""
-        observation, *rest, infos = self.env.step(actions)
-        if "final_obs" in infos:
-            infos = {**infos, "final_obs": flat(infos["final_obs"])}
-        return flat(observation), *rest, infos
-
-
-def flat(observation: Any) -> Tensor:
-    """Return what is seen of worlds as rows, shape [B, O]; dictionaries in their keys' order."""
-    if isinstance(observation, dict):
-        # As Gymnasium's space of dictionaries sorts them.
-        return torch.cat([flat(observation[name]) for name in sorted(observation)], dim=1)
-    return torch.as_tensor(observation).flatten(1)
+        return cls(ALGORITHMS[name].load(path, device="cpu"))

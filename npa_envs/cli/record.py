@@ -145,13 +145,20 @@ def policy_of(options: RecordOptions, problem: Problem) -> Callable[[Any], Any]:
     known = (*LEARNS_NOTHING, "gradient") if problem.is_garden else LEARNS_NOTHING
     if options.policy in known:
         # What learns nothing is only chosen, by seeds that are not recorded.
-        told = {"entries": 1, "evaluation_seeds": [FIRST_CHOICE_SEED], "device": options.device}
-        return train(options.policy, problem, Budget(particle_steps=10**12), 0, **told).policy
+        return train(
+            options.policy,
+            problem,
+            Budget(particle_steps=10**12),
+            0,
+            device=options.device,
+            evaluation_seeds=[FIRST_CHOICE_SEED],
+            entries=1,
+        ).policy
     source = options.policy
     if source.endswith(".zip") and problem.is_garden:
         from npa_envs.agents.learning.garden_sb3 import GardenPolicy
 
-        return GardenPolicy.load(source, options.device)
+        return GardenPolicy.load(source)
     if problem.is_garden:
         raise NPAError(
             f"policy must be one of {known} or a file sac.zip or ppo.zip, got {source!r}"
