@@ -22,7 +22,9 @@ INFERENCE = (2**22, 2**24, 40_000_000, 100_000_000, 120_000_000)
 TRAINING = (2**22, 2**24)
 
 
-def measured(particle_count: int, steps: int, device: torch.device, *, train: bool) -> dict[str, object]:
+def measured(
+    particle_count: int, steps: int, device: torch.device, *, train: bool
+) -> dict[str, object]:
     """Return what a rollout of a world takes."""
     workload = Workload(2, 1, particle_count, steps)
     torch.cuda.empty_cache()

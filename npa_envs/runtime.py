@@ -16,6 +16,11 @@ import warp as wp
 
 from npa_envs.errors import NPAError, shown
 
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
 _BROKEN_CACHE = ("Failed to load CPU", "Failed to load CUDA")
 """How what Warp says about object files that it cannot load begins."""
 
@@ -55,6 +60,27 @@ def start_warp() -> None:
     # Handlers go in the reverse order: the one that warns has to be there before this one.
     weakref.finalize(wp, int).detach()
     atexit.register(_remove_header_folders)
+
+
+@contextlib.contextmanager
+def in_turn(module: str) -> Iterator[None]:
+    """Let one process at a time compile or load a module of kernels, within the block.
+
+    Of many that start together, on one computer or on several that share a folder, the first one
+    compiles. The others wait, and load what it has left. The system frees the lock of a process
+    that ends in whatever way. Where it has no such locks, or the cache cannot be written to, each
+    process does all by itself.
+
+    Args:
+        module: The module's name.
+    """
+    with contextlib.ExitStack() as held:
+        with contextlib.suppress(OSError):
+            lock = (kernel_cache_folder() / f"{module}.lock").open("a", encoding="utf-8")
+            held.enter_context(lock)
+            if fcntl is not None:
+                fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
 
 
 def _remove_header_folders() -> None:

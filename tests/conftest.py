@@ -1,13 +1,10 @@
 """Options and fixtures of the whole suite."""
 
 import os
-import tempfile
 from pathlib import Path
 
 import pytest
 import torch
-import warp as wp
-from filelock import FileLock
 
 REFERENCE = Path(
     os.environ.get(
@@ -28,23 +25,6 @@ def pytest_collection_modifyitems(items):
             item.add_marker(skip)
         if "device" in getattr(item, "fixturenames", ()):
             item.add_marker("device")
-
-
-@pytest.fixture(scope="session", autouse=True)
-def compiled_once():
-    """Let one worker compile a module of kernels, and the others load what it has compiled."""
-    if "PYTEST_XDIST_WORKER" not in os.environ:
-        yield
-        return
-    load = wp.Module.load
-
-    def load_in_turn(module, *arguments, **options):
-        with FileLock(Path(tempfile.gettempdir()) / f"{module.name}.lock"):
-            return load(module, *arguments, **options)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(wp.Module, "load", load_in_turn)
-        yield
 
 
 @pytest.fixture(scope="session")

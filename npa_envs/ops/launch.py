@@ -21,7 +21,7 @@ from torch import Tensor
 
 from npa_envs.kernels.access import CUDA_BLOCK
 from npa_envs.kernels.cpu import SMALLEST_RANGES
-from npa_envs.runtime import quiet_warp, start_warp
+from npa_envs.runtime import in_turn, quiet_warp, start_warp
 
 SCALARS: dict[torch.dtype, Any] = {torch.float32: wp.float32, torch.float64: wp.float64}
 """Warp's scalar type for each floating dtype that the operators take."""
@@ -145,13 +145,12 @@ class _Arguments:
         arguments: tuple[Any, ...],
     ) -> None:
         where = warp_device(device)
-        launched.add((kernel, device))
         types = [argument.type for argument in kernel.adj.args]
         given = [
             _description(value, kind) if isinstance(value, Tensor) else value
             for value, kind in zip(arguments, types, strict=True)
         ]
-        with quiet_warp():
+        with quiet_warp(), _first_load(kernel, device):
             self._launch = wp.launch(
                 kernel,
                 size,
@@ -161,6 +160,7 @@ class _Arguments:
                 record_tape=False,
                 record_cmd=True,
             )
+        launched.add((kernel, device))
         self._device = device
         self._bounds = {size: self._launch.bounds}
         made = self._launch.params[1:]
@@ -235,6 +235,12 @@ class _Arguments:
 
     def _run_on_cpu(self, memory: Any, size: tuple[int, ...]) -> None:
         self._launch.hooks.forward(ctypes.byref(self._bounds_of(size)), ctypes.byref(memory))
+
+
+def _first_load(kernel: Any, device: torch.device) -> contextlib.AbstractContextManager[None]:
+    """Return what other processes wait for while a kernel's module is compiled or loaded."""
+    known = any(other.module is kernel.module and where == device for other, where in launched)
+    return contextlib.nullcontext() if known else in_turn(kernel.module.name)
 
 
 launched: set[tuple[Any, torch.device]] = set()
