@@ -1,4 +1,4 @@
-"""The program of docs/tutorial.md: it runs as it stands there, and learns what the page says."""
+"""The programs of the tutorials: they run as they stand there, and learn what the pages say."""
 
 import math
 import re
@@ -14,9 +14,9 @@ ROUNDS = "model.learn(100 * 16"
 pytest.importorskip("stable_baselines3")
 
 
-def program() -> str:
+def program(page: Path = TUTORIAL) -> str:
     """Return the page's only block of Python."""
-    (block,) = re.findall(r"^```python\n(.*?)^```", TUTORIAL.read_text(), re.MULTILINE | re.DOTALL)
+    (block,) = re.findall(r"^```python\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL)
     return block
 
 
@@ -66,3 +66,23 @@ def test_ppo_beats_random_actions_by_three_standard_errors_in_five_minutes(
     # Not by doing nothing, either.
     assert mean > 3.0 * error
     assert mean == pytest.approx(told()["RowPolicy"], abs=0.2)
+
+
+def test_the_program_for_a_graphics_card_runs_on_any_device(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    code = program(TUTORIAL.with_name("tutorial_gpu.md"))
+    for usual, small in {
+        "particle_count=512": "particle_count=16",
+        "episode_steps=48": "episode_steps=2",
+        "num_envs=32": "num_envs=2",
+        "100_000_000": "500",
+        "30_000_000": "500",
+        "10_000_000": "500",
+    }.items():
+        assert code.count(usual) == 1
+        code = code.replace(usual, small)
+    run(code)
+    told = re.findall(r"^([\w, ']+): -?[\d.]+", capsys.readouterr().out, re.MULTILINE)
+    assert told == ["zero", "ppo", "gradient", "ppo, begun with the gradient's rule"]
+    for method in ("ppo", "gradient"):
+        assert (tmp_path / "runs" / method / "rule-0.safetensors").is_file()
