@@ -20,6 +20,8 @@ from npa_envs.agents.comparison.npa_bench import (
     ENTRIES,
     GROUPS,
     METHODS,
+    NOTHING,
+    YARDSTICK,
     Row,
     problem_of,
     read_rows,
@@ -52,12 +54,15 @@ def problems() -> str:
 
 def ranked(rows: dict[str, Row]) -> list[str]:
     """Return the methods: the library's own in their order, then all others by name."""
-    return sorted(rows, key=lambda name: (METHODS.index(name) if name in METHODS else 99, name))
+    own = list(METHODS)
+    return sorted(rows, key=lambda name: (own.index(name) if name in own else len(own), name))
 
 
 def scored(rows: dict[str, Row], group: str) -> str:
     """Return the scores of all methods on a group of problems, Markdown."""
-    ids = [env_id for env_id in GROUPS[group] if len(rows["gradient"].returns(env_id))]
+    if not {NOTHING, YARDSTICK} <= rows.keys():
+        return f"Scores need the rows `{NOTHING}` and `{YARDSTICK}`."
+    ids = [env_id for env_id in GROUPS[group] if len(rows[YARDSTICK].returns(env_id))]
     lines = []
     for method in ranked(rows):
         found = scores_in(rows, method, ids)
@@ -91,7 +96,7 @@ def described(rows: dict[str, Row]) -> str:
     lines = []
     for method in ranked(rows):
         runs = rows[method].runs
-        lines.append((f"`{method}`", rows[method].about or "of this library", str(len(runs))))
+        lines.append((f"`{method}`", rows[method].about or NONE, str(len(runs))))
     return table(("Method", "What it is", "Runs"), lines)
 
 
