@@ -44,7 +44,14 @@ METHODS: dict[str, tuple[type[Any], dict[str, Any], dict[str, Any]]] = {
 }
 """Algorithm, what of its defaults is changed, and keywords of the environment."""
 
-MANY = {"ppo": {"n_steps": 32, "batch_size": 1024, "n_epochs": 5}}
+MANY = {
+    "ppo": {
+        "n_steps": 32,
+        "batch_size": 1024,
+        "n_epochs": 5,
+        "policy_kwargs": {"log_std_init": -1.0},
+    }
+}
 """What is changed besides where many worlds are stepped together."""
 
 

@@ -33,7 +33,7 @@ class Gardener2DEnvConfig(GardenConfig):
     """Probability of a gust in a step: particles around a random one are carried along in a random
     direction (dimensionless)."""
 
-    gust_radius: float = 0.3
+    gust_radius: float = 0.4
     """Radius within which a gust carries particles along, softly [length units]."""
 
     gust_length: float = 0.4

@@ -40,11 +40,9 @@ class Shepherd2DEnvConfig(GardenConfig):
     reward: GardenReward = "dense"
     """"dense": minus the distance to the goal; "sparse": 0 at the goal and -1 elsewhere."""
 
-    place_count: int = 3
+    place_count: int = 2
 
-    place_reach: float = 0.6
-
-    brush_radius: float = 0.4
+    place_reach: float = 0.4
 
     push_length: float = 0.1
 

@@ -70,6 +70,7 @@ SMALL = (
         MappingProxyType(
             {
                 "particle_count": 256,
+                "push_length": 0.1,
                 "gust_chance": 0.5,
                 "gust_radius": 0.6,
                 "blight_chance": 0.25,
@@ -81,9 +82,7 @@ SMALL = (
         "npa_envs.envs.shepherd2d",
         "Shepherd2D",
         32,
-        MappingProxyType(
-            {"particle_count": 256, "place_count": 2, "place_reach": 0.4, "brush_radius": 0.6}
-        ),
+        MappingProxyType({"particle_count": 256}),
     ),
 )
 """Settings of environments with few particles and few numbers to act by, never changed under the

@@ -187,6 +187,69 @@ def test_a_small_form_is_the_environment_with_other_keywords(small):
     assert_same(first, again.step(action))
 
 
+FROZEN = {
+    "npa/Gardener2D-v0": {
+        "particle_count": 512,
+        "brush_radius": 0.6,
+        "push_length": 0.15,
+        "place_count": 4,
+        "place_reach": 0.75,
+        "gust_chance": 1.0,
+        "gust_radius": 0.4,
+        "gust_length": 0.4,
+        "blight_chance": 0.5,
+        "blight_radius": 0.3,
+        "position_noise": 0.002,
+    },
+    "npa/Gardener2DSmall-v0": {
+        "particle_count": 256,
+        "brush_radius": 0.6,
+        "push_length": 0.1,
+        "place_count": 4,
+        "place_reach": 0.75,
+        "gust_chance": 0.5,
+        "gust_radius": 0.6,
+        "gust_length": 0.4,
+        "blight_chance": 0.25,
+        "blight_radius": 0.3,
+        "position_noise": 0.002,
+    },
+    "npa/Shepherd2D-v0": {
+        "particle_count": 512,
+        "brush_radius": 0.6,
+        "push_length": 0.1,
+        "place_count": 2,
+        "place_reach": 0.4,
+        "aim": "move",
+        "goal_reach": 0.6,
+        "tolerance": 0.1,
+        "lost_limit": 0.5,
+        "reward_weight": 1.0,
+    },
+}
+FROZEN["npa/Shepherd2DSmall-v0"] = FROZEN["npa/Shepherd2D-v0"] | {"particle_count": 256}
+FOR_ALL = {
+    "target": "heart",
+    "rule": None,
+    "grow_steps": 256,
+    "seed_pool": 16,
+    "rule_steps": 8,
+    "tools": ("push",),
+    "actions": "grid",
+    "observe": "grid",
+    "reward": "dense",
+    "eps": 0.1,
+    "resolution": 32,
+}
+
+
+@pytest.mark.parametrize("name", FROZEN)
+def test_settings_stay_what_they_are_as_long_as_the_version_does(name):
+    config = gymnasium.make(name).unwrapped.config
+    for key, value in (FOR_ALL | FROZEN[name]).items():
+        assert getattr(config, key) == value, key
+
+
 @pytest.mark.parametrize(
     ("keywords", "message"),
     [
