@@ -22,6 +22,7 @@ from npa_envs.tasks.base import Task
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.iteration import TrainingCycle
 from npa_envs.world.randomness import Randomness, WorldRandom
+from npa_envs.world.recorded import CudaGraph
 from npa_envs.world.rollout import Memory
 
 LONGEST = 96
@@ -212,6 +213,7 @@ class EpisodeTask:
         counts = torch.tensor(problem.counts)
         self._species = torch.arange(len(counts)).repeat_interleave(counts).to(device)
         _check_rules_of_play(problem, self._task)
+        self._clamped: tuple[RuleSet, list[ClampedRule]] | None = None
 
     @property
     def can_be_recorded(self) -> bool:
@@ -235,9 +237,19 @@ class EpisodeTask:
         """
         parts = {name: part.mean() for name, part in self._losses(x, s).items()}
         total = torch.stack(list(parts.values())).sum()
-        if torch.is_grad_enabled() and (x.requires_grad or s.requires_grad):
-            self._check_gradient(total)
+        self._check_gradient(total, x, s)
         return total, parts
+
+    def world_losses(self, x: Tensor, s: Tensor) -> Tensor:
+        """Return the environment's loss of each world, the mean over its species, shape [B].
+
+        Raises:
+            NPAError: As for `loss`.
+        """
+        total = torch.stack(list(self._losses(x, s).values())).sum(dim=0)
+        total = total.flatten(1).mean(dim=1) if total.dim() > 1 else total
+        self._check_gradient(total, x, s)
+        return total
 
     def rollout(
         self,
@@ -253,11 +265,17 @@ class EpisodeTask:
         memory: Memory,
         generator: Randomness,
         return_path_length: Literal[True],
+        keep_every: int | None = None,
+        cuda_graph: CudaGraph = "auto",
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Run a set of rules as the environment would, differentiably; as `npa_envs.rollout`."""
         assert isinstance(rules, RuleSet), "the learner trains sets of rules"
         physics, config = self.physics, self.problem.config
-        clamped = [ClampedRule(rule, physics.state_scale) for rule in rules]
+        if self._clamped is None or self._clamped[0] is not rules:
+            # Kept, as recorded rollouts know rules that are not plain by themselves.
+            limit = physics.state_scale
+            self._clamped = rules, [ClampedRule(rule, limit) for rule in rules]
+        clamped = self._clamped[1]
         common: dict[str, Any] = {
             "eps": eps,
             "box": box,
@@ -267,6 +285,8 @@ class EpisodeTask:
             "memory": memory,
             "generator": generator,
             "return_path_length": return_path_length,
+            "keep_every": keep_every,
+            "cuda_graph": cuda_graph,
         }
         if not isinstance(config, SpeciesConfig):
             return npa_envs.rollout(clamped[0], x, s, steps, **common)
@@ -286,12 +306,13 @@ class EpisodeTask:
             return self._task.losses(Population(x, s, self.problem.counts, self._species))
         return self._task.losses(x, s)
 
-    def _check_gradient(self, total: Tensor) -> None:
-        if not total.requires_grad:
+    def _check_gradient(self, total: Tensor, x: Tensor, s: Tensor) -> None:
+        asked = torch.is_grad_enabled() and (x.requires_grad or s.requires_grad)
+        if asked and not total.requires_grad:
             raise NPAError(
                 f"the losses of {type(self._task).__name__} must be differentiable for "
-                "method='gradient', but no gradient leads from them to positions or states: "
-                "compute them by torch's operations, or learn by 'ppo' or 'evolution'"
+                "a method that follows gradients, but no gradient leads from them to positions or "
+                "states: compute them by torch's operations, or learn by 'ppo' or 'evolution'"
             )
 
 
@@ -379,6 +400,10 @@ class ClampedRule(NPARule):
     def is_plain(self) -> bool:
         """Return whether `folded` may stand in for the rule: where it may for the other one."""
         return self.rule_is_plain
+
+    def has_network(self) -> bool:
+        """Return False: weights alone do not make the rule, whose steps are clamped."""
+        return False
 
     def folded(self) -> FoldedRule:
         """Return the weights as two plain products with clamped state steps."""

@@ -119,6 +119,25 @@ def test_what_is_differentiated_is_the_environments_own_episode(problem):
     assert all(bar.abs().sum() > 0.0 for bar in bars)
 
 
+@pytest.mark.parametrize("cuda_graph", ["auto", True])
+def test_repeated_rollouts_stay_clamped_where_they_are_recorded(cuda_graph, device):
+    problem = heart(state_scale=0.1)
+    rules, task = wild_rules(problem).to(device), episode_task(problem, device)
+    x, s = task.seed(2, generator=torch.Generator(device).manual_seed(0), device=device)
+    found = []
+    for _ in range(4):
+        _, after, _ = task.rollout(
+            rules, x, s, 3,
+            eps=task.eps, box=task.box, update_prob=1.0, memory="store",
+            generator=torch.Generator(device).manual_seed(1), return_path_length=True,
+            cuda_graph=cuda_graph,
+        )  # fmt: skip
+        found.append(after.detach())
+    assert found[0].abs().max() > 0.29
+    assert all(after.abs().max() <= 0.3001 for after in found)
+    assert all(torch.allclose(after, found[0], atol=1e-5) for after in found)
+
+
 @pytest.mark.parametrize(
     ("problem", "share", "gain", "options"),
     [
