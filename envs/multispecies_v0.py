@@ -8,8 +8,9 @@ from __future__ import annotations
 from typing import Any
 
 from npa_envs.envs.multi.parallel import CrowdEnv, in_turns, register
-from npa_envs.envs.multi.tasks import ENVIRONMENTS
+from npa_envs.envs.multi.tasks import ENVIRONMENTS, task_settings
 from npa_envs.envs.multi.vector import MultiSpeciesVectorEnv
+from npa_envs.registration import SPECIES_SIZES
 
 
 class MultiSpeciesEnv(CrowdEnv):
@@ -163,23 +164,26 @@ class MultiSpeciesEnv(CrowdEnv):
         super().__init__(task, config, by_particle=False)
 
 
-def parallel_env(task: str = "mixing", species_count: int = 2, **config: Any) -> MultiSpeciesEnv:
+def parallel_env(
+    task: str = "mixing", species_count: int | None = None, **config: Any
+) -> MultiSpeciesEnv:
     """Return an environment in which all species act at once.
 
     Args:
-        task: "mixing", "segregation", "co_morphogenesis", "invasion" or "symbiosis".
-        species_count: Species K: agents `species_0` to `species_{K-1}`.
+        task: "mixing", "segregation", "co_morphogenesis", "invasion" or "symbiosis"; or an id, such
+            as "npa/MixingSmall-v0".
+        species_count: Species K: agents `species_0` to `species_{K-1}`; None: 2.
         config: Fields of the task's configuration; docs/environments/MultiSpecies.md lists them.
 
     Raises:
         NPAError: A name is unknown, or a value wrong.
     """
-    return MultiSpeciesEnv(task, species_count=species_count, **config)
+    return MultiSpeciesEnv(**settings(task, species_count, config))
 
 
 def batched(
     task: str = "mixing",
-    species_count: int = 2,
+    species_count: int | None = None,
     *,
     world_count: int = 1,
     autoreset_mode: str = "same-step",
@@ -198,23 +202,35 @@ def batched(
         NPAError: As `parallel_env`, or the worlds do not fit into memory.
     """
     return MultiSpeciesVectorEnv(
-        task,
-        species_count=species_count,
         world_count=world_count,
         autoreset_mode=autoreset_mode,
-        **config,
+        **settings(task, species_count, config),
     )
 
 
-def raw_env(task: str = "mixing", species_count: int = 2, **config: Any) -> Any:
+def raw_env(task: str = "mixing", species_count: int | None = None, **config: Any) -> Any:
     """Return `parallel_env` with species that act in turn, and the world after the last of them."""
     return in_turns(parallel_env(task, species_count, **config))
 
 
-def env(task: str = "mixing", species_count: int = 2, **config: Any) -> Any:
+def env(task: str = "mixing", species_count: int | None = None, **config: Any) -> Any:
     """Return `raw_env` with actions clipped into their spaces."""
     return in_turns(parallel_env(task, species_count, **config), clips=True)
 
 
-for _id, _task in ENVIRONMENTS.items():
-    register(_id, __name__, {"task": _task})
+def settings(task: str, species_count: int | None, config: dict[str, Any]) -> dict[str, Any]:
+    """Return all keywords of an environment; those that are given go before those of an id.
+
+    Args:
+        task: A task's name, or an id.
+        species_count: Species K, or None for those of the id, which are 2 unless it says more.
+        config: What else is given.
+    """
+    name, keywords = task_settings(task)
+    if species_count is not None:
+        keywords["species_count"] = species_count
+    return {"task": name, "species_count": 2} | keywords | config
+
+
+for _id in (*ENVIRONMENTS, *(size.id for size in SPECIES_SIZES)):
+    register(_id, __name__, {"task": _id})

@@ -89,6 +89,23 @@ SMALL = (
 same version."""
 
 
+class SpeciesRegistration(NamedTuple):
+    """One size of a task of several species, for PettingZoo and for batches."""
+
+    id: str
+    """What `pettingzoo.make` and `npa_envs.envs.multispecies_v0.batched` take."""
+
+    task: str
+    """A name from `npa_envs.envs.multi.TASKS`."""
+
+    keywords: Mapping[str, Any]
+    """Fields of the task's configuration."""
+
+
+SPECIES_SIZES: tuple[SpeciesRegistration, ...] = ()
+"""Small and large worlds of several species, never changed under the same version."""
+
+
 def register_environments() -> None:
     """Put the table into Gymnasium's registry; what is there already is left as it is."""
     for environment in (*ENVIRONMENTS, *GARDENS, *SMALL):

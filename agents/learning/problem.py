@@ -27,11 +27,12 @@ from npa_envs.envs.core.task import EnvTask
 from npa_envs.envs.core.vector import NPAVectorEnv, worlds_to_reset
 from npa_envs.envs.garden.task import GardenTask
 from npa_envs.envs.multi.task import SpeciesConfig, SpeciesTask
-from npa_envs.envs.multi.tasks import ENVIRONMENTS as SPECIES
+from npa_envs.envs.multi.tasks import ENVIRONMENTS as SPECIES_TASKS
+from npa_envs.envs.multi.tasks import task_settings
 from npa_envs.envs.multi.tasks import task_type as species_task_type
 from npa_envs.envs.multi.vector import MultiSpeciesVectorEnv
 from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.registration import ENVIRONMENTS
+from npa_envs.registration import ENVIRONMENTS, SPECIES_SIZES
 from npa_envs.tasks.checks import check_positive
 from npa_envs.world.actions import Physics
 
@@ -46,6 +47,9 @@ EVALUATION_SEEDS = range(FIRST_EVALUATION_SEED, FIRST_EVALUATION_SEED + 16)
 
 TIME_LIMIT, LEFT = "time limit", "left the world"
 """Why species are cut off, and why they end where they diverge."""
+
+SPECIES = (*SPECIES_TASKS, *(size.id for size in SPECIES_SIZES))
+"""Ids of species tasks."""
 
 RowRewards = Literal["particle", "marginal"]
 """Rewards of environments that pay each particle."""
@@ -127,7 +131,7 @@ class Problem:
     @property
     def is_species(self) -> bool:
         """Whether several species share a world."""
-        return self.env_id in SPECIES
+        return isinstance(self.env_id, str) and self.env_id in SPECIES
 
     @property
     def is_garden(self) -> bool:
@@ -153,16 +157,23 @@ class Problem:
     def task_type(self) -> type[EnvTask[Any]] | type[SpeciesTask]:
         """Class of the task."""
         if self.is_species:
-            return species_task_type(SPECIES[self.env_id])
+            return species_task_type(task_settings(self.env_id)[0])
         return self.env_type.task_type
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Keywords that belong to the id."""
+        if self.is_species:
+            settings = task_settings(self.env_id)[1]
+            settings.pop("max_cycles", None)
+            return settings
+        return dict(gymnasium.spec(self.env_id).kwargs)
 
     @cached_property
     def config(self) -> EnvConfig | SpeciesConfig:
         """The environment's configuration, on the CPU."""
         config_type = self.task_type.config_type
-        # What an id is registered with counts, as for `gym.make`.
-        known = {} if self.is_species else gymnasium.spec(self.env_id).kwargs
-        given = {**known, **self.keywords}
+        given = self.settings | dict(self.keywords)
         if self.is_species:
             given["max_cycles"] = self.episode_steps
         elif given.get("reward") == "sparse":
@@ -245,7 +256,11 @@ class Problem:
         place = str(check_device(device))
         if self.is_species:
             return ConcatenatedSpeciesEnv(
-                SPECIES[self.env_id], count, self.episode_steps, place, self.keywords
+                task_settings(self.env_id)[0],
+                count,
+                self.episode_steps,
+                place,
+                self.settings | dict(self.keywords),
             )
         given = dict(self.keywords)
         if row_rewards:

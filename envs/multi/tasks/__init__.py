@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from npa_envs.envs.multi.task import SpeciesTask
 from npa_envs.envs.multi.tasks.mixing import MixingTask, SegregationTask
 from npa_envs.envs.multi.tasks.pictures import CoMorphogenesisTask, InvasionTask, SymbiosisTask
 from npa_envs.errors import NPAError, shown, suggest
+from npa_envs.registration import SPECIES_SIZES
 
 TASKS: dict[str, type[SpeciesTask]] = {
     "mixing": MixingTask,
@@ -25,6 +28,18 @@ ENVIRONMENTS = {
     "npa/Symbiosis-v0": "symbiosis",
 }
 """Tasks by the ids that `pettingzoo.make` takes."""
+
+
+def task_settings(name: str) -> tuple[str, dict[str, Any]]:
+    """Return the task that an id means, and its keywords; a task's name means itself.
+
+    Args:
+        name: One of `TASKS`, of `ENVIRONMENTS`, or the id of a size.
+    """
+    for size in SPECIES_SIZES:
+        if name == size.id:
+            return size.task, dict(size.keywords)
+    return (ENVIRONMENTS.get(name, name) if isinstance(name, str) else name), {}
 
 
 def task_type(name: str) -> type[SpeciesTask]:
