@@ -15,6 +15,7 @@ from typing import Any, Literal, NamedTuple, get_args
 
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.errors import NPAError, suggest
+from npa_envs.processes import part_of
 
 
 class Sizes(NamedTuple):
@@ -163,14 +164,12 @@ class Plan:
             if (task, method) not in self.left_out
         ]
 
-    def part(self, number: int, count: int) -> list[Job]:
-        """Return the runs of one of `count` machines, numbered from 1.
+    def part(self, words: str | None) -> list[Job]:
+        """Return the runs of one of several machines, as `npa_envs.processes.part_of` says.
 
         All methods on a task from a seed are on one machine: some begin with what others learned.
         """
-        groups = list(dict.fromkeys((job.axis, job.seed, job.task) for job in self.jobs()))
-        mine = set(groups[number - 1 :: count])
-        return [job for job in self.jobs() if (job.axis, job.seed, job.task) in mine]
+        return part_of(self.jobs(), words, lambda job: (job.axis, job.seed, job.task))
 
     def teacher(self, job: Job) -> Job | None:
         """Return the run whose rules a run clones; None where it does not, or options name one."""

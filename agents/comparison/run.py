@@ -19,7 +19,7 @@ import sys
 import threading
 import time
 import traceback
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -36,7 +36,8 @@ from npa_envs.agents.learning import method_options, train
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Budget, Entry
 from npa_envs.errors import DivergedError
-from npa_envs.measure.record import number, read_record, time_limit, write_record
+from npa_envs.measure.record import number, read_record, write_record
+from npa_envs.processes import Child, Places, run_children
 from npa_envs.render import write_png
 
 Status = Literal["done", "diverged", "failed"]
@@ -302,9 +303,6 @@ PROGRAM = (sys.executable, "-m", "npa_envs.agents.comparison.run")
 """What a run's process is, before the folder of the run: it gets ready, begins when a line of its
 input names a device, and ends when its input does."""
 
-LOOK_SECONDS = 0.1
-"""Pause between two looks at the processes [s]."""
-
 MEASURED = ("done", "diverged")
 """Runs that a resumed comparison does not repeat."""
 
@@ -312,33 +310,17 @@ TOLD = 2000
 """Characters at most that are told of what a dead process said last."""
 
 
-@dataclass(frozen=True)
-class Places:
-    """Where processes run."""
-
-    devices: Sequence[str]
-    """Devices, of which each process gets one."""
-    jobs: int = 1
-    """Processes at once; they are dealt out over the devices."""
-    threads: int = 1
-    """CPU threads of each."""
-
-    def device(self, number: int) -> str:
-        """Return the device of the process of a number below `jobs`."""
-        return self.devices[number % len(self.devices)]
-
-    @property
-    def ahead(self) -> bool:
-        """Whether the next process gets ready during a run: not on CPUs, which it would slow."""
-        return not any(name.startswith("cpu") for name in self.devices)
-
-
 @dataclass
-class _Process:
+class _Process(Child):
     job: Job
     folder: Path
     process: subprocess.Popen[bytes]
     begin: float = 0.0
+
+    @property
+    def over(self) -> bool:
+        """Whether it has ended."""
+        return self.process.poll() is not None
 
     def go(self, device: str) -> None:
         """Let it begin on a device."""
@@ -398,12 +380,10 @@ def run_jobs(
     Raises:
         NPAError: The folder cannot be written to.
     """
-    waiting, ready = list(jobs), deque[_Process]()
-    running: dict[int, _Process] = {}
+    waiting = list(jobs)
 
-    def start() -> _Process | None:
-        """Start the next process, if there is one that has nothing to wait for."""
-        ahead = {*waiting, *(one.job for one in (*ready, *running.values()))}
+    def start(unfinished: Sequence[_Process]) -> _Process | None:
+        ahead = {*waiting, *(one.job for one in unfinished)}
         for job in waiting:
             if plan.teacher(job) not in ahead:
                 waiting.remove(job)
@@ -415,30 +395,13 @@ def run_jobs(
         target = folder / job.folder
         for left in target.parent.glob(f".{target.name}.*"):
             shutil.rmtree(left, ignore_errors=True)
-    time_is_up = time_limit(max_seconds)
-    try:
-        while waiting or ready or running:
-            if time_is_up():
-                waiting.clear()
-                while ready:
-                    ready.pop().end()
-            for number in range(places.jobs):
-                if number in running:
-                    continue
-                one = ready.popleft() if ready else start()
-                if one is not None:
-                    running[number] = one
-                    one.go(places.device(number))
-            while places.ahead and len(ready) < places.jobs and (one := start()) is not None:
-                ready.append(one)
-            for number, one in list(running.items()):
-                if one.process.poll() is not None:
-                    del running[number]
-                    written(_finish(plan, one, folder, command))
-            time.sleep(LOOK_SECONDS if running else 0.0)
-    finally:
-        for one in [*running.values(), *ready]:
-            one.end()
+    run_children(
+        start,
+        lambda one: written(_finish(plan, one, folder, command)),
+        places,
+        ahead=places.ahead,
+        max_seconds=max_seconds,
+    )
 
 
 def _start(plan: Plan, job: Job, folder: Path, places: Places, command: str) -> _Process:

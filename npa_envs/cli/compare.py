@@ -108,7 +108,8 @@ def main(arguments: Sequence[str]) -> int:
     options = parse_options(CompareOptions, "compare", arguments)
     from npa_envs.agents.comparison.npa_bench import write_rows
     from npa_envs.agents.comparison.report import write_pictures, write_table
-    from npa_envs.agents.comparison.run import Places, held_records, run_jobs
+    from npa_envs.agents.comparison.run import held_records, run_jobs
+    from npa_envs.processes import Places
 
     # Records are not to tell where on which machine they were written.
     words = ["OUT" if word == str(options.out) else word for word in arguments]
@@ -118,7 +119,7 @@ def main(arguments: Sequence[str]) -> int:
     # All are read first: a record of other settings is refused before any work is done.
     records = held_records(plan, folder)
     jobs = plan.jobs()
-    mine = plan.part(*_part(options.part))
+    mine = plan.part(options.part)
     missing = [job for job in mine if job not in records]
 
     def whole() -> list[RunRecord]:
@@ -219,16 +220,6 @@ def _suite_plan(options: CompareOptions) -> Plan:
         episodes=QUICK_EPISODES if quick else npa_bench.EPISODES,
         settings=_settings(options),
     )
-
-
-def _part(words: str | None) -> tuple[int, int]:
-    """Return which part of how many is asked for; 1 of 1 where nothing is said."""
-    if words is None:
-        return 1, 1
-    number, mark, count = words.partition("/")
-    if not (mark and number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
-        raise NPAError(f"--part must be K/N with K from 1 to N, got {words!r}: --part 2/8")
-    return int(number), int(count)
 
 
 def _budgets(options: CompareOptions) -> dict[Axis, float]:

@@ -29,7 +29,6 @@ from npa_envs.agents.comparison.report import (
 from npa_envs.agents.comparison.run import (
     PICTURE,
     SIZE,
-    Places,
     Point,
     RunRecord,
     final_picture,
@@ -41,6 +40,7 @@ from npa_envs.cli import main
 from npa_envs.cli.compare import CompareOptions, make_plan
 from npa_envs.cli.compare import _jobs as jobs_of
 from npa_envs.errors import NPAError
+from npa_envs.processes import Places
 from npa_envs.render import write_png
 
 FACTS = {"problem": {}, "budget": 1.0, "options": {}, "episodes": 2}
@@ -127,12 +127,15 @@ def test_every_method_runs_on_every_task_from_every_seed_in_every_budget():
 
 def test_parts_share_all_runs_and_leave_those_of_a_seed_and_task_together():
     made = plan(tasks={"a": {}, "b": {}}, methods=["gradient", "clone"], seeds=(0, 1, 2))
-    parts = [made.part(number, 4) for number in (1, 2, 3, 4)]
+    parts = [made.part(f"{number}/4") for number in (1, 2, 3, 4)]
     assert sorted(str(job) for part in parts for job in part) == sorted(map(str, made.jobs()))
     assert [len(part) for part in parts] == [4, 4, 2, 2]
     for part in parts:
         assert all(made.teacher(job) in part for job in part if job.method == "clone")
-    assert made.part(1, 1) == made.jobs()
+    assert made.part(None) == made.part("1/1") == made.jobs()
+    for words in ("0/2", "3/2", "2", "a/b", "1/-2"):
+        with pytest.raises(NPAError, match="must be K/N"):
+            made.part(words)
 
 
 def test_a_clone_learns_from_the_gradient_of_its_seed_unless_options_name_a_teacher():
