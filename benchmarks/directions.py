@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import shutil
 import statistics
 import time
 from collections.abc import Mapping, Sequence
@@ -28,7 +29,7 @@ from torch import Tensor
 
 import npa_envs
 from npa_envs.measure.record import machine, write_record
-from npa_envs.rule.files import save_rule
+from npa_envs.rule.files import rule_metadata
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, turned, turns
 from npa_envs.training import preset
 from npa_envs.world.randomness import WorldRandom
@@ -59,6 +60,9 @@ def train(arguments: argparse.Namespace) -> None:
     for target in arguments.targets:
         for kind in arguments.kinds:
             fields = {**SECOND, **SIZES[arguments.size], **KINDS[kind], "target": target}
+            if arguments.size != "tiny":
+                # Few numbers of steps: few graphs.
+                fields["steps"] = (60, 66)
             if arguments.iterations:
                 fields["iterations"] = arguments.iterations
             fields |= {"repeats": 1, "tensorboard": False, "picture_interval": 0}
@@ -68,12 +72,9 @@ def train(arguments: argparse.Namespace) -> None:
             names.append(f"{target}-{kind}")
     trainers, seconds = train_side_by_side(configs, arguments.longest)
     for name, trainer in zip(names, trainers, strict=True):
-        rule = trainer._cycle.average.rule(trainer.rule)
-        save_rule(rule, arguments.out / f"{name}.safetensors")
-        told = {"iterations": trainer.iteration, "seconds_together": round(seconds, 1)}
-        told["config"] = json.loads((trainer.config.out / "config.json").read_text("utf-8"))
-        told["config"] = {k: v for k, v in told["config"].items() if k not in ("out", "device")}
-        (arguments.out / f"{name}.json").write_text(json.dumps(told, indent=2) + "\n", "utf-8")
+        trainer.save()
+        shutil.copy(trainer.folder.rule, arguments.out / f"{name}.safetensors")
+    print(f"{len(names)} runs, {trainers[0].iteration} iterations, {seconds:.1f} s together")
 
 
 def tasks_of(config: Mapping[str, Any], device: str) -> tuple[Morphogenesis2D, Morphogenesis2D]:
@@ -130,13 +131,14 @@ def measure(arguments: argparse.Namespace) -> None:
     """Measure all rules that lie in the folder."""
     found = {}
     for path in sorted(arguments.out.glob("*.safetensors")):
-        told = json.loads(path.with_suffix(".json").read_text("utf-8"))
+        metadata = rule_metadata(path)
         rule = npa_envs.load_rule(path, device=arguments.device)
-        found[path.stem] = {
-            "iterations": told["iterations"],
-            **measured(rule, told["config"], arguments.device),
+        config = json.loads(metadata["config"])
+        row = {
+            "iterations": int(metadata["iteration"]),
+            **measured(rule, config, arguments.device),
         }
-        row = found[path.stem]
+        found[path.stem] = row
         means = {step: round(statistics.mean(row["best_angle"][step]), 4) for step in STEPS}
         print(path.stem, means, "turned", round(ratio(row), 3), flush=True)
         write_record(

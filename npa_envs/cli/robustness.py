@@ -17,6 +17,7 @@ from npa_envs.cli.output import (
     check_numbers,
     chosen_names,
     parse_options,
+    rule_of,
     torch_threads,
     writable_folder,
 )
@@ -41,7 +42,8 @@ class RobustnessOptions(MeasureOptions):
     """
 
     rules: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RULES")] = ()
-    """Shipped rules (`npa-envs list`); default: all, or one of each task when quick."""
+    """Shipped rules (`npa-envs list`), files of rules, or folders of training runs; default: all
+    shipped ones, or one of each task when quick."""
 
     seed_count: int | None = None
     """Seeds for each figure; default: 8, or 2 when quick."""
@@ -72,13 +74,18 @@ def main(arguments: Sequence[str]) -> int:
     from npa_envs.measure.accuracy.habitats import rule_names, task_name
     from npa_envs.measure.record import measured_facts, time_limit
     from npa_envs.measure.robustness.study import MOST_PARTICLES, RuleRecord, measure_rule, tables
+    from npa_envs.web.rule_world import name_of
 
     check_numbers(options, seed_count=1, first_seed=0, most_particles=1, threads=1)
     enough = time_limit(options.max_seconds)
-    names = chosen_names("rule", options.rules, rule_names())
+    files = {name_of(rule_of(name)): rule_of(name) for name in options.rules if _is_file(name)}
+    shipped = [name for name in options.rules if not _is_file(name)]
+    names = chosen_names("rule", shipped, rule_names()) if shipped or not files else []
+    names += [name for name in files if name not in names]
     if options.quick and not options.rules:
         # One of each task.
         names = list({task_name(name): name for name in reversed(names)}.values())[::-1]
+    sources = {name: files.get(name, name) for name in names}
     device = check_device(options.device)
     most = options.most_particles or MOST_PARTICLES[device.type]
     seeds = _seeds(options)
@@ -101,7 +108,7 @@ def main(arguments: Sequence[str]) -> int:
             if (record is None or not record.done) and not enough():
                 record = measure_rule(
                     name,
-                    _ground(options, name, device),
+                    _ground(options, sources[name], device),
                     most,
                     facts=facts,
                     command=shlex.join(["npa-envs", "robustness", *arguments]),
@@ -122,6 +129,10 @@ def main(arguments: Sequence[str]) -> int:
         lines.append(f"{left} rules are left: call again with the same options")
     print("\n".join(lines))
     return 0
+
+
+def _is_file(name: str) -> bool:
+    return name.endswith(".safetensors") or Path(name).is_dir()
 
 
 def _seeds(options: RobustnessOptions) -> range:

@@ -96,11 +96,11 @@ class Morphogenesis2DConfig(GrowthConfig):
         return replace(self, particle_count=particle_count, target_point_count=particle_count)
 
 
-FINER = (-0.6, -0.2, 0.2, 0.6)
-"""Angles near the best one that are tried next, in steps of those tried before."""
+FINER_COUNT = 4
+"""Angles around the best one that are tried next, at even distances."""
 
 FINER_STEP = 0.4
-"""The step between them, likewise."""
+"""Their distance, in steps of the angles tried before."""
 
 FINER_TIMES = 4
 """How often that is done."""
@@ -275,9 +275,10 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
             best = self._closest(x, s, turns(angle, hand))
             angle, hand = angle.gather(1, best), hand.gather(1, best)
             if number < FINER_TIMES:
-                near = torch.tensor(FINER, device=x.device, dtype=x.dtype) * step
-                angle, hand = angle + near, hand.expand(-1, len(FINER))
                 step *= FINER_STEP
+                near = torch.arange(FINER_COUNT, device=x.device, dtype=x.dtype)
+                angle = angle + (near - 0.5 * (FINER_COUNT - 1)) * step
+                hand = hand.expand(-1, FINER_COUNT)
         return turns(angle, hand)[:, 0]
 
     def _closest(self, x: Tensor, s: Tensor, tried: Tensor) -> Tensor:

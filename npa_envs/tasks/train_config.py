@@ -18,6 +18,7 @@ from npa_envs.tasks.checks import (
     check_non_negative,
     check_positive,
     check_seed,
+    is_real,
     is_whole,
 )
 from npa_envs.world.rollout import Memory
@@ -32,6 +33,9 @@ RISE = 0.01
 
 LOWEST = 0.01
 """What is left of the learning rate at the end of the schedule "cosine"."""
+
+VARIED = ("vary_particles", "vary_eps", "vary_update_prob", "vary_dt")
+"""Fields that say what of worlds is varied."""
 
 AGEING_BLOCK = 64
 """Steps that worlds are aged by at a time: on CUDA, what one graph replays."""
@@ -51,6 +55,22 @@ class TrainConfig(Generic[TaskConfigT]):
     initial_rule: str = ""
     """Start from this rule, a name or a file, instead of random weights; '': from these. The preset
     `fast` of morphogenesis2d starts from `gecko-512`, which has grown a gecko in its worlds."""
+
+    vary_particles: tuple[float, float] = (1.0, 1.0)
+    """Range of factors on the number of particles. Half of the batches are as the task says, the
+    others of `variants` kinds of worlds, whose factors are spread evenly in the logarithm."""
+
+    vary_eps: tuple[float, float] = (1.0, 1.0)
+    """Range of factors on ε, drawn anew for each fresh world among those, in open space."""
+
+    vary_update_prob: tuple[float, float] = (1.0, 1.0)
+    """Range of factors on the probability of updates; rollouts have as many updates in all."""
+
+    vary_dt: tuple[float, float] = (1.0, 1.0)
+    """Range of factors on the time step; rollouts take as much time in all."""
+
+    variants: int = 7
+    """Kinds of worlds, each with a pool of its own, where something is varied."""
 
     moment_inverse: MomentInverse = "threshold"
     """How the rule's state gradients are corrected: "threshold", the paper's, or "smooth"."""
@@ -186,6 +206,7 @@ class TrainConfig(Generic[TaskConfigT]):
                 f"set pool_size={self.world_count} or more"
             )
         self._check_lifetimes()
+        self._check_variants()
         self._check_choice("schedule", get_args(Schedule))
         self._check_choice("dtype", ("float32", "float64"))
         self._check_choice("memory", get_args(Memory))
@@ -241,12 +262,32 @@ class TrainConfig(Generic[TaskConfigT]):
                 "set lifetimes, for example to (256, 32768)"
             )
 
+    def _check_variants(self) -> None:
+        check_positive(self, int, "variants")
+        for name in VARIED:
+            factors = getattr(self, name)
+            if (
+                not isinstance(factors, tuple)
+                or len(factors) != 2
+                or not all(is_real(factor) for factor in factors)
+                or not 0.0 < factors[0] <= factors[1]
+            ):
+                raise NPAError(
+                    f"{name} must be two factors (lo, hi) with 0 < lo <= hi, got "
+                    f"{shown(factors)}: for example {name}=(0.5, 2.0)"
+                )
+
     def _check_choice(self, name: str, choices: tuple[str, ...]) -> None:
         value = getattr(self, name)
         if not isinstance(value, str) or value not in choices:
             raise NPAError(
                 f"{name} must be one of {', '.join(choices)}, got {shown(getattr(self, name))}"
             )
+
+    @property
+    def varied(self) -> bool:
+        """Whether worlds of other kinds than the task's are trained on."""
+        return any(getattr(self, name) != (1.0, 1.0) for name in VARIED)
 
     @property
     def ages(self) -> bool:

@@ -45,6 +45,8 @@ class TrainingCycle:
         rollout: The rollout to train through; None is the engine's.
         ranks: The processes that share the run; None: this one alone.
         by_world: Each world draws by itself, as several processes need it.
+        beside: A cycle of other worlds that train the same rule: optimiser, averaged weights and
+            gradients are shared with it.
     """
 
     def __init__(
@@ -58,6 +60,7 @@ class TrainingCycle:
         *,
         ranks: Ranks | None = None,
         by_world: bool = False,
+        beside: TrainingCycle | None = None,
     ) -> None:
         self.task = task_for_rule(task, rule)
         """The task, as it is for worlds of this rule."""
@@ -97,13 +100,26 @@ class TrainingCycle:
         goals = None if goal is None else goal[:count]
         graphed = device.type == "cuda" and config.cuda_graph
         iteration = GraphedIteration if graphed else EagerIteration
-        self.batch = iteration(
-            self.task, rule, config, *batch, self.random.masks, self._rollout, goal=goals
+        self.batch: EagerIteration = iteration(
+            self.task,
+            rule,
+            config,
+            batch[0],
+            batch[1],
+            self.random.masks,
+            self._rollout,
+            goal=goals,
+            gradients=None if beside is None else beside.batch.gradients,
         )
         """Worlds before and after the last rollout, the loss and its gradients."""
-        self.optimiser = RuleOptimiser(self.batch.parameters, config)
+        parameters = self.batch.parameters
+        self.optimiser: RuleOptimiser = (
+            RuleOptimiser(parameters, config) if beside is None else beside.optimiser
+        )
         """Changes the rule."""
-        self.average = WeightAverage(self.batch.parameters, config.average)
+        self.average: WeightAverage = (
+            WeightAverage(parameters, config.average) if beside is None else beside.average
+        )
         """The running mean of the weights, where the configuration asks for one."""
         self.meter = LossMeter(self.batch)
         """What happened since the last line of the log."""
@@ -280,6 +296,15 @@ class TrainingCycle:
     def _seeds(self, world_count: int, random: Randomness) -> tuple[Tensor, Tensor, Tensor | None]:
         dtype = self._config.torch_dtype
         x, s, goal = seed_worlds(self.task, world_count, generator=random, device=random.device)
+        lo, hi = map(math.log, self._config.vary_eps)
+        if lo < hi:
+            # Scaling positions and ε alike is a symmetry: a larger ε is a smaller disk.
+            share = (
+                random.uniform(1)[:, 0]
+                if isinstance(random, WorldRandom)
+                else torch.rand(world_count, generator=random, device=random.device)
+            )
+            x = x * torch.exp(-lo - (hi - lo) * share)[:, None, None]
         return x.to(dtype), s.to(dtype), goal
 
     def _pooled(self) -> list[tuple[str, Tensor | None]]:
@@ -442,6 +467,7 @@ class EagerIteration:
         generator: Randomness of the update masks, on the worlds' device.
         rollout: The rollout to run; another one only in tests.
         goal: The worlds' goals, int64, shape [B], where the task has such.
+        gradients: Where the gradients are written, one tensor a parameter; None: to new ones.
     """
 
     def __init__(
@@ -455,6 +481,7 @@ class EagerIteration:
         rollout: Rollout | None = None,
         *,
         goal: Tensor | None = None,
+        gradients: list[Tensor] | None = None,
     ) -> None:
         self.goal = None if goal is None else goal.clone()
         """Goals of the worlds, int64, shape [B], or None; filled like `x0`."""
@@ -471,7 +498,7 @@ class EagerIteration:
         """The loss and then its named parts, shape [K]."""
         self.parameters = [p for p in rule.parameters() if p.requires_grad]
         """What the gradients are for."""
-        self.gradients = [torch.zeros_like(p) for p in self.parameters]
+        self.gradients = gradients or [torch.zeros_like(p) for p in self.parameters]
         """Their `.grad`."""
         for parameter, buffer in zip(self.parameters, self.gradients, strict=True):
             parameter.grad = buffer
@@ -753,6 +780,11 @@ class LossMeter:
         self._numbers[:-2].zero_()
         self._count = 0
         self._step_sum = 0
+
+    @property
+    def sent_count(self) -> int:
+        """Iterations of the interval that `send` sent last."""
+        return self._sent_counts[0]
 
     def receive(self) -> Interval:
         """Return what `send` sent last; waits for that, and not for what was launched since."""

@@ -44,6 +44,7 @@ from npa_envs.training.run_folder import (
     save_checkpoint,
     unusable_checkpoint,
 )
+from npa_envs.training.variation import VariedCycle
 
 FIRST_PICTURE = 10
 """Iteration after which the first picture is written, where the interval is longer."""
@@ -136,8 +137,17 @@ class Trainer:
         by_world = ranks.together or (
             content is not None and content["random_states"].keys() == {"schedule"}
         )
-        self._cycle = TrainingCycle(
-            task, self.rule, config, device, schedule, rollout, ranks=ranks, by_world=by_world
+        if config.varied and (ranks.together or rollout is not None):
+            raise NPAError(
+                "worlds are varied (vary_particles and others) in runs of one rule by one process "
+                "only: leave these fields out, or train on one device"
+            )
+        self._cycle = (
+            VariedCycle(task, self.rule, config, device, schedule, task_name=task_name)
+            if config.varied
+            else TrainingCycle(
+                task, self.rule, config, device, schedule, rollout, ranks=ranks, by_world=by_world
+            )
         )
         self.pool = self._cycle.pool
         if ranks.first:

@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from npa_envs.errors import NPAError
 from npa_envs.measure.accuracy.checks import Check, Finding, Session
 from npa_envs.rule.files import load_rule, rule_metadata, shipped_rules
 from npa_envs.rule.rule import NPARule
@@ -83,8 +85,18 @@ def rule_names() -> list[str]:
 
 
 def task_name(rule: str) -> str:
-    """Return the name of the task that a shipped rule was trained on."""
-    return rule_metadata(shipped_rules()[rule])["task"]
+    """Return the name of the task that a shipped rule, or one of a file of ours, was trained on.
+
+    Raises:
+        NPAError: The file is none of ours, or says nothing of a task.
+    """
+    metadata = rule_metadata(shipped_rules().get(rule, Path(rule)))
+    if metadata.get("task") not in HORIZONS:
+        raise NPAError(
+            f"the rule's file must say on which task it was trained, {rule!r} says "
+            f"{metadata.get('task')!r}: give a rule that npa-envs train has saved"
+        )
+    return metadata["task"]
 
 
 def habitat(
