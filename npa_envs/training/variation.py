@@ -93,7 +93,7 @@ class VariedCycle(TrainingCycle):
         self._others = []
         for number, variant in enumerate(variants_of(config)):
             count = max(2, round(told.particle_count * variant.particles))
-            prob = told.update_prob * variant.update_prob
+            prob = min(1.0, told.update_prob * variant.update_prob)
             own = replace(told.with_particle_count(count), update_prob=prob)
             middle = sum(config.steps) / 2 / (variant.update_prob * variant.dt)
             steps = max(1, round(middle))
