@@ -11,6 +11,7 @@ from npa_envs.errors import NPAError, suggest
 COMMANDS = {
     "demo": "grow, hurt and heal the shipped rule, and train a small one; about a minute on a CPU",
     "train": "train a rule on a task",
+    "sweep": "train with every combination of some options, over devices and machines",
     "rollout": "grow a rule from its seed, with damage on the way; writes GIF, MP4 and a filmstrip",
     "view": "watch and touch a rule, a training run or an environment in the browser",
     "export-web": "rules as one HTML file that runs in any browser, without a server",
@@ -83,6 +84,8 @@ def _dispatch(words: list[str]) -> int:
             from npa_envs.cli.demo import main as command
         case "train":
             from npa_envs.cli.train import main as command
+        case "sweep":
+            from npa_envs.cli.sweep import main as command
         case "rollout":
             from npa_envs.cli.rollout import main as command
         case "view":

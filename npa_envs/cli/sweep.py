@@ -1,0 +1,252 @@
+"""`npa-envs sweep`: many training runs, one for each combination of options, over devices."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import os
+import re
+import shlex
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from npa_envs.cli.output import OutFolder, StepBar, check_numbers, parse_options, writable_folder
+from npa_envs.errors import NPAError, suggest
+from npa_envs.files import read_json, write_text
+from npa_envs.measure.record import write_record
+from npa_envs.measure.tables import NONE, markdown_table
+from npa_envs.processes import Child, Places, part_of, run_children
+
+RUN_FAILED = 1
+
+RECORD, OUTPUT, TABLE = "run.json", "output.txt", "sweep.md"
+"""Files: what became of a run, what it printed, and of all of them together."""
+
+OWN = ("out", "device", "resume", "overwrite", "max-seconds", "gpus")
+"""Options of `npa-envs train` that a sweep gives by itself, or that would break it."""
+
+PROGRAM = (sys.executable, "-m", "npa_envs", "train")
+"""What a run's process is, before the task."""
+
+TOLD = 300
+"""Characters at most of what a failed run said last."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepOptions:
+    """Train with every combination of some options, each run a process of its own.
+
+    The words after `--` are those of `npa-envs train` for all runs. A sweep that was stopped goes
+    on where it was: runs that are over are left as they are, begun ones resume from their
+    checkpoints, and failed ones are tried again. Ends with code 1 where a run failed.
+    """
+
+    over: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=A,B,C")]
+    """Options of `npa-envs train` with the values to take: target=heart,ring seed=0,1,2."""
+
+    out: OutFolder = Path("runs/sweep")
+    """Folder for a run's folder each, named by its values, and sweep.md, the table of all."""
+
+    devices: tuple[str, ...] = ("cpu",)
+    """Devices that runs are dealt out to, for example cuda:0 cuda:1."""
+
+    jobs: int | None = None
+    """Runs at once; default: one for each device."""
+
+    threads: int = 1
+    """CPU threads of each run."""
+
+    part: Annotated[str | None, tyro.conf.arg(metavar="K/N")] = None
+    """Run the K-th of N parts alone: a machine, or a task of a scheduler's array, takes one each,
+    all with the same --out on a shared disk."""
+
+    max_seconds: float = math.inf
+    """No run begins after so long [s]; the next call goes on."""
+
+    progress: bool = True
+    """Show a progress bar."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One combination."""
+
+    values: Mapping[str, str]
+    """What is given to each option."""
+
+    words: Sequence[str]
+    """All words after `npa-envs train`, but for the folder and the device."""
+
+    @property
+    def name(self) -> str:
+        """Name of its folder."""
+        parts = (f"{name}={value}" for name, value in self.values.items())
+        return re.sub(r"[^\w=,.+-]", "_", ",".join(parts))
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """What became of a run."""
+
+    words: Sequence[str]
+    code: int
+    """Exit code of its process."""
+    seconds: float
+    """Wall time of the process that ended it [s]."""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run what is missing, print and write; return 1 where a run failed."""
+    words = list(arguments)
+    place = words.index("--") if "--" in words else len(words)
+    options = parse_options(SweepOptions, "sweep", words[:place])
+    check_numbers(options, jobs=1, threads=1)
+    folder = writable_folder(options.out)
+    runs = combinations(options.over, words[place + 1 :])
+    mine = part_of(runs, options.part, lambda run: run.name)
+    waiting = [run for run in mine if not is_over(folder, run)]
+    places = Places(options.devices, options.jobs or len(options.devices), options.threads)
+    with StepBar(len(waiting), show=options.progress, unit="run") as bar:
+
+        def finished(child: _Training) -> None:
+            child.write_record()
+            write_text(folder / TABLE, table(folder, runs))
+            bar.advance(1)
+
+        run_children(
+            lambda _: _Training(folder, waiting.pop(0), places.threads) if waiting else None,
+            finished,
+            places,
+            ahead=False,
+            max_seconds=options.max_seconds,
+        )
+    text = table(folder, runs)
+    write_text(folder / TABLE, text)
+    print(text, end="")
+    left = [run.name for run in mine if not is_over(folder, run)]
+    failed = [name for name in left if (folder / name / RECORD).exists()]
+    for name in failed:
+        said = (folder / name / OUTPUT).read_text("utf-8", errors="replace").strip()[-TOLD:]
+        print(f"{name} failed: {' '.join(said.split())}")
+    if len(left) > len(failed):
+        print(f"{len(left) - len(failed)} runs are left: call again with the same words")
+    return RUN_FAILED if failed else 0
+
+
+def combinations(over: Sequence[str], common: Sequence[str]) -> list[Run]:
+    """Return a run for each combination of values.
+
+    Args:
+        over: "NAME=A,B,C" each.
+        common: The words of all runs: a task, and options.
+
+    Raises:
+        NPAError: A word is no such option, one is given twice, or there is no task.
+    """
+    from npa_envs.training import TASKS
+
+    if not common or common[0] not in TASKS:
+        told = suggest(common[0], TASKS) if common else ", ".join(TASKS)
+        raise NPAError(f"the words after -- must begin with a task of npa-envs train: {told}")
+    values: dict[str, list[str]] = {}
+    for word in over:
+        name, mark, listed = word.partition("=")
+        name = name.removeprefix("--").replace("_", "-")
+        if not (mark and name and all(listed.split(","))):
+            raise NPAError(f"over must be NAME=A,B,C, got {word!r}: seed=0,1,2")
+        if name in values or f"--{name}" in common:
+            raise NPAError(f"--{name} must be given once, in --over or after --, got it twice")
+        values[name] = listed.split(",")
+    for name in OWN:
+        if name in values or f"--{name}" in common:
+            raise NPAError(f"--{name} must not be given to the runs: a sweep does so by itself")
+    chosen = [dict(zip(values, one, strict=True)) for one in itertools.product(*values.values())]
+    return [
+        Run(one, [*common, *(word for name, value in one.items() for word in (f"--{name}", value))])
+        for one in chosen
+    ]
+
+
+def is_over(folder: Path, run: Run) -> bool:
+    """Return whether a run has ended well.
+
+    Raises:
+        NPAError: Its folder holds one of other words.
+    """
+    path = folder / run.name / RECORD
+    if not path.exists():
+        return False
+    held: Any = read_json(path)
+    if list(held["words"]) != list(run.words):
+        raise NPAError(
+            f"{str(path)!r} holds a run of other words, {shlex.join(held['words'])}: choose "
+            "another folder with --out"
+        )
+    return bool(held["code"] == 0)
+
+
+class _Training(Child):
+    """A process that trains, or goes on training, in its folder."""
+
+    def __init__(self, folder: Path, run: Run, threads: int) -> None:
+        self._folder, self._run, self._threads = folder / run.name, run, threads
+        self._process: subprocess.Popen[bytes] | None = None
+        self._begin = 0.0
+
+    def go(self, device: str) -> None:
+        """Start it on a device."""
+        self._begin = time.perf_counter()
+        self._folder.mkdir(parents=True, exist_ok=True)
+        given = ("--out", str(self._folder), "--device", device, "--resume", "auto")
+        with (self._folder / OUTPUT).open("wb") as output:
+            self._process = subprocess.Popen(
+                [*PROGRAM, *self._run.words, *given, "--no-progress"],
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=output,
+                env=os.environ | {"OMP_NUM_THREADS": str(self._threads)},
+            )
+
+    @property
+    def over(self) -> bool:
+        """Whether it has ended."""
+        return self._process is not None and self._process.poll() is not None
+
+    def end(self) -> None:
+        """Let it write its checkpoint and end."""
+        if self._process is not None:
+            self._process.terminate()
+            self._process.wait()
+
+    def write_record(self) -> None:
+        """Write what became of it."""
+        assert self._process is not None, "it is over"
+        seconds = time.perf_counter() - self._begin
+        code = int(self._process.returncode)
+        write_record(self._folder / RECORD, asdict(RunRecord(self._run.words, code, seconds)))
+
+
+def table(folder: Path, runs: Sequence[Run]) -> str:
+    """Return the runs with what their reports measured, Markdown."""
+    from npa_envs.measure.quality import score_line
+
+    lines = []
+    for run in runs:
+        path = folder / run.name / RECORD
+        state, seconds, scores = "not run", NONE, NONE
+        if path.exists():
+            held: Any = read_json(path)
+            state = "done" if held["code"] == 0 else f"failed with code {held['code']}"
+            seconds = f"{held['seconds']:.0f}"
+            reports = sorted((folder / run.name / "report").glob("rule*.json"))
+            scores = "; ".join(score_line(read_json(report)) for report in reports) or NONE
+        lines.append([*run.values.values(), state, seconds, scores])
+    names = list(runs[0].values) if runs else []
+    return markdown_table([*names, "run", "seconds", "measured"], lines) + "\n"
