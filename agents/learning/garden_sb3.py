@@ -137,8 +137,7 @@ def _learned(
         gamma=options.gamma,
         learning_rate=options.learning_rate,
         seed=seed,
-        # Worlds may be on a GPU; networks are so small that a core is as fast.
-        device="cpu",
+        device=device,
         **told,
     )
     # Stable-Baselines3 would begin with worlds seed, seed + 1, and so on.

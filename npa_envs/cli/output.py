@@ -53,8 +53,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     ),
     "stress": ("stress --quick", "stress --only geometry --out results"),
     "sweep": (
-        "sweep --over target=heart,ring seed=0,1,2 --devices cuda:0 cuda:1 "
-        "-- morphogenesis2d --preset fast",
+        "sweep --over target=heart,ring seed=0,1,2 --devices cuda:0 cuda:1 -- morphogenesis2d",
     ),
     "view": ("view gecko", "view runs/heart", "view npa/Texture-v0 --policy dots"),
     "warmup": ("warmup", "warmup --device cuda --space-dims 2 3"),

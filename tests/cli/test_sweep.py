@@ -53,7 +53,7 @@ def test_every_combination_is_a_run_with_its_own_words():
         (["seed=0"], ["texture", "--seed", "1"], "must be given once"),
         (["out=a,b"], ["texture"], "by itself"),
         (["seed=0"], ["texture", "--device", "cuda"], "by itself"),
-        (["seed=0"], ["textur"], "did you mean 'texture'"),
+        (["seed=0"], ["texture2d"], "did you mean 'texture'"),
         (["seed=0"], [], "must begin with a task"),
     ],
 )
