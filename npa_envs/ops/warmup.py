@@ -9,6 +9,7 @@ import torch
 from npa_envs.ops.backend import SHARED_WORLD
 from npa_envs.ops.draws import bernoulli_draw, integer_draw, normal_draw, uniform_draw
 from npa_envs.ops.episodes import EpisodeRules, PreparedJudgement
+from npa_envs.ops.equivariance import VectorForm, read_rows, steer_rows
 from npa_envs.ops.mean import world_mean
 from npa_envs.ops.network import arrange_weights, run_network
 from npa_envs.ops.passes import Terms
@@ -50,6 +51,7 @@ def warmup(
             _warm_rows(x, s)
             _warm_static(x, s)
             _warm_network(x, s)
+            _warm_invariants(x, s)
             _warm_update(x, s)
             _warm_actions(x, s)
             _warm_observation(x, s)
@@ -139,6 +141,15 @@ def _warm_products(x: torch.Tensor, width: int, out: int) -> None:
                 updates = run_network(rows, weights, update.shape, arranged)
     if arranged is not None:
         _pull_back(updates)
+
+
+def _warm_invariants(x: torch.Tensor, s: torch.Tensor) -> None:
+    """What equivariant rules make of vectors."""
+    form = VectorForm(x.shape[2], 2 * s.shape[2], s.shape[2] + 1, 2, chiral=False)
+    rows = x.new_zeros(1, form.perception_dim + 1).requires_grad_()
+    mixing = x.new_zeros(form.perceived, form.mixed)
+    mixed, inputs = read_rows(rows, mixing, form, form.input_dim + 1)
+    _pull_back(steer_rows(inputs, mixed, mixing[0], form.input_dim))
 
 
 def _warm_pictures(x: torch.Tensor) -> None:

@@ -24,8 +24,8 @@ def picture_of_gaussians(x, s):
     return render_gaussians(x, scales, quaternions, opacities, s[..., :3], cameras).image
 
 
-def states_of_rollout(x, s, memory="store", static=False):
-    rule = lively_rule(x.device, x.dtype, x.shape[2], s.shape[2], static=static)
+def states_of_rollout(x, s, memory="store", **options):
+    rule = lively_rule(x.device, x.dtype, x.shape[2], s.shape[2], **options)
     generator = torch.Generator(x.device).manual_seed(0)
     return npa_envs.rollout(rule, x, s, 3, generator=generator, memory=memory)[1]
 
@@ -37,6 +37,7 @@ OPERATORS = {
     "a rollout": states_of_rollout,
     "a rollout that recomputes": lambda x, s: states_of_rollout(x, s, memory="minimal"),
     "a static rollout": lambda x, s: states_of_rollout(x, s, static=True),
+    "an equivariant rollout": lambda x, s: states_of_rollout(x, s, equivariant=True),
     "a picture": lambda x, s: splat(x[..., :2], s[..., :3], resolution=16, pixel_size=0.1),
     "a picture of Gaussians": picture_of_gaussians,
 }

@@ -1,0 +1,109 @@
+"""Draw what rules do that go beyond the paper, `docs/images/beyond_*.png`.
+
+    python docs/draw_beyond.py directions OUT    # OUT of benchmarks/directions.py train
+    python docs/draw_beyond.py sizes TRAINED VARIED    # files of rules
+
+It takes a minute on a CPU.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+import npa_envs
+from npa_envs.render import to_uint8, write_filmstrip
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, turned, turns
+from npa_envs.training.trained_tasks import task_of_rule
+
+IMAGES = Path(__file__).resolve().parent / "images"
+SEEDS = (1_000_000, 1_000_001, 1_000_002)
+CPU = torch.device("cpu")
+GROWN, AFTER = 512, 256
+COUNTS, RADII = (0.125, 0.25, 1.0, 4.0, 8.0), (0.5, 0.7, 1.0, 1.4, 2.0)
+
+Shots = list[tuple[str, NDArray[np.uint8]]]
+
+
+@torch.no_grad()
+def run(
+    rule: npa_envs.NPARule, task: Morphogenesis2D, x: Tensor, s: Tensor, steps: int, *, seed: int
+) -> tuple[Tensor, Tensor]:
+    """Return worlds of a task some steps later."""
+    generator = torch.Generator().manual_seed(seed)
+    return npa_envs.rollout(
+        rule, x, s, steps, eps=task.eps, update_prob=task.update_prob, generator=generator
+    )
+
+
+def task_of(
+    path: str, rule: npa_envs.NPARule, particle_count: int | None = None
+) -> Morphogenesis2D:
+    """Return the task that a rule was trained on."""
+    task = task_of_rule(path, rule, CPU, particle_count=particle_count).task
+    assert isinstance(task, Morphogenesis2D), "these rules grow pictures"
+    return task
+
+
+def as_it_lies(task: Morphogenesis2D, x: Tensor, s: Tensor) -> NDArray[np.uint8]:
+    """Return a picture of a world that is neither moved nor turned."""
+    return to_uint8(task.picture(x, s, centred=False)[0])
+
+
+def directions(folder: Path) -> Shots:
+    """Return grown worlds, and one turned by 90 degrees, of a rule of each kind."""
+    shots: Shots = []
+    for kind in ("plain", "chiral"):
+        path = str(folder / f"gecko-{kind}.safetensors")
+        rule = npa_envs.load_rule(path)
+        task = task_of(path, rule)
+        for seed in SEEDS:
+            generator = torch.Generator().manual_seed(seed)
+            x, s = run(rule, task, *task.seed(1, generator=generator), GROWN, seed=seed)
+            shots.append((f"{kind}, step {GROWN}", as_it_lies(task, x, s)))
+        quarter = turns(torch.tensor([0.5 * math.pi]), torch.ones(1))
+        x = turned(x, quarter)
+        shots.append(("turned", as_it_lies(task, x, s)))
+        x, s = run(rule, task, x, s, AFTER, seed=SEEDS[0])
+        shots.append((f"{AFTER} steps later", as_it_lies(task, x, s)))
+    return shots
+
+
+def sizes(paths: list[str]) -> Shots:
+    """Return worlds of other numbers of particles and of other radii, of two rules."""
+    shots: Shots = []
+    for path in paths:
+        rule = npa_envs.load_rule(path)
+        trained = task_of(path, rule)
+        for share in COUNTS:
+            count = round(share * trained.config.particle_count)
+            task = task_of(path, rule, count)
+            generator = torch.Generator().manual_seed(SEEDS[0])
+            x, s = run(rule, task, *task.seed(1, generator=generator), GROWN, seed=SEEDS[0])
+            shots.append((f"N = {count}", as_it_lies(task, x, s)))
+        for share in RADII:
+            # A larger radius is a smaller disk: scaling both is a symmetry.
+            generator = torch.Generator().manual_seed(SEEDS[0])
+            x, s = trained.seed(1, generator=generator)
+            x, s = run(rule, trained, x / share, s, GROWN, seed=SEEDS[0])
+            shots.append((f"ε = {share:g} ε0", as_it_lies(trained, x, s)))
+    return shots
+
+
+def main() -> None:
+    """Draw what the command line asks for."""
+    what, *rest = sys.argv[1:]
+    captions, frames = zip(
+        *(directions(Path(rest[0])) if what == "directions" else sizes(rest)), strict=True
+    )
+    write_filmstrip(IMAGES / f"beyond_{what}.png", frames, captions, columns=5)
+
+
+if __name__ == "__main__":
+    main()
