@@ -62,7 +62,7 @@ def train(arguments: argparse.Namespace) -> None:
             fields = {**SECOND, **SIZES[arguments.size], **KINDS[kind], "target": target}
             if arguments.size != "tiny":
                 # Few numbers of steps: few graphs.
-                fields["steps"] = (60, 66)
+                fields["steps"] = (62, 64)
             if arguments.iterations:
                 fields["iterations"] = arguments.iterations
             fields |= {"repeats": 1, "tensorboard": False, "picture_interval": 0}
