@@ -6,7 +6,8 @@
 One process learns with each seed. As it learns, its policy without exploration is paid for the
 episodes of `npa_envs.agents.learning.problem.EVALUATION_SEEDS`: told are the mean reward of a step
 with its standard error over episodes and, of shepherds, how many creatures were at their goal and
-whole in the last step. The record is written anew after each evaluation of a seed.
+whole in the last step. Rows of a seed are written to the folder after each evaluation, with
+`--save` beside the policy.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ import npa_envs  # noqa: F401 (registers the environments)
 from npa_envs.agents.learning.problem import EVALUATION_SEEDS
 from npa_envs.files import write_text
 from npa_envs.measure.record import script_facts, script_parser, write_record
-from npa_envs.registration import GARDENS, SMALL
+from npa_envs.registration import GARDEN_IDS
 from npa_envs.wrappers import WorldVecEnv
 
 METHODS: dict[str, tuple[type[Any], dict[str, Any], dict[str, Any]]] = {
@@ -58,7 +59,9 @@ MANY = {
 class Evaluation(BaseCallback):
     """Evaluate every so many steps, and write what came of it."""
 
-    def __init__(self, name: str, keywords: dict[str, Any], device: str, every: int, path: Path):
+    def __init__(
+        self, name: str, keywords: dict[str, Any], device: str, every: int, path: Path, saves: bool
+    ) -> None:
         super().__init__()
         self._envs = gymnasium.make_vec(
             name,
@@ -67,7 +70,7 @@ class Evaluation(BaseCallback):
             device=device,
             **keywords,
         )
-        self._every, self._path = every, path
+        self._every, self._path, self._saves = every, path, saves
         self._begun, self._next = time.perf_counter(), 0
         self.rows: list[dict[str, Any]] = []
 
@@ -97,6 +100,8 @@ class Evaluation(BaseCallback):
             row["success"] = float(np.mean(infos["final_info"]["is_success"]))
         self.rows.append(row)
         write_text(self._path, json.dumps(self.rows))
+        if self._saves:
+            self.model.save(self._path.with_suffix(".zip"))
         print(self._path.stem, {name: round(value, 3) for name, value in row.items()}, flush=True)
 
 
@@ -110,6 +115,7 @@ def learned(
     worlds: int,
     device: str,
     out: Path,
+    saves: bool,
 ) -> list[dict[str, Any]]:
     """Return the evaluations of one seed."""
     torch.set_num_threads(1)
@@ -130,7 +136,7 @@ def learned(
             )
         )
     model = algorithm(policy, env, seed=seed, device="cpu", **settings)
-    told = Evaluation(name, keywords, device, every, out / f"{method}_{seed}.json")
+    told = Evaluation(name, keywords, device, every, out / f"{method}_{seed}.json", saves)
     model.learn(steps, callback=told)
     told.evaluate()
     return told.rows
@@ -139,7 +145,7 @@ def learned(
 def main(arguments: list[str] | None = None) -> None:
     """Learn, print and write."""
     parser = script_parser((__doc__ or "").split("\n")[0])
-    parser.add_argument("id", choices=[row.id for row in (*GARDENS, *SMALL)])
+    parser.add_argument("id", choices=GARDEN_IDS)
     parser.add_argument("method", choices=METHODS)
     parser.add_argument("--steps", type=int, default=50_000, help="of all worlds together")
     parser.add_argument("--every", type=int, default=10_000, help="steps from one to the next row")
@@ -147,6 +153,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--jobs", type=int, default=1, help="seeds that learn at the same time")
     parser.add_argument("--folder", type=Path, default=Path("runs/gardens"), help="rows of seeds")
+    parser.add_argument("--save", action="store_true", help="the policies too")
     given = parser.parse_args(arguments)
     given.folder.mkdir(parents=True, exist_ok=True)
     one = partial(
@@ -158,6 +165,7 @@ def main(arguments: list[str] | None = None) -> None:
         worlds=given.worlds,
         device=given.device,
         out=given.folder,
+        saves=given.save,
     )
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(given.jobs, mp_context=context) as pool:

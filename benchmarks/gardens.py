@@ -34,7 +34,7 @@ from npa_envs.agents.gardening import (
 from npa_envs.agents.learning.problem import EVALUATION_SEEDS
 from npa_envs.measure.record import script_facts, script_parser, write_record
 from npa_envs.measure.speed.timing import synchronize
-from npa_envs.registration import GARDENS, SMALL
+from npa_envs.registration import GARDEN_IDS
 
 POLICIES = ("zero", "random", "scripted", "gradient")
 
@@ -95,8 +95,7 @@ def speed(name: str, count: int, device: str) -> dict[str, Any]:
 def main(arguments: list[str] | None = None) -> None:
     """Measure, print and write."""
     parser = script_parser((__doc__ or "").split("\n")[0])
-    known = [row.id for row in (*GARDENS, *SMALL)]
-    parser.add_argument("--ids", nargs="+", default=known, choices=known)
+    parser.add_argument("--ids", nargs="+", default=GARDEN_IDS, choices=GARDEN_IDS)
     parser.add_argument("--policies", nargs="*", default=POLICIES, choices=POLICIES)
     parser.add_argument("--episodes", type=int, default=len(EVALUATION_SEEDS))
     parser.add_argument("--steps", type=int, help="of an episode; default: the registered ones")

@@ -89,6 +89,12 @@ SMALL = (
 same version."""
 
 
+GARDEN_IDS = tuple(
+    row.id for row in (*GARDENS, *SMALL) if row.name in {garden.name for garden in GARDENS}
+)
+"""Ids of gardens, of any size."""
+
+
 class SpeciesRegistration(NamedTuple):
     """One size of a task of several species, for PettingZoo and for batches."""
 

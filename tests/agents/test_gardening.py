@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import npa_envs
+from npa_envs.agents import evaluate_policy
 from npa_envs.agents.gardening import (
     GradientGardener,
     RandomGardener,
@@ -90,3 +91,22 @@ def test_gardeners_need_a_garden_whose_brushes_are_numbers():
     for given in ({"gain": 0.0}, {"share": -1.0}, {"width": float("nan")}):
         with pytest.raises(NPAError, match=f"{next(iter(given))} must be positive"):
             ScriptedGardener(make_vec(GARDENER, 2), **given)
+
+
+@pytest.mark.slow
+def test_ppo_learns_to_garden_as_it_comes():
+    sb3 = pytest.importorskip("stable_baselines3")
+    model = sb3.PPO("MlpPolicy", gymnasium.make(GARDENER), gamma=0.9, seed=0, device="cpu")
+    model.learn(12_000)
+    envs = gymnasium.make_vec(GARDENER, 8)
+
+    def learned(seen):
+        return model.predict(seen, deterministic=True)[0]
+
+    episodes = [
+        evaluate_policy(envs, policy, seeds=range(1000, 1008))
+        for policy in (StillGardener(envs), learned)
+    ]
+    still, taught = (np.asarray(one.returns) / 32 for one in episodes)
+    error = np.std(taught - still, ddof=1) / np.sqrt(len(still))
+    assert np.mean(taught - still) > max(0.3, 3.0 * error)

@@ -22,7 +22,7 @@ from npa_envs.cli import COMMANDS, main
 from npa_envs.envs import multispecies_v0, particles_v0
 from npa_envs.envs.multi import TASKS as TABLE
 from npa_envs.ops.backend import Request, describe
-from npa_envs.registration import ENVIRONMENTS
+from npa_envs.registration import ENVIRONMENTS, GARDEN_IDS
 from npa_envs.rule.files import shipped_rules
 from npa_envs.training import TASKS as TRAINED
 
@@ -461,20 +461,48 @@ def test_the_code_about_learning_runs(tmp_path, monkeypatch, capsys):
     assert [entry.particle_steps for entry in trained.log] == [0, 2000]
 
 
+@pytest.fixture
+def _quick_gardens(monkeypatch):
+    """Living worlds that take little time: what is tested is that the calls are right."""
+    for garden in GARDEN_IDS:
+        spec = gym.spec(garden)
+        for key, value in {"grow_steps": 4, "seed_pool": 1, "rule_steps": 1}.items():
+            monkeypatch.setitem(spec.kwargs, key, value)
+
+
+@pytest.mark.usefixtures("_quick_gardens")
 def test_the_code_about_gardening_runs(capsys):
-    pytest.importorskip("stable_baselines3")
     names = {}
     for code in code_blocks(DOCS / "gardening.md"):
-        # Less of it: what is tested is that the calls are right.
-        assert "make" in code
-        code = code.replace('Small-v0"', 'Small-v0", grow_steps=4, seed_pool=1, rule_steps=1')
-        code = code.replace("0_000", "").replace("1_000", "8")
+        code = code.replace("particle_count=256", "particle_count=61, grow_steps=4")
         exec(compile(code, "gardening.md", "exec"), names)
-    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()[:2]] == [
-        "StillGardener", "ScriptedGardener",
-    ]  # fmt: skip
+    told = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in told[:2]] == ["StillGardener", "ScriptedGardener"]
     assert float(names["slope"].abs().max()) > 0.0
-    assert names["gardener"].num_timesteps == names["shepherd"].num_timesteps == 5
+    assert names["rewards"]["keeper_0"] == -names["rewards"]["raider_0"] != 0.0
+
+
+@pytest.mark.usefixtures("_quick_gardens")
+def test_the_tutorial_of_gardeners_runs(capsys, tmp_path, monkeypatch):
+    pytest.importorskip("stable_baselines3")
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    for code in code_blocks(DOCS / "tutorial_gardener.md"):
+        code = re.sub(r"learn\([\d_]+\)", "learn(34)", code).replace("1_000", "33")
+        code = code.replace("num_envs=256", "num_envs=2").replace("n_steps=32", "n_steps=8")
+        code = code.replace("range(100, 116)", "range(100, 102)").replace(
+            "num_envs=8", "num_envs=2"
+        )
+        code = code.replace("env, gamma=0.9, seed=0", "env, gamma=0.9, seed=0, **few")
+        names["few"] = {"n_steps": 17} if "import PPO" in code else {}
+        exec(compile(code, "tutorial_gardener.md", "exec"), names)
+    told = capsys.readouterr().out.splitlines()
+    policies = ["StillGardener", "RandomGardener", "ScriptedGardener", "learned"]
+    assert [line.split()[0] for line in told[:4]] == policies
+    assert told[4].startswith("arrived and whole: ")
+    assert (tmp_path / "gardener.webp").stat().st_size > 1000
+    assert names["model"].num_timesteps >= 34
+    assert names["shepherd"].num_timesteps == 34
 
 
 def test_the_code_about_ppo_runs(capsys):
