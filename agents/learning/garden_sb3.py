@@ -55,7 +55,7 @@ class SACOptions(GardenOptions):
     learning_starts: int = 1000
     """Steps of worlds before the first gradient step."""
 
-    world_steps: int = 4
+    world_steps: int = 8
     """Steps of worlds for each gradient step, as nearly as the number of worlds allows."""
 
     def __post_init__(self) -> None:
