@@ -10,6 +10,7 @@ import uuid
 from collections.abc import Sequence
 from pathlib import Path
 
+import torch
 import torch.distributed as dist
 
 from npa_envs.cli import INTERRUPTED
@@ -17,7 +18,7 @@ from npa_envs.errors import NPAError
 from npa_envs.training import RunFolder
 
 
-def launch(count: int, words: Sequence[str], out: Path) -> int:
+def launch(count: int, words: Sequence[str], out: Path, device: str) -> int:
     """Run a command in several processes, and return the exit code once all have ended.
 
     If one ends early, the others are asked to end, and are killed after half a minute.
@@ -26,10 +27,18 @@ def launch(count: int, words: Sequence[str], out: Path) -> int:
         count: Number of processes.
         words: The words after `npa-envs`.
         out: The folder that the run is written to, for what is said of a lost process.
+        device: Where it runs: each process has a CUDA device of its own, or all share the CPU.
 
     Raises:
-        NPAError: A process was ended from outside, or torch has no launcher here.
+        NPAError: There are not as many devices, a process was ended from outside, or torch has no
+            launcher here.
     """
+    seen = torch.cuda.device_count()
+    if device != "cpu" and count > seen:
+        raise NPAError(
+            f"gpus must be at most the {seen} CUDA devices that torch sees, got {count}: take "
+            "fewer, or try it with --device cpu"
+        )
     if not dist.is_available():
         raise NPAError(f"gpus must be 1 with a torch that has no torch.distributed, got {count}")
     # Only runs of several processes need it, and it takes a while.

@@ -113,7 +113,8 @@ def main(arguments: Sequence[str]) -> int:
         assert asked is not None, "said by the first process"
         words, options, config = asked
         if options.gpus > 1 and not ranks.together:
-            return launch(options.gpus, ("train", task_name, *words), config.out)
+            told = ("train", task_name, *words)
+            return launch(options.gpus, told, config.out, config.device)
         return run(task_name, options, config, (task_name, *words), ranks)
 
 
