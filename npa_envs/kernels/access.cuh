@@ -4,6 +4,23 @@
 
 namespace npa {
 
+// Wait until all that was launched before has ended and what it wrote is there. Every kernel that is
+// launched early waits, so its end says that all before it have ended.
+CUDA_CALLABLE inline void await_earlier()
+{
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
+    asm volatile("griddepcontrol.wait;" ::: "memory");
+#endif
+}
+
+// Let the blocks of the next kernel, if it is launched early, take places beside this one's.
+CUDA_CALLABLE inline void let_next_in()
+{
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
+    asm volatile("griddepcontrol.launch_dependents;" ::: "memory");
+#endif
+}
+
 // As many bytes as 16 that divide a size.
 CUDA_CALLABLE constexpr unsigned chunk_bytes(unsigned size)
 {

@@ -26,6 +26,24 @@ CUDA_BLOCK = 128
 """Threads of a block, where a launch does not say otherwise."""
 
 
+@native.func_native()
+def await_earlier():
+    """Wait for the launches before this one; kernels begin with it, before they touch memory.
+
+    On compute capability 9.0 and above such a kernel is launched before the one ahead has ended
+    (`npa_envs.ops.overlap`): at its end the blocks are there, and wait no more.
+    """
+
+
+@native.func_native()
+def let_next_in():
+    """Let the next kernel's blocks take free places before this one's have ended.
+
+    They take them where they find them: a kernel with few blocks for a processor then has too many
+    on some. So only kernels call it that are followed by one which does not mind.
+    """
+
+
 @functools.cache
 def make_wide_load(value_type: type, scalar: type) -> Any:
     """Return a Warp function that reads an entry of a flat array, on CUDA in few, wide loads.

@@ -7,6 +7,7 @@ import ctypes
 import functools
 import inspect
 import itertools
+import math
 import multiprocessing
 import os
 import sys
@@ -21,6 +22,7 @@ from torch import Tensor
 
 from npa_envs.kernels.access import CUDA_BLOCK
 from npa_envs.kernels.cpu import SMALLEST_RANGES
+from npa_envs.ops.driver import DriverLaunch
 from npa_envs.runtime import in_turn, quiet_warp, start_warp
 
 SCALARS: dict[torch.dtype, Any] = {torch.float32: wp.float32, torch.float64: wp.float64}
@@ -51,11 +53,11 @@ def _warp_stream(device: torch.device, handle: int) -> Any:
     return wp.Stream(wp.device_from_torch(device), cuda_stream=handle)
 
 
-def _current_stream(device: torch.device) -> Any:
-    """Return torch's current stream of a CUDA device as Warp knows it."""
+def _current_stream(device: torch.device) -> int:
+    """Return the handle of torch's current stream of a CUDA device."""
     index = torch.cuda.current_device() if device.index is None else device.index
     # What `torch.cuda.current_stream` makes an object of, in a tenth of its time.
-    return _warp_stream(device, torch._C._cuda_getCurrentRawStream(index))
+    return torch._C._cuda_getCurrentRawStream(index)
 
 
 class _ArrayArgument:
@@ -70,9 +72,10 @@ class _ArrayArgument:
         self._place = place
         self._shape = place.shape
         self._type = array_type
-        self._size: torch.Size | None = None
-        self._step: tuple[int, ...] = ()
+        self._size: tuple[int, ...] | None = None
         self._dtype: torch.dtype | None = None
+        self._joined = 1
+        """Entries of the array for each of the tensor's first dimension."""
 
     def set(self, tensor: Tensor | None) -> None:
         """Describe another tensor, or none."""
@@ -82,19 +85,22 @@ class _ArrayArgument:
                 _overwrite(self._place, self._type.__ctype__())
                 self._size = None
             return
-        size, step = tensor.shape, tensor.stride()
-        if size != self._size or step != self._step or tensor.dtype is not self._dtype:
-            self._describe(tensor, size, step)
+        size = tensor.shape
+        if size != self._size or tensor.dtype is not self._dtype or not tensor.is_contiguous():
+            self._describe(tensor, size)
         self._place.data = tensor.data_ptr()
 
-    def _describe(self, tensor: Tensor, size: torch.Size, step: tuple[int, ...]) -> None:
+    def _describe(self, tensor: Tensor, size: torch.Size) -> None:
         """Write shape and strides: by itself where only the first dimension has changed."""
-        known = self._size is not None and step == self._step and tensor.dtype is self._dtype
-        if known and self._size is not None and size[1:] == self._size[1:]:
-            self._shape[0] = size[0]
+        last, dense = self._size, tensor.is_contiguous()
+        known = last is not None and tensor.dtype is self._dtype and size[1:] == last[1:]
+        if known and dense and self._joined:
+            self._shape[0] = size[0] * self._joined
         else:
             _overwrite(self._place, _description(tensor, self._type))
-        self._size, self._step, self._dtype = size, step, tensor.dtype
+            self._joined = self._shape[0] // size[0] if size[0] else 0
+        # One with strides of its own is described each time.
+        self._size, self._dtype = size if dense else (-1,), tensor.dtype
 
 
 def _overwrite(place: Any, made: Any) -> None:
@@ -103,10 +109,12 @@ def _overwrite(place: Any, made: Any) -> None:
 
 
 def _description(tensor: Tensor, array_type: Any) -> Any:
-    """Return a tensor as Warp describes arrays to kernels."""
-    return wp.from_torch(
-        tensor.detach(), dtype=array_type.dtype, requires_grad=False, return_ctype=True
-    )
+    """Return a tensor as Warp describes arrays to kernels; one dimension takes all of a tensor."""
+    tensor = tensor.detach()
+    if array_type.ndim == 1:
+        entry = getattr(array_type.dtype, "_shape_", ())
+        tensor = tensor.view(tensor.numel() // math.prod(entry), *entry)
+    return wp.from_torch(tensor, dtype=array_type.dtype, requires_grad=False, return_ctype=True)
 
 
 class _StructArgument:
@@ -174,11 +182,13 @@ class _Arguments:
         self._numbers = [k for k, setter in enumerate(setters) if setter is None]
         self._last: list[Any] = [None] * len(made)
         self._addresses: Any = None
+        self._driven: DriverLaunch | None = None
         if where.is_cuda:
             begin, layout = ctypes.addressof(self._memory), type(self._memory)
             places = [begin + getattr(layout, name).offset for name in self._names]
             self._addresses = (ctypes.c_void_p * (1 + len(made)))(0, *places)
             self._launch.params_addr = self._addresses
+            self._driven = DriverLaunch(self._launch, device, self._addresses)
 
     def _setter(self, name: str, kind: Any, value: Any) -> Any:
         """Return what changes an argument; None: a number or a vector, compared and assigned."""
@@ -216,10 +226,13 @@ class _Arguments:
 
     def run(self, size: tuple[int, ...]) -> None:
         """Launch the kernel on torch's current stream, or on the CPU's threads."""
-        if self._addresses is not None:
-            self._launch.bounds = bounds = self._bounds_of(size)
+        if self._driven is not None:
+            bounds = self._bounds_of(size)
             self._addresses[0] = ctypes.addressof(bounds)
-            self._launch.launch(_current_stream(self._device))
+            stream = _current_stream(self._device)
+            if not self._driven.run(bounds.size, stream):
+                self._launch.bounds = bounds
+                self._launch.launch(_warp_stream(self._device, stream))
             return
         ranges = _ranges(self._launch.kernel, size)
         if len(ranges) == 1:
@@ -317,7 +330,8 @@ def launch(
     """Launch a kernel on torch's current stream of a device.
 
     Args:
-        kernel: A Warp kernel; its own signature says how each tensor is read.
+        kernel: A Warp kernel; its own signature says how each tensor is read. An array of one
+            dimension is all of a contiguous tensor, whatever the tensor's shape.
         size: Number of threads along each dimension.
         device: Device of every tensor among the arguments.
         arguments: Kernel arguments in order: tensors (None for an absent one), structs and numbers;

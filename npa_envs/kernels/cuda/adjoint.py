@@ -17,8 +17,10 @@ from npa_envs.kernels.access import (
     WARP,
     any_in_warp,
     as_word,
+    await_earlier,
     first_in_warp,
     largest_in_warp,
+    let_next_in,
     load_integer,
     load_scalar,
     make_wide_load,
@@ -202,6 +204,8 @@ def listed_adjoint(
 
         Those of the smoothed state are multiplied by `blur_scale`.
         """
+        await_earlier()
+        let_next_in()
         thread = wp.tid()
         row_parts = group_count * wp.static(parts)
         row = wp.int32(wp.uint32(thread) / wp.uint32(row_parts))
@@ -378,6 +382,8 @@ def listed_adjoint(
         A world has `tile_count` tiles; a warp serves a group of a tile's channels. All cotangents
         are multiplied by `norm`.
         """
+        await_earlier()
+        let_next_in()
         thread = wp.tid()
         lane = thread & wp.static(WARP - 1)
         tile = thread / wp.static(WARP)

@@ -13,6 +13,7 @@ import warp as wp
 from npa_envs.kernels import native
 from npa_envs.kernels.access import (
     as_word,
+    await_earlier,
     load_integer,
     make_lane_sum,
     make_wide_load,
@@ -154,6 +155,7 @@ def listed_density(
         Positions with volumes 1 / rho also go to `particles`, unless that is empty. A list's length
         is larger than the capacity where not all fits in.
         """
+        await_earlier()
         thread = wp.tid()
         k = thread >> wp.static(lanes.bit_length() - 1)
         lane = thread & wp.static(lanes - 1)

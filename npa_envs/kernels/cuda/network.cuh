@@ -86,7 +86,7 @@ __device__ inline void two_layers(
             #pragma unroll
             for (int i = 0; i < 4; ++i) part[k][i] = 0.0f;
             if (row < count && 16 * k + 4 * t < width) {
-                asm volatile("ld.global.nc.L1::no_allocate.v4.f32 {%0, %1, %2, %3}, [%4];"
+                asm volatile("ld.global.L1::no_allocate.v4.f32 {%0, %1, %2, %3}, [%4];"
                     : "=f"(part[k][0]), "=f"(part[k][1]), "=f"(part[k][2]), "=f"(part[k][3])
                     : "l"(from + 16 * k));
             }
@@ -119,7 +119,7 @@ __device__ inline void two_layers(
         for (int k = 0; k < STEPS; ++k) {
             #pragma unroll
             for (int tile = 0; tile < 2; ++tile) {
-                const uint4 weight = __ldg(hidden + (tile * STEPS + k) * 32);
+                const uint4 weight = hidden[(tile * STEPS + k) * 32];
                 multiply_half(sum[tile], high[k], weight.x, weight.y);
                 multiply_half(rest[0][tile], low[k], weight.x, weight.y);
                 multiply_half(rest[1][tile], high[k], weight.z, weight.w);
@@ -164,7 +164,7 @@ __device__ inline void two_layers(
         }
         #pragma unroll
         for (int tile = 0; tile < TILES; ++tile) {
-            const uint4 weight = __ldg(outer + tile * 32);
+            const uint4 weight = outer[tile * 32];
             float part[4] = {};
             multiply_half(part, left_rest, weight.x, weight.y);
             multiply_half(part, left, weight.z, weight.w);
@@ -269,7 +269,7 @@ __device__ inline void weight_sums(
         #pragma unroll
         for (int group = 0; group < 2; ++group) {
             const uint4* from = weights + ((group * count + k) * 2) * 32;
-            const uint4 upper = __ldg(from), lower = __ldg(from + 32);
+            const uint4 upper = from[0], lower = from[32];
             const unsigned a[4] = {upper.x, upper.y, upper.z, upper.w};
             const unsigned rest[4] = {lower.x, lower.y, lower.z, lower.w};
             #pragma unroll
@@ -310,7 +310,7 @@ __device__ inline void weight_sums(
             #pragma unroll
             for (int i = 0; i < 4; ++i) {
                 const int at = first + row + 8 * (i / 2) + 2 * t + i % 2;
-                const int word = at < end ? __ldg(signs + (size_t)at * WORDS) : 0;
+                const int word = at < end ? signs[(size_t)at * WORDS] : 0;
                 kept[i / 2][i % 2] = (unsigned)word >> (base % 128 / 4 + (g & 1u));
             }
             float sum[2][2][4] = {}, bar[2][2][4] = {};

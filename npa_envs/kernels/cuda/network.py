@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from npa_envs.kernels import native
-from npa_envs.kernels.access import WARP
+from npa_envs.kernels.access import WARP, await_earlier, let_next_in
 
 UNIT_GROUP = 16
 """Hidden units of one step: the inner extent of a product."""
@@ -77,6 +77,7 @@ def two_layer_kernel(steps: int, tiles: int, mode: str) -> wp.Kernel:
         output: wp.array(dtype=wp.float32, ndim=2),
     ):
         """Map rows through both layers; the hidden units between stay in registers."""
+        await_earlier()
         two_layers(unit_count, rows, hidden_weights, output_weights, output_unscale, signs, output)
 
     return network_layers
@@ -129,6 +130,8 @@ def weight_gradient_kernels(
         partial_sums: wp.array(dtype=wp.float32, ndim=2),
     ):
         """Sum both weights' gradients over each share of the rows."""
+        await_earlier()
+        let_next_in()
         weight_sums(
             unit_count,
             share_rows,
@@ -147,6 +150,8 @@ def weight_gradient_kernels(
         total: wp.array(dtype=wp.float32),
     ):
         """Add the shares' sums."""
+        await_earlier()
+        let_next_in()
         add_partial_sums(partial_sums, total)
 
     return SimpleNamespace(sum_weight_gradients=sum_weight_gradients, add_shares=add_shares)
@@ -180,6 +185,7 @@ def arrangement_kernels() -> SimpleNamespace:
         fragments: wp.array(dtype=wp.float16),
     ):
         """Scale and lay out a first layer [H, width]; threads (H / 8, width / 16, lanes)."""
+        await_earlier()
         tile, step, lane = wp.tid()
         unit = 8 * tile + lane / 4
         size = wp.float32(0.0)
@@ -207,6 +213,7 @@ def arrangement_kernels() -> SimpleNamespace:
         fragments: wp.array(dtype=wp.float16),
     ):
         """Scale and lay out a second layer [width, H]; threads (H / 16, width / 8, lanes)."""
+        await_earlier()
         step, tile, lane = wp.tid()
         column = 8 * tile + lane / 4
         size = wp.float32(0.0)
@@ -233,6 +240,7 @@ def arrangement_kernels() -> SimpleNamespace:
         fragments: wp.array(dtype=wp.bfloat16),
     ):
         """Lay out [H, width] as a left operand; threads (H / 16, width / 16, lanes)."""
+        await_earlier()
         group, step, lane = wp.tid()
         place = (group * ((weights.shape[1] + 15) / 16) + step) * 2 * wp.static(WARP)
         first = (place + lane) * 8

@@ -17,6 +17,7 @@ from npa_envs.kernels.access import (
     CUDA_BLOCK,
     any_in_warp,
     as_number,
+    await_earlier,
     largest_in_warp,
     load_integer,
     make_lane_sum,
@@ -405,6 +406,7 @@ def listed_perception(
         records say where); rows are written where `row_destination` says, or in their own order;
         clipped to plus and minus `limit` unless that is zero.
         """
+        await_earlier()
         thread = thread_number()
         lane = thread & wp.static(lanes - 1)
         row = thread >> wp.static(lanes.bit_length() - 1)

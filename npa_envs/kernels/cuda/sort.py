@@ -14,6 +14,7 @@ from npa_envs.kernels import native
 from npa_envs.kernels.access import (
     CUDA_LANES,
     WARP,
+    await_earlier,
     block_number,
     load_integer,
     make_read_channels,
@@ -159,6 +160,7 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
 
         States and rows are left out where their arrays are empty.
         """
+        await_earlier()
         world = block_number() / slice_count
         slice_number = block_number() - world * slice_count
         lane = thread_of_block()
@@ -289,6 +291,7 @@ def order_particles(space_dim: int, width: int) -> wp.Kernel:
         States and rows are left out where their arrays are empty. Threads come in whole warps, some
         of them beyond the last particle.
         """
+        await_earlier()
         k = wp.tid()
         total = arrived.shape[0]
         own = load_pair(arrived, wp.min(k, total - 1))

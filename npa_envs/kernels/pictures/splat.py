@@ -19,6 +19,7 @@ import warp as wp
 
 from npa_envs.kernels import native
 from npa_envs.kernels.access import (
+    await_earlier,
     make_lane_scatter,
     make_lane_sum,
     make_warp_sum,
@@ -247,6 +248,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         counts: wp.array(dtype=wp.int32),
     ):
         """Count the particles of each cell; counts[0] stays zero."""
+        await_earlier()
         i = wp.tid()
         world = i / particle_count
         place = pixel_place(lens, positions[i], centred, means, goal, world)
@@ -263,6 +265,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         arrived: wp.array(dtype=wp.int32),
     ):
         """List the particles of each cell in the order in which they were counted."""
+        await_earlier()
         i = wp.tid()
         arrived[starts[cell[i]] + arrival[i]] = i
 
@@ -284,6 +287,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         source: wp.array(dtype=wp.int32),
     ):
         """Write each particle's footprint at its rank by index within its cell."""
+        await_earlier()
         k = wp.tid()
         i = arrived[k]
         c = cell[i]
@@ -395,6 +399,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         partial_sums: wp.array(dtype=wp.vec2d, ndim=2),
     ):
         """Write the sums of both errors over each group of tiles; no picture is written."""
+        await_earlier()
         t = wp.tid()
         world, group, row, column, lane = tile_of(lens, t)
         sums = wp.vec2d()

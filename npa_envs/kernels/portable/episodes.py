@@ -3,6 +3,7 @@
 import warp as wp
 
 from npa_envs.kernels import native
+from npa_envs.kernels.access import await_earlier
 
 SUCCESS, DIVERGED, TIME_LIMIT = 1, 2, 4
 """Bits of an ending: why an episode is over; none is set while it runs."""
@@ -34,6 +35,7 @@ def judge_worlds(
     endings: wp.array(dtype=wp.uint8),
 ):
     """Write rewards, losses, flags and endings; of no step, where not enabled, endings alone."""
+    await_earlier()
     world = wp.tid()
     count = elapsed.shape[0]
     happens = enabled[0]

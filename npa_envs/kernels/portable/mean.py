@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from npa_envs.kernels import native
-from npa_envs.kernels.access import make_warp_sum
+from npa_envs.kernels.access import await_earlier, make_warp_sum
 from npa_envs.kernels.domain import scalar_name
 
 CHUNK = 256
@@ -32,6 +32,7 @@ def mean_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         partial_sums: wp.array(dtype=wp.float64, ndim=3),
     ):
         """Sum each chunk of a world's values."""
+        await_earlier()
         world, k, chunk, lane = wp.tid()
         total = wp.float64(0.0)
         end = wp.min((chunk + 1) * wp.static(CHUNK), values.shape[1])
@@ -49,6 +50,7 @@ def mean_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         means: wp.array(dtype=scalar, ndim=2),
     ):
         """Add the partial sums of each world and divide by the number of values."""
+        await_earlier()
         world, k, lane = wp.tid()
         total = wp.float64(0.0)
         for part in range(lane, partial_sums.shape[1], wp.static(lanes)):

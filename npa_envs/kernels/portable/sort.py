@@ -13,6 +13,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from npa_envs.kernels.access import (
+    await_earlier,
     load_integer,
     make_read_channels,
     make_wide_load,
@@ -56,6 +57,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
         counts: wp.array(dtype=wp.int32),
     ):
         """Count the particles, and the active ones, of each cell; counts[0] stays zero."""
+        await_earlier()
         i = wp.tid()
         index = (i / particle_count) * domain.cell_count
         index += cell_index(domain, cell_of(domain, positions[i]))
@@ -78,6 +80,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
 
         Of each: twice its index, plus one if it is active, and its cell.
         """
+        await_earlier()
         i = wp.tid()
         entry = 2 * i
         if masked == 0 or mask[i] != wp.uint8(0):
@@ -114,6 +117,7 @@ def sort_kernels(space_dim: int, scalar: type, width: int) -> SimpleNamespace:
 
         States and rows are left out where their arrays are empty.
         """
+        await_earlier()
         k = range_start + wp.tid()
         own = arrived[k]
         i = own[0] / 2
@@ -275,6 +279,7 @@ def give_rows(space_dim: int, scalar: type) -> wp.Kernel:
         more. `active_before` counts the active particles of these and earlier steps up to each one,
         itself included.
         """
+        await_earlier()
         step, t = wp.tid()
         earlier = wp.int32(0)
         if step > 0:

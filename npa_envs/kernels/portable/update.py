@@ -11,7 +11,14 @@ from types import SimpleNamespace
 import warp as wp
 
 from npa_envs.kernels import native
-from npa_envs.kernels.access import load_integer, make_read_at, make_wide_load, make_write_at
+from npa_envs.kernels.access import (
+    await_earlier,
+    let_next_in,
+    load_integer,
+    make_read_at,
+    make_wide_load,
+    make_write_at,
+)
 from npa_envs.kernels.cpu import ELEMENTS, in_ranges
 from npa_envs.kernels.domain import domain_types, kernel_module, scalar_name
 
@@ -97,6 +104,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         new_path_length: wp.array(dtype=scalar),
     ):
         """Move and change the particles that have a row; copy the others."""
+        await_earlier()
         # The first threads of a team move a particle each, the others change some channels each.
         sharers = (state_dim + wp.static(CHANNEL_SHARE - 1)) / wp.static(CHANNEL_SHARE)
         t = range_start + wp.tid()
@@ -167,6 +175,8 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         update_bar: wp.array(dtype=scalar),
     ):
         """Write the cotangent of every row's update, zero beyond the last active row."""
+        await_earlier()
+        let_next_in()
         # A thread has some adjacent columns of a row.
         sharers = (update_width + wp.static(CHANNEL_SHARE - 1)) / wp.static(CHANNEL_SHARE)
         t = range_start + wp.tid()
@@ -233,6 +243,7 @@ def update_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         diverged: wp.array(dtype=wp.uint8),
     ):
         """Move and change the particles that act, and mark the worlds that had to be held back."""
+        await_earlier()
         # All that is read is asked for before any of it is used: the kernel waits for memory.
         sharers = (state_dim + wp.static(CHANNEL_SHARE - 1)) / wp.static(CHANNEL_SHARE)
         t = range_start + wp.tid()
@@ -350,6 +361,7 @@ def find_not_finite(scalar: type) -> wp.Kernel:
         finite: wp.array(dtype=wp.uint8),
     ):
         """Write 0 where a value, aligned to 16 bytes in memory, is infinite or not a number."""
+        await_earlier()
         t = wp.tid()
         found = wp.int32(0)
         for k in range(wp.static(VALUES_PER_THREAD // QUAD)):

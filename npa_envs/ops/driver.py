@@ -1,0 +1,140 @@
+"""Launches by CUDA's driver: less work for the host than Warp's, and overlapped in graphs.
+
+Rollouts and environments are chains of kernels of some microseconds each, of which the time from
+the end of one to the begin of the next is a good part. With programmatic dependent launch, of
+compute capability 9.0 and above, a kernel that begins with `await_earlier` is there before the one
+ahead of it has ended, and waits until all before it have: the numbers are the same.
+
+Such a kernel must not load with `ld.global.nc` or `__ldg`, which promise that nobody writes while
+it is there: the compiler moves these loads ahead of the wait.
+
+Only what follows one kernel of its own graph is launched early: the first kernel of a graph would
+not wait for what the stream did before the graph.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from typing import Any
+
+import torch
+
+OVERLAPPING_CAPABILITY = 90
+"""Compute capability, times ten, from which on kernels wait by themselves."""
+
+MOST_THREADS = 2**31 - 1
+"""Threads of a launch, at most: kernels number them along one dimension of a grid."""
+
+# What follows is of CUDA's driver interface, cuda.h.
+
+PROGRAMMATIC_STREAM_SERIALIZATION = 6
+
+KERNEL_NODE = 0
+
+
+class _AttributeValue(ctypes.Union):
+    _fields_ = [("flag", ctypes.c_int), ("size", ctypes.c_char * 64)]
+
+
+class _Attribute(ctypes.Structure):
+    _fields_ = [("id", ctypes.c_int), ("unused", ctypes.c_int), ("value", _AttributeValue)]
+
+
+class _Config(ctypes.Structure):
+    _fields_ = [
+        ("grid_x", ctypes.c_uint),
+        ("grid_y", ctypes.c_uint),
+        ("grid_z", ctypes.c_uint),
+        ("block_x", ctypes.c_uint),
+        ("block_y", ctypes.c_uint),
+        ("block_z", ctypes.c_uint),
+        ("shared_bytes", ctypes.c_uint),
+        ("stream", ctypes.c_void_p),
+        ("attributes", ctypes.POINTER(_Attribute)),
+        ("attribute_count", ctypes.c_uint),
+    ]
+
+
+@functools.cache
+def _driver() -> Any:
+    """Return the driver, or None where it is not there or too old."""
+    for name in ("libcuda.so.1", "nvcuda.dll"):
+        try:
+            driver = ctypes.CDLL(name)
+        except OSError:
+            continue
+        needed = ("cuLaunchKernelEx", "cuStreamGetCaptureInfo_v3", "cuGraphNodeGetType")
+        return driver if all(hasattr(driver, function) for function in needed) else None
+    return None
+
+
+def _follows_kernel(stream: int) -> bool:
+    """Return whether what a captured stream is given next follows one kernel of the same graph."""
+    driver = _driver()
+    status, identifier, graph = ctypes.c_int(), ctypes.c_uint64(), ctypes.c_void_p()
+    nodes, edges = ctypes.POINTER(ctypes.c_void_p)(), ctypes.c_void_p()
+    count = ctypes.c_size_t()
+    places = (status, identifier, graph, nodes, edges, count)
+    if driver.cuStreamGetCaptureInfo_v3(ctypes.c_void_p(stream), *map(ctypes.byref, places)):
+        return False
+    if count.value != 1:
+        return False
+    kind = ctypes.c_int(-1)
+    failed = driver.cuGraphNodeGetType(ctypes.c_void_p(nodes[0]), ctypes.byref(kind))
+    return not failed and kind.value == KERNEL_NODE
+
+
+class DriverLaunch:
+    """A launch of a kernel, made again and again.
+
+    Args:
+        launch: What `wp.launch` returns with `record_cmd=True`, on CUDA.
+        device: Its device.
+        addresses: Addresses of the kernel's parameters.
+    """
+
+    def __init__(self, launch: Any, device: torch.device, addresses: Any) -> None:
+        capability = launch.device.get_cuda_compile_arch() or 0
+        self._waits = (
+            capability >= OVERLAPPING_CAPABILITY and "await_earlier()" in launch.kernel.adj.source
+        )
+        self._device = device
+        self._block = launch.block_dim
+        driver = None if launch.cluster_dim > 1 else _driver()
+        self._launch = None if driver is None else driver.cuLaunchKernelEx
+        self._function = ctypes.c_void_p(launch.hooks.forward)
+        self._addresses = addresses
+        early = _Attribute(PROGRAMMATIC_STREAM_SERIALIZATION)
+        early.value.flag = 1
+        self._config = _Config(
+            1,
+            1,
+            1,
+            self._block,
+            1,
+            1,
+            launch.hooks.forward_smem_bytes,
+            None,
+            ctypes.pointer(early),
+            0,
+        )
+        self._place = ctypes.byref(self._config)
+
+    def run(self, thread_count: int, stream: int) -> bool:
+        """Launch on the current stream; return whether that was done: otherwise Warp launches.
+
+        Args:
+            thread_count: Number of threads.
+            stream: The stream's handle.
+        """
+        if self._launch is None or thread_count > MOST_THREADS:
+            return False
+        if torch.cuda.current_device() != self._device.index:
+            return False
+        config = self._config
+        config.grid_x = -(-thread_count // self._block)
+        config.stream = stream
+        early = self._waits and torch.cuda.is_current_stream_capturing() and _follows_kernel(stream)
+        config.attribute_count = int(early)
+        return not self._launch(self._place, self._function, self._addresses, None)
