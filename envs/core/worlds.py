@@ -143,7 +143,9 @@ class Batch:
 
     def here(self) -> contextlib.AbstractContextManager[Any]:
         """Return a context in which the worlds' device is the current one."""
-        return torch.cuda.device(self.device) if self.x.is_cuda else contextlib.nullcontext()
+        if not self.x.is_cuda or torch.cuda.current_device() == self.device.index:
+            return contextlib.nullcontext()
+        return torch.cuda.device(self.device)
 
 
 class Worlds(Batch):
@@ -371,10 +373,11 @@ class Worlds(Batch):
         observation = self.queue(action, out)
         if self._beside is not None:
             self._beside.wait()
-        if not self._host_endings[-1]:
+        told: NDArray[np.uint8] = self._host_endings.numpy()
+        if not told[-1]:
             self.random.steps -= 1
             raise self._not_finite(action)
-        endings = self._host_endings[:-1].numpy().copy()
+        endings = told[:-1].copy()
         if (endings & NOT_FINITE).any():
             everyone = torch.arange(self.world_count, device=self.device)
             self._check_losses(everyone)
@@ -511,7 +514,7 @@ class Worlds(Batch):
 
     def told(self) -> list[float]:
         """Return the numbers of a single world's report after a step."""
-        numbers: list[float] = self._host_numbers[:, 0].tolist()
+        numbers: list[float] = self._host_numbers.numpy()[:, 0].tolist()
         return numbers
 
     @torch.no_grad()

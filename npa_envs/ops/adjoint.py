@@ -144,8 +144,8 @@ def _unscale(
         saved.starts,
         saved.perception,
         bar,
-        cotangents.blur.view(-1),
-        cotangents.gradient.view(-1),
+        cotangents.blur,
+        cotangents.gradient,
         cotangents.density_gradient,
     )
     return cotangents
@@ -183,7 +183,7 @@ def _gather_states(
         cotangents.bar,
         cotangents.blur,
         cotangents.gradient,
-        cotangents.gradient.view(-1),
+        cotangents.gradient,
         states_bar,
     )
     return states_bar
@@ -276,14 +276,14 @@ def _gather_by_tiles(
         plan.row_capacity,
         plan.group_count,
         saved.starts,
-        saved.particles.view(-1),
+        saved.particles,
         saved.source,
         saved.row_of,
         saved.row_positions,
         saved.row_kernel_sum,
         bar,
         cotangents,
-        cotangents.view(-1),
+        cotangents,
         states_bar,
     )
     return states_bar

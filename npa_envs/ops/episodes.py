@@ -69,7 +69,7 @@ class PreparedJudgement:
         way = ON_DIVERGENCE[rules.on_divergence]
         self._rules = (rules.last_step or 0, rules.paid_step or 0, way)
         self._read = (enabled, diverged, first_loss, success_loss)
-        self._written = (elapsed, numbers.view(-1), flags.view(torch.uint8).view(-1), endings)
+        self._written = (elapsed, numbers, flags.view(torch.uint8), endings)
 
     def __call__(self, parts: Tensor, broken: Tensor | None = None) -> None:
         """Judge the worlds.
@@ -87,7 +87,7 @@ class PreparedJudgement:
             parts.device,
             len(parts),
             *self._rules,
-            parts.view(-1),
+            parts,
             enabled,
             diverged,
             first_loss,

@@ -233,7 +233,7 @@ def _static_rows(
         cell_starts.shape[0] - 1,
         active_before,
         cell_starts,
-        x.view(total, space_dim),
+        x,
         *rows,
     )
     return [*rows, active_before.view(step_count, total)[:, -1].diff(prepend=rows[0].new_zeros(1))]

@@ -69,13 +69,11 @@ def _update_particles(
         update.shape[1],
         int(aligned),
         row_of,
-        update.view(-1),
-        x.view(total, space_dim),
-        s.view(-1),
-        path_length.view(total),
-        outputs[0].view(total, space_dim),
-        outputs[1].view(-1),
-        outputs[2].view(total),
+        update,
+        x,
+        s,
+        path_length,
+        *outputs,
     )
     return outputs
 
@@ -116,11 +114,11 @@ def _update_particles_backward(
         int(update.shape[1] % CHANNEL_SHARE == 0),
         starts,
         row_source,
-        update.contiguous().view(-1),
-        new_x_bar.contiguous().view(-1, space_dim),
-        new_s_bar.contiguous().view(-1),
-        new_path_bar.contiguous().view(-1),
-        update_bar.view(-1),
+        update.contiguous(),
+        new_x_bar.contiguous(),
+        new_s_bar.contiguous(),
+        new_path_bar.contiguous(),
+        update_bar,
     )
     return update_bar
 
@@ -278,9 +276,7 @@ def apply_actions(
     sides = None if box is None else tuple(box)
     rules = ActionRules(reach, dt, state_scale, moving, sides, position_limit, state_limit)
     aligned = s.data_ptr() % 16 == 0 and action.data_ptr() % 16 == 0
-    launch(
-        *_launch_of(action.view(-1), x, s, rules, mask, noise, enabled, diverged, aligned=aligned)
-    )
+    launch(*_launch_of(action, x, s, rules, mask, noise, enabled, diverged, aligned=aligned))
 
 
 class PreparedActions:
@@ -360,28 +356,27 @@ class PreparedActions:
         self._run(self._buffer)
 
     def _run(self, action: Tensor) -> None:
-        flat = action.detach().view(-1)
         if self._check is None or self._apply is None:
-            self._check, self._apply = self._record(flat)
-        self._check(flat)
-        self._apply(flat)
+            self._check, self._apply = self._record(action)
+        self._check(action)
+        self._apply(action)
 
-    def _record(self, flat: Tensor) -> tuple[PreparedLaunch, PreparedLaunch]:
+    def _record(self, action: Tensor) -> tuple[PreparedLaunch, PreparedLaunch]:
         """Return the launches that check and that apply, both of actions that are aligned."""
         x, s = self._worlds
-        thread_count = -(-flat.numel() // VALUES_PER_THREAD)
+        thread_count = -(-action.numel() // VALUES_PER_THREAD)
         check = PreparedLaunch(
             find_not_finite(scalar_type(x.dtype)),
             thread_count,
             x.device,
             thread_count,
-            flat,
+            action,
             self._enabled,
-            changing=flat,
+            changing=action,
         )
         aligned = s.data_ptr() % 16 == 0
-        launched = _launch_of(flat, x, s, self._rules, *self._step, aligned=aligned)
-        apply = PreparedLaunch(*launched, changing=flat)
+        launched = _launch_of(action, x, s, self._rules, *self._step, aligned=aligned)
+        apply = PreparedLaunch(*launched, changing=action)
         return check, apply
 
 
@@ -417,16 +412,16 @@ def _launch_of(
         rules.position_limit,
         rules.state_limit,
         int(mask is not None),
-        None if mask is None else mask.view(-1),
+        mask,
         int(noise is not None),
-        None if noise is None else noise.view(-1, space_dim),
+        noise,
         int(enabled is not None),
         enabled,
         state_dim,
         int(aligned),
         action,
-        x.view(-1, space_dim),
-        s.view(-1),
+        x,
+        s,
         diverged,
     )
 

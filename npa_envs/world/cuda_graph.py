@@ -39,6 +39,19 @@ def no_garbage_collection() -> Iterator[None]:
             gc.enable()
 
 
+@functools.lru_cache(maxsize=64)
+def _stream(device: torch.device, handle: int) -> torch.cuda.Stream:
+    return torch.cuda.current_stream(device)
+
+
+def current_stream(device: torch.device) -> torch.cuda.Stream:
+    """Return torch's current stream of a CUDA device, which has a number: the same object again.
+
+    `torch.cuda.current_stream` makes a new one each time, which takes ten times as long.
+    """
+    return _stream(device, torch._C._cuda_getCurrentRawStream(device.index))
+
+
 @functools.cache
 def _capture_stream(device_index: int) -> torch.cuda.Stream:
     """The one stream of a device that is captured: graphs can share memory only within a stream."""
@@ -228,6 +241,17 @@ class Beside:
         self._stream = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
         self._begin, self._end, self._mark = (torch.cuda.Event() for _ in range(3))  # type: ignore[no-untyped-call]
 
+    @staticmethod
+    @functools.lru_cache(maxsize=64)
+    def of_thread(device: torch.device, thread: int) -> Beside:
+        """Return the one of a thread, for captures: torch has 32 streams, which it gives in turn.
+
+        Args:
+            device: A CUDA device.
+            thread: The thread's identifier.
+        """
+        return Beside(device)
+
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the device alone: streams and events are a process's own."""
         return Beside, (self._device,)
@@ -235,7 +259,7 @@ class Beside:
     @contextlib.contextmanager
     def aside(self) -> Iterator[None]:
         """What is launched inside begins once the current stream has done its work so far."""
-        self._begin.record(torch.cuda.current_stream(self._device))
+        self._begin.record(current_stream(self._device))
         self._stream.wait_event(self._begin)
         with torch.cuda.stream(self._stream):
             yield
@@ -243,11 +267,11 @@ class Beside:
 
     def join(self) -> None:
         """Let what the current stream is given from now on wait until the work is done."""
-        torch.cuda.current_stream(self._device).wait_event(self._end)
+        current_stream(self._device).wait_event(self._end)
 
     def mark(self) -> None:
         """Remember what the current stream has been given so far."""
-        self._mark.record()
+        self._mark.record(current_stream(self._device))
 
     def wait(self) -> None:
         """Wait on the host until what was remembered is done."""

@@ -31,7 +31,7 @@ from npa_envs.errors import NPAError, shown
 from npa_envs.ops.checks import FiniteCheck, check_finite_positions
 from npa_envs.ops.opaque import once_differentiable
 from npa_envs.rule.rule import NPARule
-from npa_envs.world.cuda_graph import capture, prepare_capture
+from npa_envs.world.cuda_graph import capture, current_stream, prepare_capture
 from npa_envs.world.divergence import DivergenceWatch
 from npa_envs.world.randomness import Randomness, WorldRandom
 
@@ -428,10 +428,8 @@ class _Recording:
 
     def _take_turns(self) -> None:
         """Let the current stream wait for the one on which this was used last."""
-        # What `torch.cuda.current_stream` makes an object of, in a tenth of its time.
-        handle = torch._C._cuda_getCurrentRawStream(self.device.index)
-        if self._stream is None or self._stream.cuda_stream != handle:
-            stream = torch.cuda.current_stream(self.device)
+        stream = current_stream(self.device)
+        if self._stream is not stream:
             if self._stream is not None:
                 stream.wait_stream(self._stream)
             self._stream = stream
@@ -541,7 +539,7 @@ def _run_recorded(
         return None
     tensors.insert(2, lease.recording.no_path)
     ready = lease.recording.ready
-    ready.record(torch.cuda.current_stream(x.device))
+    ready.record(current_stream(x.device))
     found: list[Worlds] = []
     for steps in blocks:
         after = _replay(lease, steps, tensors, generator)

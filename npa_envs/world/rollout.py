@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from types import NoneType
 from typing import Literal, NamedTuple, Protocol, overload
@@ -200,7 +201,7 @@ def drawn_steps(draw: Callable[[], Draws], like: Tensor, steps: int) -> Iterator
         for _ in range(steps):
             yield draw()
         return
-    beside = Beside(like.device)
+    beside = Beside.of_thread(like.device, threading.get_ident())
     ready, rest = [draw()], steps - 1
     while rest > 0:
         # Their memory comes from steps that are over by then: these streams take turns in it.
