@@ -18,7 +18,7 @@ import math
 import shutil
 import statistics
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -152,6 +152,23 @@ def ratio(row: Mapping[str, Sequence[float]]) -> float:
     return statistics.mean(row["turned"]) / statistics.mean(row["left_alone"])
 
 
+class InTorch(npa_envs.NPARule):
+    """A rule that runs as the module that it is, in plain torch."""
+
+    def forward(self, perception: Tensor) -> Tensor:
+        """Map perception vectors to updates."""
+        return super().forward(perception)
+
+
+RULES: Mapping[str, Callable[[], npa_envs.NPARule]] = {
+    "plain": npa_envs.NPARule,
+    "chiral": lambda: npa_envs.NPARule(equivariant=True, chiral=True),
+    "mirrored": lambda: npa_envs.NPARule(equivariant=True),
+    "chiral, in torch": lambda: InTorch(equivariant=True, chiral=True),
+}
+"""Rules whose steps are timed."""
+
+
 def time_steps(arguments: argparse.Namespace) -> None:
     """Take the time of a step of each kind of rule, with gradients and without."""
     found: dict[str, dict[str, float]] = {}
@@ -160,10 +177,8 @@ def time_steps(arguments: argparse.Namespace) -> None:
         side = 0.7 * math.sqrt(count / 4096)
         x = (torch.rand(8, count, 2, device=device) * 2.0 - 1.0) * side
         s = torch.zeros(8, count, 16, device=device)
-        for kind, fields in KINDS.items():
-            known = {"chiral": kind == "chiral"} if fields else {}
-            options = {"equivariant": True, **known} if fields else {}
-            rule = npa_envs.NPARule(**options).to(device)
+        for kind, make in RULES.items():
+            rule = make().to(device)
             row = found[f"8 x {count}, {kind}"] = {}
             for name, backward in (("inference", False), ("training", True)):
                 row[name] = seconds_of(rule, x, s, steps, backward) / steps * 1e6
@@ -181,7 +196,7 @@ def seconds_of(rule: npa_envs.NPARule, x: Tensor, s: Tensor, steps: int, backwar
             torch.cuda.synchronize()
         begun = time.perf_counter()
         with torch.set_grad_enabled(backward):
-            after = npa_envs.rollout(rule, x, s, steps)
+            after = npa_envs.rollout(rule, x, s, steps, cuda_graph=True)
             if backward:
                 sum(part.sum() for part in after).backward()  # type: ignore[union-attr]
         if x.is_cuda:

@@ -268,7 +268,8 @@ def _number_in_stack(packed: Mapping[str, Any], name: str | None) -> int:
         raise NPAError(
             f"the file is a stack of {shape[0]} rules without names: add #0 to #{shape[0] - 1}"
         )
-    number = 0 if name is None else int(name) if name.isascii() and name.isdigit() else -1
+    digits = "0" if name is None else name
+    number = int(digits) if digits.isascii() and digits.isdigit() and len(digits) < 10 else -1
     if not 0 <= number < shape[0]:
         raise NPAError(
             f"the file is a stack of {shape[0]} rules, got #{shown(name)[1:-1]}: give #0 to "

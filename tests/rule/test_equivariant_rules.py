@@ -258,8 +258,8 @@ def test_stacks_of_plain_rules_are_told_apart_by_numbers(tmp_path):
         assert_same_rule(npa_envs.load_rule(f"{path}#{number}"), rule)
     with pytest.raises(npa_envs.NPAError, match="stack of 3 rules without names: add #0 to #2"):
         npa_envs.load_rule(path)
-    for wrong in ("3", "-1", "lizard", ""):
-        with pytest.raises(npa_envs.NPAError, match=f"got #{wrong}: give #0 to #2"):
+    for wrong in ("3", "-1", "lizard", "", "9" * 5000):
+        with pytest.raises(npa_envs.NPAError, match=f"got #{wrong[:20]}.*: give #0 to #2"):
             npa_envs.load_rule(f"{path}#{wrong}")
     path.write_text(json.dumps(plain_stack(rules[:1])))
     assert_same_rule(npa_envs.load_rule(path), rules[0])
