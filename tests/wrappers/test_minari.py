@@ -100,21 +100,23 @@ def test_rules_learn_from_a_dataset_without_a_world(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("env", "policy", "shape"),
-    [("Morphogenesis2D", "zero", None), ("Shepherd2DSmall", "random", {"desired_goal"})],
+    ("env", "policy", "names"),
+    [
+        ("Gardener2DSmall", "zero", None),
+        ("Shepherd2DSmall", "scripted", {"observation", "achieved_goal", "desired_goal"}),
+    ],
 )
-def test_the_command_records_any_policy(root, capsys, env, policy, shape):
+def test_the_command_records_any_policy(root, capsys, env, policy, names):
     words = f"record npa/{env}-v0 --policy {policy} --episodes 3 --worlds 2 --no-progress".split()
-    small = ["particle_count=32", "resolution=16", "eps=0.3"] if shape is None else []
-    small = [*small, "seed_pool=1"] if small == [] else small
-    words += ["--dataset", f"npa/{policy}-v0", "--options", *small, "--root", str(root)]
-    assert main(words) == 0
+    words += ["--dataset", f"npa/{policy}-v0", "--root", str(root)]
+    assert main([*words, "--options", "particle_count=32", "seed_pool=1"]) == 0
     assert "3 episodes, mean return" in capsys.readouterr().out
     dataset = minari.load_dataset(f"npa/{policy}-v0")
-    assert dataset.total_episodes == 3
+    assert (dataset.total_episodes, dataset.total_steps) == (3, 96)
     assert str(root) not in dataset.storage.metadata["description"]
-    first = dataset[0].observations
-    assert shape is None or shape <= first.keys()
+    first = dataset[0]
+    assert bool(first.actions.any()) == (policy != "zero")
+    assert names is None or first.observations.keys() == names
 
 
 @pytest.mark.parametrize(
