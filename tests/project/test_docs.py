@@ -171,7 +171,8 @@ def commands_of_pages() -> dict[tuple[str, ...], set[str]]:
     for path in TEXTS:
         for block in re.findall(r"^ *```(?:sh|bash)\n(.*?)^ *```", path.read_text(), re.M | re.S):
             for line in re.sub(r"\\\n", " ", block).splitlines():
-                words = re.sub(r"#.*| > .*", "", line).replace(".venv/bin/", "").split()
+                # What follows `--` is told to the runs of a sweep.
+                words = re.sub(r"#.*| > .*| -- .*", "", line).replace(".venv/bin/", "").split()
                 if words[:1] != ["npa-envs"] or len(words) < 2 or words[1].startswith("-"):
                     continue
                 command = tuple(words[1:3]) if words[1] == "train" else (words[1],)
