@@ -158,6 +158,20 @@ SEVENTH: Fields = {
 }
 """What serves `fast`, in large: half of the worlds are seeds, none is old. Not yet at full size."""
 
+EIGHTH: Fields = {
+    **STRAYS,
+    "lifetimes": (64, 16_384),
+    "pool_size": 64,
+    "steps": (48, 80),
+    "schedule": "cosine",
+    "learning_rate": 2e-3,
+    "damage_share": 0.25,
+    "damage_radius": 0.2,
+    "rest_weight": 2.0,
+    "initial_rule": "heart",
+}
+"""The eighth candidate: grown worlds are to rest."""
+
 FAST_BEFORE: Fields = {
     **NO_STRAYS,
     "learning_rate": 2e-3,
@@ -194,6 +208,15 @@ FAST_FIFTH: Fields = {
 FAST_SIXTH: Fields = FAST_FIFTH | {"seed_interval": 1}
 """Half of the worlds are seeds: the preset `fast`."""
 
+FAST_EIGHTH: Fields = {
+    **FAST_FIFTH,
+    "lifetimes": (24, 4096),
+    "pool_size": 16,
+    "damage_share": 0.5,
+    "rest_weight": 2.0,
+}
+"""The eighth candidate in small: of two worlds one is young and damaged, one grown and at rest."""
+
 ARMS: Mapping[str, Fields] = {
     "paper": {},
     "paper, seeds every 3rd": {"seed_interval": 3},
@@ -226,6 +249,15 @@ ARMS: Mapping[str, Fields] = {
     "fifth, no ageing": FIFTH | {"ageing_steps": 0},
     "fifth, rate 5e-4": FIFTH | {"learning_rate": 5e-4},
     "seventh": SEVENTH,
+    "eighth": EIGHTH,
+    "eighth, rest 1": EIGHTH | {"rest_weight": 1.0},
+    "eighth, no rest": EIGHTH | {"rest_weight": 0.0},
+    "eighth, bend": EIGHTH | {"bend_size": 0.05},
+    "eighth, rate 1e-3": EIGHTH | {"learning_rate": 1e-3},
+    "eighth, rate 4e-3": EIGHTH | {"learning_rate": 4e-3},
+    "eighth, share 0.5": EIGHTH | {"damage_share": 0.5},
+    "eighth, steps 32 to 64": EIGHTH | {"steps": (32, 64), "lifetimes": (32, 16_384)},
+    "eighth, damage 0.1": EIGHTH | {"damage_radius": 0.1},
     "seventh, untrained, rate 3e-3": SEVENTH
     | {"initial_rule": "", "learning_rate": 3e-3, "steps": (48, 50), "iterations": 1500},
 }
@@ -269,6 +301,8 @@ FAST_ARMS: Mapping[str, Fields] = {
     "fifth, rate 2e-3": FAST_FIFTH | {"learning_rate": 2e-3},
     "sixth": FAST_SIXTH,
     "sixth, rate 2e-3": FAST_SIXTH | {"learning_rate": 2e-3},
+    "eighth": FAST_EIGHTH,
+    "eighth, rate 2e-3": FAST_EIGHTH | {"learning_rate": 2e-3},
     "sixth, untrained": FAST_SIXTH | {"initial_rule": ""},
 }
 """Arms of `fast`: what each changes of it as it was; the preset is the sixth now."""

@@ -37,6 +37,9 @@ LOWEST = 0.01
 VARIED = ("vary_particles", "vary_eps", "vary_update_prob", "vary_dt")
 """Fields that say what of worlds is varied."""
 
+GROWN = 512
+"""Steps from the seed after which a world is to rest."""
+
 AGEING_BLOCK = 64
 """Steps that worlds are aged by at a time: on CUDA, what one graph replays."""
 
@@ -133,6 +136,12 @@ class TrainConfig(Generic[TaskConfigT]):
     ageing_interval: int = 16
     """Iterations from one such ageing to the next."""
 
+    rest_weight: float = 0.0
+    """Weight of what a rollout changes in grown worlds: the mean path length of their particles in
+    perception radii, and the mean |Δs| from its start to its end; of all others it is 0
+    (dimensionless). Grown are worlds of at least 512 steps whose place in the pool is never
+    damaged. Needs `lifetimes`."""
+
     damage: bool = True
     """Worlds from the pool are damaged before the rollout, so that the rule learns to heal."""
 
@@ -182,7 +191,7 @@ class TrainConfig(Generic[TaskConfigT]):
         check_positive(self, int, "ageing_steps", at_least=0)
         check_positive(self, float, "learning_rate", "runaway_limit")
         check_fraction(self, "decay", "damage_share")
-        check_non_negative(self, "weight_decay", "fresh_share", "average")
+        check_non_negative(self, "weight_decay", "fresh_share", "average", "rest_weight")
         if self.average >= 1.0:
             raise NPAError(f"average must be below 1, got {self.average}: try 0.999")
         if self.fresh_share > 1.0:
@@ -256,11 +265,12 @@ class TrainConfig(Generic[TaskConfigT]):
                 f"{self.pool_size} and {self.world_count}: set "
                 f"pool_size={self.pool_size // self.world_count * self.world_count}"
             )
-        if self.ageing_steps > 0 and not self.ages:
-            raise NPAError(
-                f"ageing_steps needs worlds that have lifetimes, got {self.ageing_steps} without: "
-                "set lifetimes, for example to (256, 32768)"
-            )
+        for name in ("ageing_steps", "rest_weight"):
+            if getattr(self, name) > 0 and not self.ages:
+                raise NPAError(
+                    f"{name} needs worlds that have lifetimes, got {getattr(self, name)} without: "
+                    "set lifetimes, for example to (256, 32768)"
+                )
 
     def _check_variants(self) -> None:
         check_positive(self, int, "variants")

@@ -25,7 +25,7 @@ from npa_envs.tasks.base import (
     task_for_rule,
     task_toward,
 )
-from npa_envs.tasks.train_config import AGEING_BLOCK, TrainConfig
+from npa_envs.tasks.train_config import AGEING_BLOCK, GROWN, TrainConfig
 from npa_envs.training.randomness import RunRandomness, registered, restart
 from npa_envs.training.ranks import Ranks
 from npa_envs.world.cuda_graph import Replayed, capture
@@ -244,6 +244,8 @@ class TrainingCycle:
             if goal is not None and fresh_goal is not None:
                 goal = torch.where(over, fresh_goal, goal)
             self._age.copy_(age.masked_fill(over, 0))
+            grown = (self._age >= GROWN) & ~self._places_hurt()
+            self.batch.grown.copy_(grown)
         self.batch.x0.copy_(x0)
         self.batch.s0.copy_(s0)
         if goal is not None:
@@ -258,9 +260,8 @@ class TrainingCycle:
             x, s, goal = self.task.damage_with_goals(x, s, goal, worlds)
         else:
             x, s = self.task.damage(x, s, worlds)
-        share = self._config.damage_share
-        if share < 1.0:
-            hit = self._places[self._index] < share * self._config.pool_size
+        if self._config.damage_share < 1.0:
+            hit = self._places_hurt()
             x, s = (
                 torch.where(hit[:, None, None], hurt, old)
                 for hurt, old in ((x, whole[0]), (s, whole[1]))
@@ -268,6 +269,11 @@ class TrainingCycle:
             if goal is not None and whole[2] is not None:
                 goal = torch.where(hit, goal, whole[2])
         return x, s, goal
+
+    def _places_hurt(self) -> Tensor:
+        """Return whether the batch's worlds come from places where all are damaged, shape [B]."""
+        share = self._config.damage_share if self._config.damage else 0.0
+        return self._places[self._index] < share * self._config.pool_size
 
     def _begin_anew(self, count: int) -> None:
         """Let the first worlds of the batch be fresh seeds."""
@@ -490,8 +496,12 @@ class EagerIteration:
         """Worlds before the rollout."""
         self.x, self.s = torch.empty_like(x), torch.empty_like(s)
         """Worlds after the rollout."""
+        self.grown = torch.zeros_like(x[:, 0, 0], dtype=torch.bool)
+        """Which worlds are grown and whole, and are to rest, shape [B]."""
+        self._rest_weight = config.rest_weight
+        self._task = task
         with torch.no_grad():
-            total, parts = task.loss(x, s, torch.zeros_like(x[..., 0]))
+            total, parts = self._loss(x, s, torch.zeros_like(x[..., 0]))
         self.term_names: tuple[str, ...] = ("loss", *parts)
         """Names of `terms`."""
         self.terms = total.new_zeros(len(self.term_names))
@@ -502,7 +512,6 @@ class EagerIteration:
         """Their `.grad`."""
         for parameter, buffer in zip(self.parameters, self.gradients, strict=True):
             parameter.grad = buffer
-        self._task = task
         self._rule = rule
         self._memory = config.memory
         self._generator = generator
@@ -530,7 +539,7 @@ class EagerIteration:
             generator=self._generator,
             return_path_length=True,
         )
-        total, parts = self._task.loss(x, s, path_length)
+        total, parts = self._loss(x, s, path_length)
         # Not backward(): its accumulation nodes remember the stream they were first used on,
         # which a capture on another stream must not touch.
         gradients = torch.autograd.grad(
@@ -541,6 +550,15 @@ class EagerIteration:
         self.terms.copy_(torch.stack([total, *parts.values()]).detach())
         self.x.copy_(x.detach())
         self.s.copy_(s.detach())
+
+    def _loss(self, x: Tensor, s: Tensor, path_length: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the task's loss and its parts, and how far grown worlds are from rest."""
+        total, parts = self._task.loss(x, s, path_length)
+        if self._rest_weight > 0.0:
+            unrest = path_length.mean(dim=1) / self._task.eps + (s - self.s0).abs().mean(dim=(1, 2))
+            parts["rest"] = (self.grown.to(x.dtype) * unrest).mean()
+            total = total + self._rest_weight * parts["rest"]
+        return total, parts
 
 
 class GraphedIteration(EagerIteration):

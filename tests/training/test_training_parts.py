@@ -208,6 +208,25 @@ def test_iteration_leaves_the_worlds_the_terms_and_the_gradients(tmp_path):
     assert not torch.equal(iteration.x, x.detach())
 
 
+def test_grown_worlds_are_to_rest(tmp_path):
+    fields = {"dtype": "float64", "lifetimes": (8, 64), "pool_size": 9}
+    _, _, plain = make_iteration(circle_config(tmp_path, **fields))
+    task, _, iteration = make_iteration(circle_config(tmp_path, rest_weight=0.5, **fields))
+    assert iteration.term_names == (*plain.term_names, "rest")
+    # The second of three worlds is grown; both iterations draw the same masks.
+    iteration.grown[1] = True
+    for one in (plain, iteration):
+        one.run(6)
+    assert torch.equal(iteration.x, plain.x)
+    # Particles of this task go straight on, so that their path is as long as their way.
+    way = (iteration.x - iteration.x0)[1].norm(dim=-1).mean() / task.eps
+    change = (iteration.s - iteration.s0)[1].abs().mean()
+    rest = 3.0 * iteration.terms[-1]
+    assert rest >= way + change - 1e-12
+    assert rest < 3.0 * (way + change)
+    torch.testing.assert_close(iteration.terms[0], plain.terms[0] + 0.5 * iteration.terms[-1])
+
+
 def test_a_parameter_outside_the_loss_gets_a_zero_gradient(tmp_path):
     task = CircleTask()
     rule = task.make_rule(torch.Generator().manual_seed(1))

@@ -185,6 +185,24 @@ def test_the_longer_lived_half_of_the_pool_ages_without_gradients_once_the_rate_
 
 
 @pytest.mark.parametrize("damage", [True, False])
+def test_worlds_that_are_old_and_never_damaged_count_as_grown(tmp_path, damage):
+    seen = []
+
+    def rollout(rule, x, s, steps, **options):
+        seen.append(trainer._cycle.batch.grown.tolist())
+        return plain_rollout(rule, x, s, 2, **options)
+
+    fields = {"iterations": 6, "world_count": 4, "pool_size": 4, "lifetimes": (200, 6000)}
+    fields |= {"steps": (256, 257), "damage": damage, "damage_share": 0.5, "rest_weight": 1.0}
+    trainer = trainer_of(circle_config(tmp_path, **fields), rollout=rollout)
+    trainer.run(progress=False)
+    # Lives of 200, 621, 1931 and 6000 steps; the first two are damaged, where worlds are.
+    none, two, all_but_one = [False] * 4, [False, False, True, True], [False, True, True, True]
+    again = two if damage else all_but_one
+    assert seen == [none, none, again, two, two, again]
+
+
+@pytest.mark.parametrize("damage", [True, False])
 def test_worlds_from_the_pool_are_damaged_where_asked_and_fresh_seeds_are_not(tmp_path, damage):
     blank = []
 
