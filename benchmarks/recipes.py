@@ -210,10 +210,11 @@ FAST_SIXTH: Fields = FAST_FIFTH | {"seed_interval": 1}
 
 FAST_EIGHTH: Fields = {
     **FAST_FIFTH,
-    "lifetimes": (24, 4096),
-    "pool_size": 16,
+    "learning_rate": 2e-3,
+    "lifetimes": (24, 256),
     "damage_share": 0.5,
-    "rest_weight": 2.0,
+    "rest_age": 64,
+    "rest_weight": 0.5,
 }
 """The eighth candidate in small: of two worlds one is young and damaged, one grown and at rest."""
 
@@ -252,7 +253,7 @@ ARMS: Mapping[str, Fields] = {
     "eighth": EIGHTH,
     "eighth, rest 1": EIGHTH | {"rest_weight": 1.0},
     "eighth, no rest": EIGHTH | {"rest_weight": 0.0},
-    "eighth, bend": EIGHTH | {"bend_size": 0.05},
+    "eighth, rest 0.5": EIGHTH | {"rest_weight": 0.5},
     "eighth, rate 1e-3": EIGHTH | {"learning_rate": 1e-3},
     "eighth, rate 4e-3": EIGHTH | {"learning_rate": 4e-3},
     "eighth, share 0.5": EIGHTH | {"damage_share": 0.5},
@@ -301,8 +302,12 @@ FAST_ARMS: Mapping[str, Fields] = {
     "fifth, rate 2e-3": FAST_FIFTH | {"learning_rate": 2e-3},
     "sixth": FAST_SIXTH,
     "sixth, rate 2e-3": FAST_SIXTH | {"learning_rate": 2e-3},
+    "sixth, share 0.5": FAST_SIXTH | {"damage_share": 0.5},
     "eighth": FAST_EIGHTH,
-    "eighth, rate 2e-3": FAST_EIGHTH | {"learning_rate": 2e-3},
+    "eighth, rate 4e-3": FAST_EIGHTH | {"learning_rate": 4e-3},
+    "eighth, no rest": FAST_EIGHTH | {"rest_weight": 0.0},
+    "eighth, rest 2": FAST_EIGHTH | {"rest_weight": 2.0},
+    "eighth, to 4096": FAST_EIGHTH | {"lifetimes": (24, 4096), "rest_age": 512},
     "sixth, untrained": FAST_SIXTH | {"initial_rule": ""},
 }
 """Arms of `fast`: what each changes of it as it was; the preset is the sixth now."""

@@ -5,7 +5,6 @@ Nothing here reads a value back from the device, so all of it may be captured in
 
 from __future__ import annotations
 
-import math
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -25,7 +24,6 @@ __all__ = [
     "DAMAGE_SIZES",
     "DamageEvent",
     "PoolDamage",
-    "bend",
     "clump",
     "cut",
     "damage_worlds",
@@ -234,38 +232,6 @@ def tear(x: Tensor, *, radius: float, chance: float, generator: Randomness | Non
     return torch.where(torn[..., None], x + (_outside(place) - centre)[:, None], x)
 
 
-WAVES, SHORTEST_WAVE = 4, 1.0
-"""Waves that a world is bent by, and the shortest of them [length units]."""
-
-
-def bend(x: Tensor, *, size: float, generator: Randomness | None = None) -> Tensor:
-    """Return the positions displaced by a smooth random field, the sum of a few long waves.
-
-    Worlds that live long are slowly deformed so: nothing but the rule itself holds them in shape.
-    Nothing waits for the device.
-
-    Args:
-        x: Particle positions [length units], shape [B, N, D].
-        size: Largest amplitude of a wave [length units].
-        generator: Source of randomness, as for `scatter`.
-
-    Raises:
-        NPAError: The generator is on another device or for another number of worlds.
-    """
-    world_count, _, space_dim = x.shape
-    check_generator(generator, x.device, world_count)
-    shape = (world_count, WAVES, space_dim)
-    draw = {"generator": generator, "device": x.device, "dtype": x.dtype}
-    wave_vectors = uniform_ball(*shape, 2.0 * math.pi / SHORTEST_WAVE, **draw)
-    amplitudes = uniform_ball(*shape, size, **draw)
-    phases = 2.0 * math.pi * uniform_draws(generator, (world_count, WAVES), x)
-    # One by one: a product of matrices is not promised to be the same in every batch.
-    for k in range(WAVES):
-        along = (x * wave_vectors[:, k, None]).sum(dim=-1, keepdim=True)
-        x = x + amplitudes[:, k, None] * torch.sin(along + phases[:, k, None, None])
-    return x
-
-
 def _outside(ball: Tensor) -> Tensor:
     """Return places between `NEAREST` and `FARTHEST` for places in the unit ball, [..., D]."""
     length: Tensor = ball.norm(dim=-1, keepdim=True)
@@ -307,10 +273,6 @@ class PoolDamage:
     """Radius up to which a ball of particles is torn off and thrown out, in a quarter of the worlds
     from the pool [length units]; 0: none."""
 
-    bend_size: float = 0.0
-    """Largest amplitude of the long waves by which worlds from the pool are bent, so that the rule
-    learns to keep its shape [length units]; 0: none."""
-
     stray_share: float = 0.0
     """Probability of each particle to be thrown out of worlds from the pool (dimensionless)."""
 
@@ -321,13 +283,7 @@ class PoolDamage:
             NPAError: A field is no finite number of at least 0.
         """
         check_non_negative(
-            self,
-            "damage_radius",
-            "clump_radius",
-            "cut_gap",
-            "flake_radius",
-            "bend_size",
-            "stray_share",
+            self, "damage_radius", "clump_radius", "cut_gap", "flake_radius", "stray_share"
         )
 
 
@@ -357,8 +313,6 @@ def hurt(
         x, s = cut(x, s, centre=world_mean(x), normal=normal, gap=damage.cut_gap * hit)
     if damage.flake_radius > 0.0:
         x = tear(x, radius=damage.flake_radius, chance=SHARE, generator=generator)
-    if damage.bend_size > 0.0:
-        x = bend(x, size=damage.bend_size, generator=generator)
     if damage.stray_share > 0.0:
         x = scatter(x, share=damage.stray_share, generator=generator)
     return x, s

@@ -37,9 +37,6 @@ LOWEST = 0.01
 VARIED = ("vary_particles", "vary_eps", "vary_update_prob", "vary_dt")
 """Fields that say what of worlds is varied."""
 
-GROWN = 512
-"""Steps from the seed after which a world is to rest."""
-
 AGEING_BLOCK = 64
 """Steps that worlds are aged by at a time: on CUDA, what one graph replays."""
 
@@ -139,8 +136,11 @@ class TrainConfig(Generic[TaskConfigT]):
     rest_weight: float = 0.0
     """Weight of what a rollout changes in grown worlds: the mean path length of their particles in
     perception radii, and the mean |Δs| from its start to its end; of all others it is 0
-    (dimensionless). Grown are worlds of at least 512 steps whose place in the pool is never
-    damaged. Needs `lifetimes`."""
+    (dimensionless). Grown are worlds of `rest_age` whose place in the pool is never damaged. It
+    ends the slow flow by which worlds lose their shape. Needs `lifetimes`."""
+
+    rest_age: int = 512
+    """Steps from the seed after which a world is grown."""
 
     damage: bool = True
     """Worlds from the pool are damaged before the rollout, so that the rule learns to heal."""
@@ -187,7 +187,7 @@ class TrainConfig(Generic[TaskConfigT]):
         """Check every field; raise NPAError where one has a wrong type or lies out of its range."""
         check_positive(self, int, "iterations", "repeats", "world_count", "pool_size")
         check_positive(self, int, "seed_interval", "log_interval", "checkpoint_interval")
-        check_positive(self, int, "ageing_interval")
+        check_positive(self, int, "ageing_interval", "rest_age")
         check_positive(self, int, "ageing_steps", at_least=0)
         check_positive(self, float, "learning_rate", "runaway_limit")
         check_fraction(self, "decay", "damage_share")

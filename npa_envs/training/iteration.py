@@ -25,7 +25,7 @@ from npa_envs.tasks.base import (
     task_for_rule,
     task_toward,
 )
-from npa_envs.tasks.train_config import AGEING_BLOCK, GROWN, TrainConfig
+from npa_envs.tasks.train_config import AGEING_BLOCK, TrainConfig
 from npa_envs.training.randomness import RunRandomness, registered, restart
 from npa_envs.training.ranks import Ranks
 from npa_envs.world.cuda_graph import Replayed, capture
@@ -244,7 +244,7 @@ class TrainingCycle:
             if goal is not None and fresh_goal is not None:
                 goal = torch.where(over, fresh_goal, goal)
             self._age.copy_(age.masked_fill(over, 0))
-            grown = (self._age >= GROWN) & ~self._places_hurt()
+            grown = (self._age >= config.rest_age) & ~self._places_hurt()
             self.batch.grown.copy_(grown)
         self.batch.x0.copy_(x0)
         self.batch.s0.copy_(s0)

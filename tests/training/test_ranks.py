@@ -24,13 +24,15 @@ LIVELY = {
     "lifetimes": (4, 400),
     "ageing_steps": 64,
     "ageing_interval": 2,
+    "rest_weight": 1.0,
+    "rest_age": 4,
     "damage_share": 0.5,
     "average": 0.9,
     "world_count": 4,
     "pool_size": 16,
     "picture_interval": 2,
 }
-"""Worlds that age, are damaged in some places, and are replaced."""
+"""Worlds that age, are to rest or are damaged in some places, and are replaced."""
 
 SEEDED = {"seed_interval": 2, "fresh_share": 0.7, "world_count": 4, "pool_size": 8}
 """Batches with several fresh seeds."""

@@ -128,9 +128,13 @@ def test_each_wrong_value_is_named(field, value, rule):
         override(PAPER, **{field: value})
 
 
+@pytest.mark.parametrize("field", ["ageing_steps", "rest_weight"])
+def test_what_needs_ages_needs_lifetimes(field):
+    with pytest.raises(NPAError, match=f"{field} needs worlds that have lifetimes, got 64"):
+        override(PAPER, **{field: 64})
+
+
 def test_worlds_age_the_more_the_less_the_rule_changes():
-    with pytest.raises(NPAError, match="ageing_steps needs worlds that have lifetimes, got 64"):
-        override(PAPER, ageing_steps=64)
     fields = {"lifetimes": (64, 128), "ageing_steps": 640, "ageing_interval": 5}
     config = override(PAPER, iterations=100, schedule="cosine", **fields)
     steps = [config.ageing_at(k) for k in range(200)]
