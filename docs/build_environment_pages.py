@@ -20,6 +20,7 @@ import typing
 from dataclasses import MISSING, fields
 from pathlib import Path
 
+import gardeners_page
 import species_pages
 from draw_environment_pictures import FILMS, film_path, picture_path
 from page_parts import (
@@ -209,7 +210,8 @@ def index() -> str:
         "[the tutorial](../tutorial.md). To make one of your own: "
         "[your own task as an environment](../own_environment.md)."
     )
-    listing = table(("Environment", "Task"), [*rows, *species_pages.index_rows()])
+    rows += [gardeners_page.index_row(), *species_pages.index_rows()]
+    listing = table(("Environment", "Task"), rows)
     return "\n\n".join((species_pages.MADE, "# Environments", opening, listing)) + "\n"
 
 
@@ -217,6 +219,7 @@ def pages() -> dict[str, str]:
     """Return all pages by their file names."""
     listed = (*ENVIRONMENTS, *GARDENS)
     made = {f"{registration.name}.md": page(registration) for registration in listed}
+    made[f"{gardeners_page.NAME}.md"] = gardeners_page.page()
     return made | species_pages.pages() | {"README.md": index()}
 
 

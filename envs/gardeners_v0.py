@@ -40,16 +40,61 @@ class _SharedGarden(Gardener2DEnv):
 class GardenersEnv(pettingzoo.ParallelEnv):  # type: ignore[misc]
     """Two gardeners at one living picture: the keeper keeps it whole, the raider spoils it.
 
-    The world is that of `npa/Gardener2D-v0` without weather. Both see what its agent sees and have
-    the brushes that it has; all brushes are used at once, and what particles feel of them adds up.
-    The keeper is paid what a gardener is, and the raider minus that, so rewards sum to zero. After
-    `max_cycles` steps both are truncated; a world that diverges terminates both. Infos are those of
-    `npa/Gardener2D-v0`, the same for both.
+    ## Description
+
+    The world is that of [`npa/Gardener2D-v0`](Gardener2D.md): a trained rule has grown a picture
+    from N particles and goes on running them. There is no weather; the raider is the weather. Both
+    agents have the same brushes and see the same. All brushes are used at once, and what a particle
+    feels of them adds up.
+
+    In `parallel_env` both act at once. In `env` and `raw_env` they act in turn, by PettingZoo's own
+    conversion, and the world moves on after the raider. `env` also clips actions into their space.
+    The id for `pettingzoo.make`, of PettingZoo 1.27 or newer, is `npa/Gardeners-v0`, once
+    `npa_envs.envs.gardeners_v0` is imported.
+
+    `garden` is the world as a Gymnasium environment. Policies of `npa_envs.agents.gardening` take
+    it, and what they do is an action of either agent: `ScriptedGardener(env.garden)`.
+
+    ## Observation space
+
+    As that of `npa/Gardener2D-v0`, for both agents.
+
+    ## Action space
+
+    As that of `npa/Gardener2D-v0`, for each agent. Every agent has to give an action. One that is
+    missing, of another shape or not finite raises `NPAError` and leaves the world as it was.
+
+    ## Reward
+
+    The keeper is paid what a gardener is: 1 for a picture as good as at the start, 0 for one as bad
+    as a grey one, and at least −1. The raider is paid minus that, so rewards sum to zero.
+
+    ## Starting state
+
+    As that of `npa/Gardener2D-v0`. `reset(seed=k)` begins the sequence of episodes that belongs to
+    k, and `reset()` goes on with the next one.
+
+    ## Episode end
+
+    After `max_cycles` steps both agents are truncated. A world that diverges terminates both.
+
+    ## Info
+
+    As that of `npa/Gardener2D-v0`, the same for both agents.
+
+    ## Arguments
+
+    `max_cycles`, the steps of an episode, and all arguments of `npa/Gardener2D-v0`. Chances of
+    gusts and blights are 0 by default. An unknown name, or a value out of range, raises an
+    `NPAError` that says what would be right.
+
+    ## Version history
+
+    - v0: first version.
 
     Args:
         max_cycles: Steps of an episode.
-        config: Fields of the configuration of `npa/Gardener2D-v0`; gusts and blights come where
-            their chances are given.
+        config: Fields of the configuration of `npa/Gardener2D-v0`.
 
     Raises:
         NPAError: A name is unknown, or a value wrong.
@@ -63,13 +108,16 @@ class GardenersEnv(pettingzoo.ParallelEnv):  # type: ignore[misc]
 
     def __init__(self, max_cycles: int = 32, **config: Any) -> None:
         calm = {"gust_chance": 0.0, "blight_chance": 0.0}
-        self._garden = _SharedGarden(**(calm | config))
-        self._episodes = TimeLimit(self._garden, max_cycles)
-        self.render_mode = self._garden.render_mode
+        self.garden = _SharedGarden(**(calm | config))
+        """The world as a Gymnasium environment, whose actions are those of both."""
+        self.max_cycles = max_cycles
+        """Steps of an episode."""
+        self._episodes = TimeLimit(self.garden, max_cycles)
+        self.render_mode = self.garden.render_mode
         self.possible_agents = list(AGENTS)
         self.agents: list[str] = []
-        self.observation_spaces = dict.fromkeys(AGENTS, self._garden.observation_space)
-        self.action_spaces = dict.fromkeys(AGENTS, self._garden.action_space)
+        self.observation_spaces = dict.fromkeys(AGENTS, self.garden.observation_space)
+        self.action_spaces = dict.fromkeys(AGENTS, self.garden.action_space)
 
     def observation_space(self, agent: str) -> Space[Any]:
         """Return the space of what an agent sees, the same object each time.
@@ -138,11 +186,11 @@ class GardenersEnv(pettingzoo.ParallelEnv):  # type: ignore[misc]
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return the world's picture, shape [R, R, 3], in the mode "rgb_array"."""
-        return self._garden.render()
+        return self.garden.render()
 
     def close(self) -> None:
         """Close the window, if there is one."""
-        self._garden.close()
+        self.garden.close()
 
 
 def _known(agent: str) -> str:

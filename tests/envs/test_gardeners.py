@@ -1,9 +1,12 @@
 """Two gardeners with opposed aims: PettingZoo's checks, rewards, brushes that add up."""
 
 import numpy as np
+import pettingzoo
 import pytest
+import torch
 from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test
 
+from npa_envs.agents.gardening import ScriptedGardener
 from npa_envs.envs import gardeners_v0
 from npa_envs.envs.gardener2d import Gardener2DEnv
 from npa_envs.errors import NPAError
@@ -24,6 +27,29 @@ def test_pettingzoo_finds_nothing_to_complain_of(form):
     parallel_api_test(gardeners_v0.parallel_env(max_cycles=5, **SMALL, **form), num_cycles=12)
     parallel_seed_test(lambda: gardeners_v0.parallel_env(max_cycles=5, **SMALL, **form), 2)
     api_test(gardeners_v0.env(max_cycles=5, **SMALL, **form), num_cycles=12)
+
+
+def test_policies_of_gardens_act_for_either_agent():
+    env = gardeners_v0.parallel_env(**SMALL)
+    seen, _ = env.reset(seed=0)
+    script = ScriptedGardener(env.garden)
+    left, right = (script(seen[agent]) for agent in env.agents)
+    assert np.array_equal(left, right)
+    assert np.abs(left).max() > 0.0
+    # One undoes what the other does.
+    x, _ = env.garden.particles()
+    env.step({"keeper_0": left, "raider_0": -right})
+    still = gardeners_v0.parallel_env(**SMALL)
+    still.reset(seed=0)
+    still.step(dict.fromkeys(still.agents, 0.0 * left))
+    assert torch.allclose(env.garden.particles()[0], still.garden.particles()[0], atol=1e-5)
+    assert not torch.allclose(env.garden.particles()[0], x, atol=1e-5)
+
+
+@pytest.mark.skipif(not hasattr(pettingzoo, "make"), reason="PettingZoo has no registry yet")
+def test_pettingzoo_makes_it():
+    made = pettingzoo.make("parallel", "npa/Gardeners-v0", max_cycles=7, **SMALL)
+    assert made.unwrapped.max_cycles == 7
 
 
 def test_what_one_earns_the_other_loses_until_the_time_limit():

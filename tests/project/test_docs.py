@@ -474,8 +474,10 @@ def _quick_gardens(monkeypatch):
 @pytest.mark.usefixtures("_quick_gardens")
 def test_the_code_about_gardening_runs(capsys):
     names = {}
-    for code in code_blocks(DOCS / "gardening.md"):
-        code = code.replace("particle_count=256", "particle_count=61, grow_steps=4")
+    of_two = code_blocks(DOCS / "environments" / "Gardeners.md")
+    for code in code_blocks(DOCS / "gardening.md") + of_two:
+        few = "max_cycles=2, particle_count=61, grow_steps=4"
+        code = re.sub(r"max_cycles=\d+(, particle_count=256)?", few, code)
         exec(compile(code, "gardening.md", "exec"), names)
     told = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in told[:2]] == ["StillGardener", "ScriptedGardener"]
