@@ -12,7 +12,7 @@ from worlds import assert_same
 from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
-from npa_envs.training import Trainer, override, preset
+from npa_envs.training import TASKS, Trainer, override, preset, train
 from npa_envs.training.iteration import TrainingCycle
 from npa_envs.training.ranks import Ranks
 from npa_envs.training.run_folder import load_checkpoint
@@ -87,6 +87,25 @@ def test_two_processes_have_the_curve_of_one(tmp_path, fields):
         torch.testing.assert_close(pools[0][name], pools[1][name], rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TASKS)
+def test_every_task_has_the_same_curve_on_two_processes(tmp_path, name):
+    if name == "point_classification":
+        pytest.importorskip("sklearn")
+    fields = {"iterations": 3, "milestones": [2], "dtype": "float64", "steps": (3, 5)}
+    fields |= {"world_count": 4, "pool_size": 8, "seed_interval": 2}
+
+    def run(folder):
+        config = preset("tiny", name, out=folder, **fields)
+        return train(config, name, progress=False).interrupted
+
+    run(tmp_path / "loads kernels")
+    for count in (1, 2):
+        assert on_ranks(count, lambda n=count: run(tmp_path / str(n)), tmp_path) == [False] * count
+    for one, two in zip(log_of(tmp_path / "1"), log_of(tmp_path / "2"), strict=True):
+        assert one == pytest.approx(two, rel=1e-10, abs=1e-14)
+
+
 def test_a_run_goes_on_with_another_number_of_processes(tmp_path):
     whole, parts = (tiny(tmp_path / name, **LIVELY) for name in ("whole", "parts"))
     on_ranks(1, lambda: trained(whole), tmp_path)
@@ -153,6 +172,30 @@ def test_a_lost_process_ends_the_others_and_the_run_goes_on_from_its_checkpoint(
     assert load_checkpoint(tmp_path / "run" / "checkpoint.pt")["iteration"] == 4
     assert trained(config, resume=True) is False
     assert log_of(tmp_path / "run")[-1]["iteration"] == 30
+
+
+def test_a_full_disk_ends_all_processes_and_leaves_the_checkpoint(tmp_path):
+    resource = pytest.importorskip("resource")
+    config = tiny(tmp_path / "run", iterations=30, checkpoint_interval=2)
+
+    def filling():
+        trainer = Trainer(Morphogenesis2D(config.task), config, task_name="morphogenesis2d")
+        iterate = trainer.iterate
+
+        def full():
+            if trainer.iteration == 3 and Ranks.current().first:
+                # The log has room for its line, a checkpoint has not.
+                resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, resource.RLIM_INFINITY))
+            iterate()
+
+        trainer.iterate = full
+        trainer.run(progress=False)
+
+    first, other = on_ranks(2, filling, tmp_path)
+    assert "cannot write" in first
+    assert "the disk is full" in first
+    assert "process 1 of 2 has lost another one" in other
+    assert load_checkpoint(tmp_path / "run" / "checkpoint.pt")["iteration"] == 2
 
 
 def test_all_processes_stop_after_the_same_iteration_where_one_is_asked_to(tmp_path):
