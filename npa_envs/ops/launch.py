@@ -94,7 +94,8 @@ class _ArrayArgument:
         """Write shape and strides: by itself where only the first dimension has changed."""
         last, dense = self._size, tensor.is_contiguous()
         known = last is not None and tensor.dtype is self._dtype and size[1:] == last[1:]
-        if known and dense and self._joined:
+        # A first dimension of 1 may have had any stride.
+        if known and dense and self._joined and last is not None and last[0] != 1:
             self._shape[0] = size[0] * self._joined
         else:
             _overwrite(self._place, _description(tensor, self._type))
