@@ -263,7 +263,7 @@ def run(
     def begun() -> None:
         if not ranks.first:
             return
-        print("\n".join(announcement(task_name, options, config)))
+        print("\n".join(announcement(task_name, options, config, ranks.count)))
         print(
             f"writing to {config.out}/ (Ctrl-C stops in order; {resume_command} goes on)",
             flush=True,
@@ -313,7 +313,7 @@ def run(
 
 
 def announcement(
-    task_name: str, options: TrainOptions, config: TrainConfig[Any]
+    task_name: str, options: TrainOptions, config: TrainConfig[Any], process_count: int = 1
 ) -> tuple[str, str]:
     """Return what a run is about to do, in two lines: what it learns, and how large and long it is.
 
@@ -321,6 +321,7 @@ def announcement(
         task_name: The task.
         options: How it runs.
         config: What it runs.
+        process_count: Processes that share it.
     """
     task = config.task
     species = getattr(task, "species", (task,))
@@ -329,15 +330,18 @@ def announcement(
     named = options.preset or default_preset(task_name, config.device)
     source = f"preset {named}" if options.config is None else str(options.config)
     expected = task_entry(task_name).expected_seconds(config)
-    if expected is None or options.gpus > 1:
+    if expected is None or process_count > 1:
         time = f"how long that takes on {config.device} the progress bar tells"
     else:
         time = f"about {duration(expected)} on a CPU that has little else to do"
     if options.max_seconds is not None:
         time += f", at most {duration(options.max_seconds)}"
+    where = config.device
+    if process_count > 1:
+        where = f"{process_count} processes ({config.device})"
     return (
         f"{task_name}: learns {' and '.join(goals)} ({'goes on' if options.resume else source})",
-        f"{config.total_iterations} iterations on {config.device}, each of {config.world_count} "
+        f"{config.total_iterations} iterations on {where}, each of {config.world_count} "
         f"worlds of {particles} particles: {time}",
     )
 
