@@ -90,8 +90,8 @@ def lively_rule(task, dtype=torch.float32):
     return rule
 
 
-def make_cycle(config, task, device="cpu", rollout=None):
+def make_cycle(config, task, device="cpu", rollout=None, **options):
     device = torch.device(device)
     schedule = torch.Generator().manual_seed(config.seed)
     rule = task.make_rule(schedule).to(device, config.torch_dtype)
-    return TrainingCycle(task, rule, config, device, schedule, rollout), rule
+    return TrainingCycle(task, rule, config, device, schedule, rollout, **options), rule

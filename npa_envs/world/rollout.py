@@ -50,7 +50,7 @@ FEWEST_STATIC = 3
 ROWS_TOGETHER = 2**24
 """Rows of static worlds that are given together, at most, if they are of several steps."""
 
-ROWS_KEPT = 2**23
+ROWS_KEPT = 2**24
 """Rows of perception that are kept for the network all together, at most."""
 
 MOST_AHEAD = 4

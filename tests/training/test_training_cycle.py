@@ -7,6 +7,7 @@ from small_digits import write_idx
 from training_runs import Recording, make_cycle
 from worlds import assert_same
 
+import npa_envs
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
 from npa_envs.tasks.point_classification import PointClassification
 from npa_envs.training import preset
@@ -22,12 +23,27 @@ def tiny_cycle(tmp_path, **fields):
     return make_cycle(config, Morphogenesis2D(config.task))
 
 
-def clouds_cycle(tmp_path, **fields):
+def world_cycle(tmp_path, **fields):
+    """Worlds that draw by themselves, as several processes need it."""
+    config = preset("tiny", out=tmp_path, steps=(2, 4), seed_interval=3, **fields)
+    return make_cycle(config, Morphogenesis2D(config.task), rollout=jittered, by_world=True)
+
+
+def jittered(rule, x, s, steps, generator, **options):
+    """The engine's rollout, but without gradients, where it would wait for a CPU, a jitter."""
+    if torch.is_grad_enabled():
+        return npa_envs.rollout(rule, x, s, steps, generator=generator, **options)
+    for _ in range(steps):
+        generator.advance()
+    return x + 0.01 * generator.normal(*x.shape[1:], dtype=x.dtype), s, torch.zeros_like(x[..., 0])
+
+
+def clouds_cycle(tmp_path, by_world=False, **fields):
     """Worlds with goals, which mutate and are varied."""
     data = {"data": str(write_idx(tmp_path / "idx")), "class_count": 3}
     varied = {"mutated_share": 0.3, "rotation": 20.0, "stretch": 0.1, "jitter": 0.01}
     config = preset("tiny", "point_classification", out=tmp_path, **data, **varied, **fields)
-    return make_cycle(config, PointClassification(config.task))
+    return make_cycle(config, PointClassification(config.task), by_world=by_world)
 
 
 AGEING = {"lifetimes": (4, 400), "ageing_steps": 64, "ageing_interval": 1, "milestones": (1,)}
@@ -56,6 +72,9 @@ def runaway():
             {"steps": (2, 4), "pool_size": 16, "lifetimes": (2, 6), "damage_share": 0.5},
         ),
         (circle_cycle, AGEING | {"pool_size": 6}),
+        (world_cycle, {"damage_share": 0.5}),
+        (world_cycle, AGEING | {"average": 0.9}),
+        (clouds_cycle, {"by_world": True, "steps": (2, 4), "pool_size": 16}),
     ],
 )
 def test_replayed_operations_train_the_same_rule_as_called_ones(tmp_path, make, fields):
