@@ -190,16 +190,6 @@ def test_fields_equal_the_oracle(dtype, space_dim, moment_inverse, device):
 threads = pytest.mark.parametrize("shared", [0, 4096], ids=("one thread", "several threads"))
 
 
-def test_a_batch_is_perceived_after_a_single_world_of_any_stride(device):
-    """A first dimension of 1 says nothing of where the next world would be."""
-    x, s = random_world(2, 40, 2, 3, dtype=torch.float32, device=device)
-    expected = torch.cat([npa_envs.perceive(x[k : k + 1], s[k : k + 1], 0.3) for k in range(2)])
-    far_x, far_s = (t[0].as_strided((1, *t.shape[1:]), (7, t.shape[2], 1)) for t in (x, s))
-    assert far_x.is_contiguous()
-    assert torch.equal(npa_envs.perceive(far_x, far_s, 0.3), expected[:1])
-    assert torch.equal(npa_envs.perceive(x, s, 0.3), expected)
-
-
 @threads
 @pytest.mark.parametrize(
     ("space_dim", "state_dim", "box"),

@@ -70,3 +70,13 @@ def test_it_can_be_compiled(device):
 def test_wrong_values_are_clear_errors(values, message):
     with pytest.raises(NPAError, match=message):
         world_mean(values)
+
+
+def test_means_of_a_batch_are_right_after_a_single_world_of_any_stride(device):
+    """A first dimension of 1 says nothing of where the next world would be."""
+    values = torch.rand(2, 37, 3, generator=torch.Generator().manual_seed(0)).to(device)
+    single = values[0].as_strided((1, 37, 3), (7, 3, 1))
+    assert single.is_contiguous()
+    first, both = world_mean(single), world_mean(values)
+    assert torch.equal(first, both[:1])
+    assert torch.equal(both[1:], world_mean(values[1:].clone()))
