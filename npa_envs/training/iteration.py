@@ -133,6 +133,7 @@ class TrainingCycle:
         self._grow_old = Replayed(self._age_worlds, device, ageing) if graphed else self._age_worlds
         self._draw = Replayed(self._draw_worlds, device, worlds) if graphed else self._draw_worlds
         self._keep = Replayed(self._keep_worlds, device) if graphed else self._keep_worlds
+        self._note = Replayed(self._note_iteration, device) if graphed else self._note_iteration
 
     def run(self, iteration: int) -> int:
         """Train for one iteration, and return the steps of its rollout, T."""
@@ -151,6 +152,9 @@ class TrainingCycle:
         self.meter.begin(iteration + 1, steps)
         self._steps.fill_(steps)
         self._keep()
+        # Between two graphs: what NCCL does is then watched for processes that do not answer.
+        self._ranks.reduce([*batch.gradients, batch.terms], self._lost)
+        self._note()
         self.optimiser.step(iteration)
         self.average.update(iteration)
         return steps
@@ -284,19 +288,20 @@ class TrainingCycle:
 
     @torch.no_grad()
     def _keep_worlds(self) -> None:
-        """Put the batch back into the pool, and take note of what it came to."""
+        """Put the batch back into the pool."""
         batch = self.batch
         goals = None
         if batch.goal is not None and self._fresh_goal is not None:
             goals = batch.goal, self._fresh_goal
         fresh = self._fresh_x, self._fresh_s
         age = self._age + self._steps if self._config.ages else None
-        lost = self.pool.write(self._index, batch.x, batch.s, *fresh, goals, age).sum()
-        lost += self._lost
+        self._lost += self.pool.write(self._index, batch.x, batch.s, *fresh, goals, age).sum()
+
+    @torch.no_grad()
+    def _note_iteration(self) -> None:
+        """Take note of what the batch of all processes came to, and prepare its gradients."""
+        self.meter.observe(self._lost)
         self._lost.zero_()
-        # From here on, all processes have the same numbers.
-        self._ranks.reduce([*batch.gradients, batch.terms], lost)
-        self.meter.observe(lost)
         self.optimiser.prepare_gradients()
 
     def _seeds(self, world_count: int, random: Randomness) -> tuple[Tensor, Tensor, Tensor | None]:

@@ -148,7 +148,7 @@ class Ranks:
     def reduce(self, means: Sequence[Tensor], total: Tensor) -> None:
         """Replace numbers by their means, and one by its sum, over all processes, in place.
 
-        On CUDA the host waits for nothing, and this can be recorded in a graph.
+        On CUDA the host waits for nothing.
 
         Args:
             means: Tensors of one dtype.
