@@ -353,7 +353,6 @@ class Worlds(Batch):
             # Of several the host reads none, and this waits for the device.
             self._host_numbers.copy_(numbers)
 
-    @torch.no_grad()
     def step(self, action: Tensor, out: Tensor | None = None) -> tuple[NDArray[np.uint8], Tensor]:
         """Apply actions to all worlds; return their endings, [B], and what is perceived, [B, N, P].
 
@@ -517,7 +516,6 @@ class Worlds(Batch):
         numbers: list[float] = self._host_numbers.numpy()[:, 0].tolist()
         return numbers
 
-    @torch.no_grad()
     def guarded(self, endings: NDArray[np.uint8], observation: Tensor) -> NDArray[np.uint8]:
         """Do what `on_divergence` says about worlds that diverged; return what ends episodes.
 

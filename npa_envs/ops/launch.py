@@ -60,6 +60,10 @@ def _current_stream(device: torch.device) -> int:
     return torch._C._cuda_getCurrentRawStream(index)
 
 
+NEVER = (-1, -1)
+"""A size that no tensor has, nor any but for its first dimension."""
+
+
 class _ArrayArgument:
     """The description of a tensor within a kernel's arguments, changed in place.
 
@@ -101,7 +105,7 @@ class _ArrayArgument:
             _overwrite(self._place, _description(tensor, self._type))
             self._joined = self._shape[0] // size[0] if size[0] else 0
         # One with strides of its own is described each time.
-        self._size, self._dtype = size if dense else (-1,), tensor.dtype
+        self._size, self._dtype = size if dense else NEVER, tensor.dtype
 
 
 def _overwrite(place: Any, made: Any) -> None:
