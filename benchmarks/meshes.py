@@ -3,8 +3,8 @@
 An arm is a recipe with one choice changed. `run` trains arms on meshes, one run after the other,
 and measures the rules as `npa-envs evaluate` does, on seeds that training never saw. Every finished
 run is a line of JSON with its rule and a picture: four held-out views of the target, and of one
-world after 128 steps and at the end. `draw` writes the unseen meshes as files, `report` prints the
-lines as a table.
+world after 128 steps and at the end. `draw` writes the unseen meshes as files, `particles` asks how
+well particles can draw a mesh without any rule, `report` prints the runs as a table.
 
     python benchmarks/meshes.py draw --out MESHES
     python benchmarks/meshes.py run --out OUT --device cuda --targets rocket --arms recipe
@@ -31,9 +31,17 @@ from npa_envs.measure.quality import evaluate
 from npa_envs.measure.record import current_commit, machine
 from npa_envs.measure.tables import as_objects
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D
-from npa_envs.tasks.targets.meshes import FloatArray, Mesh, ellipsoid, grid_faces, joined, turned
+from npa_envs.tasks.targets.meshes import (
+    FloatArray,
+    Mesh,
+    ellipsoid,
+    grid_faces,
+    joined,
+    load_mesh,
+    turned,
+)
 from npa_envs.tasks.targets.views import Views, over, some_views
-from npa_envs.training import preset, train
+from npa_envs.training import override, preset, train
 from npa_envs.world.recorded import release_recordings
 
 SEEDS = tuple(range(1_000_000, 1_000_008))
@@ -80,6 +88,34 @@ ARMS: Mapping[str, Fields] = {
     "no SSIM": {"ssim_weight": 0.0},
 }
 """What each arm changes of `RECIPE`."""
+
+FAST_TOGETHER: Fields = {
+    "schedule": "cosine",
+    "stray_share": 1e-3,
+    "stray_weight": 10.0,
+    "clump_radius": 0.2,
+    "cut_gap": 0.1,
+}
+"""What the preset `fast` of 2D has, in 3D."""
+
+FAST_REST: Fields = {
+    **FAST_TOGETHER,
+    "lifetimes": (16, 4096),
+    "damage_share": 0.5,
+    "rest_weight": 2.0,
+}
+"""Of two worlds one is young and damaged, one is grown and to rest."""
+
+FAST_ARMS: Mapping[str, Fields] = {
+    "fast": {},
+    "cosine": {"schedule": "cosine"},
+    "cosine, rate 4e-3": {"schedule": "cosine", "learning_rate": 4e-3},
+    "together": FAST_TOGETHER,
+    "rest": FAST_REST,
+    "sigma 0.045": {"schedule": "cosine", "sigma": 0.045, "opacity": 0.6},
+    "state 24": {"schedule": "cosine", "state_dim": 24},
+}
+"""What each arm changes of the preset `fast`."""
 
 
 def make_knot() -> Mesh:
@@ -199,12 +235,17 @@ def run(arguments: argparse.Namespace) -> None:
 def one_run(arguments: argparse.Namespace, arm: str, target: str) -> None:
     """Train an arm on a mesh, and write what became of it."""
     out: Path = arguments.out
-    changes = {**RECIPE, **ARMS[arm], **json.loads(arguments.fields)}
+    own = RECIPE | ARMS[arm] if arguments.size == "full" else FAST_ARMS[arm]
+    changes = {**own, **json.loads(arguments.fields)}
     changes = {k: tuple(v) if isinstance(v, list) else v for k, v in changes.items()}
-    name = f"{arm.replace(' ', '_')}-{Path(target).stem}{arguments.label}"
+    name = f"{arm.replace(',', '').replace(' ', '_')}-{Path(target).stem}{arguments.label}"
     fixed = {"tensorboard": False, "picture_interval": 0, "checkpoint_interval": 10**9}
     fixed |= {"target": target, "device": arguments.device, "out": arguments.runs / name}
-    config = preset("paper", "morphogenesis3d", **changes, **fixed, log_interval=100)
+    base = "paper" if arguments.size == "full" else "fast"
+    config = preset(base, "morphogenesis3d", **changes, **fixed, log_interval=100)
+    if config.schedule == "milestones" and arguments.size == "fast":
+        marks = (2 * config.iterations // 3, 7 * config.iterations // 8)
+        config = override(config, milestones=marks)
     result = train(
         config,
         "morphogenesis3d",
@@ -232,15 +273,64 @@ def one_run(arguments: argparse.Namespace, arm: str, target: str) -> None:
     with torch.no_grad():
         sheet(task, worlds).save(out / f"{name}.png")
     seconds = result.record["seconds"]
-    line = {"arm": arm, "target": Path(target).stem, "fields": changes, "seconds": seconds}
-    line |= {"iterations": result.iteration, "growth": as_objects(rows)}
-    line |= {"commit": arguments.commit or current_commit(), "date": date.today().isoformat()}
-    line |= {"machine": machine(torch.device(arguments.device))}
+    line = {"size": arguments.size, "arm": arm, "target": Path(target).stem, "fields": changes}
+    line |= {"iterations": result.iteration, "seconds": seconds, "growth": as_objects(rows)}
+    line |= origin(arguments)
     with (out / "meshes.jsonl").open("a") as file:
         file.write(json.dumps(line) + "\n")
     (out / f"{name}.safetensors").write_bytes((config.out / "rule.safetensors").read_bytes())
     told = "  ".join(f"{row.step}: {row.psnr:.2f}" for row in rows)
     print(f"{name:32s} {result.iteration} in {seconds:.0f} s  {told}", flush=True)
+
+
+def origin(arguments: argparse.Namespace) -> dict[str, str]:
+    """Return what a line says of where it was made."""
+    commit = arguments.commit or current_commit()
+    made_on = machine(torch.device(arguments.device))
+    return {"commit": commit, "date": date.today().isoformat(), "machine": made_on}
+
+
+def particles(arguments: argparse.Namespace) -> None:
+    """Let round particles on the surface itself follow the loss: how well can they draw at all?"""
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    for target in arguments.targets:
+        for sigma, opacity in zip(arguments.sigmas, arguments.opacities, strict=True):
+            fields = {"target": target, "sigma": sigma, "opacity": opacity, "blur_sigma": 0.0}
+            config = preset("paper", "morphogenesis3d", **fields).task
+            task = Morphogenesis3D(config, device=arguments.device)
+            places, shades = surface(load_mesh(target), config.particle_count)
+            x = places[None].to(arguments.device).requires_grad_()
+            s = (shades[None] - 0.5).to(arguments.device).requires_grad_()
+            optimiser = torch.optim.Adam([{"params": [x], "lr": 2e-3}, {"params": [s], "lr": 3e-2}])
+            fall = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, arguments.iterations)
+            for number in range(arguments.iterations):
+                task.begin(number)
+                loss, _ = task.compare(x, s)
+                optimiser.zero_grad()
+                loss.backward()
+                optimiser.step()
+                fall.step()
+            with torch.no_grad():
+                psnr = task.view_psnr(x, s).item()
+            line = {"target": Path(target).stem, "sigma": sigma, "opacity": opacity, "psnr": psnr}
+            line |= {"iterations": arguments.iterations, **origin(arguments)}
+            with (arguments.out / "particles.jsonl").open("a") as file:
+                file.write(json.dumps(line) + "\n")
+            print(f"{target:10s} sigma {sigma:g}, opacity {opacity:g}: {psnr:.2f} dB", flush=True)
+
+
+def surface(mesh: Mesh, count: int) -> tuple[Tensor, Tensor]:
+    """Return points spread evenly over a mesh [length units] and their colours, [count, 3] each."""
+    random = np.random.default_rng(0)
+    corners, shades = mesh.vertices[mesh.faces], mesh.colours[mesh.faces]
+    sides = corners[:, 1:] - corners[:, :1]
+    area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+    face = random.choice(len(area), count, p=area / area.sum())
+    share = random.dirichlet((1.0, 1.0, 1.0), count)[..., None]
+    places, colours = (
+        torch.from_numpy((share * values[face]).sum(axis=1)).float() for values in (corners, shades)
+    )
+    return places, colours
 
 
 def report(arguments: argparse.Namespace) -> None:
@@ -258,11 +348,15 @@ def report(arguments: argparse.Namespace) -> None:
 def main() -> None:
     """Read the arguments and do what they say."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("what", choices=("draw", "run", "report"))
+    parser.add_argument("what", choices=("draw", "run", "particles", "report"))
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--runs", type=Path, default=Path("runs"))
     parser.add_argument("--targets", nargs="+", default=["rocket", "mushroom"])
-    parser.add_argument("--arms", nargs="+", choices=ARMS, default=["recipe"])
+    parser.add_argument("--size", choices=("full", "fast"), default="full")
+    parser.add_argument("--arms", nargs="+", default=["recipe"], help="of the size")
+    parser.add_argument("--sigmas", type=float, nargs="+", default=[0.02, 0.014, 0.01, 0.008])
+    parser.add_argument("--opacities", type=float, nargs="+", default=[0.15, 0.3, 0.5, 0.7])
+    parser.add_argument("--iterations", type=int, default=60, help="of particles without a rule")
     parser.add_argument("--fields", default="{}", help="fields to change in all arms, as JSON")
     parser.add_argument("--label", default="", help="last part of the files' names")
     parser.add_argument("--steps", type=int, nargs="+", default=list(STEPS))
@@ -272,7 +366,9 @@ def main() -> None:
     parser.add_argument("--commit", help="what the lines name, where files are no checkout")
     parser.add_argument("--device", default="cpu")
     arguments = parser.parse_args()
-    {"draw": draw, "run": run, "report": report}[arguments.what](arguments)
+    torch.set_num_threads(1)
+    commands = {"draw": draw, "run": run, "particles": particles, "report": report}
+    commands[arguments.what](arguments)
 
 
 if __name__ == "__main__":
