@@ -39,6 +39,9 @@ PICTURE = DOCS / "images" / "npa_bench.png"
 PANELS = 3
 """Panels side by side."""
 
+NO_ROWS = "No runs are stored yet."
+"""What stands where a table would be empty."""
+
 
 def problems() -> str:
     """Return the table of the problems, Markdown."""
@@ -71,7 +74,7 @@ def scored(rows: dict[str, Row], group: str) -> str:
             together = str(score(list(found.values()))) if len(found) == len(ids) else NONE
             lines.append((f"`{method}`", *cells, together))
     heads = ("Method", *(f"`{task_name(env_id)}`" for env_id in ids), "All")
-    return table(heads, lines) if lines else ""
+    return table(heads, lines) if lines else NO_ROWS
 
 
 def returned(rows: dict[str, Row]) -> str:
@@ -103,10 +106,11 @@ def described(rows: dict[str, Row]) -> str:
 def parts(rows: dict[str, Row]) -> dict[str, str]:
     """Return what stands between the marks of the page, by their names."""
     made = {"problems": problems()}
-    if rows:
-        made |= {name: scored(rows, name) for name in GROUPS}
-        made |= {"returns": returned(rows), "methods": described(rows)}
-    return made
+    made |= {name: scored(rows, name) if rows else NO_ROWS for name in GROUPS}
+    return made | {
+        "returns": returned(rows) if rows else NO_ROWS,
+        "methods": described(rows) if rows else NO_ROWS,
+    }
 
 
 def page(text: str, rows: dict[str, Row]) -> str:

@@ -75,7 +75,6 @@ def test_the_program_for_a_graphics_card_runs_on_any_device(tmp_path, monkeypatc
         "particle_count=512": "particle_count=16",
         "episode_steps=48": "episode_steps=2",
         "num_envs=32": "num_envs=2",
-        "100_000_000": "500",
         "30_000_000": "500",
         "10_000_000": "500",
     }.items():
