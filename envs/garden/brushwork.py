@@ -9,7 +9,7 @@ from torch import Tensor
 
 from npa_envs import world_mean
 from npa_envs.envs.garden.config import GardenConfig
-from npa_envs.world.brushes import softness
+from npa_envs.world.brushes import offsets_from, softness
 
 DIRECTIONS = ((1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1))
 """Ways in which a brush of the "discrete" form pushes."""
@@ -45,22 +45,29 @@ def grid_places(config: GardenConfig, device: torch.device | None = None) -> Ten
     return torch.stack((across.flatten(), up.flatten()), dim=-1)
 
 
-def holds(x: Tensor, places: Tensor, config: GardenConfig) -> Tensor:
-    """Return how much soft brushes hold of each particle, dimensionless, shape [B, K, N].
+def offsets(x: Tensor, places: Tensor, config: GardenConfig) -> Tensor:
+    """Return the way from each place to each particle [length units], shape [B, K, N, 2].
 
     Args:
         x: Positions [length units], shape [B, N, 2].
         places: Where brushes are [length units], shape [B, K, 2].
-        config: Says how large they are.
+        config: Says what box the world has.
     """
     spread = x[:, None].expand(-1, places.shape[1], -1, -1)
-    held = softness(
-        spread.flatten(0, 1),
-        centre=places.flatten(0, 1),
-        radius=config.brush_radius,
-        box=None if config.box is None else (config.box,) * 2,
-    )
-    return held.view(spread.shape[:3])
+    box = None if config.box is None else (config.box,) * 2
+    return offsets_from(spread.flatten(0, 1), places.flatten(0, 1), box).view(spread.shape)
+
+
+def holds(away: Tensor, config: GardenConfig) -> Tensor:
+    """Return how much soft brushes hold of each particle, dimensionless, shape [B, K, N].
+
+    Args:
+        away: What `offsets` returns, shape [B, K, N, 2].
+        config: Says how large brushes are.
+    """
+    origin = away.new_zeros(away.shape[0] * away.shape[1], 2)
+    held = softness(away.flatten(0, 1), centre=origin, radius=config.brush_radius)
+    return held.view(away.shape[:3])
 
 
 def brushed(
@@ -88,7 +95,7 @@ def brushed(
         places = grid_places(config, x.device).to(x)
         # Several hands, each with a brush at every place.
         places = places.repeat(action.shape[1] // len(places), 1)
-    held = holds(x, middle[:, None] + places, config)
+    held = holds(offsets(x, middle[:, None] + places, config), config)
     doses = held[..., None] * action[:, :, None]
     # Torch's own sums may change in the last bit with the number of worlds.
     felt = len(doses[0]) * world_mean(doses.flatten(2)).view(*x.shape[:2], columns.width)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from npa_envs import world_mean
 from npa_envs.envs.core.task import Start
-from npa_envs.envs.garden.brushwork import brushed, grid_places, holds
+from npa_envs.envs.garden.brushwork import brushed, grid_places, holds, offsets
 from npa_envs.envs.garden.config import GardenConfig
 from npa_envs.envs.grown import GrownTask
 from npa_envs.errors import NPAError
@@ -46,7 +46,9 @@ class Lacking:
         self._scale = torch.ones(SEEN_AT_A_PLACE, device=places.device)
         none = places.new_zeros(1, 2)
         wanted = self._held(target.points[None], target.colours[None] - COLOUR_OFFSET, none)
-        self._scale = torch.tensor(SEEN_SCALES, device=places.device) / wanted[..., 0].mean()
+        # Brushes may be too small to hold anything.
+        usual = wanted[..., 0].mean().clamp_min(1.0 / len(target.points))
+        self._scale = torch.tensor(SEEN_SCALES, device=places.device) / usual
         self._wanted = self._scale * wanted
 
     def __call__(self, x: Tensor, s: Tensor, middle: Tensor) -> Tensor:
@@ -64,11 +66,11 @@ class Lacking:
         return self._wanted - self._held(x, s[..., -3:], middle)
 
     def _held(self, x: Tensor, colour: Tensor, middle: Tensor) -> Tensor:
-        places = middle[:, None] + self.places
-        away = (x[:, None] - places[:, :, None]) / self._config.brush_radius
+        away = offsets(x, middle[:, None] + self.places, self._config)
+        sides = away / self._config.brush_radius
         colours = colour[:, None].expand(-1, len(self.places), -1, -1)
-        told = torch.cat((torch.ones_like(away[..., :1]), away, colours), dim=-1)
-        told = told * holds(x, places, self._config)[..., None]
+        told = torch.cat((torch.ones_like(sides[..., :1]), sides, colours), dim=-1)
+        told = told * holds(away, self._config)[..., None]
         mean = world_mean(told.transpose(1, 2).flatten(2))
         return self._scale * mean.view(len(x), len(self.places), SEEN_AT_A_PLACE)
 
@@ -98,6 +100,12 @@ class GardenTask(GrownTask[Config]):
         self.rule.requires_grad_(False)
         self.lacking = Lacking(grid_places(config, device), self.goal.target, config)
         """What lacks at the places of the grid."""
+
+    @classmethod
+    def extra_bytes(cls, config: Any, world_count: int) -> int:
+        """Return about how much memory pool, pictures and brushes need [bytes]."""
+        told = SEEN_AT_A_PLACE * config.place_count**2 * config.particle_count
+        return super().extra_bytes(config, world_count) + 3 * 4 * told * world_count
 
     def lived(
         self,

@@ -346,6 +346,28 @@ def test_what_lacks_is_seen_where_it_lacks():
     assert float(lack[:, 3].max()) > 0.5
 
 
+def test_brushes_reach_across_the_edges_of_a_box_and_may_be_too_small_to_hold_anything():
+    config = make(
+        GARDENER,
+        boundary="periodic",
+        box_size=2.0,
+        brush_radius=0.4,
+        place_count=2,
+        place_reach=0.9,
+    ).unwrapped.config
+    x = torch.tensor([[[-0.95, -0.9], [0.0, 0.0]]])
+    s, middle = torch.zeros(1, 2, 16), torch.zeros(1, 2)
+    # The last of the four places is across both edges.
+    action = torch.zeros(1, 4, 2)
+    action[0, 3, 0] = 1.0
+    moved, _, _ = brushed(x, s, action, middle, config)
+    held = (1.0 - (0.15**2 + 0.2**2) / 0.4**2) ** 2
+    assert moved[0, 0].tolist() == pytest.approx([-0.95 + 0.15 * held, -0.9], abs=1e-6)
+    assert moved[0, 1].tolist() == [0.0, 0.0]
+    seen, _ = make(GARDENER, brush_radius=1e-3).reset(seed=0)
+    assert np.isfinite(seen).all()
+
+
 def test_a_world_that_is_stopped_stays_as_it_is():
     calm = {"gust_chance": 0.0, "blight_chance": 0.0, "position_noise": 0.0}
     env = make(GARDENER, **(FREE | {"brush_radius": 1e3} | calm))
