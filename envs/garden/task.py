@@ -105,7 +105,7 @@ class GardenTask(GrownTask[Config]):
     def extra_bytes(cls, config: Any, world_count: int) -> int:
         """Return about how much memory pool, pictures and brushes need [bytes]."""
         told = SEEN_AT_A_PLACE * config.place_count**2 * config.particle_count
-        return super().extra_bytes(config, world_count) + 3 * 4 * told * world_count
+        return super().extra_bytes(config, world_count) + int(3 * 4 * told * world_count)
 
     def lived(
         self,
