@@ -35,6 +35,11 @@ class MultiSpeciesEnv(CrowdEnv):
     | `"invasion"` | `npa/Invasion-v0` | species 0 grows a picture, the others keep it from it |
     | `"symbiosis"` | `npa/Symbiosis-v0` | all grow one picture that takes all particles |
 
+    `npa/MixingSmall-v0`, `npa/SegregationSmall-v0`, `npa/CoMorphogenesisSmall-v0` and
+    `npa/SymbiosisSmall-v0` are the same tasks in worlds of 64 particles and episodes of 32 steps;
+    `npa_envs.registration.SPECIES_SIZES` holds their keywords. `parallel_env`, `env`, `raw_env` and
+    `batched` take ids instead of tasks as well.
+
     In `parallel_env` all agents act at once. In `env` and `raw_env` they act in turn, by
     PettingZoo's own conversion, and the world moves on after the last one. `env` also clips actions
     into their space. The ids are for `pettingzoo.make`, of PettingZoo 1.27 or newer, once

@@ -85,14 +85,91 @@ SMALL = (
         MappingProxyType({"particle_count": 256}),
     ),
 )
-"""Settings of environments with few particles and few numbers to act by, never changed under the
-same version."""
+"""Gardens with few particles and few numbers to act by, never changed under the same version."""
 
 
 GARDEN_IDS = tuple(
     row.id for row in (*GARDENS, *SMALL) if row.name in {garden.name for garden in GARDENS}
 )
 """Ids of gardens, of any size."""
+
+
+_FEW: Mapping[str, Any] = {"particle_count": 64, "state_dim": 4, "state_scale": 0.1, "eps": 0.2}
+"""What small worlds have in common."""
+
+_SMALL_PICTURE: Mapping[str, Any] = {**_FEW, "colour_weight": 20.0}
+
+_SMALL_SPECIES: Mapping[str, Any] = {
+    **_FEW,
+    "species_count": 2,
+    "eps0": 0.2,
+    "perception": "per_species",
+    "max_cycles": 32,
+}
+
+_SMALL_PICTURE_OF_SPECIES: Mapping[str, Any] = {
+    **_SMALL_SPECIES,
+    "colour_weight": 20.0,
+    "resolution": 32,
+    "seed_radius": 0.3,
+}
+
+
+def _sized(name: str, size: str, steps: int, **keywords: Any) -> Registration:
+    """Return a form of one of `ENVIRONMENTS` with other keywords."""
+    usual = next(row for row in ENVIRONMENTS if row.name == name)
+    sized_id = usual.id.replace("-v", f"{size}-v")
+    return Registration(sized_id, usual.module, name, steps, MappingProxyType(keywords))
+
+
+SIZES = (
+    _sized(
+        "Morphogenesis2D",
+        "Small",
+        32,
+        **{**_SMALL_PICTURE, "target": "ring", "seed_radius": 0.4},
+    ),
+    _sized(
+        "Regeneration2D",
+        "Small",
+        24,
+        **_SMALL_PICTURE,
+        eps0=0.2,
+        target="heart",
+        rule="picture",
+        damage="erase",
+        damage_size=0.4,
+        resolution=32,
+    ),
+    _sized(
+        "Texture",
+        "Small",
+        24,
+        **{**_FEW, "particle_count": 96, "eps": 0.3},
+        eps0=0.3,
+        target="stripes",
+        resolution=32,
+    ),
+    _sized(
+        "PointClassification",
+        "Small",
+        16,
+        **{**_FEW, "state_dim": 12, "eps": 0.5},
+        eps0=0.5,
+        update_prob=1.0,
+        score="cross_entropy",
+    ),
+    _sized("Morphogenesis2D", "Large", 512, particle_count=4096, resolution=128),
+    _sized("Regeneration2D", "Large", 256, particle_count=4096, resolution=128),
+    _sized("Texture", "Large", 256, particle_count=4096, resolution=128),
+    _sized("PointClassification", "Large", 64, particle_count=2048),
+    _sized("Morphogenesis3D", "Large", 256, particle_count=4096),
+)
+"""Worlds of few particles, in which PPO learns within minutes on a laptop, and of many, for a GPU.
+Settings are never changed under the same version."""
+
+ALL = (*ENVIRONMENTS, *GARDENS, *SMALL, *SIZES)
+"""All that Gymnasium knows."""
 
 
 class SpeciesRegistration(NamedTuple):
@@ -108,13 +185,28 @@ class SpeciesRegistration(NamedTuple):
     """Fields of the task's configuration."""
 
 
-SPECIES_SIZES: tuple[SpeciesRegistration, ...] = ()
-"""Small and large worlds of several species, never changed under the same version."""
+SPECIES_SIZES = (
+    SpeciesRegistration("npa/MixingSmall-v0", "mixing", MappingProxyType(dict(_SMALL_SPECIES))),
+    SpeciesRegistration(
+        "npa/SegregationSmall-v0", "segregation", MappingProxyType(dict(_SMALL_SPECIES))
+    ),
+    SpeciesRegistration(
+        "npa/CoMorphogenesisSmall-v0",
+        "co_morphogenesis",
+        MappingProxyType({**_SMALL_PICTURE_OF_SPECIES, "targets": ("heart", "ring")}),
+    ),
+    SpeciesRegistration(
+        "npa/SymbiosisSmall-v0",
+        "symbiosis",
+        MappingProxyType({**_SMALL_PICTURE_OF_SPECIES, "target": "flower"}),
+    ),
+)
+"""The same for tasks of several species. Invasion has none: no opponent is fixed."""
 
 
 def register_environments() -> None:
     """Put the table into Gymnasium's registry; what is there already is left as it is."""
-    for environment in (*ENVIRONMENTS, *GARDENS, *SMALL):
+    for environment in ALL:
         if environment.id not in gymnasium.registry:
             gymnasium.register(
                 environment.id,

@@ -41,6 +41,7 @@ __all__ = [
 
 METHODS: dict[str, str] = {
     "gradient": "npa_envs.agents.learning.gradient:train",
+    "shac": "npa_envs.agents.learning.shac:train",
     "ppo": "npa_envs.agents.learning.ppo:train",
     "ppo_world": "npa_envs.agents.learning.sb3:train",
     "evolution": "npa_envs.agents.learning.evolution:train",

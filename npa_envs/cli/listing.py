@@ -17,7 +17,7 @@ def main(arguments: Sequence[str]) -> int:
     """Print everything that has a name."""
     parse_options(ListOptions, "list", arguments)
     from npa_envs.measure.quality import score_line, scores
-    from npa_envs.registration import ENVIRONMENTS, GARDENS, SMALL
+    from npa_envs.registration import ALL
     from npa_envs.rule.files import load_rule, shipped_rules
     from npa_envs.tasks.losses.texture import TEXTURE_LOSSES
     from npa_envs.tasks.targets.clouds import BUILT_IN
@@ -34,7 +34,7 @@ def main(arguments: Sequence[str]) -> int:
                 f"{config.world_count} worlds, about {duration(seconds)} on a CPU"
             )
     print("environments (import npa_envs; gymnasium.make(NAME) or make_vec(NAME, num_envs=64))")
-    for environment in (*ENVIRONMENTS, *GARDENS, *SMALL):
+    for environment in ALL:
         print(f"  {environment.id}: episodes of {environment.max_episode_steps} steps")
     print("targets (--target NAME, or the path of a picture; for morphogenesis also one emoji)")
     for name, entry in TASKS.items():

@@ -108,7 +108,7 @@ def problem_of(options: RecordOptions) -> Problem:
         NPAError: There is no such environment, or it has several species or no such keyword.
     """
     from npa_envs.agents.learning import Problem
-    from npa_envs.registration import ENVIRONMENTS, GARDENS, SMALL
+    from npa_envs.registration import ALL
 
     keywords: dict[str, Any] = {}
     for word in options.options:
@@ -119,7 +119,7 @@ def problem_of(options: RecordOptions) -> Problem:
             keywords[name] = json.loads(value)
         except ValueError:
             keywords[name] = value
-    limits = {known.id: known.max_episode_steps for known in (*ENVIRONMENTS, *GARDENS, *SMALL)}
+    limits = {known.id: known.max_episode_steps for known in ALL}
     worlds = min(options.worlds, options.episodes)
     problem = Problem(
         env_id=options.env,

@@ -176,6 +176,7 @@ def test_what_was_learned_is_better_in_another_world_than_nothing_and_gets_bette
 
 LEARNERS = {
     "gradient": {"world_count": 4},
+    "shac": {"world_count": 4, "steps": 2, "critic_epochs": 1},
     "ppo": {"steps": 4},
     "ppo_world": {"steps": 4, "minibatches": 4},
     "clone": {"collect_steps": 4},
@@ -219,8 +220,8 @@ def test_a_run_follows_from_its_seed_and_learns_in_worlds_of_its_own(method, use
     assert worlds[0] == worlds[1]
     assert not worlds[0] & worlds[2]
     assert all(max(numbers, default=0) < FIRST_EVALUATION_SEED for numbers in worlds)
-    # The gradient draws its worlds otherwise.
-    assert bool(worlds[0]) == (method != "gradient")
+    # Methods that differentiate worlds draw them otherwise.
+    assert bool(worlds[0]) == (method not in ("gradient", "shac"))
     if method != "scripted":
         ours, theirs, other = (given.rules[0].output.weight for given in rules)
         assert torch.equal(ours, theirs)

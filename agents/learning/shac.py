@@ -1,0 +1,297 @@
+"""Short-horizon actor-critic: gradients through a few steps, a critic for the rest.
+
+Source: Xu et al., arXiv 2204.07137. Worlds live on from window to window. Rules ascend the rewards
+of a window, differentiated through its steps, and what a critic says of the worlds at its end. The
+gradient never leads through a whole episode.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+from typing import NamedTuple, get_args
+
+import torch
+from torch import Tensor
+
+from npa_envs.agents.learning.gradient import episode_task
+from npa_envs.agents.learning.ppo_common import Critic, CriticKind, check_word, first_rules
+from npa_envs.agents.learning.problem import Problem
+from npa_envs.agents.learning.progress import Progress, annealed
+from npa_envs.agents.learning.rules import RuleSet
+from npa_envs.tasks.base import seed_worlds, task_toward
+from npa_envs.tasks.checks import check_fraction, check_non_negative, check_positive
+from npa_envs.training.iteration import normalise_gradients
+from npa_envs.world.rollout import Memory
+
+
+@dataclass(frozen=True, kw_only=True)
+class SHACOptions:
+    """Options of `train`."""
+
+    steps: int = 16
+    """Steps that a gradient leads through, h, at most: an episode is cut into windows of equal
+    length."""
+
+    world_count: int = 8
+    """Worlds B."""
+
+    gamma: float = 0.97
+    """Discount of a reward one step later (dimensionless)."""
+
+    foresight: float = 0.25
+    """Weight of what the critic foresees in what rules ascend; 1: all of it, as in the source; 0:
+    rules look no farther than their window (dimensionless)."""
+
+    td_lambda: float = 0.95
+    """Weight of what is paid later against what the critic foresees, in its targets
+    (dimensionless)."""
+
+    learning_rate: float = 4e-3
+    """AdamW's for the rules, at the beginning; gradients are normalised parameter by parameter."""
+
+    last_rate: float = 0.05
+    """Learning rate at the end, as a share of the first (dimensionless)."""
+
+    critic_learning_rate: float = 1e-3
+    """Adam's for the critic."""
+
+    critic_epochs: int = 4
+    """Passes of the critic over a window."""
+
+    minibatches: int = 4
+    """Parts that a window is shuffled into in each pass."""
+
+    critic: CriticKind = "central"
+    """A value is the mean of what follows from each particle, or from the whole world
+    ("central")."""
+
+    critic_width: int = 64
+    """Units in a hidden layer of the critic."""
+
+    target_rate: float = 0.2
+    """Share of the critic that its slowly following copy takes over after each window: the copy
+    says what targets and gradients are made of (dimensionless)."""
+
+    memory: Memory = "store"
+    """What the backward pass reads: "store", "recompute" or "minimal", as in `rollout`."""
+
+    def __post_init__(self) -> None:
+        """Check every field; raises NPAError. `memory` is checked where rollouts begin."""
+        check_positive(self, int, "steps", "world_count", "critic_epochs", "minibatches")
+        check_positive(self, int, "critic_width")
+        check_word("critic", self.critic, get_args(CriticKind))
+        check_positive(self, float, "learning_rate", "critic_learning_rate")
+        check_fraction(self, "gamma", "td_lambda", "last_rate", "target_rate")
+        check_non_negative(self, "foresight")
+
+
+DEFAULTS = SHACOptions()
+
+
+def train(
+    problem: Problem,
+    progress: Progress,
+    seed: int,
+    *,
+    device: torch.device,
+    start: RuleSet | None = None,
+    options: SHACOptions = DEFAULTS,
+) -> RuleSet:
+    """Return the rules that a short-horizon actor-critic finds within a budget.
+
+    Rewards are what each step takes off the environment's loss, as with `reward="dense"`. An
+    episode's end is no end to the critic: worlds would go on. State
+    steps are clamped as by the gradient's learner.
+
+    Raises:
+        NPAError: The environment's loss has no gradient.
+        DivergedError: The rules' weights are not finite.
+    """
+    learner = Learner(problem, options, seed, device, start)
+
+    def iteration() -> int:
+        learner.learn(annealed(options.learning_rate, options.last_rate, progress.share))
+        return options.world_count * learner.window * problem.particle_count
+
+    return progress.run(learner.rules, iteration)
+
+
+class Window(NamedTuple):
+    """What h steps of B worlds were."""
+
+    features: Tensor
+    """What the critic sees of the worlds before and after each step, shape [h + 1, B, N, F]."""
+
+    losses: Tensor
+    """The worlds' losses then, shape [h + 1, B]."""
+
+    @property
+    def rewards(self) -> Tensor:
+        """What each step took off the loss, shape [h, B]."""
+        return self.losses[:-1] - self.losses[1:]
+
+
+class Learner:
+    """Rules, critic and worlds; the seed is that of all that is drawn."""
+
+    def __init__(
+        self,
+        problem: Problem,
+        options: SHACOptions,
+        seed: int,
+        device: torch.device,
+        start: RuleSet | None,
+    ) -> None:
+        self.options, self.device = options, device
+        self.rules = first_rules(problem, seed, start).to(device)
+        """What is learned."""
+        count = -(-problem.episode_steps // options.steps)
+        self.window = -(-problem.episode_steps // count)
+        """Steps of a window, h."""
+        self.task = episode_task(problem, device)
+        self.generator = torch.Generator(device).manual_seed(seed)
+        width = problem.physics.space_dim + problem.physics.state_dim + 1
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            critic = Critic(width, problem.counts, options.critic, options.critic_width)
+        self.critic = critic.to(device)
+        self.target = copy.deepcopy(self.critic).requires_grad_(False)
+        """The critic's copy, which follows it slowly."""
+        self._weights = [p for p in self.rules.parameters() if p.requires_grad]
+        self._optimizer = torch.optim.AdamW(self._weights, fused=True)
+        self._critic_optimizer = torch.optim.Adam(
+            self.critic.parameters(), lr=options.critic_learning_rate, fused=True
+        )
+        self._limits = problem.physics.position_limit, problem.physics.state_limit
+        self.x, self.s, self.goal = self._fresh(options.world_count)
+        self.window_count = count
+        """Windows of an episode."""
+        self.windows_left = [1 + k % count for k in range(options.world_count)]
+        """Windows left of each world's episode: at first all numbers, so that every part of an
+        episode is in a batch."""
+
+    def learn(self, rate: float) -> None:
+        """Let worlds live for a window, and rules and critic learn from it once."""
+        window = self.play()
+        gradients = torch.autograd.grad(-self.gain(window), self._weights, allow_unused=True)
+        followed = [(w, g) for w, g in zip(self._weights, gradients, strict=True) if g is not None]
+        for weight, gradient in followed:
+            weight.grad = gradient.clone(memory_format=torch.contiguous_format)
+        normalise_gradients([weight.grad for weight, _ in followed if weight.grad is not None])
+        self._optimizer.param_groups[0]["lr"] = rate
+        self._optimizer.step()
+        self.learn_values(Window(*(part.detach() for part in window)))
+
+    def play(self) -> Window:
+        """Run the rules for a window, differentiably, and begin episodes anew where one is over."""
+        task, steps = self.task, self.window
+        x0, s0 = self.x, self.s
+        x, s, _ = task.rollout(
+            self.rules,
+            x0,
+            s0,
+            steps,
+            eps=task.eps,
+            box=task.box,
+            update_prob=task.update_prob,
+            memory=self.options.memory,
+            generator=self.generator,
+            return_path_length=True,
+            keep_every=1,
+            cuda_graph=True,
+        )
+        x, s = torch.cat((x0[None], x)), torch.cat((s0[None], s))
+        goals = None if self.goal is None else self.goal.repeat(steps + 1)
+        losses = task_toward(task, goals).world_losses(x.flatten(0, 1), s.flatten(0, 1))
+        losses = losses.view(steps + 1, -1)
+        told = losses[..., None, None].expand(*s.shape[:-1], 1)
+        features = torch.cat((x - x.mean(dim=-2, keepdim=True), s, told), dim=-1)
+        # Worlds that run away are held at the limits of the environment until they begin anew.
+        self.x, self.s = (
+            torch.nan_to_num(last.detach()).clamp(-limit, limit)
+            for last, limit in ((x[-1], self._limits[0]), (s[-1], self._limits[1]))
+        )
+        self._restart()
+        return Window(features, losses)
+
+    def _restart(self) -> None:
+        """Begin the next episodes of worlds whose last window this was."""
+        self.windows_left = [left - 1 for left in self.windows_left]
+        over = [k for k, left in enumerate(self.windows_left) if left == 0]
+        if not over:
+            return
+        x, s, goal = self._fresh(len(over))
+        index = torch.tensor(over, device=self.device)
+        self.x, self.s = self.x.index_copy(0, index, x), self.s.index_copy(0, index, s)
+        if self.goal is not None and goal is not None:
+            self.goal = self.goal.index_copy(0, index, goal)
+        for world in over:
+            self.windows_left[world] = self.window_count
+
+    def _fresh(self, count: int) -> tuple[Tensor, Tensor, Tensor | None]:
+        return seed_worlds(self.task, count, generator=self.generator, device=self.device)
+
+    def gain(self, window: Window) -> Tensor:
+        """Return the mean discounted reward of a window, and of what is foreseen after it."""
+        gamma, steps = self.options.gamma, self.window
+        discounts = gamma ** torch.arange(steps, device=self.device, dtype=torch.float32)
+        paid = (discounts[:, None] * window.rewards).sum(dim=0)
+        foreseen = values(self.target, window.features[-1])
+        return (paid + self.options.foresight * gamma**steps * foreseen).mean()
+
+    def learn_values(self, window: Window) -> None:
+        """Let the critic learn what the window was worth, and its copy follow."""
+        options = self.options
+        seen = window.features[:-1].flatten(0, 1)
+        with torch.no_grad():
+            for critic in (self.critic, self.target):
+                critic.observe(seen)
+            later = values(self.target, window.features[1:].flatten(0, 1))
+            targets = td_lambda_targets(
+                window.rewards,
+                later.view_as(window.rewards),
+                gamma=options.gamma,
+                td_lambda=options.td_lambda,
+            ).flatten()
+            for critic in (self.critic, self.target):
+                critic.rescale(targets)
+        for _ in range(options.critic_epochs):
+            order = torch.randperm(len(seen), generator=self.generator, device=self.device)
+            for part in order.tensor_split(min(options.minibatches, len(order))):
+                error = (values(self.critic, seen[part]) - targets[part]) / self.critic.scale
+                self._critic_optimizer.zero_grad()
+                (0.5 * error.square().mean()).backward()
+                self._critic_optimizer.step()
+        with torch.no_grad():
+            pairs = zip(self.target.parameters(), self.critic.parameters(), strict=True)
+            for followed, learned in pairs:
+                followed.lerp_(learned, options.target_rate)
+
+
+def values(critic: Critic, features: Tensor) -> Tensor:
+    """Return the values of worlds of which a critic sees [M, N, F], shape [M]."""
+    said: Tensor = critic(features)
+    return said.mean(dim=-1)
+
+
+def td_lambda_targets(
+    rewards: Tensor, following: Tensor, *, gamma: float, td_lambda: float
+) -> Tensor:
+    """Return what a critic should have said before each step of a window, shape [h, ...].
+
+    Sums of rewards to come, discounted; after each step the critic's own word counts with weight
+    1 - `td_lambda`, after the last one alone. Source: arXiv 2204.07137, equation 7.
+
+    Args:
+        rewards: Of each step, shape [h, ...].
+        following: What the critic says of the worlds after each step, shape [h, ...].
+        gamma: Discount of a reward one step later.
+        td_lambda: Weight of what is paid later.
+    """
+    targets = torch.empty_like(rewards)
+    later = following[-1]
+    for step in reversed(range(len(rewards))):
+        later = rewards[step] + gamma * torch.lerp(following[step], later, td_lambda)
+        targets[step] = later
+    return targets

@@ -1,0 +1,96 @@
+"""Small and large forms of environments: frozen settings, checkers, batches."""
+
+import json
+import warnings
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from pettingzoo.test import parallel_api_test
+from small_envs import assert_same, world_of
+
+from npa_envs.agents.learning import Problem
+from npa_envs.envs import multispecies_v0
+from npa_envs.registration import ENVIRONMENTS, SIZES, SPECIES_SIZES
+
+FROZEN = json.loads(Path(__file__).with_name("frozen_sizes.json").read_text())
+"""Steps of an episode and keywords by id, as they were when the ids were made."""
+
+QUICK = [row for row in SIZES if "Small" in row.id]
+by_id = pytest.mark.parametrize("row", QUICK, ids=lambda row: row.id)
+of_species = pytest.mark.parametrize("row", SPECIES_SIZES, ids=lambda row: row.id)
+
+
+def test_settings_are_what_they_were():
+    now = {row.id: {"steps": row.max_episode_steps, **row.keywords} for row in SIZES}
+    now |= {row.id: {"task": row.task, **row.keywords} for row in SPECIES_SIZES}
+    assert json.loads(json.dumps(now)) == FROZEN
+
+
+@pytest.mark.parametrize("row", SIZES, ids=lambda row: row.id)
+def test_an_id_is_the_environment_of_its_name_with_other_keywords(row):
+    usual = row.id.replace("Small", "").replace("Large", "")
+    assert usual in {registered.id for registered in ENVIRONMENTS}
+    spec = gymnasium.spec(row.id)
+    assert (spec.entry_point, spec.vector_entry_point) == (
+        row.entry_point, row.vector_entry_point,
+    ) == (gymnasium.spec(usual).entry_point, gymnasium.spec(usual).vector_entry_point)  # fmt: skip
+    sized = Problem(env_id=row.id, episode_steps=row.max_episode_steps)
+    told = Problem(env_id=usual, keywords=dict(row.keywords), episode_steps=4)
+    assert sized.config == told.config
+    changed = Problem(env_id=row.id, keywords={"update_prob": 0.25}, episode_steps=4)
+    assert changed.config.update_prob == 0.25
+    assert changed.config.particle_count == sized.config.particle_count
+
+
+@by_id
+def test_gymnasium_finds_nothing_to_complain_of(row):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(gymnasium.make(row.id).unwrapped, skip_render_check=True)
+
+
+@by_id
+def test_a_batch_equals_single_environments_to_the_end_of_their_episodes(row):
+    limit = {"max_episode_steps": 5}
+    envs = gymnasium.make_vec(
+        row.id, 2, vectorization_mode="vector_entry_point", autoreset_mode="same-step", **limit
+    )
+    singles = [gymnasium.make(row.id, **limit) for _ in range(2)]
+    seen, _ = envs.reset(seed=4)
+    random = np.random.default_rng(0)
+    for k, env in enumerate(singles):
+        assert_same(seen[k], env.reset(seed=4 + k)[0])
+    for step in range(5):
+        action = random.uniform(-1, 1, envs.action_space.shape).astype(np.float32)
+        seen, paid, ended, cut, infos = envs.step(action)
+        for k, env in enumerate(singles):
+            alone = env.step(action[k])
+            whole = infos["final_obs"] if step == 4 else seen
+            assert_same(world_of(whole, k), alone[0])
+            assert (np.float32(paid[k]), ended[k], cut[k]) == (np.float32(alone[1]), *alone[2:4])
+            assert cut[k] == (step == 4)
+
+
+@of_species
+def test_species_of_an_id_pass_the_checker_and_a_batch_equals_them(row):
+    parallel_api_test(multispecies_v0.parallel_env(row.id, max_cycles=4), num_cycles=6)
+    env = multispecies_v0.parallel_env(row.id)
+    envs = multispecies_v0.batched(row.id, world_count=2)
+    problem = Problem(env_id=row.id, episode_steps=row.keywords["max_cycles"])
+    assert env.worlds.task.config == envs.config == problem.config
+    (seen, _), (alone, _) = envs.reset(seed=3), env.reset(seed=4)
+    random = np.random.default_rng(0)
+    for _ in range(3):
+        actions = {
+            agent: random.uniform(-1, 1, space.shape).astype(np.float32)
+            for agent, space in envs.action_spaces.items()
+        }
+        assert_same(world_of(seen, 1), alone)
+        seen, paid, *_ = envs.step(actions)
+        alone, own, *_ = env.step({agent: action[1] for agent, action in actions.items()})
+        assert {a: np.float32(paid[a][1]) for a in own} == {
+            a: np.float32(v) for a, v in own.items()
+        }
