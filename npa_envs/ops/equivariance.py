@@ -112,7 +112,7 @@ def _read_rows(
     launch(kernels.mix_vectors, len(rows) * count, device, scalars, rows, mixing, mixed)
     launch(
         kernels.write_inputs,
-        len(rows) * width,
+        len(rows) * count,
         device,
         scalars,
         scalars + perceived * space_dim,
@@ -156,7 +156,14 @@ def _read_rows_backward(
         total,
     )
     launch(
-        kernels.pull_back_rows, count * width, device, scalars, mixing, inputs_bar, total, rows_bar
+        kernels.pull_back_rows,
+        count * len(mixing),
+        device,
+        scalars,
+        mixing,
+        inputs_bar,
+        total,
+        rows_bar,
     )
     return total, rows_bar
 

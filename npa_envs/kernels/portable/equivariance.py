@@ -1,6 +1,6 @@
 """Vectors of equivariant rules: mixtures, products that stay the same in turned worlds, steering.
 
-`npa_envs/ops/equivariance.py` has the formulas. Each thread makes a number or a vector of a row.
+`npa_envs/ops/equivariance.py` has the formulas. A thread makes a few numbers of a row.
 """
 
 import functools
@@ -29,16 +29,6 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
             result[0] = -u[1]
             result[1] = u[0]
         return result
-
-    @wp.func
-    def pair_of(number: wp.int32, first: wp.int32, count: wp.int32):
-        """Return the pair (a, b), b >= a + first, that has a number among those of `count`."""
-        a = wp.int32(0)
-        rest = number
-        while rest >= count - first - a:
-            rest -= count - first - a
-            a += 1
-        return a, a + first + rest
 
     @wp.func
     def place_of(a: wp.int32, b: wp.int32, first: wp.int32, count: wp.int32):
@@ -80,25 +70,27 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         inputs: numbers,
     ):
         """Write scalars, products, what is at column `one` of a row, and zeros."""
+        # A thread has the pairs that begin with its vector, and some of the scalars.
         t = range_start + wp.tid()
-        width = inputs.shape[1]
-        row = t / width
-        column = t - row * width
         count = mixed.shape[1]
-        pairs = count * (count + 1) / 2
-        crosses = chiral * (pairs - count)
-        value = scalar(0.0)
-        if column < scalars:
-            value = rows[row, column]
-        elif column < scalars + pairs:
-            a, b = pair_of(column - scalars, 0, count)
-            value = wp.dot(mixed[row, a], mixed[row, b])
-        elif column < scalars + pairs + crosses:
-            a, b = pair_of(column - scalars - pairs, 1, count)
-            value = wp.dot(turned(mixed[row, a]), mixed[row, b])
-        elif column == scalars + pairs + crosses:
-            value = rows[row, one]
-        inputs[row, column] = value
+        row = t / count
+        a = t - row * count
+        u = mixed[row, a]
+        for column in range(a, scalars, count):
+            inputs[row, column] = rows[row, column]
+        place = scalars + place_of(a, a, 0, count)
+        for b in range(a, count):
+            inputs[row, place + b - a] = wp.dot(u, mixed[row, b])
+        end = scalars + count * (count + 1) / 2
+        if chiral != 0:
+            place = end + place_of(a, a + 1, 1, count)
+            for b in range(a + 1, count):
+                inputs[row, place + b - a - 1] = wp.dot(turned(u), mixed[row, b])
+            end += count * (count - 1) / 2
+        if a == 0:
+            inputs[row, end] = rows[row, one]
+            for column in range(end + 1, inputs.shape[1]):
+                inputs[row, column] = scalar(0.0)
 
     @in_ranges(ELEMENTS)
     @wp.kernel(enable_backward=False, module=module)
@@ -144,20 +136,21 @@ def equivariance_kernels(space_dim: int, scalar: type) -> SimpleNamespace:
         rows_bar: numbers,
     ):
         """Write the cotangent of each row; that of its one and zeros is zero."""
+        # A thread has a perceived vector, and some of the scalars.
         t = range_start + wp.tid()
-        width = rows_bar.shape[1]
-        row = t / width
-        column = t - row * width
-        value = scalar(0.0)
-        if column < scalars:
-            value = inputs_bar[row, column]
-        else:
-            i = (column - scalars) / wp.static(space_dim)
-            d = column - scalars - i * wp.static(space_dim)
-            if i < mixing.shape[0]:
-                for a in range(mixing.shape[1]):
-                    value += mixing[i, a] * mixed_bar[row, a][d]
-        rows_bar[row, column] = value
+        count = mixing.shape[0]
+        row = t / count
+        i = t - row * count
+        for column in range(i, scalars, count):
+            rows_bar[row, column] = inputs_bar[row, column]
+        total = vector()
+        for a in range(mixing.shape[1]):
+            total += mixing[i, a] * mixed_bar[row, a]
+        for d in range(wp.static(space_dim)):
+            rows_bar[row, scalars + i * wp.static(space_dim) + d] = total[d]
+        if i == 0:
+            for column in range(scalars + count * wp.static(space_dim), rows_bar.shape[1]):
+                rows_bar[row, column] = scalar(0.0)
 
     @in_ranges(ELEMENTS)
     @wp.kernel(enable_backward=False, module=module)
