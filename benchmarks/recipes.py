@@ -6,13 +6,14 @@ GPU several runs share the device, each on a stream of its own. Every finished r
 JSON, so that a stopped call goes on where it was. `pictures` draws the emoji; `warm-up` compiles
 all kernels and tests that runs side by side learn bit for bit what they learn alone; `merge` makes
 one record, one sheet of pictures and one archive of rules of what several processes left; `report`
-prints the tables and draws the figure.
+prints the tables and draws the figure; `follow` says what the decay of a rule's world is.
 
     python benchmarks/recipes.py pictures --out PICTURES
     python benchmarks/recipes.py warm-up --device cuda --out OUT
     python benchmarks/recipes.py run --pictures PICTURES/development --device cuda --out OUT
     python benchmarks/recipes.py merge --out OUT
     python benchmarks/recipes.py report OUT/recipes.json --figure recipes.png
+    python benchmarks/recipes.py follow RULE --target PICTURE.png
 """
 
 from __future__ import annotations
@@ -35,7 +36,9 @@ from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from PIL import Image
+from torch import Tensor
 
 from npa_envs.errors import NPAError
 from npa_envs.files import write_bytes
@@ -43,11 +46,12 @@ from npa_envs.measure.plots import new_figure, number_plainly, png
 from npa_envs.measure.quality import Runner, evaluate, healing
 from npa_envs.measure.record import machine, write_record
 from npa_envs.render.colours import to_uint8
-from npa_envs.rule.files import save_rule
+from npa_envs.rule.files import load_rule, save_rule
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DTrainConfig
 from npa_envs.tasks.targets.emoji import render_emoji
 from npa_envs.training import Trainer, preset
 from npa_envs.world.recorded import release_recordings
+from npa_envs.world.rollout import rollout
 
 SEEDS = tuple(range(1000, 1008))
 """Seeds of the worlds that rules are measured on."""
@@ -156,7 +160,7 @@ SEVENTH: Fields = {
     "learning_rate": 2e-3,
     "initial_rule": "heart",
 }
-"""What serves `fast`, in large: half of the worlds are seeds, none is old. Not yet at full size."""
+"""What serves `fast`, in large: half of the worlds are seeds, none is old. Not at full size."""
 
 EIGHTH: Fields = {
     **STRAYS,
@@ -619,6 +623,72 @@ def merge(arguments: argparse.Namespace) -> None:
         path.unlink()
 
 
+MOTIONS = ("place", "angle", "affine", "deformation")
+"""What a grown picture is moved by to be more like its target."""
+
+GRID = 8
+"""Displacements along each side of the field that a picture is deformed by."""
+
+
+def moved(x: Tensor, motion: str, place: Tensor, affine: Tensor, field: Tensor) -> Tensor:
+    """Return the positions of one world [1, N, 2] moved as far as a motion allows."""
+    away = x - x.mean(dim=1, keepdim=True)
+    if motion == "angle":
+        cosine, sine = affine[0, 0].cos(), affine[0, 0].sin()
+        away = away @ torch.stack([cosine, sine, -sine, cosine]).view(2, 2)
+    elif motion == "affine":
+        away = away + away @ affine
+    elif motion == "deformation":
+        wide = F.interpolate(field, scale_factor=4, mode="bicubic", align_corners=True)
+        at = x.detach().clamp(-1.0, 1.0)[:, None]
+        away = away + F.grid_sample(wide, at, align_corners=True)[:, :, 0].transpose(1, 2)
+    return away + place
+
+
+def least_loss(task: Morphogenesis2D, x: Tensor, s: Tensor, motion: str) -> float:
+    """Return the splat loss of one world moved so that it is least, by 60 steps of Adam."""
+    place = task.target.points.mean(dim=0).clone().requires_grad_()
+    affine = torch.zeros(2, 2, requires_grad=True)
+    field = torch.zeros(1, 2, GRID, GRID, requires_grad=True)
+    optimiser = torch.optim.Adam([place, affine, field], lr=0.01)
+    least = math.inf
+    for _ in range(60):
+        picture = task.picture(moved(x, motion, place, affine, field), s, centred=False)
+        # |d| + d^2 as in `Morphogenesis2D.splat_errors`, which centres pictures itself.
+        size = (picture - task.target_picture).abs()
+        errors = size + size * size
+        density = errors[..., 3]
+        colour = errors[..., :3].mean(dim=-1) * torch.exp(-density.detach())
+        loss = (density + task.config.colour_weight * colour).mean()
+        least = min(least, loss.item())
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+    return least
+
+
+def follow(arguments: argparse.Namespace) -> None:
+    """Print what of one world's loss, as it grows old, lies in motions of the whole."""
+    rule = load_rule(arguments.rule)
+    task = Morphogenesis2D(preset(arguments.preset, target=arguments.target).task)
+    generator = torch.Generator().manual_seed(SEEDS[0])
+    x, s = task.seed(1, generator=generator)
+    before = 0
+    options = {"eps": task.eps, "update_prob": task.update_prob, "generator": generator}
+    print(f"step  loss  {'  '.join(MOTIONS)}  motion in 64 steps, of it the whole's")
+    for step in arguments.steps:
+        with torch.no_grad():
+            x, s = rollout(rule, x, s, step - before, **options)
+            later, _ = rollout(rule, x, s, 64, **options)
+        before = step
+        least = "  ".join(f"{least_loss(task, x, s, motion):.3f}" for motion in MOTIONS)
+        way = (later - x)[0]
+        lengths = way.norm(dim=-1).mean(), way.mean(dim=0).norm()
+        print(
+            f"{step}  {float(task.metric(x, s)):.3f}  {least}  {lengths[0]:.1e}  {lengths[1]:.1e}"
+        )
+
+
 REPORTED = (64, 128, 512, 1024, 4096, LAST)
 """Steps of the tables."""
 
@@ -656,13 +726,13 @@ def draw(runs: Sequence[Mapping[str, Any]]) -> bytes:
             members = [run for run in own if run["arm"] == arm]
             steps = [row["step"] for row in members[0]["growth"]]
             means = [statistics.fmean(_loss(run, step) or 0.0 for run in members) for step in steps]
-            dashes = ("-", "--", ":")[number // 10 % 3]
+            dashes = ("-", "--", ":", "-.")[number // 10 % 4]
             panel.plot(steps, means, dashes, color=f"C{number % 10}", label=arm)
         panel.set(xscale="log", yscale="log", title=size)
         panel.set(xlabel="steps from the seed", ylabel="splat loss, mean of pictures and seeds")
         number_plainly(panel.xaxis)
         number_plainly(panel.yaxis)
-        panel.legend(fontsize=8, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.12))
+        panel.legend(fontsize=8, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.17))
     return png(figure)
 
 
@@ -714,6 +784,12 @@ def main() -> None:
     own.set_defaults(main=merge)
     own.add_argument("--out", type=Path, required=True)
     own.add_argument("--device", default="cpu")
+    own = commands.add_parser("follow")
+    own.set_defaults(main=follow)
+    own.add_argument("rule", help="name or file of a rule")
+    own.add_argument("--target", required=True)
+    own.add_argument("--preset", default="paper", help="what the world is like")
+    own.add_argument("--steps", type=int, nargs="+", default=[512, 4096, 20_000])
     own = commands.add_parser("report")
     own.set_defaults(main=report)
     own.add_argument("record", type=Path)

@@ -70,10 +70,12 @@ def shipped_rules(task: str | None = None) -> dict[str, Path]:
 def first_rules() -> dict[str, Path]:
     """Return the rules that runs of presets begin with: name -> file, sorted by name.
 
-    They have learned one picture in small worlds, and are not shipped to be looked at.
+    The preset `best` of 2D morphogenesis begins with the shipped heart. Others have learned one
+    picture in small worlds, and are not shipped to be looked at.
     """
     folder = Path(__file__).resolve().parent / "first"
-    return {path.stem: path for path in sorted(folder.glob("*.safetensors"))}
+    rules = {path.stem: path for path in sorted(folder.glob("*.safetensors"))}
+    return rules | {"heart": shipped_rules()["heart"]}
 
 
 def load_rule(source: str | Path, *, device: str | torch.device = "cpu") -> NPARule:

@@ -69,7 +69,7 @@ TASKS: Mapping[str, TaskEntry] = {
         presets=MORPHOGENESIS2D_PRESETS,
         make=lambda config, device: Morphogenesis2D(config, device=device),
         targets=builtin_targets,
-        fast_seconds=210.0,
+        fast_seconds=170.0,
     ),
     "co_morphogenesis2d": TaskEntry(
         summary="grow pictures in one world, each by a rule of its own",
@@ -77,7 +77,7 @@ TASKS: Mapping[str, TaskEntry] = {
         # Films and the evaluation take its rules one by one, as rules of their own task.
         make=lambda config, device: cast(PictureTask, CoMorphogenesis2D(config, device=device)),
         targets=tuple,
-        fast_seconds=500.0,
+        fast_seconds=340.0,
         joint=True,
     ),
     "morphogenesis3d": TaskEntry(

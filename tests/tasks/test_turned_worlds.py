@@ -131,10 +131,11 @@ def test_a_rule_without_direction_is_trained_measured_and_exported_from_the_comm
     assert "is equivariant: watch it with npa-envs view" in capsys.readouterr().err
 
 
-def test_presets_that_begin_with_a_first_rule_begin_untrained(tmp_path):
+@pytest.mark.parametrize("name", ["fast", "best"])
+def test_presets_that_begin_with_a_first_rule_begin_untrained(name):
     from npa_envs.training.trainer import initial_rule
 
-    config = preset("fast", equivariant=True)
+    config = preset(name, equivariant=True)
     assert config.initial_rule
     untrained = Morphogenesis2D(config.task).make_rule(torch.Generator().manual_seed(0))
     assert initial_rule(config, untrained) is untrained
