@@ -67,7 +67,14 @@ class Entry(NamedTuple):
     particle_steps: int
 
 
-PARTICLES: Mapping[str, Entry] = {}
+PARTICLES: Mapping[str, Entry] = {
+    "npa/Morphogenesis2DSmall-v0": Entry(32, 16, 64, 5_000_000),
+    "npa/Regeneration2DSmall-v0": Entry(24, 16, 64, 5_000_000),
+    # Its loss takes most of the time.
+    "npa/TextureSmall-v0": Entry(24, 16, 64, 1_000_000),
+    "npa/PointClassificationSmall-v0": Entry(16, 16, 64, 5_000_000),
+    "npa/MixingSmall-v0": Entry(32, 16, 64, 5_000_000),
+}
 """Problems in which an action has a row for each particle, by their ids."""
 
 GARDENS: Mapping[str, Entry] = {

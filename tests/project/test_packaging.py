@@ -71,7 +71,8 @@ def test_wheel_holds_every_source_file_the_rules_and_the_license(site: Path) -> 
     sources += (ROOT / "npa_envs/rule/shipped").glob("*.*")
     sources += (ROOT / "npa_envs/rule/first").glob("*.*")
     sources += (ROOT / "npa_envs/web/page").glob("*.*")
-    mapped = [p for name in MAPPED_PACKAGES for p in (ROOT / name).rglob("*.py")]
+    kinds = ("*.py", "*.schema.json")
+    mapped = [p for name in MAPPED_PACKAGES for k in kinds for p in (ROOT / name).rglob(k)]
     expected = {"py.typed", *(p.relative_to(ROOT / "npa_envs").as_posix() for p in sources)}
     expected |= {p.relative_to(ROOT).as_posix() for p in mapped}
     package = site / "npa_envs"
