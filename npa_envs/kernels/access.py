@@ -31,7 +31,8 @@ def await_earlier():
     """Wait for the launches before this one; kernels begin with it, before they touch memory.
 
     On compute capability 9.0 and above such a kernel is launched before the one ahead has ended
-    (`npa_envs.ops.overlap`): at its end the blocks are there, and wait no more.
+    (`npa_envs/ops/driver.py`): when that ends its blocks are there. It loads neither by `__ldg` nor
+    by `ld.global.nc`, which the compiler moves ahead of the wait.
     """
 
 
