@@ -34,8 +34,14 @@ LIVELY = {
 }
 """Worlds that age, are to rest or are damaged in some places, and are replaced."""
 
-SEEDED = {"seed_interval": 2, "fresh_share": 0.7, "world_count": 4, "pool_size": 8}
-"""Batches with several fresh seeds."""
+SEEDED = {
+    "seed_interval": 3,
+    "fresh_share": 0.7,
+    "world_count": 4,
+    "pool_size": 8,
+    "damage_share": 0.5,
+}
+"""Batches with several fresh seeds; worlds of some places are damaged."""
 
 
 def tiny(out, **fields):
