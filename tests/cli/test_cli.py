@@ -295,6 +295,7 @@ def test_runs_that_name_no_preset_take_the_best_one_on_cuda_and_the_fast_one_els
 
 def test_a_configuration_file_may_name_its_preset_and_the_command_line_another(tmp_path, capsys):
     from npa_envs.cli.train import starting_configuration
+    from npa_envs.training import preset
 
     path = tmp_path / "run.yaml"
     path.write_text("preset: tiny\nseed: 5\n")
@@ -302,7 +303,7 @@ def test_a_configuration_file_may_name_its_preset_and_the_command_line_another(t
     config = starting_configuration("morphogenesis2d", words)
     assert (config.iterations, config.seed) == (40, 5)
     config = starting_configuration("morphogenesis2d", [*words, "--preset", "fast"])
-    assert (config.iterations, config.seed) == (2400, 5)
+    assert (config.iterations, config.seed) == (preset("fast").iterations, 5)
     path.write_text("preset: tinny\n")
     assert "did you mean 'tiny'" in error_of(capsys, ["train", "morphogenesis2d", *words])
 
