@@ -19,11 +19,12 @@ EXTRAS = {
     "sb3": "Stable-Baselines3",
     "human": 'the window of render_mode="human"',
     "view": "the viewer",
-    "bench": "plots of measurements",
+    "bench": "plots of measurements, scores of NPA-Bench",
     "evolution": "evolution strategies",
     "points": "the digits of point_classification",
     "views": "the loss of morphogenesis3d",
     "meshes": "mesh files",
+    "minari": "episodes as datasets",
 }
 """What each extra that `all` holds is for."""
 
