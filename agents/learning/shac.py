@@ -9,17 +9,17 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
-from typing import NamedTuple, get_args
+from typing import NamedTuple, cast, get_args
 
 import torch
 from torch import Tensor
 
-from npa_envs.agents.learning.gradient import episode_task
+from npa_envs.agents.learning.gradient import EpisodeTask, episode_task
 from npa_envs.agents.learning.ppo_common import Critic, CriticKind, check_word, first_rules
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Progress, annealed
 from npa_envs.agents.learning.rules import RuleSet
-from npa_envs.tasks.base import seed_worlds, task_toward
+from npa_envs.tasks.base import Task, seed_worlds, task_toward
 from npa_envs.tasks.checks import check_fraction, check_non_negative, check_positive
 from npa_envs.training.iteration import normalise_gradients
 from npa_envs.world.rollout import Memory
@@ -203,7 +203,8 @@ class Learner:
         )
         x, s = torch.cat((x0[None], x)), torch.cat((s0[None], s))
         goals = None if self.goal is None else self.goal.repeat(steps + 1)
-        losses = task_toward(task, goals).world_losses(x.flatten(0, 1), s.flatten(0, 1))
+        aimed = cast(EpisodeTask, task_toward(cast(Task, task), goals))
+        losses = aimed.world_losses(x.flatten(0, 1), s.flatten(0, 1))
         losses = losses.view(steps + 1, -1)
         told = losses[..., None, None].expand(*s.shape[:-1], 1)
         features = torch.cat((x - x.mean(dim=-2, keepdim=True), s, told), dim=-1)
@@ -230,7 +231,9 @@ class Learner:
             self.windows_left[world] = self.window_count
 
     def _fresh(self, count: int) -> tuple[Tensor, Tensor, Tensor | None]:
-        return seed_worlds(self.task, count, generator=self.generator, device=self.device)
+        # The task has what is asked of one here.
+        task = cast(Task, self.task)
+        return seed_worlds(task, count, generator=self.generator, device=self.device)
 
     def gain(self, window: Window) -> Tensor:
         """Return the mean discounted reward of a window, and of what is foreseen after it."""
@@ -261,7 +264,7 @@ class Learner:
             for part in order.tensor_split(min(options.minibatches, len(order))):
                 error = (values(self.critic, seen[part]) - targets[part]) / self.critic.scale
                 self._critic_optimizer.zero_grad()
-                (0.5 * error.square().mean()).backward()
+                torch.autograd.backward(0.5 * error.square().mean())
                 self._critic_optimizer.step()
         with torch.no_grad():
             pairs = zip(self.target.parameters(), self.critic.parameters(), strict=True)
