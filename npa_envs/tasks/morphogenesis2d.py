@@ -21,6 +21,7 @@ from npa_envs.tasks.growth import GrowthConfig, GrowthTask
 from npa_envs.tasks.targets.images import LARGEST_POINT_COUNT
 from npa_envs.tasks.targets.points import PointTarget, load_target
 from npa_envs.tasks.train_config import TrainConfig, fast_run, tiny_run
+from npa_envs.world.randomness import Randomness, WorldRandom
 
 SMALLEST_PICTURE = 4
 """Pixels a side of a picture that is blurred and halved, at least."""
@@ -71,6 +72,10 @@ class Morphogenesis2DConfig(GrowthConfig):
     chiral: bool = True
     """An equivariant rule tells left from right. Without, a mirrored picture is as good."""
 
+    seed_axis: float = 0.5
+    """Seeds of an equivariant rule have a head and a tail: across the disk, the first state goes
+    from minus this to this (dimensionless), along a direction drawn for each world. 0: no such."""
+
     angles: int = 16
     """Angles that are tried first for an equivariant rule's world, evenly spread. Sixteen more near
     the best of them are tried next: 1/39 of the step between the first ones remains."""
@@ -87,7 +92,7 @@ class Morphogenesis2DConfig(GrowthConfig):
                 f"got {self.blur_levels} for a resolution of {self.resolution}: lower it"
             )
         check_positive(self, float, "sigma")
-        check_non_negative(self, "splat_weight", "colour_weight", "drift_weight")
+        check_non_negative(self, "splat_weight", "colour_weight", "drift_weight", "seed_axis")
         check_flag(self, "equivariant", "chiral")
         check_positive(self, int, "angles", at_least=4)
 
@@ -148,6 +153,29 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         self._reach = max(1.0, radius)
         self.target_picture = self._splat(self.target.points[None], self.target.colours[None])[0]
         """Its picture: rgb sums and density, dimensionless, shape [R, R, 4]."""
+
+    def seed(
+        self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
+    ) -> tuple[Tensor, Tensor]:
+        """Return fresh worlds, of an equivariant rule with a head and a tail.
+
+        Args:
+            world_count: Worlds B.
+            generator: Source of the positions and of the axes, on `device`.
+            device: Where the worlds are made.
+        """
+        x, s = super().seed(world_count, generator=generator, device=device)
+        config = self.config
+        if config.equivariant and config.seed_axis > 0.0:
+            share = (
+                generator.uniform(1, dtype=x.dtype)
+                if isinstance(generator, WorldRandom)
+                else torch.rand(world_count, 1, generator=generator, device=x.device, dtype=x.dtype)
+            )
+            angle = 2.0 * math.pi * share
+            along = x[..., 0] * angle.cos() + x[..., 1] * angle.sin()
+            s[..., 0] = config.seed_axis * along / config.seed_radius
+        return x, s
 
     def picture(self, x: Tensor, s: Tensor, *, centred: bool = True) -> Tensor:
         """Return each world's picture: colour sums and density, dimensionless, shape [B, R, R, 4].

@@ -6,6 +6,7 @@ import math
 import pytest
 import torch
 
+import npa_envs
 from npa_envs.cli import main
 from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule, rule_metadata
@@ -83,6 +84,25 @@ def test_the_gradient_is_that_at_the_angle_chosen():
     assert torch.allclose(ours, turned(theirs, turn.mT), atol=1e-12)
 
 
+def test_seeds_have_a_head_and_a_tail_in_a_direction_of_their_own():
+    task = task_of(seed_axis=0.25)
+    x, s = task.seed(3, generator=npa_envs.WorldRandom([1, 2, 3]))
+    radius = task.config.seed_radius
+    directions = torch.linalg.lstsq(x, s[..., :1]).solution[..., 0] * radius
+    along = (x @ directions[..., None])[..., 0] / radius
+    assert torch.allclose(along, s[..., 0], atol=1e-6)
+    assert torch.allclose(directions.norm(dim=1), torch.tensor(0.25), atol=1e-6)
+    assert (directions[:, None] - directions).norm(dim=-1).sort(dim=1).values[:, 1].min() > 0.01
+    assert s[..., 1:].abs().max() == 0.0
+    alone = task.seed(1, generator=npa_envs.WorldRandom([2]))
+    assert torch.equal(alone[0][0], x[1])
+    assert torch.equal(alone[1][0], s[1])
+    generator = torch.Generator().manual_seed(0)
+    assert task.seed(2, generator=generator)[1][..., 0].abs().amax() <= 0.25
+    for blank in (task_of(seed_axis=0.0), task_of(equivariant=False)):
+        assert blank.seed(2, generator=generator)[1].abs().max() == 0.0
+
+
 def test_penalties_know_no_direction_either():
     task = task_of(stray_weight=1.0, bound_weight=1.0)
     generator = torch.Generator().manual_seed(0)
@@ -103,6 +123,7 @@ def test_penalties_know_no_direction_either():
     [
         ({"equivariant": "yes"}, "equivariant must be True or False, got 'yes'"),
         ({"chiral": 1}, "chiral must be True or False, got 1"),
+        ({"seed_axis": -1.0}, "seed_axis must be a finite number of at least 0"),
         ({"angles": 3}, "angles must be a whole number of at least 4, got 3"),
     ],
 )
