@@ -39,6 +39,8 @@ PICTURE = DOCS / "images" / "npa_bench.png"
 PANELS = 3
 """Panels side by side."""
 
+CAPTION = "Returns of held-out episodes over particle-steps; bands are standard errors."
+
 NO_ROWS = "No runs are stored yet."
 """What stands where a table would be empty."""
 
@@ -110,6 +112,7 @@ def parts(rows: dict[str, Row]) -> dict[str, str]:
     return made | {
         "returns": returned(rows) if rows else NO_ROWS,
         "methods": described(rows) if rows else NO_ROWS,
+        "curves": f"![{CAPTION}](images/{PICTURE.name})" if rows else NO_ROWS,
     }
 
 

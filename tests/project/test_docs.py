@@ -113,6 +113,7 @@ def test_tables_and_curves_of_the_benchmark_show_all_rows(bench):
     assert "| `other` | 1.500 ± 0.500 |" in text
     assert text.index("| `sac` | it is sac | 2 |") < text.index("| `other` | it is other | 2 |")
     assert f"| `{second}` |" in text
+    assert "](images/npa_bench.png)" in text
     assert bench.curves(rows).startswith(b"\x89PNG")
     del rows["gradient"]
     assert "Scores need the rows" in bench.page(text, rows)
