@@ -21,6 +21,7 @@ from npa_envs.agents.comparison.npa_bench import (
 from npa_envs.agents.comparison.plan import Job
 from npa_envs.agents.comparison.run import Point, RunRecord
 from npa_envs.agents.learning import methods_for
+from npa_envs.cli import main
 from npa_envs.cli.compare import CompareOptions, make_plan
 from npa_envs.errors import NPAError
 
@@ -179,3 +180,17 @@ def test_the_runs_of_a_task_are_called_by_its_id():
     assert str(Job("particle-steps", npa_bench.task_name(FIRST), "sac", 3).folder) == (
         f"particle-steps/{FIRST.removeprefix('npa/')}/sac/seed-3"
     )
+
+
+@pytest.mark.slow
+def test_the_command_writes_rows_that_can_be_read(tmp_path, capsys):
+    words = ["compare", "--suite", "npa-bench-v0", "--tasks", "MixingSmall-v0", "--no-progress"]
+    assert main([*words, "--methods", "zero", "random", "--jobs", "2", "--out", str(tmp_path)]) == 0
+    assert "| random | 5 |" in capsys.readouterr().out
+    rows = read_rows(tmp_path / "rows")
+    assert list(rows) == ["random", "zero"]
+    for row in rows.values():
+        assert [run.seed for run in row.runs] == [0, 1, 2, 3, 4]
+        assert {run.env_id for run in row.runs} == {"npa/MixingSmall-v0"}
+    assert np.allclose(rows["zero"].returns("npa/MixingSmall-v0"), 0.0)
+    assert (rows["random"].returns("npa/MixingSmall-v0") > 0.1).all()
