@@ -105,7 +105,7 @@ def test_it_grows_a_heart_nearly_as_well_as_the_whole_gradient():
     returns = [
         train(m, problem, budget, 0, entries=1).log[-1].mean_return for m in ("shac", "zero")
     ]
-    assert returns[0] > 1.6
+    assert returns[0] > 1.5
     assert returns[1] == 0.0
 
 

@@ -11,7 +11,7 @@ from gymnasium.utils.env_checker import check_env
 from pettingzoo.test import parallel_api_test
 from small_envs import assert_same, world_of
 
-from npa_envs.agents.learning import Problem
+from npa_envs.agents.learning import Budget, Problem, train
 from npa_envs.envs import multispecies_v0
 from npa_envs.registration import ENVIRONMENTS, SIZES, SPECIES_SIZES
 
@@ -72,6 +72,22 @@ def test_a_batch_equals_single_environments_to_the_end_of_their_episodes(row):
             assert_same(world_of(whole, k), alone[0])
             assert (np.float32(paid[k]), ended[k], cut[k]) == (np.float32(alone[1]), *alone[2:4])
             assert cut[k] == (step == 4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["ppo", "ppo_world"])
+def test_ppo_is_above_random_zero_and_scripted_policies_in_a_small_world(method):
+    if method == "ppo_world":
+        pytest.importorskip("stable_baselines3")
+    problem = Problem(env_id="npa/Morphogenesis2DSmall-v0", episode_steps=32, hidden_dim=64)
+
+    def returned(method, seed):
+        budget = Budget(particle_steps=1_000_000)
+        return train(method, problem, budget, seed, entries=1).log[-1].mean_return
+
+    learned = np.array([returned(method, seed) for seed in range(3)])
+    others = max(0.0, *(returned(name, 0) for name in ("random", "scripted")))
+    assert learned.mean() - 3.0 * learned.std(ddof=1) / np.sqrt(3) > others
 
 
 @of_species
