@@ -1,7 +1,7 @@
 """Draw what rules do that go beyond the paper, `docs/images/beyond_*.png`.
 
-    python docs/draw_beyond.py directions OUT    # OUT of benchmarks/directions.py train
-    python docs/draw_beyond.py sizes TRAINED VARIED    # files of rules
+    python docs/draw_beyond.py directions PLAIN EQUIVARIANT    # files of rules
+    python docs/draw_beyond.py sizes TRAINED VARIED
 
 It takes a minute on a CPU.
 """
@@ -25,7 +25,10 @@ from npa_envs.training.trained_tasks import task_of_rule
 IMAGES = Path(__file__).resolve().parent / "images"
 SEEDS = (1_000_000, 1_000_001, 1_000_002)
 CPU = torch.device("cpu")
-GROWN, AFTER = 512, 256
+GROWN, AFTER = 128, 128
+SIDE = 128
+"""Pixels on each side of a picture, at least."""
+
 COUNTS, RADII = (0.125, 0.25, 1.0, 4.0, 8.0), (0.5, 0.7, 1.0, 1.4, 2.0)
 
 Shots = list[tuple[str, NDArray[np.uint8]]]
@@ -53,14 +56,15 @@ def task_of(
 
 def as_it_lies(task: Morphogenesis2D, x: Tensor, s: Tensor) -> NDArray[np.uint8]:
     """Return a picture of a world that is neither moved nor turned."""
-    return to_uint8(task.picture(x, s, centred=False)[0])
+    picture = to_uint8(task.picture(x, s, centred=False)[0])
+    times = -(-SIDE // len(picture))
+    return picture.repeat(times, axis=0).repeat(times, axis=1)
 
 
-def directions(folder: Path) -> Shots:
-    """Return grown worlds, and one turned by 90 degrees, of a rule of each kind."""
+def directions(paths: list[str]) -> Shots:
+    """Return grown worlds, and one turned by 90 degrees, of a plain rule and an equivariant one."""
     shots: Shots = []
-    for kind in ("plain", "chiral"):
-        path = str(folder / f"gecko-{kind}.safetensors")
+    for kind, path in zip(("plain", "equivariant"), paths, strict=True):
         rule = npa_envs.load_rule(path)
         task = task_of(path, rule)
         for seed in SEEDS:
@@ -92,16 +96,14 @@ def sizes(paths: list[str]) -> Shots:
             generator = torch.Generator().manual_seed(SEEDS[0])
             x, s = trained.seed(1, generator=generator)
             x, s = run(rule, trained, x / share, s, GROWN, seed=SEEDS[0])
-            shots.append((f"ε = {share:g} ε0", as_it_lies(trained, x, s)))
+            shots.append((f"{share:g} x radius", as_it_lies(trained, x, s)))
     return shots
 
 
 def main() -> None:
     """Draw what the command line asks for."""
     what, *rest = sys.argv[1:]
-    captions, frames = zip(
-        *(directions(Path(rest[0])) if what == "directions" else sizes(rest)), strict=True
-    )
+    captions, frames = zip(*{"directions": directions, "sizes": sizes}[what](rest), strict=True)
     write_filmstrip(IMAGES / f"beyond_{what}.png", frames, captions, columns=5)
 
 
