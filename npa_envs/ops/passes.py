@@ -269,7 +269,7 @@ def perception_launch(
         None if listed is None else listed.neighbours,
         densities.particles,
         ordered.states,
-        ordered.states,
+        ordered.states.view(plan.total, -1),
         row_place,
         destination,
         densities.density_gradient,
