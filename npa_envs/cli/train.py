@@ -10,11 +10,12 @@ from dataclasses import dataclass, field, fields, make_dataclass, replace
 from pathlib import Path
 from typing import Any, get_type_hints
 
+import torch
 import tyro
 
 from npa_envs.cli import INTERRUPTED
 from npa_envs.cli.launch import launch
-from npa_envs.cli.output import OutFolder, duration, parse_options
+from npa_envs.cli.output import OutFolder, duration, parse_options, torch_threads
 from npa_envs.cli.report import Training, write_report
 from npa_envs.errors import NPAError
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig
@@ -36,6 +37,9 @@ from npa_envs.training.ranks import Ranks, joined_ranks
 
 COMMON = ("target", "iterations", "device", "out")
 """Fields of configurations that stand among the most common options, where a task has them."""
+
+THREADED_BATCH = 4096
+"""Particles of a batch from which on two threads train faster than one (docs/performance.md)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -270,15 +274,16 @@ def run(
         )
 
     try:
-        result = train(
-            config,
-            task_name,
-            resume=options.resume,
-            overwrite=options.overwrite,
-            progress=options.progress,
-            max_seconds=options.max_seconds,
-            begun=begun,
-        )
+        with torch_threads(thread_count(config)):
+            result = train(
+                config,
+                task_name,
+                resume=options.resume,
+                overwrite=options.overwrite,
+                progress=options.progress,
+                max_seconds=options.max_seconds,
+                begun=begun,
+            )
     except KeyboardInterrupt:
         print(f"interrupted; the last checkpoint is {folder.checkpoint}\ngo on: {resume_command}")
         raise
@@ -310,6 +315,16 @@ def run(
         print(f"  together    {meet}")
     print(f"  look at it  npa-envs view {shlex.quote(str(folder.path))}")
     return INTERRUPTED if result.interrupted else 0
+
+
+def thread_count(config: TrainConfig[Any]) -> int:
+    """Return how many CPU threads torch and the kernels train with: one where batches are small.
+
+    Several would wait for each other longer than they work (`THREADED_BATCH`).
+    """
+    species = getattr(config.task, "species", (config.task,))
+    batch = config.world_count * sum(own.particle_count for own in species)
+    return 1 if batch < THREADED_BATCH else torch.get_num_threads()
 
 
 def announcement(

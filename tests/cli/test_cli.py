@@ -16,11 +16,12 @@ from PIL import Image
 
 from npa_envs.cli import COMMANDS, doctor, main
 from npa_envs.cli.film import Film
-from npa_envs.cli.output import EXAMPLES
+from npa_envs.cli.output import EXAMPLES, torch_threads
+from npa_envs.cli.train import thread_count
 from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule, save_rule
 from npa_envs.rule.rule import NPARule
-from npa_envs.training import Trainer
+from npa_envs.training import Trainer, preset
 
 TINY = ["morphogenesis2d", "--preset", "tiny", "--no-report", "--iterations", "6", "--no-progress"]
 
@@ -232,6 +233,12 @@ def test_doctor_names_old_cards_idle_cores_cold_caches_and_what_is_not_there(mon
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     assert "ssh -L" in doctor._browser()[0].cure
+
+
+@pytest.mark.parametrize(("name", "expected"), [("fast", 1), ("paper", 3)])
+def test_small_batches_train_on_one_thread(name, expected):
+    with torch_threads(3):
+        assert thread_count(preset(name)) == expected
 
 
 def test_train_says_what_it_learns_and_writes_a_rule_that_loads(tmp_path, capsys):
