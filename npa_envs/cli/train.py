@@ -322,9 +322,13 @@ def thread_count(config: TrainConfig[Any]) -> int:
 
     Several would wait for each other longer than they work (`THREADED_BATCH`).
     """
-    species = getattr(config.task, "species", (config.task,))
-    batch = config.world_count * sum(own.particle_count for own in species)
+    batch = config.world_count * sum(own.particle_count for own in _species(config))
     return 1 if batch < THREADED_BATCH else torch.get_num_threads()
+
+
+def _species(config: TrainConfig[Any]) -> Sequence[Any]:
+    """Return the tasks of all species; of one, where a task has no others."""
+    return getattr(config.task, "species", (config.task,))
 
 
 def announcement(
@@ -338,8 +342,7 @@ def announcement(
         config: What it runs.
         process_count: Processes that share it.
     """
-    task = config.task
-    species = getattr(task, "species", (task,))
+    species = _species(config)
     goals = [getattr(own, "target", None) or f"the data {own.data}" for own in species]
     particles = " and ".join(str(own.particle_count) for own in species)
     named = options.preset or default_preset(task_name, config.device)
