@@ -6,7 +6,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from worlds import tensors
 
 from npa_envs.training import JsonlLog, Trainer
-from npa_envs.training.iteration import TrainingCycle
+from npa_envs.training.cycle import TrainingCycle
 
 
 def trainer_of(config, task=None, **options):

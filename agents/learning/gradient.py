@@ -20,7 +20,7 @@ from npa_envs.errors import NPAError, shown
 from npa_envs.rule.rule import FoldedRule, NPARule
 from npa_envs.tasks.base import Task
 from npa_envs.tasks.train_config import TrainConfig
-from npa_envs.training.iteration import TrainingCycle
+from npa_envs.training.cycle import TrainingCycle
 from npa_envs.world.randomness import Randomness, WorldRandom
 from npa_envs.world.recorded import CudaGraph
 from npa_envs.world.rollout import Memory

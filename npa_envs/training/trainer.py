@@ -31,7 +31,8 @@ from npa_envs.rule.files import first_rules, load_rule, save_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import GoalTask, Task, differing_fields, task_for_rule, task_toward
 from npa_envs.tasks.train_config import TrainConfig
-from npa_envs.training.iteration import Rollout, TrainingCycle
+from npa_envs.training.cycle import TrainingCycle
+from npa_envs.training.iteration import Rollout
 from npa_envs.training.overrides import config_to_dict
 from npa_envs.training.ranks import Ranks
 from npa_envs.training.run_folder import (

@@ -19,7 +19,9 @@ from npa_envs.errors import NPAError
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task
 from npa_envs.tasks.train_config import VARIED, TrainConfig
-from npa_envs.training.iteration import Interval, LossMeter, Rollout, RolloutOptions, TrainingCycle
+from npa_envs.training.cycle import TrainingCycle
+from npa_envs.training.iteration import Rollout, RolloutOptions
+from npa_envs.training.meter import Interval, LossMeter
 from npa_envs.training.presets import task_entry
 
 PLACES = {"vary_particles": (1, 0), "vary_update_prob": (2, 1), "vary_dt": (3, 3)}

@@ -11,17 +11,16 @@ from torch import nn
 
 from npa_envs.devices import check_device, parse_device
 from npa_envs.errors import NPAError
-from npa_envs.training.iteration import (
-    EagerIteration,
-    Interval,
-    LossMeter,
+from npa_envs.training.iteration import EagerIteration
+from npa_envs.training.meter import Interval, LossMeter
+from npa_envs.training.optimiser import (
     RuleOptimiser,
     WeightAverage,
-    WorldPool,
     clear_non_finite,
     normalise_gradients,
 )
 from npa_envs.training.overrides import config_to_dict
+from npa_envs.training.pool import WorldPool
 from npa_envs.training.run_folder import JsonlLog, check_same_run, load_checkpoint, save_checkpoint
 
 

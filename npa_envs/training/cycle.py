@@ -1,0 +1,316 @@
+"""The cycle of training: worlds from a pool, rollout, gradients, worlds back, optimiser's step.
+
+Nothing here waits for the device. An iteration runs eagerly, or as CUDA graphs; what happened is
+kept on the device until a line of the log asks for it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import npa_envs.world.rollout
+from npa_envs.rule.rule import NPARule
+from npa_envs.tasks.base import GoalTask, ScheduledTask, Task, seed_worlds, task_for_rule
+from npa_envs.tasks.train_config import AGEING_BLOCK, TrainConfig
+from npa_envs.training.iteration import EagerIteration, GraphedIteration, Rollout
+from npa_envs.training.meter import LossMeter
+from npa_envs.training.optimiser import RuleOptimiser, WeightAverage
+from npa_envs.training.pool import WorldPool
+from npa_envs.training.randomness import RunRandomness, registered, restart
+from npa_envs.training.ranks import Ranks
+from npa_envs.world.cuda_graph import Replayed
+from npa_envs.world.randomness import Randomness, WorldRandom
+
+
+class TrainingCycle:
+    """All that changes while a rule is trained.
+
+    Args:
+        task: What to learn.
+        rule: The rule, on the device, in the run's dtype.
+        config: How.
+        device: Where the worlds are.
+        schedule: Randomness of the numbers of steps, on the CPU.
+        rollout: The rollout to train through; None is the engine's.
+        ranks: The processes that share the run; None: this one alone.
+        by_world: Each world draws by itself, as several processes need it.
+        beside: A cycle of other worlds that train the same rule: optimiser, averaged weights and
+            gradients are shared with it.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        rule: NPARule,
+        config: TrainConfig[Any],
+        device: torch.device,
+        schedule: torch.Generator,
+        rollout: Rollout | None = None,
+        *,
+        ranks: Ranks | None = None,
+        by_world: bool = False,
+        beside: TrainingCycle | None = None,
+    ) -> None:
+        self.task = task_for_rule(task, rule)
+        """The task, as it is for worlds of this rule."""
+        self._rule = rule
+        self._config = config
+        self._rollout: Rollout = npa_envs.world.rollout.rollout if rollout is None else rollout
+        self._ranks = ranks = Ranks() if ranks is None else ranks
+        self._section = config.pool_size // config.world_count if by_world else config.pool_size
+        if by_world:
+            ranks.check(config)
+        places = ranks.places(config.pool_size, self._section)
+        old = places >= config.pool_size // 2
+        self.random = (
+            RunRandomness.by_world(config, device, schedule, ranks, places[old])
+            if by_world
+            else RunRandomness.of_batch(config, device, schedule)
+        )
+        """What the run draws from."""
+        self._places = places.to(device)
+        self._old = old.nonzero()[:, 0].to(device)
+        x, s, goal = self._seeds(len(places), self.random.pool)
+        lifetimes = config.lifetimes if config.ages else None
+        self.pool = WorldPool(
+            x,
+            s,
+            goal,
+            runaway_limit=config.runaway_limit,
+            lifetimes=lifetimes,
+            places=places,
+            total=config.pool_size,
+        )
+        """Worlds of this process that live on between batches."""
+        numbers = ranks.places(config.world_count, 1)
+        self._fresh_count = int((numbers < config.fresh_count).sum())
+        count = len(numbers)
+        batch = x[:count], s[:count]
+        goals = None if goal is None else goal[:count]
+        graphed = device.type == "cuda" and config.cuda_graph
+        iteration = GraphedIteration if graphed else EagerIteration
+        self.batch: EagerIteration = iteration(
+            self.task,
+            rule,
+            config,
+            batch[0],
+            batch[1],
+            self.random.masks,
+            self._rollout,
+            goal=goals,
+            gradients=None if beside is None else beside.batch.gradients,
+        )
+        """Worlds before and after the last rollout, the loss and its gradients."""
+        parameters = self.batch.parameters
+        self.optimiser: RuleOptimiser = (
+            RuleOptimiser(parameters, config) if beside is None else beside.optimiser
+        )
+        """Changes the rule."""
+        self.average: WeightAverage = (
+            WeightAverage(parameters, config.average) if beside is None else beside.average
+        )
+        """The running mean of the weights, where the configuration asks for one."""
+        self.meter = LossMeter(self.batch)
+        """What happened since the last line of the log."""
+        self._index = torch.zeros(count, dtype=torch.int64, device=device)
+        self._age = torch.zeros_like(self._index)
+        self._steps = torch.zeros_like(self._index[0])
+        self._lost = torch.zeros_like(self._index[0])
+        self._fresh_x, self._fresh_s = (torch.empty_like(t) for t in batch)
+        self._fresh_goal = None if goals is None else torch.empty_like(goals)
+        worlds, ageing = registered(self.random.worlds), registered(self.random.ageing)
+        self._grow_old = Replayed(self._age_worlds, device, ageing) if graphed else self._age_worlds
+        self._draw = Replayed(self._draw_worlds, device, worlds) if graphed else self._draw_worlds
+        self._keep = Replayed(self._keep_worlds, device) if graphed else self._keep_worlds
+        self._note = Replayed(self._note_iteration, device) if graphed else self._note_iteration
+
+    def run(self, iteration: int) -> int:
+        """Train for one iteration, and return the steps of its rollout, T."""
+        config, batch = self._config, self.batch
+        lo, hi = config.steps
+        steps = int(torch.randint(lo, hi, (), generator=self.random.schedule))
+        if isinstance(self.task, ScheduledTask):
+            self.task.begin(iteration)
+        for _ in range(config.ageing_at(iteration) // AGEING_BLOCK):
+            if len(self._old) > 0:
+                self._grow_old()
+        self._draw()
+        if not config.ages and iteration % config.seed_interval == 0:
+            self._begin_anew(self._fresh_count)
+        batch.run(steps)
+        self.meter.begin(iteration + 1, steps)
+        self._steps.fill_(steps)
+        self._keep()
+        # Between two graphs: what NCCL does is then watched for processes that do not answer.
+        self._ranks.reduce([*batch.gradients, batch.terms], self._lost)
+        self._note()
+        self.optimiser.step(iteration)
+        self.average.update(iteration)
+        return steps
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return all that changes but the rule, for a checkpoint; of all processes on the first."""
+        return {
+            "optimiser": self.optimiser.state_dict(),
+            "pool": {
+                name: self._ranks.collected(tensor, self._section)
+                for name, tensor in self._pooled()
+                if tensor is not None
+            },
+            "meter": self.meter.state_dict(),
+            "random_states": self.random.state_dict(),
+            **self.average.state_dict(),
+        }
+
+    def state_like(self, iteration: int) -> dict[str, Any]:
+        """Return what `state_dict` has after so many iterations, with other numbers in it."""
+        optimiser = {"state": self.optimiser.moments_like()} if iteration > 0 else {"state": {}}
+        whole = self._config.pool_size
+        pool = {
+            name: tensor[:1].expand(whole, *tensor.shape[1:])
+            for name, tensor in self._pooled()
+            if tensor is not None
+        }
+        return {
+            "optimiser": optimiser,
+            "pool": pool,
+            "meter": self.meter.state_dict(),
+            "random_states": self.random.state_dict(),
+            **self.average.state_dict(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any], iteration: int) -> None:
+        """Go on after so many iterations from what `state_dict` returned; before the first one."""
+        self.optimiser.load_state_dict(state["optimiser"])
+        for name, tensor in self._pooled():
+            if tensor is not None:
+                tensor.copy_(self._ranks.own(state["pool"][name], self._section))
+        self.meter.load_state_dict(state["meter"])
+        self.average.load_state_dict(state)
+        self.random.load_state_dict(state["random_states"], iteration, self._config)
+
+    @torch.no_grad()
+    def _age_worlds(self) -> None:
+        """Run the worlds of the longer-lived half of the pool for some steps, without gradients."""
+        pool, old, random = self.pool, self._old, self.random.ageing
+        assert pool.age is not None, "made with lifetimes"
+        restart(random)
+        x, s, goal = pool.read(old)
+        x, s, _ = self._rollout(
+            self._rule,
+            x,
+            s,
+            AGEING_BLOCK,
+            eps=self.task.eps,
+            box=self.task.box,
+            update_prob=self.task.update_prob,
+            memory=self._config.memory,
+            generator=random,
+            return_path_length=True,
+        )
+        fresh_x, fresh_s, fresh_goal = self._seeds(len(old), random)
+        goals = None if goal is None or fresh_goal is None else (goal, fresh_goal)
+        age = pool.age.index_select(0, old) + AGEING_BLOCK
+        self._lost += pool.write(old, x, s, fresh_x, fresh_s, goals, age).sum()
+
+    @torch.no_grad()
+    def _draw_worlds(self) -> None:
+        """Fill the batch from the pool, and have seeds at hand."""
+        config, worlds = self._config, self.random.worlds
+        restart(worlds, self.random.masks)
+        self._index.copy_(self.pool.sample(len(self._index), worlds))
+        x0, s0, goal = self.pool.read(self._index)
+        if config.damage:
+            x0, s0, goal = self._damaged(x0, s0, goal)
+        # Drawn in every iteration, needed or not: nobody on the host knows which worlds run away.
+        fresh_x, fresh_s, fresh_goal = self._seeds(len(self._index), worlds)
+        self._fresh_x.copy_(fresh_x)
+        self._fresh_s.copy_(fresh_s)
+        if self._fresh_goal is not None and fresh_goal is not None:
+            self._fresh_goal.copy_(fresh_goal)
+        if config.ages:
+            age, over = self.pool.ages_of(self._index)
+            x0, s0 = (
+                torch.where(over[:, None, None], fresh, old)
+                for fresh, old in ((fresh_x, x0), (fresh_s, s0))
+            )
+            if goal is not None and fresh_goal is not None:
+                goal = torch.where(over, fresh_goal, goal)
+            self._age.copy_(age.masked_fill(over, 0))
+            grown = (self._age >= config.rest_age) & ~self._places_hurt()
+            self.batch.grown.copy_(grown)
+        self.batch.x0.copy_(x0)
+        self.batch.s0.copy_(s0)
+        if goal is not None:
+            self.batch.aim(goal)
+
+    def _damaged(
+        self, x: Tensor, s: Tensor, goal: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Return worlds of the pool damaged, where they are in places of damaged ones."""
+        worlds, whole = self.random.worlds, (x, s, goal)
+        if isinstance(self.task, GoalTask) and goal is not None:
+            x, s, goal = self.task.damage_with_goals(x, s, goal, worlds)
+        else:
+            x, s = self.task.damage(x, s, worlds)
+        if self._config.damage_share < 1.0:
+            hit = self._places_hurt()
+            x, s = (
+                torch.where(hit[:, None, None], hurt, old)
+                for hurt, old in ((x, whole[0]), (s, whole[1]))
+            )
+            if goal is not None and whole[2] is not None:
+                goal = torch.where(hit, goal, whole[2])
+        return x, s, goal
+
+    def _places_hurt(self) -> Tensor:
+        """Return whether the batch's worlds come from places where all are damaged, shape [B]."""
+        share = self._config.damage_share if self._config.damage else 0.0
+        return self._places[self._index] < share * self._config.pool_size
+
+    def _begin_anew(self, count: int) -> None:
+        """Let the first worlds of the batch be fresh seeds."""
+        batch = self.batch
+        batch.x0[:count], batch.s0[:count] = self._fresh_x[:count], self._fresh_s[:count]
+        if batch.goal is not None and self._fresh_goal is not None:
+            batch.goal[:count] = self._fresh_goal[:count]
+
+    @torch.no_grad()
+    def _keep_worlds(self) -> None:
+        """Put the batch back into the pool."""
+        batch = self.batch
+        goals = None
+        if batch.goal is not None and self._fresh_goal is not None:
+            goals = batch.goal, self._fresh_goal
+        fresh = self._fresh_x, self._fresh_s
+        age = self._age + self._steps if self._config.ages else None
+        self._lost += self.pool.write(self._index, batch.x, batch.s, *fresh, goals, age).sum()
+
+    @torch.no_grad()
+    def _note_iteration(self) -> None:
+        """Take note of what the batch of all processes came to, and prepare its gradients."""
+        self.meter.observe(self._lost)
+        self._lost.zero_()
+        self.optimiser.prepare_gradients()
+
+    def _seeds(self, world_count: int, random: Randomness) -> tuple[Tensor, Tensor, Tensor | None]:
+        dtype = self._config.torch_dtype
+        x, s, goal = seed_worlds(self.task, world_count, generator=random, device=random.device)
+        lo, hi = map(math.log, self._config.vary_eps)
+        if lo < hi:
+            # Scaling positions and ε alike is a symmetry: a larger ε is a smaller disk.
+            share = (
+                random.uniform(1)[:, 0]
+                if isinstance(random, WorldRandom)
+                else torch.rand(world_count, generator=random, device=random.device)
+            )
+            x = x * torch.exp(-lo - (hi - lo) * share)[:, None, None]
+        return x.to(dtype), s.to(dtype), goal
+
+    def _pooled(self) -> list[tuple[str, Tensor | None]]:
+        pool = self.pool
+        return [("x", pool.x), ("s", pool.s), ("goal", pool.goal), ("age", pool.age)]

@@ -1,0 +1,126 @@
+"""The pool of worlds that a rule is trained on."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from npa_envs.world.randomness import Randomness, WorldRandom
+
+
+class WorldPool:
+    """Worlds that live on between batches, on the device, so that a rule learns to be stable.
+
+    Args:
+        x: Positions of every world [length units], shape [W, N, D], W the pool's size.
+        s: States, shape [W, N, C].
+        goal: The goal of every world, shape [W], where the task has such.
+        runaway_limit: A world with a larger |x| or |s|, or one that is not finite, is not kept.
+        lifetimes: Steps that the world in the first place lives, and that in the last, all others
+            between; None: for ever.
+        places: Places of these worlds among those of all processes, int64, shape [W]; None: they
+            are all.
+        total: Worlds of all processes; None: W.
+    """
+
+    def __init__(
+        self,
+        x: Tensor,
+        s: Tensor,
+        goal: Tensor | None = None,
+        *,
+        runaway_limit: float,
+        lifetimes: tuple[int, int] | None = None,
+        places: Tensor | None = None,
+        total: int | None = None,
+    ) -> None:
+        self.x = x
+        """Positions [length units], shape [W, N, D]."""
+        self.s = s
+        """States (dimensionless), shape [W, N, C]."""
+        self.goal = goal
+        """Goals, int64, shape [W], or None."""
+        self.age = None if lifetimes is None else torch.zeros_like(x[:, 0, 0], dtype=torch.int64)
+        """Steps since the seed, int64, shape [W], or None."""
+        self.lifetime: Tensor | None = None
+        """Age at which the world of each place has lived, int64, shape [W], or None."""
+        if lifetimes is not None:
+            lo, hi = map(math.log, lifetimes)
+            logarithms = torch.linspace(lo, hi, total or len(x), dtype=torch.float64)
+            own = logarithms if places is None else logarithms[places]
+            self.lifetime = own.exp().round().to(x.device, torch.int64)
+        self._runaway_limit = runaway_limit
+
+    def sample(self, world_count: int, generator: Randomness) -> Tensor:
+        """Draw different worlds: one of each of B equal sections.
+
+        From a generator and where they have no lifetimes, B of all worlds instead.
+
+        Returns:
+            Their indices, shape [B].
+        """
+        size = len(self.x) // world_count
+        first = torch.arange(0, size * world_count, size, device=self.x.device)
+        if isinstance(generator, WorldRandom):
+            return first + generator.integers(size, 1)[:, 0]
+        # The largest of random numbers: unlike randperm, one short kernel and no host copy.
+        keys = torch.rand(len(self.x), generator=generator, device=self.x.device)
+        if self.age is None:
+            return keys.topk(world_count).indices
+        return first + keys.view(world_count, size).argmax(dim=1)
+
+    def ages_of(self, index: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the ages of worlds that have lifetimes, and which have lived, shape [B] each."""
+        assert self.age is not None, "made with lifetimes"
+        assert self.lifetime is not None, "made with lifetimes"
+        age = self.age.index_select(0, index)
+        return age, age >= self.lifetime.index_select(0, index)
+
+    def read(self, index: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Return copies of the worlds at `index` [B]: x [B, N, D], s [B, N, C] and goals [B]."""
+        goal = None if self.goal is None else self.goal.index_select(0, index)
+        return self.x.index_select(0, index), self.s.index_select(0, index), goal
+
+    def write(
+        self,
+        index: Tensor,
+        x: Tensor,
+        s: Tensor,
+        fresh_x: Tensor,
+        fresh_s: Tensor,
+        goals: tuple[Tensor, Tensor] | None = None,
+        age: Tensor | None = None,
+    ) -> Tensor:
+        """Put worlds back; those that are not finite or run away are replaced by fresh ones.
+
+        Args:
+            index: Where to, shape [B].
+            x: Positions after the rollout [length units], shape [B, N, D].
+            s: States after the rollout, shape [B, N, C].
+            fresh_x: Positions of seeds, shape [B, N, D].
+            fresh_s: States of seeds, shape [B, N, C].
+            goals: Goals of the worlds and of the seeds, shape [B], where the pool has such.
+            age: Steps of the worlds since their seeds, int64, shape [B], where they have lifetimes.
+
+        Returns:
+            Which worlds were replaced, shape [B], bool.
+        """
+        farthest = torch.maximum(_largest(x), _largest(s))
+        # A comparison with NaN is false, so what is not finite is not kept either.
+        keep = farthest <= self._runaway_limit
+        mask = keep[:, None, None]
+        self.x.index_copy_(0, index, torch.where(mask, x, fresh_x))
+        self.s.index_copy_(0, index, torch.where(mask, s, fresh_s))
+        if self.goal is not None and goals is not None:
+            self.goal.index_copy_(0, index, torch.where(keep, *goals))
+        if self.age is not None and age is not None:
+            self.age.index_copy_(0, index, age.masked_fill(~keep, 0))
+        return ~keep
+
+
+def _largest(worlds: Tensor) -> Tensor:
+    """Return each world's largest absolute value, NaN where there is one; shape [B]."""
+    largest: Tensor = torch.linalg.vector_norm(worlds.flatten(1), math.inf, dim=1)
+    return largest
