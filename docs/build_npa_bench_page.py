@@ -3,8 +3,8 @@
     python docs/build_npa_bench_page.py          write the tables and the curves' picture
     python docs/build_npa_bench_page.py --check  fail where the page is not current
 
-Rows are the files of `benchmarks/results/npa_bench_v0/`, each of which is checked. Tables stand
-between marks in the page; all else in it is written by hand.
+Rows are the files of a suite's folder, such as `benchmarks/results/npa_bench_small_v0/`, each of
+which is checked. Tables stand between marks in the page; all else in it is written by hand.
 """
 
 from __future__ import annotations
@@ -17,13 +17,12 @@ import numpy as np
 from page_parts import table, write_or_check
 
 from npa_envs.agents.comparison.npa_bench import (
-    ENTRIES,
-    GROUPS,
     METHODS,
     NOTHING,
+    SUITES,
     YARDSTICK,
     Row,
-    problem_of,
+    Suite,
     read_rows,
     score,
     scores_in,
@@ -33,24 +32,28 @@ from npa_envs.measure.plots import draw_band, legend_of, new_figure, png
 from npa_envs.measure.tables import NONE
 
 DOCS = Path(__file__).resolve().parent
-ROWS = DOCS.parent / "benchmarks" / "results" / "npa_bench_v0"
+ROWS = DOCS.parent / "benchmarks" / "results"
 PAGE = "npa_bench.md"
-PICTURE = DOCS / "images" / "npa_bench.png"
 PANELS = 3
 """Panels side by side."""
 
 CAPTION = "Returns of held-out episodes over particle-steps; bands are standard errors."
 
 NO_ROWS = "No runs are stored yet."
-"""What stands where a table would be empty."""
+"""What stands where a suite has no rows."""
 
 
-def problems() -> str:
+def plain_name(suite: Suite) -> str:
+    """Return a suite's name as files and folders have it."""
+    return suite.name.replace("-", "_")
+
+
+def problems(suite: Suite) -> str:
     """Return the table of the problems, Markdown."""
     lines = []
-    for env_id, entry in ENTRIES.items():
-        count = problem_of(task_name(env_id)).particle_count
-        steps = f"{entry.particle_steps:.0e}".replace("e+0", "e")
+    for env_id, entry in suite.entries.items():
+        count = suite.problem_of(task_name(env_id)).particle_count
+        steps = f"{entry.particle_steps:.1e}".replace("e+0", "e").replace(".0e", "e")
         line = (count, entry.episode_steps, entry.num_envs, entry.hidden_dim, steps)
         lines.append((f"`{env_id}`", *map(str, line)))
     heads = ("Id", "Particles", "Steps", "Worlds", "Hidden units", "Particle-steps of a run")
@@ -63,11 +66,17 @@ def ranked(rows: dict[str, Row]) -> list[str]:
     return sorted(rows, key=lambda name: (own.index(name) if name in own else len(own), name))
 
 
-def scored(rows: dict[str, Row], group: str) -> str:
+def measured(suite: Suite, rows: dict[str, Row]) -> list[str]:
+    """Return the ids of the problems that have runs."""
+    ran = {run.env_id for row in rows.values() for run in row.runs}
+    return [env_id for env_id in suite.entries if env_id in ran]
+
+
+def scored(suite: Suite, rows: dict[str, Row], group: str) -> str:
     """Return the scores of all methods on a group of problems, Markdown."""
     if not {NOTHING, YARDSTICK} <= rows.keys():
         return f"Scores need the rows `{NOTHING}` and `{YARDSTICK}`."
-    ids = [env_id for env_id in GROUPS[group] if len(rows[YARDSTICK].returns(env_id))]
+    ids = [env_id for env_id in suite.groups[group] if len(rows[YARDSTICK].returns(env_id))]
     lines = []
     for method in ranked(rows):
         found = scores_in(rows, method, ids)
@@ -79,9 +88,9 @@ def scored(rows: dict[str, Row], group: str) -> str:
     return table(heads, lines) if lines else NO_ROWS
 
 
-def returned(rows: dict[str, Row]) -> str:
+def returned(suite: Suite, rows: dict[str, Row]) -> str:
     """Return the mean returns with their standard errors over seeds, Markdown."""
-    ids = [env_id for env_id in ENTRIES if any(len(row.returns(env_id)) for row in rows.values())]
+    ids = measured(suite, rows)
     lines = []
     for method in ranked(rows):
         cells = []
@@ -105,20 +114,22 @@ def described(rows: dict[str, Row]) -> str:
     return table(("Method", "What it is", "Runs"), lines)
 
 
-def parts(rows: dict[str, Row]) -> dict[str, str]:
-    """Return what stands between the marks of the page, by their names."""
-    made = {"problems": problems()}
-    made |= {name: scored(rows, name) if rows else NO_ROWS for name in GROUPS}
-    return made | {
-        "returns": returned(rows) if rows else NO_ROWS,
-        "methods": described(rows) if rows else NO_ROWS,
-        "curves": f"![{CAPTION}](images/{PICTURE.name})" if rows else NO_ROWS,
-    }
+def results(suite: Suite, rows: dict[str, Row]) -> str:
+    """Return all tables of a suite's rows, and its picture, Markdown."""
+    if not rows:
+        return NO_ROWS
+    told = [described(rows)]
+    told += [f"Scores, {name}:\n\n{scored(suite, rows, name)}" for name in suite.groups]
+    told += [f"Returns, mean and standard error over seeds:\n\n{returned(suite, rows)}"]
+    told += [f"![{CAPTION}](images/{plain_name(suite)}.png)"]
+    return "\n\n".join(told)
 
 
-def page(text: str, rows: dict[str, Row]) -> str:
-    """Return a page with its tables made anew."""
-    for name, made in parts(rows).items():
+def page(text: str, rows: dict[str, dict[str, Row]]) -> str:
+    """Return a page with its tables made anew, from the rows of each suite."""
+    parts = {f"problems of {name}": problems(suite) for name, suite in SUITES.items()}
+    parts |= {f"results of {name}": results(suite, rows[name]) for name, suite in SUITES.items()}
+    for name, made in parts.items():
         mark = rf"(<!-- made: {name} -->\n).*?(<!-- end -->)"
         assert len(re.findall(mark, text, re.DOTALL)) == 1, f"{PAGE} has one mark {name}"
         text = re.sub(
@@ -127,9 +138,9 @@ def page(text: str, rows: dict[str, Row]) -> str:
     return text
 
 
-def curves(rows: dict[str, Row]) -> bytes:
+def curves(suite: Suite, rows: dict[str, Row]) -> bytes:
     """Return the learning curves of all problems as a PNG file; bands are standard errors."""
-    ids = [env_id for env_id in ENTRIES if any(len(row.returns(env_id)) for row in rows.values())]
+    ids = measured(suite, rows)
     lines = -(-len(ids) // PANELS)
     figure, grid = new_figure(lines, PANELS, (11.0, 3.2 * lines))
     for panel, env_id in zip(grid.flat, ids, strict=False):
@@ -164,10 +175,13 @@ def draw_method(panel: object, row: Row, env_id: str, colour: str) -> None:
 
 def main(arguments: list[str] | None = None, folder: Path = DOCS) -> int:
     """Write or check the page; return the exit status."""
-    rows = read_rows(ROWS)
+    rows = {name: read_rows(suite, ROWS / plain_name(suite)) for name, suite in SUITES.items()}
     made = {PAGE: page((folder / PAGE).read_text(encoding="utf-8"), rows)}
-    if rows and "--check" not in (sys.argv[1:] if arguments is None else arguments):
-        PICTURE.write_bytes(curves(rows))
+    if "--check" not in (sys.argv[1:] if arguments is None else arguments):
+        for name, suite in SUITES.items():
+            if rows[name]:
+                picture = DOCS / "images" / f"{plain_name(suite)}.png"
+                picture.write_bytes(curves(suite, rows[name]))
     return write_or_check(folder, made, [PAGE], __doc__, arguments)
 
 

@@ -1,7 +1,8 @@
 """NPA-Bench v0: frozen problems and budgets, rows of results as JSON files, and their scores.
 
-A row is what one method reached: for each problem the returns of at least `LEAST_SEEDS` runs. It is
-a file, which anybody can write; `npa_bench_v0.schema.json` beside this module is its schema. Scores
+There are two suites by one protocol, one for a GPU and a small one for a laptop. A row is what one
+method reached in a suite: for each problem the returns of at least `LEAST_SEEDS` runs. It is a
+file, which anybody can write; `npa_bench_v0.schema.json` beside this module is its schema. Scores
 follow from the files alone: those of the methods `zero` and `gradient` are 0 and 1.
 """
 
@@ -19,12 +20,11 @@ from numpy.typing import NDArray
 
 from npa_envs.agents.comparison.plan import Axis, Plan
 from npa_envs.agents.comparison.run import RunRecord
+from npa_envs.agents.learning import methods_for
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
 from npa_envs.files import read_json
 from npa_envs.measure.record import write_record
-
-NAME = "npa-bench-v0"
 
 AXIS: Axis = "particle-steps"
 """What is equal for all methods."""
@@ -49,7 +49,7 @@ EPISODES = 32
 LEAST_SEEDS = 5
 """Runs of a method on a problem, at least, from different seeds."""
 
-EXCESS = 1.1
+EXCESS = 1.25
 """A run may take so many times its budget, as the last iteration is not cut off."""
 
 SCHEMA = Path(__file__).with_name("npa_bench_v0.schema.json")
@@ -67,30 +67,60 @@ class Entry(NamedTuple):
     particle_steps: int
 
 
-PARTICLES: Mapping[str, Entry] = {
-    "npa/Morphogenesis2DSmall-v0": Entry(32, 16, 64, 5_000_000),
-    "npa/Regeneration2DSmall-v0": Entry(24, 16, 64, 5_000_000),
-    # Its loss takes most of the time.
-    "npa/TextureSmall-v0": Entry(24, 16, 64, 1_000_000),
-    "npa/PointClassificationSmall-v0": Entry(16, 16, 64, 5_000_000),
-    "npa/MixingSmall-v0": Entry(32, 16, 64, 5_000_000),
-}
-"""Problems in which an action has a row for each particle, by their ids."""
-
-GARDENS: Mapping[str, Entry] = {
-    # 48 828 steps of worlds, of 8 steps of the rule each.
-    "npa/Gardener2DSmall-v0": Entry(32, 64, 64, 100_000_000),
-    "npa/Shepherd2DSmall-v0": Entry(32, 64, 64, 100_000_000),
-}
-"""Problems in which a rule runs the particles; in particle-steps the rule's steps count."""
-
-GROUPS: Mapping[str, Mapping[str, Entry]] = {"particles": PARTICLES, "gardens": GARDENS}
-
-ENTRIES: Mapping[str, Entry] = {**PARTICLES, **GARDENS}
-"""All problems by their ids. Nothing of them ever changes; others make another version."""
-
 QUICK_SHARE = 1e-3
 """Share of the budgets that quick runs have: they say nothing but that it runs."""
+
+LEFT_OUT = frozenset({("npa/PointClassificationSmall-v0", "scripted")})
+"""Pairs of a problem and a method that are not run: no scripted policy classifies."""
+
+
+@dataclass(frozen=True)
+class Suite:
+    """Problems by their ids with their budgets. Nothing of them ever changes; others make another
+    version.
+    """
+
+    name: str
+    groups: Mapping[str, Mapping[str, Entry]]
+    """Problems that are told together."""
+
+    @property
+    def entries(self) -> dict[str, Entry]:
+        """All problems by their ids."""
+        return {env_id: entry for group in self.groups.values() for env_id, entry in group.items()}
+
+    @property
+    def tasks(self) -> dict[str, str]:
+        """Ids by the names of tasks."""
+        return {task_name(env_id): env_id for env_id in self.entries}
+
+    @property
+    def methods(self) -> list[str]:
+        """Methods that learn one of the problems at least."""
+        suited = [methods_for(self.problem_of(task)) for task in self.tasks]
+        return [name for name in METHODS if any(name in table for table in suited)]
+
+    def problem_of(self, task: str) -> Problem:
+        """Return the problem of a name of `tasks`.
+
+        Raises:
+            NPAError: There is no such task.
+        """
+        if task not in self.tasks:
+            raise NPAError(
+                f"unknown task {shown(task)} of {self.name}: {suggest(task, self.tasks)}"
+            )
+        entry = self.entries[self.tasks[task]]
+        return Problem(
+            env_id=self.tasks[task],
+            episode_steps=entry.episode_steps,
+            num_envs=entry.num_envs,
+            hidden_dim=entry.hidden_dim,
+        )
+
+    def budget_of(self, task: str, *, quick: bool = False) -> float:
+        """Return the particle-steps that a run may learn from."""
+        return self.entries[self.tasks[task]].particle_steps * (QUICK_SHARE if quick else 1.0)
 
 
 def task_name(env_id: str) -> str:
@@ -98,33 +128,42 @@ def task_name(env_id: str) -> str:
     return env_id.removeprefix("npa/")
 
 
-LEFT_OUT = frozenset({("npa/PointClassificationSmall-v0", "scripted")})
-"""Pairs of a problem and a method that are not run: no scripted policy classifies."""
+_PARTICLES = {
+    "npa/Morphogenesis2DSmall-v0": Entry(32, 16, 64, 5_000_000),
+    "npa/Regeneration2DSmall-v0": Entry(24, 16, 64, 5_000_000),
+    # Its loss takes most of the time.
+    "npa/TextureSmall-v0": Entry(24, 16, 64, 1_000_000),
+    "npa/PointClassificationSmall-v0": Entry(16, 16, 64, 5_000_000),
+    "npa/MixingSmall-v0": Entry(32, 16, 64, 5_000_000),
+}
 
-TASKS = {task_name(env_id): env_id for env_id in ENTRIES}
-"""Ids by the names of tasks."""
+_GARDENS = {
+    # 48 828 steps of worlds, of 8 steps of the rule each.
+    "npa/Gardener2DSmall-v0": Entry(32, 64, 64, 100_000_000),
+    "npa/Shepherd2DSmall-v0": Entry(32, 64, 64, 100_000_000),
+}
 
+_SMALL = {
+    "npa/Morphogenesis2DSmall-v0": Entry(32, 16, 64, 1_000_000),
+    "npa/Regeneration2DSmall-v0": Entry(24, 16, 64, 500_000),
+    "npa/TextureSmall-v0": Entry(24, 16, 64, 300_000),
+    "npa/PointClassificationSmall-v0": Entry(16, 16, 64, 1_000_000),
+    "npa/MixingSmall-v0": Entry(32, 16, 64, 500_000),
+    "npa/SegregationSmall-v0": Entry(32, 16, 64, 500_000),
+    "npa/CoMorphogenesisSmall-v0": Entry(32, 16, 64, 500_000),
+    "npa/SymbiosisSmall-v0": Entry(32, 16, 64, 1_500_000),
+}
+"""As many particle-steps as a core makes in a minute or less."""
 
-def problem_of(task: str) -> Problem:
-    """Return the problem of a name of `TASKS`.
-
-    Raises:
-        NPAError: There is no such task.
-    """
-    if task not in TASKS:
-        raise NPAError(f"unknown task {shown(task)} of {NAME}: {suggest(task, TASKS)}")
-    entry = ENTRIES[TASKS[task]]
-    return Problem(
-        env_id=TASKS[task],
-        episode_steps=entry.episode_steps,
-        num_envs=entry.num_envs,
-        hidden_dim=entry.hidden_dim,
+SUITES: Mapping[str, Suite] = {
+    suite.name: suite
+    for suite in (
+        Suite("npa-bench-v0", {"particles": _PARTICLES, "gardens": _GARDENS}),
+        Suite("npa-bench-small-v0", {"small": _SMALL}),
     )
-
-
-def budget_of(task: str, *, quick: bool = False) -> float:
-    """Return the particle-steps that a run may learn from."""
-    return ENTRIES[TASKS[task]].particle_steps * (QUICK_SHARE if quick else 1.0)
+}
+"""Suites by their names. An action has a row for each particle; in gardens a rule runs the
+particles, and its steps count."""
 
 
 # Rows: what methods reached
@@ -146,8 +185,9 @@ class Run:
 
 @dataclass(frozen=True)
 class Row:
-    """What a method reached."""
+    """What a method reached in a suite."""
 
+    suite: Suite
     method: str
     runs: tuple[Run, ...]
     about: str = ""
@@ -159,8 +199,10 @@ class Row:
         return np.array([run.mean_return for run in found])
 
 
-def write_rows(plan: Plan, records: Sequence[RunRecord], folder: Path, command: str) -> list[Path]:
-    """Write a file for each method of a plan, METHOD.json, and return the paths.
+def write_rows(
+    suite: Suite, plan: Plan, records: Sequence[RunRecord], folder: Path, command: str
+) -> list[Path]:
+    """Write a file for each method of a suite's plan, METHOD.json, and return the paths.
 
     Raises:
         NPAError: A file cannot be written.
@@ -172,22 +214,22 @@ def write_rows(plan: Plan, records: Sequence[RunRecord], folder: Path, command: 
             paths.append(folder / f"{method}.json")
             facts = {name: plan.settings[name] for name in ("machine", "commit", "versions")}
             row = {
-                "benchmark": NAME,
+                "benchmark": suite.name,
                 "method": method,
                 "about": METHODS[method],
                 "command": command,
                 "date": max(record.date for record in some),
                 **facts,
-                "runs": [_run_object(record) for record in some],
+                "runs": [_run_object(suite, record) for record in some],
             }
             write_record(paths[-1], row)
     return paths
 
 
-def _run_object(record: RunRecord) -> dict[str, Any]:
+def _run_object(suite: Suite, record: RunRecord) -> dict[str, Any]:
     points = record.curve
     return {
-        "id": TASKS[record.job.task],
+        "id": suite.tasks[record.job.task],
         "seed": record.job.seed,
         "particle_steps": points[-1].particle_steps if points else 0,
         "seconds": round(points[-1].seconds, 2) if points else 0.0,
@@ -217,7 +259,7 @@ def read_row(path: Path) -> Row:
             f"{path.name} must follow {SCHEMA.name}, but at {error.json_path} {error.message}"
         ) from error
     runs = tuple(_read_run(run) for run in held["runs"])
-    row = Row(held["method"], runs, held.get("about", ""))
+    row = Row(SUITES[held["benchmark"]], held["method"], runs, held.get("about", ""))
     _check_row(row, path.name)
     return row
 
@@ -231,9 +273,12 @@ def _read_run(held: Mapping[str, Any]) -> Run:
 
 def _check_row(row: Row, name: str) -> None:
     """Check what a schema cannot say; raises NPAError."""
+    entries = row.suite.entries
     for env_id in dict.fromkeys(run.env_id for run in row.runs):
-        if env_id not in ENTRIES:
-            raise NPAError(f"{name} has runs of {env_id}, no problem of {NAME}: leave them out")
+        if env_id not in entries:
+            raise NPAError(
+                f"{name} has runs of {env_id}, no problem of {row.suite.name}: leave them out"
+            )
         some = [run for run in row.runs if run.env_id == env_id]
         seeds = {run.seed for run in some}
         if len(seeds) < len(some) or len(seeds) < LEAST_SEEDS:
@@ -241,7 +286,7 @@ def _check_row(row: Row, name: str) -> None:
                 f"{name} must have runs of {env_id} from at least {LEAST_SEEDS} seeds, each once, "
                 f"got {sorted(run.seed for run in some)}: run the missing ones"
             )
-        most = EXCESS * ENTRIES[env_id].particle_steps
+        most = EXCESS * entries[env_id].particle_steps
         for run in some:
             if run.particle_steps > most:
                 raise NPAError(
@@ -250,15 +295,20 @@ def _check_row(row: Row, name: str) -> None:
                 )
 
 
-def read_rows(folder: Path) -> dict[str, Row]:
-    """Return all rows of a folder by their methods.
+def read_rows(suite: Suite, folder: Path) -> dict[str, Row]:
+    """Return all rows of a suite's folder by their methods.
 
     Raises:
-        NPAError: As for `read_row`; or two files are of one method.
+        NPAError: As for `read_row`; or a file is of another suite, or two are of one method.
     """
     rows: dict[str, Row] = {}
     for path in sorted(folder.glob("*.json")):
         row = read_row(path)
+        if row.suite is not suite:
+            raise NPAError(
+                f"{path} must be a row of {suite.name} like its folder, got {row.suite.name}: "
+                "put it into the folder of its suite"
+            )
         if row.method in rows:
             raise NPAError(f"{path.name} is a second row of {row.method!r}: name the method anew")
         rows[row.method] = row

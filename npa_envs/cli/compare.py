@@ -56,8 +56,8 @@ class CompareOptions(MeasureOptions):
     """Folder for AXIS/TASK/METHOD/seed-K/, comparison.md, .json and .csv, and pictures
     (curves need the extra `bench`)."""
 
-    suite: Literal["npa-bench-v0"] | None = None
-    """Run a frozen benchmark, whose tasks, budgets, episodes and methods' options are its own, and
+    suite: Literal["npa-bench-v0", "npa-bench-small-v0"] | None = None
+    """Run a frozen benchmark, the small one on a laptop, with its own tasks, budgets and episodes;
     write a row for each method, OUT/rows/METHOD.json."""
 
     tasks: tuple[str, ...] = ()
@@ -106,7 +106,7 @@ class CompareOptions(MeasureOptions):
 def main(arguments: Sequence[str]) -> int:
     """Run what is missing, print and write; return 1 where a run failed."""
     options = parse_options(CompareOptions, "compare", arguments)
-    from npa_envs.agents.comparison.npa_bench import write_rows
+    from npa_envs.agents.comparison.npa_bench import SUITES, write_rows
     from npa_envs.agents.comparison.report import write_pictures, write_table
     from npa_envs.agents.comparison.run import held_records, run_jobs
     from npa_envs.processes import Places
@@ -143,7 +143,9 @@ def main(arguments: Sequence[str]) -> int:
         )
     told = [write_table(plan, whole(), folder, command), *write_pictures(whole(), folder)]
     if options.suite is not None:
-        rows = write_rows(plan, whole(), writable_folder(folder / "rows"), command)
+        rows = write_rows(
+            SUITES[options.suite], plan, whole(), writable_folder(folder / "rows"), command
+        )
         told += [f"wrote {path}" for path in rows]
     failed = [record for record in whole() if record.status == "failed"]
     told += [f"{record.job} failed: {record.error}" for record in failed]
@@ -193,6 +195,8 @@ def _suite_plan(options: CompareOptions) -> Plan:
     from npa_envs.agents.comparison.plan import Plan
     from npa_envs.agents.learning import methods_for
 
+    assert options.suite is not None, "asked for by its caller"
+    suite = npa_bench.SUITES[options.suite]
     for name in ("seconds", "particle_steps", "episodes", "options"):
         if getattr(options, name) not in (None, ()):
             raise NPAError(
@@ -200,22 +204,22 @@ def _suite_plan(options: CompareOptions) -> Plan:
                 "frozen: leave it out, or compare without a suite"
             )
     quick = options.quick
-    tasks = chosen_names("task", options.tasks, npa_bench.TASKS)
+    tasks = chosen_names("task", options.tasks, suite.tasks)
     if quick and not options.tasks:
         tasks = tasks[:1]
-    methods = chosen_names("method", options.methods, npa_bench.METHODS)
-    problems = {name: npa_bench.problem_of(name) for name in tasks}
+    methods = chosen_names("method", options.methods, suite.methods)
+    problems = {name: suite.problem_of(name) for name in tasks}
     suited = {name: methods_for(problem) for name, problem in problems.items()}
     return Plan(
         tasks={name: json.loads(problem.to_json()) for name, problem in problems.items()},
         methods=methods,
         seeds=tuple(range(options.seeds or (1 if quick else npa_bench.LEAST_SEEDS))),
-        budgets={npa_bench.AXIS: {name: npa_bench.budget_of(name, quick=quick) for name in tasks}},
+        budgets={npa_bench.AXIS: {name: suite.budget_of(name, quick=quick) for name in tasks}},
         left_out=[
             (task, method)
             for task in tasks
             for method in methods
-            if method not in suited[task] or (npa_bench.TASKS[task], method) in npa_bench.LEFT_OUT
+            if method not in suited[task] or (suite.tasks[task], method) in npa_bench.LEFT_OUT
         ],
         episodes=QUICK_EPISODES if quick else npa_bench.EPISODES,
         settings=_settings(options),

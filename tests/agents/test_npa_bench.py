@@ -8,7 +8,7 @@ import pytest
 
 from npa_envs.agents.comparison import npa_bench
 from npa_envs.agents.comparison.npa_bench import (
-    ENTRIES,
+    SUITES,
     Row,
     Run,
     normalised,
@@ -24,19 +24,21 @@ from npa_envs.agents.learning import methods_for
 from npa_envs.cli import main
 from npa_envs.cli.compare import CompareOptions, make_plan
 from npa_envs.errors import NPAError
+from npa_envs.registration import SIZES, SPECIES_SIZES
 
 pytest.importorskip("jsonschema")
 pytest.importorskip("scipy")
 
-FIRST, SECOND = list(ENTRIES)[:2]
+SUITE = SUITES["npa-bench-v0"]
+FIRST = next(iter(SUITE.entries))
 
 
 def row(method: str, *means: float, env_id: str = FIRST) -> Row:
-    return Row(method, tuple(Run(env_id, k, 0.0, mean) for k, mean in enumerate(means)))
+    return Row(SUITE, method, tuple(Run(env_id, k, 0.0, mean) for k, mean in enumerate(means)))
 
 
-def suite(**changes):
-    return make_plan(CompareOptions(suite="npa-bench-v0", commit="c0ffee", **changes))
+def plan_of(suite="npa-bench-v0", **changes):
+    return make_plan(CompareOptions(suite=suite, commit="c0ffee", **changes))
 
 
 def records(plan, status="done"):
@@ -54,13 +56,14 @@ def records(plan, status="done"):
     ]
 
 
-def test_the_suite_is_every_method_on_all_that_it_can_learn_within_the_frozen_budgets():
-    made = suite()
-    assert set(made.tasks) == set(npa_bench.TASKS)
+@pytest.mark.parametrize("suite", SUITES.values(), ids=SUITES)
+def test_a_suite_is_every_method_on_all_that_it_can_learn_within_the_frozen_budgets(suite):
+    made = plan_of(suite.name)
+    assert set(made.tasks) == set(suite.tasks)
     assert (list(made.seeds), made.episodes) == ([0, 1, 2, 3, 4], 32)
-    for task, env_id in npa_bench.TASKS.items():
-        assert made.budgets["particle-steps"][task] == ENTRIES[env_id].particle_steps
-        problem = npa_bench.problem_of(task)
+    for task, env_id in suite.tasks.items():
+        assert made.budgets["particle-steps"][task] == suite.entries[env_id].particle_steps
+        problem = suite.problem_of(task)
         ran = {job.method for job in made.jobs() if job.task == task}
         assert ran <= methods_for(problem).keys()
         assert {"zero", "gradient", "random", "ppo_world"} <= ran
@@ -80,19 +83,19 @@ def test_the_suite_is_every_method_on_all_that_it_can_learn_within_the_frozen_bu
 )
 def test_a_frozen_protocol_cannot_be_changed(changes, words):
     with pytest.raises(NPAError, match=words):
-        suite(**changes)
+        plan_of(**changes)
 
 
 # Rows
 
 
 def test_rows_come_back_from_their_files(tmp_path):
-    made = suite(methods=("zero", "random"))
-    (first, second) = write_rows(made, records(made), tmp_path, "it")
+    made = plan_of(methods=("zero", "random"))
+    (first, second) = write_rows(SUITE, made, records(made), tmp_path, "it")
     assert (first.name, second.name) == ("random.json", "zero.json")
-    rows = read_rows(tmp_path)
+    rows = read_rows(SUITE, tmp_path)
     assert list(rows) == ["random", "zero"]
-    for env_id in ENTRIES:
+    for env_id in SUITE.entries:
         assert rows["zero"].returns(env_id).tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
     assert rows["zero"].runs[0].curve == ((0.0, -1.0), (1000.0, 0.5))
     held = json.loads(first.read_text())
@@ -100,13 +103,13 @@ def test_rows_come_back_from_their_files(tmp_path):
 
 
 def test_a_run_that_failed_is_in_no_row_and_one_that_diverged_has_no_returns(tmp_path):
-    made = suite(methods=("zero",))
+    made = plan_of(methods=("zero",))
     some = records(made)
     some[0] = RunRecord(job=some[0].job, facts={}, status="failed")
-    (path,) = write_rows(made, some, tmp_path, "it")
+    (path,) = write_rows(SUITE, made, some, tmp_path, "it")
     assert len(json.loads(path.read_text())["runs"]) == len(some) - 1
     some[0] = RunRecord(job=some[0].job, facts={}, status="diverged", date="2026-01-01")
-    write_rows(made, some, tmp_path, "it")
+    write_rows(SUITE, made, some, tmp_path, "it")
     found = read_row(path)
     assert math.isnan(next(run for run in found.runs if run.seed == some[0].job.seed).mean_return)
 
@@ -116,7 +119,7 @@ def test_a_run_that_failed_is_in_no_row_and_one_that_diverged_has_no_returns(tmp
     [
         (lambda held: held.pop("machine"), "'machine' is a required property"),
         (lambda held: held.update(extra=1), "Additional properties"),
-        (lambda held: held.update(benchmark="npa-bench-v1"), "was expected"),
+        (lambda held: held.update(benchmark="npa-bench-v1"), "is not one of"),
         (lambda held: held["runs"][0].update(returns=[1.0]), r"\$.runs\[0\].returns"),
         (lambda held: held["runs"][0].update(returns=["a"] * 32), "is not of type"),
         (lambda held: held["runs"][0].update(id="npa/Other-v0"), "no problem of npa-bench-v0"),
@@ -126,8 +129,8 @@ def test_a_run_that_failed_is_in_no_row_and_one_that_diverged_has_no_returns(tmp
     ],
 )
 def test_a_row_that_breaks_a_rule_is_refused(tmp_path, change, words):
-    made = suite(methods=("zero",))
-    (path,) = write_rows(made, records(made), tmp_path, "it")
+    made = plan_of(methods=("zero",))
+    (path,) = write_rows(SUITE, made, records(made), tmp_path, "it")
     held = json.loads(path.read_text())
     change(held)
     path.write_text(json.dumps(held))
@@ -135,12 +138,26 @@ def test_a_row_that_breaks_a_rule_is_refused(tmp_path, change, words):
         read_row(path)
 
 
+def test_a_row_of_another_suite_is_refused(tmp_path):
+    small = SUITES["npa-bench-small-v0"]
+    made = plan_of(small.name, methods=("zero",))
+    write_rows(small, made, records(made), tmp_path, "it")
+    assert read_rows(small, tmp_path)["zero"].suite is small
+    with pytest.raises(NPAError, match="must be a row of npa-bench-v0"):
+        read_rows(SUITE, tmp_path)
+
+
+def test_the_small_suite_is_all_small_worlds_that_rules_act_in():
+    small = {row.id for row in SIZES if "Small" in row.id} | {row.id for row in SPECIES_SIZES}
+    assert set(SUITES["npa-bench-small-v0"].entries) == small
+
+
 def test_a_method_has_one_row(tmp_path):
-    made = suite(methods=("zero",))
-    (path,) = write_rows(made, records(made), tmp_path, "it")
+    made = plan_of(methods=("zero",))
+    (path,) = write_rows(SUITE, made, records(made), tmp_path, "it")
     (tmp_path / "again.json").write_bytes(path.read_bytes())
     with pytest.raises(NPAError, match="second row of 'zero'"):
-        read_rows(tmp_path)
+        read_rows(SUITE, tmp_path)
 
 
 # Scores
@@ -154,7 +171,7 @@ def test_scores_count_from_nothing_to_the_gradient():
     }
     assert normalised(rows, "ppo", FIRST).tolist() == [0.5, 0.0, 2.0, 0.0]
     assert normalised(rows, "gradient", FIRST).mean() == 1.0
-    assert list(scores_in(rows, "ppo", ENTRIES)) == [FIRST]
+    assert list(scores_in(rows, "ppo", SUITE.entries)) == [FIRST]
     with pytest.raises(NPAError, match="need runs of 'gradient'"):
         normalised({"zero": rows["zero"], "ppo": rows["ppo"]}, "ppo", FIRST)
     with pytest.raises(NPAError, match="better than zero"):
@@ -187,7 +204,7 @@ def test_the_command_writes_rows_that_can_be_read(tmp_path, capsys):
     words = ["compare", "--suite", "npa-bench-v0", "--tasks", "MixingSmall-v0", "--no-progress"]
     assert main([*words, "--methods", "zero", "random", "--jobs", "2", "--out", str(tmp_path)]) == 0
     assert "| random | 5 |" in capsys.readouterr().out
-    rows = read_rows(tmp_path / "rows")
+    rows = read_rows(SUITE, tmp_path / "rows")
     assert list(rows) == ["random", "zero"]
     for row in rows.values():
         assert [run.seed for run in row.runs] == [0, 1, 2, 3, 4]

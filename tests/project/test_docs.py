@@ -90,33 +90,36 @@ def bench():
 def test_the_tables_of_the_benchmark_are_what_its_files_say(bench, tmp_path, capsys):
     assert bench.main(["--check"]) == 0
     text = (DOCS / bench.PAGE).read_text()
-    (tmp_path / bench.PAGE).write_text(text.replace("1e8", "2e8"))
+    (tmp_path / bench.PAGE).write_text(text.replace("| 1e8 |", "| 2e8 |"))
     assert bench.main(["--check"], tmp_path) == 1
     assert "run python docs/build_npa_bench_page.py" in capsys.readouterr().err
 
 
 def test_tables_and_curves_of_the_benchmark_show_all_rows(bench):
-    from npa_envs.agents.comparison.npa_bench import GARDENS, Row, Run
+    from npa_envs.agents.comparison.npa_bench import SUITES, Row, Run
 
-    first, second = list(GARDENS)[:2]
+    suite = SUITES["npa-bench-v0"]
+    first, second = list(suite.groups["gardens"])[:2]
 
     def row(method, *means):
         curve = ((0.0, 0.0), (9.0, means[-1])) if method == "other" else ((0.0, means[-1]),)
         runs = [Run(first, seed, 9.0, mean, curve) for seed, mean in enumerate(means)]
-        return Row(method, tuple(runs), f"it is {method}")
+        return Row(suite, method, tuple(runs), f"it is {method}")
 
     rows = {name: row(name, *means) for name, means in {
         "other": (1.0, 2.0), "zero": (0.0, 0.0), "gradient": (4.0, 4.0), "sac": (3.0, 3.0),
     }.items()}  # fmt: skip
-    text = bench.page((DOCS / bench.PAGE).read_text(), rows)
+    text = bench.results(suite, rows)
     assert "| `other` | 0.38 [0.25, 0.50] | 0.38 [0.25, 0.50] |" in text
     assert "| `other` | 1.500 ± 0.500 |" in text
     assert text.index("| `sac` | it is sac | 2 |") < text.index("| `other` | it is other | 2 |")
-    assert f"| `{second}` |" in text
-    assert "](images/npa_bench.png)" in text
-    assert bench.curves(rows).startswith(b"\x89PNG")
+    assert second not in text
+    assert "](images/npa_bench_v0.png)" in text
+    assert text in bench.page((DOCS / bench.PAGE).read_text(), dict.fromkeys(SUITES, rows))
+    assert bench.curves(suite, rows).startswith(b"\x89PNG")
     del rows["gradient"]
-    assert "Scores need the rows" in bench.page(text, rows)
+    assert "Scores need the rows" in bench.results(suite, rows)
+    assert bench.results(suite, {}) == bench.NO_ROWS
 
 
 @pytest.fixture(scope="module")
