@@ -400,12 +400,13 @@ def train_side_by_side(
     return trainers, time.perf_counter() - begun
 
 
-def measured(trainer: Trainer, size: str) -> dict[str, Any]:
-    """Return growth and healing of a trained rule, by the means of all worlds."""
+def measured(trainer: Trainer, size: str, last_step: int = LAST) -> dict[str, Any]:
+    """Return growth and, where `last_step` is `LAST`, healing of a rule, by all worlds' means."""
     task: Any = trainer.task
     rule = trainer._cycle.average.rule(trainer.rule)
     device = trainer.config.device
     steps = (4, 8) if size == "tiny" else (*STEPS, LAST)
+    steps = tuple(step for step in steps if step <= last_step)
     grow, heal = (8, 8) if size == "tiny" else (1024, 500)
     rows, healed = [], []
     # A rule may diverge; then what came before is kept.
@@ -414,7 +415,10 @@ def measured(trainer: Trainer, size: str) -> dict[str, Any]:
             rows = evaluate(rule, task, checkpoints=steps, seeds=SEEDS, device=device)
         steps = steps[:-1]
     with contextlib.suppress(NPAError):
-        healed = healing(rule, task, grow_steps=grow, heal_steps=heal, seeds=SEEDS, device=device)
+        if last_step == LAST:
+            healed = healing(
+                rule, task, grow_steps=grow, heal_steps=heal, seeds=SEEDS, device=device
+            )
     if trainer.config.device.startswith("cuda"):
         release_recordings()
     found = {"growth": [asdict(row) for row in rows], "healing": [asdict(row) for row in healed]}
@@ -512,7 +516,8 @@ def run_all(arguments: argparse.Namespace) -> None:
             trainers, seconds = train_side_by_side(configs, arguments.longest)
             for run, trainer in zip(group, trainers, strict=True):
                 line = asdict(run) | {"iterations": trainer.iteration, "seconds": seconds}
-                line |= {"together": len(group), "fields": changes} | measured(trainer, run.size)
+                line |= {"together": len(group), "fields": changes}
+                line |= measured(trainer, run.size, arguments.last_step)
                 rule = trainer._cycle.average.rule(trainer.rule)
                 save_rule(rule, out / f"rule-{run.name}.safetensors")
                 if arguments.strips:
@@ -779,6 +784,7 @@ def main() -> None:
     own.add_argument("--longest", type=float, default=math.inf, help="seconds of a run, at most")
     own.add_argument("--process", default="0", help="part of the name of the file of results")
     own.add_argument("--fields", default="{}", help="JSON object of fields for all arms")
+    own.add_argument("--last-step", type=int, default=LAST, help="measure no later one")
     own.add_argument("--strips", action="store_true", help="pictures of what grows")
     own = commands.add_parser("merge")
     own.set_defaults(main=merge)

@@ -20,6 +20,10 @@ class NPAError(ValueError):
     """A mistake in what the caller gave; the message says how to mend it."""
 
 
+class LostProcessError(NPAError):
+    """Another process of a run has ended or cannot be reached; it says why, or its launcher."""
+
+
 class DivergedError(NPAError):
     """Numbers became infinite or NaN; the message says when, which, and in which worlds."""
 

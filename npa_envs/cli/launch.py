@@ -9,13 +9,17 @@ import sys
 import uuid
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 import torch.distributed as dist
 
 from npa_envs.cli import INTERRUPTED
-from npa_envs.errors import NPAError
+from npa_envs.errors import LostProcessError, NPAError
 from npa_envs.training import RunFolder
+
+if TYPE_CHECKING:
+    from torch.distributed.elastic.multiprocessing.errors import ProcessFailure
 
 
 def launch(count: int, words: Sequence[str], out: Path, device: str) -> int:
@@ -30,17 +34,19 @@ def launch(count: int, words: Sequence[str], out: Path, device: str) -> int:
         device: Where it runs: each process has a CUDA device of its own, or all share the CPU.
 
     Raises:
-        NPAError: There are not as many devices, a process was ended from outside, or torch has no
-            launcher here.
+        NPAError: There are not as many devices, a process was ended from outside, another than the
+            first has left an error, or torch has no launcher here.
     """
     seen = torch.cuda.device_count()
     if device != "cpu" and count > seen:
         raise NPAError(
-            f"gpus must be at most the {seen} CUDA devices that torch sees, got {count}: take "
-            "fewer, or try it with --device cpu"
+            f"processes must be at most the {seen} CUDA devices that torch sees, got {count}: take "
+            "fewer, or --device cpu"
         )
     if not dist.is_available():
-        raise NPAError(f"gpus must be 1 with a torch that has no torch.distributed, got {count}")
+        raise NPAError(
+            f"processes must be 1 with a torch that has no torch.distributed, got {count}"
+        )
     # Only runs of several processes need it, and it takes a while.
     from torch.distributed.elastic.multiprocessing.api import SignalException
     from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
@@ -59,13 +65,25 @@ def launch(count: int, words: Sequence[str], out: Path, device: str) -> int:
         rdzv_endpoint="localhost:0",
         max_restarts=0,
         monitor_interval=0.5,
+        # A machine need not know its own name.
+        local_addr="localhost",
     )
     try:
         elastic_launch(config, sys.executable)("-m", "npa_envs", *words)
     except SignalException:
         return INTERRUPTED
     except ChildFailedError as error:
-        rank, failure = error.get_first_failure()
+        left = {rank: left_by(failure) for rank, failure in error.failures.items()}
+        for reason in left.values():
+            # The first process tells its own.
+            if reason not in ("", left.get(0)):
+                raise NPAError(reason) from error
+        # One that was killed comes before what the others say of it, and before those that were
+        # then asked to end.
+        rank, failure = min(
+            error.failures.items(),
+            key=lambda item: (item[1].exitcode == -signal.SIGTERM, item[1].exitcode > 0),
+        )
         if failure.exitcode > 0:
             return int(failure.exitcode)  # It has said why.
         name = signal.Signals(-failure.exitcode).name
@@ -75,3 +93,23 @@ def launch(count: int, words: Sequence[str], out: Path, device: str) -> int:
             f"{RunFolder(out).checkpoint}; go on from it with --resume"
         ) from error
     return 0
+
+
+def leave_to_launcher(error: NPAError) -> None:
+    """Leave the reason why this process ends to the launcher: what several say is told once.
+
+    Args:
+        error: The reason; that another process is lost is none.
+    """
+    from torch.distributed.elastic.multiprocessing.errors import get_error_handler
+
+    if not isinstance(error, LostProcessError):
+        get_error_handler().record_exception(error)
+
+
+def left_by(failure: ProcessFailure) -> str:
+    """Return the reason that a process has left, or an empty string."""
+    if not isinstance(failure.message, dict):
+        return ""
+    # Torch writes the error's class before it.
+    return str(failure.message["message"]).partition(": ")[2]

@@ -11,10 +11,11 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 import torch
+import torch.distributed as dist
 import tyro
 
-from npa_envs.cli import INTERRUPTED
-from npa_envs.cli.launch import launch
+from npa_envs.cli import INTERRUPTED, USAGE_ERROR
+from npa_envs.cli.launch import launch, leave_to_launcher
 from npa_envs.cli.output import OutFolder, duration, parse_options, torch_threads
 from npa_envs.cli.report import Training, write_report
 from npa_envs.errors import NPAError
@@ -40,6 +41,12 @@ COMMON = ("target", "iterations", "device", "out")
 
 THREADED_BATCH = 4096
 """Particles of a batch from which on two threads train faster than one (docs/performance.md)."""
+
+PAIRED_SECONDS = 60.0
+"""Shortest run of one process that two share unasked [s]: the start of the second one costs 4."""
+
+PAIRED_TIME = 0.65
+"""Time of two processes as a share of one's, where batches are small (docs/performance.md)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,9 +74,10 @@ class TrainOptions:
     config: Path | None = None
     """YAML, TOML or JSON file with field names and values, also `preset`; goes over the preset."""
 
-    gpus: int = 1
-    """GPUs that share the run, each with a process of its own; `--device cpu` shares out the CPU,
-    to try it. `torchrun --nproc-per-node=4 -m npa_envs train ...` does the same."""
+    processes: int | None = None
+    """Processes that share the run, on CUDA each with a GPU of its own; by default 1, but 2 where
+    a CPU has cores for them and the batch is small. `torchrun --nproc-per-node=4 -m npa_envs train
+    ...` does the same."""
 
     resume: bool = False
     """Go on from the checkpoint in the folder `out`, with the configuration that lies there.
@@ -116,29 +124,36 @@ def main(arguments: Sequence[str]) -> int:
         asked = ranks.told(asked)
         assert asked is not None, "said by the first process"
         words, options, config = asked
-        if options.gpus > 1 and not ranks.together:
-            told = ("train", task_name, *words)
-            return launch(options.gpus, told, config.out, config.device)
-        return run(task_name, options, config, (task_name, *words), ranks)
+        count = process_count(task_name, options, config)
+        if count > 1 and not ranks.together:
+            told = ["train", task_name, *words]
+            if options.processes is None:
+                told += ["--processes", str(count)]
+            return launch(count, told, config.out, config.device)
+        try:
+            return run(task_name, options, config, (task_name, *words), ranks)
+        except NPAError as error:
+            if not ranks.together:
+                raise
+            leave_to_launcher(error)
+            if ranks.first:
+                raise
+            raise SystemExit(USAGE_ERROR) from error
 
 
 def settled(task_name: str, words: Sequence[str]) -> list[str]:
-    """Return the options with `--resume auto` decided, and with CUDA as the device of `--gpus`.
+    """Return the options with `--resume auto` decided.
 
     Raises:
         NPAError: As for `starting_configuration`.
     """
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-    parser.add_argument("--gpus", type=int, default=1)
-    parser.add_argument("--device")
     parser.add_argument("--resume", nargs="?", choices=("auto",))
     try:
         first, _ = parser.parse_known_args(words)
     except argparse.ArgumentError as error:
         raise NPAError(f"{error.argument_name}: {error.message}") from error
     chosen = list(words)
-    if first.gpus > 1 and first.device is None:
-        chosen += ["--device", "cuda"]
     if first.resume == "auto":
         if "--resume=auto" in chosen:
             chosen.remove("--resume=auto")
@@ -260,9 +275,8 @@ def run(
         raise NPAError(f"max_seconds must be positive and finite, got {options.max_seconds}")
     folder = RunFolder(config.out)
     resume_command = f"npa-envs train {task_name} --out {shlex.quote(str(config.out))} --resume"
-    if ranks.count > 1:
-        resume_command += f" --gpus {ranks.count}"
-        resume_command += " --device cpu" if config.device == "cpu" else ""
+    if ranks.count > 1 or options.processes is not None:
+        resume_command += f" --processes {ranks.count}"
 
     def begun() -> None:
         if not ranks.first:
@@ -326,6 +340,30 @@ def thread_count(config: TrainConfig[Any]) -> int:
     return 1 if batch < THREADED_BATCH else torch.get_num_threads()
 
 
+def process_count(task_name: str, options: TrainOptions, config: TrainConfig[Any]) -> int:
+    """Return how many processes train: by default two where a CPU's other cores would be idle.
+
+    They are where batches are too small for several threads. A short run would be over before the
+    second process has paid for its start.
+
+    Raises:
+        NPAError: There are to be fewer than one.
+    """
+    if options.processes is not None:
+        if options.processes < 1:
+            raise NPAError(f"processes must be at least 1, got {options.processes}")
+        return options.processes
+    seconds = task_entry(task_name).expected_seconds(config)
+    idle = thread_count(config) < torch.get_num_threads() and dist.is_available()
+    if not idle or config.varied or seconds is None or seconds < PAIRED_SECONDS:
+        return 1
+    try:
+        Ranks(0, 2).check(config)
+    except NPAError:
+        return 1
+    return 2
+
+
 def _species(config: TrainConfig[Any]) -> Sequence[Any]:
     """Return the tasks of all species; of one, where a task has no others."""
     return getattr(config.task, "species", (config.task,))
@@ -348,7 +386,11 @@ def announcement(
     named = options.preset or default_preset(task_name, config.device)
     source = f"preset {named}" if options.config is None else str(options.config)
     expected = task_entry(task_name).expected_seconds(config)
-    if expected is None or process_count > 1:
+    if process_count == 2 and thread_count(config) == 1 and expected is not None:
+        expected *= PAIRED_TIME
+    elif process_count > 1:
+        expected = None
+    if expected is None:
         time = f"how long that takes on {config.device} the progress bar tells"
     else:
         time = f"about {duration(expected)} on a CPU that has little else to do"

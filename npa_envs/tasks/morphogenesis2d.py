@@ -432,7 +432,7 @@ MORPHOGENESIS2D_PRESETS: Mapping[str, Morphogenesis2DTrainConfig] = {
             stray_share=1e-3,
             **_TOGETHER,
         ),
-        iterations=1600,
+        iterations=2400,
         pool_size=32,
         steps=(16, 32),
         learning_rate=4e-3,

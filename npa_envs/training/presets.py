@@ -69,7 +69,7 @@ TASKS: Mapping[str, TaskEntry] = {
         presets=MORPHOGENESIS2D_PRESETS,
         make=lambda config, device: Morphogenesis2D(config, device=device),
         targets=builtin_targets,
-        fast_seconds=170.0,
+        fast_seconds=220.0,
     ),
     "co_morphogenesis2d": TaskEntry(
         summary="grow pictures in one world, each by a rule of its own",

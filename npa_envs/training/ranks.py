@@ -12,7 +12,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from npa_envs.errors import NPAError, shown
+from npa_envs.errors import LostProcessError, NPAError, shown
 from npa_envs.tasks.train_config import TrainConfig
 
 ValueT = TypeVar("ValueT")
@@ -195,7 +195,7 @@ class Ranks:
         except RuntimeError as error:
             if isinstance(error, torch.OutOfMemoryError):
                 raise
-            raise NPAError(
+            raise LostProcessError(
                 f"process {self.rank} of {self.count} has lost another one, which has ended or "
                 f"cannot be reached ({shown(error)}): the last checkpoint is intact; see what "
                 "the other process said, then resume"

@@ -1,4 +1,4 @@
-"""`npa-envs train` with `--gpus` and `--resume auto`: what is decided before anything starts."""
+"""`npa-envs train` with `--processes` and `--resume auto`: what is decided before a start."""
 
 import pytest
 import torch
@@ -6,8 +6,10 @@ from circle_task import circle_config
 from training_runs import trainer_of
 
 from npa_envs.cli import main
-from npa_envs.cli.train import settled
+from npa_envs.cli.output import torch_threads
+from npa_envs.cli.train import TrainOptions, process_count, settled
 from npa_envs.errors import NPAError
+from npa_envs.training import preset
 
 TASK = "morphogenesis2d"
 
@@ -25,26 +27,51 @@ def test_resume_auto_begins_and_later_goes_on(tmp_path):
         settled(TASK, ["--resume", "never"])
 
 
-def test_gpus_are_cuda_devices_unless_told_otherwise():
-    assert settled(TASK, ["--gpus", "2"]) == ["--gpus", "2", "--device", "cuda"]
-    words = ["--gpus", "2", "--device", "cpu"]
-    assert settled(TASK, words) == words
-    assert settled(TASK, ["--gpus", "1"]) == ["--gpus", "1"]
+@pytest.mark.parametrize(
+    ("name", "fields", "threads", "expected"),
+    [
+        ("fast", {}, 2, 2),
+        ("fast", {}, 8, 2),
+        ("fast", {}, 1, 1),
+        ("fast", {"device": "cuda"}, 2, 1),
+        ("fast", {"world_count": 3}, 2, 1),
+        ("fast", {"world_count": 4, "pool_size": 30}, 2, 1),
+        ("fast", {"vary_eps": (0.5, 2.0)}, 2, 1),
+        ("fast", {"iterations": 100}, 2, 1),
+        ("paper", {}, 2, 1),
+    ],
+)
+def test_two_processes_train_where_a_second_core_would_be_idle(name, fields, threads, expected):
+    with torch_threads(threads):
+        assert process_count(TASK, TrainOptions(), preset(name, **fields)) == expected
+        for asked in (1, 3):
+            options = TrainOptions(processes=asked)
+            assert process_count(TASK, options, preset(name, **fields)) == asked
 
 
-def test_more_gpus_than_there_are_is_refused_before_anything_starts(tmp_path, capsys):
+def test_fewer_processes_than_one_are_refused():
+    with pytest.raises(NPAError, match="processes must be at least 1, got 0"):
+        process_count(TASK, TrainOptions(processes=0), preset("tiny"))
+
+
+def test_more_processes_than_gpus_are_refused_before_anything_starts(tmp_path, capsys):
     count = torch.cuda.device_count() + 2
     words = [
         "train",
         TASK,
         "--preset",
         "tiny",
-        "--gpus",
+        "--device",
+        "cuda",
+        "--processes",
         str(count),
         "--out",
         str(tmp_path / "run"),
     ]
     assert main(words) == 2
     said = capsys.readouterr().err
-    assert f"gpus must be at most the {count - 2} CUDA devices that torch sees, got {count}" in said
+    assert (
+        f"processes must be at most the {count - 2} CUDA devices that torch sees, got {count}"
+        in said
+    )
     assert not (tmp_path / "run").exists()

@@ -1,4 +1,4 @@
-"""`npa-envs train --gpus`, killed: the checkpoint can always be read, and nothing is left."""
+"""`npa-envs train --processes`, killed: the checkpoint can always be read, and nothing is left."""
 
 import json
 import os
@@ -25,7 +25,7 @@ pytestmark = [
 def started(out, *options):
     """A run on two processes that would go on for hours, if need be from its checkpoint."""
     command = [sys.executable, "-m", "npa_envs", "train", "morphogenesis2d", "--preset", "tiny"]
-    command += ["--gpus", "2", "--device", "cpu", "--resume", "auto", "--out", str(out)]
+    command += ["--processes", "2", "--resume", "auto", "--out", str(out)]
     command += ["--iterations", "1000000", "--checkpoint-interval", str(INTERVAL), "--no-progress"]
     return subprocess.Popen(
         [*command, *options], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
@@ -95,7 +95,7 @@ def test_a_signal_to_the_launcher_saves_what_was_learned(tmp_path, number):
     said, _ = run.communicate(timeout=60)
     assert run.returncode == 130
     assert "stopped at iteration" in said
-    assert "--resume --gpus 2 --device cpu" in said
+    assert "--resume --processes 2" in said
     saved = check_left(tmp_path / "run", workers, 0)
     assert saved == last_iteration(tmp_path / "run")
 
@@ -112,5 +112,5 @@ def test_a_mistake_is_told_once_and_ends_all(tmp_path):
     run = started(tmp_path / "run", "--world-count", "3")
     said, _ = run.communicate(timeout=60)
     assert run.returncode == 2
-    assert "world_count must be a multiple of the number of processes, got 3 and 2" in said
+    assert said.count("world_count must be a multiple of the number of processes, got 3") == 1
     assert "Traceback" not in said
