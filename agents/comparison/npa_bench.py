@@ -118,6 +118,13 @@ class Suite:
             hidden_dim=entry.hidden_dim,
         )
 
+    def leaves_out(self, task: str, method: str) -> bool:
+        """Return whether a method has nothing for a task; "module:function" is taken to have."""
+        if ":" in method:
+            return False
+        known = methods_for(self.problem_of(task))
+        return method not in known or (self.tasks[task], method) in LEFT_OUT
+
     def budget_of(self, task: str, *, quick: bool = False) -> float:
         """Return the particle-steps that a run may learn from."""
         return self.entries[self.tasks[task]].particle_steps * (QUICK_SHARE if quick else 1.0)
@@ -216,7 +223,8 @@ def write_rows(
             row = {
                 "benchmark": suite.name,
                 "method": method,
-                "about": METHODS[method],
+                "about": METHODS.get(method) or plan.own[method],
+                "options": dict(plan.options.get(method, {})),
                 "command": command,
                 "date": max(record.date for record in some),
                 **facts,

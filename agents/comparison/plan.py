@@ -146,6 +146,8 @@ class Plan:
     """Seconds or particle-steps that each run may take, by axis and task."""
     options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     """Keyword options by method; others run with their defaults."""
+    own: Mapping[str, str] = field(default_factory=dict)
+    """What is run as methods with names of their own: a known method, or "module:function"."""
     left_out: Collection[tuple[str, str]] = ()
     """Pairs (task, method) that are not run, as the method has nothing for the task."""
     episodes: int = 32
@@ -173,7 +175,9 @@ class Plan:
 
     def teacher(self, job: Job) -> Job | None:
         """Return the run whose rules a run clones; None where it does not, or options name one."""
-        if job.method != "clone" or "teacher" in self.options.get("clone", {}):
+        if self.own.get(job.method, job.method) != "clone":
+            return None
+        if "teacher" in self.options.get(job.method, {}):
             return None
         return replace(job, method="gradient")
 
@@ -182,6 +186,7 @@ class Plan:
         return {
             "problem": dict(self.tasks[job.task]),
             "budget": self.budgets[job.axis][job.task],
+            "method": self.own.get(job.method, job.method),
             "options": dict(self.options.get(job.method, {})),
             "episodes": self.episodes,
             **self.settings,

@@ -140,7 +140,7 @@ class Request:
 
     job: Job
     facts: dict[str, Any]
-    """What its figures follow from: problem, budget, options, episodes, and more."""
+    """What its figures follow from: problem, budget, method, options, episodes, and more."""
     threads: int = 1
     command: str = ""
     teacher: str = ""
@@ -156,6 +156,11 @@ class Request:
     def problem(self) -> Problem:
         """What is to be learned."""
         return Problem.from_json(json.dumps(self.facts["problem"]))
+
+    @property
+    def method(self) -> str:
+        """What learns: a known method, or "module:function"."""
+        return str(self.facts["method"])
 
     @property
     def budget(self) -> Budget:
@@ -218,7 +223,7 @@ def _learn(
     if request.teacher:
         options["teacher"] = request.teacher
     trained = train(
-        job.method,
+        request.method,
         problem,
         request.budget,
         job.seed,
@@ -293,7 +298,7 @@ def main(folder: Path) -> None:
     threading.Thread(target=listen, daemon=True).start()
     # Loads what the method needs. Whatever breaks here breaks in `run` as well, which records it.
     with contextlib.suppress(Exception):
-        method_options(Request.read(folder).job.method)
+        method_options(Request.read(folder).method)
     run(folder, lines.get())
 
 

@@ -20,7 +20,7 @@ from npa_envs.agents.learning.problem import EVALUATION_SEEDS, Problem
 from npa_envs.agents.learning.progress import Budget, Entry, Progress, check_finite
 from npa_envs.agents.learning.rules import RuleSet, RuleSetPolicy, starting_rules
 from npa_envs.devices import check_device
-from npa_envs.errors import NPAError, shown, suggest
+from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
 from npa_envs.tasks.checks import is_whole
 
 __all__ = [
@@ -113,7 +113,7 @@ def train(
     """Learn a problem by a method, within a budget.
 
     Args:
-        method: A name from `methods_for(problem)`.
+        method: A name from `methods_for(problem)`, or your own function, "package.module:function".
         problem: What is to be learned.
         budget: What may be spent.
         seed: Of everything that the method draws, from 0 to 99: runs with different seeds learn in
@@ -170,7 +170,8 @@ def method_options(method: str) -> dict[str, Any]:
     """Return the options of a method, with their defaults.
 
     Args:
-        method: A name from `METHODS`; one that is there for gardens alone, from `GARDEN_METHODS`.
+        method: A name from `METHODS`; one that is there for gardens alone, from `GARDEN_METHODS`;
+            or your own function, "package.module:function".
 
     Raises:
         NPAError: There is no such method.
@@ -198,9 +199,21 @@ def _declared(function: Callable[..., Any]) -> Any:
 def _function(method: str, table: dict[str, str]) -> Callable[..., Any]:
     if method in REMOVED:
         raise NPAError(f"method {shown(method)} is no more: {REMOVED[method]}")
-    if not isinstance(method, str) or method not in table:
+    if not isinstance(method, str) or (method not in table and ":" not in method):
         raise NPAError(
             f"method must be a known word, got {shown(method)}: {suggest(method, table)}"
         )
-    function: Callable[..., Any] = pkgutil.resolve_name(table[method])
+    function: Callable[..., Any]
+    if method in table:
+        function = pkgutil.resolve_name(table[method])
+        return function
+    try:
+        function = pkgutil.resolve_name(method)
+    except MissingDependencyError:
+        raise
+    except (ImportError, AttributeError, ValueError) as error:
+        raise NPAError(
+            "a method of your own must be 'package.module:function' that Python finds, got "
+            f"{shown(method)} ({error}): run where the module lies, or install it"
+        ) from error
     return function

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
+import re
 import shlex
-from collections.abc import Sequence
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -66,7 +69,8 @@ class CompareOptions(MeasureOptions):
 
     methods: tuple[str, ...] = ()
     """Methods of npa_envs.agents.learning; default: all but `clone`, which needs a teacher: the run
-    of `gradient` from the same seed, or options; of a suite: all of them."""
+    of `gradient` from the same seed, or options; of a suite: all of them. NAME=METHOD gives one a
+    name of its own, for other options (bold=ppo), or runs your function (mine=module:function)."""
 
     seeds: int | None = None
     """Seeds for each method and task: 0, 1, ...; default: 3, 5 of a suite, or 1 when quick."""
@@ -173,7 +177,7 @@ def make_plan(options: CompareOptions) -> Plan:
     tasks = chosen_names("task", options.tasks, PROBLEMS)
     for name in REMOVED.keys() & set(options.methods):
         raise NPAError(f"method {name!r} is no more: {REMOVED[name]}")
-    methods = chosen_names("method", options.methods, METHODS)
+    methods, own = _chosen_methods(options.methods, METHODS)
     if not options.methods:
         methods = [name for name in methods if name not in NEED_MORE]
     problems = {name: make_problem(name, quick=options.quick) for name in tasks}
@@ -182,7 +186,8 @@ def make_plan(options: CompareOptions) -> Plan:
         methods=methods,
         seeds=tuple(range(3 if options.seeds is None else options.seeds)),
         budgets={axis: dict.fromkeys(tasks, held) for axis, held in _budgets(options).items()},
-        options=_method_options(options.options, methods),
+        options=_method_options(options.options, methods, own),
+        own=own,
         left_out=() if options.methods else LEFT_OUT,
         episodes=options.episodes or (QUICK_EPISODES if options.quick else 32),
         settings=_settings(options),
@@ -193,12 +198,11 @@ def _suite_plan(options: CompareOptions) -> Plan:
     """Return the plan of NPA-Bench, of which some tasks, methods and seeds may be chosen."""
     from npa_envs.agents.comparison import npa_bench
     from npa_envs.agents.comparison.plan import Plan
-    from npa_envs.agents.learning import methods_for
 
     assert options.suite is not None, "asked for by its caller"
     suite = npa_bench.SUITES[options.suite]
-    for name in ("seconds", "particle_steps", "episodes", "options"):
-        if getattr(options, name) not in (None, ()):
+    for name in ("seconds", "particle_steps", "episodes"):
+        if getattr(options, name) is not None:
             raise NPAError(
                 f"--{name.replace('_', '-')} must not be given with --suite, whose protocol is "
                 "frozen: leave it out, or compare without a suite"
@@ -207,9 +211,14 @@ def _suite_plan(options: CompareOptions) -> Plan:
     tasks = chosen_names("task", options.tasks, suite.tasks)
     if quick and not options.tasks:
         tasks = tasks[:1]
-    methods = chosen_names("method", options.methods, suite.methods)
+    methods, own = _chosen_methods(options.methods, suite.methods)
+    told = _method_options(options.options, methods, own)
+    for name in told.keys() - own.keys():
+        raise NPAError(
+            f"options of {name!r} are frozen in {suite.name}: give it a name of its own, "
+            f"--methods my_{name}={name} --options my_{name}.NAME=VALUE"
+        )
     problems = {name: suite.problem_of(name) for name in tasks}
-    suited = {name: methods_for(problem) for name, problem in problems.items()}
     return Plan(
         tasks={name: json.loads(problem.to_json()) for name, problem in problems.items()},
         methods=methods,
@@ -219,8 +228,10 @@ def _suite_plan(options: CompareOptions) -> Plan:
             (task, method)
             for task in tasks
             for method in methods
-            if method not in suited[task] or (suite.tasks[task], method) in npa_bench.LEFT_OUT
+            if suite.leaves_out(task, own.get(method, method))
         ],
+        options=told,
+        own=own,
         episodes=QUICK_EPISODES if quick else npa_bench.EPISODES,
         settings=_settings(options),
     )
@@ -246,7 +257,38 @@ def _budgets(options: CompareOptions) -> dict[Axis, float]:
     return budgets
 
 
-def _method_options(words: Sequence[str], methods: Sequence[str]) -> dict[str, dict[str, Any]]:
+def _chosen_methods(words: Sequence[str], known: Iterable[str]) -> tuple[list[str], dict[str, str]]:
+    """Return the names of the methods to run, and of those with names of their own what is run."""
+    from npa_envs.agents.learning import method_options
+
+    known = list(known)
+    own = dict(word.split("=", 1) for word in words if "=" in word)
+    for name, method in own.items():
+        if not re.fullmatch("[a-z0-9_]+", name) or name in known:
+            raise NPAError(
+                "a method's own name must be new and of small letters, digits and _, got "
+                f"{name!r}: my_{method.rpartition(':')[2]}={method}"
+            )
+        with _this_folder_searched():
+            method_options(method)
+    plain = [word for word in words if "=" not in word]
+    return [*(chosen_names("method", plain, known) if plain or not own else []), *own], own
+
+
+@contextlib.contextmanager
+def _this_folder_searched() -> Iterator[None]:
+    """Let Python find modules in the current folder while a block runs, as runs' processes do."""
+    before = list(sys.path)
+    sys.path.insert(0, str(Path.cwd()))
+    try:
+        yield
+    finally:
+        sys.path[:] = before
+
+
+def _method_options(
+    words: Sequence[str], methods: Sequence[str], own: Mapping[str, str]
+) -> dict[str, dict[str, Any]]:
     from npa_envs.agents.learning import method_options
 
     found: dict[str, dict[str, Any]] = {}
@@ -259,7 +301,8 @@ def _method_options(words: Sequence[str], methods: Sequence[str]) -> dict[str, d
             )
         if method not in methods:
             raise NPAError(f"unknown method {method!r} in {word!r}: {suggest(method, methods)}")
-        known = method_options(method)
+        with _this_folder_searched():
+            known = method_options(own.get(method, method))
         if option not in known:
             raise NPAError(f"unknown option {option!r} in {word!r}: {suggest(option, known)}")
         try:

@@ -76,7 +76,10 @@ def test_a_suite_is_every_method_on_all_that_it_can_learn_within_the_frozen_budg
         ({"seconds": 1.0}, "--seconds must not be given with --suite"),
         ({"particle_steps": 1.0}, "--particle-steps must not"),
         ({"episodes": 3}, "--episodes must not"),
-        ({"options": ("sac.gamma=0.5",)}, "--options must not"),
+        ({"options": ("sac.gamma=0.5",)}, "options of 'sac' are frozen"),
+        ({"methods": ("ppo=ppo",)}, "must be new and of small letters"),
+        ({"methods": ("mine=absent_module:train",)}, "Python finds, got 'absent_module:train'"),
+        ({"methods": ("mine=ppo",), "options": ("mine.bold=1",)}, "unknown option 'bold'"),
         ({"tasks": ("Gardener2DSmall-v1",)}, "did you mean 'Gardener2DSmall-v0'"),
         ({"methods": ("sacc",)}, "did you mean 'sac'"),
     ],
@@ -100,6 +103,45 @@ def test_rows_come_back_from_their_files(tmp_path):
     assert rows["zero"].runs[0].curve == ((0.0, -1.0), (1000.0, 0.5))
     held = json.loads(first.read_text())
     assert (held["commit"], held["command"], held["date"]) == ("c0ffee", "it", "2026-01-02")
+
+
+@pytest.fixture
+def _still(tmp_path, monkeypatch):
+    """A method of one's own, in a module of the current folder."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "still.py").write_text(
+        "def train(problem, progress, seed, *, device, start=None, patience=1):\n"
+        "    rules = problem.new_rules(seed).to(device)\n"
+        "    progress.start(rules)\n"
+        "    return rules\n"
+    )
+
+
+@pytest.mark.usefixtures("_still")
+def test_a_row_of_ones_own_says_what_was_run(tmp_path):
+    small = SUITES["npa-bench-small-v0"]
+    made = plan_of(
+        small.name,
+        methods=("zero", "still=still:train", "bold=ppo"),
+        options=("bold.credit=marginal", "still.patience=2"),
+        tasks=("MixingSmall-v0",),
+    )
+    assert made.methods == ["zero", "still", "bold"]
+    assert {made.facts(job)["method"] for job in made.jobs()} == {"zero", "still:train", "ppo"}
+    write_rows(small, made, records(made), tmp_path, "it")
+    assert read_rows(small, tmp_path)["still"].about == "still:train"
+    held = json.loads((tmp_path / "bold.json").read_text())
+    assert (held["about"], held["options"]) == ("ppo", {"credit": "marginal"})
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("_still")
+def test_a_method_of_ones_own_is_compared(tmp_path):
+    words = ["compare", "--quick", "--particle-steps", "100", "--no-progress", "--out", "out"]
+    assert main([*words, "--methods", "still=still:train"]) == 0
+    (path,) = (tmp_path / "out").glob("particle-steps/*/still/seed-0/run.json")
+    run = json.loads(path.read_text())
+    assert (run["status"], run["facts"]["method"]) == ("done", "still:train")
 
 
 def test_a_run_that_failed_is_in_no_row_and_one_that_diverged_has_no_returns(tmp_path):

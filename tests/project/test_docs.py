@@ -17,7 +17,7 @@ from gymnasium.utils.env_checker import check_env
 from small_envs import assert_batch_of_singles
 
 import npa_envs
-from npa_envs.agents.learning import METHODS, Budget, train
+from npa_envs.agents.learning import Budget, train
 from npa_envs.cli import COMMANDS, main
 from npa_envs.envs import multispecies_v0, particles_v0
 from npa_envs.envs.multi import TASKS as TABLE
@@ -459,10 +459,10 @@ def test_the_code_about_learning_runs(tmp_path, monkeypatch, capsys):
     # Its search pays for episodes too, and ends early here.
     assert scripted > random
     assert (tmp_path / "grown" / "rule-0.safetensors").exists()
-    exec(compile(method, "learning.md", "exec"), names)
-    monkeypatch.setitem(METHODS, "own", "npa_envs:own")
-    monkeypatch.setattr(npa_envs, "own", names["train"], raising=False)
-    trained = train("own", names["problem"], Budget(particle_steps=2000), 0, noise=0.2, entries=1)
+    (tmp_path / "mine.py").write_text(method)
+    monkeypatch.syspath_prepend(tmp_path)
+    budget = Budget(particle_steps=2000)
+    trained = train("mine:train", names["problem"], budget, 0, noise=0.2, entries=1)
     assert [entry.particle_steps for entry in trained.log] == [0, 2000]
 
 
