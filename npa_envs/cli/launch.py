@@ -109,7 +109,6 @@ def leave_to_launcher(error: NPAError) -> None:
 
 def left_by(failure: ProcessFailure) -> str:
     """Return the reason that a process has left, or an empty string."""
-    if not isinstance(failure.message, dict):
-        return ""
+    said = failure.error_file_data["message"]
     # Torch writes the error's class before it.
-    return str(failure.message["message"]).partition(": ")[2]
+    return str(said["message"]).partition(": ")[2] if isinstance(said, dict) else ""

@@ -114,3 +114,41 @@ def test_a_mistake_is_told_once_and_ends_all(tmp_path):
     assert run.returncode == 2
     assert said.count("world_count must be a multiple of the number of processes, got 3") == 1
     assert "Traceback" not in said
+
+
+def test_the_reason_of_any_process_is_told(tmp_path, monkeypatch):
+    # Python runs this in each process as it starts.
+    (tmp_path / "sitecustomize.py").write_text(FAILING)
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
+    run = started(tmp_path / "run")
+    said, _ = run.communicate(timeout=60)
+    assert run.returncode == 2
+    assert said.count("npa-envs: error: memory is full: take less") == 1
+    assert load_checkpoint(tmp_path / "run" / "checkpoint.pt")["iteration"] == 0
+
+
+FAILING = """
+import os
+
+if os.environ.get("RANK") == "1":
+    from npa_envs.errors import NPAError
+    from npa_envs.training.cycle import TrainingCycle
+
+    def run(cycle, iteration):
+        raise NPAError("memory is full: take less")
+
+    TrainingCycle.run = run
+"""
+
+
+def test_a_small_batch_is_shared_unasked(tmp_path, monkeypatch):
+    # As on a machine of two cores.
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")
+    command = [sys.executable, "-m", "npa_envs", "train", "morphogenesis2d", "--max-seconds", "1"]
+    command += ["--target", "ring", "--no-report", "--out", str(tmp_path / "run")]
+    told = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    assert "on 2 processes (cpu)" in told.stdout
+    assert "--resume --processes 2" in told.stdout
+    again = [*command, "--resume"]
+    told = subprocess.run(again, capture_output=True, text=True, timeout=120, check=True)
+    assert "learns ring (goes on)" in told.stdout
