@@ -49,7 +49,7 @@ from npa_envs.render.colours import to_uint8
 from npa_envs.rule.files import load_rule, save_rule
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DTrainConfig
 from npa_envs.tasks.targets.emoji import render_emoji
-from npa_envs.training import Trainer, preset
+from npa_envs.training import Trainer, preset, task_entry
 from npa_envs.world.recorded import release_recordings
 from npa_envs.world.rollout import rollout
 
@@ -381,7 +381,7 @@ def train_side_by_side(
     streams, trainers = [], []
     for config in configs:
         with stream_of(device) as stream, on(stream):
-            task = Morphogenesis2D(config.task, device=device)
+            task = task_entry("morphogenesis2d").make(config.task, device)
             trainers.append(Trainer(task, config, task_name="morphogenesis2d"))
             streams.append(stream)
     begun = time.perf_counter()
@@ -591,14 +591,20 @@ DRAWN = 12
 """Pictures to develop on, and as many to test."""
 
 
-def draw_pictures(arguments: argparse.Namespace) -> None:
-    """Write emoji, drawn at random but always the same of the same font, as PNG files."""
+def single_emoji() -> dict[str, Image.Image]:
+    """Return the picture of every emoji of one character that the installed font draws, by name."""
     emoji = {}
     for code in (code for first, last in BLOCKS for code in range(first, last + 1)):
         name = unicodedata.name(chr(code), "")
         if name and not SKIN_TONES[0] <= code <= SKIN_TONES[1]:
             with contextlib.suppress(NPAError):
                 emoji[name.lower().replace(" ", "-")] = render_emoji(chr(code))
+    return emoji
+
+
+def draw_pictures(arguments: argparse.Namespace) -> None:
+    """Write emoji, drawn at random but always the same of the same font, as PNG files."""
+    emoji = single_emoji()
     drawn = random.Random(0).sample(list(emoji), 2 * DRAWN)
     for number, name in enumerate(drawn):
         folder = arguments.out / ("development" if number < DRAWN else "test")

@@ -26,6 +26,7 @@ from npa_envs.render import (
     write_splat,
 )
 from npa_envs.rule.rule import NPARule
+from npa_envs.tasks.base import coded_states
 from npa_envs.tasks.damage import DamageEvent, damage_worlds
 from npa_envs.training.trained_tasks import task_of_rule
 from npa_envs.world.rollout import rollout
@@ -159,6 +160,7 @@ def film_world(
                 film.shoot(task, x, s, f"step {step}", step=step)
             for damage in hurts.get(step, ()) if step < last else ():
                 x, s = damage_worlds(x, s, kind=damage.kind, size=damage.size, generator=generator)
+                s = coded_states(task, s)
                 film.shoot(task, x, s, f"step {step}: {damage.text}", mark=True)
             if stop():
                 break

@@ -219,7 +219,8 @@ def parse(
             name: getattr(holder, name)
             for name in COMMON
             for holder in (defaults, defaults.task)
-            if hasattr(holder, name) and not (name == "target" and hasattr(holder, "targets"))
+            if hasattr(holder, name)
+            and not (name == "target" and isinstance(holder, SpeciesOptions))
         }
         common = _without(TrainOptions(**told), set(COMMON) - told.keys())
         training = _without(replace(defaults, task=_without(defaults.task, told)), told)
@@ -369,6 +370,12 @@ def _species(config: TrainConfig[Any]) -> Sequence[Any]:
     return getattr(config.task, "species", (config.task,))
 
 
+def _goals(task: Any) -> Sequence[str]:
+    """Return what a task learns, in a word or two each."""
+    targets = getattr(task, "targets", ())
+    return targets or (getattr(task, "target", None) or f"the data {task.data}",)
+
+
 def announcement(
     task_name: str, options: TrainOptions, config: TrainConfig[Any], process_count: int = 1
 ) -> tuple[str, str]:
@@ -381,7 +388,7 @@ def announcement(
         process_count: Processes that share it.
     """
     species = _species(config)
-    goals = [getattr(own, "target", None) or f"the data {own.data}" for own in species]
+    goals = [goal for own in species for goal in _goals(own)]
     particles = " and ".join(str(own.particle_count) for own in species)
     named = options.preset or default_preset(task_name, config.device)
     source = f"preset {named}" if options.config is None else str(options.config)
@@ -430,6 +437,9 @@ class SpeciesOptions(Morphogenesis2DConfig):
     """What all species share is said once; a --config file says it species by species."""
 
     target: tyro.conf.Suppress[str] = "gecko"
+    code_dim: tyro.conf.Suppress[int] = 8
+    encoder: tyro.conf.Suppress[bool] = False
+    switch_share: tyro.conf.Suppress[float] = 0.1
 
     particle_count: int = 4096
     """Particles of each species."""
@@ -466,7 +476,9 @@ def parse_joint(
     species = []
     for number, target in enumerate(targets):
         _, own = read(_flat(base, task, min(number, len(task.species) - 1)))
-        species.append(_of_type(Morphogenesis2DConfig, replace(own.task, target=target)))
+        species.append(
+            _of_type(Morphogenesis2DConfig, replace(own.task, target=target, targets=()))
+        )
     together = replace(task, species=tuple(species), distance=told.task.distance)
     return launch, _of_type(JointTrainConfig, told, task=together)
 

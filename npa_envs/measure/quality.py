@@ -19,7 +19,7 @@ from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.measure.tables import table_text, tables_json
 from npa_envs.rule.files import shipped_rules
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.base import PictureTask, ViewTask, task_for_rule
+from npa_envs.tasks.base import PictureTask, ViewTask, coded_states, task_for_rule
 from npa_envs.tasks.damage import cut, erase_state, random_particle
 from npa_envs.tasks.point_classification import PointClassification, majority, particle_classes
 from npa_envs.world.rollout import rollout
@@ -230,7 +230,7 @@ def healing(
         f"cut, gap {cut_gap:g}": cut(x, s, centre=x.mean(1), normal=normal, gap=cut_gap),
         f"erased disk, radius {erase_radius:g}": (
             x,
-            erase_state(x, s, centre=centre, radius=erase_radius),
+            coded_states(task, erase_state(x, s, centre=centre, radius=erase_radius)),
         ),
     }
     rows = []

@@ -48,6 +48,7 @@ _DEMO_KIND = {
     "density_gradient": True,
     "species_count": 0,
     "equivariant": False,
+    "code_dim": 0,
 }
 """What rules of the web demo are like; its files do not say it."""
 

@@ -3,7 +3,8 @@
 Ours holds the weights under `NPARule`'s own names and, in the header's metadata, the format's name
 and version, every hyper-parameter and a checksum, so that a file is all that is needed to run a
 rule. The checksum is SHA-256 over all else that the file says; older files have none. Version 2 is
-for equivariant rules alone, which older versions of the package cannot run.
+for equivariant rules alone, version 3 for rules with codes: older versions of the package cannot
+run them.
 """
 
 from __future__ import annotations
@@ -39,8 +40,12 @@ FORMAT_VERSION = 1
 EQUIVARIANT_VERSION = 2
 """The format's version in files of equivariant rules."""
 
+CODED_VERSION = 3
+"""The format's version in files of rules with codes."""
+
+_PLAIN: dict[Any, type] = {Literal: str, tuple: tuple}
 _FIELDS = {
-    name: str if get_origin(kind) is Literal else kind
+    name: _PLAIN.get(get_origin(kind), kind)
     for name, kind in get_type_hints(RuleHyperParameters).items()
 }
 _RESERVED = {"format", "version", "checksum", *_FIELDS}
@@ -146,6 +151,7 @@ def save_rule(
             f"use {shown(str(path.with_suffix('.safetensors')))}"
         )
     version = EQUIVARIANT_VERSION if rule.equivariant else FORMAT_VERSION
+    version = CODED_VERSION if rule.codes is not None else version
     header = {"format": FORMAT_NAME, "version": str(version)}
     header |= {name: json.dumps(value) for name, value in rule.hyper_parameters().items()}
     if not isinstance(metadata, Mapping | None):
@@ -242,10 +248,10 @@ def _read_header(path: Path) -> dict[str, str]:
             f"the metadata's format must be {FORMAT_NAME!r}, got {shown(header.get('format'))}: "
             "this safetensors file was not written by npa_envs.save_rule"
         )
-    known = str(FORMAT_VERSION), str(EQUIVARIANT_VERSION)
+    known = [str(version) for version in range(FORMAT_VERSION, CODED_VERSION + 1)]
     if header.get("version") not in known:
         raise NPAError(
-            f"the metadata's version must be {' or '.join(known)}, got "
+            f"the metadata's version must be one of {', '.join(known)}, got "
             f"{shown(header.get('version'))}: upgrade with pip install -U npa-envs"
         )
     return header
@@ -292,6 +298,8 @@ def _parse(header: Mapping[str, str], name: str, kind: type) -> Any:
         value = parse_json(header[name])
         if kind is float and type(value) is int:
             value = float(value)
+        if kind is tuple and type(value) is list:
+            value = tuple(value)
     except (NPAError, OverflowError):
         value = None
     if type(value) is not kind:

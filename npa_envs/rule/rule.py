@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol, TypedDict
 
 import torch
@@ -17,6 +18,7 @@ from npa_envs.ops.checks import (
 )
 from npa_envs.ops.equivariance import VectorForm, invariants, read_rows, steer_rows, steered
 from npa_envs.ops.network import ArrangedWeights, arrange_weights, run_network
+from npa_envs.rule.codes import Codes
 
 COLOUR_OFFSET = 0.5
 """A particle's colour is its last three outputs plus this, dimensionless."""
@@ -62,6 +64,9 @@ class RuleHyperParameters(NamedAlways, total=False):
     equivariant: bool
     chiral: bool
     mixed_vectors: int
+    code_dim: int
+    code_names: tuple[str, ...]
+    encoder: bool
 
 
 class NPARule(nn.Module):
@@ -98,10 +103,14 @@ class NPARule(nn.Module):
         equivariant: The rule knows no direction.
         chiral: An equivariant rule of 2D worlds tells left from right.
         mixed_vectors: Mixed vectors of an equivariant rule, at least 1.
+        code_dim: The first so many of the state channels are a code, K, which the rule perceives
+            and never changes: it says what to grow.
+        code_names: What the codes that the rule knows stand for; there are some if there is a code.
+        encoder: The rule reads codes from pictures (`codes.encode`).
 
     Raises:
         NPAError: A dimension or a length is out of range, `moment_inverse` is another word, or what
-            is asked of an equivariant rule does not go together.
+            is asked of an equivariant rule or of codes does not go together.
     """
 
     def __init__(
@@ -123,10 +132,13 @@ class NPARule(nn.Module):
         equivariant: bool = False,
         chiral: bool = False,
         mixed_vectors: int = MIXED_VECTORS,
+        code_dim: int = 0,
+        code_names: Sequence[str] = (),
+        encoder: bool = False,
     ) -> None:
         super().__init__()
         widths = (state_dim, hidden_dim, readout_dim, readout_hidden_dim, mixed_vectors)
-        sizes = (space_dim, *widths, species_count)
+        sizes = (space_dim, *widths, species_count, code_dim)
         if any(isinstance(size, bool) or not isinstance(size, int) for size in sizes):
             raise NPAError(f"dimensions of a rule must be integers, got {shown(sizes)}")
         if space_dim not in (2, 3):
@@ -162,7 +174,9 @@ class NPARule(nn.Module):
         self.equivariant = checked_flag("equivariant", equivariant)
         self.chiral = checked_flag("chiral", chiral)
         self.mixed_vectors = mixed_vectors
+        self.code_dim = code_dim
         self._check_equivariance()
+        self._check_codes(len(code_names), checked_flag("encoder", encoder))
 
         self.hidden = nn.Linear(self.input_dim, hidden_dim)
         self.output = nn.Linear(hidden_dim, self.output_dim, bias=False)
@@ -184,6 +198,23 @@ class NPARule(nn.Module):
             self.mixing = nn.Parameter(nn.init.xavier_uniform_(mixing))
             steering = torch.empty(1, 0 if self.static else vectors.gate_count)
             self.steering = nn.Parameter(nn.init.xavier_uniform_(steering)[0])
+        self.codes = Codes(code_names, code_dim, encoder=encoder) if code_dim else None
+        """The codes that the rule knows, where it perceives such."""
+
+    def _check_codes(self, name_count: int, encoder: bool) -> None:
+        if not 0 <= self.code_dim < self.state_dim:
+            raise NPAError(
+                f"code_dim must be at least 0 and below state_dim = {self.state_dim}, got "
+                f"{self.code_dim}: a code is among the state channels"
+            )
+        if (self.code_dim > 0) != (name_count > 0) or (encoder and not self.code_dim):
+            raise NPAError(
+                f"code_dim and code_names go together, and an encoder needs both, got code_dim="
+                f"{self.code_dim}, {name_count} code_names, encoder={encoder}: for example "
+                "code_dim=8, code_names=['gecko', 'heart']"
+            )
+        if self.code_dim and self.equivariant:
+            raise NPAError("an equivariant rule has no codes, got code_dim and equivariant=True")
 
     def _check_equivariance(self) -> None:
         if not self.equivariant:
@@ -221,9 +252,9 @@ class NPARule(nn.Module):
 
     @property
     def output_dim(self) -> int:
-        """Outputs of the network: A, or of an equivariant rule a number for each gate, then Δs."""
+        """Outputs of the network: A less the code, or an equivariant rule's gates, then Δs."""
         if not self.equivariant or self.static:
-            return self.update_dim
+            return self.update_dim - self.code_dim
         return self.vector_form.gate_count + self.state_dim
 
     @property
@@ -255,7 +286,20 @@ class NPARule(nn.Module):
         if self.equivariant:
             return self._update_by_invariants(perception)
         update: Tensor = self.output(torch.relu(self.hidden(perception)))
-        return update
+        if self.code_dim == 0:
+            return update
+        moves, states = update.tensor_split([self.update_dim - self.state_dim], dim=-1)
+        kept = moves.new_zeros(*moves.shape[:-1], self.code_dim)
+        return torch.cat((moves, kept, states), dim=-1)
+
+    @property
+    def update_weight(self) -> Tensor:
+        """W2, with rows of zeros for the code, which never changes; shape [A, H]."""
+        weight = self.output.weight
+        if self.code_dim == 0:
+            return weight
+        moves, states = weight.tensor_split([self.update_dim - self.state_dim])
+        return torch.cat((moves, weight.new_zeros(self.code_dim, self.hidden_dim), states))
 
     def _update_by_invariants(self, perception: Tensor) -> Tensor:
         """Map perception vectors to raw updates by what stays the same in a turned world."""
@@ -302,7 +346,8 @@ class NPARule(nn.Module):
         """Return the weights as two plain products, differentiable in the parameters."""
         padding = -(self.input_dim + 1) % FOLD
         weight = torch.cat((self.hidden.weight, self.hidden.bias[:, None]), dim=1)
-        output_weight = nn.functional.pad(self.output.weight, (0, 0, 0, -self.output_dim % FOLD))
+        update_weight = self.update_weight
+        output_weight = nn.functional.pad(update_weight, (0, 0, 0, -len(update_weight) % FOLD))
         hidden_weight = nn.functional.pad(weight, (0, padding))
         return fold_weights(hidden_weight, output_weight)
 
@@ -325,6 +370,29 @@ class NPARule(nn.Module):
         """
         return self.read_out(states)[..., -3:] + COLOUR_OFFSET
 
+    def with_code(self, states: Tensor, code: Tensor) -> Tensor:
+        """Return states that carry a code; all else of them stays as it is.
+
+        Args:
+            states: Particle states, dimensionless, shape [B, N, C].
+            code: A code, dimensionless, shape [K]; one for each world, [B, 1, K]; or one for each
+                particle, [B, N, K].
+
+        Raises:
+            NPAError: The rule has no codes, or the shapes do not fit.
+        """
+        if self.code_dim == 0:
+            raise NPAError("this rule has no codes: train one with targets (--targets)")
+        shape = (*states.shape[:-1], self.code_dim)
+        try:
+            carried = code.to(states).expand(shape)
+        except RuntimeError as error:
+            raise NPAError(
+                f"code must have shape [K], [B, 1, K] or [B, N, K] for {shape}, got "
+                f"{tuple(code.shape)}"
+            ) from error
+        return torch.cat((carried, states[..., self.code_dim :]), dim=-1)
+
     def _repr_html_(self) -> str:
         """Return what Jupyter shows: what the rule sees, what it does, how large it is."""
         seen = ["its own state", "the states around it"]
@@ -332,6 +400,7 @@ class NPARule(nn.Module):
         seen += ["where particles stand denser"] * self.density_gradient
         seen += [f"{self.species_count} species apart"] * (self.species_count > 0)
         seen += ["no direction"] * self.equivariant
+        seen += ["a code of what to grow"] * (self.code_dim > 0)
         done = "changes its state" if self.static else "moves and changes its state"
         rows = {
             "a particle perceives": f"{', '.join(seen)}: {self.perception_dim} numbers",
@@ -381,6 +450,10 @@ class NPARule(nn.Module):
             made["equivariant"] = True
             made["chiral"] = self.chiral
             made["mixed_vectors"] = self.mixed_vectors
+        if self.codes is not None:
+            made["code_dim"] = self.code_dim
+            made["code_names"] = self.codes.names
+            made["encoder"] = self.codes.encoder is not None
         return made
 
 
@@ -392,6 +465,42 @@ def _is_hooked(module: nn.Module) -> bool:
         or module._backward_hooks
         or module._backward_pre_hooks
     )
+
+
+@torch.no_grad()
+def with_codes(rule: NPARule, untrained: NPARule) -> NPARule:
+    """Return an untrained rule with the weights that a rule without codes has.
+
+    What is new, the columns of the codes, stays as it is, and so do further hidden units.
+
+    Args:
+        rule: A rule without codes.
+        untrained: A rule with codes, otherwise of the same shape, but for as many hidden units or
+            more; it is changed where the shapes fit.
+
+    Returns:
+        The untrained rule; or `rule`, where the shapes do not fit.
+    """
+    count, space_dim, code_dim = untrained.state_dim, untrained.space_dim, untrained.code_dim
+    own = torch.ones(untrained.perception_dim, dtype=torch.bool)
+    own[:code_dim] = False
+    own[count : count + code_dim] = False
+    if untrained.state_gradient:
+        own[2 * count : 2 * count + code_dim * space_dim] = False
+    rows = rule.hidden_dim
+    fits = (
+        int(own.sum()) == rule.perception_dim
+        and rows <= untrained.hidden_dim
+        and rule.output_dim == untrained.output_dim
+        and rule.readout is None
+        and untrained.readout is None
+    )
+    if not fits:
+        return rule
+    untrained.hidden.weight[:rows, own] = rule.hidden.weight.to(untrained.hidden.weight)
+    untrained.hidden.bias[:rows] = rule.hidden.bias.to(untrained.hidden.bias)
+    untrained.output.weight[:, :rows] = rule.output.weight.to(untrained.output.weight)
+    return untrained
 
 
 def check_rule(rule: Any) -> None:

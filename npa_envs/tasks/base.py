@@ -84,13 +84,14 @@ class PictureTask(Task, Protocol):
 
 @runtime_checkable
 class ReadOutTask(Protocol):
-    """A task that compares what a rule reads out of the states, instead of the states themselves.
+    """A task that needs its rule: it compares what the rule reads out of the states, or its fresh
+    worlds carry a code of the rule.
 
     It has all that `Task` has besides.
     """
 
     def for_rule(self, rule: NPARule) -> Task:
-        """Return the task with losses, metric and pictures that read states through `rule`.
+        """Return the task with worlds, losses, metric and pictures as they are for `rule`.
 
         Its parameters are read anew at each call, so that losses are differentiable in them and
         change with them. The task itself stays as it is.
@@ -118,6 +119,20 @@ class GoalTask(Protocol):
         """Return the task with loss and metric for worlds of these goals.
 
         The tensor is read anew at each call. The task itself stays as it is.
+        """
+
+
+@runtime_checkable
+class CodedTask(Protocol):
+    """A task whose worlds may carry a code of their rule, which says what to grow.
+
+    It has all that `Task` has besides.
+    """
+
+    def coded(self, s: Tensor) -> Tensor:
+        """Return states [B, N, C] with the code of each world as it is now, or as they are.
+
+        Where it is learned, they are differentiable in it.
         """
 
 
@@ -299,6 +314,18 @@ def task_toward(task: TaskT, goal: Tensor | None) -> TaskT:
     return (
         task if goal is None or not isinstance(task, GoalTask) else cast(TaskT, task.toward(goal))
     )
+
+
+def coded_states(task: Task, s: Tensor) -> Tensor:
+    """Return states that carry the code of their task again, where it has one.
+
+    Damage to states takes it away, and no rule writes it.
+
+    Args:
+        task: Any task, toward the worlds' goals.
+        s: States (dimensionless), shape [B, N, C].
+    """
+    return task.coded(s) if isinstance(task, CodedTask) else s
 
 
 def seed_worlds(

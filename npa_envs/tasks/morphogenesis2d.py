@@ -2,26 +2,30 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, shown
 from npa_envs.ops import splat, world_mean
 from npa_envs.ops.pictures.losses import picture_losses
-from npa_envs.rule.rule import COLOUR_OFFSET
+from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
 from npa_envs.tasks.checks import check_flag, check_non_negative, check_positive, check_text
 from npa_envs.tasks.growth import GrowthConfig, GrowthTask
 from npa_envs.tasks.targets.images import LARGEST_POINT_COUNT
 from npa_envs.tasks.targets.points import PointTarget, load_target
 from npa_envs.tasks.train_config import TrainConfig, fast_run, tiny_run
 from npa_envs.world.randomness import Randomness, WorldRandom
+
+LARGEST_CODE = 1024
+"""Numbers of a code, at most."""
 
 SMALLEST_PICTURE = 4
 """Pixels a side of a picture that is blurred and halved, at least."""
@@ -37,6 +41,20 @@ class Morphogenesis2DConfig(GrowthConfig):
 
     target: str = "gecko"
     """What to grow: a built-in name, an emoji, or the path of a PNG, JPEG or WebP file."""
+
+    targets: tuple[str, ...] = ()
+    """Several things to grow by one rule, in place of `target`: as that, or folders of pictures."""
+
+    code_dim: int = 8
+    """Numbers of the code by which particles are told which of `targets` to grow, K: so many state
+    channels more, in front of the others."""
+
+    encoder: bool = False
+    """Codes are read from the pictures by a network that is trained along, so that new pictures
+    have one too. Without, each target's code is learned by itself."""
+
+    switch_share: float = 0.1
+    """Probability of a world from the pool to become another one of `targets` in mid-life."""
 
     target_point_count: int = 4096
     """About how many opaque pixels the target is resampled to; as many as there are particles."""
@@ -93,8 +111,21 @@ class Morphogenesis2DConfig(GrowthConfig):
             )
         check_positive(self, float, "sigma")
         check_non_negative(self, "splat_weight", "colour_weight", "drift_weight", "seed_axis")
-        check_flag(self, "equivariant", "chiral")
+        check_flag(self, "equivariant", "chiral", "encoder")
+        self._check_targets()
         check_positive(self, int, "angles", at_least=4)
+
+    def _check_targets(self) -> None:
+        targets = self.targets
+        if not isinstance(targets, tuple) or not all(isinstance(t, str) and t for t in targets):
+            raise NPAError(
+                f"targets must be a tuple of names, emoji, files or folders, got {shown(targets)}: "
+                "for example targets=('gecko', 'heart')"
+            )
+        check_positive(self, int, "code_dim", at_most=LARGEST_CODE)
+        check_non_negative(self, "switch_share")
+        if self.switch_share > 1.0:
+            raise NPAError(f"switch_share must be at most 1, got {self.switch_share}: try 0.1")
 
     def with_particle_count(self, particle_count: int) -> Morphogenesis2DConfig:
         """Return the same task with another number of particles, and of the target's points."""
@@ -116,6 +147,8 @@ UNOWNED = 0.05
 
 class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
     """The task of arXiv 2601.16096, section 4.1, with its loss; satisfies `PictureTask`.
+
+    Of a rule of many pictures, `for_rule` gives the task of one of them.
 
     Args:
         config: Target, world, rule size and loss weights.
@@ -151,8 +184,40 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         self._target_mean = self.target.points.mean(dim=0)
         radius = float((self.target.points - self._target_mean).norm(dim=1).max())
         self._reach = max(1.0, radius)
-        self.target_picture = self._splat(self.target.points[None], self.target.colours[None])[0]
-        """Its picture: rgb sums and density, dimensionless, shape [R, R, 4]."""
+        self._pixel_size = self.target.pixel_size
+        self._code: Tensor | None = None
+        points, colours = self.target.points[None], self.target.colours[None]
+        self._target_picture = self._splat(points, colours)[0]
+
+    @property
+    def target_picture(self) -> Tensor:
+        """The target's picture: rgb sums and density, dimensionless, shape [R, R, 4]."""
+        return self._target_picture
+
+    def for_rule(self, rule: NPARule) -> Self:
+        """Return the task whose fresh worlds carry the code that a rule has for the target.
+
+        It is the code of the target's name, or else what the rule's encoder reads from its picture.
+
+        Raises:
+            NPAError: The rule has codes, but none of this name, and no encoder.
+        """
+        codes = rule.codes
+        if codes is None:
+            return self
+        if codes.encoder is None or self.target.name in codes.names:
+            return self.with_code(codes[self.target.name])
+        return self.with_code(codes.encode(self.target_picture[None].to(codes.table))[0])
+
+    def with_code(self, code: Tensor) -> Self:
+        """Return the task whose fresh worlds carry a code, in front of the other states.
+
+        Args:
+            code: Dimensionless, shape [K].
+        """
+        bound = copy.copy(self)
+        bound._code = code.detach()
+        return bound
 
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
@@ -175,7 +240,16 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
             angle = 2.0 * math.pi * share
             along = x[..., 0] * angle.cos() + x[..., 1] * angle.sin()
             s[..., 0] = config.seed_axis * along / config.seed_radius
+        if self._code is not None:
+            s = self.coded(torch.cat((s.new_zeros(*s.shape[:2], len(self._code)), s), dim=-1))
         return x, s
+
+    def coded(self, s: Tensor) -> Tensor:
+        """Return states with the task's code, or as they are where it has none."""
+        if self._code is None:
+            return s
+        code = self._code.to(s).expand(*s.shape[:2], -1)
+        return torch.cat((code, s[..., len(self._code) :]), dim=-1)
 
     def picture(self, x: Tensor, s: Tensor, *, centred: bool = True) -> Tensor:
         """Return each world's picture: colour sums and density, dimensionless, shape [B, R, R, 4].
@@ -208,6 +282,9 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
             if self.config.equivariant:
                 x = turned(x, self.best_turn(x, s))
             return self._picture_losses(x, s)
+        return self._mean_errors(x, s)
+
+    def _mean_errors(self, x: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         density, colour = self.splat_errors(x, s)
         return _pixel_mean(density), _pixel_mean(colour)
 
@@ -326,7 +403,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
             self.target_picture,
             goal=self._target_mean,
             shift=COLOUR_OFFSET,
-            pixel_size=self.target.pixel_size,
+            pixel_size=self._pixel_size,
             sigma=self.config.sigma,
         )
 
@@ -341,7 +418,7 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
             x,
             colour,
             resolution=self.config.resolution,
-            pixel_size=self.target.pixel_size,
+            pixel_size=self._pixel_size,
             sigma=self.config.sigma,
         )
 

@@ -14,7 +14,15 @@ from torch import Tensor
 
 import npa_envs.world.rollout
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.base import GoalTask, ScheduledTask, Task, seed_worlds, task_for_rule
+from npa_envs.tasks.base import (
+    GoalTask,
+    ScheduledTask,
+    Task,
+    coded_states,
+    seed_worlds,
+    task_for_rule,
+    task_toward,
+)
 from npa_envs.tasks.train_config import AGEING_BLOCK, TrainConfig
 from npa_envs.training.iteration import EagerIteration, GraphedIteration, Rollout
 from npa_envs.training.meter import LossMeter
@@ -200,6 +208,7 @@ class TrainingCycle:
         assert pool.age is not None, "made with lifetimes"
         restart(random)
         x, s, goal = pool.read(old)
+        s = coded_states(task_toward(self.task, goal), s)
         x, s, _ = self._rollout(
             self._rule,
             x,

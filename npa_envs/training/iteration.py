@@ -9,7 +9,7 @@ from torch import Tensor
 
 import npa_envs.world.rollout
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.base import Task, task_toward
+from npa_envs.tasks.base import Task, coded_states, task_toward
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.randomness import registered
 from npa_envs.world.cuda_graph import capture
@@ -109,10 +109,14 @@ class EagerIteration:
         self._forward_backward(steps)
 
     def _forward_backward(self, steps: int) -> None:
+        # Through these states codes learn; the pool holds them as they were.
+        s0 = coded_states(self._task, self.s0)
+        if s0 is not self.s0:
+            self.s0.copy_(s0.detach())
         x, s, path_length = self._rollout(
             self._rule,
             self.x0,
-            self.s0,
+            s0,
             steps,
             eps=self._task.eps,
             box=self._task.box,

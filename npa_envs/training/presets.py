@@ -11,6 +11,7 @@ import torch
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.tasks.base import PictureTask
 from npa_envs.tasks.co_morphogenesis2d import CO_MORPHOGENESIS2D_PRESETS, CoMorphogenesis2D
+from npa_envs.tasks.many_pictures import ManyPictures
 from npa_envs.tasks.morphogenesis2d import MORPHOGENESIS2D_PRESETS, Morphogenesis2D
 from npa_envs.tasks.morphogenesis3d import MORPHOGENESIS3D_PRESETS, Morphogenesis3D
 from npa_envs.tasks.point_classification import POINT_CLASSIFICATION_PRESETS, PointClassification
@@ -67,7 +68,9 @@ TASKS: Mapping[str, TaskEntry] = {
     "morphogenesis2d": TaskEntry(
         summary="grow a picture from a disk of blank particles",
         presets=MORPHOGENESIS2D_PRESETS,
-        make=lambda config, device: Morphogenesis2D(config, device=device),
+        make=lambda config, device: (ManyPictures if config.targets else Morphogenesis2D)(
+            config, device=device
+        ),
         targets=builtin_targets,
         fast_seconds=220.0,
     ),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +11,12 @@ import torch
 
 from npa_envs.errors import NPAError
 from npa_envs.files import parse_json
+from npa_envs.rule.codes import Codes
 from npa_envs.rule.files import first_rules, rule_metadata, shipped_rules
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import PictureTask, task_for_rule
+from npa_envs.tasks.many_pictures import named_targets
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.tasks.point_classification import PointClassification
 from npa_envs.training.overrides import override
 from npa_envs.training.presets import preset, task_entry
@@ -41,8 +44,10 @@ def task_of_rule(
     """Return the task that a rule was trained on, as its file tells.
 
     A rule whose file says nothing of a task, as the authors' do, is run in the paper's world of
-    2D morphogenesis with the rule's own sizes. Where the target is not known, or is a picture that
-    is not there any more, a built-in one stands in for it: worlds can still be run and drawn.
+    2D morphogenesis with the rule's own sizes. Of a rule of many pictures it is the task of one of
+    them: of the code that `target` names, else the first. Where the target is not known, or is a
+    picture that is not there any more, a built-in one stands in for it: worlds can still be run and
+    drawn.
 
     Args:
         source: What the rule was loaded from.
@@ -65,7 +70,10 @@ def task_of_rule(
             f"{entry.space_dim}D worlds of {task_name}, got space_dim={rule.space_dim}, "
             f"static={rule.static}: run this one in Python with npa_envs.rollout"
         )
-    own: dict[str, Any] = {"state_dim": rule.state_dim, "hidden_dim": rule.hidden_dim}
+    own: dict[str, Any] = {
+        "state_dim": rule.state_dim - rule.code_dim,
+        "hidden_dim": rule.hidden_dim,
+    }
     own |= {"eps": rule.eps0} | ({} if rule.static else {"alpha": rule.alpha})
     told = "config" in metadata
     config = preset("paper", task_name, **own) if not told else trained_config(path, metadata)
@@ -73,6 +81,8 @@ def task_of_rule(
     if particle_count is not None:
         config = override(config, task=config.task.with_particle_count(particle_count))
     chosen = fields.get("target") is not None
+    if rule.codes is not None:
+        config = override(config, targets=(), target=_one_of(config.task, rule.codes, chosen))
     doubt = None if told or chosen else "its file does not say what it grows"
     try:
         task = entry.make(config.task, device)
@@ -84,8 +94,27 @@ def task_of_rule(
         if chosen or not entry.targets():
             raise
         stand_in = override(config, target=entry.targets()[0])
-        task = task_for_rule(entry.make(stand_in.task, device), rule)
+        task = entry.make(stand_in.task, device)
+        if isinstance(task, Morphogenesis2D) and rule.codes is not None:
+            task = Morphogenesis2D(
+                stand_in.task, target=replace(task.target, name=rule.codes.names[0]), device=device
+            )
+        task = task_for_rule(task, rule)
         return TrainedTask(task, f"its target cannot be loaded: {error}")
+
+
+def _one_of(task: Morphogenesis2DConfig, codes: Codes, chosen: bool) -> str:
+    """Return where the target of one of a rule's codes comes from: the chosen or the first one's.
+
+    A target that has no code is a picture for the rule's encoder.
+    """
+    name = task.target if chosen else codes.names[0]
+    try:
+        sources = named_targets(task.targets)
+    except NPAError:
+        # Its folder is not there any more.
+        sources = {}
+    return sources.get(name, name)
 
 
 def trained_config(path: Path, metadata: Mapping[str, str]) -> Any:

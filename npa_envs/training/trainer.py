@@ -28,7 +28,7 @@ from npa_envs.files import write_bytes, write_text
 from npa_envs.render.colours import to_uint8
 from npa_envs.render.film import encode_frame
 from npa_envs.rule.files import first_rules, load_rule, save_rule
-from npa_envs.rule.rule import NPARule
+from npa_envs.rule.rule import NPARule, with_codes
 from npa_envs.tasks.base import GoalTask, Task, differing_fields, task_for_rule, task_toward
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.cycle import TrainingCycle
@@ -400,7 +400,7 @@ def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
     """Return the rule that a run starts from, with the configuration's `moment_inverse`.
 
     An equivariant rule starts from random weights where the configuration names a first rule, which
-    knows directions, as presets do.
+    knows directions, as presets do. A rule with codes may start from one without.
 
     Args:
         config: The run's configuration.
@@ -415,6 +415,8 @@ def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
         return untrained
     source = config.initial_rule
     rule = load_rule(source)
+    if untrained.code_dim and not rule.code_dim:
+        rule = with_codes(rule, untrained)
     if rule.moment_inverse == "threshold":
         rule.moment_inverse = config.moment_inverse
     wrong = differing_fields(rule, untrained)

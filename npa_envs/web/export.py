@@ -190,14 +190,19 @@ def check_browser_rule(rule: NPARule, name: str) -> None:
     """Check that the page's engine can run a rule.
 
     Raises:
-        NPAError: It is equivariant, has a network of its own, perceives species by themselves, or
-            is too large.
+        NPAError: It is equivariant, has codes or a network of its own, perceives species by
+            themselves, or is too large.
     """
     check_rule(rule)
     if rule.equivariant:
         raise NPAError(
             f"a page runs rules that know directions only, {shown(name)} is equivariant: watch it "
             "with npa-envs view"
+        )
+    if rule.code_dim:
+        raise NPAError(
+            f"a page runs rules without codes only, {shown(name)} has code_dim={rule.code_dim}: "
+            "watch it with npa-envs view"
         )
     if not rule.is_plain():
         raise NPAError(

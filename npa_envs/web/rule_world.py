@@ -15,7 +15,7 @@ from torch import Tensor
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.rule.files import load_rule, shipped_rules
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.base import PictureTask, seed_worlds, task_toward
+from npa_envs.tasks.base import PictureTask, coded_states, seed_worlds, task_toward
 from npa_envs.tasks.checks import is_real
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig
 from npa_envs.tasks.damage import DAMAGE_SIZES, damage_worlds
@@ -318,7 +318,8 @@ class RuleWorld(Live):
     @torch.no_grad()
     def _damage(self, name: str) -> None:
         if self.x.shape[1]:
-            self.x, self.s = damage_worlds(self.x, self.s, kind=name, generator=self._generator)
+            self.x, s = damage_worlds(self.x, self.s, kind=name, generator=self._generator)
+            self.s = coded_states(self.task, s)
 
     @torch.no_grad()
     def _brush(self, message: Mapping[str, Any]) -> bool:

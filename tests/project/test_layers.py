@@ -48,6 +48,7 @@ LADDER = {
     "npa_envs.ops": rung(2, "warp torch", never=("npa_envs.reference",)),
     "npa_envs.world.randomness": rung(3, "torch numpy", never=ORACLES),
     "npa_envs.world.divergence": rung(3, "torch", never=ORACLES),
+    "npa_envs.rule.codes": rung(2, "torch"),
     "npa_envs.rule.rule": rung(3, "torch"),
     "npa_envs.rule": rung(4, "torch safetensors", never=INSIDES),
     "npa_envs.world": rung(5, "torch", never=ORACLES),
@@ -63,6 +64,7 @@ LADDER = {
     "npa_envs.measure.speed.hash_grid": rung(3, "warp torch", never=("npa_envs.reference",)),
     "npa_envs.measure.judge": rung(9, "torch", never=INSIDES),
     "npa_envs.measure.quality": rung(9, "torch numpy tqdm", never=INSIDES),
+    "npa_envs.measure.codes": rung(10, "torch", never=INSIDES),
     "npa_envs.measure.interaction": rung(10, "torch numpy matplotlib", never=ORACLES),
     "npa_envs.measure.speed": rung(
         12, "torch numpy matplotlib scipy warpSPHCore", never=("npa_envs.kernels",)

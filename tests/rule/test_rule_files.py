@@ -146,7 +146,7 @@ def write_ours(path: Path, change: Callable[[dict, dict], None]) -> None:
 
 
 BAD_HEADERS: dict[str, tuple[Callable[[dict, dict], Any], str]] = {
-    "unknown version": (lambda h, w: h.update(version="3"), "must be 1 or 2, got '3'.*upgrade"),
+    "unknown version": (lambda h, w: h.update(version="4"), "one of 1, 2, 3, got '4'.*upgrade"),
     "another format": (lambda h, w: h.update(format="llama"), "format must be 'npa-envs rule'"),
     "no format": (lambda h, w: h.pop("format"), "format must be 'npa-envs rule', got None"),
     "a missing key": (lambda h, w: h.pop("alpha"), "lacks 'alpha'"),

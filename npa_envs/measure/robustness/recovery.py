@@ -15,6 +15,7 @@ from torch import Tensor
 
 from npa_envs.measure.robustness.grounds import Ground, Home, courses
 from npa_envs.ops import world_mean
+from npa_envs.tasks.base import coded_states
 from npa_envs.tasks.damage import DAMAGE_SIZES, clump, cut, erase_state, random_particle
 from npa_envs.world.randomness import Purpose, WorldRandom
 
@@ -213,7 +214,8 @@ def _beside_twins(
     names = [damage.name for damage in damages]
     for damage in damages:
         random = ground.random(Purpose.DAMAGE)
-        copies.append(damage.apply(home.x, home.s, random, home.task.box))
+        x, s = damage.apply(home.x, home.s, random, home.task.box)
+        copies.append((x, coded_states(home.task, s)))
         keys.append(keys[0])
     if control:
         copies.append(copies[0])

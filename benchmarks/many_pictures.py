@@ -1,0 +1,347 @@
+"""One rule of many pictures, beside rules of one picture of the same recipe.
+
+`pictures` draws emoji that no other experiment uses, to train on and to hold out; `ways` trains the
+same pictures with three ways to tell a rule its code; `train` trains rules of many pictures (KINDS)
+and controls of one picture each, side by side; `measure` runs all of them on seeds that training
+never saw: losses with the right code and with that of another picture, and PSNR of what an encoder
+grows from pictures that it never saw. Each writes what it found to OUT as it goes.
+
+    python benchmarks/many_pictures.py pictures --out PICTURES
+    python benchmarks/many_pictures.py ways --targets FOLDER --out OUT
+    python benchmarks/many_pictures.py train --targets FOLDER --controls 12 --out OUT --device cuda
+    python benchmarks/many_pictures.py measure --held-out FOLDER --out OUT --device cuda
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import random
+import shutil
+import statistics
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from recipes import DRAWN, SECOND, SIZES, single_emoji, train_side_by_side
+from torch import Tensor, nn
+
+import npa_envs
+from npa_envs.measure.codes import PictureRow, grown, picture_rows, tasks_of_pictures
+from npa_envs.measure.quality import psnr
+from npa_envs.measure.record import machine, write_record
+from npa_envs.rule.files import rule_metadata
+from npa_envs.tasks.many_pictures import ManyPictures, named_targets
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
+from npa_envs.training import Trainer, preset
+
+KINDS: Mapping[str, Mapping[str, Any]] = {
+    "codes": {},
+    "codes-32": {"code_dim": 32},
+    "encoder": {"encoder": True},
+}
+"""Rules of many pictures: 8 or 32 learned numbers a picture, or 8 that are read from it."""
+
+LOCAL: Mapping[str, Any] = {"particle_count": 256, "target_point_count": 256}
+"""Worlds of the preset `fast` with half of its particles: for one core."""
+
+SEEDS = tuple(range(1000, 1004))
+"""Seeds of the worlds that rules are measured on."""
+
+STEPS = (64, 256, 1024)
+"""Steps at which they are measured."""
+
+TRAINED, HELD_OUT = 60, 20
+"""Pictures that `pictures` draws."""
+
+
+def draw_pictures(arguments: argparse.Namespace) -> None:
+    """Write emoji as PNG files, drawn at random but always the same of the same font."""
+    emoji = single_emoji()
+    taken = random.Random(0).sample(list(emoji), 2 * DRAWN)
+    left = [name for name in emoji if name not in taken]
+    drawn = random.Random(1).sample(left, TRAINED + HELD_OUT)
+    folders = {"development": taken[:DRAWN], "train": drawn[:TRAINED], "held-out": drawn[TRAINED:]}
+    for folder, names in folders.items():
+        (arguments.out / folder).mkdir(parents=True, exist_ok=True)
+        for name in names:
+            emoji[name].save(arguments.out / folder / f"{name}.png", optimize=True)
+
+
+class Film(npa_envs.NPARule):
+    """A rule whose hidden units are scaled by its code: FiLM (arXiv 1709.07871)."""
+
+    def __init__(self, *args: Any, **told: Any) -> None:
+        super().__init__(*args, **told)
+        self.scale = nn.Linear(self.code_dim, self.hidden_dim)
+        nn.init.zeros_(self.scale.weight)
+        nn.init.zeros_(self.scale.bias)
+
+    def forward(self, perception: Tensor) -> Tensor:
+        """Map perception vectors to updates."""
+        scale = 1.0 + self.scale(perception[..., : self.code_dim])
+        return self.updates(torch.relu(scale * self.hidden(perception)))
+
+    def updates(self, hidden: Tensor) -> Tensor:
+        """Return updates, which are 0 for the code."""
+        return nn.functional.linear(hidden, self.update_weight)
+
+
+class Hyper(Film):
+    """A rule whose first layer a linear hypernetwork changes by a matrix of rank 8."""
+
+    def __init__(self, *args: Any, **told: Any) -> None:
+        super().__init__(*args, **told)
+        del self.scale
+        self.down = nn.Linear(self.perception_dim, 8, bias=False)
+        self.middle = nn.Linear(self.code_dim, 64)
+        self.up = nn.Linear(8, self.hidden_dim, bias=False)
+        for module in (self.down, self.middle, self.up):
+            nn.init.xavier_uniform_(module.weight, gain=0.3)
+
+    def forward(self, perception: Tensor) -> Tensor:
+        """Map perception vectors to updates."""
+        weights = self.middle(perception[..., : self.code_dim]).unflatten(-1, (8, 8))
+        changed = (weights @ self.down(perception)[..., None])[..., 0]
+        return self.updates(torch.relu(self.hidden(perception) + self.up(changed)))
+
+
+WAYS: Mapping[str, type[npa_envs.NPARule]] = {
+    "concatenation": npa_envs.NPARule,
+    "film": Film,
+    "hypernetwork": Hyper,
+}
+"""Ways to tell a rule its code: as further perceived channels alone, or besides as these do."""
+
+
+class WayTask(ManyPictures):
+    """Many pictures by a rule of a given kind."""
+
+    kind: type[npa_envs.NPARule] = npa_envs.NPARule
+
+    def make_rule(self, generator: torch.Generator) -> npa_envs.NPARule:
+        """Return an untrained rule of the kind."""
+        config = self.config
+        with torch.random.fork_rng(devices=()):
+            torch.manual_seed(int(torch.randint(2**31, (), generator=generator)))
+            return self.kind(hidden_dim=config.hidden_dim, eps0=config.eps, **self.rule_shape)
+
+
+def fields_of(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return what all runs of a call are told."""
+    if arguments.size == "local":
+        fields = dict(LOCAL)
+    else:
+        fields = {**SECOND, **SIZES[arguments.size]}
+        if arguments.size != "tiny":
+            # Few numbers of steps: few graphs.
+            fields["steps"] = (62, 64)
+    if arguments.iterations:
+        fields["iterations"] = arguments.iterations
+    fields |= {"repeats": 1, "tensorboard": False, "picture_interval": 0, "log_interval": 50}
+    return fields | {"checkpoint_interval": 10**9, "device": arguments.device}
+
+
+def base_of(arguments: argparse.Namespace) -> str:
+    """Return the preset that runs begin from."""
+    return "fast" if arguments.size == "local" else "paper"
+
+
+def many_fields(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return what rules of many pictures are told besides."""
+    fields: dict[str, Any] = {"targets": tuple(arguments.targets)}
+    for name in ("world_count", "pool_size", "hidden_dim", "code_dim", "switch_share"):
+        value = getattr(arguments, name)
+        if value is not None:
+            fields[name] = value
+    if arguments.many_iterations:
+        fields["iterations"] = arguments.many_iterations
+    return fields
+
+
+def ways(arguments: argparse.Namespace) -> None:
+    """Train the pictures by each way, and measure what came of it."""
+    found: dict[str, Any] = {}
+    for name in arguments.kinds or WAYS:
+        told = fields_of(arguments) | many_fields(arguments)
+        out = arguments.out / "runs" / name
+        config = preset(base_of(arguments), **told, out=out)
+        task = WayTask(config.task, device=arguments.device)
+        task.kind = WAYS[name]
+        begun = time.process_time()
+        trainer = Trainer(task, config, task_name="morphogenesis2d", overwrite=True)
+        result = trainer.run(progress=False, max_seconds=arguments.longest)
+        rows = measured(result.rule, config.task, arguments.device)
+        found[name] = {
+            "iterations": result.iteration,
+            "processor_seconds": round(time.process_time() - begun, 1),
+            "weights": result.rule.weight_count,
+            "rows": rows,
+        }
+        print(name, result.iteration, median_losses(rows), flush=True)
+        write_record(arguments.out / "ways.json", record(arguments, found))
+
+
+def record(arguments: argparse.Namespace, found: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a record says."""
+    told = {
+        name: [str(Path(one).name) for one in value] if name == "targets" else value
+        for name, value in vars(arguments).items()
+        if name not in ("out", "held_out", "command")
+    }
+    return {"machine": machine(torch.device(arguments.device)), "told": told, "rules": found}
+
+
+def measured(rule: npa_envs.NPARule, config: Any, device: str) -> dict[str, list[dict[str, Any]]]:
+    """Return the rows of a rule's pictures at each of `STEPS`."""
+    tasks = tasks_of_pictures(rule, config, device=device)
+    return {
+        str(step): [
+            asdict(row) for row in picture_rows(rule, tasks, step=step, seeds=SEEDS, device=device)
+        ]
+        for step in STEPS
+    }
+
+
+def median_losses(rows: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, str]:
+    """Return the median loss and the median shuffled loss at each step, for people."""
+    return {
+        step: f"{table[-1]['loss']:.3f}, shuffled {table[-1]['shuffled']:.3f}"
+        for step, table in rows.items()
+    }
+
+
+def train(arguments: argparse.Namespace) -> None:
+    """Train rules of many pictures and the controls side by side."""
+    told, many = fields_of(arguments), many_fields(arguments)
+    base = base_of(arguments)
+    sources = named_targets(arguments.targets)
+    chosen = random.Random(2).sample(list(sources), min(arguments.controls, len(sources)))
+    wanted: dict[str, dict[str, Any]] = {
+        kind: told | many | KINDS[kind] for kind in arguments.kinds or KINDS
+    }
+    wanted |= {f"control-{name}": told | {"target": sources[name]} for name in chosen}
+    configs = [
+        preset(base, **fields, out=arguments.out / "runs" / name) for name, fields in wanted.items()
+    ]
+    trainers, seconds = train_side_by_side(configs, arguments.longest)
+    for name, trainer in zip(wanted, trainers, strict=True):
+        trainer.save()
+        shutil.copy(trainer.folder.rule, arguments.out / f"{name}.safetensors")
+    print(f"{len(wanted)} runs, {[t.iteration for t in trainers]} iterations, {seconds:.1f} s")
+
+
+@torch.no_grad()
+def measure(arguments: argparse.Namespace) -> None:
+    """Measure all rules that lie in the folder."""
+    found: dict[str, Any] = {}
+    device = arguments.device
+    for path in sorted(arguments.out.glob("*.safetensors")):
+        metadata = rule_metadata(path)
+        rule = npa_envs.load_rule(path, device=device)
+        config = preset(base_of(arguments), **json.loads(metadata["config"])).task
+        row: dict[str, Any] = {"iterations": int(metadata["iteration"])}
+        if rule.codes is None:
+            row["rows"] = control_rows(rule, config, device)
+            print(path.stem, {step: rows[0]["loss"] for step, rows in row["rows"].items()})
+        else:
+            row["rows"] = measured(rule, config, device)
+            print(path.stem, median_losses(row["rows"]), flush=True)
+            if rule.codes.encoder is not None and arguments.held_out:
+                row["held_out"] = held_out_rows(rule, config, arguments.held_out, device)
+                ratios = [entry["psnr"] for entry in row["held_out"]]
+                print(path.stem, "held out", round(statistics.mean(ratios), 2), "dB", flush=True)
+        found[path.stem] = row
+        write_record(arguments.out / "many_pictures.json", record(arguments, found))
+    print("ratios of medians", ratios_of(found))
+
+
+def control_rows(rule: npa_envs.NPARule, config: Any, device: str) -> dict[str, list[Any]]:
+    """Return what a rule of one picture grows, at each of `STEPS`."""
+    task = Morphogenesis2D(config, device=device)
+    found = {}
+    for step in STEPS:
+        x, s = (part[0] for part in grown(rule, [task], step=step, seeds=SEEDS, device=device))
+        loss = task.metric(x, s).mean().item()
+        ratio = psnr(task.picture(x, s), task.target_picture).mean().item()
+        found[str(step)] = [{"target": task.target.name, "loss": loss, "psnr": ratio}]
+    return found
+
+
+def held_out_rows(
+    rule: npa_envs.NPARule, config: Any, held_out: Sequence[str], device: str
+) -> list[dict[str, Any]]:
+    """Return what a rule grows from pictures that only its encoder sees, at the second of `STEPS`.
+
+    Beside it the PSNR of a blank picture, and of the trained picture that comes closest.
+    """
+    known = tasks_of_pictures(rule, config, device=device)
+    tasks = [
+        Morphogenesis2D(replace(config, target=source, targets=()), device=device).for_rule(rule)
+        for source in named_targets(held_out).values()
+    ]
+    rows = picture_rows(rule, tasks, step=STEPS[1], seeds=SEEDS, device=device)
+    return [asdict(row) | floors(row, task, known) for row, task in zip(rows, tasks, strict=False)]
+
+
+def floors(
+    row: PictureRow, task: Morphogenesis2D, known: Sequence[Morphogenesis2D]
+) -> dict[str, Any]:
+    """Return how close a blank picture and the closest trained picture come to a target [dB]."""
+    target = task.target_picture
+    blank = psnr(torch.zeros_like(target)[None], target).item()
+    nearest = max(known, key=lambda other: psnr(other.target_picture[None], target).item())
+    closest = psnr(nearest.target_picture[None], target).item()
+    return {"blank": blank, "nearest": nearest.target.name, "nearest_psnr": closest}
+
+
+def ratios_of(found: Mapping[str, Any]) -> dict[str, float]:
+    """Return the median loss of each rule of many pictures over the controls', where both are."""
+    step = str(STEPS[1])
+    controls = {
+        row["rows"][step][0]["target"]: row["rows"][step][0]["loss"]
+        for name, row in found.items()
+        if name.startswith("control-")
+    }
+    if not controls:
+        return {}
+    alone = statistics.median(controls.values())
+    ratios = {}
+    for name, row in found.items():
+        if not name.startswith("control-"):
+            own = [r["loss"] for r in row["rows"][step] if r["target"] in controls]
+            ratios[name] = round(statistics.median(own) / alone, 3)
+    return ratios
+
+
+def main() -> None:
+    """Do what the command line asks for."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("command", choices=("pictures", "ways", "train", "measure"))
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--targets", nargs="+", default=("gecko", "heart"))
+    parser.add_argument("--held-out", nargs="+", default=())
+    parser.add_argument("--kinds", nargs="*", default=())
+    parser.add_argument("--controls", type=int, default=12)
+    parser.add_argument("--size", choices=("local", *SIZES), default="local")
+    parser.add_argument("--iterations", type=int, default=0)
+    parser.add_argument("--many-iterations", type=int, default=0)
+    parser.add_argument("--longest", type=float, default=math.inf)
+    for name in ("world-count", "pool-size", "hidden-dim", "code-dim"):
+        parser.add_argument(f"--{name}", type=int)
+    parser.add_argument("--switch-share", type=float)
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    commands = {"pictures": draw_pictures, "ways": ways, "train": train, "measure": measure}
+    commands[arguments.command](arguments)
+
+
+if __name__ == "__main__":
+    main()

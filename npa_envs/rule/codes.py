@@ -1,0 +1,146 @@
+"""Codes: the numbers by which a rule of many pictures is told which one to grow."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from npa_envs.errors import NPAError, shown, suggest
+
+LARGEST_CODE_COUNT = 65536
+"""No rule knows more codes by name."""
+
+PICTURE_SIDE = 32
+"""Pixels on each side of the pictures that an encoder reads."""
+
+WIDTHS = (16, 32, 64)
+"""Channels of an encoder's layers, each of which halves the picture."""
+
+
+class Codes(nn.Module):
+    """Codes by name, each of `dim` numbers in about [-1, 1] (dimensionless).
+
+    A code is state that a rule perceives and never changes: the first `code_dim` channels of each
+    particle.
+
+    Args:
+        names: What each code stands for, all different.
+        dim: Numbers of a code, K.
+        encoder: Codes are read from pictures by a network, so that a picture that was never trained
+            on has one too. Without, each is learned by itself.
+
+    Raises:
+        NPAError: There are no names, too many, or two are the same.
+    """
+
+    table: Tensor
+    """The codes, shape [T, K]: learned, or what the encoder said last of the pictures."""
+
+    def __init__(self, names: Sequence[str], dim: int, *, encoder: bool = False) -> None:
+        super().__init__()
+        if isinstance(names, str) or not all(isinstance(name, str) for name in names):
+            raise NPAError(f"code_names must be a list of names, got {shown(names)}")
+        if len(set(names)) < len(names) or len(names) > LARGEST_CODE_COUNT:
+            raise NPAError(
+                f"code_names must be different names, at most {LARGEST_CODE_COUNT}, got "
+                f"{shown(list(names))}: leave one of each"
+            )
+        self.names = tuple(names)
+        """What each code stands for."""
+        table = torch.empty(len(names), dim).uniform_(-1.0, 1.0)
+        if encoder:
+            self.register_buffer("table", table.zero_())
+        else:
+            self.table = nn.Parameter(table)
+        self.encoder = PictureEncoder(dim) if encoder else None
+        """Reads codes from pictures, where the rule was trained with one."""
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def number(self, name: str) -> int:
+        """Return the place of a name.
+
+        Raises:
+            NPAError: No code has this name.
+        """
+        if name not in self.names:
+            raise NPAError(f"unknown code {shown(name)}: {suggest(name, self.names)}")
+        return self.names.index(name)
+
+    def __getitem__(self, name: str) -> Tensor:
+        """Return the code of a name, shape [K].
+
+        Raises:
+            NPAError: No code has this name.
+        """
+        return self.table[self.number(name)]
+
+    def blend(self, shares: Mapping[str, float]) -> Tensor:
+        """Return the mean of codes, each weighted by its share, shape [K].
+
+        Args:
+            shares: Weight of each name, for example {"gecko": 0.5, "butterfly": 0.5}.
+
+        Raises:
+            NPAError: A name is unknown, or the weights are not finite or add up to 0 or less.
+        """
+        total = sum(shares.values())
+        if not (math.isfinite(total) and total > 0.0):
+            raise NPAError(
+                f"shares must be finite and add up to more than 0, got {shown(dict(shares))}: "
+                "give each name a weight such as 0.5"
+            )
+        parts = [share / total * self[name] for name, share in shares.items()]
+        return torch.stack(parts).sum(dim=0)
+
+    def encode(self, pictures: Tensor) -> Tensor:
+        """Return the codes of pictures, shape [B, K], differentiable.
+
+        Args:
+            pictures: rgb sums and density, as a task's `target_picture`, shape [B, R, R, 4].
+
+        Raises:
+            NPAError: The rule has no encoder, or the shape is another one.
+        """
+        if self.encoder is None:
+            raise NPAError("this rule has no encoder: train one with encoder=True (--encoder)")
+        if pictures.ndim != 4 or pictures.shape[3] != 4 or pictures.shape[1] != pictures.shape[2]:
+            raise NPAError(
+                f"pictures must have shape [B, R, R, 4], got {tuple(pictures.shape)}: for one "
+                "picture add a dimension with picture[None]"
+            )
+        codes: Tensor = self.encoder(pictures)
+        return codes
+
+
+class PictureEncoder(nn.Module):
+    """A small convolutional network from a picture to a code in [-1, 1].
+
+    Args:
+        dim: Numbers of a code, K.
+    """
+
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        channels = (4, *WIDTHS)
+        self.convolutions = nn.ModuleList(
+            nn.Conv2d(given, made, 3, stride=2, padding=1) for given, made in pairwise(channels)
+        )
+        side = PICTURE_SIDE >> len(WIDTHS)
+        self.output = nn.Linear(WIDTHS[-1] * side * side, dim)
+
+    def forward(self, pictures: Tensor) -> Tensor:
+        """Return the codes of pictures [B, R, R, 4], shape [B, K]."""
+        planes = F.adaptive_avg_pool2d(
+            pictures.to(self.output.weight).permute(0, 3, 1, 2), PICTURE_SIDE
+        )
+        for convolution in self.convolutions:
+            planes = torch.relu(convolution(planes))
+        code: Tensor = torch.tanh(self.output(planes.flatten(1)))
+        return code

@@ -1,0 +1,208 @@
+"""Many pictures by one rule: each world has a target of its own, told by a code."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, Self
+
+import torch
+from torch import Tensor
+
+from npa_envs.errors import NPAError, shown
+from npa_envs.files import home_path
+from npa_envs.rule.codes import Codes
+from npa_envs.rule.rule import NPARule
+from npa_envs.tasks.base import untrained_rule
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
+from npa_envs.tasks.seeds import drawn_indices
+from npa_envs.tasks.targets.images import looks_like_path
+from npa_envs.tasks.targets.points import builtin_targets
+from npa_envs.world.randomness import Randomness, uniform_draws
+
+PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
+"""Files of a folder that are targets."""
+
+
+def named_targets(targets: Sequence[str]) -> dict[str, str]:
+    """Return what a list of targets holds: name -> what `load_target` takes, in their order.
+
+    Args:
+        targets: Built-in names, emoji, picture files, and folders, which stand for the pictures in
+            them, sorted by name. A file's name is its own without suffix.
+
+    Raises:
+        NPAError: A folder holds no pictures, or two targets have the same name.
+    """
+    named: dict[str, str] = {}
+    for target in targets:
+        for source in _pictures_of(target):
+            is_file = source not in builtin_targets() and looks_like_path(source)
+            name = home_path(source).stem if is_file else source
+            if name in named:
+                raise NPAError(
+                    f"targets must have different names, got {shown(name)} twice: leave one out, "
+                    "or rename a file"
+                )
+            named[name] = source
+    return named
+
+
+def _pictures_of(target: str) -> list[str]:
+    folder = home_path(target)
+    if target in builtin_targets() or not folder.is_dir():
+        return [target]
+    files = sorted(path for path in folder.iterdir() if path.suffix.lower() in PICTURE_SUFFIXES)
+    if not files:
+        raise NPAError(
+            f"a folder of targets must hold pictures ({', '.join(PICTURE_SUFFIXES)}), "
+            f"{shown(target)} does not"
+        )
+    return [str(path) for path in files]
+
+
+class ManyPictures(Morphogenesis2D):
+    """Morphogenesis of several targets by one rule; satisfies `GoalTask` and `CodedTask`.
+
+    A world's goal is the place of its target among `targets`. Particles of all targets are drawn
+    equally large, and pictures are scaled so that each target's density is about 1.
+
+    Args:
+        config: As for `Morphogenesis2D`; `targets` says what to grow.
+        device: Where the targets' pictures are kept and worlds are compared with them.
+
+    Raises:
+        NPAError: There are no targets, one cannot be loaded, or the rule is to know no direction.
+    """
+
+    def __init__(
+        self, config: Morphogenesis2DConfig, *, device: str | torch.device = "cpu"
+    ) -> None:
+        named = named_targets(config.targets)
+        if not named:
+            raise NPAError("targets must name something to grow, got none: --targets gecko heart")
+        if config.equivariant:
+            raise NPAError(
+                "targets need a rule that knows directions, got equivariant=True: leave one out"
+            )
+        alone = [
+            Morphogenesis2D(replace(config, target=source, targets=()), device=device)
+            for source in named.values()
+        ]
+        super().__init__(config, target=alone[0].target, device=device)
+        self.names = tuple(named)
+        """Names of the targets."""
+        sizes = torch.tensor([task.target.pixel_size for task in alone])
+        self._pixel_size = float(sizes.square().mean().sqrt())
+        self._scales = (sizes / self._pixel_size).square().to(device)
+        self._goal: Tensor | None = None
+        self._codes: Codes | None = None
+        drawn = [
+            self._splat(task.target.points[None], task.target.colours[None])[0] for task in alone
+        ]
+        self._target_pictures = torch.stack(drawn) * self._scales[:, None, None, None]
+        self._target_mean = torch.zeros_like(self._target_mean)
+
+    @property
+    def rule_shape(self) -> dict[str, Any]:
+        """What `NPARule` takes besides the hidden width and ε0."""
+        config = self.config
+        return super().rule_shape | {
+            "state_dim": config.code_dim + config.state_dim,
+            "code_dim": config.code_dim,
+            "code_names": self.names,
+            "encoder": config.encoder,
+        }
+
+    def make_rule(self, generator: torch.Generator) -> NPARule:
+        """Return an untrained rule on the CPU; its weights are drawn from `generator`."""
+        config = self.config
+        return untrained_rule(
+            generator, hidden_dim=config.hidden_dim, eps0=config.eps, **self.rule_shape
+        )
+
+    def for_rule(self, rule: NPARule) -> Self:
+        """Return the task whose worlds carry the codes of a rule."""
+        return self._with(_codes=rule.codes)
+
+    def toward(self, goal: Tensor) -> Self:
+        """Return the task with loss and metric for worlds of these targets, int64, shape [B]."""
+        return self._with(_goal=goal)
+
+    def seed(
+        self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
+    ) -> tuple[Tensor, Tensor]:
+        """Return fresh worlds without their goals; as `seed_with_goals`."""
+        return self.seed_with_goals(world_count, generator=generator, device=device)[:2]
+
+    def seed_with_goals(
+        self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return fresh worlds of random targets, with their goals, int64, shape [B].
+
+        Args:
+            world_count: Worlds B.
+            generator: Source of positions and targets, on `device`.
+            device: Where the worlds are made.
+        """
+        x, s = super().seed(world_count, generator=generator, device=device)
+        goal = drawn_indices(len(self.names), world_count, generator, torch.device(device))
+        blank = s.new_zeros(*s.shape[:2], self.config.code_dim)
+        return x, self.toward(goal).coded(torch.cat((blank, s), dim=-1)).detach(), goal
+
+    def damage_with_goals(
+        self, x: Tensor, s: Tensor, goal: Tensor, generator: Randomness
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the worlds damaged, some with another target, and their goals."""
+        x, s = self.damage(x, s, generator)
+        if self.config.switch_share == 0.0:
+            return x, s, goal
+        other = drawn_indices(len(self.names), len(x), generator, x.device)
+        single = x.new_empty(0, dtype=torch.float32)
+        switched = uniform_draws(generator, (len(x), 1), single)[:, 0] < self.config.switch_share
+        return x, s, torch.where(switched, other, goal)
+
+    def coded(self, s: Tensor) -> Tensor:
+        """Return states with the codes of their worlds' goals, differentiable in the codes."""
+        if self._codes is None or self._goal is None:
+            return s
+        table = self._codes.table
+        if self._codes.encoder is not None:
+            codes = self._codes.encode(self._target_pictures)
+            # What files and users read.
+            with torch.no_grad():
+                table.copy_(codes)
+            table = codes
+        code = table.index_select(0, self._goal).to(s)[:, None].expand(-1, s.shape[1], -1)
+        return torch.cat((code, s[..., self.config.code_dim :]), dim=-1)
+
+    @property
+    def target_picture(self) -> Tensor:
+        """Pictures of the worlds' targets: rgb sums and density, shape [B, R, R, 4].
+
+        Raises:
+            NPAError: The goals have not been said by `toward`.
+        """
+        if self._goal is None:
+            raise NPAError("the worlds' targets must be given first: task.toward(goal), int64 [B]")
+        return self._target_pictures.index_select(0, self._goal)
+
+    def splat_losses(self, x: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Return each world's density loss and colour loss, dimensionless, shape [B] each."""
+        return self._mean_errors(x, s)
+
+    def picture(self, x: Tensor, s: Tensor, *, centred: bool = True) -> Tensor:
+        """Return each world's picture: colour sums and density, dimensionless, [B, R, R, 4].
+
+        Without goals, densities are those of a target of the mean size.
+        """
+        picture = super().picture(x, s, centred=centred)
+        if self._goal is None:
+            return picture
+        return picture * self._scales.index_select(0, self._goal).to(picture)[:, None, None, None]
+
+    def _with(self, **fields: object) -> Self:
+        bound = copy.copy(self)
+        vars(bound).update(fields)
+        return bound

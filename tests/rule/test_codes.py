@@ -1,0 +1,146 @@
+"""Rules with codes: the code stays, it is perceived, and files, blends and encoders keep it."""
+
+import json
+
+import pytest
+import torch
+from test_rule_files import assert_same_rule
+from worlds import assert_near, lively_rule, random_world
+
+import npa_envs
+from npa_envs.errors import NPAError
+from npa_envs.rule.files import rule_metadata
+from npa_envs.rule.rule import NPARule, with_codes
+
+NAMES = ("gecko", "heart", "ring")
+
+
+def coded(device="cpu", dtype=torch.float64, **options):
+    """Return a rule of seven channels, three of which are a code."""
+    options = {"state_dim": 7, "code_dim": 3, "code_names": NAMES, "eps0": 0.3, **options}
+    return lively_rule(device, dtype, **options)
+
+
+def world_of(rule, device="cpu", world_count=2):
+    x, s = random_world(world_count, 60, 2, rule.state_dim, dtype=torch.float64, device=device)
+    return x, s.to(rule.hidden.weight)
+
+
+@pytest.mark.parametrize("static", [False, True])
+def test_a_code_stays_as_it_is_and_all_else_changes(static, device):
+    rule = coded(device, static=static)
+    x, s = world_of(rule, device)
+    with torch.no_grad():
+        x, after = npa_envs.rollout(rule, x, s, 5)
+    assert torch.equal(after[..., :3], s[..., :3])
+    assert float((after[..., 3:] - s[..., 3:]).abs().mean(dim=(0, 1)).min()) > 1e-3
+
+
+def test_the_folded_rule_and_the_module_say_the_same(device):
+    rule = coded(device)
+    x, s = world_of(rule, device)
+    perception = npa_envs.perceive(x, s, eps=0.3)
+    rows = torch.nn.functional.pad(perception, (0, 1), value=1.0)
+    rows = torch.nn.functional.pad(rows, (0, rule.folded().row_width - rows.shape[-1]))
+    folded = rule.folded()(rows.flatten(0, 1))[:, : rule.update_dim]
+    assert_near(folded, rule(perception).flatten(0, 1), 1e-12)
+
+
+def test_gradients_reach_the_codes(device):
+    rule = coded(device)
+    x, s = world_of(rule, device)
+    for name in ("gecko", "heart"):
+        _, after = npa_envs.rollout(rule, x, rule.with_code(s, rule.codes[name]), 3)
+        (gradient,) = torch.autograd.grad(after[..., 3:].square().sum(), rule.codes.table)
+        row = NAMES.index(name)
+        assert float(gradient[row].abs().min()) > 0.0
+        assert float(gradient.abs().sum()) == pytest.approx(float(gradient[row].abs().sum()))
+
+
+def test_a_part_of_the_particles_can_carry_another_code():
+    rule = coded()
+    _, s = world_of(rule)
+    left = torch.arange(60) < 20
+    mixed = torch.where(left[:, None], rule.codes["gecko"], rule.codes["ring"])
+    carried = rule.with_code(s, mixed.expand(2, -1, -1))
+    assert torch.equal(carried[:, :20, :3], rule.codes["gecko"].expand(2, 20, 3))
+    assert torch.equal(carried[:, 20:, :3], rule.codes["ring"].expand(2, 40, 3))
+    assert torch.equal(carried[..., 3:], s[..., 3:])
+    with pytest.raises(NPAError, match=r"code must have shape \[K\]"):
+        rule.with_code(s, torch.zeros(4))
+    with pytest.raises(NPAError, match="has no codes"):
+        lively_rule("cpu").with_code(s, torch.zeros(3))
+
+
+def test_codes_are_read_by_name_and_blended_by_shares():
+    codes = coded().codes
+    assert codes.names == NAMES
+    assert torch.equal(codes["heart"], codes.table[1])
+    blend = codes.blend({"gecko": 1.0, "ring": 3.0})
+    assert_near(blend, 0.25 * codes.table[0] + 0.75 * codes.table[2], 1e-12)
+    with pytest.raises(NPAError, match=r"unknown code 'hart'.*heart"):
+        codes["hart"]
+    with pytest.raises(NPAError, match="add up to more than 0"):
+        codes.blend({"gecko": 1.0, "ring": -1.0})
+
+
+@pytest.mark.parametrize("encoder", [False, True])
+def test_a_file_holds_codes_names_and_encoder(encoder, tmp_path):
+    rule = coded(dtype=torch.float32, encoder=encoder)
+    path = tmp_path / "rule.safetensors"
+    npa_envs.save_rule(rule, path)
+    loaded = npa_envs.load_rule(path)
+    assert_same_rule(loaded, rule)
+    assert loaded.codes.names == NAMES
+    assert rule_metadata(path)["version"] == "3"
+    picture = torch.rand(2, 48, 48, 4)
+    if encoder:
+        assert torch.equal(loaded.codes.encode(picture), rule.codes.encode(picture))
+        assert loaded.codes.encode(picture).shape == (2, 3)
+        assert float(loaded.codes.encode(picture).detach().abs().max()) < 1.0
+        with pytest.raises(NPAError, match=r"shape \[B, R, R, 4\]"):
+            loaded.codes.encode(picture[0])
+    else:
+        with pytest.raises(NPAError, match="has no encoder"):
+            loaded.codes.encode(picture)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"code_dim": 7}, "code_dim must be at least 0 and below state_dim = 7"),
+        ({"code_dim": 0}, "go together"),
+        ({"code_names": ()}, "go together"),
+        ({"code_names": ("a", "a")}, "must be different names"),
+        ({"equivariant": True}, "an equivariant rule has no codes"),
+    ],
+)
+def test_codes_that_do_not_go_together_are_refused(options, message):
+    with pytest.raises(NPAError, match=message):
+        coded(**options)
+
+
+def test_a_rule_without_codes_gives_its_weights_to_one_with_codes():
+    plain = lively_rule("cpu", state_dim=4, eps0=0.3)
+    wider = with_codes(plain, coded(hidden_dim=20))
+    x, s = world_of(wider)
+    wider_s = wider.with_code(s, torch.zeros(3))
+    with torch.no_grad():
+        # Without the further hidden units it does what the plain rule does.
+        wider.output.weight[:, 12:] = 0.0
+    random = [npa_envs.WorldRandom([1, 2]) for _ in range(2)]
+    ours = npa_envs.rollout(wider, x, wider_s, 4, generator=random[0])
+    theirs = npa_envs.rollout(plain, x, s[..., 3:], 4, generator=random[1])
+    assert_near(ours[0], theirs[0], 1e-12)
+    assert_near(ours[1][..., 3:], theirs[1], 1e-12)
+    other = lively_rule("cpu", state_dim=6, eps0=0.3)
+    assert with_codes(other, coded()) is other
+
+
+def test_plain_rules_say_nothing_of_codes(tmp_path):
+    rule = NPARule(hidden_dim=4)
+    npa_envs.save_rule(rule, tmp_path / "plain.safetensors")
+    header = rule_metadata(tmp_path / "plain.safetensors")
+    assert "code" not in json.dumps(header)
+    assert rule.codes is None
+    assert header["version"] == "1"

@@ -1,0 +1,195 @@
+"""One rule of many pictures: targets, goals, what is compared, training, files, the command."""
+
+import json
+
+import pytest
+import torch
+from PIL import Image
+from training_runs import make_cycle
+
+import npa_envs
+from npa_envs.cli import main
+from npa_envs.errors import NPAError
+from npa_envs.measure.codes import picture_rows, tasks_of_pictures
+from npa_envs.tasks.many_pictures import ManyPictures, named_targets
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
+from npa_envs.training import Trainer, preset
+from npa_envs.training.trained_tasks import task_of_rule
+
+SMALL = {
+    "particle_count": 48, "target_point_count": 48, "state_dim": 5, "hidden_dim": 8,
+    "resolution": 16, "eps": 0.4, "code_dim": 3,
+}  # fmt: skip
+TARGETS = ("heart", "ring", "letter-a")
+
+
+def config_of(**fields):
+    return Morphogenesis2DConfig(**{"targets": TARGETS, **SMALL, **fields})
+
+
+def task_of(device="cpu", **fields):
+    return ManyPictures(config_of(**fields), device=device)
+
+
+def generator(seed=0, device="cpu"):
+    return torch.Generator(device).manual_seed(seed)
+
+
+def square(path, colour):
+    Image.new("RGBA", (8, 8), colour).save(path)
+    return str(path)
+
+
+def test_a_folder_stands_for_its_pictures(tmp_path):
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    for name in ("b.png", "a.webp"):
+        square(folder / name, "red")
+    (folder / "notes.txt").write_text("no picture")
+    named = named_targets(("heart", str(folder)))
+    assert list(named) == ["heart", "a", "b"]
+    assert named["b"] == str(folder / "b.png")
+    with pytest.raises(NPAError, match=r"different names, got 'a' twice"):
+        named_targets((str(folder), str(folder / "a.webp")))
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    with pytest.raises(NPAError, match="a folder of targets must hold pictures"):
+        named_targets((str(empty),))
+
+
+def test_each_world_is_compared_with_its_own_target(device):
+    task = task_of(device)
+    singles = [
+        Morphogenesis2D(config_of(target=name, targets=()), device=device) for name in TARGETS
+    ]
+    goal = torch.tensor([2, 0, 1], device=device)
+    aimed = task.toward(goal)
+    worlds = [singles[k].target for k in goal.tolist()]
+    for number, target in enumerate(worlds):
+        x = target.points[None].expand(3, -1, -1)
+        s = torch.zeros(3, target.point_count, 8, device=device)
+        s[..., -3:] = target.colours - 0.5
+        losses = aimed.metric(x, s)
+        assert int(losses.argmin()) == number
+        assert float(losses[number]) < 0.2 * float(losses.sum()) / 3
+        # The target itself has the density that it has alone, whatever its size.
+        own, alone = aimed.target_picture[number], singles[int(goal[number])].target_picture
+        assert float(own[..., 3].sum()) == pytest.approx(float(alone[..., 3].sum()), rel=0.1)
+
+
+def test_gradients_of_the_loss_reach_the_worlds_codes_alone(device):
+    task = task_of(device)
+    rule = task.make_rule(generator()).to(device)
+    task = task.for_rule(rule)
+    x, s, goal = task.seed_with_goals(2, generator=generator(1, device), device=device)
+    goal.fill_(1)
+    aimed = task.toward(goal)
+    s = aimed.coded(s)
+    assert torch.equal(s[..., :3], rule.codes.table[1].expand(2, 48, 3))
+    x, s, path = npa_envs.rollout(rule, x, s, 3, eps=task.eps, return_path_length=True)
+    total, parts = aimed.loss(x, s, path)
+    (gradient,) = torch.autograd.grad(total, rule.codes.table)
+    assert float(gradient[1].abs().min()) > 0.0
+    assert float(gradient[[0, 2]].abs().max()) == 0.0
+    assert {"density", "colour", "overflow"} <= parts.keys()
+
+
+def test_switched_worlds_get_another_goal_and_its_code(device):
+    task = task_of(device, switch_share=1.0, targets=("heart", "ring"))
+    task = task.for_rule(task.make_rule(generator()).to(device))
+    x, s, goal = task.seed_with_goals(16, generator=generator(1, device), device=device)
+    _, hurt, switched = task.damage_with_goals(x, s, goal, generator(2, device))
+    assert 0 < int((switched != goal).sum()) < 16
+    after = task.toward(switched).coded(hurt)
+    codes = after[..., :3].unique(dim=1)[:, 0]
+    assert len(codes.unique(dim=0)) == 2
+    kept = task_of(device, switch_share=0.0)
+    assert torch.equal(kept.damage_with_goals(x, s, goal, generator(2, device))[2], goal)
+
+
+@pytest.mark.parametrize("encoder", [False, True])
+def test_training_changes_codes_and_keeps_them_with_their_worlds(encoder):
+    task = task_of(encoder=encoder)
+    config = preset(
+        "tiny", **SMALL, targets=TARGETS, encoder=encoder, steps=(2, 4), pool_size=6, seed=3
+    )
+    cycle, rule = make_cycle(config, task)
+    before = rule.codes.table.detach().clone()
+    for iteration in range(3):
+        cycle.run(iteration)
+    moved = (rule.codes.table.detach() - before).abs().sum(dim=1)
+    assert int((moved > 0.0).sum()) >= (3 if encoder else 1)
+    goal, x0, s0 = cycle.batch.goal, cycle.batch.s0, cycle.batch.s
+    assert torch.equal(x0[..., :3], s0[..., :3])
+    assert x0[..., :3].unique(dim=1).shape[1] == 1
+    assert goal.shape == (2,)
+
+
+def test_a_resumed_run_is_the_same_run(tmp_path):
+    def trainer_of(name, **options):
+        config = preset("tiny", **SMALL, targets=TARGETS, iterations=6, out=tmp_path / name)
+        task = ManyPictures(config.task)
+        return Trainer(task, config, task_name="morphogenesis2d", **options)
+
+    straight = trainer_of("straight")
+    straight.run(progress=False)
+    stopped = trainer_of("stopped")
+    for _ in range(3):
+        stopped.iterate()
+    stopped.save()
+    resumed = trainer_of("stopped", resume=True)
+    resumed.run(progress=False)
+    assert torch.equal(resumed.rule.codes.table, straight.rule.codes.table)
+    assert torch.equal(resumed.rule.hidden.weight, straight.rule.hidden.weight)
+    assert torch.equal(resumed.pool.s, straight.pool.s)
+
+
+def test_the_command_trains_and_evaluates_by_name(tmp_path, capsys):
+    out = str(tmp_path / "many")
+    small = [f"--{name.replace('_', '-')}={value}" for name, value in SMALL.items()]
+    words = ["--preset=tiny", *small, "--iterations=2", "--no-progress", "--no-report"]
+    assert main(["train", "morphogenesis2d", "--targets", *TARGETS, f"--out={out}", *words]) == 0
+    assert "learns heart and ring and letter-a" in capsys.readouterr().out
+    rule = npa_envs.load_rule(f"{out}/rule.safetensors")
+    assert rule.codes.names == TARGETS
+    assert rule.state_dim == 8
+    task = task_of_rule(f"{out}/rule.safetensors", rule, torch.device("cpu"), target="ring").task
+    assert task.target.name == "ring"
+    _, s = task.seed(1, generator=generator())
+    assert torch.equal(s[0, :, :3], rule.codes["ring"].expand(48, 3))
+    first = task_of_rule(f"{out}/rule.safetensors", rule, torch.device("cpu")).task
+    assert first.target.name == "heart"
+    options = ["--no-progress", "--seed-count=1", "--checkpoints", "4"]
+    assert main(["evaluate", out, "--target=letter-a", *options, "--json", f"{out}/one.json"]) == 0
+    assert json.loads((tmp_path / "many" / "one.json").read_text())["growth"][0]["step"] == 4
+    assert main(["evaluate", out, "--target=gecko", *options]) == 2
+    assert "unknown code 'gecko'" in capsys.readouterr().err
+
+
+def test_rows_tell_the_right_code_from_another():
+    config = config_of()
+    rule = ManyPictures(config).make_rule(generator())
+    tasks = tasks_of_pictures(rule, config, device="cpu")
+    rows = picture_rows(rule, tasks, step=2, seeds=(1, 2))
+    assert [row.target for row in rows] == [*TARGETS, "(median)"]
+    assert rows[-1].loss == sorted(row.loss for row in rows[:3])[1]
+    # A rule that has learned nothing does not care: all worlds stay disks.
+    x, s = tasks[0].seed(2, generator=npa_envs.WorldRandom((1, 2)))
+    assert rows[0].loss == pytest.approx(float(tasks[0].metric(x, s).mean()), rel=0.2)
+    with pytest.raises(NPAError, match="two or more"):
+        picture_rows(rule, tasks[:1], step=2, seeds=(1,))
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"targets": ["heart"]}, "targets must be a tuple"),
+        ({"code_dim": 0}, "code_dim must be a whole number of at least 1"),
+        ({"switch_share": 1.5}, "switch_share must be at most 1"),
+        ({"equivariant": True}, "targets need a rule that knows directions"),
+        ({"targets": ("heart", "hart")}, "unknown|emoji"),
+    ],
+)
+def test_what_cannot_be_is_refused(fields, message):
+    with pytest.raises(NPAError, match=message):
+        task_of(**fields)
