@@ -40,6 +40,9 @@ class MultiSpeciesEnv(CrowdEnv):
     `npa_envs.registration.SPECIES_SIZES` holds their keywords. `parallel_env`, `env`, `raw_env` and
     `batched` take ids instead of tasks as well.
 
+    With `opponent="random"` the environment plays the invaders, by actions uniform in [-1, 1], and
+    `species_0` is the only agent. The invaders are perceived and drawn, and are in `state()`.
+
     In `parallel_env` all agents act at once. In `env` and `raw_env` they act in turn, by
     PettingZoo's own conversion, and the world moves on after the last one. `env` also clips actions
     into their space. The ids are for `pettingzoo.make`, of PettingZoo 1.27 or newer, once

@@ -200,13 +200,15 @@ class Problem:
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """Particles of each species; of the only one where it is alone."""
+        """Particles of each species that is an agent; of the only one where it is alone."""
         config = self.config
-        return config.counts if isinstance(config, SpeciesConfig) else (config.particle_count,)
+        if isinstance(config, SpeciesConfig):
+            return config.played_counts
+        return (config.particle_count,)
 
     @property
     def particle_count(self) -> int:
-        """Particles of a world, N."""
+        """Particles of a world that are acted upon, N."""
         return sum(self.counts)
 
     def make_task(self, device: str | torch.device = "cpu") -> EnvTask[Any] | SpeciesTask:
@@ -413,8 +415,8 @@ class ConcatenatedSpeciesEnv:
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
         self.worlds = WorldFacts(env.worlds.physics, env.worlds.perception_dim, episode_steps)
         """The worlds' constants."""
-        ends = accumulate(env.config.counts)
-        spans = [slice(end - n, end) for end, n in zip(ends, env.config.counts, strict=True)]
+        counts = env.config.played_counts
+        spans = [slice(end - n, end) for end, n in zip(accumulate(counts), counts, strict=True)]
         self.spans = dict(zip(env.agents, spans, strict=True))
         """Where each species' particles stand."""
         self.single_observation_space = _concatenated_space(env.single_observation_spaces)

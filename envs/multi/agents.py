@@ -53,13 +53,14 @@ class AgentsEnv:
         """Steps after which an episode is cut off for all."""
         self.worlds = worlds = episodes.worlds
         """The particles."""
-        word = "particle" if by_particle else "species"
-        self.possible_agents = [f"{word}_{k}" for k in range(worlds.agent_count)]
+        played = self.config.played_counts
+        word, count = ("particle", sum(played)) if by_particle else ("species", len(played))
+        self.possible_agents = [f"{word}_{k}" for k in range(count)]
         """Names of the agents."""
         limit = worlds.physics.perception_limit
         self._observation_spaces: dict[str, Box] = {}
         self._action_spaces: dict[str, Box] = {}
-        for agent, span in zip(self.possible_agents, episodes.spans, strict=True):
+        for agent, span in zip(self.possible_agents, episodes.spans[:count], strict=True):
             ahead = () if by_particle else (span.stop - span.start,)
             seen, done = (*ahead, worlds.perception_dim), (*ahead, worlds.physics.action_dim)
             self._observation_spaces[agent] = Box(-limit, limit, seen, np.float32)

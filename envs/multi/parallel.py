@@ -177,7 +177,8 @@ class CrowdEnv(AgentsEnv, pettingzoo.ParallelEnv):  # type: ignore[misc]
 
     def _count_agents(self) -> None:
         """Take down who is to act next."""
-        self._live = np.flatnonzero(self._episodes.live[0]).tolist()
+        played = len(self.possible_agents)
+        self._live = np.flatnonzero(self._episodes.live[0, :played]).tolist()
         self.agents = [self.possible_agents[k] for k in self._live]
 
     def _everyones(self, action: Tensor) -> Tensor:
@@ -186,7 +187,7 @@ class CrowdEnv(AgentsEnv, pettingzoo.ParallelEnv):  # type: ignore[misc]
         if len(action) == count:
             return action[None]
         everyone = action.new_zeros(1, count, action.shape[1])
-        live = self._episodes.live[0][self.worlds.owner]
+        live = np.isin(self.worlds.owner, self._live)
         everyone[0, torch.from_numpy(live).to(action.device)] = action
         return everyone
 

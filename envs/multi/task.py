@@ -111,6 +111,11 @@ class SpeciesConfig(WorldConfig):
         return tuple(share + int(k < rest) for k in range(self.species_count))
 
     @property
+    def played_counts(self) -> tuple[int, ...]:
+        """Particles of each species that is an agent; the environment plays those after them."""
+        return self.counts
+
+    @property
     def seed_span(self) -> float:
         """How far from the origin particles start at most [length units]."""
         return self.seed_radius + 0.5 * (self.species_count - 1) * self.seed_distance
@@ -248,6 +253,16 @@ class SpeciesTask(WorldTask[Any]):
             population: At least one particle.
         """
         raise NotImplementedError
+
+    def played(self, action: Tensor, population: Population, random: WorldRandom) -> Tensor:
+        """Return what all particles do; by default agents play all species.
+
+        Args:
+            action: What agents tell all particles, anything for those of no agent, [B, N, A].
+            population: Who is there.
+            random: One stream a world, as it stands before the step.
+        """
+        return action
 
     def settle(self, rewards: Tensor, live: Tensor, species: Tensor) -> Tensor:
         """Return what agents are paid; by default what each has earned.

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from gymnasium import Space
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
@@ -156,7 +157,8 @@ class MultiSpeciesVectorEnv(AgentsEnv):
         shapes = [(self.world_count, *space.shape) for space in self.single_action_spaces.values()]
         with worlds.here():
             action = joined_actions(actions, self.possible_agents, shapes, worlds.device)
-            outcome = self._episodes.step(action)
+            rest = worlds.particle_count - action.shape[1]
+            outcome = self._episodes.step(F.pad(action, (0, 0, 0, rest)) if rest else action)
             observation, final = outcome.observation, None
             over = np.flatnonzero(~worlds.open)
             if len(over) and self.autoreset_mode is AutoresetMode.SAME_STEP:
@@ -219,17 +221,14 @@ class MultiSpeciesVectorEnv(AgentsEnv):
         return infos
 
     def _rows(self, observation: Tensor) -> ByAgent:
-        """Return what particles perceive, [B, N, P], species by species."""
-        rows = self._out(observation)
-        spans = self._episodes.spans
-        return {
-            agent: rows[:, span] for agent, span in zip(self.possible_agents, spans, strict=True)
-        }
+        """Return what particles perceive, [B, N, P], agent by agent."""
+        rows, spans = self._out(observation), self._episodes.spans
+        return {agent: rows[:, spans[k]] for k, agent in enumerate(self.possible_agents)}
 
     def _columns(self, values: Tensor) -> ByAgent:
-        """Return values of shape [B, K] species by species, shape [B] each."""
+        """Return values of shape [B, K] agent by agent, shape [B] each."""
         columns = self._out(values.T.contiguous())
-        return dict(zip(self.possible_agents, columns, strict=True))
+        return {agent: columns[k] for k, agent in enumerate(self.possible_agents)}
 
     def _sent(self, values: NDArray[Any]) -> Tensor:
         """Return an array where results are wanted: on the device, or not."""

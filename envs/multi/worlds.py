@@ -565,6 +565,7 @@ class Cohort:
 
     def act(self, action: Tensor) -> None:
         """Apply finite actions, shape [M, N now, A], and see what came of them without waiting."""
+        action = self._judge.task.played(action, self.population, self.random)
         self._draw()
         self._actions.apply(action)
         self._look()

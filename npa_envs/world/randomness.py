@@ -34,6 +34,10 @@ class Purpose(enum.IntEnum):
     """Particles are told apart."""
     GOAL = 5
     """What an episode is to come to."""
+    OPPONENT = 6
+    """An opponent that the environment plays acts at random."""
+    TEST = 7
+    """What episodes that evaluate begin with, where those to learn from would draw it too."""
 
 
 class WorldRandom:

@@ -11,6 +11,7 @@ from small_envs import assert_same
 import npa_envs
 from npa_envs.envs import multispecies_v0, particles_v0
 from npa_envs.errors import NPAError
+from npa_envs.world.randomness import Purpose
 
 
 def test_turns_lead_to_the_same_world_as_acting_at_once():
@@ -120,6 +121,54 @@ def test_an_invasion_is_over_when_one_side_is_gone(dead):
     assert infos[f"species_{1 - dead}"]["reason"] == "no opponent"
     assert rewards["species_0"] == -rewards["species_1"] != 0.0
     assert env.agents == []
+
+
+def test_an_opponent_acts_as_agents_would_that_act_uniformly_at_random():
+    both, alone = make("invasion"), make("invasion", opponent="random")
+    assert alone.possible_agents == ["species_0"]
+    agents = both.possible_agents
+    for env in (both, alone):
+        env.reset(seed=3)
+    generator = np.random.default_rng(0)
+    moved = 0.0
+    for _ in range(4):
+        actions = drawn(both, generator)
+        shape = sum(len(actions[agent]) for agent in agents), actions["species_1"].shape[1]
+        random = both.worlds.random.beside(Purpose.OPPONENT)
+        invaders = 2.0 * random.uniform(*shape)[0] - 1.0
+        actions["species_1"] = invaders[len(actions["species_0"]) :]
+        moved += float(actions["species_1"].abs().mean())
+        expected, paid, *_ = both.step(actions)
+        seen, own, *_ = alone.step({"species_0": actions["species_0"]})
+        assert np.array_equal(seen["species_0"], expected["species_0"])
+        assert own == {"species_0": paid["species_0"]}
+        assert torch.equal(alone.particles()[0], both.particles()[0])
+    assert moved / 4 == pytest.approx(0.5, abs=0.05)
+    with pytest.raises(NPAError, match="opponent must be a known word, got 'rnadom': did you mean"):
+        make("invasion", opponent="rnadom")
+
+
+@pytest.mark.parametrize("dead", [0, 1])
+def test_an_episode_against_an_opponent_ends_when_one_side_is_gone(dead):
+    env = make("invasion", opponent="random", deaths=((dead, 2),))
+    env.reset(seed=0)
+    for ended in (False, True):
+        _, _, terminations, _, infos = env.step(still(env))
+        assert terminations == {"species_0": ended}
+    assert infos["species_0"]["reason"] == ("removed" if dead == 0 else "no opponent")
+    assert env.agents == []
+
+
+def test_particles_of_one_species_can_be_agents_against_an_opponent():
+    env = particles_v0.parallel_env("invasion", opponent="random", particle_counts=(3, 5))
+    observations, _ = env.reset(seed=0)
+    assert list(observations) == ["particle_0", "particle_1", "particle_2"]
+    assert len(env.particles()[0]) == 8
+    before = env.particles()[0]
+    env.step(still(env))
+    moved = (env.particles()[0] != before).any(dim=1)
+    assert not moved[:3].any()
+    assert moved[3:].any()
 
 
 def test_a_world_without_particles_can_be_drawn_and_described():

@@ -364,6 +364,7 @@ class Crowd:
             "on_divergence": draw.choice(("terminate", "terminate", "raise", "ignore")),
             "reward": "individual" if task == "invasion" else draw.choice(("individual", "team")),
             "perception": draw.choice(("shared", "per_species")),
+            **({"opponent": draw.choice((None, "random"))} if task == "invasion" else {}),
             "deaths": draw.choice(((), (), ((1, 2),), ((0, 1), (1, 3)))),
             "position_limit": draw.choice((4.0, 1.5)),
         }
@@ -495,13 +496,14 @@ class Crowd:
         assert self.env.agents == [a for a in acted if not (ended[a] or late[a])]
         if any(ended.values()):
             self.loss = {a: self.numbers()[a] for a in self.env.agents}
-        if self.fields["task"] == "invasion":
+        if self.fields["task"] == "invasion" and self.fields["opponent"] is None:
             assert abs(sum(rewards.values())) <= 1e-6 * (1 + max(map(abs, rewards.values())))
 
     def numbers(self) -> dict[str, Any]:
         """Return losses of the world as it is: deaths and placing change them at no charge."""
         losses = sum(part[0].double() for part in self.parallel.worlds.measured().values())
-        return dict(zip(self.parallel.possible_agents, losses.tolist(), strict=True))
+        # An opponent that the environment plays comes last.
+        return dict(zip(self.parallel.possible_agents, losses.tolist(), strict=False))
 
     def expect_batch(
         self, observations: Any, rewards: Any, ended: Any, late: Any, infos: Any

@@ -13,6 +13,7 @@ from npa_envs import world_mean
 from npa_envs.envs.multi.task import Population, SpeciesConfig, SpeciesTask, by_species
 from npa_envs.errors import NPAError, shown
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
+from npa_envs.world.randomness import Purpose, WorldRandom
 
 USUAL = ("gecko", "heart", "butterfly", "flower", "octopus", "ring")
 """What species grow that are told nothing, in turn."""
@@ -152,7 +153,18 @@ class CoMorphogenesisTask(PictureLossTask):
 
 @dataclass(frozen=True, kw_only=True)
 class InvasionConfig(OnePictureConfig):
-    """As other pictures, but rewards cannot be shared."""
+    """As other pictures, but rewards cannot be shared, and invaders need not be agents."""
+
+    words = OnePictureConfig.words | {"opponent": (None, "random")}
+
+    opponent: str | None = None
+    """Who plays the invaders: None, agents; "random", the environment, with actions uniform in
+    [-1, 1], drawn anew for each particle in each step."""
+
+    @property
+    def played_counts(self) -> tuple[int, ...]:
+        """Particles of each species that is an agent."""
+        return self.counts if self.opponent is None else self.counts[:1]
 
     def __post_init__(self) -> None:
         """Check every field."""
@@ -190,6 +202,13 @@ class InvasionTask(PictureLossTask):
         own_count, other_count = own.shape[1], sum(population.counts[1:])
         share = world_mean(own[..., None])[:, 0] * (-own_count / max(other_count, 1))
         return {"picture": torch.cat((own, share[:, None].expand(-1, other_count)), dim=1)}
+
+    def played(self, action: Tensor, population: Population, random: WorldRandom) -> Tensor:
+        """Return what all particles do: an opponent's, at random."""
+        if self.config.opponent is None:
+            return action
+        drawn = 2.0 * random.beside(Purpose.OPPONENT).uniform(*action.shape[1:]) - 1.0
+        return torch.where((population.species > 0)[:, None], drawn, action)
 
     def settle(self, rewards: Tensor, live: Tensor, species: Tensor) -> Tensor:
         """Return rewards of which the sum is zero: invaders pay in equal parts for species 0."""
