@@ -10,6 +10,9 @@ same worlds with the work queued on the device and nothing of Python's between: 
 what Python costs. `device` is the sum of the kernels' times, `idle` the share of a step without
 any.
 
+With --small only: environment steps a second of the small ids of several B, whole episodes with
+their resets, and no peers. Gardens are measured by benchmarks/gardens.py.
+
 Peers: Gymnasium steps B of our single environments one after the other ("sync") or in B processes
 ("async"). VMAS (github.com/proroklab/VectorizedMultiAgentSimulator), if installed, batches worlds
 of agents in torch; its scenarios with the most agents are counted in agent-steps a second, without
@@ -27,11 +30,15 @@ from typing import Any, NamedTuple
 
 import gymnasium
 import torch
+from torch import Tensor
 from torch.autograd import DeviceType
 from torch.profiler import ProfilerActivity, profile
 
+from npa_envs.agents.learning import Problem
 from npa_envs.measure.record import script_facts, script_parser, write_record
 from npa_envs.measure.speed.timing import synchronize
+from npa_envs.measure.tables import markdown_table
+from npa_envs.registration import SIZES, SPECIES_SIZES
 
 
 class Case(NamedTuple):
@@ -223,6 +230,61 @@ def add_kernels(row: dict[str, Any], device: torch.device, quick: bool) -> None:
             print(f"  {spent:9.2f} µs {spent / total:6.1%} {count:6.1f} x  {kernel['name'][:80]}")
 
 
+# Small worlds
+
+SMALL_STEPS = {
+    row.id: row.max_episode_steps for row in (*SIZES, *SPECIES_SIZES) if "Small" in row.id
+}
+"""Steps of an episode by id."""
+
+SMALL_WORLDS = (1, 8, 64)
+SMALL_SECONDS = 0.3
+
+
+def measure_small(
+    env_id: str, world_count: int, device: torch.device, quick: bool
+) -> dict[str, Any]:
+    """Return the row of so many worlds of a small id."""
+    steps = SMALL_STEPS[env_id]
+    envs: Any = Problem(env_id=env_id, episode_steps=steps).make_envs(world_count, device=device)
+    generator = torch.Generator(device).manual_seed(0)
+    shape = (ACTION_SETS, world_count, *envs.single_action_space.shape)
+    drawn = torch.rand(shape, generator=generator, device=device)
+    actions: list[Tensor] = list(CALM * (2.0 * drawn - 1.0))
+    envs.reset(seed=0)
+
+    def run() -> None:
+        for k in range(steps):
+            envs.step(actions[k % len(actions)])
+
+    envs.step(actions[0])
+    envs.reset(seed=0)
+    times: list[float] = []
+    while not times or (not quick and sum(times) < SMALL_SECONDS):
+        synchronize(device)
+        start = time.perf_counter()
+        run()
+        synchronize(device)
+        times.append(time.perf_counter() - start)
+    taken = statistics.median(times) / steps
+    envs.close()
+    return {
+        "id": env_id,
+        "world_count": world_count,
+        "step_us": taken * 1e6,
+        "steps_per_s": world_count / taken,
+    }
+
+
+def small_table(rows: list[dict[str, Any]]) -> str:
+    """Return environment steps a second, a line for each id, Markdown."""
+    counts = sorted({row["world_count"] for row in rows})
+    found = {(row["id"], row["world_count"]): f"{row['steps_per_s']:.0f}" for row in rows}
+    ids = dict.fromkeys(row["id"] for row in rows)
+    lines = [(f"`{name}`", *(found[name, count] for count in counts)) for name in ids]
+    return markdown_table(("Id", *(f"B {count}" for count in counts)), lines)
+
+
 # Peers
 
 GYMNASIUM_WORLDS, GYMNASIUM_PARTICLES = 8, 1024
@@ -346,11 +408,21 @@ def main() -> None:
     parser = script_parser(__doc__)
     parser.add_argument("--quick", action="store_true", help="tiny worlds: does it run?")
     parser.add_argument("--case", type=int, nargs=2, metavar=("B", "N"), help="only this one")
+    parser.add_argument("--small", action="store_true", help="only small ids")
     parser.add_argument("--skip-peers", action="store_true", help="only these environments")
     parser.add_argument("--skip-own", action="store_true", help="only the peers")
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
     device, quick = torch.device(arguments.device), arguments.quick
+    if arguments.small:
+        counts = SMALL_WORLDS[:1] if quick else SMALL_WORLDS
+        small = []
+        for name in SMALL_STEPS:
+            small += [measure_small(name, count, device, quick) for count in counts]
+            print(small_table(small[-len(counts) :]).splitlines()[-1], flush=True)
+        if arguments.output:
+            write_record(arguments.output, {**script_facts(arguments), "rows": small})
+        return
     cuda = device.type == "cuda"
     cases = QUICK if quick else CUDA if cuda else CPU
     if arguments.case:

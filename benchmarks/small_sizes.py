@@ -25,9 +25,7 @@ from npa_envs.measure.record import script_facts, script_parser, write_record
 from npa_envs.measure.tables import markdown_table
 from npa_envs.registration import SIZES, SPECIES_SIZES
 
-STEPS = {row.id: row.max_episode_steps for row in SIZES if "Small" in row.id} | {
-    row.id: row.keywords["max_cycles"] for row in SPECIES_SIZES
-}
+STEPS = {row.id: row.max_episode_steps for row in (*SIZES, *SPECIES_SIZES) if "Small" in row.id}
 """Steps of an episode by id."""
 
 METHODS = ("zero", "random", "scripted", "ppo", "ppo_world", "gradient")

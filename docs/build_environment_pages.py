@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import importlib
 import inspect
-import json
 import re
 import sys
 import typing
@@ -38,7 +37,7 @@ from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.spaces import Rows
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.envs.garden.environments import GardenEnv
-from npa_envs.registration import ENVIRONMENTS, GARDENS, SIZES, SMALL, Registration
+from npa_envs.registration import ENVIRONMENTS, GARDENS, LATER, SIZES, SMALL, Registration
 
 DOCS = Path(__file__).resolve().parent
 PAGES = DOCS / "environments"
@@ -105,10 +104,11 @@ def argument_tables(config_type: type[EnvConfig]) -> str:
 def small_forms(registration: Registration) -> str:
     """Return what ids with other keywords there are of an environment, Markdown."""
     told = ""
-    for small in (*SMALL, *SIZES):
+    for small in (*SMALL, *SIZES, *LATER):
         if small.name == registration.name:
             given = ", ".join(
-                f"`{name}={json.dumps(value)}`" for name, value in small.keywords.items()
+                f"`{name}={default_text(value).strip('`')}`"
+                for name, value in small.keywords.items()
             )
             told += f"\n\n`{small.id}` is the same environment with {given}."
     return told

@@ -9,6 +9,7 @@ from typing import ClassVar, TypeVar, get_args
 import torch
 from torch import Tensor
 
+from npa_envs.envs.core.task import Start
 from npa_envs.envs.morphogenesis2d import Morphogenesis2DEnvConfig, PictureTask
 from npa_envs.errors import NPAError, shown
 from npa_envs.rule.files import load_rule, shipped_rules
@@ -30,7 +31,7 @@ class GrownConfig(Morphogenesis2DEnvConfig):
     """What else than a rule can be given, as the end of an error's message."""
 
     seed_pool: int = 4
-    """Episodes start from one of so many grown worlds, made once; 0: from a new one each time,
+    """Episodes start from one of so many grown worlds, each made once; 0: from a new one each time,
     which takes `grow_steps` steps of the rule."""
 
     rule: str | None = None
@@ -65,6 +66,10 @@ class GrownTask(PictureTask[Config]):
 
     config_type: ClassVar[type[GrownConfig]] = GrownConfig
 
+    def __init__(self, config: Config, device: torch.device) -> None:
+        super().__init__(config, device)
+        self._grown: dict[int, Start] = {}
+
     @cached_property
     def rule(self) -> NPARule:
         """What grows them.
@@ -83,6 +88,19 @@ class GrownTask(PictureTask[Config]):
     def start_is_short(self) -> bool:
         """Whether a start takes few operations: not where it grows a world."""
         return self.config.seed_pool > 0
+
+    def pooled(self, numbers: Tensor) -> Start:
+        """Return worlds of the pool; on a CPU each is grown when an episode first starts from it.
+
+        On CUDA the host would have to wait for the numbers.
+        """
+        if self.device.type != "cpu":
+            return super().pooled(numbers)
+        wanted = numbers.tolist()
+        for number in set(wanted) - self._grown.keys():
+            self._grown[number] = self.made_for_pool([number])
+        worlds = [self._grown[number] for number in wanted]
+        return Start(torch.cat([world.x for world in worlds]), torch.cat([w.s for w in worlds]))
 
     def seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
         """Return grown worlds."""

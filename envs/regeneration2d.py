@@ -15,9 +15,9 @@ from npa_envs.envs.grown import GrownConfig, GrownTask
 from npa_envs.envs.morphogenesis2d import PictureTask
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.rule.rule import COLOUR_OFFSET
-from npa_envs.tasks.checks import check_fraction, check_positive
+from npa_envs.tasks.checks import check_flag, check_fraction, check_positive
 from npa_envs.tasks.damage import damage_worlds
-from npa_envs.world.randomness import WorldRandom
+from npa_envs.world.randomness import Purpose, WorldRandom
 
 RANDOM_DAMAGE = "random"
 """Each episode draws its kind of damage."""
@@ -57,6 +57,10 @@ class Regeneration2DEnvConfig(GrownConfig):
     target's name. "picture" starts from the target's own points instead, with blank hidden
     states."""
 
+    split_damage: bool = False
+    """Damage of split="test" is drawn apart from that of "train", also where `reset` is given the
+    same seeds."""
+
     healed_share: float = 0.8
     """The episode ends in success once this share of what the damage added to the loss is gone,
     unless `success_loss` is given (dimensionless, in (0, 1])."""
@@ -69,6 +73,7 @@ class Regeneration2DEnvConfig(GrownConfig):
             hint = suggest(self.damage, kinds)
             raise NPAError(f"damage must be a known kind, got {shown(self.damage)}: {hint}")
         check_fraction(self, "healed_share")
+        check_flag(self, "split_damage")
         if self.damage_size is not None:
             check_positive(self, float, "damage_size")
 
@@ -96,6 +101,8 @@ class RegenerationTask(GrownTask[Regeneration2DEnvConfig]):
     def start(self, random: WorldRandom) -> Start:
         """Return damaged worlds; they are healed once their loss is near the undamaged one."""
         x, s, threshold, _ = super().start(random)
+        if self.config.split_damage and self.config.split == "test":
+            random = random.beside(Purpose.TEST)
         kinds = RANDOM_KINDS if self.config.damage == RANDOM_DAMAGE else (self.config.damage,)
         chosen = random.integers(len(kinds), 1, 1)
         hurt_x, hurt_s = x, s
@@ -145,9 +152,13 @@ class Regeneration2DEnv(NPAEnv):
     ## Starting state
 
     The rule grows a world for `grow_steps` steps from a disk of blank particles. Then one kind of
-    damage is done to it. With the default `seed_pool=4` there are four grown worlds. They are made
-    at the first reset, which takes some seconds on a CPU. The damage is drawn anew for each
-    episode.
+    damage is done to it. The worlds are made once: with the default `seed_pool=4` there are four,
+    and 256 in `npa/Regeneration2D-v1`. On a CPU each is grown when an episode first starts from it,
+    which takes 0.4 s of CPU time with 1024 particles; on CUDA the first reset grows all of them.
+    The damage is drawn anew for each episode.
+
+    `split="test"` has grown worlds of its own, as many, and in v1 damage of its own as well: learn
+    with "train", evaluate with "test".
 
     | `damage` | What is done |
     |---|---|
@@ -165,6 +176,10 @@ class Regeneration2DEnv(NPAEnv):
     The damage adds to the loss. The episode ends in success once `healed_share` of this addition is
     gone. If you give `success_loss`, it ends once the loss is at most this instead. If damage
     raises the loss by less than 2 %, there is nothing to heal, and the episode runs to its limit.
+
+    ## Version history
+
+    - v1: 256 grown worlds instead of four, and damage that `split="test"` draws apart.
     """
 
     task_type = RegenerationTask

@@ -115,21 +115,21 @@ _SMALL_PICTURE_OF_SPECIES: Mapping[str, Any] = {
 }
 
 
-def _sized(name: str, size: str, steps: int, **keywords: Any) -> Registration:
+def _form(name: str, size: str, steps: int, version: int = 0, **keywords: Any) -> Registration:
     """Return a form of one of `ENVIRONMENTS` with other keywords."""
     usual = next(row for row in ENVIRONMENTS if row.name == name)
-    sized_id = usual.id.replace("-v", f"{size}-v")
-    return Registration(sized_id, usual.module, name, steps, MappingProxyType(keywords))
+    form_id = usual.id.replace("-v0", f"{size}-v{version}")
+    return Registration(form_id, usual.module, name, steps, MappingProxyType(keywords))
 
 
 SIZES = (
-    _sized(
+    _form(
         "Morphogenesis2D",
         "Small",
         32,
         **{**_SMALL_PICTURE, "target": "ring", "seed_radius": 0.4},
     ),
-    _sized(
+    _form(
         "Regeneration2D",
         "Small",
         24,
@@ -141,7 +141,7 @@ SIZES = (
         damage_size=0.4,
         resolution=32,
     ),
-    _sized(
+    _form(
         "Texture",
         "Small",
         24,
@@ -150,7 +150,7 @@ SIZES = (
         target="stripes",
         resolution=32,
     ),
-    _sized(
+    _form(
         "PointClassification",
         "Small",
         16,
@@ -159,16 +159,24 @@ SIZES = (
         update_prob=1.0,
         score="cross_entropy",
     ),
-    _sized("Morphogenesis2D", "Large", 512, particle_count=4096, resolution=128),
-    _sized("Regeneration2D", "Large", 256, particle_count=4096, resolution=128),
-    _sized("Texture", "Large", 256, particle_count=4096, resolution=128),
-    _sized("PointClassification", "Large", 64, particle_count=2048),
-    _sized("Morphogenesis3D", "Large", 256, particle_count=4096),
+    _form("Morphogenesis2D", "Large", 512, particle_count=4096, resolution=128),
+    _form("Regeneration2D", "Large", 256, particle_count=4096, resolution=128),
+    _form("Texture", "Large", 256, particle_count=4096, resolution=128),
+    _form("PointClassification", "Large", 64, particle_count=2048),
+    _form("Morphogenesis3D", "Large", 256, particle_count=4096),
 )
 """Worlds of few particles, in which PPO learns within minutes on a laptop, and of many, for a GPU.
 Settings are never changed under the same version."""
 
-ALL = (*ENVIRONMENTS, *GARDENS, *SMALL, *SIZES)
+_MANY_WOUNDS: Mapping[str, Any] = {"seed_pool": 256, "split_damage": True}
+
+LATER = (
+    _form("Regeneration2D", "", 128, 1, **_MANY_WOUNDS),
+    _form("Regeneration2D", "Large", 256, 1, particle_count=4096, resolution=128, **_MANY_WOUNDS),
+)
+"""Later versions, which begin otherwise than version 0; settings of both are never changed."""
+
+ALL = (*ENVIRONMENTS, *GARDENS, *SMALL, *SIZES, *LATER)
 """All that Gymnasium knows."""
 
 
@@ -183,6 +191,12 @@ class SpeciesRegistration(NamedTuple):
 
     keywords: Mapping[str, Any]
     """Fields of the task's configuration."""
+
+    @property
+    def max_episode_steps(self) -> int:
+        """Steps after which an episode is cut off."""
+        steps: int = self.keywords["max_cycles"]
+        return steps
 
 
 SPECIES_SIZES = (
@@ -201,7 +215,7 @@ SPECIES_SIZES = (
         MappingProxyType({**_SMALL_PICTURE_OF_SPECIES, "target": "flower"}),
     ),
 )
-"""The same for tasks of several species. Invasion has none: no opponent is fixed."""
+"""The same for tasks of several species."""
 
 
 def register_environments() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Generic, NamedTuple, Self, TypeVar
 
 import numpy as np
@@ -220,10 +220,7 @@ class EnvTask(WorldTask[Config]):
         if self.config.seed_pool == 0:
             start = self._as_start("fresh", self.fresh(random))
         else:
-            pool = self.pool()
-            chosen = random.integers(self.config.seed_pool, 1)[:, 0]
-            goal = None if pool.goal is None else pool.goal[chosen]
-            start = Start(pool.x[chosen], pool.s[chosen], goal=goal)
+            start = self.pooled(random.integers(self.config.seed_pool, 1)[:, 0])
         threshold, success = self.config.success_loss, None
         if threshold is not None:
             success = torch.full((len(start.x),), threshold, device=self.device)
@@ -234,16 +231,23 @@ class EnvTask(WorldTask[Config]):
         """Seed of the first world of the pool; each of the others has one more."""
         return 0
 
-    def pool(self) -> Start:
-        """Return the worlds that episodes start from, made when first asked for."""
+    def pooled(self, numbers: Tensor) -> Start:
+        """Return worlds of the pool, which is made when first asked for.
+
+        Args:
+            numbers: Which ones, below `seed_pool`, int64, shape [B].
+        """
         if self._pool is None:
-            # Not the streams that episodes with these seeds go on with.
-            first = self.first_pool_seed
-            seeds = range(first, first + self.config.seed_pool)
-            random = WorldRandom(seeds, device=self.device)
-            made = self.fresh(random.beside(Purpose.GROWTH))
-            self._pool = self._as_start("fresh", made)
-        return self._pool
+            self._pool = self.made_for_pool(range(self.config.seed_pool))
+        x, s, _, goal = self._pool
+        return Start(x[numbers], s[numbers], goal=None if goal is None else goal[numbers])
+
+    def made_for_pool(self, numbers: Sequence[int]) -> Start:
+        """Make worlds of the pool, each from a seed of its own."""
+        seeds = [self.first_pool_seed + number for number in numbers]
+        # Not the streams that episodes with these seeds go on with.
+        random = WorldRandom(seeds, device=self.device).beside(Purpose.GROWTH)
+        return self._as_start("fresh", self.fresh(random))
 
     def draw(self, x: Tensor, s: Tensor, steps: NDArray[np.int64]) -> NDArray[np.uint8]:
         """Return a picture of each world, shape [B, R, R, 3], so many steps after its start, [B].

@@ -51,6 +51,8 @@ def episode(env, seed, count=12, beside=None):
 def test_gymnasium_finds_nothing_to_complain_of(name):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
+        # Where there is a later version, Gymnasium says so.
+        warnings.filterwarnings("ignore", message=".* is out of date")
         check_env(make(name).unwrapped)
 
 
@@ -326,7 +328,7 @@ def test_seed_pool_repeats_its_starts():
 def test_a_test_split_grows_other_worlds_than_those_to_learn_from():
     name, given = "npa/Regeneration2D-v0", {"particle_count": 64, "grow_steps": 4, "seed_pool": 2}
     train, same, test = (
-        gymnasium.make(name, **given, split=split).unwrapped.task.pool().x
+        gymnasium.make(name, **given, split=split).unwrapped.task.pooled(torch.arange(2)).x
         for split in ("train", "train", "test")
     )
     assert torch.equal(train, same)
@@ -335,6 +337,38 @@ def test_a_test_split_grows_other_worlds_than_those_to_learn_from():
         gymnasium.make(name, **(given | {"seed_pool": 0}), split="test")
     with pytest.raises(NPAError, match="split must be 'train' or 'test', got 'eval'"):
         gymnasium.make(name, **given, split="eval")
+
+
+def test_version_1_of_regeneration_begins_with_many_worlds_and_evaluates_with_other_damage():
+    tiny = {"particle_count": 32, "grow_steps": 2, "resolution": 16}
+    starts = {}
+    for version in (0, 1):
+        env = gymnasium.make(f"npa/Regeneration2D-v{version}", **tiny, damage="erase")
+        starts[version] = {
+            env.reset(seed=seed) and env.unwrapped.particles()[0].numpy().tobytes()
+            for seed in range(40)
+        }
+    assert (len(starts[0]), len(starts[1]) > 30) == (4, True)
+
+    # Pictures are the same in both splits: what differs is the damage.
+    tiny |= {"rule": "picture", "seed_pool": 1}
+    for version, apart in ((0, False), (1, True)):
+        name = f"npa/Regeneration2D-v{version}"
+        train, test = (gymnasium.make(name, **tiny, split=split) for split in ("train", "test"))
+        for seed in range(3):
+            train.reset(seed=seed), test.reset(seed=seed)
+            damaged = zip(train.unwrapped.particles(), test.unwrapped.particles(), strict=True)
+            assert all(torch.equal(one, other) for one, other in damaged) != apart
+
+
+def test_a_world_of_a_pool_is_the_same_whenever_it_is_grown():
+    given = {"particle_count": 32, "grow_steps": 2, "resolution": 16, "seed_pool": 8}
+    alone, batch = (gymnasium.make("npa/Regeneration2D-v1", **given).unwrapped for _ in range(2))
+    whole = batch.task.pooled(torch.arange(8))
+    for number in (5, 2, 5):
+        one = alone.task.pooled(torch.tensor([number]))
+        assert torch.equal(one.x[0], whole.x[number])
+        assert torch.equal(one.s[0], whole.s[number])
 
 
 def test_regeneration_starts_grown_and_damaged():
@@ -353,7 +387,7 @@ def test_regeneration_starts_grown_and_damaged():
     growth = random.beside(Purpose.GROWTH)
     with torch.no_grad():
         expected = npa_envs.rollout(grown, start_x, start_s, 48, generator=growth)
-    assert torch.equal(task.pool().x, expected[0])
+    assert torch.equal(task.pooled(torch.tensor([0])).x, expected[0])
     assert torch.equal(x, expected[0][0])
 
 
@@ -362,7 +396,8 @@ def test_every_damage_raises_the_loss(damage):
     env = gymnasium.make(
         "npa/Regeneration2D-v0", particle_count=256, rule="picture", damage=damage, damage_size=0.4
     )
-    whole = float(sum(env.unwrapped.task.losses(*env.unwrapped.task.pool()[:2]).values())[0])
+    pool = env.unwrapped.task.pooled(torch.tensor([0]))
+    whole = float(sum(env.unwrapped.task.losses(*pool[:2]).values())[0])
     for seed in range(6):
         _, info = env.reset(seed=seed)
         assert info["loss"] > 1.05 * whole

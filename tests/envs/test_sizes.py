@@ -1,4 +1,4 @@
-"""Small and large forms of environments: frozen settings, checkers, batches."""
+"""Small, large and later forms of environments: frozen settings, checkers, batches."""
 
 import json
 import warnings
@@ -13,25 +13,26 @@ from small_envs import assert_same, world_of
 
 from npa_envs.agents.learning import Budget, Problem, train
 from npa_envs.envs import multispecies_v0
-from npa_envs.registration import ENVIRONMENTS, SIZES, SPECIES_SIZES
+from npa_envs.registration import ENVIRONMENTS, LATER, SIZES, SPECIES_SIZES
 
 FROZEN = json.loads(Path(__file__).with_name("frozen_sizes.json").read_text())
 """Steps of an episode and keywords by id, as they were when the ids were made."""
 
+FORMS = (*SIZES, *LATER)
 QUICK = [row for row in SIZES if "Small" in row.id]
 by_id = pytest.mark.parametrize("row", QUICK, ids=lambda row: row.id)
 of_species = pytest.mark.parametrize("row", SPECIES_SIZES, ids=lambda row: row.id)
 
 
 def test_settings_are_what_they_were():
-    now = {row.id: {"steps": row.max_episode_steps, **row.keywords} for row in SIZES}
+    now = {row.id: {"steps": row.max_episode_steps, **row.keywords} for row in FORMS}
     now |= {row.id: {"task": row.task, **row.keywords} for row in SPECIES_SIZES}
     assert json.loads(json.dumps(now)) == FROZEN
 
 
-@pytest.mark.parametrize("row", SIZES, ids=lambda row: row.id)
+@pytest.mark.parametrize("row", FORMS, ids=lambda row: row.id)
 def test_an_id_is_the_environment_of_its_name_with_other_keywords(row):
-    usual = row.id.replace("Small", "").replace("Large", "")
+    usual = row.id.replace("Small", "").replace("Large", "").replace("-v1", "-v0")
     assert usual in {registered.id for registered in ENVIRONMENTS}
     spec = gymnasium.spec(row.id)
     assert (spec.entry_point, spec.vector_entry_point) == (
