@@ -60,7 +60,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "train morphogenesis2d": (
         "train morphogenesis2d --target heart --out runs/heart",
         "train morphogenesis2d --preset paper --target lizard.png --device cuda",
-        "train morphogenesis2d --preset paper --target lizard.png --device cuda --processes 4",
+        "train morphogenesis2d --preset paper --target lizard.png --gpus 4",
     ),
     "train co_morphogenesis2d": (
         "train co_morphogenesis2d --targets ring heart",

@@ -29,7 +29,7 @@ RUN_FAILED = 1
 RECORD, OUTPUT, TABLE = "run.json", "output.txt", "sweep.md"
 """Files: what became of a run, what it printed, and of all of them together."""
 
-OWN = ("out", "device", "resume", "overwrite", "max-seconds", "processes")
+OWN = ("out", "device", "resume", "overwrite", "max-seconds", "processes", "gpus")
 """Options of `npa-envs train` that a sweep gives by itself, or that would break it."""
 
 PROGRAM = (sys.executable, "-m", "npa_envs", "train")

@@ -79,6 +79,9 @@ class TrainOptions:
     a CPU has cores for them and the batch is small. `torchrun --nproc-per-node=4 -m npa_envs train
     ...` does the same."""
 
+    gpus: int | None = None
+    """GPUs that share the run: `--gpus 4` says `--device cuda --processes 4`."""
+
     resume: bool = False
     """Go on from the checkpoint in the folder `out`, with the configuration that lies there.
     `--resume auto`: if there is one; else begin."""
@@ -127,7 +130,7 @@ def main(arguments: Sequence[str]) -> int:
         count = process_count(task_name, options, config)
         if count > 1 and not ranks.together:
             told = ["train", task_name, *words]
-            if options.processes is None:
+            if options.processes is None and options.gpus is None:
                 told += ["--processes", str(count)]
             return launch(count, told, config.out, config.device)
         try:
@@ -142,18 +145,22 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def settled(task_name: str, words: Sequence[str]) -> list[str]:
-    """Return the options with `--resume auto` decided.
+    """Return the options with `--resume auto` decided, and with CUDA as the device of `--gpus`.
 
     Raises:
         NPAError: As for `starting_configuration`.
     """
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    parser.add_argument("--gpus")
+    parser.add_argument("--device")
     parser.add_argument("--resume", nargs="?", choices=("auto",))
     try:
         first, _ = parser.parse_known_args(words)
     except argparse.ArgumentError as error:
         raise NPAError(f"{error.argument_name}: {error.message}") from error
     chosen = list(words)
+    if first.gpus is not None and first.device is None:
+        chosen += ["--device", "cuda"]
     if first.resume == "auto":
         if "--resume=auto" in chosen:
             chosen.remove("--resume=auto")
@@ -348,12 +355,20 @@ def process_count(task_name: str, options: TrainOptions, config: TrainConfig[Any
     second process has paid for its start.
 
     Raises:
-        NPAError: There are to be fewer than one.
+        NPAError: There are to be fewer than one, or GPUs that are not to be used.
     """
-    if options.processes is not None:
-        if options.processes < 1:
-            raise NPAError(f"processes must be at least 1, got {options.processes}")
-        return options.processes
+    if options.gpus is not None and options.processes is not None:
+        raise NPAError(
+            f"gpus says how many processes there are, got gpus {options.gpus} and processes "
+            f"{options.processes}: give one of them"
+        )
+    if options.gpus is not None and config.device == "cpu":
+        raise NPAError("gpus goes with device 'cuda', got 'cpu': take --processes instead")
+    for name, count in (("gpus", options.gpus), ("processes", options.processes)):
+        if count is not None:
+            if count < 1:
+                raise NPAError(f"{name} must be at least 1, got {count}")
+            return count
     seconds = task_entry(task_name).expected_seconds(config)
     idle = thread_count(config) < torch.get_num_threads() and dist.is_available()
     if not idle or config.varied or seconds is None or seconds < PAIRED_SECONDS:

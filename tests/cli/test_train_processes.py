@@ -54,6 +54,20 @@ def test_fewer_processes_than_one_are_refused():
         process_count(TASK, TrainOptions(processes=0), preset("tiny"))
 
 
+def test_gpus_are_processes_that_have_a_gpu_each():
+    asked = TrainOptions(gpus=4)
+    assert process_count(TASK, asked, preset("fast", device="cuda")) == 4
+    assert settled(TASK, ["--gpus", "4"]) == ["--gpus", "4", "--device", "cuda"]
+    given = ["--gpus=4", "--device", "cuda"]
+    assert settled(TASK, given) == given
+    with pytest.raises(NPAError, match="gpus goes with device 'cuda', got 'cpu'"):
+        process_count(TASK, asked, preset("fast"))
+    with pytest.raises(NPAError, match="gpus must be at least 1, got 0"):
+        process_count(TASK, TrainOptions(gpus=0), preset("fast", device="cuda"))
+    with pytest.raises(NPAError, match="give one of them"):
+        process_count(TASK, TrainOptions(gpus=2, processes=2), preset("fast", device="cuda"))
+
+
 def test_more_processes_than_gpus_are_refused_before_anything_starts(tmp_path, capsys):
     count = torch.cuda.device_count() + 2
     words = [
