@@ -15,7 +15,7 @@ import torch
 import torch.distributed as dist
 
 from npa_envs.cli import INTERRUPTED
-from npa_envs.errors import LostProcessError, NPAError
+from npa_envs.errors import LostProcessError, NPAError, shown
 from npa_envs.training import RunFolder
 
 if TYPE_CHECKING:
@@ -34,8 +34,8 @@ def launch(count: int, words: Sequence[str], out: Path, device: str) -> int:
         device: Where it runs: each process has a CUDA device of its own, or all share the CPU.
 
     Raises:
-        NPAError: There are not as many devices, a process was ended from outside, another than the
-            first has left an error, or torch has no launcher here.
+        NPAError: There are not as many devices, processes cannot reach each other, one was ended
+            from outside, another than the first has left an error, or torch has no launcher here.
     """
     seen = torch.cuda.device_count()
     if device != "cpu" and count > seen:
@@ -50,6 +50,7 @@ def launch(count: int, words: Sequence[str], out: Path, device: str) -> int:
     # Only runs of several processes need it, and it takes a while.
     from torch.distributed.elastic.multiprocessing.api import SignalException
     from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
+    from torch.distributed.elastic.rendezvous.api import RendezvousError
     from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
     # It tells of each step that it takes, and of each signal.
@@ -72,6 +73,11 @@ def launch(count: int, words: Sequence[str], out: Path, device: str) -> int:
         elastic_launch(config, sys.executable)("-m", "npa_envs", *words)
     except SignalException:
         return INTERRUPTED
+    except RendezvousError as error:
+        raise NPAError(
+            f"processes must reach each other at localhost, but they cannot ({shown(error)}): "
+            "take --processes 1"
+        ) from error
     except ChildFailedError as error:
         left = {rank: left_by(failure) for rank, failure in error.failures.items()}
         for reason in left.values():
