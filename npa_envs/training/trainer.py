@@ -5,15 +5,10 @@ from __future__ import annotations
 import copy
 import json
 import math
-import signal
-import sys
-import threading
 import time
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -45,6 +40,7 @@ from npa_envs.training.run_folder import (
     save_checkpoint,
     unusable_checkpoint,
 )
+from npa_envs.training.stopping import stop_flag
 from npa_envs.training.variation import VariedCycle
 
 FIRST_PICTURE = 10
@@ -427,41 +423,6 @@ def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
             "weights (initial_rule='')"
         )
     return rule
-
-
-@contextmanager
-def stop_flag(*, patient: bool = False) -> Iterator[threading.Event]:
-    """Within the block, the first SIGINT or SIGTERM sets the event; the next one acts as usual.
-
-    In a thread other than the main one, where signals cannot be caught, it stays unset.
-
-    Args:
-        patient: The next ones do nothing: torchrun passes on what a terminal has sent already.
-    """
-    asked = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield asked
-        return
-    previous: dict[signal.Signals, Any] = {}
-
-    def give_back() -> None:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
-
-    def stop(number: int, frame: FrameType | None) -> None:
-        if patient:
-            asked.set()
-            return
-        asked.set()
-        print("\nstopping after this iteration; once more to stop at once", file=sys.stderr)
-        give_back()
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        previous[number] = signal.signal(number, stop)
-    try:
-        yield asked
-    finally:
-        give_back()
 
 
 def write_batch_picture(path: Path, picture: Tensor, board: Any, iteration: int) -> None:
