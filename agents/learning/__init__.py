@@ -16,15 +16,19 @@ from typing import Any, NamedTuple
 
 import torch
 
+from npa_envs.agents.learning.kept import KeptProgress
 from npa_envs.agents.learning.problem import EVALUATION_SEEDS, Problem
 from npa_envs.agents.learning.progress import Budget, Entry, Progress, check_finite
 from npa_envs.agents.learning.rules import RuleSet, RuleSetPolicy, starting_rules
 from npa_envs.devices import check_device
 from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
 from npa_envs.tasks.checks import is_whole
+from npa_envs.training.ranks import Ranks
+from npa_envs.training.run_folder import RunFolder
 
 __all__ = [
     "GARDEN_METHODS",
+    "KEPT_METHODS",
     "METHODS",
     "Budget",
     "Entry",
@@ -55,6 +59,9 @@ METHODS: dict[str, str] = {
 rules and of all draws, `start` are rules to begin with, which are copied, or None. A method's
 options are further keyword arguments, or the fields of a dataclass which is the default of an
 argument `options`. Others may be added."""
+
+KEPT_METHODS = ("ppo", "shac")
+"""Methods whose runs can be kept in a folder, go on from there, and be shared by processes."""
 
 GARDEN_METHODS: dict[str, str] = {
     "gradient": "npa_envs.agents.learning.gardeners:train_gradient",
@@ -87,6 +94,9 @@ class Trained(NamedTuple):
     """Maps observations, [B, N, P], to actions, [B, N, A], and a dict of agents' observations, of
     PettingZoo's parallel environments, to one of their actions: the rules' where there are some."""
 
+    interrupted: bool = False
+    """Whether SIGTERM or Ctrl-C stopped it before its budget was spent: it can be resumed."""
+
     def save(self, folder: str | Path) -> list[Path]:
         """Write what was learned, if anything: rules' files, or the policy's own; return paths.
 
@@ -108,9 +118,15 @@ def train(
     evaluation_seeds: Iterable[int] = EVALUATION_SEEDS,
     entries: int = 20,
     on_entry: Callable[[Entry], None] | None = None,
+    out: str | Path | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
     **options: Any,
 ) -> Trained:
     """Learn a problem by a method, within a budget.
+
+    Where torch has a default group of processes, they learn together, by `KEPT_METHODS` only: each
+    has a share of the worlds, and the first one writes.
 
     Args:
         method: A name from `methods_for(problem)`, or your own function, "package.module:function".
@@ -123,11 +139,15 @@ def train(
         evaluation_seeds: Of the episodes by which the learning curve is drawn.
         entries: Points of the curve besides the first, at equal shares of the budget.
         on_entry: Called with each point as soon as it is known.
+        out: Folder for checkpoint, rules and curve, by `KEPT_METHODS` only: there SIGTERM and
+            Ctrl-C let a run stop in order. None: nothing is written.
+        resume: Go on from the checkpoint in `out`, on any number of processes, with new episodes.
+        overwrite: Begin anew although `out` holds a run; its files are removed.
         options: The method's own: `method_options` names them.
 
     Raises:
-        NPAError: There is no such method or option, the method cannot learn this problem, or the
-            rules to begin with do not fit it.
+        NPAError: There is no such method or option, the method cannot learn this problem, cannot be
+            shared or kept, or the rules to begin with do not fit it. Or as for `KeptProgress`.
         DivergedError: The rules' weights have become infinite or NaN.
         MissingDependencyError: The method needs a library that is not installed.
     """
@@ -143,22 +163,41 @@ def train(
     place = check_device(device)
     if start is not None:
         start = starting_rules(problem, seed, place, start)
-    progress = Progress(
-        problem,
-        budget,
-        device=place,
-        evaluation_seeds=evaluation_seeds,
-        entries=entries,
-        on_entry=on_entry,
-    )
+    _check_kept(method, out, resume or overwrite)
     declared = _declared(function)
+    account: dict[str, Any] = {
+        "problem": problem,
+        "budget": budget,
+        "device": place,
+        "evaluation_seeds": evaluation_seeds,
+        "entries": entries,
+        "on_entry": on_entry,
+    }
+    progress = Progress(**account)
+    if out is not None:
+        told = {"method": method, "problem": problem.to_json(), "seed": seed, "options": options}
+        progress = KeptProgress(
+            RunFolder(Path(out)), told, resume=resume, overwrite=overwrite, **account
+        )
     given = {"options": replace(declared, **options)} if declared is not None else options
     result = function(problem, progress, seed, device=place, start=start, **given)
     if isinstance(result, RuleSet):
         # Of no use any more, they may keep the memory of recorded work.
         result.zero_grad()
-        return Trained(result, progress.log, result.policy())
+        return Trained(result, progress.log, result.policy(), progress.interrupted)
     return Trained(None, progress.log, result)
+
+
+def _check_kept(method: str, out: str | Path | None, told: bool) -> None:
+    """Check that a run can be kept and shared, where that is asked for."""
+    several = Ranks.current().count > 1
+    if method not in KEPT_METHODS and (several or out is not None):
+        asked = "be shared by processes" if several else "be kept in a folder (out)"
+        raise NPAError(
+            f"method {shown(method)} cannot {asked}: take one of {', '.join(KEPT_METHODS)}"
+        )
+    if told and out is None:
+        raise NPAError("resume and overwrite need a folder: give out='runs/heart'")
 
 
 def methods_for(problem: Problem) -> dict[str, str]:

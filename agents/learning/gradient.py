@@ -221,7 +221,7 @@ class EpisodeTask:
         return isinstance(self._task, SpeciesTask) or self._task.start_is_short
 
     def seed(
-        self, world_count: int, *, generator: torch.Generator, device: torch.device
+        self, world_count: int, *, generator: Randomness, device: torch.device
     ) -> tuple[Tensor, Tensor]:
         """Return worlds as episodes begin: positions [B, N, D] and states [B, N, C]."""
         x, s, *_ = self._start(world_count, generator, device)
@@ -294,9 +294,12 @@ class EpisodeTask:
         return npa_envs.rollout_species(clamped, x, s, steps, **common)
 
     def _start(
-        self, world_count: int, generator: torch.Generator, device: torch.device
+        self, world_count: int, generator: Randomness, device: torch.device
     ) -> tuple[Any, ...]:
-        keys = torch.randint(*KEY_RANGE, (world_count,), generator=generator, device=device)
+        if isinstance(generator, WorldRandom):
+            keys = generator.integers(KEY_RANGE[1])
+        else:
+            keys = torch.randint(*KEY_RANGE, (world_count,), generator=generator, device=device)
         start: tuple[Any, ...] = self._task.start(WorldRandom.from_keys(keys))
         return start
 
@@ -320,7 +323,7 @@ class GoalEpisodeTask(EpisodeTask):
     """The same for a task whose worlds have goals of their own, such as the class of a cloud."""
 
     def seed_with_goals(
-        self, world_count: int, *, generator: torch.Generator, device: torch.device
+        self, world_count: int, *, generator: Randomness, device: torch.device
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return worlds at the beginning of their episodes, and their goals, int64, shape [B]."""
         x, s, _, goal = self._start(world_count, generator, device)

@@ -20,8 +20,10 @@ from npa_envs.agents.learning.ppo_common import (
     CommonOptions,
     Critic,
     GaussianRules,
+    Minibatches,
     check_word,
     first_rules,
+    learner_random,
     noise_left,
 )
 from npa_envs.agents.learning.problem import (
@@ -35,6 +37,8 @@ from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.envs.core.memory import free_bytes, needed_bytes
 from npa_envs.errors import NPAError
 from npa_envs.tasks.checks import check_non_negative, check_positive
+from npa_envs.training.randomness import registered, restart
+from npa_envs.training.ranks import ALONE, Ranks
 from npa_envs.world.cuda_graph import Replayed
 from npa_envs.wrappers.base import own_rewards
 
@@ -54,8 +58,8 @@ class PPOOptions(CommonOptions):
 
     worlds: int | None = None
     """Worlds B to act in; None: the problem's `num_envs`, and on CUDA, where that is more, as many
-    as have 131 072 particles together, if memory has room for them and particle-steps are enough
-    for 128 rounds."""
+    as have 131 072 particles together on each GPU, if memory has room for them and particle-steps
+    are enough for 128 rounds. Several processes share them out."""
 
     critic_learning_rate: float = 1e-3
     """The critic's step at the start, as `learning_rate` is the rules'."""
@@ -120,8 +124,9 @@ def train(
     Raises:
         DivergedError: The policy has diverged.
     """
-    options = replace(options, worlds=world_count(problem, options, device, progress.budget))
-    learner = Learner(problem, options, seed, device, start)
+    ranks = progress.ranks
+    count = ranks.told(world_count(problem, options, device, progress.budget, ranks))
+    learner = Learner(problem, replace(options, worlds=count), seed, device, start, ranks)
 
     def round_of_ppo() -> int:
         share_left = 1.0 - progress.share
@@ -129,11 +134,15 @@ def train(
         learner.improve(share_left)
         return learner.round_size
 
-    return progress.run(learner.actor.rules, round_of_ppo)
+    return progress.run(learner.actor.rules, round_of_ppo, learner)
 
 
 class Learner:
-    """Rules, critic, worlds and what was seen of them; the seed is that of all that is drawn."""
+    """Rules, critic, worlds and what was seen of them; the seed is that of all that is drawn.
+
+    Several processes each have a share of the worlds, draw for each of these by itself, and add up
+    gradients, moments and weights. On CUDA they record nothing that this is part of.
+    """
 
     def __init__(
         self,
@@ -142,16 +151,21 @@ class Learner:
         seed: int,
         device: torch.device,
         start: RuleSet | None,
+        ranks: Ranks = ALONE,
     ) -> None:
-        self.options, self.pace = options, options.pace(start)
+        self.options, self.pace, self.ranks = options, options.pace(start), ranks
+        total = problem.num_envs if options.worlds is None else options.worlds
+        ranks.check_dealt("worlds", total)
+        places = ranks.places(total)
         self.envs = problem.make_envs(
-            options.worlds,
+            len(places),
             device=device,
             row_rewards=None if options.credit == "world" else options.credit,
             tell_updated=options.masked,
             copy=False,
         )
-        self.generator = torch.Generator(device).manual_seed(seed)
+        self.random = learner_random(seed, total, places, device, ranks)
+        """What exploration and shuffles draw from."""
         rules = first_rules(problem, seed, start)
         self.actor = GaussianRules(rules, self.pace.initial_std).to(device)
         with torch.random.fork_rng(devices=[]):
@@ -174,14 +188,15 @@ class Learner:
             )
             for net in (self.actor, self.critic)
         )
-        observation, _ = self.envs.reset(seed=world_seeds(seed, self.envs.num_envs))
+        self._seed, self._places, self._total = seed, places.tolist(), total
+        observation = self._worlds_of_part(0)
         self.memory = Memory(
             options.steps,
             observation,
             problem.interface.action_dim,
             own_advantages=options.ratio == "particle",
         )
-        self.critic.observe(observation)
+        self.critic.observe(observation, ranks)
         self.rounds = 0
         """Rounds done."""
         # What recorded work reads and writes besides.
@@ -190,22 +205,42 @@ class Learner:
             part[0].clone() for part in (self.memory.actions, self.memory.log_probs)
         )
         self._near, self._rate, self._all_act = torch.ones(3, device=device)
-        played = options.steps * self.envs.num_envs
-        sizes = [played] if options.ratio == "world" else [played * n for n in problem.counts]
         # Of what is shuffled for the rules, and of worlds for the critic.
-        self._orders = [
-            torch.zeros(size, dtype=torch.int64, device=device) for size in (*sizes, played)
-        ]
-        self._act = Replayed(self._draw_actions, device, self.generator)
+        rows = (1,) if options.ratio == "world" else problem.counts
+        self._minibatches = Minibatches(
+            options.steps, len(places), (*rows, 1), options.minibatches, self.random
+        )
+        self._act = Replayed(self._draw_actions, device, registered(self.random))
         self._value = Replayed(self._find_values, device)
-        self._judge = Replayed(self._find_advantages, device)
-        self._learn_values = Replayed(self._improve_critic, device)
-        self._learn = Replayed(self._improve_both, device)
+        alone = not ranks.together
+        self._judge = Replayed(self._find_advantages, device, recorded=alone)
+        self._learn_values = Replayed(self._improve_critic, device, recorded=alone)
+        self._learn = Replayed(self._improve_both, device, recorded=alone)
+
+    def modules(self) -> dict[str, nn.Module]:
+        """Return what learns, by the names that checkpoints have for it."""
+        return {"actor": self.actor, "critic": self.critic}
+
+    def optimisers(self) -> dict[str, torch.optim.Optimizer]:
+        """Return what makes it learn."""
+        return {"actor": self.optimizer, "critic": self.critic_optimizer}
+
+    def go_on(self, iteration: int, part: int) -> None:
+        """Go on after so many rounds, for the part-th time, from 1 on, with other worlds."""
+        self.rounds = iteration
+        self.memory.seen[-1].copy_(self._worlds_of_part(part))
+
+    def _worlds_of_part(self, part: int) -> Tensor:
+        """Begin the episodes of a part of the run, and return what is seen."""
+        seeds = world_seeds(self._seed, self._total, part)
+        observation: Tensor
+        observation, _ = self.envs.reset(seed=[seeds[place] for place in self._places])
+        return observation
 
     @property
     def round_size(self) -> int:
-        """Particle steps of a round, T B N."""
-        return self.memory.rewards.numel()
+        """Particle steps of a round of all processes, T B N."""
+        return self.ranks.count * self.memory.rewards.numel()
 
     @torch.no_grad()
     def play(self) -> Round:
@@ -241,7 +276,8 @@ class Learner:
     @torch.no_grad()
     def _draw_actions(self) -> None:
         """Draw what particles do about what they perceive now."""
-        action, log_prob = self.actor.sample(self._now, self.generator)
+        restart(self.random)
+        action, log_prob = self.actor.sample(self._now, self.random)
         self._action.copy_(action)
         self._log_prob.copy_(log_prob)
 
@@ -270,7 +306,7 @@ class Learner:
         memory.targets.copy_(advantages + values)
         if self.options.ratio == "world":
             advantages = over_particles(advantages, memory.acted)
-        memory.advantages.copy_(standardised(advantages, memory.acted))
+        memory.advantages.copy_(standardised(advantages, memory.acted, self.ranks))
 
     def improve(self, share_left: float) -> None:
         """Let rules and critic learn from the last round.
@@ -281,15 +317,14 @@ class Learner:
         options = self.options
         rules_learn = self.rounds >= self.pace.critic_rounds
         self.rounds += 1
-        self.critic.observe(self.memory.seen[:-1])
-        self.critic.rescale(self.memory.targets)
+        self.critic.observe(self.memory.seen[:-1], self.ranks)
+        self.critic.rescale(self.memory.targets, self.ranks)
         rate = self.critic_optimizer.param_groups[0]["lr"]
         rate.fill_(options.critic_learning_rate * share_left)
         self._rate.fill_(self.pace.learning_rate * share_left)
         self._near.fill_(1.0)
         for _ in range(options.epochs):
-            for order in self._orders:
-                torch.randperm(len(order), generator=self.generator, out=order)
+            self._minibatches.shuffle()
             if not rules_learn:
                 self._learn_values()
                 continue
@@ -303,19 +338,20 @@ class Learner:
 
     def _improve_critic(self) -> None:
         """Let the critic learn once from all of a round, in the order that was drawn."""
-        for worlds in self._shuffled([self.memory.round], self._orders[-1:]):
-            self._descend(self.critic_optimizer, self._critic_loss(*worlds))
+        whole, orders = self.memory.round, self._minibatches.parts[-1:]
+        for (worlds,) in shuffled([whole], orders):
+            self._descend(self.critic_optimizer, self._critic_loss(worlds))
 
     def _improve_both(self) -> None:
         """Let critic and rules learn once from all of a round, in the orders that were drawn."""
         whole = self.memory.round
-        *orders, order = self._orders
-        parts = self._shuffled(self._groups(whole), orders)
-        for part, worlds in zip(parts, self._shuffled([whole], [order]), strict=True):
-            self._descend(self.critic_optimizer, self._critic_loss(*worlds))
+        *orders, order = self._minibatches.parts
+        parts = shuffled(self._groups(whole), orders)
+        for part, (worlds,) in zip(parts, shuffled([whole], [order]), strict=True):
+            self._descend(self.critic_optimizer, self._critic_loss(worlds))
             gain, kl = self._surrogate(part)
             # Rules that have gone too far stay, without a question to the host.
-            self._near *= kl.detach() <= self.pace.target_kl
+            self._near *= kl <= self.pace.target_kl
             self.optimizer.param_groups[0]["lr"].copy_(self._near * self._rate)
             self._descend(self.optimizer, -gain)
 
@@ -325,16 +361,6 @@ class Learner:
             return [batch]
         spans = self.actor.rules.spans
         return [Round(*(value[:, span].flatten(0, 1) for value in batch)) for span in spans]
-
-    def _shuffled(self, groups: list[Round], orders: list[Tensor]) -> Iterator[list[Round]]:
-        """Return minibatches: parts of each group, in an order of its own."""
-        count = min(self.options.minibatches, len(self._orders[-1]))
-        parts = [order.tensor_split(count) for order in orders]
-        for chosen in zip(*parts, strict=True):
-            yield [
-                Round(*(value[rows] for value in group))
-                for group, rows in zip(groups, chosen, strict=True)
-            ]
 
     def _surrogate(self, part: list[Round]) -> tuple[Tensor, Tensor]:
         """Return the clipped gain of the rules, and how far their actions have moved [nats]."""
@@ -351,18 +377,24 @@ class Learner:
             torch.cat(values)
             for values in (changes, [p.advantages for p in part], [p.acted for p in part])
         )
-        kl = (acted * (torch.expm1(log_ratio) - log_ratio)).sum() / acted.sum().clamp(min=1.0)
+        moved = (acted * (torch.expm1(log_ratio) - log_ratio)).sum().detach()
+        total = count = acted.sum()
         if options.ratio == "world":
             log_ratio = over_particles(log_ratio, acted)
             acted = acted.amax(dim=1, keepdim=True)
-        gain = clipped_gain(log_ratio, advantages, acted, clip=options.largest_change)
+            count = acted.sum()
+        self.ranks.reduce([moved, total, count])
+        kl = moved / total.clamp(min=1.0)
+        gain = clipped_gain(log_ratio, advantages, acted, count, clip=options.largest_change)
         if options.entropy_weight:
             gain = gain + options.entropy_weight * actor.entropy()
         return gain, kl
 
     def _critic_loss(self, worlds: Round) -> Tensor:
         error: Tensor = (self.critic(worlds.observations) - worlds.targets) / self.critic.scale
-        return 0.5 * (worlds.acted * error.square()).sum() / worlds.acted.sum().clamp(min=1.0)
+        count = worlds.acted.sum()
+        self.ranks.reduce([count])
+        return 0.5 * (worlds.acted * error.square()).sum() / count.clamp(min=1.0)
 
     def _descend(self, optimizer: torch.optim.Optimizer, loss: Tensor) -> None:
         # A read-out does not act, and layers may be frozen.
@@ -374,6 +406,7 @@ class Learner:
             if gradient is not None:
                 # Laid out like the parameter, as the fused optimizer takes for granted.
                 parameter.grad = torch.empty_like(parameter).copy_(gradient)
+        self.ranks.reduce([p.grad for p in parameters if p.grad is not None])
         nn.utils.clip_grad_norm_(parameters, self.options.max_gradient_norm)
         optimizer.step()
 
@@ -394,6 +427,15 @@ class Round(NamedTuple):
     """What the critic should have said, shape [M, N]."""
     acted: Tensor
     """1 where a particle's species was alive, else 0, shape [M, N]."""
+
+
+def shuffled(groups: list[Round], parts: list[tuple[Tensor, ...]]) -> Iterator[list[Round]]:
+    """Return minibatches: in each, a part of the rows of every group."""
+    for chosen in zip(*parts, strict=True):
+        yield [
+            Round(*(value[rows] for value in group))
+            for group, rows in zip(groups, chosen, strict=True)
+        ]
 
 
 class Memory:
@@ -476,51 +518,64 @@ def over_particles(values: Tensor, weights: Tensor) -> Tensor:
     return total / weights.sum(dim=-1, keepdim=True).clamp(min=1e-8)
 
 
-def standardised(values: Tensor, weights: Tensor) -> Tensor:
+def standardised(values: Tensor, weights: Tensor, ranks: Ranks = ALONE) -> Tensor:
     """Return numbers less each step's weighted mean, in units of the standard deviation of all.
 
     A step's mean over all worlds is what it is worth whatever is done: how far an episode has come,
     which a critic learns only with time. A single world is compared with its own other steps.
-    Values have shape [T, B, N], or [T, B, 1] for one number a world, weights [T, B, N].
+    Values have shape [T, B, N], or [T, B, 1] for one number a world, weights [T, B, N]; means and
+    deviation are over the worlds of all processes.
     """
     shares = weights if values.shape == weights.shape else weights.amax(-1, True)
-    alike = (1, 2) if values.shape[1] > 1 else (0, 1, 2)
-    total = shares.sum(alike, keepdim=True).clamp(min=1e-8)
-    centred = shares * (values - (values * shares).sum(alike, keepdim=True) / total)
-    return centred / (centred.square().sum() / shares.sum().clamp(min=1e-8) + 1e-16).sqrt()
+    alike = (1, 2) if values.shape[1] * ranks.count > 1 else (0, 1, 2)
+    means, totals = (part.sum(alike, keepdim=True) for part in (values * shares, shares))
+    ranks.reduce([means, totals])
+    centred = shares * (values - means / totals.clamp(min=1e-8))
+    square, total = centred.square().sum(), shares.sum()
+    ranks.reduce([square, total])
+    return centred / (square / total.clamp(min=1e-8) + 1e-16).sqrt()
 
 
-def clipped_gain(log_ratio: Tensor, advantages: Tensor, weights: Tensor, *, clip: float) -> Tensor:
+def clipped_gain(
+    log_ratio: Tensor, advantages: Tensor, weights: Tensor, total: Tensor, *, clip: float
+) -> Tensor:
     """Return the weighted mean of min(r A, clip(r) A), for r the ratio of likelihoods to before.
 
-    All have shape [M, N], or [M, 1] for one ratio a world; ratios count up to 1 ± `clip`.
+    All have shape [M, N], or [M, 1] for one ratio a world; ratios count up to 1 ± `clip`. `total`
+    is the sum of all weights, or its mean over the processes whose gradients are averaged.
     Source: Schulman et al., arXiv 1707.06347, equation 7.
     """
     ratio = log_ratio.exp()
     clipped = ratio.clamp(1.0 - clip, 1.0 + clip)
     gain = torch.minimum(ratio * advantages, clipped * advantages)
-    return (weights * gain).sum() / weights.sum().clamp(min=1.0)
+    return (weights * gain).sum() / total.clamp(min=1.0)
 
 
-def world_count(problem: Problem, options: PPOOptions, device: torch.device, budget: Budget) -> int:
-    """Return the worlds B to act in.
+def world_count(
+    problem: Problem,
+    options: PPOOptions,
+    device: torch.device,
+    budget: Budget,
+    ranks: Ranks = ALONE,
+) -> int:
+    """Return the worlds B to act in, of all processes.
 
     They are what the options say; where those say nothing, the problem's on the CPU, and on a GPU
-    about `MANY_PARTICLES` particles' worth, if memory and budget allow, never fewer than the
-    problem's.
+    about `MANY_PARTICLES` particles' worth for each process, if memory and budget allow, never
+    fewer than the problem's.
     """
     if options.worlds is not None:
         return options.worlds
     if device.type != "cuda":
         return problem.num_envs
-    counts = [MANY_PARTICLES // problem.particle_count, WORLDS_PER_SEED]
+    counts = [MANY_PARTICLES // problem.particle_count, WORLDS_PER_SEED // ranks.count]
     free = free_bytes(device)
     if free is not None:
         counts.append(int(ROOM * free) // world_bytes(problem, options, device))
     if budget.particle_steps is not None:
-        round_size = options.steps * problem.particle_count
+        round_size = ranks.count * options.steps * problem.particle_count
         counts.append(budget.particle_steps // (FEWEST_ROUNDS * round_size))
-    return max(problem.num_envs, min(counts))
+    return max(problem.num_envs, ranks.count * min(counts))
 
 
 def world_bytes(problem: Problem, options: PPOOptions, device: torch.device) -> int:

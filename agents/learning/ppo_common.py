@@ -1,4 +1,4 @@
-"""Parts of both forms of PPO: options, rules that explore, and the critic."""
+"""Parts of both forms of PPO, and of SHAC: options, rules that explore, the critic, minibatches."""
 
 from __future__ import annotations
 
@@ -15,6 +15,9 @@ from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.tasks.checks import check_fraction, check_non_negative, check_positive
+from npa_envs.training.randomness import restart, world_streams
+from npa_envs.training.ranks import ALONE, Ranks
+from npa_envs.world.randomness import Randomness, WorldRandom, normal_draws
 
 
 class Pace(NamedTuple):
@@ -175,7 +178,8 @@ class GaussianRules(nn.Module):
         """What acts without exploration."""
         widths = [rule.update_dim for rule in self.rules]
         start = torch.full((len(widths), widths[0]), math.log(initial_std))
-        self._left = 1.0
+        self.noise_left = 1.0
+        """Share of the first standard deviations that is left (dimensionless)."""
         self.log_std = nn.Parameter(start)
         """Logarithms of the standard deviations, a row for each species, shape [K, A]."""
         counts = [span.stop - span.start for span in self.rules.spans]
@@ -184,6 +188,14 @@ class GaussianRules(nn.Module):
         # The same rules one by one, not registered a second time.
         self._each = tuple(RuleSet([rule], [1], self.rules.interface) for rule in self.rules)
 
+    def get_extra_state(self) -> float:
+        """Return what a state has besides parameters: what is left of the noise."""
+        return self.noise_left
+
+    def set_extra_state(self, state: float) -> None:
+        """Go on with the noise that a state had."""
+        self.noise_left = state
+
     def row_log_std(self) -> Tensor:
         """Return the logarithms of the standard deviations of every particle, shape [N, A]."""
         return self.log_std[self.row_species]
@@ -191,15 +203,15 @@ class GaussianRules(nn.Module):
     @torch.no_grad()
     def leave_noise(self, left: float) -> None:
         """Scale standard deviations to a share of the first; what was learned of them stays."""
-        self.log_std.add_(math.log(left / self._left))
-        self._left = left
+        self.log_std.add_(math.log(left / self.noise_left))
+        self.noise_left = left
 
     def sample(
-        self, observation: Tensor, generator: torch.Generator | None = None
+        self, observation: Tensor, generator: Randomness | None = None
     ) -> tuple[Tensor, Tensor]:
         """Draw actions for observations [M, N, P], not clipped, with log-probabilities [M, N]."""
         mean, log_std = self.rules.mean(observation), self.row_log_std()
-        noise = torch.randn(mean.shape, generator=generator, device=mean.device)
+        noise = normal_draws(generator, mean.shape, mean)
         action = mean + log_std.exp() * noise
         return action, gaussian_log_prob(mean, log_std, action)
 
@@ -273,18 +285,25 @@ class Critic(nn.Module):
         return self.scale * values
 
     @torch.no_grad()
-    def observe(self, observation: Tensor) -> None:
-        """Take observations [..., P] into the moments that inputs are standardised by."""
+    def observe(self, observation: Tensor, ranks: Ranks = ALONE) -> None:
+        """Take observations [..., P] into the moments that inputs are standardised by.
+
+        Where several processes share a run, these are the moments of what all of them observe.
+        """
         rate = self._rate(0)
         rows = observation.flatten(0, -2)
-        self.mean.lerp_(rows.mean(dim=0), rate)
-        self.square.lerp_(rows.square().mean(dim=0), rate)
+        mean, square = rows.mean(dim=0), rows.square().mean(dim=0)
+        ranks.reduce([mean, square])
+        self.mean.lerp_(mean, rate)
+        self.square.lerp_(square, rate)
 
     @torch.no_grad()
-    def rescale(self, targets: Tensor) -> None:
+    def rescale(self, targets: Tensor, ranks: Ranks = ALONE) -> None:
         """Take targets into the scale of values; what the critic says now keeps its meaning."""
         before = self.scale.clone()
-        size = targets.square().mean().sqrt().clamp(min=1e-8)
+        square = targets.square().mean()
+        ranks.reduce([square])
+        size = square.sqrt().clamp(min=1e-8)
         self.scale.lerp_(size, self._rate(1))
         for parameter in (self.value.weight, self.value.bias):
             parameter.mul_(before / self.scale)
@@ -293,3 +312,73 @@ class Critic(nn.Module):
         """Return the share of the newest batch, on the device."""
         self.updates[moment] += 1.0
         return (1.0 / self.updates[moment]).clamp(min=SLOWEST)
+
+
+def learner_random(
+    seed: int, total: int, places: Tensor, device: torch.device, ranks: Ranks
+) -> Randomness:
+    """Return what a learner draws from: of each world by itself where processes share them."""
+    if ranks.together:
+        return world_streams((seed,), total, places, device)
+    return torch.Generator(device).manual_seed(seed)
+
+
+class Minibatches:
+    """Parts that the rows of a round are shuffled into, anew for each pass.
+
+    A process alone shuffles all rows. Where several share a run, the rows of each world are
+    shuffled by its own stream, and a part has as many of each world: so it is the same part of the
+    whole round for any number of processes.
+
+    Args:
+        steps: Steps of a round, T.
+        worlds: Worlds of this process, B.
+        rows: Rows of a step of a world, n, in each of the groups that are shuffled by themselves.
+            Those of a group stand as [T, B, n].
+        count: Parts, or fewer where there are not as many rows.
+        random: What the orders are drawn from.
+    """
+
+    def __init__(
+        self, steps: int, worlds: int, rows: Sequence[int], count: int, random: Randomness
+    ) -> None:
+        self._shape = steps, worlds
+        self._rows = rows
+        self._random = random
+        shared = worlds if isinstance(random, WorldRandom) else 1
+        self.count = min(count, steps * worlds * min(rows) // shared)
+        """Parts of a pass."""
+        # What is recorded reads them where they are.
+        self._orders = [
+            torch.zeros(steps * worlds * n, dtype=torch.int64, device=random.device) for n in rows
+        ]
+        # As even as `tensor_split` makes them.
+        self._sizes = [
+            [shared * ((len(order) // shared + k) // self.count) for k in range(self.count)][::-1]
+            for order in self._orders
+        ]
+
+    @property
+    def parts(self) -> list[tuple[Tensor, ...]]:
+        """Rows of each part, int64, by group: views, which `shuffle` writes anew."""
+        return [
+            torch.split(order, sizes)
+            for order, sizes in zip(self._orders, self._sizes, strict=True)
+        ]
+
+    def shuffle(self) -> None:
+        """Draw the orders of the next pass."""
+        restart(self._random)
+        for order, rows in zip(self._orders, self._rows, strict=True):
+            if isinstance(self._random, WorldRandom):
+                order.copy_(self._by_world(self._random, rows))
+            else:
+                torch.randperm(len(order), generator=self._random, out=order)
+
+    def _by_world(self, random: WorldRandom, rows: int) -> Tensor:
+        """Return all rows of a group, part by part, shape [T B n]."""
+        steps, worlds = self._shape
+        places = random.uniform(steps * rows).argsort(dim=1, stable=True)
+        world = torch.arange(worlds, device=places.device)[:, None]
+        index = (places // rows * worlds + world) * rows + places % rows
+        return torch.cat([part.flatten() for part in index.tensor_split(self.count, dim=1)])

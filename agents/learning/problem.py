@@ -324,8 +324,10 @@ class Problem:
             raise NPAError(f"text must be JSON, got {shown(text)} ({error})") from error
 
 
-def world_seeds(seed: int, count: int) -> range:
+def world_seeds(seed: int, count: int, part: int = 0) -> list[int]:
     """Return the seeds of the worlds that a run learns in, which no other run has.
+
+    Each part of a run, from one stop to the next, has others, as long as there are enough.
 
     Raises:
         NPAError: There are too many, or the seed is so large that they are those of evaluations.
@@ -341,7 +343,7 @@ def world_seeds(seed: int, count: int) -> range:
             "seeds with the next run"
         )
     first = seed * WORLDS_PER_SEED
-    return range(first, first + count)
+    return [first + (part * count + world) % WORLDS_PER_SEED for world in range(count)]
 
 
 class WorldFacts(NamedTuple):

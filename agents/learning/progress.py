@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import torch
+from torch import nn
 
 from npa_envs.agents.evaluation import evaluate_policy
 from npa_envs.agents.learning.problem import Problem
@@ -16,6 +17,8 @@ from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.devices import check_device
 from npa_envs.errors import DivergedError, NPAError, shown
 from npa_envs.tasks.checks import is_real, is_whole
+from npa_envs.training.ranks import Ranks
+from npa_envs.world.randomness import Randomness
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,6 +74,22 @@ class Entry:
     """Mean loss at the episodes' ends, before the next ones start."""
 
 
+class Learner(Protocol):
+    """A learner whose run can be stopped and go on: what is to be kept of it."""
+
+    random: Randomness
+    """What it draws from."""
+
+    def modules(self) -> Mapping[str, nn.Module]:
+        """Return what learns, by name."""
+
+    def optimisers(self) -> Mapping[str, torch.optim.Optimizer]:
+        """Return what makes it learn, by name: of Adam's kind."""
+
+    def go_on(self, iteration: int, part: int) -> None:
+        """Go on after so many iterations, for the part-th time, from 1 on, with other worlds."""
+
+
 class Progress:
     """Keeps a learner's account, and evaluates what it has learned every now and then.
 
@@ -87,6 +106,9 @@ class Progress:
     Neither what happens before `start` nor evaluations count. On CUDA the host waits for the device
     only where it evaluates; besides, `advance` keeps it at most one iteration ahead, so that time
     is what the device took.
+
+    Where torch has a default group of processes, each has an account, and all go by the clock of
+    the first one. Each evaluates the same episodes, and the first one tells of them.
 
     Args:
         problem: What is learned.
@@ -118,6 +140,8 @@ class Progress:
         """Particle-steps spent so far."""
         self.log: list[Entry] = []
         """Evaluations so far."""
+        self.ranks = Ranks.current()
+        """The processes that share the run."""
         self._seeds = list(evaluation_seeds)
         if not self._seeds:
             raise NPAError(
@@ -134,13 +158,21 @@ class Progress:
         self._started = False
         self._since: float | None = None
         self._seconds = 0.0
+        self._elapsed = 0.0
         self._looks = 0
+        self.interrupted = False
+        """Whether a run that is kept was asked to stop before its end."""
         self._previous: torch.cuda.Event | None = None
 
-    def run(self, rules: RuleSet, iteration: Callable[[], int]) -> RuleSet:
+    def run(
+        self, rules: RuleSet, iteration: Callable[[], int], learner: Learner | None = None
+    ) -> RuleSet:
         """Learn until the budget is spent, and return the rules.
 
-        An iteration lets the rules learn a little, and returns the particle-steps that it took.
+        Args:
+            rules: What is learned.
+            iteration: Lets the rules learn a little, and returns the particle-steps that it took.
+            learner: What checkpoints are made of, where the run is kept.
 
         Raises:
             NPAError: It has started before.
@@ -156,14 +188,18 @@ class Progress:
     def start(self, actor: RuleSet | Callable[[Any], Any]) -> None:
         """Evaluate the rules or the policy that the learner begins with, and begin to count.
 
+        Of a run that goes on, this is known.
+
         Raises:
             NPAError: It has started before.
         """
         if self._started:
             raise NPAError("progress must start once, got a second start: make one for each run")
         self._started = True
-        self._evaluate(actor)
+        if not self.log:
+            self._evaluate(actor)
         self._since = time.perf_counter()
+        self._agree_on_time()
 
     @property
     def seconds(self) -> float:
@@ -174,7 +210,8 @@ class Progress:
     def share(self) -> float:
         """Share of the budget that is spent; above 1 by the last iteration's excess."""
         limits = self.budget
-        by_time = 0.0 if limits.seconds is None else self.seconds / limits.seconds
+        seconds = self._elapsed if self.ranks.together else self.seconds
+        by_time = 0.0 if limits.seconds is None else seconds / limits.seconds
         by_steps = 0.0
         if limits.particle_steps is not None:
             by_steps = self.particle_steps / limits.particle_steps
@@ -199,6 +236,7 @@ class Progress:
             if self._previous is not None:
                 self._previous.synchronize()
             self._previous = event
+        self._agree_on_time()
 
     def look(self, actor: RuleSet | Callable[[Any], Any], force: bool = False) -> None:
         """Evaluate where the next share of the budget is spent.
@@ -217,10 +255,15 @@ class Progress:
         if not fresh or not (force or due):
             return
         self._wait()
-        self._seconds, self._since = self.seconds, None
+        self._agree_on_time()
+        self._seconds, self._since = self._elapsed, None
         self._looks = int(self.share * self._entries)
         self._evaluate(actor)
         self._since = time.perf_counter()
+
+    def _agree_on_time(self) -> None:
+        """Take down the time as the first process has it."""
+        self._elapsed = self.ranks.told(self.seconds)
 
     def _check_started(self, caller: str) -> None:
         if not self._started:
@@ -234,6 +277,7 @@ class Progress:
         if isinstance(actor, RuleSet):
             policy = actor.policy()
             check_finite(actor, self.particle_steps)
+            self.ranks.check_same(list(actor.parameters()))
         episodes = evaluate_policy(self._envs, policy, self._seeds)
         entry = Entry(
             seconds=self._seconds,
@@ -244,7 +288,7 @@ class Progress:
         )
         self._wait()
         self.log.append(entry)
-        if self._on_entry is not None:
+        if self._on_entry is not None and self.ranks.first:
             self._on_entry(entry)
 
     def _wait(self) -> None:

@@ -15,13 +15,23 @@ import torch
 from torch import Tensor
 
 from npa_envs.agents.learning.gradient import EpisodeTask, episode_task
-from npa_envs.agents.learning.ppo_common import Critic, CriticKind, check_word, first_rules
+from npa_envs.agents.learning.ppo_common import (
+    Critic,
+    CriticKind,
+    Minibatches,
+    check_word,
+    first_rules,
+    learner_random,
+)
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Progress, annealed
 from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.tasks.base import Task, seed_worlds, task_toward
 from npa_envs.tasks.checks import check_fraction, check_non_negative, check_positive
 from npa_envs.training.optimiser import normalise_gradients
+from npa_envs.training.randomness import restart
+from npa_envs.training.ranks import ALONE, Ranks
+from npa_envs.world.randomness import WorldRandom
 from npa_envs.world.rollout import Memory
 
 
@@ -34,7 +44,7 @@ class SHACOptions:
     length."""
 
     world_count: int = 8
-    """Worlds B."""
+    """Worlds B; several processes share them out."""
 
     gamma: float = 0.97
     """Discount of a reward one step later (dimensionless)."""
@@ -108,13 +118,13 @@ def train(
         NPAError: The environment's loss has no gradient.
         DivergedError: The rules' weights are not finite.
     """
-    learner = Learner(problem, options, seed, device, start)
+    learner = Learner(problem, options, seed, device, start, progress.ranks)
 
     def iteration() -> int:
         learner.learn(annealed(options.learning_rate, options.last_rate, progress.share))
         return options.world_count * learner.window * problem.particle_count
 
-    return progress.run(learner.rules, iteration)
+    return progress.run(learner.rules, iteration, learner)
 
 
 class Window(NamedTuple):
@@ -133,7 +143,11 @@ class Window(NamedTuple):
 
 
 class Learner:
-    """Rules, critic and worlds; the seed is that of all that is drawn."""
+    """Rules, critic and worlds; the seed is that of all that is drawn.
+
+    Several processes each have a share of the worlds, draw for each of these by itself, and take
+    the means of gradients and moments.
+    """
 
     def __init__(
         self,
@@ -142,15 +156,19 @@ class Learner:
         seed: int,
         device: torch.device,
         start: RuleSet | None,
+        ranks: Ranks = ALONE,
     ) -> None:
-        self.options, self.device = options, device
+        self.options, self.device, self.ranks = options, device, ranks
+        ranks.check_dealt("world_count", options.world_count)
+        places = ranks.places(options.world_count)
         self.rules = first_rules(problem, seed, start).to(device)
         """What is learned."""
         count = -(-problem.episode_steps // options.steps)
         self.window = -(-problem.episode_steps // count)
         """Steps of a window, h."""
         self.task = episode_task(problem, device)
-        self.generator = torch.Generator(device).manual_seed(seed)
+        self.random = learner_random(seed, options.world_count, places, device, ranks)
+        """What worlds, update masks and shuffles draw from."""
         width = problem.physics.space_dim + problem.physics.state_dim + 1
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
@@ -164,12 +182,33 @@ class Learner:
             self.critic.parameters(), lr=options.critic_learning_rate, fused=True
         )
         self._limits = problem.physics.position_limit, problem.physics.state_limit
-        self.x, self.s, self.goal = self._fresh(options.world_count)
         self.window_count = count
         """Windows of an episode."""
-        self.windows_left = [1 + k % count for k in range(options.world_count)]
+        self._places = places.tolist()
+        self._minibatches = Minibatches(
+            self.window, len(places), (1,), options.minibatches, self.random
+        )
+        self._begin()
+
+    def _begin(self) -> None:
+        """Begin the episodes of all worlds."""
+        restart(self.random)
+        self.x, self.s, self.goal = self._fresh(list(range(len(self._places))))
+        self.windows_left = [1 + place % self.window_count for place in self._places]
         """Windows left of each world's episode: at first all numbers, so that every part of an
         episode is in a batch."""
+
+    def modules(self) -> dict[str, torch.nn.Module]:
+        """Return what learns, by the names that checkpoints have for it."""
+        return {"rules": self.rules, "critic": self.critic, "target": self.target}
+
+    def optimisers(self) -> dict[str, torch.optim.Optimizer]:
+        """Return what makes it learn."""
+        return {"rules": self._optimizer, "critic": self._critic_optimizer}
+
+    def go_on(self, iteration: int, part: int) -> None:
+        """Go on after so many windows, for the part-th time, from 1 on, with fresh worlds."""
+        self._begin()
 
     def learn(self, rate: float) -> None:
         """Let worlds live for a window, and rules and critic learn from it once."""
@@ -178,7 +217,9 @@ class Learner:
         followed = [(w, g) for w, g in zip(self._weights, gradients, strict=True) if g is not None]
         for weight, gradient in followed:
             weight.grad = gradient.clone(memory_format=torch.contiguous_format)
-        normalise_gradients([weight.grad for weight, _ in followed if weight.grad is not None])
+        means = [weight.grad for weight, _ in followed if weight.grad is not None]
+        self.ranks.reduce(means)
+        normalise_gradients(means)
         self._optimizer.param_groups[0]["lr"] = rate
         self._optimizer.step()
         self.learn_values(Window(*(part.detach() for part in window)))
@@ -187,6 +228,7 @@ class Learner:
         """Run the rules for a window, differentiably, and begin episodes anew where one is over."""
         task, steps = self.task, self.window
         x0, s0 = self.x, self.s
+        restart(self.random)
         x, s, _ = task.rollout(
             self.rules,
             x0,
@@ -196,7 +238,7 @@ class Learner:
             box=task.box,
             update_prob=task.update_prob,
             memory=self.options.memory,
-            generator=self.generator,
+            generator=self.random,
             return_path_length=True,
             keep_every=1,
             cuda_graph=True,
@@ -218,11 +260,12 @@ class Learner:
 
     def _restart(self) -> None:
         """Begin the next episodes of worlds whose last window this was."""
+        restart(self.random)
         self.windows_left = [left - 1 for left in self.windows_left]
         over = [k for k, left in enumerate(self.windows_left) if left == 0]
         if not over:
             return
-        x, s, goal = self._fresh(len(over))
+        x, s, goal = self._fresh(over)
         index = torch.tensor(over, device=self.device)
         self.x, self.s = self.x.index_copy(0, index, x), self.s.index_copy(0, index, s)
         if self.goal is not None and goal is not None:
@@ -230,10 +273,14 @@ class Learner:
         for world in over:
             self.windows_left[world] = self.window_count
 
-    def _fresh(self, count: int) -> tuple[Tensor, Tensor, Tensor | None]:
+    def _fresh(self, worlds: list[int]) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Return worlds as their episodes begin."""
+        random = self.random
+        if isinstance(random, WorldRandom):
+            random = random.take(torch.tensor(worlds, device=self.device))
         # The task has what is asked of one here.
         task = cast(Task, self.task)
-        return seed_worlds(task, count, generator=self.generator, device=self.device)
+        return seed_worlds(task, len(worlds), generator=random, device=self.device)
 
     def gain(self, window: Window) -> Tensor:
         """Return the mean discounted reward of a window, and of what is foreseen after it."""
@@ -249,7 +296,7 @@ class Learner:
         seen = window.features[:-1].flatten(0, 1)
         with torch.no_grad():
             for critic in (self.critic, self.target):
-                critic.observe(seen)
+                critic.observe(seen, self.ranks)
             later = values(self.target, window.features[1:].flatten(0, 1))
             targets = td_lambda_targets(
                 window.rewards,
@@ -258,13 +305,15 @@ class Learner:
                 td_lambda=options.td_lambda,
             ).flatten()
             for critic in (self.critic, self.target):
-                critic.rescale(targets)
+                critic.rescale(targets, self.ranks)
+        weights = list(self.critic.parameters())
         for _ in range(options.critic_epochs):
-            order = torch.randperm(len(seen), generator=self.generator, device=self.device)
-            for part in order.tensor_split(min(options.minibatches, len(order))):
+            self._minibatches.shuffle()
+            for part in self._minibatches.parts[0]:
                 error = (values(self.critic, seen[part]) - targets[part]) / self.critic.scale
                 self._critic_optimizer.zero_grad()
                 torch.autograd.backward(0.5 * error.square().mean())
+                self.ranks.reduce([p.grad for p in weights if p.grad is not None])
                 self._critic_optimizer.step()
         with torch.no_grad():
             pairs = zip(self.target.parameters(), self.critic.parameters(), strict=True)

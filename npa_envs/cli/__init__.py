@@ -11,6 +11,7 @@ from npa_envs.errors import NPAError, suggest
 COMMANDS = {
     "demo": "grow, hurt and heal the shipped rule, and train a small one; about a minute on a CPU",
     "train": "train a rule on a task",
+    "learn": "learn an environment by reinforcement learning, on one GPU or several",
     "sweep": "train with every combination of some options, over devices and machines",
     "rollout": "grow a rule from its seed, with damage on the way; writes GIF, MP4 and a filmstrip",
     "view": "watch and touch a rule, a training run or an environment in the browser",
@@ -102,6 +103,8 @@ def _dispatch(words: list[str]) -> int:
             from npa_envs.cli.stress import main as command
         case "robustness":
             from npa_envs.cli.robustness import main as command
+        case "learn":
+            from npa_envs.cli.learn import main as command
         case "compare":
             from npa_envs.cli.compare import main as command
         case "record":

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import signal
 import sys
 import uuid
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
 import torch.distributed as dist
 
-from npa_envs.cli import INTERRUPTED
+from npa_envs.cli import INTERRUPTED, USAGE_ERROR
 from npa_envs.errors import LostProcessError, NPAError, shown
 from npa_envs.training import RunFolder
+from npa_envs.training.ranks import Ranks
 
 if TYPE_CHECKING:
     from torch.distributed.elastic.multiprocessing.errors import ProcessFailure
@@ -99,6 +101,24 @@ def launch(count: int, words: Sequence[str], out: Path, device: str) -> int:
             f"{RunFolder(out).checkpoint}; go on from it with --resume"
         ) from error
     return 0
+
+
+@contextlib.contextmanager
+def told_once(ranks: Ranks) -> Iterator[None]:
+    """Let the first process tell of an error, and leave that of another one to the launcher.
+
+    Raises:
+        NPAError: What was raised within the block, in a process alone and in the first one.
+        SystemExit: It was raised in another one.
+    """
+    try:
+        yield
+    except NPAError as error:
+        if ranks.together:
+            leave_to_launcher(error)
+        if not ranks.first:
+            raise SystemExit(USAGE_ERROR) from error
+        raise
 
 
 def leave_to_launcher(error: NPAError) -> None:

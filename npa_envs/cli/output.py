@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import inspect
+import json
 import sys
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -39,6 +41,11 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "evaluate": ("evaluate gecko --healing", "evaluate runs/heart --seed-count 2"),
     "export-web": ("export-web gecko heart -o page.html", "export-web --gallery -o gallery.html"),
     "interact": ("interact gecko heart", "interact --quick"),
+    "learn": (
+        "learn ppo npa/Morphogenesis2D-v0 --keywords target=heart --particle-steps 1e9 "
+        "--device cuda",
+        "learn shac npa/Mixing-v0 --seconds 600 --device cuda --processes 2 --out runs/mixing",
+    ),
     "list": ("list",),
     "record": (
         "record npa/Morphogenesis2D-v0 --policy gecko --options target=gecko "
@@ -230,6 +237,54 @@ def check_numbers(options: Any, **least: int) -> None:
     seconds = getattr(options, "max_seconds", None)
     if seconds is not None and not seconds > 0.0:
         raise NPAError(f"max_seconds must be positive, got {seconds}: leave it out for no limit")
+
+
+def named_values(name: str, words: Iterable[str]) -> dict[str, Any]:
+    """Return what words NAME=VALUE of the option of a name say, values as JSON or plain text.
+
+    Raises:
+        NPAError: A word is none.
+    """
+    found: dict[str, Any] = {}
+    for word in words:
+        key, mark, value = word.partition("=")
+        if not mark:
+            raise NPAError(f"{name} must be NAME=VALUE, got {word!r}: target=heart")
+        try:
+            found[key] = json.loads(value)
+        except ValueError:
+            found[key] = value
+    return found
+
+
+def settled_resume(words: Sequence[str], out_of: Callable[[Sequence[str]], Path]) -> list[str]:
+    """Return the words of a command with `--resume auto` decided: by the folder that they name.
+
+    Args:
+        words: The words after the command.
+        out_of: Returns the folder that words without it name.
+
+    Raises:
+        NPAError: Another word stands behind `--resume`.
+    """
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    parser.add_argument("--resume", nargs="?", choices=("auto",))
+    try:
+        first, _ = parser.parse_known_args(words)
+    except argparse.ArgumentError as error:
+        raise NPAError(f"{error.argument_name}: {error.message}") from error
+    chosen = list(words)
+    if first.resume == "auto":
+        if "--resume=auto" in chosen:
+            chosen.remove("--resume=auto")
+        else:
+            place = chosen.index("--resume")
+            del chosen[place : place + 2]
+        from npa_envs.training.run_folder import RunFolder
+
+        if RunFolder(out_of(chosen)).checkpoint.exists():
+            chosen.append("--resume")
+    return chosen
 
 
 def chosen_names(kind: str, names: Sequence[str], known: Iterable[str]) -> list[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shlex
 from collections.abc import Callable, Iterator, Sequence
@@ -16,6 +15,7 @@ from npa_envs.cli.output import (
     RunOptions,
     StepBar,
     check_numbers,
+    named_values,
     parse_options,
     rule_of,
     writable_folder,
@@ -110,20 +110,11 @@ def problem_of(options: RecordOptions) -> Problem:
     from npa_envs.agents.learning import Problem
     from npa_envs.registration import ALL
 
-    keywords: dict[str, Any] = {}
-    for word in options.options:
-        name, mark, value = word.partition("=")
-        if not mark:
-            raise NPAError(f"options must be NAME=VALUE, got {word!r}: target=heart")
-        try:
-            keywords[name] = json.loads(value)
-        except ValueError:
-            keywords[name] = value
     limits = {known.id: known.max_episode_steps for known in ALL}
     worlds = min(options.worlds, options.episodes)
     problem = Problem(
         env_id=options.env,
-        keywords=keywords,
+        keywords=named_values("options", options.options),
         episode_steps=limits.get(options.env, 1),
         num_envs=worlds,
     )

@@ -14,9 +14,15 @@ import torch
 import torch.distributed as dist
 import tyro
 
-from npa_envs.cli import INTERRUPTED, USAGE_ERROR
-from npa_envs.cli.launch import launch, leave_to_launcher
-from npa_envs.cli.output import OutFolder, duration, parse_options, torch_threads
+from npa_envs.cli import INTERRUPTED
+from npa_envs.cli.launch import launch, told_once
+from npa_envs.cli.output import (
+    OutFolder,
+    duration,
+    parse_options,
+    settled_resume,
+    torch_threads,
+)
 from npa_envs.cli.report import Training, write_report
 from npa_envs.errors import NPAError
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig
@@ -133,15 +139,8 @@ def main(arguments: Sequence[str]) -> int:
             if options.processes is None and options.gpus is None:
                 told += ["--processes", str(count)]
             return launch(count, told, config.out, config.device)
-        try:
+        with told_once(ranks):
             return run(task_name, options, config, (task_name, *words), ranks)
-        except NPAError as error:
-            if not ranks.together:
-                raise
-            leave_to_launcher(error)
-            if ranks.first:
-                raise
-            raise SystemExit(USAGE_ERROR) from error
 
 
 def settled(task_name: str, words: Sequence[str]) -> list[str]:
@@ -150,27 +149,18 @@ def settled(task_name: str, words: Sequence[str]) -> list[str]:
     Raises:
         NPAError: As for `starting_configuration`.
     """
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--gpus")
     parser.add_argument("--device")
-    parser.add_argument("--resume", nargs="?", choices=("auto",))
-    try:
-        first, _ = parser.parse_known_args(words)
-    except argparse.ArgumentError as error:
-        raise NPAError(f"{error.argument_name}: {error.message}") from error
+    first, _ = parser.parse_known_args(words)
     chosen = list(words)
     if first.gpus is not None and first.device is None:
         chosen += ["--device", "cuda"]
-    if first.resume == "auto":
-        if "--resume=auto" in chosen:
-            chosen.remove("--resume=auto")
-        else:
-            place = chosen.index("--resume")
-            del chosen[place : place + 2]
-        _, config = parse(task_name, starting_configuration(task_name, chosen), chosen)
-        if RunFolder(config.out).checkpoint.exists():
-            chosen.append("--resume")
-    return chosen
+
+    def out_of(words: Sequence[str]) -> Path:
+        return parse(task_name, starting_configuration(task_name, words), words)[1].out
+
+    return settled_resume(chosen, out_of)
 
 
 def starting_configuration(task_name: str, arguments: Sequence[str]) -> TrainConfig[Any]:

@@ -94,7 +94,7 @@ class TrainingCycle:
             total=config.pool_size,
         )
         """Worlds of this process that live on between batches."""
-        numbers = ranks.places(config.world_count, 1)
+        numbers = ranks.places(config.world_count)
         self._fresh_count = int((numbers < config.fresh_count).sum())
         count = len(numbers)
         batch = x[:count], s[:count]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -66,12 +66,9 @@ class RunRandomness:
         batch, pool = config.world_count, config.pool_size
 
         def streams(purpose: int, total: int, places: Tensor) -> WorldRandom:
-            keys = np.random.default_rng((config.seed, purpose)).integers(
-                2**64, size=total, dtype=np.uint64
-            )
-            return WorldRandom.from_keys(torch.from_numpy(keys.view(np.int64))[places].to(device))
+            return world_streams((config.seed, purpose), total, places, device)
 
-        of_batch = ranks.places(batch, 1)
+        of_batch = ranks.places(batch)
         return cls(
             schedule,
             pool=streams(0, pool, ranks.places(pool, pool // batch)),
@@ -102,6 +99,21 @@ class RunRandomness:
         if isinstance(self.ageing, WorldRandom):
             steps = sum(config.ageing_at(before) for before in range(iteration))
             self.ageing.episodes.fill_(steps // AGEING_BLOCK)
+
+
+def world_streams(
+    seed: Sequence[int], total: int, places: Tensor, device: torch.device
+) -> WorldRandom:
+    """Return streams of this process's worlds, which do not depend on who else has which.
+
+    Args:
+        seed: Whole numbers of at least 0: the run's seed and what is drawn, for example.
+        total: Worlds of all processes.
+        places: Which of them are this process's, on the CPU, int64, shape [B].
+        device: Where the worlds are.
+    """
+    keys = np.random.default_rng(seed).integers(2**64, size=total, dtype=np.uint64)
+    return WorldRandom.from_keys(torch.from_numpy(keys.view(np.int64))[places].to(device))
 
 
 def restart(*sources: Randomness) -> None:

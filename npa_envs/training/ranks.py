@@ -61,19 +61,27 @@ class Ranks:
             NPAError: The batch cannot be dealt out evenly, or the pool not among its worlds.
         """
         batch, pool = config.world_count, config.pool_size
-        if batch % self.count:
-            nearest = max(batch // self.count, 1) * self.count
-            raise NPAError(
-                f"world_count must be a multiple of the number of processes, got {batch} and "
-                f"{self.count}: set world_count={nearest}"
-            )
+        self.check_dealt("world_count", batch)
         if pool % batch:
             raise NPAError(
                 f"pool_size must be a multiple of world_count in a run of several processes, got "
                 f"{pool} and {batch}: set pool_size={pool // batch * batch}"
             )
 
-    def places(self, total: int, section: int) -> Tensor:
+    def check_dealt(self, name: str, worlds: int) -> None:
+        """Check that the worlds of a batch, which the caller calls so, can be dealt out evenly.
+
+        Raises:
+            NPAError: They cannot.
+        """
+        if worlds % self.count:
+            nearest = max(worlds // self.count, 1) * self.count
+            raise NPAError(
+                f"{name} must be a multiple of the number of processes, got {worlds} and "
+                f"{self.count}: set {name}={nearest}"
+            )
+
+    def places(self, total: int, section: int = 1) -> Tensor:
         """Return which of all worlds are this process's, on the CPU, int64, shape [total / R].
 
         Args:
@@ -145,7 +153,7 @@ class Ranks:
         # Whoever started them would end them; where that one was killed, they end by themselves.
         return self.any(asked or os.getppid() != self._parent)
 
-    def reduce(self, means: Sequence[Tensor], total: Tensor) -> None:
+    def reduce(self, means: Sequence[Tensor], total: Tensor | None = None) -> None:
         """Replace numbers by their means, and one by its sum, over all processes, in place.
 
         On CUDA the host waits for nothing.
@@ -156,10 +164,14 @@ class Ranks:
         """
         if not self.together:
             return
-        flat = torch.cat([*(mean.reshape(-1) for mean in means), total.reshape(1).to(means[0])])
+        parts = [mean.reshape(-1) for mean in means]
+        if total is not None:
+            parts.append(total.reshape(1).to(means[0]))
+        flat = torch.cat(parts)
         with self._in_touch():
             dist.all_reduce(flat)
-        total.copy_(flat[-1])
+        if total is not None:
+            total.copy_(flat[-1])
         flat /= self.count
         first = 0
         for mean in means:
@@ -200,6 +212,10 @@ class Ranks:
                 f"cannot be reached ({shown(error)}): the last checkpoint is intact; see what "
                 "the other process said, then resume"
             ) from error
+
+
+ALONE = Ranks()
+"""A process that shares nothing."""
 
 
 @contextlib.contextmanager

@@ -67,17 +67,18 @@ class RunFolder:
         """Locked while a trainer writes to the folder; holds the trainer's process and computer."""
         self._known: tuple[int, int] | None = None
 
-    def prepare(self, byte_count: int) -> None:
+    def prepare(self, byte_count: int, *, pictures: bool = True) -> None:
         """Create the folder and see that a checkpoint can be written there.
 
         Args:
             byte_count: About how large a checkpoint is [bytes].
+            pictures: Make the folder of pictures as well.
 
         Raises:
             NPAError: The folder cannot be created or written to, or its disk has too little room.
         """
         try:
-            self.pictures.mkdir(parents=True, exist_ok=True)
+            (self.pictures if pictures else self.path).mkdir(parents=True, exist_ok=True)
             free = shutil.disk_usage(self.path).free
         except OSError as error:
             raise NPAError(

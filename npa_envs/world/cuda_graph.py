@@ -195,6 +195,7 @@ class Replayed:
         device: Where these are.
         generator: A generator on the device that the function draws from; the numbers are the same
             whether it is captured or not.
+        recorded: False: run it as it is on CUDA too.
     """
 
     def __init__(
@@ -202,10 +203,13 @@ class Replayed:
         function: Callable[[], None],
         device: torch.device,
         generator: torch.Generator | None = None,
+        *,
+        recorded: bool = True,
     ) -> None:
         self._function = WeakFunction(function)
         self._device = device
         self._generator = generator
+        self._recorded = recorded and device.type == "cuda"
         self._warm = False
         self._graph: torch.cuda.CUDAGraph | None = None
 
@@ -220,7 +224,7 @@ class Replayed:
             ReferenceError: It is a method, and its object is gone.
         """
         function = self._function()
-        if self._device.type == "cpu" or not self._warm:
+        if not self._recorded or not self._warm:
             function()
             self._warm = True
             return

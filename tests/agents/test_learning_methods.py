@@ -356,8 +356,11 @@ def test_where_no_script_helps_there_is_none():
 
 def test_worlds_of_one_seed_follow_each_other_and_end_before_those_of_the_next():
     assert list(world_seeds(0, 3)) == [0, 1, 2]
-    assert world_seeds(3, 10_000).stop == world_seeds(4, 1).start
-    assert world_seeds(99, 10_000).stop == EVALUATION_SEEDS.start
+    assert world_seeds(3, 10_000)[-1] + 1 == world_seeds(4, 1)[0]
+    assert world_seeds(99, 10_000)[-1] + 1 == EVALUATION_SEEDS.start
+    # Parts of a run have others, until they come round.
+    assert world_seeds(1, 3, 2) == [10_006, 10_007, 10_008]
+    assert world_seeds(0, 6_000, 1)[3_999:4_001] == [9_999, 0]
 
 
 @pytest.mark.parametrize(

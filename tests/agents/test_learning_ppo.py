@@ -248,7 +248,7 @@ def test_gains_are_clipped_where_the_ratio_has_gone_where_it_pays():
     log_ratio = torch.tensor([[0.5], [0.5], [-0.5], [-0.5], [0.0]]).requires_grad_()
     advantages = torch.tensor([[1.0], [-1.0], [1.0], [-1.0], [2.0]])
     weights = torch.tensor([[1.0], [1.0], [1.0], [1.0], [0.0]])
-    gain = clipped_gain(log_ratio, advantages, weights, clip=0.2)
+    gain = clipped_gain(log_ratio, advantages, weights, weights.sum(), clip=0.2)
     wanted = 1.2 - math.exp(0.5) + math.exp(-0.5) - 0.8
     assert float(gain.detach()) == pytest.approx(wanted / 4.0, abs=1e-6)
     gain.backward()

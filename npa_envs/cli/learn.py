@@ -1,0 +1,169 @@
+"""`npa-envs learn`: one method on one environment, kept in a folder, on one device or several."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from npa_envs.cli.launch import launch, told_once
+from npa_envs.cli.output import (
+    OutFolder,
+    RunOptions,
+    check_numbers,
+    named_values,
+    parse_options,
+    settled_resume,
+)
+from npa_envs.errors import NPAError
+
+if TYPE_CHECKING:
+    from npa_envs.agents.learning import Entry, Problem
+    from npa_envs.training.ranks import Ranks
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearnOptions(RunOptions):
+    """Learn an environment by reinforcement learning, and keep the run in a folder.
+
+    A line is printed, and a checkpoint written, for each point of the learning curve. A run that
+    was stopped, by SIGTERM, Ctrl-C or a kill, goes on with `--resume`, on any number of processes.
+    """
+
+    method: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="METHOD")]
+    """ppo or shac."""
+
+    env: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ENV")]
+    """Id of an environment, of Gymnasium or of several species (`npa-envs list`)."""
+
+    keywords: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = ()
+    """Keywords of the environment, values as JSON or plain text: target=heart."""
+
+    options: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = ()
+    """Options of the method, likewise: steps=32 (docs/learning.md)."""
+
+    episode_steps: int | None = None
+    """Steps after which an episode is cut off; default: as registered, 256 of several species."""
+
+    worlds: int = 16
+    """Worlds to act in, of all processes; on CUDA ppo takes more where it can."""
+
+    seed: int = 0
+    """Of everything that is drawn, from 0 to 99."""
+
+    particle_steps: float | None = None
+    """Steps of the worlds, times the particles that took them, to learn from: 1e8."""
+
+    seconds: float | None = None
+    """Time to learn [s]; start and evaluations come on top."""
+
+    episodes: int = 16
+    """Episodes by which a point of the curve is measured."""
+
+    entries: int = 20
+    """Points of the curve besides the first, and checkpoints."""
+
+    out: OutFolder = Path("runs/learn")
+    """Folder for checkpoint, rules and curve."""
+
+    processes: int = 1
+    """Processes that share the run, on CUDA each with a GPU of its own. `torchrun
+    --nproc-per-node=4 -m npa_envs learn ...` does the same."""
+
+    resume: bool = False
+    """Go on from the checkpoint in the folder `out`. `--resume auto`: if there is one; else
+    begin."""
+
+    overwrite: bool = False
+    """Begin anew although the folder `out` holds a run; the run's files are removed."""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Learn; return 130 where it was stopped."""
+    from npa_envs.training.ranks import joined_ranks
+
+    with joined_ranks() as ranks:
+        asked = None
+        if ranks.first:
+            words = settled_resume(arguments, lambda words: parse(words).out)
+            asked = words, parse(words)
+        asked = ranks.told(asked)
+        assert asked is not None, "said by the first process"
+        words, options = asked
+        if options.processes > 1 and not ranks.together:
+            return launch(options.processes, ("learn", *words), options.out, options.device)
+        with told_once(ranks):
+            return run(options, ranks)
+
+
+def parse(words: Sequence[str]) -> LearnOptions:
+    """Return what the words after `npa-envs learn` say."""
+    options = parse_options(LearnOptions, "learn", words)
+    check_numbers(options, worlds=1, episodes=1, entries=1, processes=1)
+    return options
+
+
+def run(options: LearnOptions, ranks: Ranks) -> int:
+    """Learn as one process of those that share the run, and return the exit code.
+
+    Raises:
+        NPAError: There is no budget, or as for `npa_envs.agents.learning.train`.
+    """
+    from npa_envs.agents.learning import Budget, train
+    from npa_envs.agents.learning.problem import FIRST_EVALUATION_SEED
+    from npa_envs.cli import INTERRUPTED
+
+    steps = options.particle_steps
+    if steps is None and options.seconds is None:
+        raise NPAError("learn needs a budget: give --particle-steps 1e8, --seconds 600 or both")
+    if steps is not None and not math.isfinite(steps):
+        raise NPAError(f"particle_steps must be finite, got {steps}: try 1e8")
+
+    def told(entry: Entry) -> None:
+        if options.progress:
+            print(
+                f"{entry.seconds:8.1f} s  {entry.particle_steps:.3g} particle-steps  "
+                f"return {entry.mean_return:.4g}  final loss {entry.final_loss:.4g}",
+                flush=True,
+            )
+
+    found = train(
+        options.method,
+        problem_of(options),
+        Budget(seconds=options.seconds, particle_steps=None if steps is None else int(steps)),
+        options.seed,
+        device=options.device,
+        evaluation_seeds=range(FIRST_EVALUATION_SEED, FIRST_EVALUATION_SEED + options.episodes),
+        entries=options.entries,
+        on_entry=told,
+        out=options.out,
+        resume=options.resume,
+        overwrite=options.overwrite,
+        **named_values("options", options.options),
+    )
+    if ranks.first:
+        end = "stopped; the same words with --resume go on" if found.interrupted else "finished"
+        print(f"{end}: rules, curve and checkpoint are in {options.out}/")
+    return INTERRUPTED if found.interrupted else 0
+
+
+def problem_of(options: LearnOptions) -> Problem:
+    """Return what is to be learned.
+
+    Raises:
+        NPAError: There is no such environment or keyword, or a number is out of its range.
+    """
+    from npa_envs.agents.learning import Problem
+    from npa_envs.registration import ALL
+
+    limits: dict[str, Any] = {known.id: known.max_episode_steps for known in ALL}
+    return Problem(
+        env_id=options.env,
+        keywords=named_values("keywords", options.keywords),
+        episode_steps=options.episode_steps or limits.get(options.env, 256),
+        num_envs=options.worlds,
+    )

@@ -1,0 +1,210 @@
+"""PPO and SHAC by several processes: the same curve for any number of them."""
+
+import json
+import os
+import shutil
+import signal
+
+import pytest
+import torch
+from learning_problems import heart, species
+from processes import on_ranks
+
+from npa_envs.agents.learning import Budget, ppo, shac, train
+from npa_envs.errors import NPAError
+from npa_envs.rule.files import load_rule
+from npa_envs.training.ranks import Ranks
+from npa_envs.training.run_folder import load_checkpoint, save_checkpoint
+
+HEART = heart(num_envs=4, episode_steps=6)
+DYING = species(episode_steps=6, deaths=[[1, 3]])
+CPU = torch.device("cpu")
+
+FORMS = {
+    "PPO": (HEART, ppo, {"steps": 5, "masked": True, "minibatches": 2, "epochs": 2}),
+    "PPO by worlds": (HEART, ppo, {"steps": 4, "ratio": "world", "critic": "central"}),
+    "PPO of species that die": (DYING, ppo, {"worlds": 4, "steps": 4, "credit": "particle"}),
+    "SHAC": (HEART, shac, {"steps": 2, "world_count": 4}),
+}
+
+
+def learner_of(form):
+    """The learner of this process, whose numbers are float64; worlds themselves are float32."""
+    problem, method, options = FORMS[form]
+    kind = ppo.PPOOptions if method is ppo else shac.SHACOptions
+    made = method.Learner(problem, kind(**options), 0, CPU, None, Ranks.current())
+    for module in made.modules().values():
+        module.double()
+    if method is ppo:
+        for holder in (made.memory, made):
+            for name, value in vars(holder).items():
+                if isinstance(value, torch.Tensor) and value.is_floating_point():
+                    setattr(holder, name, value.double())
+        # As at the beginning.
+        made.critic.updates.zero_()
+        made.critic.observe(made.memory.seen[-1], made.ranks)
+        return made
+    fresh = made._fresh
+    made._fresh = lambda worlds: tuple(
+        part.double() if part is not None and part.is_floating_point() else part
+        for part in fresh(worlds)
+    )
+    made._begin()
+    return made
+
+
+def learned(form):
+    """What a process has learned in some rounds, and what it has learned it from."""
+    made, said = learner_of(form), []
+    for share_left in (1.0, 0.7, 0.4):
+        if isinstance(made, ppo.Learner):
+            batch = made.play()
+            made.improve(share_left)
+            told = batch.advantages.square().mean(), batch.targets.mean()
+        else:
+            told = made.play().losses[-1].mean(), made.gain(made.play())
+            made.learn(0.01 * share_left)
+        said.append([float(part.detach()) for part in told])
+    weights = [
+        weight for module in made.modules().values() for weight in module.state_dict().values()
+    ]
+    return said, [
+        weight.flatten().tolist() for weight in weights if isinstance(weight, torch.Tensor)
+    ]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def loaded_kernels():
+    """Load once what each forked process would have to load by itself."""
+    for form in QUICK:
+        learned(form)
+
+
+QUICK = ("PPO of species that die", "SHAC")
+
+
+@pytest.mark.parametrize(
+    "form",
+    [form if form in QUICK else pytest.param(form, marks=pytest.mark.slow) for form in FORMS],
+)
+def test_two_processes_learn_what_one_does(form, tmp_path):
+    ((one, weights),) = on_ranks(1, lambda: learned(form), tmp_path)
+    both = on_ranks(2, lambda: learned(form), tmp_path)
+    assert both[0][1] == both[1][1]
+    for ours, theirs in zip(both[0][1], weights, strict=True):
+        assert ours == pytest.approx(theirs, rel=1e-9, abs=1e-11)
+    # Each has seen half of the worlds.
+    for first, second, whole in zip(both[0][0], both[1][0], one, strict=True):
+        means = [(a + b) / 2 for a, b in zip(first, second, strict=True)]
+        assert means == pytest.approx(whole, rel=1e-9, abs=1e-11)
+
+
+METHODS = {"ppo": {"worlds": 4, "steps": 3}, "shac": {"world_count": 4, "steps": 2}}
+ROUND = {"ppo": 3 * 4 * 48, "shac": 2 * 4 * 48}
+"""Particle-steps of an iteration."""
+
+
+def kept(method, out, rounds, **given):
+    """Learn for some rounds; what is learned, and the particle-steps of the curve's entries."""
+    trained = train(
+        method,
+        HEART,
+        Budget(particle_steps=rounds * ROUND[method]),
+        0,
+        evaluation_seeds=range(500, 502),
+        entries=2,
+        out=out,
+        **METHODS[method],
+        **given,
+    )
+    weights = [weight.flatten().tolist() for weight in trained.rules.parameters()]
+    return weights, [entry.particle_steps // ROUND[method] for entry in trained.log]
+
+
+@pytest.mark.parametrize("method", [pytest.param("ppo", marks=pytest.mark.slow), "shac"])
+def test_a_run_goes_on_with_another_number_of_processes(method, tmp_path):
+    begun = on_ranks(2, lambda: kept(method, tmp_path / "run", 4), tmp_path)
+    assert begun[0] == begun[1]
+    assert begun[0][1] == [0, 2, 4]
+    files = sorted(path.name for path in (tmp_path / "run").iterdir())
+    assert files == [".lock", "checkpoint.pt", "log.jsonl", "rule-0.safetensors"]
+    for copy in ("one", "two", "alone"):
+        shutil.copytree(tmp_path / "run", tmp_path / copy)
+
+    def resumed(copy):
+        return kept(method, tmp_path / copy, 8, resume=True)
+
+    (one,) = on_ranks(1, lambda: resumed("one"), tmp_path)
+    two = on_ranks(2, lambda: resumed("two"), tmp_path)
+    for weights, steps in (one, *two, resumed("alone")):
+        # It has gone on from where it was, with the entries that there were.
+        assert steps == [0, 2, 4, 8]
+        assert weights != begun[0][0]
+    # Within what float32 makes of sums in another order.
+    for ours, theirs in zip(two[0][0], one[0], strict=True):
+        assert ours == pytest.approx(theirs, rel=1e-3, abs=1e-5)
+    lines = (tmp_path / "two" / "log.jsonl").read_text().splitlines()
+    assert [json.loads(line)["particle_steps"] // ROUND[method] for line in lines] == steps
+    rule = load_rule(tmp_path / "two" / "rule-0.safetensors")
+    assert [weight.flatten().tolist() for weight in rule.parameters()] == two[0][0]
+
+
+def test_a_run_that_is_asked_to_stop_can_be_resumed(tmp_path, monkeypatch):
+    improve = ppo.Learner.improve
+
+    def asked(learner, share_left):
+        improve(learner, share_left)
+        if learner.rounds == 3 and not learner.ranks.rank:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(ppo.Learner, "improve", asked)
+    assert kept("ppo", tmp_path, 8)[1] == [0, 3]
+    assert load_checkpoint(tmp_path / "checkpoint.pt")["iteration"] == 3
+    monkeypatch.undo()
+    assert kept("ppo", tmp_path, 8, resume=True)[1] == [0, 3, 4, 8]
+
+
+@pytest.fixture
+def finished(tmp_path):
+    kept("ppo", tmp_path / "run", 1)
+    return tmp_path / "run"
+
+
+@pytest.mark.parametrize(
+    ("method", "given", "message"),
+    [
+        ("ppo", {}, "holds one: resume it"),
+        ("shac", {"resume": True}, "differs in method, options"),
+        ("evolution", {"resume": True}, "cannot be kept in a folder"),
+    ],
+)
+def test_a_folder_with_another_run_is_refused(method, given, message, finished):
+    with pytest.raises(NPAError, match=message):
+        train(method, HEART, Budget(particle_steps=1), 0, out=finished, **given)
+
+
+def test_a_checkpoint_that_was_changed_is_refused(finished):
+    content = load_checkpoint(finished / "checkpoint.pt")
+    spoilt = [{"curve": []}, {"iteration": -1}, {"part": "x"}, {"optimisers": {"actor": {}}}]
+    name = next(iter(content["modules"]["actor"]))
+    modules = content["modules"] | {"actor": content["modules"]["actor"] | {name: torch.ones(1)}}
+    for change in (*spoilt, {"modules": modules}):
+        save_checkpoint(finished / "checkpoint.pt", content | change)
+        with pytest.raises(NPAError, match="must hold all that a run needs"):
+            kept("ppo", finished, 2, resume=True)
+
+
+def test_what_cannot_be_shared_is_refused(tmp_path):
+    said = on_ranks(2, lambda: kept("ppo", None, 1), tmp_path)
+    assert said[0] == said[1]
+
+    def evolved():
+        train("evolution", HEART, Budget(particle_steps=1), 0)
+
+    def uneven():
+        train("ppo", HEART, Budget(particle_steps=1), 0, worlds=3)
+
+    for told in on_ranks(2, evolved, tmp_path):
+        assert "method 'evolution' cannot be shared by processes: take one of ppo, shac" in told
+    for told in on_ranks(2, uneven, tmp_path):
+        assert "worlds must be a multiple of the number of processes, got 3 and 2" in told
