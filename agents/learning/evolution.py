@@ -16,18 +16,15 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from npa_envs.agents.learning.problem import FIRST_EVALUATION_SEED, Problem
 from npa_envs.agents.learning.progress import Progress
 from npa_envs.agents.learning.rules import RuleSet, starting_rules
+from npa_envs.agents.learning.weights import RuleWeights, layers_of, updates_of
 from npa_envs.agents.policies import bounded, perceived
-from npa_envs.errors import MissingDependencyError, NPAError
-from npa_envs.rule.rule import NPARule
+from npa_envs.errors import MissingDependencyError
 from npa_envs.tasks.checks import check_positive
-
-MOST_HIDDEN = 2**27
-"""Numbers of hidden layers that are held at once, at most: 512 MiB of float32."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,51 +86,16 @@ def train(
     return progress.run(rules, generation)
 
 
-class Population:
-    """Rules of one architecture whose weights are the rows of a matrix.
-
-    A row holds the weights of the update networks, one species after the other: W1, b1, W2. What
-    else a rule has (its read-out) is not changed.
+class Population(RuleWeights):
+    """Rules of one architecture whose weights are the rows of a matrix, as `RuleWeights` has them.
 
     Raises:
         NPAError: A rule is more than its two layers.
     """
 
     def __init__(self, rules: RuleSet) -> None:
+        super().__init__(rules)
         self._rules = rules
-        self._parts = [part for rule in rules for part in _weights(rule)]
-        for rule in rules:
-            if not rule.is_plain():
-                raise NPAError(
-                    "rules must be plain NPARules, whose networks are their two layers, got one "
-                    "that overrides its network: evolve it by its own code"
-                )
-
-    def vector(self) -> NDArray[np.float64]:
-        """Return the weights of the rules as they are, shape [W]."""
-        with torch.no_grad():
-            return nn.utils.parameters_to_vector(self._parts).double().cpu().numpy()
-
-    def put(self, vector: NDArray[np.float64]) -> None:
-        """Give the rules these weights, shape [W]."""
-        first = self._parts[0]
-        with torch.no_grad():
-            nn.utils.vector_to_parameters(
-                torch.as_tensor(vector, dtype=first.dtype, device=first.device), self._parts
-            )
-
-    def scales(self) -> NDArray[np.float64]:
-        """Return the size that each weight would be drawn with, by Xavier and at a gain of 1.
-
-        Layers of different width take steps of different size; biases that of their layer.
-        """
-        sizes = []
-        for rule in self._rules:
-            hidden, bias, output = _weights(rule)
-            first = math.sqrt(2.0 / sum(hidden.shape))
-            sizes += [np.full(hidden.numel() + bias.numel(), first)]
-            sizes += [np.full(output.numel(), math.sqrt(2.0 / sum(output.shape)))]
-        return np.concatenate(sizes)
 
     @torch.no_grad()
     def actions(self, weights: Tensor, observation: Tensor) -> Tensor:
@@ -144,37 +106,15 @@ class Population:
         candidates = len(weights)
         parts, at = [], 0
         for rule, span in zip(self._rules, self._rules.spans, strict=True):
-            size = sum(part.numel() for part in _weights(rule))
+            size = sum(part.numel() for part in layers_of(rule))
             seen = observation[:, span]
             rows = perceived(rule, seen.flatten(0, 1))
             rows = rows.view(candidates, -1, rows.shape[1])
-            update = _updates(rule, weights[:, at : at + size], rows).flatten(0, 1)
+            update = updates_of(rule, weights[:, at : at + size], rows).flatten(0, 1)
             action = self._rules.interface.action(*bounded(rule, update))
             parts.append(action.view(*seen.shape[:2], -1))
             at += size
         return torch.cat(parts, dim=1)
-
-
-def _weights(rule: NPARule) -> tuple[Tensor, Tensor, Tensor]:
-    """Return W1 [H, P], b1 [H] and W2 [A, H]."""
-    return rule.hidden.weight, rule.hidden.bias, rule.output.weight
-
-
-def _updates(rule: NPARule, weights: Tensor, rows: Tensor) -> Tensor:
-    """Return raw updates, [K, R, A], of K candidates' weights for their own rows, [K, R, P]."""
-    shapes = [tuple(part.shape) for part in _weights(rule)]
-    sizes = [math.prod(shape) for shape in shapes]
-    first, bias, second = (
-        part.reshape(-1, *shape)
-        for part, shape in zip(torch.split(weights, sizes, dim=1), shapes, strict=True)
-    )
-    at_once = max(1, MOST_HIDDEN // (rows.shape[1] * rule.hidden_dim))
-    updates = []
-    for k in range(0, len(weights), at_once):
-        some = slice(k, k + at_once)
-        hidden = torch.baddbmm(bias[some, None], rows[some], first[some].mT).relu_()
-        updates.append(torch.bmm(hidden, second[some].mT))
-    return torch.cat(updates)
 
 
 def fitness(

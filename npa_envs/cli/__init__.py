@@ -22,6 +22,7 @@ COMMANDS = {
     "stress": "hard cases, what is expected of each, and where things break",
     "robustness": "what rules bear and what they heal: losses and recovery times over many seeds",
     "compare": "reinforcement learning, evolution and the gradient on the same tasks",
+    "search": "rules nobody asked for: an archive of what differs and stays alive, as an atlas",
     "record": "episodes of a policy as a dataset of Minari",
     "list": "tasks, presets, environments, built-in targets, losses, shipped rules",
     "warmup": "compile the kernels ahead of time",
@@ -107,6 +108,8 @@ def _dispatch(words: list[str]) -> int:
             from npa_envs.cli.learn import main as command
         case "compare":
             from npa_envs.cli.compare import main as command
+        case "search":
+            from npa_envs.cli.search import main as command
         case "record":
             from npa_envs.cli.record import main as command
         case "list":

@@ -58,6 +58,10 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "rollout runs/heart",
         "rollout gecko --resolution 512 --style points --background black",
     ),
+    "search": (
+        "search",
+        "search --kind pair --method cma-me --budget 5e7 --out runs/pairs",
+    ),
     "stress": ("stress --quick", "stress --only geometry --out results"),
     "sweep": (
         "sweep --over target=heart,ring seed=0,1,2 --devices cuda:0 cuda:1 -- morphogenesis2d",

@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, shown
 from npa_envs.files import parse_json
 from npa_envs.rule.codes import Codes
 from npa_envs.rule.files import first_rules, rule_metadata, shipped_rules
@@ -44,7 +44,8 @@ def task_of_rule(
     """Return the task that a rule was trained on, as its file tells.
 
     A rule whose file says nothing of a task, as the authors' do, is run in the paper's world of
-    2D morphogenesis with the rule's own sizes. Of a rule of many pictures it is the task of one of
+    2D morphogenesis with the rule's own sizes, or in the one that it was found in where
+    `npa-envs search` wrote the file. Of a rule of many pictures it is the task of one of
     them: of the code that `target` names, else the first. Where the target is not known, or is a
     picture that is not there any more, a built-in one stands in for it: worlds can still be run and
     drawn.
@@ -76,7 +77,10 @@ def task_of_rule(
     }
     own |= {"eps": rule.eps0} | ({} if rule.static else {"alpha": rule.alpha})
     told = "config" in metadata
-    config = preset("paper", task_name, **own) if not told else trained_config(path, metadata)
+    if not told:
+        config = override(preset("paper", task_name, **own), **_world_of(path, metadata))
+    else:
+        config = trained_config(path, metadata)
     config = override(config, **{k: v for k, v in fields.items() if v is not None})
     if particle_count is not None:
         config = override(config, task=config.task.with_particle_count(particle_count))
@@ -115,6 +119,26 @@ def _one_of(task: Morphogenesis2DConfig, codes: Codes, chosen: bool) -> str:
         # Its folder is not there any more.
         sources = {}
     return sources.get(name, name)
+
+
+def _world_of(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
+    """Return the fields of the world that a rule was found in, where its file says nothing more.
+
+    Raises:
+        NPAError: What it says is damaged.
+    """
+    try:
+        fields = parse_json(metadata.get("world", "{}"))
+    except NPAError:
+        fields = None
+    if not isinstance(fields, dict):
+        raise NPAError(
+            f"the metadata's world of {str(path)!r} must be a JSON object, got "
+            f"{shown(metadata['world'])}: save the rule again with npa_envs.save_rule"
+        )
+    if "particle_count" in fields:
+        fields["target_point_count"] = fields["particle_count"]
+    return fields
 
 
 def trained_config(path: Path, metadata: Mapping[str, str]) -> Any:

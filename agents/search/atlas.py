@@ -1,0 +1,195 @@
+"""The atlas: elites as files that all commands open, and a page that lays them out."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from npa_envs.agents.search.run import Elite, Search
+from npa_envs.agents.search.worlds import SEED_RADIUS, UPDATE_PROB, Axis, Trials
+from npa_envs.files import write_text
+from npa_envs.measure.plots import new_figure, png
+from npa_envs.render import draw_worlds
+from npa_envs.render.film import encode_frame
+from npa_envs.rule.files import save_rule
+from npa_envs.rule.rule import NPARule
+from npa_envs.training.overrides import config_to_dict
+from npa_envs.training.presets import preset
+from npa_envs.training.run_folder import RunFolder
+
+ELITES, PAGE = "elites", "atlas.html"
+"""Names in the folder of a search."""
+
+SIDE = 64
+"""Pixels on each side of an elite's picture."""
+
+HALF_WIDTH = 0.6
+"""From a picture's middle, the centroid, to its edge [length units]."""
+
+Pictures = Mapping[tuple[int, ...], NDArray[np.uint8]]
+"""Pictures by cell, uint8, [R, R, 3] each."""
+
+
+def write_elites(search: Search, folder: Path) -> Pictures:
+    """Write each elite's rules, and return what its first world looks like at the end.
+
+    One rule is `elites/CELL.safetensors`. A pair is the folder `elites/CELL`, laid out as a run of
+    joint training, so that `npa-envs view` shows both.
+
+    Raises:
+        NPAError: A file cannot be written.
+    """
+    pictures = {}
+    for elite in search.elites():
+        rules = search.candidates.rules_of(elite.solution)
+        trials = search.candidates.try_all(elite.solution[None])
+        place = folder / ELITES / elite.name
+        if search.world.kind == "rule":
+            place.parent.mkdir(parents=True, exist_ok=True)
+            save_rule(
+                rules[0],
+                place.with_name(f"{elite.name}.safetensors"),
+                metadata=_metadata(search, elite),
+            )
+        else:
+            _write_pair(search, elite, rules, place)
+        pictures[elite.cell] = _picture(search, trials)
+    return pictures
+
+
+def _metadata(search: Search, elite: Elite) -> dict[str, str]:
+    """Return what a rule's file says: in which world it was found, and what it was there."""
+    names = [axis.name for axis in search.axes]
+    told = {"quality": elite.found.quality, **dict(zip(names, elite.found.measures, strict=True))}
+    world = {"particle_count": search.world.counts[0]}
+    world |= {"update_prob": UPDATE_PROB, "seed_radius": SEED_RADIUS}
+    return {"found": json.dumps(told), "world": json.dumps(world)}
+
+
+def _write_pair(search: Search, elite: Elite, rules: Sequence[NPARule], place: Path) -> None:
+    """Write two species as a run's folder; what they were to grow is only a place holder there."""
+    run, world = RunFolder(place), search.world
+    place.mkdir(parents=True, exist_ok=True)
+    for number, rule in enumerate(rules):
+        save_rule(rule, run.rule_of(number), metadata=_metadata(search, elite))
+    species = [
+        {
+            "target": "heart", "particle_count": count, "target_point_count": count,
+            "eps": world.eps, "update_prob": UPDATE_PROB, "seed_radius": SEED_RADIUS,
+            "state_dim": world.state_dim, "hidden_dim": world.hidden_dim,
+        }
+        for count in world.counts
+    ]  # fmt: skip
+    config = preset("fast", "co_morphogenesis2d", species=species, distance=world.distance)
+    write_text(run.config, json.dumps(config_to_dict(config), indent=2, default=str))
+
+
+def _picture(search: Search, trials: Trials) -> NDArray[np.uint8]:
+    world = search.world
+    x, s = trials.x[0, :1], trials.s[0, :1]
+    (frame,) = draw_worlds(
+        x,
+        s,
+        resolution=SIDE,
+        pixel_size=math.sqrt(math.pi / world.counts[0]) * SEED_RADIUS,
+        centre=x.mean(dim=1),
+        half_width=HALF_WIDTH,
+    )
+    picture: NDArray[np.uint8] = frame
+    return picture
+
+
+def page(search: Search, pictures: Pictures) -> str:
+    """Return the atlas as one HTML page: a table for each cell of the last axis.
+
+    Columns are the first axis from left to right, rows the second one from below.
+    """
+    across, up, last = search.axes
+    elites = {elite.cell: elite for elite in search.elites()}
+    growth = search.growth[-1]
+    facts = (
+        f"{search.facts['method']}, seed {search.facts['seed']}: {growth.evaluations} candidates, "
+        f"{search.particle_steps} particle-steps, {len(elites)} elites, coverage "
+        f"{growth.coverage:.3f}, QD score {growth.qd_score:.3f}, best {growth.best:.3f}"
+    )
+    tables = []
+    for layer in range(last.cells):
+        rows = []
+        for row in reversed(range(up.cells)):
+            cells = [
+                _cell(search, elites.get((column, row, layer)), pictures)
+                for column in range(across.cells)
+            ]
+            rows.append(f"<tr><th>{_span(up, row)}</th>{''.join(cells)}</tr>")
+        foot = "".join(f"<th>{_span(across, column)}</th>" for column in range(across.cells))
+        tables.append(
+            f"<h2>{last.name} {_span(last, layer)}</h2>\n"
+            f"<table>\n{chr(10).join(rows)}\n<tr><th>{up.name} ↑ {across.name} →</th>{foot}</tr>"
+            "\n</table>"
+        )
+    return "\n".join([_HEAD, f"<h1>Atlas</h1>\n<p>{facts}</p>", *tables, "</html>\n"])
+
+
+_HEAD = f"""<!doctype html>
+<html lang="en"><meta charset="utf-8"><title>Atlas</title>
+<style>
+body {{ font: 14px sans-serif; margin: 1em; }}
+table {{ border-collapse: collapse; }}
+th {{ font-weight: normal; font-size: 11px; padding: 2px 6px; }}
+td {{ width: {SIDE}px; height: {SIDE}px; border: 1px solid #ddd; padding: 0; }}
+img {{ display: block; width: {SIDE}px; height: {SIDE}px; }}
+</style>"""
+
+
+def _cell(search: Search, elite: Elite | None, pictures: Pictures) -> str:
+    if elite is None:
+        return "<td></td>"
+    told = zip(search.axes, elite.found.measures, strict=True)
+    text = ", ".join(f"{axis.name} {value:.3f}" for axis, value in told)
+    file = f"{ELITES}/{elite.name}" + (".safetensors" if search.world.kind == "rule" else "")
+    data = base64.b64encode(encode_frame(pictures[elite.cell], "JPEG")).decode()
+    return (
+        f'<td><a href="{file}"><img alt="{elite.name}" title="{elite.name}: quality '
+        f'{elite.found.quality:.3f}, {text}" src="data:image/jpeg;base64,{data}"></a></td>'
+    )
+
+
+def _span(axis: Axis, cell: int) -> str:
+    """Return where a cell of an axis begins and ends."""
+    width = (axis.highest - axis.lowest) / axis.cells
+    begin = axis.lowest + cell * width
+    return f"{begin:.3g} to {begin + width:.3g}"
+
+
+def figure(axes: Sequence[Axis], pictures: Pictures) -> bytes:
+    """Return the atlas as a PNG file: a panel for each cell of the last axis, two in a row."""
+    across, up, last = axes
+    rows = -(-last.cells // 2)
+    drawn, panels = new_figure(rows, 2, (9.0, 4.6 * rows))
+    for layer, panel in enumerate(panels.flat):
+        if layer >= last.cells:
+            panel.axis("off")
+            continue
+        _draw_layer(panel, axes, pictures, layer)
+        panel.set_title(f"{last.name} {_span(last, layer)}", fontsize=9)
+        panel.set(xlabel=across.name, ylabel=up.name)
+    return png(drawn, dpi=110)
+
+
+def _draw_layer(panel: Any, axes: Sequence[Axis], pictures: Pictures, layer: int) -> None:
+    across, up, _ = axes
+    width, height = ((axis.highest - axis.lowest) / axis.cells for axis in (across, up))
+    for (column, row, own), picture in pictures.items():
+        if own == layer:
+            left, low = across.lowest + column * width, up.lowest + row * height
+            panel.imshow(picture, extent=(left, left + width, low, low + height), aspect="auto")
+    panel.set(xlim=(across.lowest, across.highest), ylim=(up.lowest, up.highest))
+    panel.set_facecolor("#eeeeee")
+    panel.tick_params(labelsize=7)

@@ -1,0 +1,332 @@
+"""Worlds of candidate rules: how alive each is, and where among all others it belongs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from npa_envs import NPARule, WorldRandom, perception_fields, rollout, rollout_species
+from npa_envs.agents.learning.weights import RuleWeights, updates_of
+from npa_envs.errors import NPAError, shown
+from npa_envs.measure.interaction import mixing_index
+from npa_envs.tasks.checks import check_non_negative, check_positive
+from npa_envs.tasks.seeds import uniform_ball
+
+Kind = Literal["rule", "pair"]
+"""What is searched: one rule, or two species that share a world."""
+
+SNAPSHOTS = 16
+"""Moments at which a world is looked at, evenly spread; the later half of them counts."""
+
+UPDATE_PROB = 0.5
+"""Probability of a particle's update in a step (dimensionless)."""
+
+SEED_RADIUS = 0.2
+"""Radius of the disk that each species starts in [length units]."""
+
+LEAST_VARIANCE = 1e-12
+"""Colours that vary no more than this are one colour."""
+
+Numbers = NDArray[np.float64]
+
+
+class Axis(NamedTuple):
+    """A descriptor: one way in which worlds differ."""
+
+    name: str
+    """What it is called."""
+    lowest: float
+    """Where its first cell begins."""
+    highest: float
+    """Where its last cell ends."""
+    cells: int
+    """Cells of equal width."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchWorld:
+    """The world that candidates live in."""
+
+    kind: Kind = "rule"
+    """What is searched: "rule", or "pair" for two species that share a world."""
+
+    particle_count: int = 128
+    """Particles N, of both species together."""
+
+    steps: int = 128
+    """Steps from the seed, a multiple of 16."""
+
+    world_count: int = 1
+    """Worlds that each candidate is tried in, B; figures are their means."""
+
+    state_dim: int = 4
+    """State channels C, at least 3; the last three are the colour (less 0.5)."""
+
+    hidden_dim: int = 8
+    """Hidden units of each rule."""
+
+    eps: float = 0.1
+    """Perception radius ε [length units]."""
+
+    distance: float = 0.4
+    """Distance between the centres of two species' seeds [length units]."""
+
+    def __post_init__(self) -> None:
+        """Check every field; raises NPAError."""
+        if self.kind not in ("rule", "pair"):
+            raise NPAError(f"kind must be 'rule' or 'pair', got {shown(self.kind)}")
+        check_positive(self, int, "particle_count", at_least=4)
+        check_positive(self, int, "steps", "world_count", "hidden_dim")
+        check_positive(self, int, "state_dim", at_least=3)
+        check_positive(self, float, "eps")
+        check_non_negative(self, "distance")
+        if self.steps % SNAPSHOTS:
+            raise NPAError(
+                f"steps must be a multiple of {SNAPSHOTS}, got {self.steps}: "
+                f"take {-(-self.steps // SNAPSHOTS) * SNAPSHOTS}"
+            )
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """Particles of each species."""
+        if self.kind == "rule":
+            return (self.particle_count,)
+        return (self.particle_count // 2, self.particle_count - self.particle_count // 2)
+
+    @property
+    def particle_steps(self) -> int:
+        """What one candidate costs: B N T."""
+        return self.world_count * self.particle_count * self.steps
+
+    def make_rules(self) -> list[NPARule]:
+        """Return a rule for each species, whose weights are to be put in, on the CPU."""
+        with torch.random.fork_rng(devices=()):
+            return [
+                NPARule(2, self.state_dim, self.hidden_dim, eps0=self.eps).requires_grad_(False)
+                for _ in self.counts
+            ]
+
+    def axes(self) -> tuple[Axis, ...]:
+        """Return the descriptors.
+
+        `speed` is the mean path length of a step [ε], at most the rule's α times the probability
+        of an update. `crowding` is log(ρ / ρ₁) / log N of the mean density ρ at particles, where
+        ρ₁ is that of a particle alone: 0 where each is alone, 1 where all stand in one place.
+        `mixing` is, for two species, the mixing index. For one rule it is 1 − r of the correlation
+        r between particles' colours and those around them: 0 where neighbours look alike, 1 where
+        they have nothing in common. All are dimensionless but for the speed.
+        """
+        fastest = self.make_rules()[0].alpha * UPDATE_PROB
+        return (
+            Axis("speed", 0.0, fastest, 10),
+            Axis("crowding", 0.0, 1.0, 10),
+            Axis("mixing", 0.0, 1.0, 4),
+        )
+
+
+class Found(NamedTuple):
+    """What a candidate's worlds come to."""
+
+    quality: float
+    """`bounded` times `alive`, in (0, 1]."""
+    measures: tuple[float, ...]
+    """Its descriptors, in the order of `SearchWorld.axes`."""
+
+
+class Trials(NamedTuple):
+    """The worlds of K candidates at the end, and what was found."""
+
+    found: list[Found | None]
+    """Of each; None where numbers blew up, or where nothing changes any more."""
+    x: Tensor
+    """Positions [length units], shape [K, B, N, D]."""
+    s: Tensor
+    """States, dimensionless, shape [K, B, N, C]."""
+
+
+class RuleStack(NPARule):
+    """K rules of one architecture, each of which updates its own worlds of a batch.
+
+    Worlds must be as many for each rule, with the same masks for each, so that every rule has as
+    many rows of perception.
+
+    Args:
+        rule: The architecture.
+        weights: The rules' W1, b1 and W2 as `RuleWeights` orders them, shape [K, W].
+    """
+
+    def __init__(self, rule: NPARule, weights: Tensor) -> None:
+        with torch.random.fork_rng(devices=()):
+            super().__init__(**rule.hyper_parameters())
+        self.weights = weights
+        """Weights of each rule, shape [K, W]."""
+        self.to(weights.device)
+
+    def forward(self, perception: Tensor) -> Tensor:
+        """Map rows of perception [K R, P] to raw updates [K R, A]."""
+        count = len(self.weights)
+        if len(perception) % count:
+            # Where nobody is updated there is one row, which nobody reads.
+            return perception.new_zeros(len(perception), self.update_dim)
+        rows = perception.reshape(count, len(perception) // count, self.perception_dim)
+        return updates_of(self, self.weights, rows).flatten(0, 1)
+
+
+class Candidates:
+    """Tries rules whose weights are given, all from the same seeds and with the same masks.
+
+    On a CPU candidates share a batch of worlds. On CUDA, where rows of perception are not counted,
+    they are tried one after the other.
+
+    Args:
+        world: Where they live.
+        device: Where that is computed.
+        seeds: The worlds' numbers, one for each of B; default: 0 to B - 1.
+    """
+
+    def __init__(
+        self, world: SearchWorld, *, device: torch.device, seeds: Sequence[int] | None = None
+    ) -> None:
+        self.world = world
+        self.device = device
+        """Where worlds are computed."""
+        self._seeds = tuple(range(world.world_count) if seeds is None else seeds)
+        self._rules = world.make_rules()
+        self.scales = RuleWeights(self._rules).scales()
+        """Size of each weight as Xavier would draw it, shape [W]: solutions are in these units."""
+        alone = torch.zeros(1, 1, 2), torch.zeros(1, 1, 1)
+        self._alone = float(perception_fields(*alone, eps=world.eps).rho)
+
+    @property
+    def weight_count(self) -> int:
+        """Numbers that a candidate is made of, W."""
+        return len(self.scales)
+
+    def rules_of(self, solution: Numbers) -> list[NPARule]:
+        """Return a candidate's rules, one for each species, on the CPU.
+
+        Args:
+            solution: Its weights in units of `scales`, shape [W].
+        """
+        rules = self.world.make_rules()
+        RuleWeights(rules).put(solution * self.scales)
+        return rules
+
+    @torch.no_grad()
+    def try_all(self, solutions: Numbers) -> Trials:
+        """Grow candidates' worlds and judge them.
+
+        Args:
+            solutions: Their weights in units of `scales`, shape [K, W].
+        """
+        weights = torch.as_tensor(solutions * self.scales, dtype=torch.float32).to(self.device)
+        together = len(weights) if self.device.type == "cpu" else 1
+        parts = [self._try(some) for some in weights.split(together)]
+        found = [one for part in parts for one in part.found]
+        return Trials(found, torch.cat([p.x for p in parts]), torch.cat([p.s for p in parts]))
+
+    def _try(self, weights: Tensor) -> Trials:
+        world, count = self.world, len(weights)
+        random = WorldRandom(self._seeds * count, device=self.device)
+        x, s = self._seed(random)
+        every = world.steps // SNAPSHOTS
+        told: dict[str, Any] = {
+            "generator": random, "keep_every": every, "update_prob": UPDATE_PROB,
+            "return_path_length": True,
+        }  # fmt: skip
+        if world.kind == "rule":
+            stack = RuleStack(self._rules[0], weights)
+            xs, ss, path = rollout(stack, x, s, world.steps, **told)
+        else:
+            halves = weights.chunk(2, dim=1)
+            stacks = [RuleStack(*own) for own in zip(self._rules, halves, strict=True)]
+            counts = world.counts
+            # Each sees densities as it would alone.
+            xs, ss, path = rollout_species(
+                stacks, x, s, world.steps, counts=counts, density_counts=counts, **told
+            )
+        late = SNAPSHOTS // 2
+        travelled = (path[-1] - path[late - 1]).mean(dim=1) / ((SNAPSHOTS - late) * every)
+        moments = [values[late:].unflatten(1, (count, -1)) for values in (xs, ss)]
+        speeds = travelled.view(count, -1).mean(dim=1) / world.eps
+        found = [
+            self._judge(*(values[:, k] for values in moments), float(speeds[k]))
+            for k in range(count)
+        ]
+        return Trials(found, *(values[-1] for values in moments))
+
+    def _judge(self, xs: Tensor, ss: Tensor, speed: float) -> Found | None:
+        """Return what a candidate came to, from late moments [T, B, N, ·] of its worlds."""
+        if not (xs.isfinite().all() and ss.isfinite().all()):
+            return None
+        quality = float(quality_of(xs, ss))
+        if quality <= 0.0:
+            return None
+        return Found(
+            quality, (speed, *self.crowding_and_mixing(xs.flatten(0, 1), ss.flatten(0, 1)))
+        )
+
+    def _seed(self, random: WorldRandom) -> tuple[Tensor, Tensor]:
+        """Return disks of blank particles, one for each species, in a row around the origin."""
+        world = self.world
+        parts = []
+        for number, count in enumerate(world.counts):
+            disk = uniform_ball(
+                random.world_count, count, 2, SEED_RADIUS, generator=random, device=self.device
+            )
+            disk[..., 0] += world.distance * (number - 0.5 * (len(world.counts) - 1))
+            parts.append(disk)
+        x = torch.cat(parts, dim=1)
+        return x, x.new_zeros(*x.shape[:2], world.state_dim)
+
+    def crowding_and_mixing(self, x: Tensor, s: Tensor) -> tuple[float, float]:
+        """Return two descriptors of worlds x [B, N, D], s [B, N, C]."""
+        world = self.world
+        colours = _colours(s)
+        fields = perception_fields(x, colours, eps=world.eps)
+        crowding = math.log(float(fields.rho.mean()) / self._alone) / math.log(world.particle_count)
+        if world.kind == "pair":
+            mixing = mixing_index(x, world.counts, eps=world.eps)
+        else:
+            mixing = 1.0 - correlation(colours, fields.blur)
+        return crowding, float(mixing.mean().clamp(0.0, 1.0))
+
+
+def _colours(s: Tensor) -> Tensor:
+    """Return the colours that can be seen, less 0.5, shape [..., 3]."""
+    return s[..., -3:].clamp(-0.5, 0.5)
+
+
+def quality_of(xs: Tensor, ss: Tensor) -> Tensor:
+    """Return how alive worlds are within their bounds, in [0, 1], shape [].
+
+    bounded = 1 / (1 + mean |s − clip(s, −1, 1)| + mean |x − clip(x, −1, 1)|), with the terms that
+    training penalises. alive = twice the standard deviation over time of a particle's colour
+    channels, averaged: 1 where each flickers between 0 and 1. The quality is bounded times alive.
+
+    Args:
+        xs: Positions at T moments [length units], shape [T, B, N, D].
+        ss: States, dimensionless, shape [T, B, N, C].
+    """
+    excess = [(values - values.clamp(-1.0, 1.0)).abs().mean() for values in (xs, ss)]
+    alive = 2.0 * _colours(ss).std(dim=0, correction=0).mean()
+    return alive / (1.0 + excess[0] + excess[1])
+
+
+def correlation(first: Tensor, second: Tensor) -> Tensor:
+    """Return the correlation of two fields [B, N, K] over particles and channels, shape [B].
+
+    Each channel counts from its mean. It is 1 where the first field is the same everywhere.
+    """
+    a, b = (field - field.mean(dim=1, keepdim=True) for field in (first, second))
+    together = (a * b).sum(dim=(1, 2))
+    sizes = a.square().sum(dim=(1, 2)) * b.square().sum(dim=(1, 2))
+    one_colour = a.square().mean(dim=(1, 2)) <= LEAST_VARIANCE
+    return torch.where(one_colour, 1.0, together / sizes.clamp_min(1e-30).sqrt())

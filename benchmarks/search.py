@@ -1,0 +1,132 @@
+"""Searches for rules compared: MAP-Elites, CMA-ME, CMA-ES and chance, for equal particle-steps.
+
+`run` does all methods with all seeds, each in a folder of its own, so that it can be stopped and
+goes on; afterwards each archive's elites are tried in worlds that the search did not see. `draw`
+draws the growth of the archives: means over seeds, and their 95 % intervals (Student's t).
+
+    python benchmarks/search.py run --out runs/searches --output benchmarks/results/search_cpu.json
+    python benchmarks/search.py draw --output benchmarks/results/search_cpu.json
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.stats import t as student
+
+from npa_envs.agents.search.methods import METHODS
+from npa_envs.agents.search.run import RESULTS, Growth, Search, tried_again
+from npa_envs.agents.search.worlds import SearchWorld
+from npa_envs.devices import check_device
+from npa_envs.files import read_json, write_bytes
+from npa_envs.measure.plots import draw_band, legend_of, new_figure, png
+from npa_envs.measure.record import script_facts, script_parser, write_record
+from npa_envs.measure.tables import markdown_table
+
+IMAGE = Path(__file__).resolve().parents[1] / "docs" / "images" / "search_growth.png"
+
+FRESH_SEEDS = (1_000_000, 1_000_001)
+"""Worlds that no search saw."""
+
+CURVES = {"qd_score": "QD score", "coverage": "coverage", "best": "best quality"}
+
+COLOURS = {"map-elites": "C0", "cma-me": "C1", "cma-es": "C2", "random": "C7"}
+
+
+def run(arguments: Any) -> None:
+    """Run all searches, one seed after the other, and write what they came to after each."""
+    world = SearchWorld(kind=arguments.kind, particle_count=arguments.particles)
+    facts = {
+        **script_facts(arguments),
+        "world": asdict(world),
+        "budget": arguments.budget,
+        "fresh_seeds": list(FRESH_SEEDS),
+    }
+    runs: dict[str, list[dict[str, Any]]] = {method: [] for method in arguments.methods}
+    for seed in range(arguments.seeds):
+        for method in arguments.methods:
+            folder = arguments.out / f"{arguments.kind}-{method}-{seed}"
+            folder.mkdir(parents=True, exist_ok=True)
+            search = Search(
+                world,
+                method=method,
+                seed=seed,
+                device=check_device(arguments.device),
+                path=folder / RESULTS,
+            )
+            search.run(int(arguments.budget))
+            again = tried_again(search, FRESH_SEEDS)
+            runs[method].append(
+                {
+                    "seed": seed,
+                    "growth": [list(step) for step in search.growth],
+                    "fresh_worlds": list(again),
+                }
+            )
+            write_record(arguments.output, {**facts, "runs": runs})
+            print(method, seed, search.growth[-1], "fresh", again, flush=True)
+
+
+def interval(values: Sequence[float]) -> tuple[float, float, float]:
+    """Return the lower end of the 95 % interval of a mean, the mean, and the upper end."""
+    middle, count = fmean(values), len(values)
+    if count < 2:
+        return math.nan, middle, math.nan
+    half = float(student.ppf(0.975, count - 1)) * float(np.std(values, ddof=1)) / math.sqrt(count)
+    return middle - half, middle, middle + half
+
+
+def draw(arguments: Any) -> None:
+    """Draw how archives grew, and print the figures at the end."""
+    runs = read_json(arguments.output, limit=2**26)["runs"]
+    figure, panels = new_figure(1, len(CURVES), (10.0, 3.4))
+    for panel, (name, label) in zip(panels[0], CURVES.items(), strict=True):
+        column = Growth._fields.index(name)
+        for method, done in runs.items():
+            # Methods of unequal seeds, where a run was stopped, are shown as far as all go.
+            curves: NDArray[np.float64] = np.array([one["growth"] for one in done])
+            bands = [interval(values) for values in curves[:, :, column].T.tolist()]
+            lines = tuple(zip(*bands, strict=True))
+            draw_band(panel, curves[0, :, 0], lines, COLOURS[method], method)  # type: ignore[arg-type]
+        panel.set(xlabel="candidates", ylabel=label, ylim=(0.0, None))
+    legend_of(figure, panels[0][0], ncols=len(runs))
+    write_bytes(IMAGE, png(figure))
+    rows = []
+    for method, done in runs.items():
+        cells = []
+        for key in ("growth", "fresh_worlds"):
+            ends = [one[key][-1] if key == "growth" else one[key] for one in done]
+            for name in CURVES:
+                values = [end[Growth._fields.index(name)] for end in ends]
+                low, middle, high = interval(values)
+                cells.append(f"{middle:.3f} ({low:.3f} to {high:.3f})")
+        rows.append([method, str(len(done)), *cells])
+    heads = ["method", "seeds", *CURVES.values(), *(f"fresh: {name}" for name in CURVES.values())]
+    print(markdown_table(heads, rows))
+
+
+def main() -> None:
+    """Do what the command line asks for."""
+    parser = script_parser(__doc__)
+    parser.add_argument("command", choices=("run", "draw"))
+    parser.add_argument("--out", type=Path, default=Path("runs/searches"))
+    parser.add_argument("--kind", choices=("rule", "pair"), default="rule")
+    parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(METHODS))
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--particles", type=int, default=128)
+    parser.add_argument("--budget", type=float, default=2e7, help="particle-steps of each search")
+    arguments = parser.parse_args()
+    torch.set_num_threads(arguments.threads)
+    {"run": run, "draw": draw}[arguments.command](arguments)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,134 @@
+"""`npa-envs search`: rules that nobody asked for, laid out by what they do."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Literal
+
+from npa_envs.cli.output import (
+    OutFolder,
+    RunOptions,
+    StepBar,
+    check_numbers,
+    parse_options,
+    torch_threads,
+    writable_folder,
+)
+from npa_envs.errors import NPAError
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchOptions(RunOptions):
+    """Search for rules, or pairs of species, that differ from each other and stay alive.
+
+    An archive keeps the best candidate of each kind: by speed, by how crowded particles stand, and
+    by how colours (or species) mix. Best is whose colours change most while states and positions
+    stay within [-1, 1]. The folder gets every elite as a rule's file (of a pair, a folder) that
+    `view` and `rollout` open, a page that shows them, and a record. The same command goes on where
+    a search was stopped, and further with a larger budget.
+    """
+
+    kind: Literal["rule", "pair"] = "rule"
+    """One rule, or two species that share a world."""
+
+    method: Literal["map-elites", "cma-me", "cma-es", "random"] = "map-elites"
+    """What proposes candidates: mutants of elites; CMA-ES rewarded for what is new, or for quality
+    alone; chance."""
+
+    budget: float = 2e7
+    """Particle-steps of the whole search: candidates times worlds, particles and steps."""
+
+    particle_count: int = 128
+    """Particles N, of both species together."""
+
+    steps: int = 128
+    """Steps from the seed, a multiple of 16; the second half of them is judged."""
+
+    world_count: int = 1
+    """Worlds that each candidate is tried in; figures are their means."""
+
+    state_dim: int = 4
+    """State channels, at least 3."""
+
+    hidden_dim: int = 8
+    """Hidden units of each rule."""
+
+    eps: float = 0.1
+    """Perception radius [length units]."""
+
+    distance: float = 0.4
+    """Pairs only: distance between the centres of the two seeds [length units]."""
+
+    batch_size: int = 20
+    """Candidates that are proposed together."""
+
+    seed: int = 0
+    """Of the proposals; all candidates meet the same worlds."""
+
+    threads: int = 1
+    """CPU threads of torch and of the kernels."""
+
+    max_seconds: float | None = None
+    """Stop after this time; the same command goes on. Default: never."""
+
+    out: OutFolder = Path("runs/search")
+    """Folder to write to; created where missing."""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Search, and write elites and atlas."""
+    options = parse_options(SearchOptions, "search", arguments)
+    check_numbers(options, threads=1)
+    from npa_envs.agents.search.atlas import PAGE, figure, page, write_elites
+    from npa_envs.agents.search.run import RESULTS, Search
+    from npa_envs.agents.search.worlds import SearchWorld
+    from npa_envs.devices import check_device
+    from npa_envs.files import write_text
+    from npa_envs.measure.plots import write_plots
+    from npa_envs.measure.record import time_limit
+
+    enough = time_limit(options.max_seconds)
+    world = SearchWorld(**{own.name: getattr(options, own.name) for own in fields(SearchWorld)})
+    least = options.batch_size * world.particle_steps
+    if not least <= options.budget < float("inf"):
+        raise NPAError(
+            f"budget must be finite and at least that of one batch, {least} particle-steps, got "
+            f"{options.budget:g}: raise it"
+        )
+    device = check_device(options.device)
+    folder = writable_folder(options.out)
+    search = Search(
+        world,
+        method=options.method,
+        seed=options.seed,
+        batch_size=options.batch_size,
+        device=device,
+        path=folder / RESULTS,
+    )
+    if search.evaluations:
+        print(f"{search.evaluations} candidates were tried before")
+    budget = int(options.budget)
+    with (
+        StepBar(budget, show=options.progress, unit="particle-step") as bar,
+        torch_threads(options.threads),
+    ):
+        bar.advance(search.particle_steps)
+        search.run(budget, enough=enough, progress=bar.advance)
+        if not search.growth:
+            print("nothing was tried: raise --max-seconds")
+            return 0
+        pictures = write_elites(search, folder)
+    growth = search.growth[-1]
+    print(
+        f"{growth.evaluations} candidates, {len(pictures)} elites: coverage {growth.coverage:.3f}, "
+        f"QD score {growth.qd_score:.3f}, best quality {growth.best:.3f}"
+    )
+    write_text(folder / PAGE, page(search, pictures))
+    print(f"wrote {folder / PAGE} and the elites' rules")
+    drawn = write_plots(
+        lambda: {"": figure(search.axes, pictures)}, folder / "atlas.png", "picture of the atlas"
+    )
+    print("\n".join(drawn))
+    return 0

@@ -1,0 +1,251 @@
+"""The search for rules that differ: what candidates are judged by, and what a search leaves."""
+
+import json
+import math
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from npa_envs import load_rule, rollout
+from npa_envs.agents.search.methods import METHODS, import_ribs
+from npa_envs.agents.search.run import RESULTS, Search, tried_again
+from npa_envs.agents.search.worlds import (
+    SEED_RADIUS,
+    SNAPSHOTS,
+    UPDATE_PROB,
+    Candidates,
+    SearchWorld,
+    correlation,
+    quality_of,
+)
+from npa_envs.cli import main
+from npa_envs.errors import MissingDependencyError, NPAError
+from npa_envs.rule.files import rule_metadata
+from npa_envs.tasks.seeds import uniform_ball
+from npa_envs.training.trained_tasks import task_of_rule
+from npa_envs.web.rule_world import RunWorld
+from npa_envs.world.randomness import WorldRandom
+
+CPU = torch.device("cpu")
+SMALL = {"particle_count": 16, "steps": 16, "hidden_dim": 4}
+OPTIONS = ["--particle-count", "16", "--steps", "16", "--hidden-dim", "4", "--batch-size", "4"]
+BATCH_COST = 4 * 16 * 16
+
+
+def candidates(kind="rule", device=CPU, **options):
+    return Candidates(SearchWorld(kind=kind, **SMALL | options), device=device)
+
+
+def solutions(tried, count, size=0.2, seed=0):
+    return size * np.random.default_rng(seed).standard_normal((count, tried.weight_count))
+
+
+def search(**options):
+    world = SearchWorld(**SMALL, **options.pop("world", {}))
+    return Search(world, batch_size=4, device=CPU, **options)
+
+
+def needs_ribs():
+    pytest.importorskip("ribs", reason="the extra search is not installed")
+
+
+# Worlds
+
+
+@pytest.mark.parametrize("kind", ["rule", "pair"])
+def test_a_candidate_comes_to_the_same_alone_and_beside_others(kind, device):
+    tried = candidates(kind, device, world_count=2)
+    given = solutions(tried, 3)
+    together = tried.try_all(given)
+    for number, one in enumerate(given):
+        alone = tried.try_all(one[None])
+        assert torch.equal(alone.x[0], together.x[number])
+        assert alone.found == together.found[number : number + 1]
+
+
+def test_a_candidate_lives_as_its_rule_does_in_a_rollout(device):
+    tried = candidates(device=device)
+    (given,) = solutions(tried, 1)
+    trials = tried.try_all(given[None])
+    (rule,) = tried.rules_of(given)
+    random = WorldRandom([0], device=device)
+    x = uniform_ball(1, 16, 2, SEED_RADIUS, generator=random, device=device)
+    s = x.new_zeros(1, 16, 4)
+    x, s = rollout(rule.to(device), x, s, 16, update_prob=UPDATE_PROB, generator=random)
+    torch.testing.assert_close(trials.x[0], x, atol=1e-4, rtol=0.0)
+    torch.testing.assert_close(trials.s[0], s, atol=1e-4, rtol=1e-3)
+
+
+def test_dead_and_exploding_rules_are_found_to_be_nothing():
+    tried = candidates()
+    dead = np.zeros(tried.weight_count)
+    wild = np.full(tried.weight_count, 1e12)
+    (alive,) = solutions(tried, 1)
+    assert [one is None for one in tried.try_all(np.stack((dead, wild, alive))).found] == [
+        True,
+        True,
+        False,
+    ]
+
+
+def test_descriptors_lie_within_their_axes():
+    world = SearchWorld(kind="pair", **SMALL)
+    tried = Candidates(world, device=CPU)
+    for found in tried.try_all(solutions(tried, 8, size=0.5)).found:
+        if found is not None:
+            assert 0.0 < found.quality <= 1.0
+            # A step's probability is met on average only.
+            slack = (0.1, 0.0, 0.0)
+            for axis, value, more in zip(world.axes(), found.measures, slack, strict=True):
+                assert axis.lowest <= value <= axis.highest + more
+
+
+def test_crowding_is_one_in_one_place_and_zero_alone():
+    tried = candidates()
+    s = torch.zeros(1, 16, 4)
+    together, _ = tried.crowding_and_mixing(torch.zeros(1, 16, 2), s)
+    apart, _ = tried.crowding_and_mixing(torch.arange(32.0).view(1, 16, 2), s)
+    assert (together, apart) == (pytest.approx(1.0, abs=1e-5), pytest.approx(0.0, abs=1e-5))
+
+
+def test_quality_is_change_of_colour_less_excess():
+    x = torch.zeros(2, 1, 5, 2)
+    flicker = torch.zeros(2, 1, 5, 4)
+    flicker[0] = -0.5
+    flicker[1] = 0.5
+    assert float(quality_of(x, flicker)) == pytest.approx(1.0)
+    assert float(quality_of(x, torch.zeros_like(flicker))) == 0.0
+    # Half of the coordinates are 2 beyond the bounds.
+    x[..., 0] = 3.0
+    assert float(quality_of(x, flicker)) == pytest.approx(0.5)
+
+
+def test_the_correlation_is_that_of_numpy_and_one_where_all_are_alike():
+    a, b = np.random.default_rng(0).standard_normal((2, 20))
+    first, second = (torch.from_numpy(v).view(1, 20, 1) for v in (a, b))
+    assert float(correlation(first, second)) == pytest.approx(np.corrcoef(a, b)[0, 1])
+    assert float(correlation(torch.ones_like(first), second)) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"kind": "trio"}, "kind must be 'rule' or 'pair', got 'trio'"),
+        ({"steps": 20}, f"steps must be a multiple of {SNAPSHOTS}, got 20: take 32"),
+        ({"state_dim": 2}, "state_dim must be a whole number of at least 3"),
+        ({"distance": -1.0}, "distance must be"),
+    ],
+)
+def test_worlds_refuse_what_cannot_be(options, words):
+    with pytest.raises(NPAError, match=words):
+        SearchWorld(**options)
+
+
+# Searches
+
+
+def test_a_missing_library_is_named_with_its_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "ribs.archives", None)
+    monkeypatch.setitem(sys.modules, "ribs", None)
+    with pytest.raises(MissingDependencyError, match=r"pip install 'npa-envs\[search\]'"):
+        import_ribs()
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_stopped_search_goes_on_as_if_it_had_not_been(method, tmp_path):
+    needs_ribs()
+    whole = search(method=method, seed=3)
+    whole.run(4 * BATCH_COST)
+    path = tmp_path / RESULTS
+    search(method=method, seed=3, path=path).run(2 * BATCH_COST)
+    again = search(method=method, seed=3, path=path)
+    assert again.evaluations == 8
+    again.run(4 * BATCH_COST + 1)
+    assert again.evaluations == 16
+    assert again.growth == whole.growth
+    for ours, theirs in zip(again.elites(), whole.elites(), strict=True):
+        assert ours.cell == theirs.cell
+        assert np.array_equal(ours.solution, theirs.solution)
+
+
+def test_each_cell_keeps_its_best_and_the_scores_are_theirs(tmp_path):
+    needs_ribs()
+    path = tmp_path / RESULTS
+    done = search(method="random", path=path)
+    done.run(6 * BATCH_COST)
+    best: dict[tuple[int, ...], float] = {}
+    held = json.loads(path.read_text())
+    for batch in held["batches"]:
+        for told in batch["found"]:
+            if told is not None:
+                spans = [(a.lowest, a.highest, a.cells) for a in done.axes]
+                cell = tuple(
+                    min(max(math.floor((value - low) / (high - low) * cells), 0), cells - 1)
+                    for value, (low, high, cells) in zip(told[1:], spans, strict=True)
+                )
+                best[cell] = max(best.get(cell, 0.0), told[0])
+    growth = done.growth[-1]
+    assert growth.evaluations == 24
+    assert {elite.cell: elite.found.quality for elite in done.elites()} == best
+    assert growth.qd_score == pytest.approx(sum(best.values()))
+    assert growth.coverage == pytest.approx(len(best) / 400)
+    assert growth.best == pytest.approx(max(best.values()))
+
+
+def test_elites_that_meet_the_same_worlds_again_score_the_same():
+    needs_ribs()
+    done = search()
+    done.run(4 * BATCH_COST)
+    again, found = tried_again(done, [0]), done.growth[-1]
+    assert again.qd_score == pytest.approx(found.qd_score)
+    assert again.coverage == found.coverage
+    assert tried_again(done, [1]).qd_score != pytest.approx(found.qd_score)
+
+
+def test_a_record_of_other_settings_or_candidates_is_refused(tmp_path):
+    needs_ribs()
+    path = tmp_path / RESULTS
+    search(path=path).run(2 * BATCH_COST)
+    with pytest.raises(NPAError, match="figures of other settings: seed was 0, now 1"):
+        search(path=path, seed=1)
+    held = json.loads(path.read_text())
+    held["batches"][1]["fingerprint"] += 1
+    path.write_text(json.dumps(held))
+    with pytest.raises(NPAError, match="batch 1 is of others"):
+        search(path=path)
+
+
+def test_the_command_leaves_elites_that_other_commands_open(tmp_path, capsys):
+    needs_ribs()
+    out = tmp_path / "found"
+    words = ["search", *OPTIONS, "--no-progress", "--out", str(out), "--budget"]
+    assert main([*words, str(2 * BATCH_COST)]) == 0
+    assert main([*words, str(3 * BATCH_COST)]) == 0
+    printed = capsys.readouterr().out
+    assert "8 candidates were tried before\n12 candidates, " in printed
+    files = sorted((out / "elites").glob("*.safetensors"))
+    told = json.loads(rule_metadata(files[0])["found"])
+    assert sorted(told) == ["crowding", "mixing", "quality", "speed"]
+    page = (out / "atlas.html").read_text()
+    assert page.count("<img") == len(files)
+    assert f'href="elites/{files[0].name}"' in page
+    assert (out / "atlas.png").read_bytes().startswith(b"\x89PNG")
+    rule = load_rule(files[0])
+    trained = task_of_rule(str(files[0]), rule, CPU)
+    assert trained.doubt == "its file does not say what it grows"
+    assert trained.task.config.particle_count == 16
+    assert main([*words, "10"]) == 2
+    assert "budget must be finite and at least that of one batch" in capsys.readouterr().err
+
+
+def test_a_pair_is_a_folder_that_the_viewer_opens(tmp_path):
+    needs_ribs()
+    words = ["search", *OPTIONS, "--kind", "pair", "--no-progress", "--out", str(tmp_path)]
+    assert main([*words, "--budget", str(BATCH_COST)]) == 0
+    world = RunWorld(min((tmp_path / "elites").iterdir()), device=CPU)
+    world.reset(0)
+    assert world.counts == [8, 8]
+    left, right = world.x[0].split(8)
+    assert float((right - left).mean(dim=0)[0]) == pytest.approx(0.4, abs=0.15)
