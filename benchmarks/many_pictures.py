@@ -31,7 +31,7 @@ from recipes import DRAWN, SECOND, SIZES, single_emoji, train_side_by_side
 from torch import Tensor, nn
 
 import npa_envs
-from npa_envs.measure.codes import PictureRow, grown, picture_rows, tasks_of_pictures
+from npa_envs.measure.codes import MEDIAN, PICTURE_CHECKPOINTS, PictureRow, grown, picture_rows
 from npa_envs.measure.quality import psnr
 from npa_envs.measure.record import machine, write_record
 from npa_envs.rule.files import rule_metadata
@@ -41,10 +41,11 @@ from npa_envs.training import Trainer, preset
 
 KINDS: Mapping[str, Mapping[str, Any]] = {
     "codes": {},
-    "codes-32": {"code_dim": 32},
-    "encoder": {"encoder": True},
+    "wide": {"code_dim": 16, "hidden_dim": 256},
+    "encoder": {"encoder": True, "code_dim": 16, "hidden_dim": 256},
 }
-"""Rules of many pictures: 8 or 32 learned numbers a picture, or 8 that are read from it."""
+"""Rules of many pictures: 8 learned numbers a picture and as many hidden units as the controls; 16
+and twice the units; and 16 that are read from the picture."""
 
 LOCAL: Mapping[str, Any] = {"particle_count": 256, "target_point_count": 256}
 """Worlds of the preset `fast` with half of its particles: for one core."""
@@ -52,8 +53,8 @@ LOCAL: Mapping[str, Any] = {"particle_count": 256, "target_point_count": 256}
 SEEDS = tuple(range(1000, 1004))
 """Seeds of the worlds that rules are measured on."""
 
-STEPS = (64, 256, 1024)
-"""Steps at which they are measured."""
+STEP = PICTURE_CHECKPOINTS[1]
+"""Steps after which rules are compared with each other."""
 
 TRAINED, HELD_OUT = 60, 20
 """Pictures that `pictures` draws."""
@@ -196,22 +197,27 @@ def record(arguments: argparse.Namespace, found: Mapping[str, Any]) -> dict[str,
     return {"machine": machine(torch.device(arguments.device)), "told": told, "rules": found}
 
 
-def measured(rule: npa_envs.NPARule, config: Any, device: str) -> dict[str, list[dict[str, Any]]]:
-    """Return the rows of a rule's pictures at each of `STEPS`."""
-    tasks = tasks_of_pictures(rule, config, device=device)
-    return {
-        str(step): [
-            asdict(row) for row in picture_rows(rule, tasks, step=step, seeds=SEEDS, device=device)
-        ]
-        for step in STEPS
-    }
+def tasks_of(rule: npa_envs.NPARule, config: Any, device: str) -> list[Morphogenesis2D]:
+    """Return the task of each picture that a rule has a code for."""
+    sources = named_targets(config.targets)
+    return [
+        Morphogenesis2D(replace(config, target=source, targets=()), device=device).for_rule(rule)
+        for source in sources.values()
+    ]
 
 
-def median_losses(rows: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, str]:
+def measured(rule: npa_envs.NPARule, config: Any, device: str) -> list[dict[str, Any]]:
+    """Return the rows of a rule's pictures."""
+    tasks = tasks_of(rule, config, device)
+    return [asdict(row) for row in picture_rows(rule, tasks, seeds=SEEDS, device=device)]
+
+
+def median_losses(rows: Sequence[Mapping[str, Any]]) -> dict[int, str]:
     """Return the median loss and the median shuffled loss at each step, for people."""
     return {
-        step: f"{table[-1]['loss']:.3f}, shuffled {table[-1]['shuffled']:.3f}"
-        for step, table in rows.items()
+        row["step"]: f"{row['loss']:.3f}, shuffled {row['shuffled']:.3f}"
+        for row in rows
+        if row["target"] == MEDIAN
     }
 
 
@@ -222,7 +228,7 @@ def train(arguments: argparse.Namespace) -> None:
     sources = named_targets(arguments.targets)
     chosen = random.Random(2).sample(list(sources), min(arguments.controls, len(sources)))
     wanted: dict[str, dict[str, Any]] = {
-        kind: told | many | KINDS[kind] for kind in arguments.kinds or KINDS
+        kind: told | many | KINDS[kind] for kind in arguments.kinds or KINDS if kind != "none"
     }
     wanted |= {f"control-{name}": told | {"target": sources[name]} for name in chosen}
     configs = [
@@ -247,7 +253,7 @@ def measure(arguments: argparse.Namespace) -> None:
         row: dict[str, Any] = {"iterations": int(metadata["iteration"])}
         if rule.codes is None:
             row["rows"] = control_rows(rule, config, device)
-            print(path.stem, {step: rows[0]["loss"] for step, rows in row["rows"].items()})
+            print(path.stem, {entry["step"]: round(entry["loss"], 3) for entry in row["rows"]})
         else:
             row["rows"] = measured(rule, config, device)
             print(path.stem, median_losses(row["rows"]), flush=True)
@@ -260,31 +266,31 @@ def measure(arguments: argparse.Namespace) -> None:
     print("ratios of medians", ratios_of(found))
 
 
-def control_rows(rule: npa_envs.NPARule, config: Any, device: str) -> dict[str, list[Any]]:
-    """Return what a rule of one picture grows, at each of `STEPS`."""
+def control_rows(rule: npa_envs.NPARule, config: Any, device: str) -> list[dict[str, Any]]:
+    """Return what a rule of one picture grows."""
     task = Morphogenesis2D(config, device=device)
-    found = {}
-    for step in STEPS:
-        x, s = (part[0] for part in grown(rule, [task], step=step, seeds=SEEDS, device=device))
-        loss = task.metric(x, s).mean().item()
-        ratio = psnr(task.picture(x, s), task.target_picture).mean().item()
-        found[str(step)] = [{"target": task.target.name, "loss": loss, "psnr": ratio}]
-    return found
+    rows = []
+    worlds = grown(rule, [task], seeds=SEEDS, device=device)
+    for step, (x, s) in zip(PICTURE_CHECKPOINTS, worlds, strict=True):
+        loss = task.metric(x[0], s[0]).mean().item()
+        ratio = psnr(task.picture(x[0], s[0]), task.target_picture).mean().item()
+        rows.append({"step": step, "target": task.target.name, "loss": loss, "psnr": ratio})
+    return rows
 
 
 def held_out_rows(
     rule: npa_envs.NPARule, config: Any, held_out: Sequence[str], device: str
 ) -> list[dict[str, Any]]:
-    """Return what a rule grows from pictures that only its encoder sees, at the second of `STEPS`.
+    """Return what a rule grows from pictures that only its encoder sees.
 
     Beside it the PSNR of a blank picture, and of the trained picture that comes closest.
     """
-    known = tasks_of_pictures(rule, config, device=device)
+    known = tasks_of(rule, config, device)
     tasks = [
         Morphogenesis2D(replace(config, target=source, targets=()), device=device).for_rule(rule)
         for source in named_targets(held_out).values()
     ]
-    rows = picture_rows(rule, tasks, step=STEPS[1], seeds=SEEDS, device=device)
+    rows = picture_rows(rule, tasks, checkpoints=(STEP,), seeds=SEEDS, device=device)
     return [asdict(row) | floors(row, task, known) for row, task in zip(rows, tasks, strict=False)]
 
 
@@ -301,11 +307,11 @@ def floors(
 
 def ratios_of(found: Mapping[str, Any]) -> dict[str, float]:
     """Return the median loss of each rule of many pictures over the controls', where both are."""
-    step = str(STEPS[1])
     controls = {
-        row["rows"][step][0]["target"]: row["rows"][step][0]["loss"]
+        entry["target"]: entry["loss"]
         for name, row in found.items()
-        if name.startswith("control-")
+        for entry in row["rows"]
+        if name.startswith("control-") and entry["step"] == STEP
     }
     if not controls:
         return {}
@@ -313,7 +319,11 @@ def ratios_of(found: Mapping[str, Any]) -> dict[str, float]:
     ratios = {}
     for name, row in found.items():
         if not name.startswith("control-"):
-            own = [r["loss"] for r in row["rows"][step] if r["target"] in controls]
+            own = [
+                entry["loss"]
+                for entry in row["rows"]
+                if entry["step"] == STEP and entry["target"] in controls
+            ]
             ratios[name] = round(statistics.median(own) / alone, 3)
     return ratios
 

@@ -5,9 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from npa_envs.cli.output import RuleOptions, StepBar, check_numbers, parse_options, rule_of
-from npa_envs.errors import NPAError
+from npa_envs.errors import NPAError, shown
+
+if TYPE_CHECKING:
+    import torch
+
+    from npa_envs.rule.rule import NPARule
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -15,7 +21,8 @@ class EvaluateOptions(RuleOptions):
     """Measure loss, PSNR, overflow and extent of a rule over thousands of steps.
 
     Of a rule that classifies point clouds: the accuracy on clouds it was not trained on, and what
-    they say when they are cut or become others.
+    they say when they are cut or become others. Of a rule of many pictures, unless `--target` names
+    one of them: loss and PSNR of each, and the loss with the code of another.
     """
 
     data_folder: str | None = None
@@ -62,6 +69,8 @@ def main(arguments: Sequence[str]) -> int:
     source = rule_of(options.rule)
     rule = load_rule(source, device=device).float()
     world = options.world() | {"data_folder": options.data_folder}
+    if rule.codes is not None and options.target is None:
+        return evaluate_pictures(options, source, rule, device)
     trained = task_of_rule(source, rule, device, **world)
     if trained.doubt is not None:
         raise NPAError(
@@ -93,5 +102,51 @@ def main(arguments: Sequence[str]) -> int:
         print(table_text(rows, missing="-" if name == "growth" else "never"))
     if options.json is not None:
         write_text(options.json, tables_json(tables, metric=trained.task.metric_name))
+        print(f"wrote {options.json}")
+    return 0
+
+
+def evaluate_pictures(
+    options: EvaluateOptions, source: str, rule: NPARule, device: torch.device
+) -> int:
+    """Measure and print what each code of a rule of many pictures grows.
+
+    Raises:
+        NPAError: A picture cannot be loaded any more, or something is asked for that is measured of
+            one picture.
+    """
+    from npa_envs.files import write_text
+    from npa_envs.measure.codes import PICTURE_CHECKPOINTS, picture_rows
+    from npa_envs.measure.tables import table_text, tables_json
+    from npa_envs.training.trained_tasks import task_of_rule
+
+    assert rule.codes is not None, "asked before"
+    if options.healing or options.judge:
+        raise NPAError(
+            "healing and judge are measured of one picture at a time, of the rule's "
+            f"{len(rule.codes)}: give --target {shown(rule.codes.names[0])}"
+        )
+    checkpoints = options.checkpoints or PICTURE_CHECKPOINTS
+    tasks: list[Any] = []
+    for name in rule.codes.names:
+        world = options.world() | {"target": name}
+        tasks.append(task_of_rule(source, rule, device, **world).task)
+    with StepBar(None, show=options.progress) as bar:
+        rows = picture_rows(
+            rule,
+            tasks,
+            checkpoints=checkpoints,
+            seeds=range(options.first_seed, options.first_seed + options.seed_count),
+            device=device,
+            progress=bar.advance,
+        )
+    metric = tasks[0].metric_name
+    print(
+        f"{options.rule}: {len(tasks)} pictures, {options.seed_count} worlds each, loss: {metric}, "
+        "shuffled: with the code of the next picture"
+    )
+    print(table_text(rows))
+    if options.json is not None:
+        write_text(options.json, tables_json({"pictures": rows}, metric=metric))
         print(f"wrote {options.json}")
     return 0

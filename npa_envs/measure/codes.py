@@ -4,62 +4,42 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.measure.quality import psnr
+from npa_envs.measure.quality import check_steps, psnr
 from npa_envs.rule.rule import NPARule
-from npa_envs.tasks.many_pictures import named_targets
-from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
 from npa_envs.world.randomness import WorldRandom
 from npa_envs.world.rollout import rollout
 
 WORLDS = 64
 """Worlds that are run at once."""
 
-STEP = 256
-"""Steps from the seed after which pictures are compared, where nothing else is said."""
+PICTURE_CHECKPOINTS = (64, 256, 1024)
+"""Steps from the seed after which pictures are compared, unless others are asked for."""
+
+MEDIAN = "(median)"
+"""What stands in place of a picture's name in rows of medians."""
 
 
 @dataclass(frozen=True)
 class PictureRow:
     """Worlds of one picture, grown from its code."""
 
+    step: int
+    """Steps from the seed."""
     target: str
-    """The picture's name; the last row is of the median picture."""
+    """The picture's name, or `MEDIAN`."""
     loss: float
     """Splat loss with its own code, mean of the worlds."""
+    shuffled: float
+    """Splat loss with the code of the next picture of the list, mean of the worlds."""
     psnr: float
     """PSNR with its own code, mean of the worlds [dB]."""
-    shuffled: float
-    """Splat loss with the code of another picture, mean of the worlds."""
-
-
-def tasks_of_pictures(
-    rule: NPARule, config: Morphogenesis2DConfig, *, device: str | torch.device
-) -> list[Morphogenesis2D]:
-    """Return the task of each picture that a rule has a code for, in the order of its codes.
-
-    Args:
-        rule: A rule of many pictures.
-        config: What it was trained with.
-        device: Where the targets' pictures are kept.
-
-    Raises:
-        NPAError: The rule has no codes, or a picture cannot be loaded.
-    """
-    if rule.codes is None:
-        raise NPAError("the rule must have codes, this one has none: train it with --targets")
-    sources = named_targets(config.targets)
-    return [
-        Morphogenesis2D(
-            replace(config, target=sources.get(name, name), targets=()), device=device
-        ).for_rule(rule)
-        for name in rule.codes.names
-    ]
 
 
 @torch.no_grad()
@@ -67,26 +47,31 @@ def grown(
     rule: NPARule,
     tasks: Sequence[Morphogenesis2D],
     *,
-    step: int,
+    checkpoints: Sequence[int] = PICTURE_CHECKPOINTS,
     seeds: Sequence[int],
-    device: str | torch.device,
+    device: str | torch.device = "cpu",
     progress: Callable[[int], None] | None = None,
-) -> tuple[Tensor, Tensor]:
-    """Return worlds of each task after some steps from the same seeds.
+) -> list[tuple[Tensor, Tensor]]:
+    """Return worlds of each task after some steps, all from the same seeds.
 
     Args:
         rule: The rule.
         tasks: Tasks of equal worlds, each with its own code.
-        step: Steps from the seed.
+        checkpoints: Steps from the seed, positive and increasing.
         seeds: One number for each world of a task.
         device: Where to run.
         progress: Called with the number of steps done since its last call.
 
     Returns:
-        Positions [length units], shape [T, B, N, 2], and states, shape [T, B, N, C].
+        For each of `checkpoints` positions [length units], shape [T, B, N, 2], and states, shape
+        [T, B, N, C].
+
+    Raises:
+        NPAError: `checkpoints` are empty or out of order.
     """
+    check_steps("checkpoints", checkpoints)
     together = max(1, WORLDS // len(seeds))
-    found = []
+    found: list[list[tuple[Tensor, Tensor]]] = [[] for _ in checkpoints]
     for first in range(0, len(tasks), together):
         some = tasks[first : first + together]
         fresh = [
@@ -94,20 +79,31 @@ def grown(
             for task in some
         ]
         x, s = (torch.cat(parts) for parts in zip(*fresh, strict=True))
-        x, s = rollout(
-            rule,
-            x,
-            s,
-            step,
-            eps=some[0].eps,
-            update_prob=some[0].update_prob,
-            generator=WorldRandom([*seeds] * len(some), device=device),
-        )
-        found.append(tuple(part.view(len(some), -1, *part.shape[1:]) for part in (x, s)))
-        if progress is not None:
-            progress(step)
-    x, s = (torch.cat(parts) for parts in zip(*found, strict=True))
-    return x, s
+        random = WorldRandom([*seeds] * len(some), device=device)
+        done = 0
+        for number, step in enumerate(checkpoints):
+            x, s = rollout(
+                rule,
+                x,
+                s,
+                step - done,
+                eps=some[0].eps,
+                update_prob=some[0].update_prob,
+                generator=random,
+            )
+            found[number].append((x, s))
+            if progress is not None:
+                progress(step - done)
+            done = step
+    return [
+        (_by_task(tasks, [x for x, _ in parts]), _by_task(tasks, [s for _, s in parts]))
+        for parts in found
+    ]
+
+
+def _by_task(tasks: Sequence[Morphogenesis2D], parts: Sequence[Tensor]) -> Tensor:
+    whole = torch.cat(list(parts))
+    return whole.view(len(tasks), -1, *whole.shape[1:])
 
 
 @torch.no_grad()
@@ -115,7 +111,7 @@ def picture_rows(
     rule: NPARule,
     tasks: Sequence[Morphogenesis2D],
     *,
-    step: int = STEP,
+    checkpoints: Sequence[int] = PICTURE_CHECKPOINTS,
     seeds: Sequence[int],
     device: str | torch.device = "cpu",
     progress: Callable[[int], None] | None = None,
@@ -124,38 +120,43 @@ def picture_rows(
 
     Args:
         rule: The rule.
-        tasks: The tasks of its pictures (`tasks_of_pictures`), two or more.
-        step: Steps from the seed.
-        seeds: One number for each world of a picture.
+        tasks: The tasks of its pictures, each with its code, two or more.
+        checkpoints: As for `grown`.
+        seeds: As for `grown`.
         device: Where to run.
-        progress: Called with the number of steps done since its last call.
+        progress: As for `grown`.
 
     Returns:
-        A row for each picture, and one of the medians.
+        For each of `checkpoints` a row for each picture, and one of the medians.
 
     Raises:
-        NPAError: There are fewer than two pictures.
+        NPAError: There are fewer than two pictures, or as for `grown`.
     """
     if len(tasks) < 2:
         raise NPAError(f"pictures must be two or more, got {len(tasks)}: nothing to tell apart")
-    x, s = grown(rule, tasks, step=step, seeds=seeds, device=device, progress=progress)
+    told = {"seeds": seeds, "device": device, "progress": progress}
+    worlds = grown(rule, tasks, checkpoints=checkpoints, **told)  # type: ignore[arg-type]
     rows = []
-    for number, task in enumerate(tasks):
-        own, other = number, (number + 1) % len(tasks)
-        ratio = psnr(task.picture(x[own], s[own]), task.target_picture)
-        rows.append(
-            PictureRow(
-                target=task.target.name,
-                loss=task.metric(x[own], s[own]).mean().item(),
-                psnr=ratio.mean().item(),
-                shuffled=task.metric(x[other], s[other]).mean().item(),
-            )
-        )
-    median = PictureRow(
-        target="(median)",
-        **{
-            name: statistics.median(getattr(row, name) for row in rows)
-            for name in ("loss", "psnr", "shuffled")
-        },
+    for step, (x, s) in zip(checkpoints, worlds, strict=True):
+        own = [_row(step, tasks, number, x, s) for number in range(len(tasks))]
+        medians = {
+            name: statistics.median(getattr(row, name) for row in own)
+            for name in ("loss", "shuffled", "psnr")
+        }
+        rows += [*own, PictureRow(step=step, target=MEDIAN, **medians)]
+    return rows
+
+
+def _row(
+    step: int, tasks: Sequence[Morphogenesis2D], number: int, x: Tensor, s: Tensor
+) -> PictureRow:
+    """Return the row of one task, of worlds x [T, B, N, 2], s [T, B, N, C] of all."""
+    task, other = tasks[number], (number + 1) % len(tasks)
+    ratio = psnr(task.picture(x[number], s[number]), task.target_picture)
+    return PictureRow(
+        step=step,
+        target=task.target.name,
+        loss=task.metric(x[number], s[number]).mean().item(),
+        shuffled=task.metric(x[other], s[other]).mean().item(),
+        psnr=ratio.mean().item(),
     )
-    return [*rows, median]
