@@ -34,7 +34,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "compare": (
         "compare --quick --out quick",
         "compare --seconds 60 --methods gradient ppo --tasks morphogenesis2d",
-        "compare --suite npa-bench-v0 --out bench --devices cuda:0 cuda:1",
+        "compare --suite npa-bench-small-v0 --out bench --jobs 2",
     ),
     "demo": ("demo", "demo --target star --train-seconds 60 --out star"),
     "doctor": ("doctor",),

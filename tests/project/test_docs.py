@@ -443,7 +443,7 @@ def test_the_code_about_several_species_runs():
 
 def test_the_code_about_learning_runs(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    example, method, *_ = code_blocks(DOCS / "learning.md")
+    example, _, method = code_blocks(DOCS / "learning.md")
     names = {}
     # Less of it: what is tested is that it runs, and what needs no learning.
     assert example.count("00_000") == 2

@@ -4,6 +4,7 @@ import json
 import re
 from collections.abc import Callable
 from pathlib import Path
+from statistics import mean, stdev
 from typing import Any
 
 import pytest
@@ -191,3 +192,33 @@ def test_the_page_on_species_has_the_numbers_of_its_file() -> None:
     text = (ROOT / "docs" / "species.md").read_text(encoding="utf-8")
     pattern = rf"`rollout` takes ({NUMBER}) ms"
     assert differences(text, pattern, [row["rollout_us"]["median"] * 1e-3]) == []
+
+
+SMALL_WORLDS = content(RESULTS / "small_sizes_cpu.json")["rows"]
+
+
+def estimates(env_id: str) -> list[tuple[float, float] | None]:
+    """Means and standard errors of a small world's returns, as the table has them; None: not run.
+
+    They are of random and scripted policies, the library's PPO, and Stable-Baselines3's.
+    """
+    other = "ppo_particles" if "PointClassification" in env_id else "ppo_world"
+    found: list[tuple[float, float] | None] = []
+    for method in ("random", "scripted", "ppo", other):
+        runs = [row for row in SMALL_WORLDS if (row["id"], row["method"]) == (env_id, method)]
+        values = [row["return"] for row in runs if "return" in row]
+        error = stdev(values) / len(values) ** 0.5 if len(values) > 1 else 0.0
+        found.append((mean(values), error) if values else None)
+    return found
+
+
+def test_the_table_of_small_worlds_has_the_numbers_of_its_file() -> None:
+    page = (ROOT / "docs" / "learning.md").read_text(encoding="utf-8")
+    told = dict(re.findall(r"^\| `(npa/[\w-]+)` \| (.*) \|$", page, re.MULTILINE))
+    assert set(told) == {row["id"] for row in SMALL_WORLDS}
+    for env_id, line in told.items():
+        cells = []
+        for found in estimates(env_id):
+            cell = "" if found is None else f"{found[0]:.3f}".replace("-", "−")
+            cells.append(cell + (f" ± {found[1]:.3f}" if found and found[1] > 5e-4 else ""))
+        assert line.split(" | ") == cells, env_id
