@@ -94,9 +94,6 @@ class Trained(NamedTuple):
     """Maps observations, [B, N, P], to actions, [B, N, A], and a dict of agents' observations, of
     PettingZoo's parallel environments, to one of their actions: the rules' where there are some."""
 
-    interrupted: bool = False
-    """Whether SIGTERM or Ctrl-C stopped it before its budget was spent: it can be resumed."""
-
     def save(self, folder: str | Path) -> list[Path]:
         """Write what was learned, if anything: rules' files, or the policy's own; return paths.
 
@@ -184,7 +181,7 @@ def train(
     if isinstance(result, RuleSet):
         # Of no use any more, they may keep the memory of recorded work.
         result.zero_grad()
-        return Trained(result, progress.log, result.policy(), progress.interrupted)
+        return Trained(result, progress.log, result.policy())
     return Trained(None, progress.log, result)
 
 

@@ -102,7 +102,6 @@ class KeptProgress(Progress):
                     self._save(rules, learner)
             self.look(rules, force=True)
             self._save(rules, learner)
-            self.interrupted = not self.over
 
     def _opened(self, resume: bool) -> dict[str, Any] | None:
         """Return the checkpoint to go on from, or None, once the folder is fit to be written to."""

@@ -53,6 +53,14 @@ class Budget:
                 f"particle_steps must be a positive integer, got {shown(steps)}: try 10**7"
             )
 
+    def share(self, seconds: float, particle_steps: int) -> float:
+        """Return the share of the budget that time [s] and particle-steps are; 1: it is spent."""
+        by_time = 0.0 if self.seconds is None else seconds / self.seconds
+        by_steps = 0.0
+        if self.particle_steps is not None:
+            by_steps = particle_steps / self.particle_steps
+        return max(by_time, by_steps)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Entry:
@@ -160,8 +168,6 @@ class Progress:
         self._seconds = 0.0
         self._elapsed = 0.0
         self._looks = 0
-        self.interrupted = False
-        """Whether a run that is kept was asked to stop before its end."""
         self._previous: torch.cuda.Event | None = None
 
     def run(
@@ -209,13 +215,8 @@ class Progress:
     @property
     def share(self) -> float:
         """Share of the budget that is spent; above 1 by the last iteration's excess."""
-        limits = self.budget
         seconds = self._elapsed if self.ranks.together else self.seconds
-        by_time = 0.0 if limits.seconds is None else seconds / limits.seconds
-        by_steps = 0.0
-        if limits.particle_steps is not None:
-            by_steps = self.particle_steps / limits.particle_steps
-        return max(by_time, by_steps)
+        return self.budget.share(seconds, self.particle_steps)
 
     @property
     def over(self) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -70,9 +70,12 @@ class LearnOptions(RunOptions):
     out: OutFolder = Path("runs/learn")
     """Folder for checkpoint, rules and curve."""
 
-    processes: int = 1
-    """Processes that share the run, on CUDA each with a GPU of its own. `torchrun
+    processes: int | None = None
+    """Processes that share the run, on CUDA each with a GPU of its own; by default 1. `torchrun
     --nproc-per-node=4 -m npa_envs learn ...` does the same."""
+
+    gpus: int | None = None
+    """GPUs that share the run: `--gpus 4` says `--device cuda --processes 4`."""
 
     resume: bool = False
     """Go on from the checkpoint in the folder `out`. `--resume auto`: if there is one; else
@@ -94,17 +97,26 @@ def main(arguments: Sequence[str]) -> int:
         asked = ranks.told(asked)
         assert asked is not None, "said by the first process"
         words, options = asked
-        if options.processes > 1 and not ranks.together:
-            return launch(options.processes, ("learn", *words), options.out, options.device)
+        count = options.processes or 1
+        if count > 1 and not ranks.together:
+            return launch(count, ("learn", *words), options.out, options.device)
         with told_once(ranks):
             return run(options, ranks)
 
 
 def parse(words: Sequence[str]) -> LearnOptions:
-    """Return what the words after `npa-envs learn` say."""
+    """Return what the words after `npa-envs learn` say.
+
+    Raises:
+        NPAError: A number is too small, or GPUs are given beside what they stand for.
+    """
     options = parse_options(LearnOptions, "learn", words)
-    check_numbers(options, worlds=1, episodes=1, entries=1, processes=1)
-    return options
+    check_numbers(options, worlds=1, episodes=1, entries=1, processes=1, gpus=1)
+    if options.gpus is None:
+        return options
+    if options.processes is not None or "--device" in words:
+        raise NPAError("gpus stands for --device cuda and --processes: give one or the other")
+    return replace(options, device="cuda", processes=options.gpus)
 
 
 def run(options: LearnOptions, ranks: Ranks) -> int:
@@ -131,10 +143,11 @@ def run(options: LearnOptions, ranks: Ranks) -> int:
                 flush=True,
             )
 
+    budget = Budget(seconds=options.seconds, particle_steps=None if steps is None else int(steps))
     found = train(
         options.method,
         problem_of(options),
-        Budget(seconds=options.seconds, particle_steps=None if steps is None else int(steps)),
+        budget,
         options.seed,
         device=options.device,
         evaluation_seeds=range(FIRST_EVALUATION_SEED, FIRST_EVALUATION_SEED + options.episodes),
@@ -145,10 +158,12 @@ def run(options: LearnOptions, ranks: Ranks) -> int:
         overwrite=options.overwrite,
         **named_values("options", options.options),
     )
+    last = found.log[-1]
+    finished = budget.share(last.seconds, last.particle_steps) >= 1.0
     if ranks.first:
-        end = "stopped; the same words with --resume go on" if found.interrupted else "finished"
+        end = "finished" if finished else "stopped; the same words with --resume go on"
         print(f"{end}: rules, curve and checkpoint are in {options.out}/")
-    return INTERRUPTED if found.interrupted else 0
+    return 0 if finished else INTERRUPTED
 
 
 def problem_of(options: LearnOptions) -> Problem:

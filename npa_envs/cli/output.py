@@ -44,7 +44,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "learn": (
         "learn ppo npa/Morphogenesis2D-v0 --keywords target=heart --particle-steps 1e9 "
         "--device cuda",
-        "learn shac npa/Mixing-v0 --seconds 600 --device cuda --processes 2 --out runs/mixing",
+        "learn shac npa/Mixing-v0 --seconds 600 --gpus 2 --out runs/mixing",
     ),
     "list": ("list",),
     "record": (

@@ -46,6 +46,7 @@ def test_two_processes_share_a_run(tmp_path, capfd):
     [
         (["--options", "tempo=3"], "has no option 'tempo'"),
         (["--keywords", "heart"], "keywords must be NAME=VALUE, got 'heart'"),
+        (["--gpus", "2", "--processes", "2"], "gpus stands for --device cuda and --processes"),
         (["--resume", "now"], "invalid choice: 'now'"),
     ],
 )
