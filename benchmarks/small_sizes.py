@@ -91,30 +91,25 @@ def ppo_particles(problem: Problem, steps: int, seed: int) -> tuple[float, int, 
 def measured(env_id: str, method: str, seed: int, device: str) -> dict[str, Any]:
     """Return what one run came to; a run without a result says why."""
     problem = Problem(env_id=env_id, episode_steps=STEPS[env_id], hidden_dim=64)
-    budget = Budget(particle_steps=BUDGETS.get(env_id, USUAL))
+    steps = BUDGETS.get(env_id, USUAL)
     options = OPTIONS.get((env_id, method), {})
     row: dict[str, Any] = {"id": env_id, "method": method, "seed": seed, "options": options}
     begun = time.perf_counter()
-    if method == "ppo_particles":
-        mean, steps, seconds = ppo_particles(problem, int(budget.particle_steps or 0), seed)
-        return row | {
-            "return": mean,
-            "particle_steps": steps,
-            "seconds": round(seconds, 1),
-            "whole_seconds": round(time.perf_counter() - begun, 1),
-        }
     try:
-        log = train(
-            method, problem, budget, seed,
-            device=device, evaluation_seeds=EPISODES, entries=1, **options,
-        ).log  # fmt: skip
+        if method == "ppo_particles":
+            mean, learned_from, seconds = ppo_particles(problem, steps, seed)
+        else:
+            last = train(
+                method, problem, Budget(particle_steps=steps), seed,
+                device=device, evaluation_seeds=EPISODES, entries=1, **options,
+            ).log[-1]  # fmt: skip
+            mean, learned_from, seconds = last.mean_return, last.particle_steps, last.seconds
     except NPAError as error:
         return row | {"failed": str(error)}
-    last = log[-1]
     return row | {
-        "return": last.mean_return,
-        "particle_steps": last.particle_steps,
-        "seconds": round(last.seconds, 1),
+        "return": mean,
+        "particle_steps": learned_from,
+        "seconds": round(seconds, 1),
         "whole_seconds": round(time.perf_counter() - begun, 1),
     }
 
