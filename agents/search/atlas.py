@@ -68,7 +68,7 @@ def _metadata(search: Search, elite: Elite) -> dict[str, str]:
     """Return what a rule's file says: in which world it was found, and what it was there."""
     names = [axis.name for axis in search.axes]
     told = {"quality": elite.found.quality, **dict(zip(names, elite.found.measures, strict=True))}
-    world = {"particle_count": search.world.counts[0]}
+    world: dict[str, float] = {"particle_count": search.world.counts[0]}
     world |= {"update_prob": UPDATE_PROB, "seed_radius": SEED_RADIUS}
     return {"found": json.dumps(told), "world": json.dumps(world)}
 

@@ -228,7 +228,7 @@ class Candidates:
         """
         weights = torch.as_tensor(solutions * self.scales, dtype=torch.float32).to(self.device)
         together = len(weights) if self.device.type == "cpu" else 1
-        parts = [self._try(some) for some in weights.split(together)]
+        parts = [self._try(some) for some in torch.split(weights, together)]
         found = [one for part in parts for one in part.found]
         return Trials(found, torch.cat([p.x for p in parts]), torch.cat([p.s for p in parts]))
 
@@ -254,13 +254,10 @@ class Candidates:
             )
         late = SNAPSHOTS // 2
         travelled = (path[-1] - path[late - 1]).mean(dim=1) / ((SNAPSHOTS - late) * every)
-        moments = [values[late:].unflatten(1, (count, -1)) for values in (xs, ss)]
+        late_x, late_s = (values[late:].unflatten(1, (count, -1)) for values in (xs, ss))
         speeds = travelled.view(count, -1).mean(dim=1) / world.eps
-        found = [
-            self._judge(*(values[:, k] for values in moments), float(speeds[k]))
-            for k in range(count)
-        ]
-        return Trials(found, *(values[-1] for values in moments))
+        found = [self._judge(late_x[:, k], late_s[:, k], float(speeds[k])) for k in range(count)]
+        return Trials(found, late_x[-1], late_s[-1])
 
     def _judge(self, xs: Tensor, ss: Tensor, speed: float) -> Found | None:
         """Return what a candidate came to, from late moments [T, B, N, ·] of its worlds."""

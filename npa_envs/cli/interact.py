@@ -25,7 +25,7 @@ from npa_envs.errors import NPAError
 if TYPE_CHECKING:
     import torch
 
-    from npa_envs.measure.interaction import InteractionSettings, Organism
+    from npa_envs.measure.interaction import InteractionRow, InteractionSettings, Organism
     from npa_envs.rule.rule import NPARule
 
 RESULTS = "interactions.json"
@@ -47,12 +47,13 @@ QUICK: dict[str, Any] = {
 class InteractOptions(RunOptions):
     """Grow every rule beside every other one, and measure what that does to it.
 
-    Every ordered pair of rules, also of a rule with itself, at every distance and ratio: the first
-    one's task loss on its own particles together and alone, how much both mix, and how far its
-    centroid is moved. "cooperates": the loss falls by more than the margin; "disrupted": it rises
-    by more; "mixes": the mixing index is 0.25 or more. Each rule sees densities as it does alone:
-    divided by its own particles. The folder gets a JSON file, a heat map and a filmstrip of each
-    pair; a run that was stopped goes on where it was.
+    Every ordered pair of rules, also of a rule with itself, at every distance, ratio and radius:
+    the first one's task loss on its own particles together and alone, how much both mix, and how
+    far its centroid is moved. "cooperates": the loss falls by more than the margin; "disrupted": it
+    rises by more; "mixes": the mixing index is 0.25 or more. Each rule sees densities as it does
+    alone: divided by its own particles. The folder gets a JSON file, a heat map and a filmstrip of
+    each pair, and a phase diagram of each where there are several ratios or radii; a run that was
+    stopped goes on where it was.
     """
 
     rules: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RULE")] = ()
@@ -69,6 +70,12 @@ class InteractOptions(RunOptions):
 
     ratios: tuple[float, ...] = (0.5,)
     """Shares of the particles that are the measured rule's."""
+
+    eps_factors: tuple[float, ...] = (1.0,)
+    """Perception radii, over that of the rules."""
+
+    itself: bool = True
+    """Also bring each rule together with itself."""
 
     steps: int = 512
     """Steps from the seeds."""
@@ -110,14 +117,19 @@ def main(arguments: Sequence[str]) -> int:
     folder = writable_folder(options.out)
     told = _told(organisms, settings)
     rows = read_rows(folder / RESULTS, told)
-    pairs = [(first, second) for first in organisms for second in organisms]
+    pairs = [
+        (first, second)
+        for first in organisms
+        for second in organisms
+        if options.itself or first is not second
+    ]
     done = {(row.rule, row.beside) for row in rows}
     missing = [pair for pair in pairs if (pair[0].name, pair[1].name) not in done]
     if done:
         print(f"{len(pairs) - len(missing)} of {len(pairs)} pairs were measured before")
     # What is grown alone comes once for each ratio and measured rule.
     runs = len(missing) * len(settings.distances) + len({pair[0].name for pair in missing})
-    total = runs * len(settings.ratios) * settings.steps
+    total = runs * len(settings.ratios) * len(settings.eps_factors) * settings.steps
     with StepBar(total, show=options.progress) as bar:
         encounters = Encounters(settings, device=device, progress=bar.advance)
         encounters.check(organisms)
@@ -131,6 +143,8 @@ def main(arguments: Sequence[str]) -> int:
     print(table_text(rows))
     print(f"wrote {folder / RESULTS} and a filmstrip of each pair")
     maps = write_plots(lambda: {"": heat_map(rows)}, folder / "interactions.png", "heat map")
+    if len(settings.ratios) > 1 or len(settings.eps_factors) > 1:
+        maps += write_plots(lambda: _phases(rows), folder / "phases-*.png", "phase diagrams")
     print("\n".join(maps))
     return 0
 
@@ -165,12 +179,23 @@ def _organisms(
         particle_count=options.particle_count or max(counts),
         distances=options.distances,
         ratios=options.ratios,
+        eps_factors=options.eps_factors,
         steps=options.steps,
         seeds=tuple(range(options.first_seed, options.first_seed + options.seed_count)),
         update_prob=options.update_prob,
         margin=options.margin,
     )
     return organisms, settings
+
+
+def _phases(rows: Sequence[InteractionRow]) -> dict[str, bytes]:
+    """Return the phase diagram of each pair."""
+    from npa_envs.measure.interaction import phase_diagram
+
+    pairs: dict[str, list[InteractionRow]] = {}
+    for row in rows:
+        pairs.setdefault(f"{row.rule}-{row.beside}", []).append(row)
+    return {name: phase_diagram(own) for name, own in pairs.items()}
 
 
 def _task_of(source: str, rule: NPARule, device: torch.device, count: int) -> Any:

@@ -6,6 +6,7 @@ measured by the other's own task, on its own particles, against the same seeds g
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -31,6 +32,9 @@ from npa_envs.world.species import rollout_species
 MARGIN = 0.2
 """A loss that changes by less than this share of itself counts as undisturbed."""
 
+RESAMPLES = 2000
+"""Draws of a bootstrap."""
+
 MIXED = 0.25
 """Mixing index from which on two species mix (dimensionless)."""
 
@@ -45,6 +49,8 @@ class InteractionSettings:
     """Distances between the centres of the two seeds [length units]."""
     ratios: tuple[float, ...] = (0.5,)
     """Shares of the particles that are of the measured species, in (0, 1)."""
+    eps_factors: tuple[float, ...] = (1.0,)
+    """Perception radii, over that of the rules (dimensionless)."""
     steps: int = 512
     """Steps from the seeds."""
     seeds: tuple[int, ...] = tuple(range(8))
@@ -67,6 +73,10 @@ class InteractionSettings:
             raise NPAError(
                 f"distances must be finite and not negative, got {self.distances}: try 0 0.5 1"
             )
+        if not self.eps_factors or not all(0.0 < f < math.inf for f in self.eps_factors):
+            raise NPAError(
+                f"eps_factors must be finite and above 0, got {self.eps_factors}: try 0.7 1 1.4"
+            )
         for name, shares in (("ratios", self.ratios), ("margin", (self.margin,))):
             if not shares or not all(0.0 < share < 1.0 for share in shares):
                 raise NPAError(f"{name} must lie in (0, 1), got {shares}")
@@ -86,7 +96,8 @@ class InteractionRow:
     `alone` and `together` are A's task metric of its own particles where it grows alone and beside
     B; `change` is together / alone, `mixing` the `mixing_index` at the end, `displacement` how far
     A's centroid ends from where it ends alone [length units]. `distance` is between the centres of
-    their seeds [length units], `ratio` A's share of the particles.
+    their seeds [length units], `ratio` A's share of the particles, `eps_factor` the perception
+    radius over that of the rules. `low` and `high` are the ends of 95 % intervals over the worlds.
     """
 
     rule: str
@@ -99,6 +110,11 @@ class InteractionRow:
     mixing: float
     displacement: float
     verdict: str
+    eps_factor: float = 1.0
+    change_low: float = math.nan
+    change_high: float = math.nan
+    mixing_low: float = math.nan
+    mixing_high: float = math.nan
 
 
 def verdict(change: float, mixing: float, margin: float = MARGIN) -> str:
@@ -114,6 +130,25 @@ def verdict(change: float, mixing: float, margin: float = MARGIN) -> str:
     elif change <= 1.0 + margin:
         word = "undisturbed"
     return f"{word}, mixes" if mixing >= MIXED else word
+
+
+def ratio_interval(above: Tensor, below: Tensor) -> tuple[float, float]:
+    """Return the ends of the 95 % interval of mean(above) / mean(below), by bootstrap over worlds.
+
+    Worlds are drawn anew, with replacement and both numbers together, `RESAMPLES` times. Where
+    a mean below is 0 the ratio is infinite.
+
+    Args:
+        above: A number of each world, infinite where it is lost, shape [B].
+        below: Another one, finite and not negative, shape [B].
+    """
+    count = len(above)
+    draws = np.random.default_rng(0).integers(count, size=(RESAMPLES, count))
+    tops, bases = (values.double().cpu().numpy()[draws].mean(axis=1) for values in (above, below))
+    ratios = np.divide(tops, bases, out=np.full_like(tops, np.inf), where=bases > 0.0)
+    # No interpolation: it makes no number of two infinite ones.
+    low, high = np.quantile(ratios, (0.025, 0.975), method="nearest")
+    return float(low), float(high)
 
 
 def mixing_index(x: Tensor, counts: Sequence[int], *, eps: float) -> Tensor:
@@ -197,7 +232,7 @@ class Encounters:
         self.settings = settings
         self._device = device
         self._progress = progress
-        self._solos: dict[tuple[str, int], _Solo] = {}
+        self._solos: dict[tuple[str, int, float], _Solo] = {}
 
     def check(self, organisms: Sequence[Organism]) -> None:
         """Check that any two of the rules can share a world.
@@ -217,16 +252,16 @@ class Encounters:
 
     @torch.no_grad()
     def meet(self, first: Organism, second: Organism) -> tuple[list[InteractionRow], Scenes]:
-        """Grow one rule, which is measured, beside another or itself, at every distance and ratio.
+        """Grow one rule, which is measured, beside another or itself, at every setting.
 
         Returns:
-            One row for each ratio and distance, and pictures.
+            One row for each radius, ratio and distance, and pictures.
         """
         rows, scenes = [], Scenes()
-        for ratio in self.settings.ratios:
-            solo = self._solo(first, self.settings.counts(ratio)[0])
+        for factor, ratio in itertools.product(self.settings.eps_factors, self.settings.ratios):
+            solo = self._solo(first, self.settings.counts(ratio)[0], factor)
             for distance in self.settings.distances:
-                rows.append(self._row(first, second, ratio, distance, solo, scenes))
+                rows.append(self._row(first, second, ratio, distance, factor, solo, scenes))
         return rows, scenes
 
     def _row(
@@ -235,6 +270,7 @@ class Encounters:
         second: Organism,
         ratio: float,
         distance: float,
+        factor: float,
         solo: _Solo,
         scenes: Scenes,
     ) -> InteractionRow:
@@ -252,15 +288,19 @@ class Encounters:
                 half_width=half_width,
             )
             scenes.frames.append(picture)
-            scenes.captions.append(f"d {distance:g}, r {ratio:g}, step {step}")
+            radius = "" if factor == 1.0 else f"eps x {factor:g}, "
+            scenes.captions.append(f"{radius}d {distance:g}, r {ratio:g}, step {step}")
 
-        x, s, lost = self._grow([first, second], counts, distance, shoot)
+        x, s, lost = self._grow([first, second], counts, distance, factor, shoot)
         own = x[:, : counts[0]]
         losses = task.metric(own, s[:, : counts[0]]).masked_fill(lost, math.inf)
         away = (own.mean(dim=1) - solo.centroids).norm(dim=-1)
         alone, together = solo.losses.mean().item(), losses.mean().item()
         change = together / alone if alone > 0.0 else math.inf
-        mixing = mixing_index(x, counts, eps=first.rule.eps0).mean().item()
+        mixings = mixing_index(x, counts, eps=factor * first.rule.eps0)
+        mixing = mixings.mean().item()
+        change_low, change_high = ratio_interval(losses, solo.losses)
+        mixing_low, mixing_high = ratio_interval(mixings, torch.ones_like(mixings))
         return InteractionRow(
             rule=first.name,
             beside=second.name,
@@ -272,12 +312,17 @@ class Encounters:
             mixing=mixing,
             displacement=away.mean().item(),
             verdict=verdict(change, mixing, self.settings.margin),
+            eps_factor=factor,
+            change_low=change_low,
+            change_high=change_high,
+            mixing_low=mixing_low,
+            mixing_high=mixing_high,
         )
 
-    def _solo(self, organism: Organism, count: int) -> _Solo:
-        key = organism.name, count
+    def _solo(self, organism: Organism, count: int, factor: float) -> _Solo:
+        key = organism.name, count, factor
         if key not in self._solos:
-            x, s, lost = self._grow([organism], (count,), 0.0)
+            x, s, lost = self._grow([organism], (count,), 0.0, factor)
             losses = organism.task_of(count).metric(x, s).masked_fill(lost, math.inf)
             self._solos[key] = _Solo(losses, x.mean(dim=1))
         return self._solos[key]
@@ -287,6 +332,7 @@ class Encounters:
         organisms: Sequence[Organism],
         counts: tuple[int, ...],
         distance: float,
+        factor: float,
         shoot: Callable[[Tensor, Tensor, int], None] = lambda x, s, step: None,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Grow one or two species from their seeds; also say which worlds blew up on the way.
@@ -315,6 +361,7 @@ class Encounters:
                 s,
                 then - now,
                 counts=counts,
+                eps=factor * organisms[0].rule.eps0,
                 update_prob=[settings.update_prob or own.update_prob for own in organisms],
                 generator=random,
                 density_counts=counts,
@@ -368,21 +415,25 @@ def write_rows(path: Path, settings: Mapping[str, Any], rows: Sequence[Interacti
         {
             "ratio": ratio,
             "distance": distance,
+            "eps_factor": factor,
             **{
                 what: _matrix(some, names, what)
                 for what in ("change", "mixing", "displacement", "verdict")
             },
         }
-        for (ratio, distance), some in _by_setting(rows).items()
+        for (factor, ratio, distance), some in _by_setting(rows).items()
     ]
     content = {"settings": settings, "rows": as_objects(rows), "matrices": matrices}
     write_record(path, content)
 
 
-def _by_setting(rows: Sequence[InteractionRow]) -> dict[tuple[float, float], list[InteractionRow]]:
-    found: dict[tuple[float, float], list[InteractionRow]] = {}
+def _by_setting(
+    rows: Sequence[InteractionRow],
+) -> dict[tuple[float, float, float], list[InteractionRow]]:
+    """Return the rows of each radius, ratio and distance."""
+    found: dict[tuple[float, float, float], list[InteractionRow]] = {}
     for row in rows:
-        found.setdefault((row.ratio, row.distance), []).append(row)
+        found.setdefault((row.eps_factor, row.ratio, row.distance), []).append(row)
     return found
 
 
@@ -398,13 +449,70 @@ def heat_map(rows: Sequence[InteractionRow]) -> bytes:
     One pair of panels for each distance and ratio; rows are the measured rules. Pairs that are
     missing stay blank. Needs matplotlib.
     """
-    from matplotlib.colors import LogNorm, Normalize
-
     names = list(dict.fromkeys([row.rule for row in rows] + [row.beside for row in rows]))
     settings = _by_setting(rows)
     side = 1.6 + 0.55 * len(names)
     figure, grid = new_figure(len(settings), 2, (2 * side + 2.0, side * len(settings)))
-    drawn: tuple[tuple[str, str, str, Any, dict[str, Any]], ...] = (
+    for ((factor, ratio, distance), some), panels in zip(settings.items(), grid, strict=True):
+        told = f"distance {distance:g}, ratio {ratio:g}" + _radius(factor)
+        for panel, (what, title, colours, norm, bar) in zip(panels, _shades(), strict=True):
+            values = _matrix(some, names, what)
+            scale = draw_matrix(panel, names, names, values, colours=colours, norm=norm)
+            panel.set(xlabel="beside", title=f"{title}\n{told}")
+            figure.colorbar(scale, ax=panel, **bar).minorticks_off()
+        panels[0].set_ylabel("rule")
+    return png(figure)
+
+
+def phase_diagram(rows: Sequence[InteractionRow]) -> bytes:
+    """Return a PNG: what becomes of one pair of rules over distance, ratio and radius.
+
+    Above how the loss changes, below how much both mix; each cell with its interval. Panels from
+    left to right are of growing radii. Needs matplotlib.
+
+    Args:
+        rows: All of the same two rules.
+    """
+    factors, ratios, distances = (
+        sorted(set(each)) for each in zip(*_by_setting(rows), strict=True)
+    )
+    found = {(row.eps_factor, row.ratio, row.distance): row for row in rows}
+    size = 1.6 + 0.62 * len(distances), 1.4 + 0.4 * len(ratios)
+    figure, grid = new_figure(2, len(factors), (size[0] * len(factors) + 1.0, 2 * size[1]))
+    for panels, (what, title, colours, norm, bar) in zip(grid, _shades(), strict=True):
+        for panel, factor in zip(panels, factors, strict=True):
+            held = [[found.get((factor, r, d)) for d in distances] for r in ratios]
+            scale = draw_matrix(
+                panel,
+                [f"{ratio:g}" for ratio in ratios],
+                [f"{distance:g}" for distance in distances],
+                [[None if row is None else getattr(row, what) for row in line] for line in held],
+                colours=colours,
+                norm=norm,
+                notes=[
+                    ["" if row is None else _interval(row, what) for row in line] for line in held
+                ],
+            )
+            panel.set(xlabel="distance", title=title + _radius(factor))
+        panels[0].set_ylabel(f"ratio of {rows[0].rule}")
+        figure.colorbar(scale, ax=list(panels), **bar).minorticks_off()
+    figure.suptitle(f"{rows[0].rule} beside {rows[0].beside}", fontsize=10)
+    return png(figure)
+
+
+def _interval(row: InteractionRow, what: str) -> str:
+    return f"{getattr(row, f'{what}_low'):.2g} to {getattr(row, f'{what}_high'):.2g}"
+
+
+def _radius(factor: float) -> str:
+    return "" if factor == 1.0 else f", ε × {factor:g}"
+
+
+def _shades() -> tuple[tuple[str, str, str, Any, dict[str, Any]], ...]:
+    """Return what is drawn of rows: field, title, colours, their norm, and marks of their bar."""
+    from matplotlib.colors import LogNorm, Normalize
+
+    return (
         (
             "change",
             "loss together / alone",
@@ -414,11 +522,3 @@ def heat_map(rows: Sequence[InteractionRow]) -> bytes:
         ),
         ("mixing", "mixing index", "viridis", Normalize(0.0, 1.0), {}),
     )
-    for ((ratio, distance), some), panels in zip(settings.items(), grid, strict=True):
-        for panel, (what, title, colours, norm, bar) in zip(panels, drawn, strict=True):
-            values = _matrix(some, names, what)
-            scale = draw_matrix(panel, names, names, values, colours=colours, norm=norm)
-            panel.set(xlabel="beside", title=f"{title}\ndistance {distance:g}, ratio {ratio:g}")
-            figure.colorbar(scale, ax=panel, **bar).minorticks_off()
-        panels[0].set_ylabel("rule")
-    return png(figure)

@@ -98,8 +98,11 @@ def draw_matrix(
     *,
     colours: str,
     norm: Any,
+    notes: Sequence[Sequence[str]] | None = None,
 ) -> Any:
     """Draw a matrix, write each number into its cell, and return what `figure.colorbar` takes.
+
+    `notes` are lines below the numbers, one for each cell.
 
     NaN is black, None stays blank; `norm` maps numbers to [0, 1] of a colour map, and what is
     beyond has the colour of the end.
@@ -121,7 +124,8 @@ def draw_matrix(
             panel.add_patch(Rectangle(corner, 1.0, 1.0, facecolor=colour, edgecolor="white"))
             dark = wrong or sum(colour[:3]) < 1.2
             ink = {"color": "white" if dark else "black", "ha": "center", "va": "center"}
-            panel.text(across, down, f"{value:.2g}", fontsize=6, **ink)
+            text = f"{value:.2g}" + ("" if notes is None else f"\n{notes[down][across]}")
+            panel.text(across, down, text, fontsize=6 if notes is None else 5, **ink)
     panel.set_xticks(range(len(columns)), columns, rotation=45, ha="right", fontsize=7)
     panel.set_yticks(range(len(rows)), rows, fontsize=7)
     return scale

@@ -20,6 +20,8 @@ from npa_envs.measure.interaction import (
     Organism,
     heat_map,
     mixing_index,
+    phase_diagram,
+    ratio_interval,
     verdict,
 )
 from npa_envs.rule.files import save_rule
@@ -148,6 +150,47 @@ def test_a_world_that_blows_up_is_disrupted_and_the_study_goes_on():
     assert math.isfinite(rows[0].alone)
 
 
+def test_the_interval_of_a_ratio_is_that_of_its_worlds():
+    ones = torch.ones(4)
+    assert ratio_interval(2.0 * ones, ones) == (2.0, 2.0)
+    # Both numbers of a world are drawn together.
+    assert ratio_interval(torch.arange(1.0, 5.0), torch.arange(1.0, 5.0)) == (1.0, 1.0)
+    above = torch.randn(200, generator=torch.Generator().manual_seed(0)) + 3.0
+    low, high = ratio_interval(above, torch.ones(200))
+    half = 1.96 * above.std().item() / math.sqrt(200)
+    assert low == pytest.approx(above.mean().item() - half, abs=0.2 * half)
+    assert high == pytest.approx(above.mean().item() + half, abs=0.2 * half)
+    low, high = ratio_interval(torch.tensor([1.0, 1.0, 1.0, math.inf]), ones)
+    assert (low, high) == (1.0, math.inf)
+    assert ratio_interval(ones, torch.zeros(4)) == (math.inf, math.inf)
+
+
+def test_a_larger_radius_mixes_more_and_figures_lie_in_their_intervals():
+    one, twice = (
+        Encounters(settings(eps_factors=(factor,), distances=(0.2,)), device=CPU)
+        for factor in (1.0, 2.0)
+    )
+    pair = organism(), organism("b", seed=1)
+    (usual,), _ = one.meet(*pair)
+    (wide,), _ = twice.meet(*pair)
+    assert wide.eps_factor == 2.0
+    assert wide.alone != usual.alone
+    assert wide.mixing > usual.mixing
+    assert usual.mixing_low <= usual.mixing <= usual.mixing_high
+    assert usual.change_low <= usual.change <= usual.change_high
+
+
+def test_a_phase_diagram_is_drawn_of_a_pair_with_gaps_and_infinities():
+    pytest.importorskip("matplotlib")
+    row = InteractionRow("a", "b", 0.0, 0.5, 0.1, 0.2, 2.0, 0.1, 0.0, "disrupted")
+    others = (
+        {"ratio": 0.25, "change": math.inf, "change_high": math.inf},
+        {"eps_factor": 2.0},
+    )
+    drawn = phase_diagram([row, *(dataclasses.replace(row, **changed) for changed in others)])
+    assert drawn.startswith(b"\x89PNG")
+
+
 def test_rules_that_cannot_share_a_world_are_named():
     encounters = Encounters(settings(), device=CPU)
     with pytest.raises(NPAError, match=r"a and b cannot share a world: .*eps0, got 0\.15 .* 0\.2"):
@@ -162,6 +205,7 @@ def test_rules_that_cannot_share_a_world_are_named():
         ({"seeds": ()}, "seed count must be at least 1, got 0"),
         ({"distances": (-1.0,)}, r"finite and not negative, got \(-1\.0,\)"),
         ({"ratios": (0.5, 1.0)}, r"ratios must lie in \(0, 1\), got \(0\.5, 1\.0\)"),
+        ({"eps_factors": (0.0,)}, r"eps_factors must be finite and above 0, got \(0\.0,\)"),
         ({"margin": 0.0}, r"margin must lie in \(0, 1\)"),
         ({"update_prob": 1.5}, r"update_prob must lie in \(0, 1\], got 1\.5"),
     ],
@@ -228,6 +272,18 @@ class TestCommand:
         printed = capsys.readouterr().out
         assert printed.count("\n") >= 9
         assert "undisturbed" in printed
+
+    def test_several_radii_make_phase_diagrams_of_each_pair(self, rules, tmp_path, capsys):
+        pytest.importorskip("matplotlib")
+        more = ("--eps-factors", "1", "1.5", "--no-itself")
+        assert main(self.words(rules, tmp_path, *more)) == 0
+        rows = json.loads((tmp_path / "interactions.json").read_text())["rows"]
+        told = [(row["rule"], row["eps_factor"], row["distance"]) for row in rows]
+        settings = [(factor, distance) for factor in (1.0, 1.5) for distance in (0.0, 2.0)]
+        assert told == [(name, *each) for name in ("one", "two") for each in settings]
+        for name in ("one-two", "two-one"):
+            with Image.open(tmp_path / f"phases-{name}.png") as drawn:
+                assert drawn.width > drawn.height
 
     def test_a_stopped_run_goes_on_and_ends_as_one_that_was_not(
         self, rules, tmp_path, capsys, monkeypatch
