@@ -39,6 +39,10 @@ class Interface(NamedTuple):
     species_count: int = 0
     """Species whose densities and density gradients follow in an observation; 0: none."""
 
+    told_dim: int = 0
+    """Columns at the end of an observation that tell of the world's target; policies leave them
+    out."""
+
     @property
     def shared_dim(self) -> int:
         """Columns of an observation that tell of all species together."""
@@ -127,6 +131,7 @@ def interface_of(env: Any) -> Interface:
         physics.moving,
         physics.state_scale,
         appended // (1 + physics.space_dim),
+        getattr(worlds, "told_dim", 0),
     )
 
 
@@ -214,12 +219,13 @@ class Policy:
 
     def _act_on(self, observation: Tensor) -> Tensor:
         shape, columns = tuple(observation.shape), self.interface.perception_dim
-        if len(shape) not in (2, 3) or shape[-1] != columns:
+        whole = columns + self.interface.told_dim
+        if len(shape) not in (2, 3) or shape[-1] != whole:
             raise NPAError(
-                f"observation must have shape [N, P] or [B, N, P] with P = {columns}, got {shape}: "
+                f"observation must have shape [N, P] or [B, N, P] with P = {whole}, got {shape}: "
                 "use the policy with the environment that it was made for"
             )
-        action = self.act(observation.float().reshape(-1, *shape[-2:]))
+        action = self.act(observation[..., :columns].float().reshape(-1, shape[-2], columns))
         return action.view(*shape[:-1], self.interface.action_dim)
 
 

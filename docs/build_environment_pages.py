@@ -34,7 +34,6 @@ from page_parts import (
 
 from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
-from npa_envs.envs.core.spaces import Rows
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.envs.garden.environments import GardenEnv
 from npa_envs.registration import ENVIRONMENTS, GARDENS, LATER, SIZES, SMALL, Registration
@@ -70,7 +69,7 @@ def resolved_sections(env_class: type) -> dict[str, str]:
     first = sections(environment_class(ENVIRONMENTS[0]))
     shared = sections(NPAEnv)
     order = [name for name in (first | shared) if name]
-    if env_class.form_type is not Rows:
+    if issubclass(env_class, GardenEnv):
         # Living worlds pay otherwise; all else that they do not say is said of all environments.
         del shared["Reward"]
         first, shared = {}, shared | sections(GardenEnv)
@@ -171,7 +170,7 @@ def page(registration: Registration) -> str:
     spaces = {"Observation space": form.observation_space, "Action space": form.action_space}
     letters = {"C": config.state_dim, "D": task.space_dim, "N": count}
     text = resolved_sections(env_class)
-    if env_class.form_type is Rows:
+    if not issubclass(env_class, GardenEnv):
         for heading, space in spaces.items():
             text[heading] = numbered_columns(text[heading], letters, space.shape[1])
     text["Arguments"] += "\n\n" + argument_tables(task.config_type)

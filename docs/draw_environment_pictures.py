@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -65,6 +66,15 @@ FILMS = {
         steps=(0, 8, 16, 32, 64, 128, 256),
         rows=({},),
         caption="An episode of the shipped rule `gecko`.",
+    ),
+    "Pictures2D": Film(
+        steps=(0, 8, 16, 32, 64, 128, 256),
+        rows=({"targets": ("heart",)}, {"targets": ("flower",)}, {"targets": ("octopus",)}),
+        caption="Three episodes that ask for another picture each; the shipped rule of each acts.",
+        rule=None,
+        policies=tuple(
+            partial(RulePolicy, load_rule(name)) for name in ("heart", "flower", "octopus")
+        ),
     ),
     "Regeneration2D": Film(
         steps=(0, 2, 8, 32, 64, 128),
@@ -157,7 +167,8 @@ def film_episode(registration: Registration, film: Film, row: int, size: int) ->
 
 def caption(keywords: dict[str, Any], step: int) -> str:
     """Return what stands below a picture of a strip."""
-    words = dict.fromkeys(filter(str.isalpha, map(str, keywords.values())))
+    values = (v[0] if isinstance(v, tuple) else v for v in keywords.values())
+    words = dict.fromkeys(filter(str.isalpha, map(str, values)))
     return ", ".join((*words, f"step {step}"))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import torch
 from torch import Tensor
@@ -19,12 +19,11 @@ from npa_envs.tasks.targets.images import LARGEST_POINT_COUNT
 
 
 @dataclass(frozen=True, kw_only=True)
-class Morphogenesis2DEnvConfig(EnvConfig):
-    """Adds the target, the seed and the loss of `Morphogenesis2DConfig`, which explains them."""
+class PictureConfig(EnvConfig):
+    """Adds the seed and the loss of `Morphogenesis2DConfig`, which explains them."""
 
     task_config_type = Morphogenesis2DConfig
 
-    target: str = Morphogenesis2DConfig.target
     resolution: int = 64
     sigma: float = Morphogenesis2DConfig.sigma
     colour_weight: float = Morphogenesis2DConfig.colour_weight
@@ -44,18 +43,27 @@ class Morphogenesis2DEnvConfig(EnvConfig):
         return self.task_config(Morphogenesis2DConfig, target_point_count=self.particle_count)
 
 
-Config = TypeVar("Config", bound=Morphogenesis2DEnvConfig)
+@dataclass(frozen=True, kw_only=True)
+class Morphogenesis2DEnvConfig(PictureConfig):
+    """Adds the target."""
+
+    target: str = Morphogenesis2DConfig.target
+
+
+Config = TypeVar("Config", bound=PictureConfig)
 
 
 class PictureTask(GoalTask[Config]):
     """A picture to grow, compared by the splat loss of `npa_envs.tasks.morphogenesis2d`."""
 
-    config_type = Morphogenesis2DEnvConfig
+    config_type: ClassVar[type[PictureConfig]] = Morphogenesis2DEnvConfig
     goal: Morphogenesis2D
+    goal_type: ClassVar[type[Morphogenesis2D]] = Morphogenesis2D
+    """The task as training sees it."""
 
     def __init__(self, config: Config, device: torch.device) -> None:
         super().__init__(config, device)
-        self.goal = Morphogenesis2D(config.goal, device=device)
+        self.goal = self.goal_type(config.goal, device=device)
 
     @classmethod
     def extra_bytes(cls, config: Any, world_count: int) -> int:

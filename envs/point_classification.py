@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, Self, get_args
+from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -113,12 +113,6 @@ class PointClassificationTask(GoalTask[PointClassificationEnvConfig]):
             random.world_count, generator=random, device=self.device
         )
         return Start(x, s, goal=label)
-
-    def toward(self, goal: Tensor) -> Self:
-        """Return the task with losses for worlds of these classes."""
-        aimed = type(self).__new__(type(self))
-        vars(aimed).update(vars(self) | {"goal": self.goal.toward(goal)})
-        return aimed
 
     def losses(self, x: Tensor, s: Tensor) -> Mapping[str, Tensor]:
         """Return each world's loss of what it says of its class, and its weighted overflow."""

@@ -52,6 +52,7 @@ ENVIRONMENTS = (
         64,
     ),
     Registration("npa/Morphogenesis3D-v0", "npa_envs.envs.morphogenesis3d", "Morphogenesis3D", 128),
+    Registration("npa/Pictures2D-v0", "npa_envs.envs.pictures2d", "Pictures2D", 256),
 )
 """Where an action has a row for each particle. A change of behaviour is a new version of the id."""
 
@@ -105,6 +106,19 @@ _SMALL_SPECIES: Mapping[str, Any] = {
     "eps0": 0.2,
     "perception": "per_species",
     "max_cycles": 32,
+}
+
+_SMALL_INVASION: Mapping[str, Any] = {
+    "particle_counts": (64, 32),
+    "state_dim": 4,
+    "state_scale": 0.1,
+    "eps": 0.2,
+    "perception": "per_species",
+    "max_cycles": 32,
+    "colour_weight": 20.0,
+    "seed_radius": 0.4,
+    "target": "ring",
+    "opponent": "random",
 }
 
 _SMALL_PICTURE_OF_SPECIES: Mapping[str, Any] = {
@@ -214,8 +228,9 @@ SPECIES_SIZES = (
         "symbiosis",
         MappingProxyType({**_SMALL_PICTURE_OF_SPECIES, "target": "flower"}),
     ),
+    SpeciesRegistration("npa/InvasionSmall-v0", "invasion", MappingProxyType(_SMALL_INVASION)),
 )
-"""The same for tasks of several species."""
+"""The same for tasks of several species. The opponent of an invasion is fixed."""
 
 
 def register_environments() -> None:

@@ -13,6 +13,7 @@ IDS = [environment.id for environment in ENVIRONMENTS]
 SMALL: dict[str, Any] = {"particle_count": 61, "eps": 0.3, "resolution": 16, "render_size": 24}
 # None: the environment has no such field.
 SPECIAL: dict[str, dict[str, Any]] = {
+    "npa/Pictures2D-v0": {"targets": ("heart", "ring"), "test_targets": ("letter-a",)},
     "npa/Regeneration2D-v0": {"rule": "picture"},
     "npa/PointClassification-v0": {"resolution": None},
     "npa/Morphogenesis3D-v0": {"seed_radius": 0.2, "view_count": 2, "target": "doughnut"},

@@ -65,6 +65,7 @@ ELSEWHERE = {
     "device": "it is given to train and make_envs",
     "output": "learners are given tensors",
     "autoreset_mode": "learners' worlds restart in the step that ends their episodes",
+    "observe_target": "rules read what particles perceive, and no target",
     "task": "the id says it",
     "perceive": "the id says it",
 }

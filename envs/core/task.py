@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Generic, NamedTuple, Self, TypeVar
 
@@ -13,6 +14,7 @@ from torch import Tensor
 from npa_envs.envs.core.config import EnvConfig, WorldConfig
 from npa_envs.errors import NPAError
 from npa_envs.render import draw_worlds
+from npa_envs.tasks.base import GoalTask as TrainedWithGoals
 from npa_envs.world.credit import marginal_gains
 from npa_envs.world.randomness import Purpose, WorldRandom
 
@@ -287,6 +289,14 @@ class GoalTask(EnvTask[Config]):
             random.world_count, generator=random, device=self.device
         )
         return seeds
+
+    def toward(self, goal: Tensor) -> Self:
+        """Return the task with losses for worlds of these goals, where training has such too."""
+        if not isinstance(self.goal, TrainedWithGoals):
+            return self
+        aimed = copy.copy(self)
+        aimed.goal = self.goal.toward(goal)
+        return aimed
 
     def particle_losses(self, x: Tensor, s: Tensor) -> Tensor:
         """Return each particle's share of the task's loss."""

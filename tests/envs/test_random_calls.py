@@ -120,6 +120,9 @@ class OneSpecies:
             "success_loss": draw.choice((None, 0.0, 0.2)),
             "max_episode_steps": draw.choice((1, 3, 8)),
         }
+        if name == "npa/Pictures2D-v0":
+            fields |= {"observe_target": draw.random() < 0.5}
+            fields |= {"split": draw.choice(("train", "train", "test"))}
         self.form = form
         if not self.ours:
             fields["output"] = "numpy"

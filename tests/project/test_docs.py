@@ -268,7 +268,7 @@ def test_a_page_lists_the_arguments_with_their_defaults(registration, builder):
     config = builder.environment_class(registration).task_type.config_type()
     arguments = section(page, "Arguments")
     assert sorted(first_cells(arguments)) == sorted(vars(config))
-    name = "data" if registration.name == "PointClassification" else "target"
+    name = {"PointClassification": "data", "Pictures2D": "split"}.get(registration.name, "target")
     assert f'| `{name}` | str | `"{getattr(config, name)}"` |' in arguments
     assert "| `success_loss` | float or None | `None` |" in arguments
 

@@ -1,0 +1,262 @@
+"""`npa/Pictures2D-v0`: each episode asks for one of several pictures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Self, get_args
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from gymnasium.spaces import Box
+from numpy.typing import NDArray
+from torch import Tensor
+
+from npa_envs.envs.core.config import EnvConfig, WorldConfig
+from npa_envs.envs.core.memory import OBSERVATION_COPIES
+from npa_envs.envs.core.single import NPAEnv
+from npa_envs.envs.core.spaces import Rows
+from npa_envs.envs.core.task import EnvTask, Start
+from npa_envs.envs.core.vector import NPAVectorEnv
+from npa_envs.envs.core.worlds import Worlds
+from npa_envs.envs.morphogenesis2d import PictureConfig, PictureTask
+from npa_envs.errors import NPAError, shown
+from npa_envs.tasks.checks import check_flag, check_positive
+from npa_envs.tasks.many_pictures import ManyPictures, named_targets
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
+from npa_envs.tasks.targets.clouds import Split
+from npa_envs.world.actions import Physics, survey_worlds
+from npa_envs.world.cuda_graph import sent
+from npa_envs.world.randomness import WorldRandom
+
+CHANNELS = 4
+"""Red, green and blue of a pixel, and how many particles lie there."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pictures2DEnvConfig(PictureConfig):
+    """Which pictures are asked for, and whether particles are told."""
+
+    words = EnvConfig.words | {"split": get_args(Split)}
+
+    targets: tuple[str, ...] = ("butterfly", "flower", "gecko", "heart", "octopus")
+    """Pictures of the split "train": built-in names, emoji, picture files, or folders of such."""
+
+    test_targets: tuple[str, ...] = ("letter-a", "ring")
+    """Pictures of the split "test", none of which is among `targets`."""
+
+    split: Split = "train"
+    """Which pictures episodes ask for: "train", or "test" to evaluate with others."""
+
+    observe_target: bool = False
+    """Each row of the observation ends with a small picture of the target."""
+
+    picture_size: int = 4
+    """Pixels on each side of the picture that is seen; it divides `resolution`."""
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        super().__post_init__()
+        check_flag(self, "observe_target")
+        check_positive(self, int, "picture_size")
+        if self.resolution % self.picture_size:
+            raise NPAError(
+                f"picture_size must divide resolution = {self.resolution}, got "
+                f"{self.picture_size}: try {self.resolution}"
+            )
+        if not self.targets or not self.test_targets:
+            raise NPAError(
+                "targets and test_targets must name a picture each, got "
+                f"{shown(self.targets)} and {shown(self.test_targets)}: for example ('heart',)"
+            )
+        # Checks names, also of the split that is not asked for.
+        _ = self._goal_of(self.targets), self._goal_of(self.test_targets)
+        both = named_targets(self.targets).keys() & named_targets(self.test_targets).keys()
+        if both:
+            raise NPAError(
+                f"test_targets must not be among targets, got {shown(min(both))} in both: leave it "
+                "out of one"
+            )
+
+    @property
+    def goal(self) -> Morphogenesis2DConfig:
+        """What the task itself is told."""
+        return self._goal_of(self.targets if self.split == "train" else self.test_targets)
+
+    @property
+    def told_dim(self) -> int:
+        """Numbers that a row tells of the target, T; 0: none."""
+        return CHANNELS * self.picture_size**2 if self.observe_target else 0
+
+    def _goal_of(self, targets: tuple[str, ...]) -> Morphogenesis2DConfig:
+        count = self.particle_count
+        return self.task_config(Morphogenesis2DConfig, targets=targets, target_point_count=count)
+
+
+class PicturesTask(PictureTask[Pictures2DEnvConfig]):
+    """Several pictures to grow, one asked for in each world."""
+
+    config_type = Pictures2DEnvConfig
+    goal: ManyPictures
+    goal_type = ManyPictures
+
+    def __init__(self, config: Pictures2DEnvConfig, device: torch.device) -> None:
+        super().__init__(config, device)
+        self.names = self.goal.names
+        """Names of the pictures of the split, by their numbers."""
+        everyone = torch.arange(len(self.names), device=device)
+        pictures = self.goal.toward(everyone).target_picture.permute(0, 3, 1, 2)
+        small = F.avg_pool2d(pictures, config.resolution // config.picture_size)
+        limit = config.observation_limit
+        self.told_rows = small.flatten(1).clamp(-limit, limit)
+        """What rows tell of each picture, dimensionless, shape [K, T]."""
+        self._number = everyone[:1]
+
+    @classmethod
+    def extra_bytes(cls, config: Any, world_count: int) -> int:
+        """Return about how much memory pool, pictures and what rows tell of them need [bytes]."""
+        numbers = OBSERVATION_COPIES * world_count * config.particle_count * config.told_dim
+        return super().extra_bytes(config, world_count) + int(4 * numbers)
+
+    def fresh(self, random: WorldRandom) -> Start:
+        """Return worlds as training begins with them, and the numbers of their pictures."""
+        x, s, number = self.goal.seed_with_goals(
+            random.world_count, generator=random, device=self.device
+        )
+        # No rule of codes acts here.
+        return Start(x, s[..., -self.config.state_dim :].contiguous(), goal=number)
+
+    def toward(self, goal: Tensor) -> Self:
+        """Return the task with losses for worlds of these pictures."""
+        aimed = super().toward(goal)
+        aimed._number = goal
+        return aimed
+
+    def told(self, s: Tensor) -> dict[str, Tensor]:
+        """Return the number of each world's picture, int64, shape [B]."""
+        return {"target": self._number.clone()}
+
+
+class PictureRows(Rows):
+    """Rows of what particles perceive, with the numbers of the target behind, where asked."""
+
+    def __init__(self, physics: Physics, config: WorldConfig) -> None:
+        super().__init__(physics, config)
+        assert isinstance(config, Pictures2DEnvConfig), "the environments' own configuration"
+        columns = physics.perception_dim + config.told_dim
+        limit = physics.perception_limit
+        self.observation_space = Box(-limit, limit, (config.particle_count, columns), np.float32)
+
+
+class PictureWorlds(Worlds):
+    """B worlds, each with a picture that it is to grow; arguments and errors of `Worlds`."""
+
+    task: PicturesTask
+
+    def __init__(
+        self,
+        task_type: type[EnvTask[Any]],
+        config: EnvConfig,
+        world_count: int,
+        episode_steps: int | None = None,
+    ) -> None:
+        super().__init__(task_type, config, world_count, episode_steps)
+        self.told_dim = self.task.config.told_dim
+        """Numbers that rows tell of the target besides what particles perceive, T."""
+        if self.told_dim:
+            self.restart = self._restart  # type: ignore[assignment]
+
+    def perceive(self, out: Tensor | None = None) -> Tensor:
+        """Return what is observed in all worlds as they are, [B, N, P + T], written to `out`."""
+        if not self.told_dim:
+            return super().perceive(out)
+        return self._with_target(super().perceive(), self._goal, out)
+
+    def queue(self, action: Tensor, out: Tensor | None = None) -> Tensor:
+        """Do what `step` does but wait for the device; return what is observed, [B, N, P + T]."""
+        if not self.told_dim:
+            return super().queue(action, out)
+        return self._with_target(super().queue(action), self._goal, out)
+
+    def told_observation(self, observation: Tensor) -> Tensor:
+        """Return what is observed in a single world after a step, shape [1, N, P + T]."""
+        return observation if self.told_dim else super().told_observation(observation)
+
+    def _restart(self, worlds: NDArray[np.int64], observation: Tensor) -> None:
+        """Start the next episodes of some worlds, [M], and write what is observed there."""
+        index = sent(worlds, self.device)
+        start = self.start(index)
+        rows = survey_worlds(start.x, start.s, self.physics).perceive()
+        observation[index] = self._with_target(rows, self._goal[index], None)
+
+    def _with_target(self, rows: Tensor, goal: Tensor, out: Tensor | None) -> Tensor:
+        """Return rows, [M, N, P], with what they tell of the worlds' pictures, [M], behind."""
+        told = self.task.told_rows[goal][:, None].expand(-1, rows.shape[1], -1)
+        wide = torch.cat((rows, told), dim=-1)
+        return wide if out is None else out.copy_(wide)
+
+
+class Pictures2DEnv(NPAEnv):
+    """Grow the picture that is asked for from a disk of blank particles.
+
+    ## Description
+
+    As in `npa/Morphogenesis2D-v0` a disk of grey particles is to become a picture, but each episode
+    draws which one. With `observe_target=True` every particle is told: its row of the observation
+    ends with a small picture of the target. Without, nothing in the observation tells the pictures
+    apart; `info["target"]` does.
+
+    Learn with the pictures of the split "train", and evaluate with those of `split="test"`, of
+    which none is among the first. A policy that was told pictures can try ones that it has never
+    seen; one that was not can only find what serves all of them.
+
+    Particles of all pictures are drawn equally large, and pictures are scaled so that each one's
+    density is about 1. Action space and reward are those of `Morphogenesis2DEnv`.
+
+    ## Observation space
+
+    `Box(-64, 64, (N, P + T), float32)` with P = 4C + 2, and T = 4 G² numbers of the target where
+    `observe_target=True`, else 0; G is `picture_size`. The first P columns are those of
+    `Morphogenesis2DEnv`.
+
+    | Columns | Perceived | Unit |
+    |---|---|---|
+    | `0 : C` | the particle's own state s | dimensionless |
+    | `C : 2C` | mean state of the neighbourhood, itself included | dimensionless |
+    | `2C : 4C` | gradient of the state: x, y of channel 0, then of channel 1, ... | 1 / length |
+    | `4C : 4C + 2` | gradient of the density over N, x and y: where it gets denser | 1 / length³ |
+
+    The T columns behind these tell of the target, the same in all rows: means over squares of
+    pixels, G × G of red, then of green, of blue, and of density, rows from the bottom up
+    (dimensionless). Policies of `npa_envs.agents` leave them out.
+
+    ## Starting state
+
+    Particles are uniform in a disk of radius `seed_radius` around the origin, all states are zero.
+    The picture is drawn uniformly from those of the split. After `place_particles` a world keeps
+    its picture.
+
+    ## Episode end
+
+    `success_loss` is None by default: growth has no natural end, and the picture should last.
+
+    ## Info
+
+    | Key | In | Value |
+    |---|---|---|
+    | `loss_density`, `loss_colour` | reset, step | the parts of the loss |
+    | `reward_density`, `reward_colour` | step | how much each part improved in this step |
+    | `target` | reset, step | number of the picture; `env.unwrapped.task.names` has its name |
+    """
+
+    task_type = PicturesTask
+    worlds_type = PictureWorlds
+    form_type = PictureRows
+
+
+class Pictures2DVectorEnv(NPAVectorEnv):
+    """Worlds of `Pictures2DEnv`, batched on one device; its docstring describes both."""
+
+    task_type = PicturesTask
+    worlds_type = PictureWorlds
+    form_type = PictureRows
