@@ -33,6 +33,7 @@ STEPS = {row.id: row.max_episode_steps for row in (*SIZES, *SPECIES_SIZES) if "S
 METHODS = ("zero", "random", "scripted", "ppo", "ppo_world", "ppo_particles", "gradient")
 
 BUDGETS = {
+    "npa/InvasionSmall-v0": 1_000_000,
     "npa/Morphogenesis2DSmall-v0": 1_000_000,
     "npa/PointClassificationSmall-v0": 1_000_000,
     "npa/SymbiosisSmall-v0": 1_500_000,
