@@ -38,15 +38,17 @@ def import_ribs() -> Any:
     """Return the library with its parts imported.
 
     Raises:
-        MissingDependencyError: It is not installed.
+        MissingDependencyError: It is not installed, or cma, by which it runs CMA-ES, is not.
     """
     try:
+        import cma  # noqa: F401
         import ribs.archives
         import ribs.emitters
         import ribs.schedulers
     except ImportError as error:
         raise MissingDependencyError(
-            "the search needs pyribs, which is not installed: pip install 'npa-envs[search]'"
+            "the search needs pyribs and cma, which are not both installed: "
+            "pip install 'npa-envs[search]'"
         ) from error
     return ribs
 

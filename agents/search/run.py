@@ -92,7 +92,7 @@ class Search:
 
     Raises:
         NPAError: A setting is wrong, or the record is of other settings.
-        MissingDependencyError: pyribs is not installed.
+        MissingDependencyError: pyribs or cma is not installed.
     """
 
     def __init__(

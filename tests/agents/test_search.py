@@ -9,20 +9,20 @@ import pytest
 import torch
 
 from npa_envs import load_rule, rollout
+from npa_envs.agents.search import Search, SearchWorld, tried_again
 from npa_envs.agents.search.methods import METHODS, import_ribs
-from npa_envs.agents.search.run import RESULTS, Search, tried_again
+from npa_envs.agents.search.run import RESULTS
 from npa_envs.agents.search.worlds import (
     SEED_RADIUS,
     SNAPSHOTS,
     UPDATE_PROB,
     Candidates,
-    SearchWorld,
     correlation,
     quality_of,
 )
 from npa_envs.cli import main
 from npa_envs.errors import MissingDependencyError, NPAError
-from npa_envs.rule.files import rule_metadata
+from npa_envs.rule.files import rule_metadata, save_rule
 from npa_envs.tasks.seeds import uniform_ball
 from npa_envs.training.trained_tasks import task_of_rule
 from npa_envs.web.rule_world import RunWorld
@@ -147,8 +147,7 @@ def test_worlds_refuse_what_cannot_be(options, words):
 
 
 def test_a_missing_library_is_named_with_its_extra(monkeypatch):
-    monkeypatch.setitem(sys.modules, "ribs.archives", None)
-    monkeypatch.setitem(sys.modules, "ribs", None)
+    monkeypatch.setitem(sys.modules, "cma", None)
     with pytest.raises(MissingDependencyError, match=r"pip install 'npa-envs\[search\]'"):
         import_ribs()
 
@@ -238,6 +237,15 @@ def test_the_command_leaves_elites_that_other_commands_open(tmp_path, capsys):
     assert trained.task.config.particle_count == 16
     assert main([*words, "10"]) == 2
     assert "budget must be finite and at least that of one batch" in capsys.readouterr().err
+
+
+def test_a_damaged_world_of_a_rule_is_an_error(tmp_path):
+    path = tmp_path / "odd.safetensors"
+    (rule,) = SearchWorld(**SMALL).make_rules()
+    for told, words in (("[1]", "must be a JSON object, got"), ('{"sides": 3}', "sides")):
+        save_rule(rule, path, metadata={"world": told})
+        with pytest.raises(NPAError, match=words):
+            task_of_rule(str(path), rule, CPU)
 
 
 def test_a_pair_is_a_folder_that_the_viewer_opens(tmp_path):

@@ -205,6 +205,7 @@ def test_commands_in_blocks_of_shell_have_the_options_that_they_are_given(capsys
         ("npa_envs.wrappers", "wrappers"),
         ("npa_envs.agents", "agents"),
         ("npa_envs.agents.learning", "agents"),
+        ("npa_envs.agents.search", "agents"),
         ("npa_envs.render", "pictures"),
     ],
 )
@@ -384,6 +385,16 @@ def test_the_code_of_a_page_runs(page, tmp_path, monkeypatch, capsys):
     else:
         assert [frame.shape for frame in names["frames"]] == [(256, 256, 3)] * 4
         assert (tmp_path / "seed.ply").stat().st_size > 512 * 26 * 4
+
+
+def test_the_code_about_the_search_runs():
+    pytest.importorskip("ribs", reason="the extra search is not installed")
+    (block,) = code_blocks(DOCS / "search.md")
+    names = {}
+    exec(block, names)
+    assert names["search"].evaluations == 40
+    assert 0.0 < names["best"].found.quality <= 1.0
+    assert names["rule"].weight_count == len(names["best"].solution)
 
 
 def test_the_code_about_own_losses_runs(tmp_path, monkeypatch, capsys):

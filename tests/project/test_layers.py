@@ -85,7 +85,7 @@ LADDER = {
     "npa_envs.agents.comparison": rung(
         19, "torch numpy PIL scipy matplotlib jsonschema", never=INSIDES
     ),
-    "npa_envs.agents.search": rung(19, "torch numpy ribs", never=INSIDES),
+    "npa_envs.agents.search": rung(19, "torch numpy cma ribs", never=INSIDES),
     "npa_envs.web": rung(20, "torch numpy gymnasium PIL starlette uvicorn", never=ORACLES),
     "npa_envs.cli": rung(21, "torch numpy tqdm tyro imageio_ffmpeg", never=ORACLES),
     "npa_envs.__main__": rung(22),
