@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import texture_candidates  # noqa: F401  names more losses
 import torch
 from PIL import Image
 
