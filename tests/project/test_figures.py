@@ -194,6 +194,15 @@ def test_the_page_on_species_has_the_numbers_of_its_file() -> None:
     assert differences(text, pattern, [row["rollout_us"]["median"] * 1e-3]) == []
 
 
+def test_the_table_of_small_environments_has_the_speeds_of_its_file() -> None:
+    page = (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8")
+    told = dict(re.findall(r"^\| `(npa/[\w-]+)` \| (.*) \|$", page, re.MULTILINE))
+    measured: dict[str, list[str]] = {}
+    for row in content(RESULTS / "small_speed_cpu.json")["rows"]:
+        measured.setdefault(row["id"], []).append(f"{row['steps_per_s']:.0f}")
+    assert {env_id: line.split(" | ") for env_id, line in told.items()} == measured
+
+
 SMALL_WORLDS = content(RESULTS / "small_sizes_cpu.json")["rows"]
 
 
