@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -225,7 +225,7 @@ def growth_of(archive: Any, evaluations: int) -> Growth:
     return Growth(evaluations, float(stats.qd_score), float(stats.coverage), best)
 
 
-def tried_again(search: Search, seeds: Sequence[int]) -> Growth:
+def tried_again(search: Search, seeds: Sequence[int], *, steps: int | None = None) -> Growth:
     """Return what the archive would hold if its elites had met other worlds instead.
 
     Each elite is tried once more, in worlds of other seeds, and put where it then belongs.
@@ -233,8 +233,13 @@ def tried_again(search: Search, seeds: Sequence[int]) -> Growth:
     Args:
         search: Whose elites.
         seeds: The worlds' numbers, of which each elite meets all.
+        steps: Steps from the seed, of which the later half is judged; default: as searched.
+
+    Raises:
+        NPAError: The number of steps is no multiple of 16.
     """
-    candidates = Candidates(search.world, device=search.candidates.device, seeds=seeds)
+    world = search.world if steps is None else replace(search.world, steps=steps)
+    candidates = Candidates(world, device=search.candidates.device, seeds=seeds)
     archive = make_archive(candidates.weight_count, search.axes)
     elites = search.elites()
     if elites:

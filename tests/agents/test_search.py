@@ -201,6 +201,7 @@ def test_elites_that_meet_the_same_worlds_again_score_the_same():
     assert again.qd_score == pytest.approx(found.qd_score)
     assert again.coverage == found.coverage
     assert tried_again(done, [1]).qd_score != pytest.approx(found.qd_score)
+    assert tried_again(done, [0], steps=32).qd_score != pytest.approx(found.qd_score)
 
 
 def test_a_record_of_other_settings_or_candidates_is_refused(tmp_path):
