@@ -9,7 +9,7 @@ short kernels, which a host takes longer to launch than a GPU to run.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
@@ -140,8 +140,8 @@ def train(
 class Learner:
     """Rules, critic, worlds and what was seen of them; the seed is that of all that is drawn.
 
-    Several processes each have a share of the worlds, draw for each of these by itself, and add up
-    gradients, moments and weights. On CUDA they record nothing that this is part of.
+    Several processes each have a share of the worlds, draw for each of these by itself, and take
+    the means of gradients, moments and weights.
     """
 
     def __init__(
@@ -212,10 +212,23 @@ class Learner:
         )
         self._act = Replayed(self._draw_actions, device, registered(self.random))
         self._value = Replayed(self._find_values, device)
-        alone = not ranks.together
-        self._judge = Replayed(self._find_advantages, device, recorded=alone)
-        self._learn_values = Replayed(self._improve_critic, device, recorded=alone)
-        self._learn = Replayed(self._improve_both, device, recorded=alone)
+        # A process alone records whole passes. Several record what lies between their reductions.
+        shared = ranks.together
+        self._judge = Replayed(self._find_advantages, device, recorded=not shared)
+        self._learn_values = Replayed(self._improve_critic, device, recorded=not shared)
+        self._learn = Replayed(self._improve_both, device, recorded=not shared)
+        pool = torch.cuda.graph_pool_handle() if shared and device.type == "cuda" else None
+        self._weigh_own, self._step, *self._find = (
+            Replayed(function, device, recorded=shared, pool=pool)
+            for function in (
+                self._weigh_parts,
+                self._step_both,
+                *[self._find_gradients] * self._minibatches.count,
+            )
+        )
+        self._part = 0
+        self._weights = self._near.new_zeros(self._minibatches.count, 2)
+        self._moved = self._near.new_zeros(2)
 
     def modules(self) -> dict[str, nn.Module]:
         """Return what learns, by the names that checkpoints have for it."""
@@ -338,32 +351,90 @@ class Learner:
 
     def _improve_critic(self) -> None:
         """Let the critic learn once from all of a round, in the order that was drawn."""
-        whole, orders = self.memory.round, self._minibatches.parts[-1:]
-        for (worlds,) in shuffled([whole], orders):
-            self._descend(self.critic_optimizer, self._critic_loss(worlds))
+        self._weigh()
+        for part in range(self._minibatches.count):
+            self._part = part
+            self._find_critic_gradients()
+            self.ranks.reduce(gradients_of(self.critic_optimizer))
+            self._descend(self.critic_optimizer)
 
     def _improve_both(self) -> None:
         """Let critic and rules learn once from all of a round, in the orders that were drawn."""
-        whole = self.memory.round
-        *orders, order = self._minibatches.parts
-        parts = shuffled(self._groups(whole), orders)
-        for part, (worlds,) in zip(parts, shuffled([whole], [order]), strict=True):
-            self._descend(self.critic_optimizer, self._critic_loss(worlds))
-            gain, kl = self._surrogate(part)
-            # Rules that have gone too far stay, without a question to the host.
-            self._near *= kl <= self.pace.target_kl
-            self.optimizer.param_groups[0]["lr"].copy_(self._near * self._rate)
-            self._descend(self.optimizer, -gain)
+        self._weigh()
+        for part, find in enumerate(self._find):
+            self._part = part
+            find()
+            found = gradients_of(self.critic_optimizer) + gradients_of(self.optimizer)
+            self.ranks.reduce([*found, self._moved])
+            self._step()
 
-    def _groups(self, batch: Round) -> list[Round]:
-        """Return what is shuffled when rules learn: whole worlds, or each species' particles."""
+    def _find_gradients(self) -> None:
+        """Find the gradients of critic and rules in a part of the pass."""
+        self._find_critic_gradients()
+        rows = [Round(*own) for own in self._rows(self._part, self.memory.round)]
+        find_gradients(self.optimizer, -self._gain(rows))
+
+    def _find_critic_gradients(self) -> None:
+        worlds = Round(*self._worlds(self._part, self.memory.round))
+        find_gradients(self.critic_optimizer, self._critic_loss(worlds))
+
+    def _step_both(self) -> None:
+        """Let critic and rules follow their gradients."""
+        self._descend(self.critic_optimizer)
+        # Rules that have gone too far stay, without a question to the host.
+        moved, count = self._moved
+        self._near *= moved / count.clamp(min=1.0) <= self.pace.target_kl
+        self.optimizer.param_groups[0]["lr"].copy_(self._near * self._rate)
+        self._descend(self.optimizer)
+
+    def _descend(self, optimizer: torch.optim.Optimizer) -> None:
+        parameters = optimizer.param_groups[0]["params"]
+        nn.utils.clip_grad_norm_(parameters, self.options.max_gradient_norm)
+        optimizer.step()
+
+    def _weigh(self) -> None:
+        """Find what the parts of a pass weigh, where processes weigh them together."""
+        if self.ranks.together:
+            self._weigh_own()
+            self.ranks.reduce([self._weights])
+
+    def _weigh_parts(self) -> None:
+        """Add up what rows of worlds and of rules count for, in each part of a pass."""
+        acted = [self.memory.round.acted]
+        for part in range(self._minibatches.count):
+            (worlds,) = self._worlds(part, acted)
+            rows = torch.cat([own for (own,) in self._rows(part, acted)])
+            weights = worlds.sum(), self._gain_weights(rows).sum()
+            self._weights[part].copy_(torch.stack(weights))
+
+    def _weight(self, weights: Tensor, column: int) -> Tensor:
+        """Return the sum of a part's weights; of several processes, its mean over them."""
+        return self._weights[self._part, column] if self.ranks.together else weights.sum()
+
+    def _worlds(self, part: int, values: Sequence[Tensor]) -> list[Tensor]:
+        """Return of values, [M, N, ...] each, the worlds that the critic learns from in a part."""
+        order = self._minibatches.parts[-1][part]
+        return [value[order] for value in values]
+
+    def _rows(self, part: int, values: Sequence[Tensor]) -> list[list[Tensor]]:
+        """Return what the rules learn from: worlds as well, or particles of each species."""
+        orders = [parts[part] for parts in self._minibatches.parts[:-1]]
         if self.options.ratio == "world":
-            return [batch]
-        spans = self.actor.rules.spans
-        return [Round(*(value[:, span].flatten(0, 1) for value in batch)) for span in spans]
+            return [[value[order] for value in values] for order in orders]
+        rows, count = [], self.memory.acted.shape[2]
+        for span, order in zip(self.actor.rules.spans, orders, strict=True):
+            own = span.stop - span.start
+            whole = own == count
+            index = order if whole else order // own * count + span.start + order % own
+            rows.append([value.flatten(0, 1)[index] for value in values])
+        return rows
 
-    def _surrogate(self, part: list[Round]) -> tuple[Tensor, Tensor]:
-        """Return the clipped gain of the rules, and how far their actions have moved [nats]."""
+    def _gain_weights(self, acted: Tensor) -> Tensor:
+        """Return what the ratios of rows count for, from what their particles do."""
+        return acted.amax(dim=1, keepdim=True) if self.options.ratio == "world" else acted
+
+    def _gain(self, part: list[Round]) -> Tensor:
+        """Return the clipped gain of the rules, and take down how far actions have moved [nats]."""
         options, actor = self.options, self.actor
         if options.ratio == "world":
             (worlds,) = part
@@ -378,37 +449,40 @@ class Learner:
             for values in (changes, [p.advantages for p in part], [p.acted for p in part])
         )
         moved = (acted * (torch.expm1(log_ratio) - log_ratio)).sum().detach()
-        total = count = acted.sum()
+        self._moved.copy_(torch.stack((moved, acted.sum())))
         if options.ratio == "world":
             log_ratio = over_particles(log_ratio, acted)
-            acted = acted.amax(dim=1, keepdim=True)
-            count = acted.sum()
-        self.ranks.reduce([moved, total, count])
-        kl = moved / total.clamp(min=1.0)
-        gain = clipped_gain(log_ratio, advantages, acted, count, clip=options.largest_change)
+        weights = self._gain_weights(acted)
+        total = self._weight(weights, 1)
+        gain = clipped_gain(log_ratio, advantages, weights, total, clip=options.largest_change)
         if options.entropy_weight:
             gain = gain + options.entropy_weight * actor.entropy()
-        return gain, kl
+        return gain
 
     def _critic_loss(self, worlds: Round) -> Tensor:
         error: Tensor = (self.critic(worlds.observations) - worlds.targets) / self.critic.scale
-        count = worlds.acted.sum()
-        self.ranks.reduce([count])
-        return 0.5 * (worlds.acted * error.square()).sum() / count.clamp(min=1.0)
+        squares = (worlds.acted * error.square()).sum()
+        return 0.5 * squares / self._weight(worlds.acted, 0).clamp(min=1.0)
 
-    def _descend(self, optimizer: torch.optim.Optimizer, loss: Tensor) -> None:
-        # A read-out does not act, and layers may be frozen.
-        parameters = [p for p in optimizer.param_groups[0]["params"] if p.requires_grad]
-        # Not backward(): its accumulation nodes remember the stream they were first used on, which
-        # a capture on another stream must not touch.
-        gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
-        for parameter, gradient in zip(parameters, gradients, strict=True):
-            if gradient is not None:
+
+def find_gradients(optimizer: torch.optim.Optimizer, loss: Tensor) -> None:
+    """Write the gradients of a loss to where those of an optimiser's parameters are."""
+    # A read-out does not act, and layers may be frozen.
+    parameters = [p for p in optimizer.param_groups[0]["params"] if p.requires_grad]
+    # Not backward(): its accumulation nodes remember the stream they were first used on, which a
+    # capture on another stream must not touch.
+    gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
+    for parameter, gradient in zip(parameters, gradients, strict=True):
+        if gradient is not None:
+            if parameter.grad is None:
                 # Laid out like the parameter, as the fused optimizer takes for granted.
-                parameter.grad = torch.empty_like(parameter).copy_(gradient)
-        self.ranks.reduce([p.grad for p in parameters if p.grad is not None])
-        nn.utils.clip_grad_norm_(parameters, self.options.max_gradient_norm)
-        optimizer.step()
+                parameter.grad = torch.empty_like(parameter)
+            parameter.grad.copy_(gradient)
+
+
+def gradients_of(optimizer: torch.optim.Optimizer) -> list[Tensor]:
+    """Return the gradients of an optimiser's parameters, of those that have one."""
+    return [p.grad for p in optimizer.param_groups[0]["params"] if p.grad is not None]
 
 
 class Round(NamedTuple):
@@ -427,15 +501,6 @@ class Round(NamedTuple):
     """What the critic should have said, shape [M, N]."""
     acted: Tensor
     """1 where a particle's species was alive, else 0, shape [M, N]."""
-
-
-def shuffled(groups: list[Round], parts: list[tuple[Tensor, ...]]) -> Iterator[list[Round]]:
-    """Return minibatches: in each, a part of the rows of every group."""
-    for chosen in zip(*parts, strict=True):
-        yield [
-            Round(*(value[rows] for value in group))
-            for group, rows in zip(groups, chosen, strict=True)
-        ]
 
 
 class Memory:

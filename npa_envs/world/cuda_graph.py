@@ -196,6 +196,8 @@ class Replayed:
         generator: A generator on the device that the function draws from; the numbers are the same
             whether it is captured or not.
         recorded: False: run it as it is on CUDA too.
+        pool: Memory (`torch.cuda.graph_pool_handle()`) to share with functions that never run at
+            the same time, and of whose work nothing is needed that lies there; None: its own.
     """
 
     def __init__(
@@ -205,11 +207,13 @@ class Replayed:
         generator: torch.Generator | None = None,
         *,
         recorded: bool = True,
+        pool: Any = None,
     ) -> None:
         self._function = WeakFunction(function)
         self._device = device
         self._generator = generator
         self._recorded = recorded and device.type == "cuda"
+        self._pool = pool
         self._warm = False
         self._graph: torch.cuda.CUDAGraph | None = None
 
@@ -229,7 +233,9 @@ class Replayed:
             self._warm = True
             return
         if self._graph is None:
-            self._graph = capture(function, self._device, generator=self._generator)
+            self._graph = capture(
+                function, self._device, pool=self._pool, generator=self._generator
+            )
         self._graph.replay()
 
 
