@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from npa_envs.cli.output import RuleOptions, StepBar, check_numbers, parse_options, rule_of
 from npa_envs.errors import NPAError, shown
@@ -118,7 +118,7 @@ def evaluate_pictures(
     from npa_envs.files import write_text
     from npa_envs.measure.codes import PICTURE_CHECKPOINTS, picture_rows
     from npa_envs.measure.tables import table_text, tables_json
-    from npa_envs.training.trained_tasks import task_of_rule
+    from npa_envs.training.trained_tasks import tasks_of_codes
 
     assert rule.codes is not None, "asked before"
     if options.healing or options.judge:
@@ -127,10 +127,7 @@ def evaluate_pictures(
             f"{len(rule.codes)}: give --target {shown(rule.codes.names[0])}"
         )
     checkpoints = options.checkpoints or PICTURE_CHECKPOINTS
-    tasks: list[Any] = []
-    for name in rule.codes.names:
-        world = options.world() | {"target": name}
-        tasks.append(task_of_rule(source, rule, device, **world).task)
+    tasks = tasks_of_codes(source, rule, device, **options.world())
     with StepBar(None, show=options.progress) as bar:
         rows = picture_rows(
             rule,

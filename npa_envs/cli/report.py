@@ -15,6 +15,7 @@ import torch
 from npa_envs.cli.film import film_world, frame_steps, large_task, write_film, write_solid
 from npa_envs.cli.output import StepBar, writable_folder
 from npa_envs.files import write_text
+from npa_envs.measure.codes import picture_rows
 from npa_envs.measure.judge import Judge, JudgeRow
 from npa_envs.measure.quality import CHECKPOINTS, CLOUD_CHECKPOINTS, score_line, tables_of
 from npa_envs.measure.record import current_commit, machine, versions
@@ -24,7 +25,7 @@ from npa_envs.tasks.base import PictureTask, ViewTask, seed_worlds
 from npa_envs.tasks.damage import DamageEvent
 from npa_envs.tasks.point_classification import PointClassification
 from npa_envs.tasks.texture import Texture
-from npa_envs.training.trained_tasks import task_of_rule
+from npa_envs.training.trained_tasks import task_of_rule, tasks_of_codes
 
 if TYPE_CHECKING:
     from npa_envs.rule.rule import NPARule
@@ -41,6 +42,7 @@ FILM_DAMAGES = (DamageEvent(200, "cut"), DamageEvent(350, "erase"))
 TITLES: Mapping[str, str] = {
     "growth": "",
     "healing": "Damaged, and left to themselves:",
+    "pictures": "Each picture by its own code, and by that of the next one, shuffled:",
     "judge": "Judged by what no loss compares, as ratios of which 1 is the target itself:",
     "accuracy": "",
     "changes": "Some steps after something was done to the clouds:",
@@ -108,6 +110,9 @@ def write_report(
         _film(path, rule, task, folder, device, bar)
     if judged:
         tables["judge"] = judged
+    if len(tasks := tasks_of_codes(str(path), rule, device)) > 1:
+        seeds = range(FIRST_SEED, FIRST_SEED + count)
+        tables["pictures"] = picture_rows(rule, tasks, seeds=seeds, device=device)
     command = f"npa-envs evaluate {shlex.quote(str(path))} --device {device.type}"
     if not clouds:
         command += f" --seed-count {count} --checkpoints {' '.join(map(str, checkpoints))}"
@@ -158,6 +163,7 @@ def _card(
 ) -> str:
     config = task.config
     goal = getattr(config, "target", None) or config.data
+    others = "" if rule.codes is None else f", one of {len(rule.codes)} pictures"
     space = (
         "open space" if task.box is None else f"periodic box of {' x '.join(map(str, task.box))}"
     )
@@ -176,7 +182,7 @@ def _card(
     ]  # fmt: skip
     parts = [
         f"# {Path(goal).stem}",
-        f"A rule of the task `{training.task_name}` for `{goal}`.",
+        f"A rule of the task `{training.task_name}` for `{goal}`{others}.",
         markdown_table(("", ""), rows),
         "## Training",
         f"Commit {facts['commit']}: {training.iterations} iterations in {training.seconds:.0f} s.",

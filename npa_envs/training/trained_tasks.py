@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -107,18 +107,35 @@ def task_of_rule(
         return TrainedTask(task, f"its target cannot be loaded: {error}")
 
 
+def tasks_of_codes(
+    source: str, rule: NPARule, device: torch.device, **fields: Any
+) -> list[Morphogenesis2D]:
+    """Return the task of each picture that a rule has a code for, in their order; none without.
+
+    Args:
+        source: What the rule was loaded from.
+        rule: The rule.
+        device: Where the tasks keep their targets.
+        fields: As for `task_of_rule`.
+
+    Raises:
+        NPAError: As for `task_of_rule`.
+    """
+    found: list[Morphogenesis2D] = []
+    for name in () if rule.codes is None else rule.codes.names:
+        task = task_of_rule(source, rule, device, **(fields | {"target": name})).task
+        assert isinstance(task, Morphogenesis2D), "only these have codes"
+        found.append(task)
+    return found
+
+
 def _one_of(task: Morphogenesis2DConfig, codes: Codes, chosen: bool) -> str:
     """Return where the target of one of a rule's codes comes from: the chosen or the first one's.
 
     A target that has no code is a picture for the rule's encoder.
     """
     name = task.target if chosen else codes.names[0]
-    try:
-        sources = named_targets(task.targets)
-    except NPAError:
-        # Its folder is not there any more.
-        sources = {}
-    return sources.get(name, name)
+    return _named(task.targets).get(name, name)
 
 
 def _world_of(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
@@ -139,6 +156,28 @@ def _world_of(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
     if "particle_count" in fields:
         fields["target_point_count"] = fields["particle_count"]
     return fields
+
+
+def sources_of_codes(source: str, codes: Codes) -> dict[str, str]:
+    """Return where the picture of each code of a rule comes from: name -> what `load_target` takes.
+
+    Args:
+        source: What the rule was loaded from.
+        codes: Its codes.
+    """
+    path = (shipped_rules() | first_rules()).get(source, Path(source))
+    metadata = rule_metadata(path) if path.suffix == ".safetensors" else {}
+    targets = trained_config(path, metadata).task.targets if "config" in metadata else ()
+    sources = _named(targets)
+    return {name: sources.get(name, name) for name in codes.names}
+
+
+def _named(targets: Sequence[str]) -> dict[str, str]:
+    """Return what `named_targets` does; nothing where a folder is not there any more."""
+    try:
+        return named_targets(targets)
+    except NPAError:
+        return {}
 
 
 def trained_config(path: Path, metadata: Mapping[str, str]) -> Any:

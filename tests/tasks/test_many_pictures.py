@@ -1,6 +1,7 @@
 """One rule of many pictures: targets, goals, what is compared, training, files, the command."""
 
 import json
+import re
 
 import pytest
 import torch
@@ -147,9 +148,12 @@ def test_a_resumed_run_is_the_same_run(tmp_path):
 def test_the_command_trains_and_evaluates_by_name(tmp_path, capsys):
     out = str(tmp_path / "many")
     small = [f"--{name.replace('_', '-')}={value}" for name, value in SMALL.items()]
-    words = ["--preset=tiny", *small, "--iterations=2", "--no-progress", "--no-report"]
+    words = ["--preset=tiny", *small, "--iterations=2", "--no-progress"]
     assert main(["train", "morphogenesis2d", "--targets", *TARGETS, f"--out={out}", *words]) == 0
     assert "learns heart and ring and letter-a" in capsys.readouterr().out
+    card = (tmp_path / "many" / "report" / "rule.md").read_text()
+    assert "for `heart`, one of 3 pictures" in card
+    assert len(re.findall(r"\| letter-a \|", card)) == 3
     rule = npa_envs.load_rule(f"{out}/rule.safetensors")
     assert rule.codes.names == TARGETS
     assert rule.state_dim == 8
