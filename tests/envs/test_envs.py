@@ -362,12 +362,14 @@ def test_version_1_of_regeneration_begins_with_many_worlds_and_evaluates_with_ot
             assert all(torch.equal(one, other) for one, other in damaged) != apart
 
 
-def test_a_world_of_a_pool_is_the_same_whenever_it_is_grown():
-    given = {"particle_count": 32, "grow_steps": 2, "resolution": 16, "seed_pool": 8}
-    alone, batch = (gymnasium.make("npa/Regeneration2D-v1", **given).unwrapped for _ in range(2))
-    whole = batch.task.pooled(torch.arange(8))
+def test_a_world_of_a_pool_is_the_same_whenever_it_is_grown(device):
+    given = {"particle_count": 32, "grow_steps": 2, "resolution": 16, "device": str(device)}
+    alone, batch = (
+        gymnasium.make("npa/Regeneration2D-v1", **given, seed_pool=8).unwrapped for _ in range(2)
+    )
+    whole = batch.task.pooled(torch.arange(8, device=device))
     for number in (5, 2, 5):
-        one = alone.task.pooled(torch.tensor([number]))
+        one = alone.task.pooled(torch.tensor([number], device=device))
         assert torch.equal(one.x[0], whole.x[number])
         assert torch.equal(one.s[0], whole.s[number])
 

@@ -123,8 +123,9 @@ def test_an_invasion_is_over_when_one_side_is_gone(dead):
     assert env.agents == []
 
 
-def test_an_opponent_acts_as_agents_would_that_act_uniformly_at_random():
-    both, alone = make("invasion"), make("invasion", opponent="random")
+def test_an_opponent_acts_as_agents_would_that_act_uniformly_at_random(device):
+    where = {"device": str(device)}
+    both, alone = make("invasion", **where), make("invasion", opponent="random", **where)
     assert alone.possible_agents == ["species_0"]
     agents = both.possible_agents
     for env in (both, alone):
@@ -135,7 +136,7 @@ def test_an_opponent_acts_as_agents_would_that_act_uniformly_at_random():
         actions = drawn(both, generator)
         shape = sum(len(actions[agent]) for agent in agents), actions["species_1"].shape[1]
         random = both.worlds.random.beside(Purpose.OPPONENT)
-        invaders = 2.0 * random.uniform(*shape)[0] - 1.0
+        invaders = (2.0 * random.uniform(*shape)[0] - 1.0).cpu()
         actions["species_1"] = invaders[len(actions["species_0"]) :]
         moved += float(actions["species_1"].abs().mean())
         expected, paid, *_ = both.step(actions)

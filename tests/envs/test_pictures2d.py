@@ -47,13 +47,14 @@ def test_a_world_is_paid_for_its_own_picture():
         assert loss[asked == number].max() < 0.25 * loss[asked != number].min()
 
 
-def test_rows_end_with_the_picture_that_is_asked_for():
-    plain, told = (make_vec(NAME, 6, observe_target=on) for on in (False, True))
+def test_rows_end_with_the_picture_that_is_asked_for(device):
+    where = {"device": str(device)}
+    plain, told = (make_vec(NAME, 6, observe_target=on, **where) for on in (False, True))
     (rows, infos), (wide, _) = plain.reset(seed=0), told.reset(seed=0)
     assert wide.shape[-1] == rows.shape[-1] + TOLD
     assert_same(wide[..., :-TOLD], rows)
     task = told.unwrapped.task
-    pictures = task.goal.toward(torch.arange(2)).target_picture.numpy()
+    pictures = task.goal.toward(torch.arange(2, device=device)).target_picture.cpu().numpy()
     for k, number in enumerate(infos["target"]):
         told_of = wide[k, :, -TOLD:].reshape(-1, 4, 4, 4)
         assert (told_of == told_of[0]).all()
@@ -64,8 +65,8 @@ def test_rows_end_with_the_picture_that_is_asked_for():
 
 
 @pytest.mark.parametrize("mode", ["same-step", "next-step"])
-def test_a_batch_that_is_told_its_pictures_equals_single_environments(mode):
-    keywords = {"observe_target": True, "max_episode_steps": 3}
+def test_a_batch_that_is_told_its_pictures_equals_single_environments(mode, device):
+    keywords = {"observe_target": True, "max_episode_steps": 3, "device": str(device)}
     envs = make_vec(NAME, 3, autoreset_mode=mode, **keywords)
     singles = [make(NAME, **keywords) for _ in range(3)]
     random = np.random.default_rng(0)
