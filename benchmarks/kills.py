@@ -22,7 +22,7 @@ import time
 from pathlib import Path
 
 from npa_envs.training import JsonlLog, RunFolder
-from npa_envs.training.run_folder import load_checkpoint
+from npa_envs.training.checkpoint import load_checkpoint
 
 PATIENCE = 120.0
 """Seconds that a run may take to begin, and to end."""

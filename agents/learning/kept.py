@@ -16,13 +16,13 @@ from npa_envs.agents.learning.rules import RuleSet
 from npa_envs.errors import NPAError, shown
 from npa_envs.files import json_text, write_text
 from npa_envs.tasks.checks import is_real
-from npa_envs.training.run_folder import (
-    RunFolder,
+from npa_envs.training.checkpoint import (
     check_content,
     load_checkpoint,
     save_checkpoint,
     unusable_checkpoint,
 )
+from npa_envs.training.run_folder import RunFolder
 from npa_envs.training.stopping import stop_flag
 from npa_envs.world.randomness import WorldRandom
 

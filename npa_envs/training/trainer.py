@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import json
 import math
 import time
@@ -11,46 +10,35 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
-from torch import Tensor, nn
 from tqdm import tqdm
 
 from npa_envs.devices import check_device
-from npa_envs.errors import DivergedError, NPAError, shown
-from npa_envs.files import write_bytes, write_text
-from npa_envs.render.colours import to_uint8
-from npa_envs.render.film import encode_frame
+from npa_envs.errors import NPAError, shown
+from npa_envs.files import write_text
 from npa_envs.rule.files import first_rules, load_rule, save_rule
 from npa_envs.rule.rule import NPARule, with_codes
-from npa_envs.tasks.base import GoalTask, Task, differing_fields, task_for_rule, task_toward
+from npa_envs.tasks.base import GoalTask, Task, differing_fields
 from npa_envs.tasks.train_config import TrainConfig
-from npa_envs.training.cycle import TrainingCycle
-from npa_envs.training.iteration import Rollout
-from npa_envs.training.overrides import config_to_dict
-from npa_envs.training.ranks import Ranks
-from npa_envs.training.run_folder import (
-    JsonlLog,
-    RunFolder,
+from npa_envs.training.batch_picture import write_batch_picture
+from npa_envs.training.checkpoint import (
     check_content,
     check_same_run,
     load_checkpoint,
-    open_tensorboard,
     save_checkpoint,
     unusable_checkpoint,
 )
+from npa_envs.training.cycle import TrainingCycle
+from npa_envs.training.diagnosis import divergence_error
+from npa_envs.training.iteration import Rollout
+from npa_envs.training.overrides import config_to_dict
+from npa_envs.training.ranks import Ranks
+from npa_envs.training.run_folder import JsonlLog, RunFolder, open_tensorboard
 from npa_envs.training.stopping import stop_flag
 from npa_envs.training.variation import VariedCycle
 
 FIRST_PICTURE = 10
 """Iteration after which the first picture is written, where the interval is longer."""
-
-PICTURE_HEIGHT = 256
-"""Least height of the pictures [pixels]; the pixels of smaller worlds are repeated."""
-
-PICTURE_GAP = 8
-"""Pixels between the worlds of a picture."""
 
 
 @dataclass(frozen=True)
@@ -423,94 +411,3 @@ def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
             "weights (initial_rule='')"
         )
     return rule
-
-
-def write_batch_picture(path: Path, picture: Tensor, board: Any, iteration: int) -> None:
-    """Write target and worlds of a batch side by side as a PNG, and as a JPEG to TensorBoard.
-
-    Args:
-        path: The file to write, at least `PICTURE_HEIGHT` pixels high.
-        picture: rgb sums and density of the target, if there is one, and of each world, shape
-            [B, R, R, 4].
-        board: TensorBoard's writer (`open_tensorboard`), or None.
-        iteration: Iterations done so far.
-
-    Raises:
-        NPAError: The file cannot be written.
-    """
-    repeats = math.ceil(PICTURE_HEIGHT / picture.shape[1])
-    frames = to_uint8(picture).repeat(repeats, axis=1).repeat(repeats, axis=2)
-    frames = np.pad(frames, ((0, 0), (0, 0), (0, PICTURE_GAP), (0, 0)), constant_values=255)
-    frame = np.concatenate(list(frames), axis=1)[:, :-PICTURE_GAP]
-    write_bytes(path, encode_frame(frame, "PNG"))
-    if board is not None:
-        _add_picture(board, frame, iteration)
-
-
-def _add_picture(board: Any, frame: NDArray[np.uint8], iteration: int) -> None:
-    # Imported late: only runs with TensorBoard need it.
-    from tensorboard.compat.proto.summary_pb2 import Summary
-
-    # The writer's own add_image makes a PNG, and TensorBoard takes a checksum of it in Python, byte
-    # by byte, which holds up the interpreter for longer than all the rest takes.
-    height, width, channels = frame.shape
-    image = Summary.Image(
-        height=height,
-        width=width,
-        colorspace=channels,
-        encoded_image_string=encode_frame(frame, "JPEG"),
-    )
-    summary = Summary(value=[Summary.Value(tag="batch", image=image)])
-    board.file_writer.add_summary(summary, iteration)
-
-
-def divergence_error(
-    task: Task, rule: NPARule, snapshot: dict[str, Any], diagnosis: Path
-) -> DivergedError:
-    """Return the error that ends a run whose loss is not finite.
-
-    Args:
-        task: The run's task, to find the worlds at fault.
-        rule: The run's rule; its parameters may have changed since.
-        snapshot: `LossMeter.snapshot()`.
-        diagnosis: Where the snapshot was written.
-    """
-    terms = [name for name, value in snapshot["terms"].items() if not math.isfinite(value)]
-    visible = [name for name in terms if name != "loss"] or terms
-    worlds = bad_worlds(task, rule, snapshot)
-    where = f"world{'s' * (len(worlds) > 1)} {', '.join(map(str, worlds))}" if worlds else "no one"
-    return DivergedError(
-        f"the loss must stay finite, but {' and '.join(visible)} was not in iteration "
-        f"{snapshot['iteration']} ({snapshot['steps']} steps, {where} of the batch): lower "
-        "learning_rate, or use fewer steps; the worlds and the rule are in "
-        f"{shown(str(diagnosis))}, "
-        "the last good checkpoint is untouched"
-    )
-
-
-def bad_worlds(task: Task, rule: NPARule, snapshot: dict[str, Any]) -> list[int]:
-    """Return which worlds of the batch alone give a loss that is not finite.
-
-    Args:
-        task: The run's task.
-        rule: The run's rule.
-        snapshot: `LossMeter.snapshot()`, with `x` [B, N, D] and `s` [B, N, C] after the rollout,
-            the `parameters` at that time, and `goal` [B] where the task has goals.
-    """
-    rule = copy.deepcopy(rule).cpu()
-    trained = [parameter for parameter in rule.parameters() if parameter.requires_grad]
-    nn.utils.vector_to_parameters(snapshot["parameters"], trained)
-    task = task_for_rule(task, rule)
-    x, s, goal = snapshot["x"], snapshot["s"], snapshot.get("goal")
-    found = []
-    for world in range(len(x)):
-        one = slice(world, world + 1)
-        finite = bool(torch.isfinite(x[one]).all() and torch.isfinite(s[one]).all())
-        if finite:
-            with torch.no_grad():
-                aimed = task_toward(task, None if goal is None else goal[one])
-                total, parts = aimed.loss(x[one], s[one], torch.zeros_like(x[one][..., 0]))
-            finite = all(bool(torch.isfinite(v).all()) for v in (total, *parts.values()))
-        if not finite:
-            found.append(world)
-    return found

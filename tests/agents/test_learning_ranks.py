@@ -13,8 +13,8 @@ from processes import on_ranks
 from npa_envs.agents.learning import Budget, ppo, shac, train
 from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule
+from npa_envs.training.checkpoint import load_checkpoint, save_checkpoint
 from npa_envs.training.ranks import Ranks
-from npa_envs.training.run_folder import load_checkpoint, save_checkpoint
 
 HEART = heart(num_envs=4, episode_steps=6)
 DYING = species(episode_steps=6, deaths=[[1, 3]])

@@ -27,7 +27,7 @@ from npa_envs.tasks.targets.points import load_target, target_from_image
 from npa_envs.tasks.targets.textures import load_texture
 from npa_envs.tasks.targets.views import load_views
 from npa_envs.training import load_config, preset
-from npa_envs.training.run_folder import load_checkpoint
+from npa_envs.training.checkpoint import load_checkpoint
 
 
 def configure(path: Path) -> Any:

@@ -13,9 +13,9 @@ from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
 from npa_envs.training import TASKS, Trainer, override, preset, train
+from npa_envs.training.checkpoint import load_checkpoint
 from npa_envs.training.cycle import TrainingCycle
 from npa_envs.training.ranks import Ranks
-from npa_envs.training.run_folder import load_checkpoint
 
 PLAIN = {}
 """The preset as it is."""

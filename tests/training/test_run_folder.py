@@ -14,7 +14,7 @@ from training_runs import Killed, KilledTask, kill, log_of, train, trainer_of
 from npa_envs.errors import NPAError
 from npa_envs.files import write_text
 from npa_envs.training import JsonlLog, RunFolder, load_config, override
-from npa_envs.training.run_folder import load_checkpoint, save_checkpoint
+from npa_envs.training.checkpoint import load_checkpoint, save_checkpoint
 
 
 def test_a_run_killed_at_its_first_checkpoint_is_resumed_with_its_configuration(

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from npa_envs.training.run_folder import load_checkpoint
+from npa_envs.training.checkpoint import load_checkpoint
 
 INTERVAL = 5
 """Iterations between two checkpoints."""

@@ -11,6 +11,7 @@ from torch import nn
 
 from npa_envs.devices import check_device, parse_device
 from npa_envs.errors import NPAError
+from npa_envs.training.checkpoint import check_same_run, load_checkpoint, save_checkpoint
 from npa_envs.training.iteration import EagerIteration
 from npa_envs.training.meter import Interval, LossMeter
 from npa_envs.training.optimiser import (
@@ -21,7 +22,7 @@ from npa_envs.training.optimiser import (
 )
 from npa_envs.training.overrides import config_to_dict
 from npa_envs.training.pool import WorldPool
-from npa_envs.training.run_folder import JsonlLog, check_same_run, load_checkpoint, save_checkpoint
+from npa_envs.training.run_folder import JsonlLog
 
 
 def make_pool(pool_size=6, particle_count=4, limit=10.0, device="cpu"):

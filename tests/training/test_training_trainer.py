@@ -19,7 +19,7 @@ from npa_envs.errors import NPAError
 from npa_envs.rule.files import load_rule, rule_metadata, save_rule
 from npa_envs.rule.rule import NPARule
 from npa_envs.training import DivergedError, JsonlLog, load_config, override
-from npa_envs.training.run_folder import load_checkpoint
+from npa_envs.training.checkpoint import load_checkpoint
 
 
 def test_training_starts_from_an_initial_rule_of_its_shape(tmp_path):

@@ -1,0 +1,254 @@
+"""Checkpoints: written whole or not at all, and checked before a run goes on from them."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator, Mapping
+from io import FileIO
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from npa_envs.errors import NPAError, shown
+from npa_envs.files import atomic_path, check_torch_archive, open_regular
+from npa_envs.tasks.checks import is_real, is_whole
+from npa_envs.tasks.train_config import TrainConfig
+from npa_envs.training.overrides import completed, config_to_dict
+
+CHECKPOINT_FORMAT = "npa-envs checkpoint"
+"""Marks a file as ours."""
+
+CHECKPOINT_VERSION = 1
+"""Raised whenever what a checkpoint holds changes."""
+
+MAY_DIFFER = frozenset(
+    {
+        "out",
+        "repeats",
+        "log_interval",
+        "picture_interval",
+        "checkpoint_interval",
+        "tensorboard",
+        "cuda_graph",
+    }
+)
+"""Fields that a resumed run may set anew: they do not change what is learned, only how long."""
+
+NEEDED: dict[str, type] = {
+    "task_name": str,
+    "config": dict,
+    "iteration": int,
+    "seconds": float,
+    "rule": dict,
+    "optimiser": dict,
+    "pool": dict,
+    "meter": dict,
+    "random_states": dict,
+}
+"""What a run is resumed from, and of what types it is."""
+
+NOT_NEGATIVE = {
+    *("iteration", "seconds", "replaced", "count", "step_sum", "goal", "age"),
+    *("step", "exp_avg_sq"),  # AdamW's
+}
+"""Names of numbers and tensors in a checkpoint that are at least 0."""
+
+
+def save_checkpoint(path: Path, content: dict[str, Any]) -> None:
+    """Write a checkpoint, whole or not at all.
+
+    Args:
+        path: The file; an existing one stays as it is until the new one is complete.
+        content: Tensors, numbers, strings, and lists and dicts of them.
+
+    Raises:
+        NPAError: The file cannot be written.
+    """
+    with atomic_path(path) as temporary, _PatientFile(temporary, "wb") as file:
+        torch.save(
+            {"format": CHECKPOINT_FORMAT, "format_version": CHECKPOINT_VERSION, **content}, file
+        )
+        if file.error is not None:
+            raise file.error
+
+
+class _PatientFile(FileIO):
+    """A file that keeps its first error of writing, and writes no more from then on.
+
+    Torch would raise an error of its own instead, which hides the system's reason (disk full).
+    """
+
+    error: OSError | None = None
+    """What went wrong first."""
+
+    def write(self, data: Any, /) -> int:
+        """Write all of the data, unless something went wrong before."""
+        rest = memoryview(data)
+        try:
+            while self.error is None and len(rest) > 0:
+                rest = rest[super().write(rest) :]
+        except OSError as error:
+            self.error = error
+        return len(data)
+
+
+def load_checkpoint(path: Path) -> dict[str, Any]:
+    """Read a checkpoint on to the CPU; nothing in it is executed.
+
+    Raises:
+        NPAError: There is no such file, it cannot be read, or it is no checkpoint of this version.
+    """
+    if not os.path.exists(path):
+        raise NPAError(
+            f"there is no checkpoint to resume from at {str(path)!r}: give the folder of an "
+            "earlier run as `out`, or start a new run"
+        )
+    try:
+        with open_regular(path, limit=sys.maxsize, what="the checkpoint") as file:
+            check_torch_archive(file)
+            file.seek(0)
+            content = torch.load(file, map_location="cpu", weights_only=True)
+    except Exception as error:
+        # What is raised for garbage depends on where in the readers the garbage lands.
+        raise NPAError(
+            f"{str(path)!r} is not a checkpoint or is damaged ({shown(error)}): "
+            "start a new run with overwrite, or put a copy of it in its place"
+        ) from error
+    if not isinstance(content, dict) or content.get("format") != CHECKPOINT_FORMAT:
+        raise NPAError(f"{str(path)!r} is not a checkpoint of npa-envs: choose another folder")
+    version = content.get("format_version")
+    if version != CHECKPOINT_VERSION:
+        raise NPAError(
+            f"{str(path)!r} has checkpoint format {version}, this version reads "
+            f"{CHECKPOINT_VERSION}: resume it with the version of npa-envs that wrote it"
+        )
+    return content
+
+
+def check_same_run(
+    content: dict[str, Any], task_name: str, config: TrainConfig[Any], path: Path
+) -> None:
+    """Check that a checkpoint belongs to the run that is to be resumed.
+
+    Raises:
+        NPAError: It lacks something, is of another task, of another configuration, or further
+            than the run goes.
+    """
+    _check_complete(content, path)
+    if content["task_name"] != task_name:
+        raise NPAError(
+            f"the checkpoint {str(path)!r} is of task {shown(content['task_name'])}, "
+            f"not of {task_name!r}: resume it with that task, or choose another folder"
+        )
+    theirs = _flat(completed(content["config"], config))
+    ours = _flat(config_to_dict(config))
+    differences = [
+        f"{name}: {shown(theirs.get(name, 'absent'))} there, {shown(ours.get(name, 'absent'))} here"
+        for name in sorted(theirs.keys() | ours.keys())
+        if name not in MAY_DIFFER and theirs.get(name) != ours.get(name)
+    ]
+    if differences:
+        raise NPAError(
+            f"the checkpoint {str(path)!r} is of another configuration ({'; '.join(differences)}): "
+            f"resume with the configuration in {str(path.with_name('config.json'))!r}, or start a "
+            "new run in another folder"
+        )
+    if content["iteration"] > config.total_iterations:
+        raise NPAError(
+            f"the checkpoint {str(path)!r} is at iteration {content['iteration']}, beyond the "
+            f"{config.total_iterations} of this run: raise repeats"
+        )
+
+
+def check_content(content: dict[str, Any], expected: Mapping[str, Any], path: Path) -> None:
+    """Check that what a run goes on from is of the kind that the run itself has.
+
+    Args:
+        content: The checkpoint.
+        expected: The same of the run as it is, by the same names: dicts have the same keys, tensors
+            the same shapes and dtypes, others the same types.
+        path: The checkpoint's, for the error.
+
+    Raises:
+        NPAError: Something is of another type, shape or dtype, not finite, or negative where that
+            makes no sense.
+    """
+    wrong = [
+        what for name, like in expected.items() for what in _wrong(name, content.get(name), like)
+    ]
+    if wrong:
+        shown = "; ".join(wrong[:3]) + ("; ..." if len(wrong) > 3 else "")
+        raise unusable_checkpoint(path, shown)
+
+
+def unusable_checkpoint(path: Path, reason: str) -> NPAError:
+    """Return the error about a checkpoint that a run cannot go on from."""
+    return NPAError(
+        f"the checkpoint {str(path)!r} must hold all that a run needs to go on, but {reason}: "
+        "start a new run with overwrite, or put a copy of it in its place"
+    )
+
+
+def _wrong(name: str, value: Any, like: Any) -> Iterator[str]:
+    """Yield what is wrong with a value of a checkpoint, with its name."""
+    if isinstance(like, Mapping):
+        if not isinstance(value, Mapping) or value.keys() != like.keys():
+            names = ", ".join(map(str, like)) or "nothing"
+            yield f"{name} must be a dict of {names}"
+            return
+        for key in like:
+            yield from _wrong(f"{name}.{key}", value[key], like[key])
+    elif isinstance(like, Tensor):
+        if not isinstance(value, Tensor) or _kind(value) != _kind(like):
+            came = f"of {_kind(value)}" if isinstance(value, Tensor) else type(value).__name__
+            yield f"{name} must be a tensor of {_kind(like)}, got {came}"
+        elif not bool(torch.isfinite(value).all()):
+            yield f"{name} must be finite"
+        elif name.rpartition(".")[2] in NOT_NEGATIVE and bool((value < 0).any()):
+            yield f"{name} must not be negative"
+    elif isinstance(like, int | float):
+        right = is_whole(value) if isinstance(like, int) else is_real(value)
+        if not right or value < 0:
+            kind = "whole" if isinstance(like, int) else "finite"
+            yield f"{name} must be a {kind} number of at least 0, got {str(value)[:40]}"
+
+
+def _kind(tensor: Tensor) -> str:
+    usual = tensor.layout == torch.strided and not tensor.is_meta
+    return f"{'' if usual else 'odd '}{str(tensor.dtype)[6:]} {tuple(tensor.shape)}"
+
+
+def _check_complete(content: dict[str, Any], path: Path) -> None:
+    """Check what has to be known before the run itself is made."""
+    needed = [(name, content.get(name), kind) for name, kind in NEEDED.items()]
+    if isinstance(content.get("config"), dict):
+        needed.append(("config.task", content["config"].get("task"), dict))
+    # A whole number of seconds is a number too.
+    wrong = [
+        name
+        for name, value, kind in needed
+        if not isinstance(value, (int, float) if kind is float else kind)
+    ]
+    if not wrong and not _is_plain(content["config"]):
+        wrong = ["config"]
+    if wrong:
+        raise unusable_checkpoint(path, f"lacks {', '.join(wrong)} or has it of a wrong type")
+    numbers = {name: kind() for name, kind in NEEDED.items() if kind in (int, float)}
+    check_content(content, numbers, path)
+
+
+def _is_plain(value: Any) -> bool:
+    """Return whether a value is what JSON has, as configurations in checkpoints are."""
+    if isinstance(value, dict):
+        return all(isinstance(key, str) and _is_plain(inner) for key, inner in value.items())
+    if isinstance(value, list):
+        return all(map(_is_plain, value))
+    return value is None or isinstance(value, str | int | float)
+
+
+def _flat(config: dict[str, Any]) -> dict[str, Any]:
+    own = {name: value for name, value in config.items() if name != "task"}
+    return own | {f"task.{name}": value for name, value in config["task"].items()}
