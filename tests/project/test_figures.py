@@ -194,6 +194,21 @@ def test_the_page_on_species_has_the_numbers_of_its_file() -> None:
     assert differences(text, pattern, [row["rollout_us"]["median"] * 1e-3]) == []
 
 
+def test_the_page_on_learners_has_what_shac_grew_in_a_small_world() -> None:
+    rows = {row["method"]: row for row in content(RESULTS / "shac_small_cpu.json")["rows"]}
+    text = (ROOT / "docs" / "learners_compared.md").read_text(encoding="utf-8")
+    pattern = (
+        rf"SHAC has ({NUMBER}) of what .* returns ({NUMBER}) and the gradient ({NUMBER}), .*"
+        rf"`ppo` returns ({NUMBER}) and the best scripted policy ({NUMBER})"
+    )
+    methods = ("shac", "gradient", "ppo", "scripted")
+    returns = [rows[method]["final_return"]["mean"] for method in methods]
+    found = [rows["shac"]["fraction"]["mean"], *returns]
+    told = re.search(pattern, " ".join(text.split()))
+    assert told is not None
+    assert differences(" ".join(told.groups()), NUMBER, found) == []
+
+
 def test_the_table_of_small_environments_has_the_speeds_of_its_file() -> None:
     page = (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8")
     told = dict(re.findall(r"^\| `(npa/[\w-]+)` \| (.*) \|$", page, re.MULTILINE))
