@@ -237,7 +237,8 @@ class Progress:
             if self._previous is not None:
                 self._previous.synchronize()
             self._previous = event
-        self._agree_on_time()
+        if self.budget.seconds is not None:
+            self._agree_on_time()
 
     def look(self, actor: RuleSet | Callable[[Any], Any], force: bool = False) -> None:
         """Evaluate where the next share of the budget is spent.

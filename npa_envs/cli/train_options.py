@@ -1,0 +1,261 @@
+"""Options of `npa-envs train`: every field of a task's configuration is one."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, fields, make_dataclass, replace
+from pathlib import Path
+from typing import Any, get_type_hints
+
+import tyro
+
+from npa_envs.cli.output import OutFolder, parse_options, settled_resume
+from npa_envs.errors import NPAError
+from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
+from npa_envs.training import (
+    JointTrainConfig,
+    RunFolder,
+    TrainConfig,
+    load_config,
+    override,
+    preset,
+    task_entry,
+)
+
+COMMON = ("target", "iterations", "device", "out")
+"""Fields of configurations that stand among the most common options, where a task has them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainOptions:
+    """What most runs are told; the paper's schedule, pool and world follow below."""
+
+    preset: str = ""
+    """Configuration to start from: `paper`, `fast` (minutes on a CPU), `tiny` (seconds), or for
+    pictures and textures `best` (minutes on a GPU); `npa-envs list` has their sizes and times. By
+    default `best` on CUDA where the task has it, else `fast`."""
+
+    target: str = ""
+    """What is to be learned: a built-in name (`npa-envs list`), a file, or for morphogenesis2d an
+    emoji."""
+
+    iterations: int = 0
+    """Optimiser steps in one repeat."""
+
+    device: str = "cpu"
+    """Where to train: cpu, cuda, cuda:1."""
+
+    out: OutFolder = Path()
+    """Folder that log, pictures, checkpoint and rule are written to; created where missing."""
+
+    config: Path | None = None
+    """YAML, TOML or JSON file with field names and values, also `preset`; goes over the preset."""
+
+    processes: int | None = None
+    """Processes that share the run, on CUDA each with a GPU of its own; by default 1, but 2 where
+    a CPU has cores for them and the batch is small. `torchrun --nproc-per-node=4 -m npa_envs train
+    ...` does the same."""
+
+    gpus: int | None = None
+    """GPUs that share the run: `--gpus 4` says `--device cuda --processes 4`."""
+
+    resume: bool = False
+    """Go on from the checkpoint in the folder `out`, with the configuration that lies there.
+    `--resume auto`: if there is one; else begin."""
+
+    overwrite: bool = False
+    """Start anew although the folder `out` holds a run; the run's files are removed."""
+
+    max_seconds: float | None = None
+    """Stop after this time [s]; the run can be resumed."""
+
+    progress: bool = True
+    """Show a progress bar."""
+
+    report: bool = True
+    """End with a report in the folder `out`: figures, a film and a card of the rule."""
+
+
+def settled(task_name: str, words: Sequence[str]) -> list[str]:
+    """Return the options with `--resume auto` decided, and with CUDA as the device of `--gpus`.
+
+    Raises:
+        NPAError: As for `starting_configuration`.
+    """
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--gpus")
+    parser.add_argument("--device")
+    first, _ = parser.parse_known_args(words)
+    chosen = list(words)
+    if first.gpus is not None and first.device is None:
+        chosen += ["--device", "cuda"]
+
+    def out_of(words: Sequence[str]) -> Path:
+        return parse(task_name, starting_configuration(task_name, words), words)[1].out
+
+    return settled_resume(chosen, out_of)
+
+
+def starting_configuration(task_name: str, arguments: Sequence[str]) -> TrainConfig[Any]:
+    """Return the configuration that the options are laid over: preset, file, or the run resumed.
+
+    Raises:
+        NPAError: No such preset, the file is wrong, or there is nothing to resume.
+    """
+    # These options decide what the others' defaults are, so they are looked at first.
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    parser.add_argument("--preset")
+    parser.add_argument("--config", type=Path)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--resume", action="store_true")
+    parser.add_argument("--out", "--output", type=Path)
+    try:
+        first, _ = parser.parse_known_args(arguments)
+    except argparse.ArgumentError as error:
+        raise NPAError(f"{error.argument_name}: {error.message}") from error
+    device = first.device if first.config is None else "cpu"
+    base = preset(first.preset or default_preset(task_name, device), task_name)
+    if first.resume and not {"-h", "--help"} & set(arguments):
+        folder = RunFolder(first.out or base.out)
+        if not folder.checkpoint.is_file():
+            raise NPAError(
+                f"there is no checkpoint to resume from at {str(folder.checkpoint)!r}: give the "
+                "folder of an earlier run with --out, or leave --resume out to start a new run"
+            )
+        base = load_config(folder.config, base, whole=True)
+    if first.config is not None:
+        presets = task_entry(task_name).presets
+        if first.preset or first.resume:
+            # What is said on the command line, or was of the run resumed, goes over the file.
+            presets = dict.fromkeys(presets, base)
+        base = load_config(first.config, base, presets=presets)
+    return base
+
+
+def default_preset(task_name: str, device: str) -> str:
+    """Return the preset of runs that name none: `best` on CUDA where there is one, else `fast`."""
+    cuda = device.startswith("cuda")
+    return "best" if cuda and "best" in task_entry(task_name).presets else "fast"
+
+
+def parse(
+    task_name: str, base: TrainConfig[Any], arguments: Sequence[str]
+) -> tuple[TrainOptions, TrainConfig[Any]]:
+    """Lay the command line's options over a configuration."""
+
+    def read(defaults: Any) -> tuple[TrainOptions, Any]:
+        # These stand first, as options of their own, and not once more below.
+        told = {
+            name: getattr(holder, name)
+            for name in COMMON
+            for holder in (defaults, defaults.task)
+            if hasattr(holder, name)
+            and not (name == "target" and isinstance(holder, SpeciesOptions))
+        }
+        common = _without(TrainOptions(**told), set(COMMON) - told.keys())
+        training = _without(replace(defaults, task=_without(defaults.task, told)), told)
+        kinds = [("common", type(common)), ("training", type(training))]
+        command = make_dataclass("Command", kinds, frozen=True)
+        parsed: Any = parse_options(
+            command,
+            f"train {task_name}",
+            arguments,
+            description=f"Train on {task_name}. Defaults shown are those of the preset.",
+            default=command(common, training),
+        )
+        task = _of_type(type(defaults.task), parsed.training.task)
+        config = _of_type(type(defaults), parsed.training, task=task)
+        return _of_type(TrainOptions, parsed.common), override(
+            config, **{name: getattr(parsed.common, name) for name in told}
+        )
+
+    return parse_joint(base, read) if isinstance(base, JointTrainConfig) else read(base)
+
+
+def _without(source: Any, names: Iterable[str]) -> Any:
+    """Return a dataclass of which some fields, where it has them, are no options."""
+    kind: Any = type(source)
+    fixed: Any = tyro.conf.Fixed
+    hints = get_type_hints(kind)
+    changed = {name: fixed[hints[name]] for name in names if name in hints}
+    if "task" in hints:
+        changed["task"] = type(source.task)
+    options = [(name, own, field(default=getattr(source, name))) for name, own in changed.items()]
+    base = kind[changed["task"]] if getattr(kind, "__parameters__", ()) else kind
+    narrow = make_dataclass(kind.__name__, options, bases=(base,), frozen=True, kw_only=True)
+    return _of_type(narrow, source)
+
+
+# Options of tasks of several species: flat, although configurations nest.
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpeciesOptions(Morphogenesis2DConfig):
+    """What all species share is said once; a --config file says it species by species."""
+
+    target: tyro.conf.Suppress[str] = "gecko"
+    code_dim: tyro.conf.Suppress[int] = 8
+    encoder: tyro.conf.Suppress[bool] = False
+    switch_share: tyro.conf.Suppress[float] = 0.1
+
+    particle_count: int = 4096
+    """Particles of each species."""
+
+    targets: tuple[str, ...] = ()
+    """What each species grows: built-in names, emoji, or paths of pictures, two or more."""
+
+    distance: float = 0.0
+    """Distance between the centres of neighbouring seeds, which lie in a row [length units]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointOptions(JointTrainConfig[SpeciesOptions]):
+    """A training run of several rules in one world; what is said of a species holds for all."""
+
+    initial_rule: tyro.conf.Suppress[str] = ""
+
+
+def parse_joint(
+    base: JointTrainConfig[CoMorphogenesis2DConfig],
+    read: Callable[[JointOptions], tuple[TrainOptions, JointOptions]],
+) -> tuple[TrainOptions, JointTrainConfig[CoMorphogenesis2DConfig]]:
+    """Return what the command line says of a run of several species.
+
+    Raises:
+        NPAError: There are fewer than two targets.
+    """
+    task = base.task
+    # Once for each species, so that what is not said stays as it is in each of them.
+    launch, told = read(_flat(base, task, 0))
+    targets = told.task.targets
+    if len(targets) < 2:
+        raise NPAError(f"targets must be two or more, got {len(targets)}: --targets ring heart")
+    species = []
+    for number, target in enumerate(targets):
+        _, own = read(_flat(base, task, min(number, len(task.species) - 1)))
+        species.append(
+            _of_type(Morphogenesis2DConfig, replace(own.task, target=target, targets=()))
+        )
+    together = replace(task, species=tuple(species), distance=told.task.distance)
+    return launch, _of_type(JointTrainConfig, told, task=together)
+
+
+def _flat(
+    base: JointTrainConfig[CoMorphogenesis2DConfig], task: CoMorphogenesis2DConfig, number: int
+) -> JointOptions:
+    """Return a configuration as options, with the fields of one species for all."""
+    targets = tuple(config.target for config in task.species)
+    options = _of_type(
+        SpeciesOptions, task.species[number], targets=targets, distance=task.distance
+    )
+    flat: JointOptions = _of_type(JointOptions, base, task=options)
+    return flat
+
+
+def _of_type(kind: Any, source: Any, **others: Any) -> Any:
+    """Return a dataclass with the fields that another one has, and others."""
+    own = {field.name for field in fields(kind)}
+    same = {f.name: getattr(source, f.name) for f in fields(source) if f.name in own}
+    return kind(**same | others)
