@@ -250,6 +250,11 @@ class RulePolicy(Policy):
             raise NPAError(
                 f"rule must be an NPARule, got {type(rule).__name__}: npa_envs.load_rule('gecko')"
             )
+        if rule.divides:
+            raise NPAError(
+                "a policy acts on particles that stay as many as they are, got a rule with "
+                "divides=True: run it with npa_envs.rollout"
+            )
         if not (is_real(state_scale) and state_scale > 0.0):
             raise NPAError(
                 f"state_scale must be positive and finite, got {shown(state_scale)}: give the "

@@ -2,6 +2,7 @@
 
     python docs/draw_beyond.py directions PLAIN EQUIVARIANT    # files of rules
     python docs/draw_beyond.py sizes TRAINED VARIED
+    python docs/draw_beyond.py division RULE
 
 It takes a minute on a CPU.
 """
@@ -21,6 +22,7 @@ import npa_envs
 from npa_envs.render import to_uint8, write_filmstrip
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, turned, turns
 from npa_envs.training.trained_tasks import task_of_rule
+from npa_envs.world.division import living
 
 IMAGES = Path(__file__).resolve().parent / "images"
 SEEDS = (1_000_000, 1_000_001, 1_000_002)
@@ -30,6 +32,12 @@ SIDE = 128
 """Pixels on each side of a picture, at least."""
 
 COUNTS, RADII = (0.125, 0.25, 1.0, 4.0, 8.0), (0.5, 0.7, 1.0, 1.4, 2.0)
+
+GROWTH = (4, 8, 12, 16, 24, 32, 64, 128)
+"""Steps at which worlds that grow from one particle are drawn."""
+
+HEALING = 64
+"""Steps after half of their particles are gone."""
 
 Shots = list[tuple[str, NDArray[np.uint8]]]
 
@@ -100,10 +108,32 @@ def sizes(paths: list[str]) -> Shots:
     return shots
 
 
+def division(paths: list[str]) -> Shots:
+    """Return a world that grows from one particle, loses one half, and grows it again."""
+    rule = npa_envs.load_rule(paths[0])
+    task = task_of(paths[0], rule)
+    x, s = task.seed(1, generator=torch.Generator())
+    shots: Shots = [("step 0: 1 lives", as_it_lies(task, x, s))]
+    step = 0
+    for steps in GROWTH:
+        x, s = run(rule, task, x, s, steps - step, seed=SEEDS[0] + steps)
+        step = steps
+        shots.append((f"step {step}: {int(living(s).sum())}", as_it_lies(task, x, s)))
+    middle = x[living(s)][:, 0].median()
+    s = torch.where((x[..., :1] > middle) & living(s)[..., None], 0.0, s)
+    shots.append((f"half is gone: {int(living(s).sum())}", as_it_lies(task, x, s)))
+    for steps in (8, 16, HEALING):
+        y, u = run(rule, task, x, s, steps, seed=SEEDS[1])
+        shots.append((f"{steps} later: {int(living(u).sum())}", as_it_lies(task, y, u)))
+    return shots
+
+
 def main() -> None:
     """Draw what the command line asks for."""
     what, *rest = sys.argv[1:]
-    captions, frames = zip(*{"directions": directions, "sizes": sizes}[what](rest), strict=True)
+    captions, frames = zip(
+        *{"directions": directions, "sizes": sizes, "division": division}[what](rest), strict=True
+    )
     write_filmstrip(IMAGES / f"beyond_{what}.png", frames, captions, columns=5)
 
 

@@ -49,6 +49,7 @@ _DEMO_KIND = {
     "species_count": 0,
     "equivariant": False,
     "code_dim": 0,
+    "divides": False,
 }
 """What rules of the web demo are like; its files do not say it."""
 

@@ -3,8 +3,8 @@
 Ours holds the weights under `NPARule`'s own names and, in the header's metadata, the format's name
 and version, every hyper-parameter and a checksum, so that a file is all that is needed to run a
 rule. The checksum is SHA-256 over all else that the file says; older files have none. Version 2 is
-for equivariant rules alone, version 3 for rules with codes: older versions of the package cannot
-run them.
+for equivariant rules alone, version 3 for rules with codes, version 4 for rules that divide: older
+versions of the package cannot run them.
 """
 
 from __future__ import annotations
@@ -42,6 +42,9 @@ EQUIVARIANT_VERSION = 2
 
 CODED_VERSION = 3
 """The format's version in files of rules with codes."""
+
+DIVIDING_VERSION = 4
+"""The format's version in files of rules that divide."""
 
 _PLAIN: dict[Any, type] = {Literal: str, tuple: tuple}
 _FIELDS = {
@@ -152,6 +155,7 @@ def save_rule(
         )
     version = EQUIVARIANT_VERSION if rule.equivariant else FORMAT_VERSION
     version = CODED_VERSION if rule.codes is not None else version
+    version = DIVIDING_VERSION if rule.divides else version
     header = {"format": FORMAT_NAME, "version": str(version)}
     header |= {name: json.dumps(value) for name, value in rule.hyper_parameters().items()}
     if not isinstance(metadata, Mapping | None):
@@ -248,7 +252,7 @@ def _read_header(path: Path) -> dict[str, str]:
             f"the metadata's format must be {FORMAT_NAME!r}, got {shown(header.get('format'))}: "
             "this safetensors file was not written by npa_envs.save_rule"
         )
-    known = [str(version) for version in range(FORMAT_VERSION, CODED_VERSION + 1)]
+    known = [str(version) for version in range(FORMAT_VERSION, DIVIDING_VERSION + 1)]
     if header.get("version") not in known:
         raise NPAError(
             f"the metadata's version must be one of {', '.join(known)}, got "

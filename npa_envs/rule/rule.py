@@ -36,6 +36,12 @@ LARGEST_DIM = 65536
 OUTPUT_BLOCKS = 4
 """The sum over hidden units is taken in this many blocks."""
 
+LIFE = 0
+"""State channel of particles that divide: 1 where they live, 0 where they are dead."""
+
+FIRST_FATES = (2.0, -8.0)
+"""Log odds of an untrained rule's particles to divide and to die, over staying."""
+
 MIXED_VECTORS = 8
 """Mixed vectors of an equivariant rule where nothing is said."""
 
@@ -67,6 +73,7 @@ class RuleHyperParameters(NamedAlways, total=False):
     code_dim: int
     code_names: tuple[str, ...]
     encoder: bool
+    divides: bool
 
 
 class NPARule(nn.Module):
@@ -107,10 +114,12 @@ class NPARule(nn.Module):
             and never changes: it says what to grow.
         code_names: What the codes that the rule knows stand for; there are some if there is a code.
         encoder: The rule reads codes from pictures (`codes.encode`).
+        divides: Particles divide and die, with odds that follow from their states. Their first
+            state is 1 where they live and 0 where they are dead (`npa_envs.world.division`).
 
     Raises:
         NPAError: A dimension or a length is out of range, `moment_inverse` is another word, or what
-            is asked of an equivariant rule or of codes does not go together.
+            is asked of an equivariant rule, of codes or of division does not go together.
     """
 
     def __init__(
@@ -135,6 +144,7 @@ class NPARule(nn.Module):
         code_dim: int = 0,
         code_names: Sequence[str] = (),
         encoder: bool = False,
+        divides: bool = False,
     ) -> None:
         super().__init__()
         widths = (state_dim, hidden_dim, readout_dim, readout_hidden_dim, mixed_vectors)
@@ -175,8 +185,10 @@ class NPARule(nn.Module):
         self.chiral = checked_flag("chiral", chiral)
         self.mixed_vectors = mixed_vectors
         self.code_dim = code_dim
+        self.divides = checked_flag("divides", divides)
         self._check_equivariance()
         self._check_codes(len(code_names), checked_flag("encoder", encoder))
+        self._check_division()
 
         self.hidden = nn.Linear(self.input_dim, hidden_dim)
         self.output = nn.Linear(hidden_dim, self.output_dim, bias=False)
@@ -192,6 +204,11 @@ class NPARule(nn.Module):
         for module in self.modules():
             if isinstance(module, nn.Linear):
                 nn.init.xavier_uniform_(module.weight, gain=INIT_GAIN)
+        if self.divides:
+            self.fate = nn.Linear(state_dim, 2)
+            with torch.no_grad():
+                self.fate.weight.zero_()
+                self.fate.bias.copy_(torch.tensor(FIRST_FATES))
         if self.equivariant:
             vectors = self.vector_form
             mixing = torch.empty(vectors.perceived, vectors.mixed)
@@ -235,6 +252,16 @@ class NPARule(nn.Module):
             raise NPAError(
                 "an equivariant rule needs vectors to perceive, got state_gradient=False and "
                 "density_gradient=False: leave one of them out"
+            )
+
+    def _check_division(self) -> None:
+        if not self.divides:
+            return
+        if self.static or self.species_count or self.code_dim:
+            raise NPAError(
+                f"rules that divide move their particles, of one species and without codes, got "
+                f"static={self.static}, species_count={self.species_count} and code_dim="
+                f"{self.code_dim}: leave these out"
             )
 
     @property
@@ -338,9 +365,10 @@ class NPARule(nn.Module):
         return FoldedInvariants.of(self) if self.has_network() else None
 
     def network_weights(self) -> list[Tensor]:
-        """Return the parameters of the network, without those of the read-out."""
+        """Return the parameters of a step, without those of the read-out."""
         weights = [self.hidden.weight, self.hidden.bias, self.output.weight]
-        return [*weights, self.mixing, self.steering] if self.equivariant else weights
+        weights += [self.mixing, self.steering] if self.equivariant else []
+        return weights + ([self.fate.weight, self.fate.bias] if self.divides else [])
 
     def folded(self) -> FoldedRule:
         """Return the weights as two plain products, differentiable in the parameters."""
@@ -350,6 +378,19 @@ class NPARule(nn.Module):
         output_weight = nn.functional.pad(update_weight, (0, 0, 0, -len(update_weight) % FOLD))
         hidden_weight = nn.functional.pad(weight, (0, padding))
         return fold_weights(hidden_weight, output_weight)
+
+    def fates(self, states: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the probabilities with which updated particles divide and die, shape [...] each.
+
+        They are the softmax of (a, 0, b), where (a, b) = W s + c and 0 is for staying.
+
+        Args:
+            states: Particle states, dimensionless, shape [..., C], of a rule that divides.
+        """
+        dividing, dying = self.fate(states).unbind(dim=-1)
+        odds = torch.stack((dividing, torch.zeros_like(dividing), dying), dim=-1)
+        divide, _, die = odds.softmax(dim=-1).unbind(dim=-1)
+        return divide, die
 
     def read_out(self, states: Tensor) -> Tensor:
         """Return the rule's outputs: the read-out network's, or the states where it has none.
@@ -402,6 +443,7 @@ class NPARule(nn.Module):
         seen += ["no direction"] * self.equivariant
         seen += ["a code of what to grow"] * (self.code_dim > 0)
         done = "changes its state" if self.static else "moves and changes its state"
+        done += ", divides and dies" * self.divides
         rows = {
             "a particle perceives": f"{', '.join(seen)}: {self.perception_dim} numbers",
             "how far": f"ε0 = {self.eps0:g} (length units)",
@@ -454,6 +496,8 @@ class NPARule(nn.Module):
             made["code_dim"] = self.code_dim
             made["code_names"] = self.codes.names
             made["encoder"] = self.codes.encoder is not None
+        if self.divides:
+            made["divides"] = True
         return made
 
 
@@ -501,6 +545,17 @@ def with_codes(rule: NPARule, untrained: NPARule) -> NPARule:
     untrained.hidden.bias[:rows] = rule.hidden.bias.to(untrained.hidden.bias)
     untrained.output.weight[:, :rows] = rule.output.weight.to(untrained.output.weight)
     return untrained
+
+
+def dividing(rule: NPARule) -> NPARule:
+    """Return a copy of a rule whose particles also divide and die, with untrained odds.
+
+    Raises:
+        NPAError: As `NPARule` of rules that divide.
+    """
+    made = NPARule(**rule.hyper_parameters() | {"divides": True}).to(rule.hidden.weight)
+    made.load_state_dict(made.state_dict() | rule.state_dict())
+    return made
 
 
 def check_rule(rule: Any) -> None:

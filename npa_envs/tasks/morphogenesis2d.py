@@ -16,12 +16,13 @@ from torch import Tensor
 from npa_envs.errors import NPAError, shown
 from npa_envs.ops import splat, world_mean
 from npa_envs.ops.pictures.losses import picture_losses
-from npa_envs.rule.rule import COLOUR_OFFSET, NPARule
+from npa_envs.rule.rule import COLOUR_OFFSET, LIFE, NPARule
 from npa_envs.tasks.checks import check_flag, check_non_negative, check_positive, check_text
 from npa_envs.tasks.growth import GrowthConfig, GrowthTask
 from npa_envs.tasks.targets.images import LARGEST_POINT_COUNT
 from npa_envs.tasks.targets.points import PointTarget, load_target
 from npa_envs.tasks.train_config import TrainConfig, fast_run, tiny_run
+from npa_envs.world.division import living
 from npa_envs.world.randomness import Randomness, WorldRandom
 
 LARGEST_CODE = 1024
@@ -94,6 +95,12 @@ class Morphogenesis2DConfig(GrowthConfig):
     """Seeds of an equivariant rule have a head and a tail: across the disk, the first state goes
     from minus this to this (dimensionless), along a direction drawn for each world. 0: no such."""
 
+    division: bool = False
+    """A world starts with one particle. Particles divide and die; at most `particle_count` live."""
+
+    division_weight: float = 0.02
+    """Weight of the gradient by which particles learn to divide and to die (dimensionless)."""
+
     angles: int = 16
     """Angles that are tried first for an equivariant rule's world, evenly spread. Sixteen more near
     the best of them are tried next: 1/39 of the step between the first ones remains."""
@@ -110,10 +117,17 @@ class Morphogenesis2DConfig(GrowthConfig):
                 f"got {self.blur_levels} for a resolution of {self.resolution}: lower it"
             )
         check_positive(self, float, "sigma")
-        check_non_negative(self, "splat_weight", "colour_weight", "drift_weight", "seed_axis")
-        check_flag(self, "equivariant", "chiral", "encoder")
+        check_non_negative(
+            self, "splat_weight", "colour_weight", "drift_weight", "seed_axis", "division_weight"
+        )
+        check_flag(self, "equivariant", "chiral", "encoder", "division")
         self._check_targets()
         check_positive(self, int, "angles", at_least=4)
+        if self.division and (self.equivariant or self.targets):
+            raise NPAError(
+                "division goes neither with equivariant, because one particle has no axis, nor "
+                "with targets: leave them out"
+            )
 
     def _check_targets(self) -> None:
         targets = self.targets
@@ -140,6 +154,9 @@ FINER_STEP = 0.4
 
 FINER_TIMES = 4
 """How often that is done."""
+
+UNSEEN = 1e3
+"""Coordinate of what no picture shows [length units]."""
 
 UNOWNED = 0.05
 """Density that belongs to nobody when a pixel's error is shared out among particles."""
@@ -222,7 +239,8 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
     def seed(
         self, world_count: int, *, generator: Randomness, device: str | torch.device = "cpu"
     ) -> tuple[Tensor, Tensor]:
-        """Return fresh worlds, of an equivariant rule with a head and a tail.
+        """Return fresh worlds: of an equivariant rule with a head and a tail, of one that divides
+        with one living particle, at the origin.
 
         Args:
             world_count: Worlds B.
@@ -231,6 +249,9 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         """
         x, s = super().seed(world_count, generator=generator, device=device)
         config = self.config
+        if config.division:
+            s[:, 0, LIFE] = 1.0
+            return torch.zeros_like(x), s
         if config.equivariant and config.seed_axis > 0.0:
             share = (
                 generator.uniform(1, dtype=x.dtype)
@@ -251,6 +272,14 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         code = self._code.to(s).expand(*s.shape[:2], -1)
         return torch.cat((code, s[..., len(self._code) :]), dim=-1)
 
+    def damage(self, x: Tensor, s: Tensor, generator: Randomness) -> tuple[Tensor, Tensor]:
+        """Return the worlds damaged; what is erased of one that divides is dead, but never all."""
+        damaged_x, damaged_s = super().damage(x, s, generator)
+        if self.config.division:
+            left = living(damaged_s).any(dim=1)[:, None, None]
+            damaged_s = torch.where(left, damaged_s, s)
+        return damaged_x, damaged_s
+
     def picture(self, x: Tensor, s: Tensor, *, centred: bool = True) -> Tensor:
         """Return each world's picture: colour sums and density, dimensionless, shape [B, R, R, 4].
 
@@ -260,7 +289,21 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
             centred: Move each world's mean to the target's, and turn worlds of an equivariant rule,
                 as the loss does.
         """
-        return self._splat(self._placed(x, s) if centred else x, s[..., -3:] + COLOUR_OFFSET)
+        x, colour = self._placed(x, s) if centred else x, s[..., -3:] + COLOUR_OFFSET
+        if self.config.division:
+            return self._living_picture(x, s, colour)
+        return self._splat(x, colour)
+
+    def _living_picture(self, x: Tensor, s: Tensor, colour: Tensor) -> Tensor:
+        """Return pictures of the living, differentiable in their life."""
+        x, life = torch.where(living(s)[..., None], x, UNSEEN), s[..., LIFE : LIFE + 1]
+        life = life.detach() + self.config.division_weight * (life - life.detach())
+        picture = self._splat(x, colour * life)
+        if not life.requires_grad:
+            return picture
+        # Spots have no weights, so life is drawn once more as a colour: that is the density.
+        density = self._splat(x, life.expand_as(colour))[..., :1]
+        return torch.cat((picture[..., :3], density), dim=-1)
 
     def splat_errors(self, x: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
         """Return each pixel's density error and colour error, dimensionless, shape [B, R, R] each.
@@ -278,7 +321,8 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         They are the means of `splat_errors` over the pixels. Where no gradient is asked for, no
         picture is kept.
         """
-        if not (torch.is_grad_enabled() and (x.requires_grad or s.requires_grad)):
+        wanted = torch.is_grad_enabled() and (x.requires_grad or s.requires_grad)
+        if not (wanted or self.config.division):
             if self.config.equivariant:
                 x = turned(x, self.best_turn(x, s))
             return self._picture_losses(x, s)
@@ -313,7 +357,9 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
     def rule_shape(self) -> dict[str, Any]:
         """What `NPARule` takes besides the channels, the hidden width and ε0."""
         config = self.config
-        known = {"equivariant": True, "chiral": config.chiral} if config.equivariant else {}
+        known: dict[str, Any] = {"divides": True} if config.division else {}
+        if config.equivariant:
+            known |= {"equivariant": True, "chiral": config.chiral}
         return super().rule_shape | known
 
     def bounded(self, x: Tensor) -> Tensor:

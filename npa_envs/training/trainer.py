@@ -17,7 +17,7 @@ from npa_envs.devices import check_device
 from npa_envs.errors import NPAError, shown
 from npa_envs.files import write_text
 from npa_envs.rule.files import first_rules, load_rule, save_rule
-from npa_envs.rule.rule import NPARule, with_codes
+from npa_envs.rule.rule import NPARule, dividing, with_codes
 from npa_envs.tasks.base import GoalTask, Task, differing_fields
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.batch_picture import write_batch_picture
@@ -383,6 +383,8 @@ class Trainer:
 def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
     """Return the rule that a run starts from, with the configuration's `moment_inverse`.
 
+    Where particles divide, the rule may be one whose particles did not.
+
     An equivariant rule starts from random weights where the configuration names a first rule, which
     knows directions, as presets do. A rule with codes may start from one without.
 
@@ -403,6 +405,8 @@ def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
         rule = with_codes(rule, untrained)
     if rule.moment_inverse == "threshold":
         rule.moment_inverse = config.moment_inverse
+    if untrained.divides and not rule.divides:
+        rule = dividing(rule)
     wrong = differing_fields(rule, untrained)
     if wrong:
         raise NPAError(

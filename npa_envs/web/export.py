@@ -204,6 +204,11 @@ def check_browser_rule(rule: NPARule, name: str) -> None:
             f"a page runs rules without codes only, {shown(name)} has code_dim={rule.code_dim}: "
             "watch it with npa-envs view"
         )
+    if rule.divides:
+        raise NPAError(
+            f"a page runs rules whose particles stay as many as they are only, {shown(name)} "
+            "divides: watch it with npa-envs view"
+        )
     if not rule.is_plain():
         raise NPAError(
             f"a page runs rules of two plain layers only, {shown(name)} is a "

@@ -28,7 +28,8 @@ from npa_envs.training.run_folder import JsonlLog, RunFolder
 from npa_envs.training.trained_tasks import TrainedTask, task_of_rule
 from npa_envs.web.colouring import Colouring, Seen, shows_of
 from npa_envs.web.live import Frame, Live, Range, Touch, brushed, checked_seed
-from npa_envs.world.brushes import inside_ball, removed
+from npa_envs.world.brushes import erase_state, inside_ball, removed
+from npa_envs.world.division import living
 from npa_envs.world.rollout import rollout
 from npa_envs.world.species import AGREEMENTS, rollout_species
 
@@ -163,6 +164,10 @@ class RuleWorld(Live):
         tools = ["erase", "push", "clump", "cut", "inject", "graft", "add"]
         if self.main.rule.static:
             tools.remove("add")
+        if self.main.rule.divides:
+            # A rule that divides lives alone, and fills its world by itself.
+            tools.remove("graft")
+            tools.remove("add")
         return {
             "type": "world",
             "title": self._title(),
@@ -200,6 +205,8 @@ class RuleWorld(Live):
         try:
             other = self._organism(name).rule
         except NPAError:
+            return False
+        if other.divides or self.main.rule.divides:
             return False
         return all(getattr(other, what) == getattr(self.main.rule, what) for what in AGREEMENTS)
 
@@ -292,13 +299,19 @@ class RuleWorld(Live):
 
     def frame(self) -> Frame:
         """Return what is seen now."""
+        x, s, travelled, updated = self.x, self.s, self._travelled, self._updated
+        counts = self.counts
+        if self.main.rule.divides:
+            alive = living(s)[0]
+            x, s, counts = x[:, alive], s[:, alive], [int(alive.sum())]
+            travelled = None if travelled is None else travelled[:, alive]
+            updated = None if updated is None else updated[:, alive]
         seen = Seen(
-            self.x, self.s, self._own_colours, self.eps, self.task.box, self.counts, self.full,
-            self._travelled, self._updated,
-        )  # fmt: skip
+            x, s, self._own_colours, self.eps, self.task.box, counts, self.full, travelled, updated
+        )
         with torch.no_grad():
             colours = self._colouring(self.show, seen)
-        positions: NDArray[np.float32] = self.x[0].cpu().numpy()
+        positions: NDArray[np.float32] = x[0].cpu().numpy()
         alone = len(self.organisms) == 1 and positions.size and self._loss_offered()
         loss = self._loss(self._metric) if alone else None
         return Frame(self.step, positions, colours, self._milliseconds, loss)
@@ -306,6 +319,8 @@ class RuleWorld(Live):
     def _own_colours(self, s: Tensor) -> Tensor:
         if isinstance(self.task, PointClassification):
             return class_colours(self.task.outputs(s))
+        if self.main.rule.divides:
+            return self.main.rule.colour(s)
         parts = zip(self.organisms, s.split_with_sizes(self.counts, dim=1), strict=True)
         return torch.cat([organism.rule.colour(part) for organism, part in parts], dim=1)
 
@@ -326,6 +341,8 @@ class RuleWorld(Live):
         touch = Touch.read(message, self.x)
         before = [organism.name for organism in self.organisms]
         match touch.tool:
+            case "erase" if self.main.rule.divides:
+                self.s = erase_state(self.x, self.s, centre=touch.at, radius=touch.radius)
             case "erase":
                 gone = inside_ball(self.x, centre=touch.at, radius=touch.radius, box=self.task.box)
                 self._arrange(*removed(self.x, self.s, gone=gone), self._species()[~gone[0]])
@@ -363,7 +380,7 @@ class RuleWorld(Live):
         if not self._may_join(organism.name):
             raise NPAError(
                 f"{organism.name} cannot live in a world of {self.main.name}: rules of one world "
-                f"must agree in {', '.join(AGREEMENTS)}"
+                f"must agree in {', '.join(AGREEMENTS)}, and not divide"
             )
         return organism
 

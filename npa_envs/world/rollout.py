@@ -32,11 +32,18 @@ from npa_envs.ops.perceive import (
 )
 from npa_envs.ops.static import StaticRows, StaticWorlds, prepare_static, static_rows
 from npa_envs.ops.update import update_particles
-from npa_envs.rule.rule import Network, NPARule, check_rule
+from npa_envs.rule.rule import LIFE, Network, NPARule, check_rule
 from npa_envs.world.cuda_graph import Beside
 from npa_envs.world.divergence import DivergenceWatch, OnDivergence, make_watch
+from npa_envs.world.division import Births, divided, living, parked
 from npa_envs.world.prepared import PreparedSteps, may_prepare, run_prepared
-from npa_envs.world.randomness import Randomness, WorldRandom, check_generator
+from npa_envs.world.randomness import (
+    Randomness,
+    WorldRandom,
+    check_generator,
+    normal_draws,
+    uniform_draws,
+)
 from npa_envs.world.recorded import CudaGraph, Worlds, check_cuda_graph, rule_form, run_call
 
 Memory = Literal["store", "recompute", "minimal"]
@@ -229,6 +236,8 @@ class Draws(NamedTuple):
     """Position noise [length units], shape [B, N, D], or None."""
     rows: StaticRows | None = None
     """Rows of the active particles, where particles never move."""
+    births: Births | None = None
+    """What fates and children hang on, where particles divide."""
 
 
 class Step(Protocol):
@@ -245,6 +254,7 @@ class Step(Protocol):
         mask: Tensor | None,
         noise: Tensor | None,
         rows: StaticRows | None,
+        births: Births | None,
     ) -> Worlds:
         """Return the worlds after one step with these draws."""
 
@@ -288,6 +298,7 @@ class RuleStep(NamedTuple):
         mask: Tensor | None,
         noise: Tensor | None,
         rows: StaticRows | None,
+        births: Births | None,
     ) -> Worlds:
         """Return the worlds after one step with these draws."""
         rule, options = self.rule, self.options
@@ -335,6 +346,61 @@ class RuleStep(NamedTuple):
         return worlds if self.static is None else Worlds(*map(self.static.unsort, worlds))
 
 
+class DivisionStep(NamedTuple):
+    """The step of a rule whose particles divide: that of the living, and then their fates."""
+
+    step: RuleStep
+    """The step of the living."""
+
+    def draws(self, x: Tensor, steps: int, generator: Randomness | None) -> Iterator[Draws]:
+        """Draw each step's update mask, position noise, fates and directions of children."""
+        yield from drawn_steps(lambda: self._draw(x, generator), x, steps)
+
+    def _draw(self, x: Tensor, generator: Randomness | None) -> Draws:
+        drawn = draw_step(x, self.step.options, generator)
+        chance = uniform_draws(generator, x.shape[:2], x)
+        return drawn._replace(births=Births(chance, normal_draws(generator, x.shape, x)))
+
+    def advance(
+        self,
+        x: Tensor,
+        s: Tensor,
+        path_length: Tensor,
+        mask: Tensor | None,
+        noise: Tensor | None,
+        rows: StaticRows | None,
+        births: Births | None,
+    ) -> Worlds:
+        """Return the worlds after one step with these draws."""
+        assert births is not None, "drawn above"
+        eps = self.step.options.eps
+        alive = living(s)
+        updated = alive if mask is None else alive & mask.bool()
+        life, rest = s[..., : LIFE + 1], s[..., LIFE + 1 :]
+        # Life is no weight of what is perceived, so perception gives it no gradient.
+        perceived = torch.cat((life.detach(), rest), dim=-1)
+        after = self.step.advance(
+            parked(x, alive, eps), perceived, path_length, updated.byte(), noise, rows, None
+        )
+        # A rule does not change life.
+        new_s = torch.cat((life, after.s[..., LIFE + 1 :]), dim=-1)
+        return Worlds(
+            *divided(
+                after.x,
+                new_s,
+                after.path_length,
+                fates=self.step.rule.fates(new_s),
+                updated=updated,
+                births=births,
+                eps=eps,
+            )
+        )
+
+    def ordered(self, worlds: Worlds) -> Worlds:
+        """Return worlds of the rollout in the caller's order of particles."""
+        return worlds
+
+
 def run_steps(
     step: Step,
     worlds: Worlds,
@@ -370,7 +436,8 @@ def run_steps(
                     step.advance, *worlds, *draws, use_reentrant=False, preserve_rng_state=False
                 )
             else:
-                worlds = step.advance(*worlds, *draws)
+                mask, noise, rows, births = draws
+                worlds = step.advance(*worlds, mask, noise, rows, births)
             if watch is not None:
                 seen = step.ordered(Worlds(*(value.detach() for value in worlds)))
                 watch.look(seen.x, seen.s)
@@ -405,14 +472,16 @@ class RolloutCall(NamedTuple):
         # Any other rule runs as the module that it is.
         network = rule.network()
         static = _prepare_static(rule, worlds.x, self.steps, self.options)
-        if network is not None and static is None and watch is None and may_prepare(worlds):
+        preparable = network is not None and static is None and not rule.divides
+        if network is not None and preparable and watch is None and may_prepare(worlds):
             prepared = self._run_prepared(rule, network, worlds, generator)
             if prepared is not None:
                 return prepared
         if static is not None:
             worlds = Worlds(*map(static.sort, worlds))
+        own = RuleStep(rule, network, self.options, static)
         return run_steps(
-            RuleStep(rule, network, self.options, static),
+            DivisionStep(own) if rule.divides else own,
             worlds,
             self.steps,
             generator=generator,
@@ -432,7 +501,7 @@ class RolloutCall(NamedTuple):
 
         def advance(network: Network, worlds: Worlds, mask: Tensor | None) -> Worlds:
             step = RuleStep(rule, network, options)
-            return step.advance(*worlds, mask, None, None)
+            return step.advance(*worlds, mask, None, None, None)
 
         def make() -> PreparedSteps:
             widths = network.row_width, network.update_width
@@ -589,6 +658,9 @@ def rollout(
     m = 1 and updates them: x ← x + m dt Δx (+ noise), s ← s + m dt Δs, with
     Δx = alpha eps δ / (1 + |δ|) and [δ ; Δs] = rule(z) (arXiv 2601.16096, section 3).
 
+    With a rule that `divides`, particle i is slot i, whose particle may die and be replaced by
+    another one's child (`npa_envs.world.division`).
+
     Args:
         rule: The rule; dtype and device of x.
         x: Particle positions [length units], shape [B, N, D].
@@ -645,6 +717,11 @@ def rollout(
         rule, x, s, eps, box, update_prob, dt, position_noise, detach_positions
     )
     check_generator(generator, x.device, x.shape[0])
+    if rule.divides and options.box is not None:
+        raise NPAError(
+            f"box must be None where particles divide, got {shown(box)}: the dead need a place far "
+            "from all others"
+        )
     after = run_call(
         RolloutCall(steps, options, memory, kept),
         (rule,),

@@ -17,6 +17,7 @@ from npa_envs.ops.static import StaticRows
 from npa_envs.ops.update import update_particles
 from npa_envs.rule.rule import Network, NPARule
 from npa_envs.world.divergence import DivergenceWatch, OnDivergence, make_watch
+from npa_envs.world.division import Births
 from npa_envs.world.randomness import Randomness, WorldRandom, check_generator
 from npa_envs.world.recorded import CudaGraph, Worlds, check_cuda_graph, run_call
 from npa_envs.world.rollout import (
@@ -287,6 +288,11 @@ def _check_agreement(rules: list[NPARule], species_count: int, perception: str) 
         )
     expected = 0 if perception == "shared" else species_count
     for number, rule in enumerate(rules):
+        if rule.divides:
+            raise NPAError(
+                f"rules of several species must not divide, got divides=True for rule {number}: "
+                "run it alone with npa_envs.rollout"
+            )
         for name in AGREEMENTS:
             first, other = getattr(rules[0], name), getattr(rule, name)
             if first != other:
@@ -366,7 +372,7 @@ class Community(NamedTuple):
             yield self._draw(x, generator)
 
     def _draw(self, x: Tensor, generator: Randomness | None) -> Draws:
-        mask, noise, _ = draw_step(x, self.options, generator)
+        mask, noise, *_ = draw_step(x, self.options, generator)
         if self.keep is None:
             return Draws(mask, noise)
         if isinstance(generator, WorldRandom):
@@ -384,6 +390,7 @@ class Community(NamedTuple):
         mask: Tensor | None,
         noise: Tensor | None,
         rows: StaticRows | None,
+        births: Births | None,
     ) -> Worlds:
         """Advance checked worlds by one step whose random draws are given."""
         species, options = self.species, self.options

@@ -146,7 +146,7 @@ def write_ours(path: Path, change: Callable[[dict, dict], None]) -> None:
 
 
 BAD_HEADERS: dict[str, tuple[Callable[[dict, dict], Any], str]] = {
-    "unknown version": (lambda h, w: h.update(version="4"), "one of 1, 2, 3, got '4'.*upgrade"),
+    "unknown version": (lambda h, w: h.update(version="5"), "one of 1, 2, 3, 4, got '5'.*upgrade"),
     "another format": (lambda h, w: h.update(format="llama"), "format must be 'npa-envs rule'"),
     "no format": (lambda h, w: h.pop("format"), "format must be 'npa-envs rule', got None"),
     "a missing key": (lambda h, w: h.pop("alpha"), "lacks 'alpha'"),
@@ -433,6 +433,7 @@ def test_a_collection_gives_each_of_its_rules_back(tmp_path: Path, channels: int
         (NPARule(moment_inverse="smooth"), "moment_inverse='threshold' only"),
         (NPARule(species_count=2), "species_count=0 only"),
         (NPARule(equivariant=True), "equivariant=False only"),
+        (NPARule(divides=True), "divides=False only"),
     ],
 )
 def test_a_collection_refuses_rules_that_the_demo_would_run_as_others(tmp_path, rule, message):

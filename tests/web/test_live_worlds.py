@@ -15,11 +15,14 @@ import torch
 from npa_envs import NPAError, load_rule, rollout, rollout_species, save_rule
 from npa_envs.agents.policies import ZeroPolicy
 from npa_envs.rule.files import rule_metadata, shipped_rules
+from npa_envs.rule.rule import dividing
 from npa_envs.tasks.damage import DAMAGE_SIZES
+from npa_envs.training import config_to_dict, preset
 from npa_envs.web.colouring import Colouring, Seen, signed_colours, species_colours
 from npa_envs.web.environment_world import EnvironmentWorld, make_environment
 from npa_envs.web.rule_world import RuleWorld, RunWorld
 from npa_envs.web.server import frame_bytes
+from npa_envs.world.division import living
 
 CPU = torch.device("cpu")
 COUNT = 96
@@ -133,6 +136,33 @@ def test_a_world_without_particles_goes_on(world):
     world.handle(brush("add", rule="heart", radius=0.2))
     world.advance()
     assert world.describe()["species"] == ["heart"]
+
+
+def test_a_world_that_divides_shows_its_living_particles(tmp_path, device):
+    config = config_to_dict(preset("paper", division=True, particle_count=64))
+    told = {name: config[name] for name in config if name not in ("out", "device")}
+    save_rule(
+        dividing(load_rule("gecko")), path := tmp_path / "dividing.safetensors",
+        metadata={"task": "morphogenesis2d", "config": json.dumps(told)},
+    )  # fmt: skip
+    world = RuleWorld(str(path), device=device)
+    assert len(world.frame().positions) == 1
+    assert not {"graft", "add"} & set(world.describe()["tools"])
+    world.handle({"type": "set", "name": "speed", "value": 8})
+    for show in ("colours", "mask", "speed", "density", "components", "species", "state 3"):
+        world.handle({"type": "set", "name": "show", "value": show})
+        world.advance()
+        alive = living(world.s)[0]
+        frame = world.frame()
+        np.testing.assert_array_equal(frame.positions, world.x[0, alive].cpu().numpy())
+        assert frame.colours.shape == (int(alive.sum()), 3)
+    assert int(alive.sum()) == 64
+    world.handle(brush("erase", radius=9.0))
+    world.advance()
+    assert world.x.shape == (1, 64, 2)
+    assert len(world.frame().positions) == 0
+    with pytest.raises(NPAError, match="and not divide"):
+        world.handle(brush("graft", rule="gecko"))
 
 
 def test_push_carries_particles_along(world):

@@ -29,6 +29,8 @@ from npa_envs.measure.accuracy.scenes import (
 )
 from npa_envs.ops import perceive, perception_fields
 from npa_envs.rule.files import load_rule
+from npa_envs.rule.rule import LIFE, NPARule
+from npa_envs.world.division import living
 from npa_envs.world.rollout import rollout
 
 CROWD = {"quick": 2_000, "cpu": 20_000, "cuda": 1_000_000}
@@ -236,6 +238,9 @@ WORLD, PARTICLE = 1, 7
 
 WORLD_COUNT, PARTICLE_COUNT, STEPS = 3, 150, 8
 
+DEAD_STEPS = {"quick": 100, "whole": 10_000}
+"""Steps of worlds whose particles divide."""
+
 
 def values_checks() -> list[Check]:
     """Return the checks of the group `values`."""
@@ -249,6 +254,11 @@ def values_checks() -> list[Check]:
             "a channel that is infinite at one particle changes no bit of other channels, of "
             "particles that do not see it, and of other worlds",
             _run_infinite_channel,
+        ),
+        "dead": (
+            "what lies in the slots of dead particles, NaN as well, changes no bit; one particle "
+            "that divides fills its world, whose numbers stay finite",
+            _run_dead,
         ),
     }
     return [
@@ -334,6 +344,31 @@ def _run_infinite_channel(space_dim: int, session: Session) -> Finding:
         "touched_numbers": float((~z.isfinite()).sum()),
     }
     return Finding(figures, dict.fromkeys(list(figures)[:3], 0.0))
+
+
+@torch.no_grad()
+def _run_dead(space_dim: int, session: Session) -> Finding:
+    torch.manual_seed(session.seed)
+    rule = NPARule(space_dim, STATE_DIM, eps0=EPS, divides=True).to(session.device)
+    x, s = _worlds(session, space_dim, STATE_DIM)
+    x, s = torch.zeros_like(x), torch.zeros_like(s)
+    s[:, 0, LIFE] = 1.0
+    other_x, other_s = _worlds(session, space_dim, STATE_DIM)
+    other_s[:] = math.nan
+    other_x[:, 0], other_s[:, 0] = x[:, 0], s[:, 0]
+    steps = DEAD_STEPS["quick" if session.quick else "whole"]
+    clean, filled = (
+        rollout(rule, *worlds, steps, generator=session.generator())
+        for worlds in ((x, s), (other_x, other_s))
+    )
+    figures = {
+        "x": differing(filled[0], clean[0]),
+        "s": differing(filled[1], clean[1]),
+        "not_finite": float(sum((~part.isfinite()).sum() for part in clean)),
+        "empty_slots": float((~living(clean[1])).sum(dim=1).max()),
+    }
+    # A few die at any time.
+    return Finding(figures, {"x": 0.0, "s": 0.0, "not_finite": 0.0, "empty_slots": 5.0})
 
 
 def _run_gradient(session: Session) -> Finding:

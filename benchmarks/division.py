@@ -1,0 +1,102 @@
+"""Rules whose particles divide, from one particle on, beside plain rules that begin with a disk.
+
+`measure` runs rules on seeds that training never saw: losses and living particles over the steps,
+and then after half of the particles are taken away, each second one or those on one side.
+
+    python benchmarks/division.py OUT.json RULE [RULE ...] [--device cuda]
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import npa_envs
+from npa_envs.measure.record import machine, write_record
+from npa_envs.rule.files import rule_metadata
+from npa_envs.tasks.base import PictureTask
+from npa_envs.training.trained_tasks import task_of_rule
+from npa_envs.world.division import living
+from npa_envs.world.randomness import WorldRandom
+
+SEEDS = tuple(range(1000, 1008))
+"""Seeds of the worlds that rules are measured on."""
+
+STEPS = (16, 32, 64, 128, 256, 512)
+"""Steps at which they are measured."""
+
+AFTER = (32, 64, 128, 256)
+"""Steps after half of the particles are gone."""
+
+
+def row(task: PictureTask, x: Tensor, s: Tensor, divides: bool) -> dict[str, list[float]]:
+    """Return the loss of each world and how many particles live in it."""
+    alive = living(s).sum(dim=1) if divides else torch.full((len(x),), x.shape[1])
+    return {"loss": task.metric(x, s).tolist(), "living": alive.tolist()}
+
+
+@torch.no_grad()
+def measured(path: Path, device: torch.device) -> dict[str, Any]:
+    """Return what is found of one rule."""
+    rule = npa_envs.load_rule(path, device=device).float()
+    task = task_of_rule(str(path), rule, device).task
+    random = WorldRandom(SEEDS, device=device)
+
+    def run(x: Tensor, s: Tensor, steps: int) -> tuple[Tensor, Tensor]:
+        return npa_envs.rollout(
+            rule, x, s, steps, eps=task.eps, update_prob=task.update_prob, generator=random
+        )
+
+    x, s = task.seed(len(SEEDS), generator=random, device=device)
+    found: dict[str, Any] = {"iteration": int(rule_metadata(path)["iteration"]), "grown": {}}
+    done = 0
+    for steps in STEPS:
+        x, s = run(x, s, steps - done)
+        done = steps
+        found["grown"][steps] = row(task, x, s, rule.divides)
+    if not rule.divides:
+        return found
+    alive = living(s)
+    right = x[..., 0].masked_fill(~alive, -torch.inf)
+    side = right >= right.quantile(1.0 - 0.5 * alive.float().mean().item(), dim=1, keepdim=True)
+    second = alive & (alive.cumsum(dim=1) % 2 == 0)
+    for name, gone in (("each second", second), ("one side", side & alive)):
+        y, u = x, torch.where(gone[..., None], 0.0, s)
+        found[name] = {0: row(task, y, u, True)}
+        done = 0
+        for steps in AFTER:
+            y, u = run(y, u, steps - done)
+            done = steps
+            found[name][steps] = row(task, y, u, True)
+    return found
+
+
+def main() -> None:
+    """Measure all rules."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("rules", type=Path, nargs="+")
+    parser.add_argument("--device", default="cpu")
+    arguments = parser.parse_args()
+    device = torch.device(arguments.device)
+    found = {}
+    for path in arguments.rules:
+        name = path.stem if path.stem != "rule" else path.resolve().parent.name
+        found[name] = measured(path, device)
+        for when, rows in found[name].items():
+            if isinstance(rows, dict):
+                means = {
+                    step: tuple(round(statistics.mean(each), 4) for each in values.values())
+                    for step, values in rows.items()
+                }
+                print(name, when, means, flush=True)
+        write_record(arguments.out, {"machine": machine(device), "rules": found})
+
+
+if __name__ == "__main__":
+    main()

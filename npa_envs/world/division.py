@@ -1,0 +1,136 @@
+"""Particles that divide and die: worlds of slots, living and dead, whose tensors keep their shape.
+
+The first state of a slot is its life: 1 where its particle lives, 0 where it is dead. Nothing here
+waits for the device.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from npa_envs.ops.mean import world_mean
+from npa_envs.rule.rule import LIFE
+
+FEWEST_OFFSPRING = 1e-3
+"""Expected offspring below which nothing is to be learned from life."""
+
+CHILD_DISTANCE = 0.5
+"""Root mean square distance of a child from its parent, in perception radii."""
+
+PARKING_DISTANCE = 65536.0
+"""Where the dead are parked: coordinates in perception radii."""
+
+PARKING_GAP = 2.5
+"""Distance between two of the dead, in perception radii: five cells, so each is in another one."""
+
+
+class Births(NamedTuple):
+    """What a step draws where particles divide."""
+
+    chance: Tensor
+    """Decides on each particle's fate, uniform in [0, 1), shape [B, N]."""
+    direction: Tensor
+    """Where a child goes, standard normal, shape [B, N, D]."""
+
+
+def living(s: Tensor) -> Tensor:
+    """Return which slots hold a living particle, bool, shape [B, N].
+
+    Args:
+        s: States of a world whose particles divide, dimensionless, shape [B, N, C].
+    """
+    return s[..., LIFE].detach() > 0.5
+
+
+def parked(x: Tensor, alive: Tensor, eps: float) -> Tensor:
+    """Return positions with the dead far away, out of reach of all others and of each other.
+
+    Args:
+        x: Positions [length units], shape [B, N, D].
+        alive: Which slots hold a living particle, bool, shape [B, N].
+        eps: Perception radius [length units].
+    """
+    count, space_dim = x.shape[1:]
+    side = 1
+    while side**space_dim < count:
+        side *= 2
+    slot = torch.arange(count, device=x.device)
+    place = torch.stack([slot // side**d % side for d in range(space_dim)], dim=-1)
+    far = eps * (PARKING_DISTANCE + PARKING_GAP * place.to(x.dtype))
+    return torch.where(alive[..., None], x, far)
+
+
+def divided(
+    x: Tensor,
+    s: Tensor,
+    path_length: Tensor,
+    *,
+    fates: tuple[Tensor, Tensor],
+    updated: Tensor,
+    births: Births,
+    eps: float,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Let updated particles divide, stay or die; differentiable.
+
+    A child takes its parent's position and state, and moves a little. The k-th child of a world
+    takes its k-th dead slot; where there are more children than slots, the last are not born. The
+    last living particle of a world does not die. Dead slots get states of 0, and the mean position
+    of the living, so that means over all slots are those of the living.
+
+    Fates are discrete. What is differentiable is life: its value stays 1, and at each update it is
+    multiplied by m / m', with m = 1 + p - d the expected number of particles that come of one, p
+    and d its probabilities to divide and to die, and m' the same without gradient. Children inherit
+    it. So the gradient of a sum over the living, weighted by life, is on average that of its
+    expected value, as long as particles do not feel each other.
+
+    Args:
+        x: Positions after the update [length units], shape [B, N, D].
+        s: States after it, dimensionless, shape [B, N, C].
+        path_length: How far each particle travelled [length units], shape [B, N]; of children 0.
+        fates: Probabilities of each particle to divide and to die, shape [B, N] each.
+        updated: Which living particles were updated, bool, shape [B, N].
+        births: What was drawn.
+        eps: Perception radius [length units].
+
+    Returns:
+        Positions, states and path lengths.
+    """
+    count, space_dim = x.shape[1:]
+    alive = living(s)
+    divide, die = fates
+    dividing = updated & (births.chance < divide.detach())
+    dying = updated & (births.chance >= 1.0 - die.detach())
+    dying &= (alive & ~dying).any(dim=1, keepdim=True)
+
+    # The k-th child of a world has rank k - 1, and so has the k-th dead slot.
+    children, slots = dividing.sum(dim=1, keepdim=True), (~alive).sum(dim=1, keepdim=True)
+    child_rank, slot_rank = dividing.cumsum(dim=1) - 1, (~alive).cumsum(dim=1) - 1
+    parents = dividing & (child_rank < slots)
+    born = ~alive & (slot_rank < children)
+    own = torch.arange(count, device=x.device).expand_as(child_rank)
+    # Who has no child is written to an entry that nobody reads.
+    parent_of_rank = own.new_zeros(len(x), count + 1)
+    parent_of_rank.scatter_(1, torch.where(parents, child_rank, count), own)
+    source = torch.where(born, parent_of_rank.gather(1, slot_rank.clamp_min(0)), own)
+
+    room = parents | (children < slots)
+    offspring = (1.0 + torch.where(room, divide, 0.0) - die).clamp_min(FEWEST_OFFSPRING)
+    life = s[..., LIFE] * torch.where(updated, offspring / offspring.detach(), 1.0)
+    s = torch.cat((life[..., None], s[..., LIFE + 1 :]), dim=-1)
+    s = torch.where((alive & ~dying)[..., None], s, 0.0)
+    s = s.gather(1, source[..., None].expand_as(s))
+    move = CHILD_DISTANCE * eps / space_dim**0.5 * births.direction
+    x = x.gather(1, source[..., None].expand_as(x)) + torch.where(born[..., None], move, 0.0)
+    alive = (alive & ~dying) | born
+    return _dead_amidst(x, alive), s, torch.where(alive & ~born, path_length, 0.0)
+
+
+def _dead_amidst(x: Tensor, alive: Tensor) -> Tensor:
+    """Return positions with the dead at the mean of the living."""
+    share = alive[..., None].to(x.dtype)
+    # Where none lives, all are at the origin.
+    middle = world_mean(x * share) / world_mean(share).clamp_min(0.5 / x.shape[1])
+    return torch.where(alive[..., None], x, middle[:, None])

@@ -1,0 +1,102 @@
+"""2D morphogenesis of particles that divide: seeds, pictures of the living, damage, rules, runs."""
+
+import pytest
+import torch
+
+import npa_envs
+from npa_envs.errors import NPAError
+from npa_envs.rule.rule import LIFE
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
+from npa_envs.training import Trainer, preset
+from npa_envs.world.division import living
+
+SMALL = {"target": "ring", "target_point_count": 64, "particle_count": 64, "resolution": 32}
+
+
+def make_task(**fields):
+    return Morphogenesis2D(Morphogenesis2DConfig(**SMALL, **{"division": True, **fields}))
+
+
+def half_alive(task, seed=0):
+    """Worlds of the task with 32 living particles, the dead amidst them."""
+    x = task.places(2, torch.Generator().manual_seed(seed), torch.device("cpu"))
+    s = torch.rand(2, 64, task.config.state_dim, generator=torch.Generator().manual_seed(1)) - 0.5
+    s[:, :32, LIFE], s[:, 32:] = 1.0, 0.0
+    x[:, 32:] = x[:, :32].mean(dim=1, keepdim=True)
+    return x, s
+
+
+def test_seeds_are_one_living_particle():
+    x, s = make_task().seed(3, generator=torch.Generator().manual_seed(0))
+    assert x.shape == (3, 64, 2)
+    assert living(s).sum(dim=1).tolist() == [1, 1, 1]
+    assert s.sum() == 3.0
+
+
+def test_pictures_and_losses_are_those_of_the_living():
+    task = make_task()
+    alone = Morphogenesis2D(
+        Morphogenesis2DConfig(**SMALL | {"particle_count": 32}), target=task.target
+    )
+    x, s = half_alive(task)
+    wanted = alone.picture(x[:, :32], s[:, :32])
+    assert (task.picture(x, s) - wanted).abs().max() < 1e-5
+    metric = alone.metric(x[:, :32], s[:, :32])
+    assert (task.metric(x, s) - metric).abs().max() < 1e-5
+
+
+def test_pictures_change_with_life_as_if_particles_were_taken_away():
+    task = make_task(division_weight=0.5)
+    x, s = half_alive(task)
+    s.requires_grad_()
+    picture = task.picture(x, s, centred=False)
+    weights = torch.randn(picture.shape, generator=torch.Generator().manual_seed(2))
+    (gradient,) = torch.autograd.grad((weights * picture).sum(), s)
+    without = s.detach().clone()
+    without[0, 5] = 0.0
+    change = (weights * (picture - task.picture(x, without, centred=False))).sum().item()
+    # Pictures are linear in life, whose gradient is weighted.
+    assert abs(gradient[0, 5, LIFE].item() - 0.5 * change) < 1e-4
+
+
+def test_damage_never_takes_the_last_particle():
+    task = make_task(damage_radius=5.0)
+    x, s = half_alive(task)
+    after = task.damage(x, s, torch.Generator().manual_seed(0))
+    assert torch.equal(after[1], s)
+    local = make_task(damage_radius=0.1).damage(x, s, torch.Generator().manual_seed(0))[1]
+    assert 0 < int(living(local).sum()) < 64
+
+
+def test_division_refuses_what_it_does_not_go_with():
+    for field in ({"equivariant": True}, {"targets": ("ring", "heart")}):
+        with pytest.raises(NPAError, match="division goes neither with equivariant"):
+            make_task(**field)
+    with pytest.raises(NPAError, match="division_weight must be"):
+        make_task(division_weight=-1.0)
+
+
+def test_a_run_trains_resumes_and_leaves_a_rule_that_divides(tmp_path):
+    fields = {
+        "division": True, "particle_count": 32, "target_point_count": 32, "iterations": 4,
+        "steps": (8, 9), "checkpoint_interval": 2, "picture_interval": 0, "tensorboard": False,
+    }  # fmt: skip
+    rules = []
+    for name, stops in (("whole", (4,)), ("resumed", (2, 4))):
+        config = preset("tiny", "morphogenesis2d", **fields, out=tmp_path / name)
+        for stop in stops:
+            trainer = Trainer(
+                Morphogenesis2D(config.task),
+                config,
+                task_name="morphogenesis2d",
+                resume=stop > stops[0],
+            )
+            while trainer.iteration < stop:
+                trainer.iterate()
+            trainer.save()
+        rules.append(npa_envs.load_rule(tmp_path / name / "rule.safetensors"))
+    first, second = rules
+    assert first.divides
+    assert first.hyper_parameters() == second.hyper_parameters()
+    assert all(map(torch.equal, first.state_dict().values(), second.state_dict().values()))
+    assert first.fate.weight.abs().max() > 0.0
