@@ -41,7 +41,9 @@ BY_ID = {registration.id: registration for registration in ENVIRONMENTS}
 
 def small(name):
     """Keywords that make an environment small, by its name."""
-    return {k: v for k, v in SMALL.items() if k != "resolution" or name not in NO_PICTURE}
+    # Pictures take a second each to draw.
+    few = {"targets": ("heart", "gecko")} if name == "Pictures2D" else {}
+    return few | {k: v for k, v in SMALL.items() if k != "resolution" or name not in NO_PICTURE}
 
 
 def code_blocks(path: Path) -> list[str]:
