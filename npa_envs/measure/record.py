@@ -127,8 +127,10 @@ def script_parser(description: str | None) -> argparse.ArgumentParser:
 
 def script_facts(arguments: argparse.Namespace) -> dict[str, str]:
     """Return what the record of a script begins with, for arguments of `script_parser`."""
+    # Records are not to tell where on which machine they were written.
+    words = ["OUT" if word == str(arguments.output) else word for word in sys.argv]
     return {
-        "command": " ".join(["python", *sys.argv]),
+        "command": " ".join(["python", *words]),
         "commit": arguments.commit or current_commit(),
         "date": date.today().isoformat(),
         "machine": machine(torch.device(arguments.device)),

@@ -1,6 +1,7 @@
 """The measured numbers of the pages are those of the files that they come from, rounded."""
 
 import json
+import math
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -221,16 +222,25 @@ def test_the_table_of_small_environments_has_the_speeds_of_its_file() -> None:
 SMALL_WORLDS = content(RESULTS / "small_sizes_cpu.json")["rows"]
 
 
+def returns(env_id: str, method: str) -> list[float]:
+    """Returns of a small world, a run each."""
+    runs = [row for row in SMALL_WORLDS if (row["id"], row["method"]) == (env_id, method)]
+    return [row["return"] for row in runs if "return" in row]
+
+
+def other_ppo(env_id: str) -> str:
+    """Form of Stable-Baselines3's PPO that is told of a small world."""
+    return "ppo_particles" if "PointClassification" in env_id else "ppo_world"
+
+
 def estimates(env_id: str) -> list[tuple[float, float] | None]:
     """Means and standard errors of a small world's returns, as the table has them; None: not run.
 
     They are of random and scripted policies, the library's PPO, and Stable-Baselines3's.
     """
-    other = "ppo_particles" if "PointClassification" in env_id else "ppo_world"
     found: list[tuple[float, float] | None] = []
-    for method in ("random", "scripted", "ppo", other):
-        runs = [row for row in SMALL_WORLDS if (row["id"], row["method"]) == (env_id, method)]
-        values = [row["return"] for row in runs if "return" in row]
+    for method in ("random", "scripted", "ppo", other_ppo(env_id)):
+        values = returns(env_id, method)
         error = stdev(values) / len(values) ** 0.5 if len(values) > 1 else 0.0
         found.append((mean(values), error) if values else None)
     return found
@@ -246,3 +256,16 @@ def test_the_table_of_small_worlds_has_the_numbers_of_its_file() -> None:
             cell = "" if found is None else f"{found[0]:.3f}".replace("-", "−")
             cells.append(cell + (f" ± {found[1]:.3f}" if found and found[1] > 5e-4 else ""))
         assert line.split(" | ") == cells, env_id
+
+
+@pytest.mark.parametrize("env_id", sorted({row["id"] for row in SMALL_WORLDS}))
+def test_ppo_is_above_what_learns_nothing_in_small_worlds_by_three_standard_errors(
+    env_id: str,
+) -> None:
+    assert len(returns(env_id, "ppo")) == len(returns(env_id, other_ppo(env_id))) == 3
+    random, scripted, *both = estimates(env_id)
+    floors = [(0.0, 0.0), *filter(None, (random, scripted))]
+    for ppo in both:
+        assert ppo is not None
+        for floor in floors:
+            assert ppo[0] - floor[0] > 3.0 * math.hypot(ppo[1], floor[1])
