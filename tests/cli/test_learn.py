@@ -1,10 +1,17 @@
 """`npa-envs learn`: a run that is kept, and goes on; by one process and by two."""
 
 import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
 
 import pytest
 
 from npa_envs.cli import main
+from npa_envs.training.checkpoint import load_checkpoint
 
 WORDS = [
     "learn",
@@ -39,6 +46,42 @@ def test_a_run_begins_and_goes_on_with_the_same_words(tmp_path, capsys):
 def test_two_processes_share_a_run(tmp_path, capfd):
     assert learned(tmp_path, 2, "--processes", "2") == (0, [0, 1, 2])
     assert capfd.readouterr().out.count("return") == 3
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs Linux's /proc")
+def test_a_killed_process_ends_a_run_and_a_signal_stops_it(tmp_path):
+    words = [*WORDS, "--particle-steps", "1e9", "--seconds", "60", "--entries", "60"]
+    words += ["--out", str(tmp_path), "--processes", "2", "--resume", "auto"]
+
+    def begun(points):
+        run = subprocess.Popen(
+            [sys.executable, "-m", "npa_envs", *words],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        end = time.monotonic() + 60
+        log = tmp_path / "log.jsonl"
+        while not log.exists() or len(log.read_text().splitlines()) < points:
+            assert run.poll() is None, run.stdout.read()
+            assert time.monotonic() < end
+            time.sleep(0.05)
+        return run
+
+    run = begun(2)
+    workers = Path(f"/proc/{run.pid}/task/{run.pid}/children").read_text().split()
+    os.kill(int(workers[1]), signal.SIGKILL)
+    said, _ = run.communicate(timeout=60)
+    assert run.returncode == 2
+    assert "process 1 of 2 was ended by SIGKILL" in said
+    done = load_checkpoint(tmp_path / "checkpoint.pt")["iteration"]
+    run = begun(len((tmp_path / "log.jsonl").read_text().splitlines()) + 1)
+    run.terminate()
+    said, _ = run.communicate(timeout=60)
+    assert run.returncode == 130
+    assert "stopped; the same words with --resume go on" in said
+    assert load_checkpoint(tmp_path / "checkpoint.pt")["iteration"] > done > 0
 
 
 @pytest.mark.parametrize(
