@@ -36,6 +36,9 @@ IMAGE = Path(__file__).resolve().parents[1] / "docs" / "images" / "search_growth
 FRESH_SEEDS = (1_000_000, 1_000_001)
 """Worlds that no search saw."""
 
+GOOD = 0.05
+"""Elites of at least this quality are counted besides."""
+
 CURVES = {"qd_score": "QD score", "coverage": "coverage", "best": "best quality"}
 
 COLOURS = {"map-elites": "C0", "cma-me": "C1", "cma-es": "C2", "random": "C7"}
@@ -68,6 +71,7 @@ def run(arguments: Any) -> None:
                 {
                     "seed": seed,
                     "growth": [list(step) for step in search.growth],
+                    "qualities": [elite.found.quality for elite in search.elites()],
                     "fresh_worlds": list(again),
                 }
             )
@@ -91,7 +95,6 @@ def draw(arguments: Any) -> None:
     for panel, (name, label) in zip(panels[0], CURVES.items(), strict=True):
         column = Growth._fields.index(name)
         for method, done in runs.items():
-            # Methods of unequal seeds, where a run was stopped, are shown as far as all go.
             curves: NDArray[np.float64] = np.array([one["growth"] for one in done])
             bands = [interval(values) for values in curves[:, :, column].T.tolist()]
             lines = tuple(zip(*bands, strict=True))
@@ -101,16 +104,27 @@ def draw(arguments: Any) -> None:
     write_bytes(IMAGE, png(figure))
     rows = []
     for method, done in runs.items():
+        figures = [figures_of(one) for one in done]
         cells = []
-        for key in ("growth", "fresh_worlds"):
-            ends = [one[key][-1] if key == "growth" else one[key] for one in done]
-            for name in CURVES:
-                values = [end[Growth._fields.index(name)] for end in ends]
-                low, middle, high = interval(values)
-                cells.append(f"{middle:.3f} ({low:.3f} to {high:.3f})")
-        rows.append([method, str(len(done)), *cells])
-    heads = ["method", "seeds", *CURVES.values(), *(f"fresh: {name}" for name in CURVES.values())]
-    print(markdown_table(heads, rows))
+        for name in figures[0]:
+            low, middle, high = interval([own[name] for own in figures])
+            cells.append(f"{middle:.3g} ({low:.3g} to {high:.3g})")
+        rows.append([f"`{method}`", *cells])
+    print(markdown_table(["method", *figures[0]], rows))
+
+
+def figures_of(run: dict[str, Any]) -> dict[str, float]:
+    """Return what a search came to, by the table's headings."""
+    grown, fresh = Growth(*run["growth"][-1]), Growth(*run["fresh_worlds"])
+    good = sum(quality >= GOOD for quality in run["qualities"])
+    return {
+        "QD score": grown.qd_score,
+        "coverage": grown.coverage,
+        f"coverage, quality at least {GOOD}": grown.coverage * good / len(run["qualities"]),
+        "best quality": grown.best,
+        "QD score, fresh worlds": fresh.qd_score,
+        "coverage, fresh worlds": fresh.coverage,
+    }
 
 
 def main() -> None:

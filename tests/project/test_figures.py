@@ -219,6 +219,23 @@ def test_the_table_of_small_environments_has_the_speeds_of_its_file() -> None:
     assert {env_id: line.split(" | ") for env_id, line in told.items()} == measured
 
 
+def search_figures(run: dict[str, Any]) -> list[float]:
+    """What a search came to, in the order of the table."""
+    _, qd_score, coverage, best = run["growth"][-1]
+    good = sum(quality >= 0.05 for quality in run["qualities"]) / 400
+    return [qd_score, coverage, good, best, *run["fresh_worlds"][1:3]]
+
+
+def test_the_table_of_searches_has_the_numbers_of_its_file() -> None:
+    text = (ROOT / "docs" / "search.md").read_text(encoding="utf-8")
+    runs = content(RESULTS / "search_cpu.json")["runs"]
+    assert {len(done) for done in runs.values()} == {5}
+    for method, done in runs.items():
+        (row,) = re.findall(rf"^\| `{method}` \| (\d.*) \|$", text, re.MULTILINE)
+        columns = zip(*map(search_figures, done), strict=True)
+        assert differences(row, rf"({NUMBER}) \(", [mean(column) for column in columns]) == []
+
+
 SMALL_WORLDS = content(RESULTS / "small_sizes_cpu.json")["rows"]
 
 
