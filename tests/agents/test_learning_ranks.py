@@ -7,6 +7,7 @@ import signal
 
 import pytest
 import torch
+import torch.distributed as dist
 from learning_problems import heart, species
 from processes import on_ranks
 
@@ -74,9 +75,9 @@ def learned(form):
 
 
 @pytest.fixture(scope="module", autouse=True)
-def loaded_kernels():
+def loaded_kernels(device):
     """Load once what each forked process would have to load by itself."""
-    for form in QUICK:
+    for form in QUICK if device.type == "cpu" else ():
         learned(form)
 
 
@@ -223,3 +224,30 @@ def test_what_cannot_be_shared_is_refused(tmp_path):
         assert "method 'evolution' cannot be shared by processes: take one of ppo, shac" in told
     for told in on_ranks(2, uneven, tmp_path):
         assert "worlds must be a multiple of the number of processes, got 3 and 2" in told
+
+
+def test_recorded_pieces_of_a_shared_round_are_those_of_kernels_one_by_one(
+    device, tmp_path, monkeypatch
+):
+    if device.type != "cuda":
+        pytest.skip("rounds are recorded on CUDA only")
+    store = dist.FileStore(str(tmp_path / "store"), 1)
+    dist.init_process_group("cpu:gloo,cuda:nccl", store=store, rank=0, world_size=1)
+
+    def rounds():
+        how = ppo.PPOOptions(steps=4, minibatches=2)
+        made = ppo.Learner(HEART, how, 0, device, None, Ranks.current())
+        # The third call of what is recorded is the first replay that nothing was recorded in.
+        for share_left in (1.0, 0.8, 0.6, 0.4):
+            batch = made.play()
+            made.improve(share_left)
+        return [*batch, *made.actor.parameters(), *made.critic.parameters()]
+
+    try:
+        recorded = rounds()
+        monkeypatch.setattr(ppo, "Replayed", lambda function, *_, **__: function)
+        for value, wanted in zip(recorded, rounds(), strict=True):
+            assert float(wanted.detach().norm()) > 0.0
+            torch.testing.assert_close(value, wanted, rtol=1e-3, atol=1e-5)
+    finally:
+        dist.destroy_process_group()
