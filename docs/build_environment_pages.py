@@ -36,7 +36,8 @@ from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.single import NPAEnv
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.envs.garden.environments import GardenEnv
-from npa_envs.registration import ENVIRONMENTS, GARDENS, LATER, SIZES, SMALL, Registration
+from npa_envs.envs.garden.worlds import LivingWorlds
+from npa_envs.registration import CODED, ENVIRONMENTS, GARDENS, LATER, SIZES, SMALL, Registration
 
 DOCS = Path(__file__).resolve().parent
 PAGES = DOCS / "environments"
@@ -69,10 +70,12 @@ def resolved_sections(env_class: type) -> dict[str, str]:
     first = sections(environment_class(ENVIRONMENTS[0]))
     shared = sections(NPAEnv)
     order = [name for name in (first | shared) if name]
-    if issubclass(env_class, GardenEnv):
-        # Living worlds pay otherwise; all else that they do not say is said of all environments.
-        del shared["Reward"]
-        first, shared = {}, shared | sections(GardenEnv)
+    if issubclass(env_class.worlds_type, LivingWorlds):
+        # They pay and tell otherwise; all else that they do not say is said of all environments.
+        del shared["Reward"], shared["Info"]
+        first = {}
+        if issubclass(env_class, GardenEnv):
+            shared |= sections(GardenEnv)
     found = {"": own[""]}
     for heading in order:
         parts = own.get(heading) or first.get(heading), shared.get(heading)
@@ -170,7 +173,7 @@ def page(registration: Registration) -> str:
     spaces = {"Observation space": form.observation_space, "Action space": form.action_space}
     letters = {"C": config.state_dim, "D": task.space_dim, "N": count}
     text = resolved_sections(env_class)
-    if not issubclass(env_class, GardenEnv):
+    if not issubclass(env_class.worlds_type, LivingWorlds):
         for heading, space in spaces.items():
             text[heading] = numbered_columns(text[heading], letters, space.shape[1])
     text["Arguments"] += "\n\n" + argument_tables(task.config_type)
@@ -200,7 +203,7 @@ def picture(registration: Registration) -> str:
 def index() -> str:
     """Return the list of the pages, Markdown."""
     rows: list[tuple[str, ...]] = []
-    for registration in (*ENVIRONMENTS, *GARDENS):
+    for registration in (*ENVIRONMENTS, *GARDENS, *CODED):
         text = sections(environment_class(registration))[""]
         rows.append((f"[`{registration.id}`]({registration.name}.md)", text))
     opening = (
@@ -216,7 +219,7 @@ def index() -> str:
 
 def pages() -> dict[str, str]:
     """Return all pages by their file names."""
-    listed = (*ENVIRONMENTS, *GARDENS)
+    listed = (*ENVIRONMENTS, *GARDENS, *CODED)
     made = {f"{registration.name}.md": page(registration) for registration in listed}
     made[f"{gardeners_page.NAME}.md"] = gardeners_page.page()
     return made | species_pages.pages() | {"README.md": index()}

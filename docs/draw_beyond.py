@@ -3,6 +3,7 @@
     python docs/draw_beyond.py directions PLAIN EQUIVARIANT    # files of rules
     python docs/draw_beyond.py sizes TRAINED VARIED
     python docs/draw_beyond.py division RULE
+    python docs/draw_beyond.py pictures MANY
 
 It takes a minute on a CPU.
 """
@@ -11,6 +12,7 @@ from __future__ import annotations
 
 import math
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +41,11 @@ GROWTH = (4, 8, 12, 16, 24, 32, 64, 128)
 HEALING = 64
 """Steps after half of their particles are gone."""
 
+COLUMNS = 5
+"""Pictures in a row."""
+
+BECOMES, AFTER_SWITCH, BLENDS = "butterfly", (0, 16, 32, 64, 128), (0.0, 0.25, 0.5, 0.75, 1.0)
+
 Shots = list[tuple[str, NDArray[np.uint8]]]
 
 
@@ -64,7 +71,12 @@ def task_of(
 
 def as_it_lies(task: Morphogenesis2D, x: Tensor, s: Tensor) -> NDArray[np.uint8]:
     """Return a picture of a world that is neither moved nor turned."""
-    picture = to_uint8(task.picture(x, s, centred=False)[0])
+    return enlarged(task.picture(x, s, centred=False)[0])
+
+
+def enlarged(fields: Tensor) -> NDArray[np.uint8]:
+    """Return a picture, of rgb sums and density [R, R, 4], with pixels that can be seen."""
+    picture = to_uint8(fields)
     times = -(-SIDE // len(picture))
     return picture.repeat(times, axis=0).repeat(times, axis=1)
 
@@ -128,13 +140,40 @@ def division(paths: list[str]) -> Shots:
     return shots
 
 
+def pictures(paths: list[str]) -> Shots:
+    """Return targets, what their codes grow, a world whose code is switched, and blended codes."""
+    (path,) = paths
+    rule = npa_envs.load_rule(path)
+    assert rule.codes is not None, "a rule of many pictures"
+    names = rule.codes.names[:COLUMNS]
+    found = [task_of_rule(path, rule, CPU, target=name).task for name in names]
+    tasks = [task for task in found if isinstance(task, Morphogenesis2D)]
+    blank = tasks[0].seed(1, generator=torch.Generator().manual_seed(SEEDS[0]))
+    shots = [(f"{task.target.name}, target", enlarged(task.target_picture)) for task in tasks]
+    for task in tasks:
+        x, s = run(rule, task, blank[0], task.coded(blank[1]), GROWN, seed=SEEDS[0])
+        shots.append((f"grown, step {GROWN}", as_it_lies(task, x, s)))
+    first, task = names[0], tasks[0]
+    x, s = run(rule, task, *blank, GROWN, seed=SEEDS[0])
+    s = rule.with_code(s, rule.codes[BECOMES])
+    shots.append((f"{first} told {BECOMES}", as_it_lies(task, x, s)))
+    for before, after in pairwise(AFTER_SWITCH):
+        x, s = run(rule, task, x, s, after - before, seed=SEEDS[0] + after)
+        shots.append((f"{after} steps later", as_it_lies(task, x, s)))
+    for share in BLENDS:
+        code = rule.codes.blend({first: 1.0 - share, BECOMES: share})
+        x, s = run(rule, task, blank[0], rule.with_code(blank[1], code), GROWN, seed=SEEDS[0])
+        shots.append((f"{1.0 - share:g} {first} + {share:g} {BECOMES}", as_it_lies(task, x, s)))
+    return shots
+
+
 def main() -> None:
     """Draw what the command line asks for."""
     what, *rest = sys.argv[1:]
-    captions, frames = zip(
-        *{"directions": directions, "sizes": sizes, "division": division}[what](rest), strict=True
-    )
-    write_filmstrip(IMAGES / f"beyond_{what}.png", frames, captions, columns=5)
+    kinds = {"directions": directions, "sizes": sizes, "division": division, "pictures": pictures}
+    draw = kinds[what]
+    captions, frames = zip(*draw(rest), strict=True)
+    write_filmstrip(IMAGES / f"beyond_{what}.png", frames, captions, columns=COLUMNS)
 
 
 if __name__ == "__main__":

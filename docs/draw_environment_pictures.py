@@ -26,7 +26,8 @@ from npa_envs.agents.gardening import (
     ScriptedShepherd,
     StillGardener,
 )
-from npa_envs.registration import ENVIRONMENTS, GARDENS, Registration
+from npa_envs.agents.shapeshifting import RecognisingShapeshifter
+from npa_envs.registration import CODED, ENVIRONMENTS, GARDENS, Registration
 from npa_envs.render import write_filmstrip, write_webp
 
 PICTURE_SIZE = 192
@@ -53,6 +54,12 @@ class Film(NamedTuple):
 
     policies: tuple[Callable[[Any], Callable[[Any], Any]], ...] = (SpreadPolicy,)
     """What acts in each row where no rule does, made for its environment."""
+
+
+def sampling(env: Any) -> Callable[[Any], Any]:
+    """Return a policy that acts at random, the same at each run."""
+    env.action_space.seed(SEED)
+    return lambda _: env.action_space.sample()
 
 
 def film_steps(last: int) -> list[int]:
@@ -128,6 +135,14 @@ FILMS = {
         rule=None,
         policies=(ScriptedShepherd, ScriptedShepherd, ScriptedShepherd),
     ),
+    "Shapeshifter2D": Film(
+        steps=(0, 15, 31, 47, 63),
+        rows=({}, {}),
+        caption="`RecognisingShapeshifter` says the codes of the goals, which change every 16 "
+        "steps; below, one that acts at random.",
+        rule=None,
+        policies=(RecognisingShapeshifter, sampling),
+    ),
 }
 """By the names of the environments."""
 
@@ -174,7 +189,7 @@ def caption(keywords: dict[str, Any], step: int) -> str:
 
 def main(names: list[str]) -> None:
     """Draw the pictures and films of the environments, all of them if none is named."""
-    for registration in (*ENVIRONMENTS, *GARDENS):
+    for registration in (*ENVIRONMENTS, *GARDENS, *CODED):
         if names and registration.name not in names:
             continue
         film = FILMS[registration.name]

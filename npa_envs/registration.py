@@ -62,6 +62,11 @@ GARDENS = (
 )
 """Where a trained rule runs the particles, and an action says what few brushes do."""
 
+CODED = (
+    Registration("npa/Shapeshifter2D-v0", "npa_envs.envs.shapeshifter2d", "Shapeshifter2D", 64),
+)
+"""Where a trained rule of many pictures runs the particles, and an action is a code."""
+
 SMALL = (
     Registration(
         "npa/Gardener2DSmall-v0",
@@ -190,7 +195,7 @@ LATER = (
 )
 """Later versions, which begin otherwise than version 0; settings of both are never changed."""
 
-ALL = (*ENVIRONMENTS, *GARDENS, *SMALL, *SIZES, *LATER)
+ALL = (*ENVIRONMENTS, *GARDENS, *CODED, *SMALL, *SIZES, *LATER)
 """All that Gymnasium knows."""
 
 

@@ -76,10 +76,10 @@ def shipped_rules(task: str | None = None) -> dict[str, Path]:
 
 
 def first_rules() -> dict[str, Path]:
-    """Return the rules that runs of presets begin with: name -> file, sorted by name.
+    """Return the rules that runs of presets and environments begin with: name -> file, by name.
 
     The preset `best` of 2D morphogenesis begins with the shipped heart. Others have learned one
-    picture in small worlds, and are not shipped to be looked at.
+    picture in small worlds, or several (`seven-pictures`), and are not shipped to be looked at.
     """
     folder = Path(__file__).resolve().parent / "first"
     rules = {path.stem: path for path in sorted(folder.glob("*.safetensors"))}

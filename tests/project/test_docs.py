@@ -399,6 +399,17 @@ def test_the_code_about_the_search_runs():
     assert names["rule"].weight_count == len(names["best"].solution)
 
 
+def test_the_code_about_codes_runs():
+    block = code_blocks(DOCS / "beyond.md")[0]
+    names = {}
+    exec(compile(block, "beyond.md", "exec"), names)
+    codes, s, x = names["rule"].codes, names["s"], names["x"]
+    right = x[0, :, 0] > 0
+    assert 0 < int(right.sum()) < len(right)
+    assert (s[0, right][:, : codes.table.shape[1]] == codes["gecko"]).all()
+    assert (s[0, ~right][:, : codes.table.shape[1]] == names["half"]).all()
+
+
 def test_the_code_about_own_losses_runs(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (block,) = code_blocks(DOCS / "own_loss.md")

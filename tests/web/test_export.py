@@ -391,6 +391,7 @@ class OwnNetwork(NPARule):
     ("rule", "message"),
     [
         (OwnNetwork(), "two plain layers only, 'mine' is a OwnNetwork with a network of its own"),
+        (NPARule(code_dim=2, code_names=["a"]), "without codes only, 'mine' has code_dim=2"),
         (NPARule(species_count=2), "perceive all species alike, 'mine' has species_count=2"),
         (NPARule(hidden_dim=13000), "at most 1048576 weights, 'mine' has 1105000"),
     ],

@@ -1,0 +1,51 @@
+"""Scripted policies that choose codes of a rule of many pictures."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from npa_envs.agents.policies import unwrapped
+from npa_envs.envs.shapeshifter2d import ShapeshifterTask
+from npa_envs.errors import NPAError
+
+
+class RecognisingShapeshifter:
+    """Say the code of the picture that looks most like the goal; for arrays and tensors alike.
+
+    It knows which code grows which picture, and looks at the observation alone.
+
+    Args:
+        env: `npa/Shapeshifter2D-v0`, single or vector, with either form of actions.
+
+    Raises:
+        NPAError: It is another environment.
+    """
+
+    def __init__(self, env: Any) -> None:
+        inner = unwrapped(env)
+        task = inner.worlds.task
+        if not isinstance(task, ShapeshifterTask):
+            raise NPAError(
+                f"env must be one whose agent chooses codes, got {type(task).__name__}: make it "
+                "with gymnasium.make('npa/Shapeshifter2D-v0')"
+            )
+        self._chosen = task.config.actions == "choice"
+        self._actions = inner.form.actions_of_codes()
+        goals = torch.arange(len(task.codes), device=task.device)
+        x = torch.zeros(len(goals), 1, 2, device=task.device)
+        s = x.new_zeros(len(goals), 1, task.config.state_dim)
+        # What would be seen with each goal; the second half is of the goal.
+        seen = task.observe(x, s, x[:, 0, 0], goals[:, None].to(x))
+        self._goals = seen.chunk(2, dim=1)[1].cpu()
+
+    def __call__(self, observation: Any) -> Any:
+        """Return the action for what is seen, [8 G²], or those of B worlds, [B, 8 G²]."""
+        seen = torch.as_tensor(observation).cpu()
+        goal = seen.unflatten(-1, (2, -1))[..., 1, :]  # type: ignore[no-untyped-call]
+        away = (goal[..., None, :] - self._goals).square().sum(dim=-1)
+        number = away.argmin(dim=-1)
+        action = number if self._chosen else self._actions[number]
+        return action.to(observation.device) if isinstance(observation, Tensor) else action.numpy()

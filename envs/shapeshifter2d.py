@@ -1,0 +1,426 @@
+"""`npa/Shapeshifter2D-v0`: choose the code of a rule of many pictures as goals change."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar, Literal, Self, get_args
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from gymnasium.spaces import Box, Discrete, Space
+from torch import Tensor
+
+from npa_envs.envs.core.config import EnvConfig
+from npa_envs.envs.core.single import NPAEnv
+from npa_envs.envs.core.spaces import Rows, action_tensor, number_tensor
+from npa_envs.envs.core.task import EnvTask, Start
+from npa_envs.envs.core.vector import NPAVectorEnv
+from npa_envs.envs.garden.config import GardenReward
+from npa_envs.envs.garden.worlds import LivingWorlds
+from npa_envs.errors import NPAError
+from npa_envs.rule.codes import Codes
+from npa_envs.rule.files import load_rule
+from npa_envs.rule.rule import NPARule
+from npa_envs.tasks.checks import check_positive
+from npa_envs.tasks.many_pictures import ManyPictures
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
+from npa_envs.training.trained_tasks import sources_of_codes
+from npa_envs.world.actions import Physics
+from npa_envs.world.randomness import Purpose, WorldRandom
+from npa_envs.world.rollout import rollout
+
+SEEN_LIMIT = 8.0
+"""What is seen is clipped to plus and minus this (dimensionless)."""
+
+GOAL_COUNT = 8
+"""Goals of an episode, one after the other; longer ones begin again with the first."""
+
+Actions = Literal["code", "choice"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shapeshifter2DEnvConfig(EnvConfig):
+    """What worlds of a rule of many pictures can be told."""
+
+    words = EnvConfig.words | {"reward": get_args(GardenReward), "actions": get_args(Actions)}
+    task_config_type = Morphogenesis2DConfig
+
+    reward: GardenReward = "dense"
+    """"dense": how near the world is to the goal, in each step; "sparse": the same, in the last
+    step alone."""
+
+    episode_steps: int = 64
+    """As elsewhere; it equals the registered `max_episode_steps`."""
+
+    particle_count: int = 256
+    state_dim: int = 24
+    eps: float = 0.2
+    eps0: float = 0.2
+
+    rule: str = "seven-pictures"
+    """A rule of many pictures, by name or file; its pictures are the goals."""
+
+    actions: Actions = "code"
+    """Form of actions: "code", the numbers of a code; "choice", which of the rule's codes."""
+
+    rule_steps: int = 8
+    """Steps of the rule in one step of the environment."""
+
+    hold_steps: int = 16
+    """Steps of the environment after which the goal becomes another picture."""
+
+    grow_steps: int = 64
+    """Steps of the rule from the seed to the world that an episode begins with."""
+
+    seed_pool: int = 16
+    """Episodes start from one of so many grown worlds, made once; 0: from a new one each time,
+    which takes `grow_steps` steps of the rule."""
+
+    resolution: int = 32
+    """Pixels on each side of the picture that the loss compares, R."""
+
+    picture_size: int = 8
+    """Pixels on each side of the pictures that are seen, G; it divides `resolution`."""
+
+    sigma: float = Morphogenesis2DConfig.sigma
+    colour_weight: float = Morphogenesis2DConfig.colour_weight
+    seed_radius: float = 0.4
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        super().__post_init__()
+        check_positive(self, int, "rule_steps", "hold_steps", "grow_steps", "picture_size")
+        if self.resolution % self.picture_size:
+            raise NPAError(
+                f"picture_size must divide resolution = {self.resolution}, got "
+                f"{self.picture_size}: try {self.resolution // 2}"
+            )
+        if self.tell_updated:
+            raise NPAError("tell_updated must be False, as actions do not belong to particles")
+        self.check_start_radius(self.seed_radius)
+        _ = self.task_config(Morphogenesis2DConfig, target_point_count=self.particle_count)
+
+
+def rule_of(config: Shapeshifter2DEnvConfig, device: torch.device) -> tuple[NPARule, Codes]:
+    """Return the rule of a configuration, with its codes.
+
+    Raises:
+        NPAError: There is no such rule, it knows fewer than two codes, or lives in other worlds.
+    """
+    rule = load_rule(config.rule, device=device).float().requires_grad_(False)
+    if rule.codes is None or len(rule.codes) < 2:
+        raise NPAError(
+            f"rule must be one of two pictures or more, got {config.rule!r}: train one with "
+            "npa-envs train morphogenesis2d --targets gecko heart"
+        )
+    wanted = {
+        "space_dim": 2,
+        "state_dim": config.state_dim,
+        "static": False,
+        "alpha": config.alpha,
+        "eps0": config.eps0,
+        "moment_inverse": config.moment_inverse,
+    }
+    for name, value in wanted.items():
+        own = getattr(rule, name)
+        if own != value:
+            raise NPAError(
+                f"{name} must be the rule's, {own!r}, got {value!r}: give {name}={own!r}, or "
+                "another rule"
+            )
+    return rule, rule.codes
+
+
+class ShapeshifterTask(EnvTask[Shapeshifter2DEnvConfig]):
+    """A picture that becomes others; what worlds keep are their goals, the present one first."""
+
+    config_type = Shapeshifter2DEnvConfig
+    mark_count: ClassVar[int] = 1 + GOAL_COUNT
+    pays_each_step: ClassVar[bool] = False
+
+    def __init__(self, config: Shapeshifter2DEnvConfig, device: torch.device) -> None:
+        super().__init__(config, device)
+        self.rule, codes = rule_of(config, device)
+        self.codes = codes
+        """The codes that the rule knows, in the order of goals."""
+        sources = sources_of_codes(config.rule, codes)
+        own = config.task_config(
+            Morphogenesis2DConfig,
+            target_point_count=config.particle_count,
+            targets=tuple(sources.values()),
+            state_dim=config.state_dim - self.rule.code_dim,
+            code_dim=self.rule.code_dim,
+        )
+        self.pictures = ManyPictures(own, device=device)
+        """The task that such rules are trained on."""
+
+    @classmethod
+    def extra_bytes(cls, config: Any, world_count: int) -> int:
+        """Return about how much memory pool and pictures need [bytes]."""
+        pictures = 32 * world_count * config.resolution**2
+        return super().extra_bytes(config, world_count) + int(pictures)
+
+    @property
+    def start_is_short(self) -> bool:
+        """Whether a start takes few operations: not where it grows a world."""
+        return self.config.seed_pool > 0
+
+    @property
+    def pixel_size(self) -> float:
+        """Size of a particle in pictures [length units]."""
+        return self.pictures.pixel_size
+
+    @cached_property
+    def blank_losses(self) -> Tensor:
+        """Loss of an empty world for each goal, shape [T]."""
+        goals = torch.arange(len(self.codes), device=self.device)
+        x = torch.full((len(goals), 1, 2), 1e3, device=self.device)
+        s = x.new_zeros(len(goals), 1, self.config.state_dim)
+        # Where nothing lies in the picture, colours do not count; the mean is not moved.
+        aimed = self.pictures.toward(goals)
+        difference = aimed.picture(x, s, centred=False) - aimed.target_picture
+        error = difference[..., 3].square() + difference[..., 3].abs()
+        return error.flatten(1).mean(dim=1)
+
+    def fresh(self, random: WorldRandom) -> Start:
+        """Return grown worlds of random pictures, with another picture as their goal."""
+        x, s, grown = self.pictures.seed_with_goals(
+            random.world_count, generator=random, device=self.device
+        )
+        s = self.rule.with_code(s, self.codes.table[grown][:, None])
+        count = self.config.grow_steps
+        # One by one: a rule's products change in the last bit with the number of worlds.
+        worlds = [
+            self._run(
+                x[k : k + 1],
+                s[k : k + 1],
+                count,
+                random.take(slice(k, k + 1)).beside(Purpose.GROWTH),
+            )
+            for k in range(len(x))
+        ]
+        x, s = (torch.cat(part) for part in zip(*worlds, strict=True))
+        return Start(x, s, goal=self._another(grown, random))
+
+    def _another(self, goal: Tensor, random: WorldRandom) -> Tensor:
+        """Return goals other than those given, int64, shape [B]."""
+        count = len(self.codes)
+        return (goal + 1 + random.integers(count - 1, 1)[:, 0]) % count
+
+    def toward(self, goal: Tensor) -> Self:
+        """Return the task with losses for worlds of these goals, int64, shape [B]."""
+        bound = copy.copy(self)
+        bound.pictures = self.pictures.toward(goal)
+        return bound
+
+    def losses(self, x: Tensor, s: Tensor) -> Mapping[str, Tensor]:
+        """Return the density error and the weighted colour error of each world."""
+        density, colour = self.pictures.splat_losses(x, s)
+        return {"density": density, "colour": self.config.colour_weight * colour}
+
+    def marked(self, start: Start, loss: Tensor, random: WorldRandom) -> Tensor:
+        """Return the goals of an episode: the present one, then all of them in turn, [B, 1 + G]."""
+        assert start.goal is not None, "made with goals"
+        goals = [start.goal]
+        while len(goals) < GOAL_COUNT:
+            goals.append(self._another(goals[-1], random))
+        # The last one is followed by the first.
+        goals[-1] = torch.where(goals[-1] == goals[0], self._another(goals[0], random), goals[-1])
+        return torch.stack([start.goal, *goals], dim=1).to(loss)
+
+    def lived(
+        self, x: Tensor, s: Tensor, action: Tensor, random: WorldRandom
+    ) -> tuple[Tensor, Tensor]:
+        """Return worlds whose particles carry the code that was chosen, after the rule's steps.
+
+        Args:
+            x: Positions [length units], shape [B, N, 2].
+            s: States, dimensionless, shape [B, N, C].
+            action: Codes, dimensionless, shape [B, 1, K].
+            random: One stream a world; advanced by `rule_steps`.
+        """
+        return self._run(x, self.rule.with_code(s, action), self.config.rule_steps, random)
+
+    def _run(self, x: Tensor, s: Tensor, steps: int, random: WorldRandom) -> tuple[Tensor, Tensor]:
+        config = self.config
+        return rollout(
+            self.rule,
+            x,
+            s,
+            steps,
+            eps=config.eps,
+            box=config.box,
+            update_prob=config.update_prob,
+            dt=config.dt,
+            position_noise=config.position_noise,
+            generator=random,
+        )
+
+    def earned(self, x: Tensor, s: Tensor, loss: Tensor, marks: Tensor) -> Tensor:
+        """Return how near worlds are to their goals: 1 there, 0 as a blank picture; shape [B]."""
+        blank = self.blank_losses.index_select(0, marks[:, 0].long())
+        return (1.0 - loss / blank).clamp_min(-1.0)
+
+    def told_of(self, x: Tensor, s: Tensor, marks: Tensor) -> dict[str, Tensor]:
+        """Return the number of each world's goal, shape [B]."""
+        return {"goal": marks[:, 0].long()}
+
+    def observe(self, x: Tensor, s: Tensor, loss: Tensor, marks: Tensor) -> Tensor:
+        """Return coarse pictures of worlds and of their goals, shape [B, 8 G²]."""
+        aimed = self.pictures.toward(marks[:, 0].long())
+        both = torch.cat((aimed.picture(x, s), aimed.target_picture), dim=-1)
+        pixels = self.config.resolution // self.config.picture_size
+        seen = F.avg_pool2d(both.permute(0, 3, 1, 2), pixels).flatten(1)
+        return seen.clamp(-SEEN_LIMIT, SEEN_LIMIT)
+
+
+class ShiftingWorlds(LivingWorlds):
+    """Living worlds whose goals change every `hold_steps` steps, after these have been paid."""
+
+    task: Any
+
+    def _rewards(self) -> Tensor:
+        """Return what worlds earn in this step, shape [B], and go on to the next goals."""
+        rewards = super()._rewards()
+        turn = (self.elapsed.long() // self.task.config.hold_steps) % GOAL_COUNT
+        goal = self.marks.gather(1, 1 + turn[:, None])
+        self.marks[:, :1] = goal
+        self._goal.copy_(goal[:, 0].long())
+        return rewards
+
+
+class CodeForm(Rows):
+    """Coarse pictures are seen; an action is a code, or the number of one.
+
+    Args:
+        physics: The worlds' constants.
+        config: The environment's configuration.
+    """
+
+    def __init__(self, physics: Physics, config: Shapeshifter2DEnvConfig) -> None:
+        _, codes = rule_of(config, torch.device("cpu"))
+        self._table = codes.table
+        self._limit = max(1.0, float(self._table.abs().max()))
+        self._chosen = config.actions == "choice"
+        self._output = config.output
+        count, dim = self._table.shape
+        seen = (8 * config.picture_size**2,)
+        self.observation_space: Space[Any] = Box(-SEEN_LIMIT, SEEN_LIMIT, seen, np.float32)
+        self.action_space: Space[Any] = (
+            Discrete(count) if self._chosen else Box(-1.0, 1.0, (dim,), np.float32)
+        )
+
+    def action(self, action: Any, world_count: int | None) -> Tensor:
+        """Return the codes that actions mean, float32, shape [B, 1, K].
+
+        Raises:
+            NPAError: They are no numbers, or have another shape, or there is no such code.
+        """
+        count, dim = self._table.shape
+        batch = () if world_count is None else (world_count,)
+        letters = "" if world_count is None else "B, "
+        if not self._chosen:
+            told = action_tensor(
+                "action", action, (*batch, dim), "env.action_space", f"[{letters}K] = "
+            )
+            return self._limit * told.view(-1, 1, dim).clamp(-1.0, 1.0)
+        chosen = number_tensor("action", action)
+        if tuple(chosen.shape) != batch or chosen.is_floating_point():
+            raise NPAError(
+                f"action must be whole numbers of shape {batch}, got {tuple(chosen.shape)} of "
+                f"{chosen.dtype}: see env.action_space"
+            )
+        if not bool(((chosen >= 0) & (chosen < count)).all()):
+            raise NPAError(f"action must be the number of one of {count} codes, from 0 on")
+        return self._table.to(chosen.device)[chosen.long().view(-1, 1)]
+
+    def actions_of_codes(self) -> Tensor:
+        """Return the action of the form "code" that says each of the rule's codes, [T, K]."""
+        return self._table / self._limit
+
+
+class Shapeshifter2DEnv(NPAEnv):
+    """Let a living picture become others, by the code that its particles carry.
+
+    ## Description
+
+    A rule of many pictures runs N particles: a code of K numbers, which all of them carry and
+    perceive, tells them what to grow ([one rule, many pictures](../beyond.md)). The agent says the
+    code. It sees what the world looks like and what it should look like, both as coarse pictures,
+    and after `hold_steps` steps the goal becomes another picture. Nobody tells the agent which code
+    grows which picture, and particles need time to arrange themselves anew.
+
+    With `actions="choice"` the agent chooses among the codes that the rule has learned: it has to
+    recognise the goal. With `actions="code"` it has to find the numbers, and may say others than
+    the rule has learned.
+
+    The default rule, `seven-pictures`, has learned the package's seven drawings in small worlds on
+    a CPU. It recolours a grown picture at once, but reshapes it hardly.
+    `npa_envs.agents.shapeshifting.RecognisingShapeshifter` says the goal's code and earns −0.03 a
+    step, actions at random earn −0.37 (means of 8 episodes). Others: `npa-envs train
+    morphogenesis2d --targets ...`, then `rule="PATH"` with the rule's own `state_dim`, `eps` and
+    `eps0`, and `particle_count` as it was trained.
+
+    ## Observation space
+
+    `Box(-8, 8, (8 G²,), float32)` with G = `picture_size`: red, green, blue and density of the
+    world's picture, then of the goal's, each row by row from the bottom up. Colours are sums over
+    particles, as the density is, which is about 1 where a goal is. The world's picture goes along
+    with its particles' mean.
+
+    ## Action space
+
+    With `actions="code"`, `Box(-1, 1, (K,), float32)`: the code, in units of the largest number in
+    the rule's codes, and at least 1. With `actions="choice"`, `Discrete(T)`: the number of one of
+    the rule's T codes. All particles carry it from then on, and the rule runs for `rule_steps`
+    steps. A number that is not finite raises `NPAError` and leaves the world as it was.
+
+    ## Reward
+
+    Worlds are compared with the goal as in `npa/Morphogenesis2D-v0`, by a loss L. The reward is
+    1 − L / L₁, and at least -1; L₁ is the loss of an empty picture. So 1 is the goal itself.
+
+    | `reward` | Reward of step t |
+    |---|---|
+    | `"dense"` | this, of the world after the step |
+    | `"sparse"` | 0, and this in the last step |
+
+    A step is paid by the goal that was seen before it.
+
+    ## Starting state
+
+    The rule has grown one of its pictures, drawn at random, for `grow_steps` steps from a disk of
+    blank particles. The first goal is another one. With the default `seed_pool=16` there are
+    sixteen such worlds, made at the first reset.
+
+    ## Episode end
+
+    `success_loss` is None by default: there is always another goal.
+
+    ## Info
+
+    | Key | In | Value |
+    |---|---|---|
+    | `goal` | reset, step | number of the goal's code |
+    | `loss` | reset, step | L as it is now; of a step, to the goal that was seen before it |
+    | `loss_density`, `loss_colour` | reset, step | the parts of the loss |
+    | `reward_density`, `reward_colour` | step | how much each part fell, whatever the goals were |
+    | `success`, `diverged` | step | whether it did so in this step, bool |
+    | `reason` | last step | why the episode ended, see above; None for worlds that go on |
+    """
+
+    task_type = ShapeshifterTask
+    worlds_type = ShiftingWorlds
+    form_type: ClassVar[type[CodeForm]] = CodeForm
+
+
+class Shapeshifter2DVectorEnv(NPAVectorEnv):
+    """Worlds of `Shapeshifter2DEnv`, batched on one device; its docstring describes both."""
+
+    task_type = ShapeshifterTask
+    worlds_type = ShiftingWorlds
+    form_type: ClassVar[type[CodeForm]] = CodeForm
