@@ -143,7 +143,7 @@ def test_worlds_refuse_what_cannot_be(options, words):
         SearchWorld(**options)
 
 
-# Searches
+# Searches. pyribs takes seconds to import, so that but one test of it runs with the fast ones.
 
 
 def test_a_missing_library_is_named_with_its_extra(monkeypatch):
@@ -152,6 +152,7 @@ def test_a_missing_library_is_named_with_its_extra(monkeypatch):
         import_ribs()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_a_stopped_search_goes_on_as_if_it_had_not_been(method, tmp_path):
     needs_ribs()
@@ -169,6 +170,7 @@ def test_a_stopped_search_goes_on_as_if_it_had_not_been(method, tmp_path):
         assert np.array_equal(ours.solution, theirs.solution)
 
 
+@pytest.mark.slow
 def test_each_cell_keeps_its_best_and_the_scores_are_theirs(tmp_path):
     needs_ribs()
     path = tmp_path / RESULTS
@@ -193,6 +195,7 @@ def test_each_cell_keeps_its_best_and_the_scores_are_theirs(tmp_path):
     assert growth.best == pytest.approx(max(best.values()))
 
 
+@pytest.mark.slow
 def test_elites_that_meet_the_same_worlds_again_score_the_same():
     needs_ribs()
     done = search()
@@ -204,6 +207,7 @@ def test_elites_that_meet_the_same_worlds_again_score_the_same():
     assert tried_again(done, [0], steps=32).qd_score != pytest.approx(found.qd_score)
 
 
+@pytest.mark.slow
 def test_a_record_of_other_settings_or_candidates_is_refused(tmp_path):
     needs_ribs()
     path = tmp_path / RESULTS
@@ -249,6 +253,7 @@ def test_a_damaged_world_of_a_rule_is_an_error(tmp_path):
             task_of_rule(str(path), rule, CPU)
 
 
+@pytest.mark.slow
 def test_a_pair_is_a_folder_that_the_viewer_opens(tmp_path):
     needs_ribs()
     words = ["search", *OPTIONS, "--kind", "pair", "--no-progress", "--out", str(tmp_path)]

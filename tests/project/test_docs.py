@@ -389,6 +389,7 @@ def test_the_code_of_a_page_runs(page, tmp_path, monkeypatch, capsys):
         assert (tmp_path / "seed.ply").stat().st_size > 512 * 26 * 4
 
 
+@pytest.mark.slow
 def test_the_code_about_the_search_runs():
     pytest.importorskip("ribs", reason="the extra search is not installed")
     (block,) = code_blocks(DOCS / "search.md")
