@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import asdict
@@ -105,26 +106,25 @@ class KeptProgress(Progress):
 
     def _opened(self, resume: bool) -> dict[str, Any] | None:
         """Return the checkpoint to go on from, or None, once the folder is fit to be written to."""
-        folder = self.folder
-        folder.prepare(0, pictures=False)
+        folder, content = self.folder, None
         folder.note_checkpoint()
         if resume:
             content = load_checkpoint(folder.checkpoint)
             held = content.get("learner")
             if held != self._told:
-                here = {} if not isinstance(held, dict) else held
+                here = held if isinstance(held, dict) else {}
                 names = [name for name in self._told if here.get(name) != self._told[name]]
                 raise NPAError(
                     f"the checkpoint {str(folder.checkpoint)!r} must be of the same run, but "
                     f"differs in {', '.join(names)}: learn what it is of, or choose another folder"
                 )
-            return content
-        if folder.checkpoint.exists() and not self._overwrite:
+        elif folder.checkpoint.exists() and not self._overwrite:
             raise NPAError(
                 f"out must be a folder without a run, but {shown(str(folder.path))} holds one: "
                 "resume it, choose another folder, or overwrite it"
             )
-        return None
+        folder.prepare(0, pictures=False)
+        return content
 
     def _save(self, rules: RuleSet, learner: Learner) -> None:
         """Write checkpoint, rules and curve, once all processes agree on what has learned."""
@@ -155,11 +155,12 @@ class KeptProgress(Progress):
         curve = content.get("curve")
         try:
             self.log = [Entry(**entry) for entry in curve or ()]
-            sound = all(is_real(value) for entry in self.log for value in asdict(entry).values())
+            numbers = [value for entry in self.log for value in asdict(entry).values()]
             load_learner_state(learner, content)
         except (TypeError, RuntimeError) as error:
             raise unusable_checkpoint(path, f"it cannot be used ({shown(error)})") from error
-        if not (self.log and sound):
+        # The error of a single episode is infinite.
+        if not self.log or not all(is_real(value) or value == math.inf for value in numbers):
             raise unusable_checkpoint(path, "curve must hold the numbers of its entries")
         self._iteration, self._part = content["iteration"], content["part"] + 1
         self.particle_steps, self._seconds = content["particle_steps"], content["seconds"]
@@ -170,6 +171,7 @@ class KeptProgress(Progress):
 def learner_state(learner: Learner) -> dict[str, Any]:
     """Return what a learner is, but for its worlds."""
     random = learner.random
+    drawn = random.episodes[:1] if isinstance(random, WorldRandom) else random.get_state()
     return {
         "modules": {name: module.state_dict() for name, module in learner.modules().items()},
         "optimisers": {
@@ -177,9 +179,7 @@ def learner_state(learner: Learner) -> dict[str, Any]:
             for name, optimiser in learner.optimisers().items()
         },
         # All worlds have drawn equally often.
-        "random": random.episodes[:1].cpu()
-        if isinstance(random, WorldRandom)
-        else random.get_state(),
+        "random": drawn.cpu(),
     }
 
 

@@ -22,7 +22,7 @@ WORDS = [
     "--worlds",
     "2",
 ]
-WORDS += ["--episode-steps", "4", "--episodes", "2", "--entries", "2", "--options", "steps=4"]
+WORDS += ["--episode-steps", "4", "--episodes", "1", "--entries", "2", "--options", "steps=4"]
 ROUND = 4 * 2 * 64
 
 
