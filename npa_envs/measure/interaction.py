@@ -493,7 +493,8 @@ def phase_diagram(rows: Sequence[InteractionRow]) -> bytes:
                     ["" if row is None else _interval(row, what) for row in line] for line in held
                 ],
             )
-            panel.set(xlabel="distance", title=title + _radius(factor))
+            panel.set(xlabel="distance")
+            panel.set_title(title + _radius(factor), fontsize=9)
         panels[0].set_ylabel(f"ratio of {rows[0].rule}")
         figure.colorbar(scale, ax=list(panels), **bar).minorticks_off()
     figure.suptitle(f"{rows[0].rule} beside {rows[0].beside}", fontsize=10)

@@ -125,7 +125,7 @@ def draw_matrix(
             dark = wrong or sum(colour[:3]) < 1.2
             ink = {"color": "white" if dark else "black", "ha": "center", "va": "center"}
             text = f"{value:.2g}" + ("" if notes is None else f"\n{notes[down][across]}")
-            panel.text(across, down, text, fontsize=6 if notes is None else 5, **ink)
+            panel.text(across, down, text, fontsize=6 if notes is None else 7, **ink)
     panel.set_xticks(range(len(columns)), columns, rotation=45, ha="right", fontsize=7)
     panel.set_yticks(range(len(rows)), rows, fontsize=7)
     return scale
