@@ -75,16 +75,17 @@ def train_scripted(
 
     Doing nothing, and all of `SCRIPTED` that the problem's task allows at each gain (a fraction of
     α ε; negative ones gather), play one episode in each of the problem's worlds, from seeds that
-    evaluations do not use, until all have done so or the budget is spent. The best one is taken.
+    evaluations do not use, until all have done so or the budget is spent. The best one is taken,
+    which may be doing nothing.
 
     Raises:
-        NPAError: There is something to start from, or no scripted policy does better than nothing.
+        NPAError: There is something to start from.
     """
     _check_no_start(start)
     envs = problem.make_envs(device=device)
     seeds = world_seeds(seed, problem.num_envs)
-    nothing: Policy = ZeroPolicy(envs)
-    progress.start(nothing)
+    best: Policy = ZeroPolicy(envs)
+    progress.start(best)
 
     def tried(policy: Policy) -> float:
         episodes = evaluate_policy(envs, policy, seeds)
@@ -93,19 +94,13 @@ def train_scripted(
         progress.advance(steps * problem.num_envs * problem.particle_count)
         return episodes.mean_return
 
-    best, most = nothing, tried(nothing)
+    most = tried(best)
     for policy in _candidates(envs, gains):
         if progress.over:
             break
         mean_return = tried(policy)
         if mean_return > most:
             best, most = policy, mean_return
-    if best is nothing:
-        raise NPAError(
-            f"method='scripted' found no policy that does better than nothing in {problem.env_id} "
-            f"after {progress.particle_steps} particle-steps: compare with 'zero' and 'random' "
-            "instead, or give a larger budget"
-        )
     progress.look(best, force=True)
     return best
 
