@@ -167,6 +167,21 @@ def test_life_has_the_gradient_of_the_expected_number(device):
     assert_near([found / wanted], [torch.ones(2)], 0.05)
 
 
+def test_where_there_is_no_slot_nothing_is_learned_of_dividing(device):
+    x, s = third_full(device, 9)
+    s[..., LIFE] = 1.0
+    s[:, 4, LIFE] = 0.0
+    odds = x.new_tensor([0.6, 0.1])[:, None, None].repeat(1, 2, 9).requires_grad_()
+    after = divided(
+        x, s, x[..., 0], fates=tuple(odds), updated=living(s), births=births_of(x), eps=EPS
+    )
+    (found,) = torch.autograd.grad(after[1][..., LIFE].sum(), odds)
+    # All would divide; the first does, and both particles that come of it stand for it.
+    expected = torch.zeros_like(found[0])
+    expected[:, 0] = 2.0 / 1.5
+    assert_near([found[0]], [expected], 1e-12)
+
+
 def test_one_particle_fills_its_world_and_stays_within_it(device):
     rule = dividing_rule(device, (1.0, -4.0))
     x = torch.zeros(2, 60, 2, dtype=torch.float64, device=device)
