@@ -172,7 +172,7 @@ def rule_form(rule: NPARule) -> Hashable:
     """Return what a plain rule's steps depend on besides its weights."""
     form: dict[str, Any] = {**rule.hyper_parameters()}
     del form["readout_dim"], form["readout_hidden_dim"]
-    return tuple(form.values())
+    return tuple(form.items())
 
 
 def _form(rule: NPARule, plain: bool) -> tuple[Hashable, list[Tensor]]:
