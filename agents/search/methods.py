@@ -123,14 +123,19 @@ def _map_elites(archive: Any, batch_size: int, seed: int) -> Proposals:
 
 def _evolution(ranker: str, restart_rule: str) -> Callable[[Any, int, int], Proposals]:
     def make(archive: Any, batch_size: int, seed: int) -> Proposals:
-        emitter = import_ribs().emitters.EvolutionStrategyEmitter(
+        ribs = import_ribs()
+        from cma.sigma_adaptation import CMAAdaptSigmaCSA
+
+        # From 300 weights on cma would go by the order of candidates, and pyribs sorts them.
+        options = {"CMA_diagonal": True, "AdaptSigma": CMAAdaptSigmaCSA}
+        emitter = ribs.emitters.EvolutionStrategyEmitter(
             archive,
             x0=np.zeros(archive.solution_dim),
             sigma0=FIRST_STEP,
             ranker=ranker,
             restart_rule=restart_rule,
             es="pycma_es",
-            es_kwargs={"opts": {"CMA_diagonal": True}},
+            es_kwargs={"opts": options},
             batch_size=batch_size,
             seed=seed,
         )

@@ -43,7 +43,7 @@ def solutions(tried, count, size=0.2, seed=0):
 
 
 def search(**options):
-    world = SearchWorld(**SMALL, **options.pop("world", {}))
+    world = SearchWorld(**SMALL | options.pop("world", {}))
     return Search(world, batch_size=4, device=CPU, **options)
 
 
@@ -168,6 +168,16 @@ def test_a_stopped_search_goes_on_as_if_it_had_not_been(method, tmp_path):
     for ours, theirs in zip(again.elites(), whole.elites(), strict=True):
         assert ours.cell == theirs.cell
         assert np.array_equal(ours.solution, theirs.solution)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("error")
+def test_cma_adapts_the_steps_of_many_weights_without_complaint():
+    needs_ribs()
+    done = search(method="cma-me", world={"kind": "pair", "hidden_dim": 8})
+    assert done.candidates.weight_count == 400
+    done.run(8 * BATCH_COST)
+    assert done.evaluations == 32
 
 
 @pytest.mark.slow
