@@ -3,8 +3,8 @@
 `pictures` draws emoji that no other experiment uses, to train on and to hold out; `ways` trains the
 same pictures with three ways to tell a rule its code; `train` trains rules of many pictures (KINDS)
 and controls of one picture each, side by side; `measure` runs all of them on seeds that training
-never saw: losses with the right code and with that of another picture, and PSNR of what an encoder
-grows from pictures that it never saw. Each writes what it found to OUT as it goes.
+never saw: losses with the right code, with that of another picture and after a switch, and PSNR of
+what an encoder grows from pictures that it never saw. Each writes what it found to OUT as it goes.
 
     python benchmarks/many_pictures.py pictures --out PICTURES
     python benchmarks/many_pictures.py ways --targets FOLDER --out OUT
@@ -256,14 +256,52 @@ def measure(arguments: argparse.Namespace) -> None:
             print(path.stem, {entry["step"]: round(entry["loss"], 3) for entry in row["rows"]})
         else:
             row["rows"] = measured(rule, config, device)
-            print(path.stem, median_losses(row["rows"]), flush=True)
+            row["switched"] = switched_rows(rule, tasks_of(rule, config, device), device)
+            medians = (
+                statistics.median(entry[kind] for entry in row["switched"])
+                for kind in ("switched", "always")
+            )
+            print(path.stem, median_losses(row["rows"]), "switched, always:", *medians, flush=True)
             if rule.codes.encoder is not None and arguments.held_out:
                 row["held_out"] = held_out_rows(rule, config, arguments.held_out, device)
                 ratios = [entry["psnr"] for entry in row["held_out"]]
                 print(path.stem, "held out", round(statistics.mean(ratios), 2), "dB", flush=True)
         found[path.stem] = row
-        write_record(arguments.out / "many_pictures.json", record(arguments, found))
+        write_record(
+            arguments.out / "many_pictures.json",
+            {"machine": machine(torch.device(device)), "rules": found},
+        )
     print("ratios of medians", ratios_of(found))
+
+
+def switched_rows(
+    rule: npa_envs.NPARule, tasks: Sequence[Morphogenesis2D], device: str
+) -> list[dict[str, Any]]:
+    """Return the loss of each picture in worlds that were the next one, and got its code at `STEP`.
+
+    As many steps later, beside that of worlds that had its code from the start, at `STEP`.
+    """
+    (before,) = grown(rule, tasks, checkpoints=(STEP,), seeds=SEEDS, device=device)
+    x, s = (torch.roll(part, -1, dims=0) for part in before)
+    coded = torch.stack([task.coded(own) for task, own in zip(tasks, s, strict=True)])
+    x, s = npa_envs.rollout(
+        rule,
+        x.flatten(0, 1),
+        coded.flatten(0, 1),
+        STEP,
+        eps=tasks[0].eps,
+        update_prob=tasks[0].update_prob,
+        generator=npa_envs.WorldRandom([*SEEDS] * len(tasks), device=device),
+    )
+    worlds = zip(tasks, x.split(len(SEEDS)), s.split(len(SEEDS)), *before, strict=True)
+    return [
+        {
+            "target": task.target.name,
+            "switched": task.metric(own_x, own_s).mean().item(),
+            "always": task.metric(old_x, old_s).mean().item(),
+        }
+        for task, own_x, own_s, old_x, old_s in worlds
+    ]
 
 
 def control_rows(rule: npa_envs.NPARule, config: Any, device: str) -> list[dict[str, Any]]:
