@@ -130,7 +130,13 @@ def _load_rule(config: GrownConfig, device: torch.device) -> NPARule:
             f"{shown(config.target)} ({', '.join(known)}): give rule='PATH'{config.without_rule}"
         )
     rule = load_rule(config.rule or config.target, device=device)
-    wanted = {"space_dim": 2, "state_dim": config.state_dim, "static": False, "divides": False}
+    wanted = {
+        "space_dim": 2,
+        "state_dim": config.state_dim,
+        "static": False,
+        "divides": False,
+        "code_dim": 0,
+    }
     for name, value in wanted.items():
         if getattr(rule, name) != value:
             raise NPAError(

@@ -265,6 +265,7 @@ def test_settings_stay_what_they_are_as_long_as_the_version_does(name):
         ({"reward": "particle"}, "reward must be a known word"),
         ({"alpha": 0.25}, "alpha must be the rule's, 0.5, got 0.25"),
         ({"target": "ring"}, "no shipped rule grows 'ring'"),
+        ({"rule": "seven-pictures", "state_dim": 24}, "rule must have code_dim=0"),
         ({"actions": "box"}, "actions must be a known word"),
         ({"place_count": 1}, "place_count must be"),
         ({"brush_radius": 0.0}, "brush_radius must be a finite number greater than 0"),
