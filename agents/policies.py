@@ -242,7 +242,8 @@ class RulePolicy(Policy):
         state_scale: The environment's, where `env` is not given (dimensionless).
 
     Raises:
-        NPAError: The rule perceives what no environment offers, or does not fit `env`.
+        NPAError: The rule perceives what no environment offers, has codes, divides, or does not fit
+            `env`.
     """
 
     def __init__(self, rule: NPARule, env: Any = None, state_scale: float = 1.0) -> None:
@@ -254,6 +255,12 @@ class RulePolicy(Policy):
             raise NPAError(
                 "a policy acts on particles that stay as many as they are, got a rule with "
                 "divides=True: run it with npa_envs.rollout"
+            )
+        if rule.code_dim:
+            raise NPAError(
+                "a policy acts on particles that carry no code, got a rule with "
+                f"code_dim={rule.code_dim}: run it with npa_envs.rollout, or in "
+                "npa/Shapeshifter2D-v0"
             )
         if not (is_real(state_scale) and state_scale > 0.0):
             raise NPAError(

@@ -189,6 +189,8 @@ def fitted(rule, **keywords):
         (lambda _: fitted({"space_dim": 3}), "space_dim, 2, got 3"),
         (lambda _: fitted({"static": True}), "got one of static particles"),
         (lambda _: fitted({"moment_correction": False}), "moment_correction=True"),
+        (lambda _: fitted({"divides": True}), "divides=True"),
+        (lambda _: fitted({"code_dim": 2, "code_names": ["ring"]}), "code_dim=2"),
         (lambda env: RulePolicy("gecko", env), "rule must be an NPARule, got str"),
         (lambda _: RulePolicy(wild_rule(), state_scale=0.0), "state_scale must be positive"),
         (lambda _: ZeroPolicy(gymnasium.make("CartPole-v1")), "an environment of npa_envs"),
