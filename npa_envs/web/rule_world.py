@@ -165,9 +165,9 @@ class RuleWorld(Live):
         if self.main.rule.static:
             tools.remove("add")
         if self.main.rule.divides:
-            # A rule that divides lives alone, and fills its world by itself.
-            tools.remove("graft")
-            tools.remove("add")
+            # A rule that divides lives alone, and fills its world by itself. What the dead have in
+            # their slots is no state to be carried anywhere.
+            tools = [tool for tool in tools if tool not in ("inject", "graft", "add")]
         return {
             "type": "world",
             "title": self._title(),
@@ -334,7 +334,8 @@ class RuleWorld(Live):
     def _damage(self, name: str) -> None:
         if self.x.shape[1]:
             self.x, s = damage_worlds(self.x, self.s, kind=name, generator=self._generator)
-            self.s = coded_states(self.task, s)
+            parts = zip(self.organisms, s.split_with_sizes(self.counts, dim=1), strict=True)
+            self.s = torch.cat([self._coded(organism, part) for organism, part in parts], dim=1)
 
     @torch.no_grad()
     def _brush(self, message: Mapping[str, Any]) -> bool:
@@ -358,7 +359,8 @@ class RuleWorld(Live):
         inside = inside_ball(self.x, centre=touch.at, radius=touch.radius, box=self.task.box)
         # Among its hosts it sees densities as they do.
         number = self._number(organism, float(self.full))
-        self._arrange(self.x, self.s, torch.where(inside[0], number, self._species()))
+        s = torch.where(inside[..., None], self._coded(organism, self.s), self.s)
+        self._arrange(self.x, s, torch.where(inside[0], number, self._species()))
 
     def _add(self, touch: Touch, organism: Organism) -> None:
         count = max(16, round(touch.strength * SEED_SHARE * self.full))
@@ -372,8 +374,16 @@ class RuleWorld(Live):
         # As if it grew alone: what is new divides densities by its own number.
         number = self._number(organism, float(count))
         x = torch.cat((self.x, ball + touch.at[:, None]), dim=1)
-        s = torch.nn.functional.pad(self.s, (0, 0, 0, count))
+        fresh = self._coded(organism, self.s.new_zeros(1, count, self.s.shape[2]))
+        s = torch.cat((self.s, fresh), dim=1)
         self._arrange(x, s, torch.nn.functional.pad(self._species(), (0, count), value=number))
+
+    def _coded(self, organism: Organism, s: Tensor) -> Tensor:
+        """Return states of a species with the code that its rule gives them, where it has such."""
+        if organism.rule.codes is None:
+            return s
+        own = organism.name == self.main.name
+        return coded_states(self.task if own else self._task_of(organism, None).task, s)
 
     def _joining(self, name: Any) -> Organism:
         organism = self._organism(name)

@@ -147,7 +147,7 @@ def test_a_world_that_divides_shows_its_living_particles(tmp_path, device):
     )  # fmt: skip
     world = RuleWorld(str(path), device=device)
     assert len(world.frame().positions) == 1
-    assert not {"graft", "add"} & set(world.describe()["tools"])
+    assert not {"inject", "graft", "add"} & set(world.describe()["tools"])
     world.handle({"type": "set", "name": "speed", "value": 8})
     for show in ("colours", "mask", "speed", "density", "components", "species", "state 3"):
         world.handle({"type": "set", "name": "show", "value": show})
@@ -163,6 +163,17 @@ def test_a_world_that_divides_shows_its_living_particles(tmp_path, device):
     assert len(world.frame().positions) == 0
     with pytest.raises(NPAError, match="and not divide"):
         world.handle(brush("graft", rule="gecko"))
+
+
+def test_what_is_added_to_a_world_of_a_rule_with_codes_carries_one(device):
+    world = RuleWorld("seven-pictures", device=device, particle_count=64)
+    code = world.main.rule.codes["gecko"]
+    world.handle(brush("add", rule="seven-pictures", at=[0.5, 0.0]))
+    assert world.x.shape[1] > 64
+    for damage in DAMAGE_SIZES:
+        world.handle({"type": "damage", "name": damage})
+    world.handle(brush("graft", rule="seven-pictures"))
+    assert torch.equal(world.s[0, :, :8], code.expand(world.s.shape[1], 8))
 
 
 def test_push_carries_particles_along(world):
