@@ -148,6 +148,11 @@ def train(
         DivergedError: The rules' weights have become infinite or NaN.
         MissingDependencyError: The method needs a library that is not installed.
     """
+    if problem.chooses_codes and method in GARDEN_METHODS | METHODS:
+        raise NPAError(
+            f"method {shown(method)} learns no codes, which are the actions in {problem.env_id}: "
+            "give a function of your own, 'package.module:function', or take another library"
+        )
     function = _function(method, methods_for(problem))
     known = _options_of(function)
     for name in options:
@@ -198,7 +203,9 @@ def _check_kept(method: str, out: str | Path | None, told: bool) -> None:
 
 
 def methods_for(problem: Problem) -> dict[str, str]:
-    """Return the table of the methods that can learn a problem."""
+    """Return the table of the methods that can learn a problem; it is empty where none can."""
+    if problem.chooses_codes:
+        return {}
     return GARDEN_METHODS if problem.is_garden else METHODS
 
 

@@ -31,6 +31,7 @@ from npa_envs.envs.multi.tasks import ENVIRONMENTS as SPECIES_TASKS
 from npa_envs.envs.multi.tasks import task_settings
 from npa_envs.envs.multi.tasks import task_type as species_task_type
 from npa_envs.envs.multi.vector import MultiSpeciesVectorEnv
+from npa_envs.envs.shapeshifter2d import ShapeshifterTask
 from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.registration import ENVIRONMENTS, SPECIES_SIZES
 from npa_envs.tasks.checks import check_positive
@@ -138,6 +139,11 @@ class Problem:
     def is_garden(self) -> bool:
         """Whether a rule runs the particles, and an action says what few brushes do."""
         return not self.is_species and issubclass(self.env_type.task_type, GardenTask)
+
+    @property
+    def chooses_codes(self) -> bool:
+        """Whether a rule of many pictures runs the particles, and an action is a code."""
+        return not self.is_species and issubclass(self.env_type.task_type, ShapeshifterTask)
 
     @cached_property
     def env_type(self) -> type[NPAVectorEnv]:

@@ -16,7 +16,7 @@ from npa_envs.agents import (
     ZeroPolicy,
     evaluate_policy,
 )
-from npa_envs.agents.learning import EVALUATION_SEEDS, Budget, RuleSet, train
+from npa_envs.agents.learning import EVALUATION_SEEDS, Budget, Problem, RuleSet, train
 from npa_envs.agents.learning.clone import Demonstrations, unexplained
 from npa_envs.agents.learning.gradient import ClampedRule, clamp_inward, episode_task
 from npa_envs.agents.learning.problem import FIRST_EVALUATION_SEED, world_seeds
@@ -240,6 +240,12 @@ def test_what_cannot_be_descended_is_refused():
         run(species("npa/Invasion-v0", seed_distance=0.5))
     with pytest.raises(NPAError, match="keep all particles"):
         run(species(deaths=[[0, 2]]))
+
+
+def test_no_method_learns_what_code_to_say():
+    problem = Problem(env_id="npa/Shapeshifter2D-v0", episode_steps=4)
+    with pytest.raises(NPAError, match="'ppo' learns no codes"):
+        train("ppo", problem, Budget(particle_steps=1), 0)
 
 
 def test_a_loss_without_a_gradient_is_refused(monkeypatch):
