@@ -33,6 +33,7 @@ from npa_envs.training import (
     task_entry,
     train,
 )
+from npa_envs.training.checkpoint import drawn_by_world, load_checkpoint
 from npa_envs.training.ranks import Ranks, joined_ranks
 
 THREADED_BATCH = 4096
@@ -172,10 +173,11 @@ def process_count(task_name: str, options: TrainOptions, config: TrainConfig[Any
     """Return how many processes train: by default two where a CPU's other cores would be idle.
 
     They are where batches are too small for several threads. A short run would be over before the
-    second process has paid for its start.
+    second process has paid for its start, and one that was begun alone goes on with the same draws.
 
     Raises:
-        NPAError: There are to be fewer than one, or GPUs that are not to be used.
+        NPAError: There are to be fewer than one, or GPUs that are not to be used; or as for
+            `load_checkpoint`, where a run is resumed.
     """
     if options.gpus is not None and options.processes is not None:
         raise NPAError(
@@ -192,6 +194,8 @@ def process_count(task_name: str, options: TrainOptions, config: TrainConfig[Any
     seconds = task_entry(task_name).expected_seconds(config)
     idle = thread_count(config) < torch.get_num_threads() and dist.is_available()
     if not idle or config.varied or seconds is None or seconds < PAIRED_SECONDS:
+        return 1
+    if options.resume and not drawn_by_world(load_checkpoint(RunFolder(config.out).checkpoint)):
         return 1
     try:
         Ranks(0, 2).check(config)

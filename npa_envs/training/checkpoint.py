@@ -128,6 +128,16 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     return content
 
 
+def drawn_by_world(content: Mapping[str, Any]) -> bool:
+    """Return whether each world of a run draws by itself, as several processes need it.
+
+    Args:
+        content: What `load_checkpoint` returned.
+    """
+    states = content.get("random_states")
+    return isinstance(states, dict) and states.keys() == {"schedule"}
+
+
 def check_same_run(
     content: dict[str, Any], task_name: str, config: TrainConfig[Any], path: Path
 ) -> None:

@@ -24,6 +24,7 @@ from npa_envs.training.batch_picture import write_batch_picture
 from npa_envs.training.checkpoint import (
     check_content,
     check_same_run,
+    drawn_by_world,
     load_checkpoint,
     save_checkpoint,
     unusable_checkpoint,
@@ -119,9 +120,7 @@ class Trainer:
         schedule = torch.Generator().manual_seed(config.seed)
         self.rule = self._make_rule(schedule).to(device, config.torch_dtype)
         # A run that several processes have begun goes on as it was, if only one is left.
-        by_world = ranks.together or (
-            content is not None and content["random_states"].keys() == {"schedule"}
-        )
+        by_world = ranks.together or (content is not None and drawn_by_world(content))
         if config.varied and (ranks.together or rollout is not None):
             raise NPAError(
                 "worlds are varied (vary_particles and others) in runs of one rule by one process "

@@ -9,7 +9,8 @@ from npa_envs.cli import main
 from npa_envs.cli.output import torch_threads
 from npa_envs.cli.train import TrainOptions, process_count, settled
 from npa_envs.errors import NPAError
-from npa_envs.training import preset
+from npa_envs.training import RunFolder, preset
+from npa_envs.training.checkpoint import load_checkpoint, save_checkpoint
 
 TASK = "morphogenesis2d"
 
@@ -47,6 +48,20 @@ def test_two_processes_train_where_a_second_core_would_be_idle(name, fields, thr
         for asked in (1, 3):
             options = TrainOptions(processes=asked)
             assert process_count(TASK, options, preset(name, **fields)) == asked
+
+
+def test_a_run_that_was_begun_alone_goes_on_alone(tmp_path):
+    trainer_of(circle_config(tmp_path))
+    resumed = preset("fast", out=tmp_path)
+    with torch_threads(2):
+        assert process_count(TASK, TrainOptions(resume=True), resumed) == 1
+        content = load_checkpoint(RunFolder(tmp_path).checkpoint)
+        # What a run of several processes leaves: its worlds' draws follow from the iteration.
+        content["random_states"] = {"schedule": content["random_states"]["schedule"]}
+        save_checkpoint(RunFolder(tmp_path).checkpoint, content)
+        assert process_count(TASK, TrainOptions(resume=True), resumed) == 2
+        with pytest.raises(NPAError, match="no checkpoint"):
+            process_count(TASK, TrainOptions(resume=True), preset("fast", out=tmp_path / "none"))
 
 
 def test_fewer_processes_than_one_are_refused():
