@@ -479,6 +479,10 @@ class RolloutCall(NamedTuple):
                 return prepared
         if static is not None:
             worlds = Worlds(*map(static.sort, worlds))
+        if rule.divides:
+            # What lies in dead slots must not reach gradients either: 0 times NaN is NaN.
+            blank = torch.where(living(worlds.s)[..., None], worlds.s, 0.0)
+            worlds = worlds._replace(s=blank)
         own = RuleStep(rule, network, self.options, static)
         return run_steps(
             DivisionStep(own) if rule.divides else own,

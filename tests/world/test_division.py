@@ -68,6 +68,22 @@ def test_what_lies_in_dead_slots_influences_nothing(update_prob, device):
     assert int(living(found[0][1]).sum()) > int(living(s).sum())
 
 
+def test_not_a_number_in_dead_slots_leaves_gradients_finite(device):
+    rule = dividing_rule(device)
+    x, s = third_full(device)
+    gradients = []
+    for fill in (0.0, float("nan")):
+        start = torch.where(living(s)[..., None], s, fill).requires_grad_()
+        x_after, s_after = npa_envs.rollout(
+            rule, x, start, 3, generator=torch.Generator(device).manual_seed(1)
+        )
+        weights = [start, rule.hidden.weight, rule.fate.weight]
+        gradients.append(
+            torch.autograd.grad(x_after.square().sum() + s_after.square().sum(), weights)
+        )
+    assert_same(*gradients)
+
+
 @pytest.mark.parametrize("space_dim", [2, 3])
 def test_the_living_do_what_they_would_in_a_world_without_the_dead(space_dim, device):
     rule = dividing_rule(device, (-50.0, -50.0), density_gradient=False, space_dim=space_dim)
