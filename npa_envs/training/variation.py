@@ -84,6 +84,11 @@ class VariedCycle(TrainingCycle):
                 f"vary_eps needs particles that move in open space, got the task {task_name}: "
                 "leave it out"
             )
+        if config.vary_eps != (1.0, 1.0) and rule.divides:
+            raise NPAError(
+                "vary_eps needs seeds of more than one particle, whose size it varies, got a rule "
+                "that divides: leave it out"
+            )
         largest = told.update_prob * config.vary_update_prob[1]
         if largest > 1.0:
             raise NPAError(

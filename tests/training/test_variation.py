@@ -132,6 +132,11 @@ def test_eps_is_not_varied_in_a_box(tmp_path):
         Trainer(Texture(config.task), config, task_name="texture")
 
 
+def test_eps_is_not_varied_where_a_world_starts_with_one_particle(tmp_path):
+    with pytest.raises(NPAError, match="vary_eps needs seeds of more than one particle"):
+        trainer_of(tmp_path, vary_eps=(0.5, 2.0), division=True)
+
+
 def test_the_command_line_takes_ranges_and_robustness_takes_the_run(tmp_path, capsys):
     out = str(tmp_path / "run")
     words = ["train", "morphogenesis2d", "--preset", "tiny", "--iterations", "2", "--no-report"]
