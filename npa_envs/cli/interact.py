@@ -114,6 +114,11 @@ def main(arguments: Sequence[str]) -> int:
         options = replace(options, **{name: QUICK[name] for name in unsaid})
     device = check_device(options.device)
     organisms, settings = _organisms(options, device)
+    if len(organisms) < 2 and not options.itself:
+        raise NPAError(
+            f"rules must be two or more without itself, got {organisms[0].name}: name another one, "
+            "or leave out --no-itself"
+        )
     folder = writable_folder(options.out)
     told = _told(organisms, settings)
     rows = read_rows(folder / RESULTS, told)

@@ -285,6 +285,12 @@ class TestCommand:
             with Image.open(tmp_path / f"phases-{name}.png") as drawn:
                 assert drawn.width > drawn.height
 
+    def test_a_rule_alone_that_is_not_to_meet_itself_is_refused(self, rules, tmp_path, capsys):
+        path, out = str(rules / "one.safetensors"), tmp_path / "out"
+        assert main(["interact", path, "--no-itself", "--out", str(out)]) == 2
+        assert "rules must be two or more without itself, got one" in capsys.readouterr().err
+        assert not out.exists()
+
     def test_a_stopped_run_goes_on_and_ends_as_one_that_was_not(
         self, rules, tmp_path, capsys, monkeypatch
     ):
