@@ -502,7 +502,9 @@ def phase_diagram(rows: Sequence[InteractionRow]) -> bytes:
 
 
 def _interval(row: InteractionRow, what: str) -> str:
-    return f"{getattr(row, f'{what}_low'):.2g} to {getattr(row, f'{what}_high'):.2g}"
+    ends = (getattr(row, f"{what}_{end}") for end in ("low", "high"))
+    # Small ends have many zeros: a cell has room for one digit more.
+    return " to ".join(f"{end:.2g}" if end >= 0.01 else f"{end:.1g}" for end in ends)
 
 
 def _radius(factor: float) -> str:
