@@ -17,7 +17,8 @@ from npa_envs.agents.learning.rules import RuleSet, starting_rules
 from npa_envs.envs.core.task import EnvTask
 from npa_envs.envs.multi.task import Population, SpeciesConfig, SpeciesTask
 from npa_envs.errors import NPAError, shown
-from npa_envs.rule.rule import FoldedRule, NPARule
+from npa_envs.rule.network import FoldedRule
+from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.cycle import TrainingCycle

@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import is_in_torch_dispatch_mode
 
 from npa_envs.ops.launch import LaunchTape
-from npa_envs.rule.rule import Network
+from npa_envs.rule.network import Network
 from npa_envs.world.recorded import LAUNCHED_FIRST, Worlds
 
 LARGEST_TOTAL = 4096

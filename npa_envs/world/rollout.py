@@ -32,7 +32,8 @@ from npa_envs.ops.perceive import (
 )
 from npa_envs.ops.static import StaticRows, StaticWorlds, prepare_static, static_rows
 from npa_envs.ops.update import update_particles
-from npa_envs.rule.rule import LIFE, Network, NPARule, check_rule
+from npa_envs.rule.network import Network
+from npa_envs.rule.rule import LIFE, NPARule, check_rule
 from npa_envs.world.cuda_graph import Beside
 from npa_envs.world.divergence import DivergenceWatch, OnDivergence, make_watch
 from npa_envs.world.division import Births, divided, living, parked

@@ -15,7 +15,8 @@ from npa_envs.ops.perceive import perceive_rows
 from npa_envs.ops.species import checked_counts, perceive_by_species
 from npa_envs.ops.static import StaticRows
 from npa_envs.ops.update import update_particles
-from npa_envs.rule.rule import Network, NPARule
+from npa_envs.rule.network import Network
+from npa_envs.rule.rule import NPARule
 from npa_envs.world.divergence import DivergenceWatch, OnDivergence, make_watch
 from npa_envs.world.division import Births
 from npa_envs.world.randomness import Randomness, WorldRandom, check_generator

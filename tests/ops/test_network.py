@@ -4,7 +4,8 @@ import pytest
 import torch
 from worlds import assert_same, relative_error
 
-from npa_envs.rule.rule import NPARule, fold_weights
+from npa_envs.rule.network import fold_weights
+from npa_envs.rule.rule import NPARule
 
 # Norms of errors over norms of answers, against float64; beside, the worst measured on an H200.
 FORWARD_TOLERANCE = 1e-6  # 2.5e-7

@@ -49,46 +49,47 @@ LADDER = {
     "npa_envs.world.randomness": rung(3, "torch numpy", never=ORACLES),
     "npa_envs.world.divergence": rung(3, "torch", never=ORACLES),
     "npa_envs.rule.codes": rung(2, "torch"),
-    "npa_envs.rule.rule": rung(3, "torch"),
-    "npa_envs.rule": rung(4, "torch safetensors", never=INSIDES),
-    "npa_envs.world": rung(5, "torch", never=ORACLES),
+    "npa_envs.rule.network": rung(3, "torch"),
+    "npa_envs.rule.rule": rung(4, "torch"),
+    "npa_envs.rule": rung(5, "torch safetensors", never=INSIDES),
+    "npa_envs.world": rung(6, "torch", never=ORACLES),
     "npa_envs.tasks": rung(
-        6, "torch numpy PIL sklearn torchvision trimesh pytorch_msssim gsplat", never=ORACLES
+        7, "torch numpy PIL sklearn torchvision trimesh pytorch_msssim gsplat", never=ORACLES
     ),
-    "npa_envs.render": rung(7, "torch numpy PIL imageio imageio_ffmpeg pygame", never=ORACLES),
-    "npa_envs.training": rung(8, "torch numpy tqdm yaml tensorboard", never=ORACLES),
-    "npa_envs": Rung(9, frozenset({COMPUTED_NAME}), never=ORACLES),
+    "npa_envs.render": rung(8, "torch numpy PIL imageio imageio_ffmpeg pygame", never=ORACLES),
+    "npa_envs.training": rung(9, "torch numpy tqdm yaml tensorboard", never=ORACLES),
+    "npa_envs": Rung(10, frozenset({COMPUTED_NAME}), never=ORACLES),
     "npa_envs.measure.record": rung(2, "torch", never=INSIDES),
     "npa_envs.measure.tables": rung(2),
     "npa_envs.measure.plots": rung(2, "matplotlib"),
     "npa_envs.measure.speed.hash_grid": rung(3, "warp torch", never=("npa_envs.reference",)),
-    "npa_envs.measure.judge": rung(9, "torch", never=INSIDES),
-    "npa_envs.measure.quality": rung(9, "torch numpy tqdm", never=INSIDES),
-    "npa_envs.measure.codes": rung(10, "torch", never=INSIDES),
-    "npa_envs.measure.interaction": rung(10, "torch numpy matplotlib", never=ORACLES),
+    "npa_envs.measure.judge": rung(10, "torch", never=INSIDES),
+    "npa_envs.measure.quality": rung(10, "torch numpy tqdm", never=INSIDES),
+    "npa_envs.measure.codes": rung(11, "torch", never=INSIDES),
+    "npa_envs.measure.interaction": rung(11, "torch numpy matplotlib", never=ORACLES),
     "npa_envs.measure.speed": rung(
-        12, "torch numpy matplotlib scipy warpSPHCore", never=("npa_envs.kernels",)
+        13, "torch numpy matplotlib scipy warpSPHCore", never=("npa_envs.kernels",)
     ),
-    "npa_envs.measure.accuracy": rung(13, "torch matplotlib", never=("npa_envs.kernels",)),
-    "npa_envs.measure.robustness": rung(14, "torch", never=ORACLES),
-    "npa_envs.measure": rung(15),
-    "npa_envs.envs": rung(16, "torch numpy gymnasium pettingzoo", never=INSIDES),
+    "npa_envs.measure.accuracy": rung(14, "torch matplotlib", never=("npa_envs.kernels",)),
+    "npa_envs.measure.robustness": rung(15, "torch", never=ORACLES),
+    "npa_envs.measure": rung(16),
+    "npa_envs.envs": rung(17, "torch numpy gymnasium pettingzoo", never=INSIDES),
     "npa_envs.wrappers": rung(
-        17,
+        18,
         "torch numpy gymnasium pettingzoo stable_baselines3 ray torchrl tensordict rsl_rl minari "
         "h5py",
         never=INSIDES,
     ),
     "npa_envs.agents": rung(
-        18, "torch numpy tqdm gymnasium pettingzoo stable_baselines3 cma", never=INSIDES
+        19, "torch numpy tqdm gymnasium pettingzoo stable_baselines3 cma", never=INSIDES
     ),
     "npa_envs.agents.comparison": rung(
-        19, "torch numpy PIL scipy matplotlib jsonschema", never=INSIDES
+        20, "torch numpy PIL scipy matplotlib jsonschema", never=INSIDES
     ),
-    "npa_envs.agents.search": rung(19, "torch numpy cma ribs", never=INSIDES),
-    "npa_envs.web": rung(20, "torch numpy gymnasium PIL starlette uvicorn", never=ORACLES),
-    "npa_envs.cli": rung(21, "torch numpy tqdm tyro imageio_ffmpeg", never=ORACLES),
-    "npa_envs.__main__": rung(22),
+    "npa_envs.agents.search": rung(20, "torch numpy cma ribs", never=INSIDES),
+    "npa_envs.web": rung(21, "torch numpy gymnasium PIL starlette uvicorn", never=ORACLES),
+    "npa_envs.cli": rung(22, "torch numpy tqdm tyro imageio_ffmpeg", never=ORACLES),
+    "npa_envs.__main__": rung(23),
 }
 WARP_AND_TORCH = {"npa_envs.ops", "npa_envs.measure.speed.hash_grid"}
 
