@@ -9,6 +9,7 @@ from typing import ClassVar, TypeVar, get_args
 import torch
 from torch import Tensor
 
+from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.task import Start
 from npa_envs.envs.morphogenesis2d import Morphogenesis2DEnvConfig, PictureTask
 from npa_envs.errors import NPAError, shown
@@ -121,6 +122,42 @@ class GrownTask(PictureTask[Config]):
             update_prob=self.config.update_prob,
             generator=random.take(slice(k, k + 1)).beside(Purpose.GROWTH),
         )
+
+
+def run_rule(
+    rule: NPARule,
+    config: EnvConfig,
+    x: Tensor,
+    s: Tensor,
+    steps: int,
+    random: WorldRandom,
+    *,
+    detach_positions: bool = False,
+) -> tuple[Tensor, Tensor]:
+    """Return worlds after some steps of a rule, with the constants of an environment's worlds.
+
+    Args:
+        rule: What runs the particles.
+        config: The environment's configuration.
+        x: Positions [length units], shape [B, N, 2].
+        s: States, dimensionless, shape [B, N, C].
+        steps: Steps of the rule.
+        random: One stream a world; advanced by `steps`.
+        detach_positions: Leave out the gradient by what particles perceive of where others are.
+    """
+    return rollout(
+        rule,
+        x,
+        s,
+        steps,
+        eps=config.eps,
+        box=config.box,
+        update_prob=config.update_prob,
+        dt=config.dt,
+        position_noise=config.position_noise,
+        detach_positions=detach_positions,
+        generator=random,
+    )
 
 
 def _load_rule(config: GrownConfig, device: torch.device) -> NPARule:

@@ -21,6 +21,7 @@ from npa_envs.envs.core.task import EnvTask, Start
 from npa_envs.envs.core.vector import NPAVectorEnv
 from npa_envs.envs.garden.config import GardenReward
 from npa_envs.envs.garden.worlds import LivingWorlds
+from npa_envs.envs.grown import run_rule
 from npa_envs.errors import NPAError
 from npa_envs.rule.codes import Codes
 from npa_envs.rule.files import load_rule
@@ -31,7 +32,6 @@ from npa_envs.tasks.morphogenesis2d import Morphogenesis2DConfig
 from npa_envs.training.trained_tasks import sources_of_codes
 from npa_envs.world.actions import Physics
 from npa_envs.world.randomness import Purpose, WorldRandom
-from npa_envs.world.rollout import rollout
 
 SEEN_LIMIT = 8.0
 """What is seen is clipped to plus and minus this (dimensionless)."""
@@ -195,7 +195,9 @@ class ShapeshifterTask(EnvTask[Shapeshifter2DEnvConfig]):
         count = self.config.grow_steps
         # One by one: a rule's products change in the last bit with the number of worlds.
         worlds = [
-            self._run(
+            run_rule(
+                self.rule,
+                self.config,
                 x[k : k + 1],
                 s[k : k + 1],
                 count,
@@ -243,22 +245,9 @@ class ShapeshifterTask(EnvTask[Shapeshifter2DEnvConfig]):
             action: Codes, dimensionless, shape [B, 1, K].
             random: One stream a world; advanced by `rule_steps`.
         """
-        return self._run(x, self.rule.with_code(s, action), self.config.rule_steps, random)
-
-    def _run(self, x: Tensor, s: Tensor, steps: int, random: WorldRandom) -> tuple[Tensor, Tensor]:
         config = self.config
-        return rollout(
-            self.rule,
-            x,
-            s,
-            steps,
-            eps=config.eps,
-            box=config.box,
-            update_prob=config.update_prob,
-            dt=config.dt,
-            position_noise=config.position_noise,
-            generator=random,
-        )
+        coded = self.rule.with_code(s, action)
+        return run_rule(self.rule, config, x, coded, config.rule_steps, random)
 
     def earned(self, x: Tensor, s: Tensor, loss: Tensor, marks: Tensor) -> Tensor:
         """Return how near worlds are to their goals: 1 there, 0 as a blank picture; shape [B]."""

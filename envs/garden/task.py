@@ -13,12 +13,11 @@ from npa_envs import world_mean
 from npa_envs.envs.core.task import Start
 from npa_envs.envs.garden.brushwork import brushed, grid_places, holds, offsets
 from npa_envs.envs.garden.config import GardenConfig
-from npa_envs.envs.grown import GrownTask
+from npa_envs.envs.grown import GrownTask, run_rule
 from npa_envs.errors import NPAError
 from npa_envs.rule.rule import COLOUR_OFFSET
 from npa_envs.tasks.targets.points import PointTarget
 from npa_envs.world.randomness import WorldRandom
-from npa_envs.world.rollout import rollout
 
 SEEN_LIMIT = 8.0
 """What is seen is clipped to plus and minus this (dimensionless, or length units)."""
@@ -142,7 +141,9 @@ class GardenTask(GrownTask[Config]):
             detach_positions: Leave out the gradient by what particles perceive of where others
                 are, as training does.
         """
-        run = partial(self._run, random=random, detach_positions=detach_positions)
+        run = partial(
+            run_rule, self.rule, self.config, random=random, detach_positions=detach_positions
+        )
         x, s, rate = brushed(x, s, action, self.middle(x), self.config)
         if rate is None:
             x, s = run(x, s, self.config.rule_steps)
@@ -155,24 +156,6 @@ class GardenTask(GrownTask[Config]):
     def struck(self, x: Tensor, s: Tensor, random: WorldRandom) -> tuple[Tensor, Tensor]:
         """Return worlds with what befalls them at the end of a step; by default nothing."""
         return x, s
-
-    def _run(
-        self, x: Tensor, s: Tensor, steps: int, *, random: WorldRandom, detach_positions: bool
-    ) -> tuple[Tensor, Tensor]:
-        config = self.config
-        return rollout(
-            self.rule,
-            x,
-            s,
-            steps,
-            eps=config.eps,
-            box=config.box,
-            update_prob=config.update_prob,
-            dt=config.dt,
-            position_noise=config.position_noise,
-            detach_positions=detach_positions,
-            generator=random,
-        )
 
     def middle(self, x: Tensor) -> Tensor:
         """Return what brushes' places are counted from: the mean, less the target's, [B, 2]."""
