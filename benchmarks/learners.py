@@ -16,6 +16,7 @@ import statistics
 import time
 
 import torch
+from scale import wait
 
 from npa_envs.agents.learning import Problem
 from npa_envs.agents.learning.ppo import Learner, PPOOptions
@@ -70,13 +71,6 @@ def measured(ranks: Ranks, worlds: int, told: argparse.Namespace) -> dict[str, o
         "advantage": batch.advantages.square().mean().item(),
         "weights": weights.norm().item(),
     }
-
-
-def wait(ranks: Ranks, device: torch.device) -> None:
-    """Wait for the device of each process."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-    ranks.any(False)
 
 
 if __name__ == "__main__":
