@@ -78,6 +78,7 @@ class Trainer:
         resume: Go on from the checkpoint in `config.out`.
         overwrite: Start anew although `config.out` holds a run; its files are removed.
         rollout: The rollout to train through; None is the engine's for one rule.
+        ranks: The processes that share the run; None: those of torch's default group.
 
     Raises:
         NPAError: There is no such device; the folder cannot be written to, holds a run already
@@ -95,6 +96,7 @@ class Trainer:
         resume: bool = False,
         overwrite: bool = False,
         rollout: Rollout | None = None,
+        ranks: Ranks | None = None,
     ) -> None:
         self.task = task
         self.config = config
@@ -108,7 +110,7 @@ class Trainer:
         self._board: Any = None
         self._seconds_before = 0.0
         self._started: float | None = None
-        self._ranks = ranks = Ranks.current()
+        self._ranks = ranks = Ranks.current() if ranks is None else ranks
         content = None
         if ranks.first:
             content = self._open_folder(resume=resume, overwrite=overwrite)
