@@ -65,6 +65,8 @@ def train(arguments: argparse.Namespace) -> None:
                 fields["steps"] = (62, 64)
             if arguments.iterations:
                 fields["iterations"] = arguments.iterations
+            if arguments.learning_rate:
+                fields["learning_rate"] = arguments.learning_rate
             fields |= {"repeats": 1, "tensorboard": False, "picture_interval": 0}
             fields |= {"checkpoint_interval": 10**9, "device": arguments.device}
             out = arguments.out / "runs" / f"{target}-{kind}"
@@ -215,6 +217,7 @@ def main() -> None:
     parser.add_argument("--kinds", nargs="+", default=tuple(KINDS))
     parser.add_argument("--size", default="small")
     parser.add_argument("--iterations", type=int, default=0)
+    parser.add_argument("--learning-rate", type=float, default=0.0)
     parser.add_argument("--longest", type=float, default=math.inf)
     parser.add_argument("--particles", nargs="+", type=int, default=(4096,))
     parser.add_argument("--steps", type=int, default=64)

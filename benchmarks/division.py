@@ -1,25 +1,33 @@
 """Rules whose particles divide, from one particle on, beside plain rules that begin with a disk.
 
-`measure` runs rules on seeds that training never saw: losses and living particles over the steps,
-and then after half of the particles are taken away, each second one or those on one side.
+`train` goes on from the shipped rule of each target by the recipe of the preset `best`: once from a
+disk, as before, and once from one particle. `measure` runs rules on seeds that training never saw:
+losses and living particles over the steps, and then after half of the particles are taken away,
+each second one or those on one side.
 
-    python benchmarks/division.py OUT.json RULE [RULE ...] [--device cuda]
+    python benchmarks/division.py train --out OUT --device cuda
+    python benchmarks/division.py measure OUT.json RULE [RULE ...] [--device cuda]
 """
 
 from __future__ import annotations
 
 import argparse
+import math
+import shutil
 import statistics
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
+from recipes import train_side_by_side
 from torch import Tensor
 
 import npa_envs
 from npa_envs.measure.record import machine, write_record
 from npa_envs.rule.files import rule_metadata
 from npa_envs.tasks.base import PictureTask
+from npa_envs.training import preset
 from npa_envs.training.trained_tasks import task_of_rule
 from npa_envs.world.division import living
 from npa_envs.world.randomness import WorldRandom
@@ -32,6 +40,41 @@ STEPS = (16, 32, 64, 128, 256, 512)
 
 AFTER = (32, 64, 128, 256)
 """Steps after half of the particles are gone."""
+
+KINDS: Mapping[str, Mapping[str, Any]] = {"disk": {}, "division": {"division": True}}
+"""What `train` trains of each target: the control, and a rule whose particles divide."""
+
+
+def train(arguments: argparse.Namespace) -> None:
+    """Train the rules of all targets side by side."""
+    small: dict[str, Any] = {}
+    if arguments.particle_count:
+        small = dict.fromkeys(("particle_count", "target_point_count"), arguments.particle_count)
+    wanted = {
+        f"{target}-{kind}": {**small, **fields, "target": target, "initial_rule": target}
+        for target in arguments.targets
+        for kind, fields in KINDS.items()
+    }
+    configs = [
+        preset(
+            "best",
+            **fields,
+            iterations=arguments.iterations,
+            # Few numbers of steps: few graphs.
+            steps=(62, 64),
+            tensorboard=False,
+            picture_interval=0,
+            checkpoint_interval=10**9,
+            device=arguments.device,
+            out=arguments.out / "runs" / name,
+        )
+        for name, fields in wanted.items()
+    ]
+    trainers, seconds = train_side_by_side(configs, arguments.longest)
+    for name, trainer in zip(wanted, trainers, strict=True):
+        trainer.save()
+        shutil.copy(trainer.folder.rule, arguments.out / f"{name}.safetensors")
+    print(f"{[*wanted]}, {trainers[0].iteration} iterations, {seconds:.1f} s together")
 
 
 def row(task: PictureTask, x: Tensor, s: Tensor, divides: bool) -> dict[str, list[float]]:
@@ -76,13 +119,8 @@ def measured(path: Path, device: torch.device) -> dict[str, Any]:
     return found
 
 
-def main() -> None:
+def measure(arguments: argparse.Namespace) -> None:
     """Measure all rules."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("out", type=Path)
-    parser.add_argument("rules", type=Path, nargs="+")
-    parser.add_argument("--device", default="cpu")
-    arguments = parser.parse_args()
     device = torch.device(arguments.device)
     found = {}
     for path in arguments.rules:
@@ -96,6 +134,29 @@ def main() -> None:
                 }
                 print(name, when, means, flush=True)
         write_record(arguments.out, {"machine": machine(device), "rules": found})
+
+
+def main() -> None:
+    """Do what the command line asks for."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    commands = parser.add_subparsers(required=True)
+    training = commands.add_parser("train")
+    training.set_defaults(run=train)
+    training.add_argument("--out", type=Path, required=True)
+    training.add_argument("--targets", nargs="+", default=("heart", "gecko"))
+    training.add_argument("--iterations", type=int, default=2500)
+    training.add_argument("--longest", type=float, default=math.inf)
+    training.add_argument("--particle-count", type=int, default=0)
+    measuring = commands.add_parser("measure")
+    measuring.set_defaults(run=measure)
+    measuring.add_argument("out", type=Path)
+    measuring.add_argument("rules", type=Path, nargs="+")
+    for command in (training, measuring):
+        command.add_argument("--device", default="cpu")
+    arguments = parser.parse_args()
+    arguments.run(arguments)
 
 
 if __name__ == "__main__":
