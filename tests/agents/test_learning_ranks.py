@@ -75,9 +75,13 @@ def learned(form):
 
 
 @pytest.fixture(scope="module", autouse=True)
-def loaded_kernels(device):
-    """Load once what each forked process would have to load by itself."""
-    for form in QUICK if device.type == "cpu" else ():
+def loaded_kernels(request):
+    """Load once what each forked process would have to load by itself.
+
+    By the fixture `device` all tests here would be run on a GPU as well, where a process that has
+    used CUDA cannot be forked.
+    """
+    for form in QUICK if request.config.getoption("--device") == "cpu" else ():
         learned(form)
 
 
