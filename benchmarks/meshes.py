@@ -1,6 +1,6 @@
 """Recipes of 3D morphogenesis compared, and meshes that none of them was developed on.
 
-An arm is a recipe with one choice changed. `run` trains arms on meshes, one run after the other,
+An arm is a recipe with one choice changed. `run` trains arms on meshes, several side by side,
 and measures the rules as `npa-envs evaluate` does, on seeds that training never saw. Every finished
 run is a line of JSON with its rule and a picture: four held-out views of the target, and of one
 world after 128 steps and at the end. `draw` writes the unseen meshes as files, `particles` asks how
@@ -15,11 +15,14 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import time
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from datetime import date
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -30,6 +33,8 @@ from npa_envs.files import write_text
 from npa_envs.measure.quality import evaluate
 from npa_envs.measure.record import current_commit, machine
 from npa_envs.measure.tables import as_objects
+from npa_envs.rule.files import load_rule, save_rule
+from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D
 from npa_envs.tasks.targets.meshes import (
     FloatArray,
@@ -40,8 +45,10 @@ from npa_envs.tasks.targets.meshes import (
     load_mesh,
     turned,
 )
-from npa_envs.tasks.targets.views import Views, over, some_views
-from npa_envs.training import override, preset, train
+from npa_envs.tasks.targets.views import Views, over, some_views, views_of_mesh
+from npa_envs.tasks.train_config import LOWEST, TrainConfig
+from npa_envs.training import Trainer, override, preset
+from npa_envs.training.overrides import config_to_dict
 from npa_envs.world.recorded import release_recordings
 
 SEEDS = tuple(range(1_000_000, 1_000_008))
@@ -54,16 +61,17 @@ Fields = Mapping[str, Any]
 
 RECIPE: Fields = {
     "repeats": 1,
-    "iterations": 1000,
+    "iterations": 3000,
     "state_dim": 24,
     "seed_radius": 0.7,
     "blur_sigma": 0.0,
     "pool_size": 32,
     "steps": (30, 34),
     "schedule": "cosine",
-    "learning_rate": 1e-3,
-    "lifetimes": (64, 8192),
+    "learning_rate": 2e-3,
+    "lifetimes": (32, 4096),
     "damage_share": 0.25,
+    "rest_weight": 0.5,
     "stray_share": 5e-5,
     "stray_weight": 10.0,
     "damage_radius": 0.15,
@@ -73,21 +81,33 @@ RECIPE: Fields = {
     "sigma": 0.012,
     "opacity": 0.4,
 }
-"""The first candidate, laid over the preset `paper`: what 2D learned, and a rule that has grown."""
+"""The candidate, laid over the preset `paper`: what 2D learned, and a rule that has grown."""
+
+FEWER: Fields = {"particle_count": 8192, "eps": 0.126, "sigma": 0.014, "opacity": 0.6}
+"""Half of the particles, which see as many neighbours and cover as much."""
+
+FEWEST: Fields = {"particle_count": 4096, "eps": 0.159, "sigma": 0.016, "opacity": 0.8}
+"""A quarter."""
 
 ARMS: Mapping[str, Fields] = {
     "recipe": {},
-    "untrained": {"initial_rule": "", "blur_sigma": 20.0, "blur_iterations": 300},
-    "blur": {"blur_sigma": 10.0, "blur_iterations": 300},
-    "rate 2e-3": {"learning_rate": 2e-3},
-    "half seeds": {"lifetimes": (0, 0), "seed_interval": 1, "fresh_share": 0.5},
-    "steps 16 to 20": {"steps": (16, 20), "iterations": 1600},
-    "2 worlds": {"world_count": 2, "iterations": 1700},
-    "sigma 0.02": {"sigma": 0.02, "opacity": 0.15},
-    "sigma 0.008": {"sigma": 0.008, "opacity": 0.6},
-    "no SSIM": {"ssim_weight": 0.0},
+    "8192": FEWER,
+    "4096": FEWEST,
+    "4096, untrained": {**FEWEST, "initial_rule": "", "blur_sigma": 20.0, "blur_iterations": 200},
+    "4096, rate 1e-3": {**FEWEST, "learning_rate": 1e-3},
+    "4096, rest 2": {**FEWEST, "rest_weight": 2.0},
+    "4096, no rest": {**FEWEST, "rest_weight": 0.0},
+    "4096, half seeds": {
+        **FEWEST,
+        "lifetimes": (0, 0),
+        "rest_weight": 0.0,
+        "seed_interval": 1,
+        "fresh_share": 0.5,
+    },
+    "4096, steps 16 to 20": {**FEWEST, "steps": (16, 20)},
+    "best": {},
 }
-"""What each arm changes of `RECIPE`."""
+"""What each arm changes of `RECIPE`; `best` is the preset itself."""
 
 FAST_TOGETHER: Fields = {
     "schedule": "cosine",
@@ -220,40 +240,130 @@ def sheet(task: Morphogenesis3D, worlds: list[tuple[Tensor, Tensor]]) -> Image.I
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Train, measure and draw, one run after the other."""
-    out: Path = arguments.out
-    out.mkdir(parents=True, exist_ok=True)
+    """Train, measure and draw, a group of runs after the other."""
+    arguments.out.mkdir(parents=True, exist_ok=True)
     begun = time.perf_counter()
-    for arm in arguments.arms:
-        for target in arguments.targets:
-            if time.perf_counter() - begun > arguments.seconds:
-                print(f"no time for {arm}, {target}", flush=True)
-                continue
-            one_run(arguments, arm, target)
+    runs = [(arm, target) for arm in arguments.arms for target in arguments.targets]
+    for first in range(0, len(runs), arguments.together):
+        group = runs[first : first + arguments.together]
+        if time.perf_counter() - begun > arguments.seconds:
+            print(f"no time for {group}", flush=True)
+            continue
+        trainers, seconds = train_side_by_side(arguments, group)
+        for (arm, target), trainer in zip(group, trainers, strict=True):
+            measure(arguments, arm, target, trainer, seconds, len(group))
+        del trainers
 
 
-def one_run(arguments: argparse.Namespace, arm: str, target: str) -> None:
-    """Train an arm on a mesh, and write what became of it."""
-    out: Path = arguments.out
-    own = RECIPE | ARMS[arm] if arguments.size == "full" else FAST_ARMS[arm]
-    changes = {**own, **json.loads(arguments.fields)}
-    changes = {k: tuple(v) if isinstance(v, list) else v for k, v in changes.items()}
+def configuration(arguments: argparse.Namespace, arm: str, target: str) -> TrainConfig[Any]:
+    """Return what a run is told."""
     name = f"{arm.replace(',', '').replace(' ', '_')}-{Path(target).stem}{arguments.label}"
     fixed = {"tensorboard": False, "picture_interval": 0, "checkpoint_interval": 10**9}
     fixed |= {"target": target, "device": arguments.device, "out": arguments.runs / name}
+    changes = own_changes(arguments, arm)
+    if arm == "best":
+        return preset("best", "morphogenesis3d", **changes, **fixed)
+    if changes.get("initial_rule") and "eps" in changes:
+        changes["initial_rule"] = rule_for(changes["initial_rule"], changes["eps"], fixed["out"])
     base = "paper" if arguments.size == "full" else "fast"
-    config = preset(base, "morphogenesis3d", **changes, **fixed, log_interval=100)
+    config = preset(base, "morphogenesis3d", **changes, **fixed)
     if config.schedule == "milestones" and arguments.size == "fast":
         marks = (2 * config.iterations // 3, 7 * config.iterations // 8)
         config = override(config, milestones=marks)
-    result = train(
-        config,
-        "morphogenesis3d",
-        overwrite=True,
-        progress=False,
-        max_seconds=arguments.longest,
-    )
-    task = Morphogenesis3D(config.task, device=arguments.device).for_rule(result.rule)
+    return config
+
+
+def rule_for(source: str, eps: float, folder: Path) -> str:
+    """Write a rule as one of another perception radius, with the same weights; return the file."""
+    rule = load_rule(source)
+    changed = NPARule(**{**rule.hyper_parameters(), "eps0": eps})
+    changed.load_state_dict(rule.state_dict())
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    path = folder.with_suffix(".first.safetensors")
+    save_rule(changed, path)
+    return str(path)
+
+
+def own_changes(arguments: argparse.Namespace, arm: str) -> dict[str, Any]:
+    """Return what a run changes of its preset."""
+    own = RECIPE | ARMS[arm] if arguments.size == "full" else FAST_ARMS[arm]
+    if arm == "best":
+        own = {}
+    changes = {**own, **json.loads(arguments.fields)}
+    return {k: tuple(v) if isinstance(v, list) else v for k, v in changes.items()}
+
+
+def train_side_by_side(
+    arguments: argparse.Namespace, group: list[tuple[str, str]]
+) -> tuple[list[Trainer], float]:
+    """Train several rules, an iteration of each in turn; return the trainers and the seconds."""
+    cuda = arguments.device.startswith("cuda")
+    trainers, streams = [], []
+    for arm, target in group:
+        config = configuration(arguments, arm, target)
+        streams.append(torch.cuda.Stream(arguments.device) if cuda else nullcontext())
+        with on(streams[-1]):
+            task = make_task(config, target, arguments.device)
+            trainers.append(Trainer(task, config, task_name="morphogenesis3d", overwrite=True))
+    begun = time.perf_counter()
+    longest = arguments.clock or arguments.longest or math.inf
+    fall = fall_by_clock(begun, arguments.clock) if arguments.clock else TrainConfig._fall
+    with patch.object(TrainConfig, "_fall", fall):
+        for number in range(max(trainer.config.total_iterations for trainer in trainers)):
+            if number % 16 == 0 and cuda:
+                # The host would run ahead of the time that the device needs.
+                torch.cuda.synchronize()
+            if number % 200 == 0:
+                print(f"iteration {number}: {time.perf_counter() - begun:.1f} s", flush=True)
+            if time.perf_counter() - begun >= longest:
+                break
+            for trainer, stream in zip(trainers, streams, strict=True):
+                if trainer.iteration < trainer.config.total_iterations:
+                    with on(stream):
+                        trainer.iterate()
+    if cuda:
+        torch.cuda.synchronize()
+    return trainers, time.perf_counter() - begun
+
+
+def on(stream: Any) -> Any:
+    """Return a context in which work goes to a stream."""
+    return torch.cuda.stream(stream) if isinstance(stream, torch.cuda.Stream) else stream
+
+
+def fall_by_clock(begun: float, seconds: float) -> Callable[[TrainConfig[Any], int], float]:
+    """Return a cosine that falls with the time, where nobody knows how many iterations fit."""
+
+    def fall(config: TrainConfig[Any], within: int) -> float:
+        share = min(1.0, (time.perf_counter() - begun) / seconds)
+        return LOWEST + (1.0 - LOWEST) * (0.5 + 0.5 * math.cos(math.pi * share))
+
+    return fall
+
+
+def make_task(config: TrainConfig[Any], target: str, device: str) -> Morphogenesis3D:
+    """Return a run's task; unseen meshes are drawn without a file, so nothing has to read one."""
+    views = None
+    if target in UNSEEN:
+        own = config.task
+        counts = own.resolution, own.training_views, own.held_out_views
+        views = views_of_mesh(UNSEEN[target]().fitted(), target, *counts)
+    return Morphogenesis3D(config.task, target=views, device=device)
+
+
+def measure(
+    arguments: argparse.Namespace,
+    arm: str,
+    target: str,
+    trainer: Trainer,
+    seconds: float,
+    together: int,
+) -> None:
+    """Measure what was trained, and write what became of it."""
+    out, config = arguments.out, trainer.config
+    rule = trainer._cycle.average.rule(trainer.rule)
+    save_rule(rule, out / f"{config.out.name}.safetensors", metadata=told_of(trainer))
+    task = trainer.task.for_rule(rule)
     worlds = []
 
     def watch(x: Tensor, s: Tensor, step: int) -> None:
@@ -261,7 +371,7 @@ def one_run(arguments: argparse.Namespace, arm: str, target: str) -> None:
             worlds.append((x, s))
 
     rows = evaluate(
-        result.rule,
+        rule,
         task,
         checkpoints=arguments.steps,
         seeds=SEEDS[: arguments.seeds],
@@ -271,16 +381,26 @@ def one_run(arguments: argparse.Namespace, arm: str, target: str) -> None:
     if arguments.device.startswith("cuda"):
         release_recordings()
     with torch.no_grad():
-        sheet(task, worlds).save(out / f"{name}.png")
-    seconds = result.record["seconds"]
-    line = {"size": arguments.size, "arm": arm, "target": Path(target).stem, "fields": changes}
-    line |= {"iterations": result.iteration, "seconds": seconds, "growth": as_objects(rows)}
-    line |= origin(arguments)
+        sheet(task, worlds).save(out / f"{config.out.name}.png")
+    line = {"size": arguments.size, "arm": arm, "target": Path(target).stem}
+    line |= {"fields": own_changes(arguments, arm), "iterations": trainer.iteration}
+    line |= {"seconds": round(seconds, 1), "together": together, "clock": arguments.clock}
+    line |= {"growth": as_objects(rows), **origin(arguments)}
     with (out / "meshes.jsonl").open("a") as file:
         file.write(json.dumps(line) + "\n")
-    (out / f"{name}.safetensors").write_bytes((config.out / "rule.safetensors").read_bytes())
     told = "  ".join(f"{row.step}: {row.psnr:.2f}" for row in rows)
-    print(f"{name:32s} {result.iteration} in {seconds:.0f} s  {told}", flush=True)
+    print(f"{config.out.name:32s} {trainer.iteration} in {seconds:.0f} s  {told}", flush=True)
+
+
+def told_of(trainer: Trainer) -> dict[str, str]:
+    """Return what a rule's file says of the task that it was trained on."""
+    told = config_to_dict(trainer.config)
+    told = {name: told[name] for name in told if name not in ("out", "device", "initial_rule")}
+    return {
+        "task": trainer.task_name,
+        "config": json.dumps(told),
+        "iteration": str(trainer.iteration),
+    }
 
 
 def origin(arguments: argparse.Namespace) -> dict[str, str]:
@@ -362,6 +482,8 @@ def main() -> None:
     parser.add_argument("--steps", type=int, nargs="+", default=list(STEPS))
     parser.add_argument("--seeds", type=int, default=len(SEEDS), help="worlds to measure")
     parser.add_argument("--longest", type=float, help="seconds of a run, at most")
+    parser.add_argument("--clock", type=float, help="seconds of a cosine that follows the time")
+    parser.add_argument("--together", type=int, default=1, help="runs side by side")
     parser.add_argument("--seconds", type=float, default=1e9, help="begin no run later")
     parser.add_argument("--commit", help="what the lines name, where files are no checkout")
     parser.add_argument("--device", default="cpu")

@@ -16,7 +16,7 @@ from npa_envs.files import home_path, read_json
 from npa_envs.ops import Cameras, cameras_of_poses, look_at, orbit
 from npa_envs.tasks.checks import check_count, is_real
 from npa_envs.tasks.targets.images import open_image, scaled_square
-from npa_envs.tasks.targets.meshes import RADIUS, draw_mesh, load_mesh
+from npa_envs.tasks.targets.meshes import RADIUS, Mesh, draw_mesh, load_mesh
 
 DISTANCE = 3.2
 """How far cameras are from the origin [length units]."""
@@ -107,11 +107,26 @@ def load_views(
     if os.path.isdir(folder):
         return read_nerf(folder, resolution, training_count, held_out_count).to(device)
     mesh = load_mesh(source)
+    return views_of_mesh(mesh, folder.stem, resolution, training_count, held_out_count).to(device)
+
+
+def views_of_mesh(
+    mesh: Mesh, name: str, resolution: int, training_count: int, held_out_count: int
+) -> ViewTarget:
+    """Draw a mesh that fits into the ball of radius 0.85 from cameras all around.
+
+    Args:
+        mesh: What to draw.
+        name: What the target is called.
+        resolution: Pixels along each side of a view.
+        training_count: Views to train with.
+        held_out_count: Views to measure by.
+    """
     views = []
     for count, turn in ((training_count, 0.0), (held_out_count, 0.5)):
         cameras = surrounding_cameras(count, resolution, turn=turn)
         views.append(Views(cameras, torch.from_numpy(draw_mesh(mesh, cameras))))
-    return ViewTarget(folder.stem, views[0], views[1]).to(device)
+    return ViewTarget(name, views[0], views[1])
 
 
 def surrounding_cameras(count: int, resolution: int, *, turn: float = 0.0) -> Cameras:
