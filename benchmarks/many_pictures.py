@@ -50,6 +50,20 @@ and twice the units; and 16 that are read from the picture."""
 LOCAL: Mapping[str, Any] = {"particle_count": 256, "target_point_count": 256}
 """Worlds of the preset `fast` with half of its particles: for one core."""
 
+MANY_FIELDS = (
+    "world_count",
+    "pool_size",
+    "fresh_share",
+    "learning_rate",
+    "hidden_dim",
+    "code_dim",
+    "switch_share",
+)
+"""What rules of many pictures may be told besides."""
+
+TRIAL = 40
+"""Iterations of a run that tells how many fit into a time."""
+
 SEEDS = tuple(range(1000, 1004))
 """Seeds of the worlds that rules are measured on."""
 
@@ -136,6 +150,9 @@ def fields_of(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return what all runs of a call are told."""
     if arguments.size == "local":
         fields = dict(LOCAL)
+    elif arguments.size == "fast":
+        # Few numbers of steps: few graphs. Wide rules cannot begin with the preset's rule.
+        fields = {"steps": (23, 25), "initial_rule": ""}
     else:
         fields = {**SECOND, **SIZES[arguments.size]}
         if arguments.size != "tiny":
@@ -149,13 +166,13 @@ def fields_of(arguments: argparse.Namespace) -> dict[str, Any]:
 
 def base_of(arguments: argparse.Namespace) -> str:
     """Return the preset that runs begin from."""
-    return "fast" if arguments.size == "local" else "paper"
+    return "fast" if arguments.size in ("local", "fast") else "paper"
 
 
 def many_fields(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return what rules of many pictures are told besides."""
     fields: dict[str, Any] = {"targets": tuple(arguments.targets)}
-    for name in ("world_count", "pool_size", "hidden_dim", "code_dim", "switch_share"):
+    for name in MANY_FIELDS:
         value = getattr(arguments, name)
         if value is not None:
             fields[name] = value
@@ -222,23 +239,57 @@ def median_losses(rows: Sequence[Mapping[str, Any]]) -> dict[int, str]:
 
 
 def train(arguments: argparse.Namespace) -> None:
-    """Train rules of many pictures and the controls side by side."""
+    """Train rules of many pictures, and then the controls side by side.
+
+    With `--many-seconds` a short run tells how many iterations fit into so many seconds. `--share K
+    N` trains every Nth control from the Kth on.
+    """
     told, many = fields_of(arguments), many_fields(arguments)
-    base = base_of(arguments)
     sources = named_targets(arguments.targets)
     chosen = random.Random(2).sample(list(sources), min(arguments.controls, len(sources)))
-    wanted: dict[str, dict[str, Any]] = {
-        kind: told | many | KINDS[kind] for kind in arguments.kinds or KINDS if kind != "none"
-    }
-    wanted |= {f"control-{name}": told | {"target": sources[name]} for name in chosen}
-    configs = [
-        preset(base, **fields, out=arguments.out / "runs" / name) for name, fields in wanted.items()
-    ]
-    trainers, seconds = train_side_by_side(configs, arguments.longest)
-    for name, trainer in zip(wanted, trainers, strict=True):
-        trainer.save()
-        shutil.copy(trainer.folder.rule, arguments.out / f"{name}.safetensors")
-    print(f"{len(wanted)} runs, {[t.iteration for t in trainers]} iterations, {seconds:.1f} s")
+    kinds = {kind: told | many | KINDS[kind] for kind in arguments.kinds or KINDS if kind != "none"}
+    if arguments.many_seconds:
+        for name, fields in kinds.items():
+            fields["iterations"] = fitting(arguments, name, fields)
+    first, step = arguments.share
+    controls = {f"control-{name}": told | {"target": sources[name]} for name in chosen[first::step]}
+    for wanted in (kinds, controls):
+        if not wanted:
+            continue
+        configs = [
+            preset(base_of(arguments), **fields, out=arguments.out / "runs" / name)
+            for name, fields in wanted.items()
+        ]
+        trainers, seconds = train_side_by_side(configs, arguments.longest)
+        for name, trainer in zip(wanted, trainers, strict=True):
+            trainer.save()
+            shutil.copy(trainer.folder.rule, arguments.out / f"{name}.safetensors")
+        told_iterations = [t.iteration for t in trainers]
+        print(f"{[*wanted]}: {told_iterations} iterations, {seconds:.1f} s together", flush=True)
+
+
+def fitting(arguments: argparse.Namespace, name: str, fields: Mapping[str, Any]) -> int:
+    """Return how many iterations of a run fit into `--many-seconds`."""
+    out = arguments.out / "trials" / name
+    told = {**fields, "iterations": 10**6}
+    config = preset(base_of(arguments), **told, out=out)
+    task = ManyPictures(config.task, device=arguments.device)
+    trainer = Trainer(task, config, task_name="morphogenesis2d", overwrite=True)
+    begun = 0.0
+    for number in range(2 * TRIAL):
+        if number == TRIAL:
+            begun = now(arguments.device)
+        trainer.iterate()
+    pace = (now(arguments.device) - begun) / TRIAL
+    print(f"{name}: {1000 * pace:.2f} ms an iteration", flush=True)
+    return max(1, int(arguments.many_seconds / pace))
+
+
+def now(device: str) -> float:
+    """Return the time when the device has done its work [s]."""
+    if device.startswith("cuda"):
+        torch.cuda.synchronize()
+    return time.perf_counter()
 
 
 @torch.no_grad()
@@ -382,9 +433,11 @@ def main() -> None:
     parser.add_argument("--iterations", type=int, default=0)
     parser.add_argument("--many-iterations", type=int, default=0)
     parser.add_argument("--longest", type=float, default=math.inf)
-    for name in ("world-count", "pool-size", "hidden-dim", "code-dim"):
-        parser.add_argument(f"--{name}", type=int)
-    parser.add_argument("--switch-share", type=float)
+    parser.add_argument("--many-seconds", type=float, default=0.0)
+    parser.add_argument("--share", type=int, nargs=2, default=(0, 1))
+    for name in MANY_FIELDS:
+        kind = float if name.endswith(("share", "rate")) else int
+        parser.add_argument(f"--{name.replace('_', '-')}", type=kind)
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     commands = {"pictures": draw_pictures, "ways": ways, "train": train, "measure": measure}
