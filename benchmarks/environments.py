@@ -10,6 +10,8 @@ same worlds with the work queued on the device and nothing of Python's between: 
 what Python costs. `device` is the sum of the kernels' times, `idle` the share of a step without
 any.
 
+With --plain only: plain loops of `env.step` without resets, of single environments and of batches.
+
 With --small only: environment steps a second of the small ids of several B, whole episodes with
 their resets, and no peers. Gardens are measured by benchmarks/gardens.py.
 
@@ -230,6 +232,66 @@ def add_kernels(row: dict[str, Any], device: torch.device, quick: bool) -> None:
             print(f"  {spent:9.2f} µs {spent / total:6.1%} {count:6.1f} x  {kernel['name'][:80]}")
 
 
+# Plain loops
+
+PLAIN_STEPS, PLAIN_WARM, PLAIN_READINGS = 48, 2, 5
+
+
+def measure_plain(
+    start: str, count: int | None, particle_count: int, output: str, device: str, quick: bool
+) -> dict[str, Any]:
+    """Return what a step of a plain loop takes, of a single environment where count is None."""
+    name, keywords = STARTS[start]
+    if start == "grown":
+        keywords = keywords | {"seed_pool": min(count or 4, 4), "grow_steps": 4 if quick else 256}
+    given: dict[str, Any] = {"particle_count": particle_count, "eps": 0.1, "device": device}
+    given |= {"max_episode_steps": EPISODE_STEPS, "output": output, **keywords}
+    env: Any
+    if count is None:
+        env = gymnasium.make(name, disable_env_checker=True, **given)
+    else:
+        env = gymnasium.make_vec(name, count, vectorization_mode="vector_entry_point", **given)
+    generator = torch.Generator().manual_seed(0)
+    sets = [
+        CALM * (2.0 * torch.rand(env.action_space.shape, generator=generator) - 1.0)
+        for _ in range(ACTION_SETS)
+    ]
+    actions = [drawn.to(device) if output == "torch" else drawn.numpy() for drawn in sets]
+    times = []
+    for reading in range(PLAIN_WARM + PLAIN_READINGS):
+        env.reset(seed=reading)
+        synchronize(torch.device(device))
+        begun = time.perf_counter()
+        for k in range(PLAIN_STEPS):
+            env.step(actions[k % ACTION_SETS])
+        synchronize(torch.device(device))
+        times.append((time.perf_counter() - begun) / PLAIN_STEPS)
+    env.close()
+    taken = times[PLAIN_WARM:]
+    return {
+        "form": "single" if count is None else "vector",
+        "world_count": count or 1,
+        "particle_count": particle_count,
+        "start": start,
+        "output": output,
+        "step_us": statistics.median(taken) * 1e6,
+        "step_us_range": [min(taken) * 1e6, max(taken) * 1e6],
+    }
+
+
+def plain_rows(device: str, quick: bool) -> Iterator[dict[str, Any]]:
+    """Yield single environments by both kinds of arrays, then batches of tensors."""
+    count = 64 if quick else 1024
+    for start in ("grown", "seed"):
+        for output in ("torch", "numpy"):
+            yield measure_plain(start, None, count, output, device, quick)
+    batches = (Case(2, 64),) if quick else PLAIN_BATCHES
+    for case in batches:
+        yield measure_plain("grown", case[0], case[1], "torch", device, quick)
+
+
+PLAIN_BATCHES = (Case(64, 4096), Case(1024, 1024), Case(1, 1024), Case(64, 1024))
+
 # Small worlds
 
 SMALL_STEPS = {
@@ -408,6 +470,7 @@ def main() -> None:
     parser = script_parser(__doc__)
     parser.add_argument("--quick", action="store_true", help="tiny worlds: does it run?")
     parser.add_argument("--case", type=int, nargs=2, metavar=("B", "N"), help="only this one")
+    parser.add_argument("--plain", action="store_true", help="only plain loops without resets")
     parser.add_argument("--small", action="store_true", help="only small ids")
     parser.add_argument("--skip-peers", action="store_true", help="only these environments")
     parser.add_argument("--skip-own", action="store_true", help="only the peers")
@@ -422,6 +485,14 @@ def main() -> None:
             print(small_table(small[-len(counts) :]).splitlines()[-1], flush=True)
         if arguments.output:
             write_record(arguments.output, {**script_facts(arguments), "rows": small})
+        return
+    if arguments.plain:
+        plain = []
+        for row in plain_rows(arguments.device, quick):
+            plain.append(row)
+            show(row)
+            if arguments.output:
+                write_record(arguments.output, {**script_facts(arguments), "rows": plain})
         return
     cuda = device.type == "cuda"
     cases = QUICK if quick else CUDA if cuda else CPU
