@@ -285,6 +285,7 @@ def test_a_configuration_file_goes_over_the_preset_and_options_over_the_file(tmp
         ("morphogenesis2d --device cuda", "best"),
         ("co_morphogenesis2d --device cuda:1", "best"),
         ("texture --device cuda", "best"),
+        ("morphogenesis3d --device cuda", "best"),
         ("point_classification --device cuda", "fast"),
         ("morphogenesis2d --device cuda --preset fast", "fast"),
     ],
