@@ -4,19 +4,26 @@
 
 Worlds are as dense as those of `npa-envs bench` (66 neighbours), with 16 channels and an untrained
 rule of 128 hidden units. Memory is all that torch has held, worlds at the beginning included.
+
+The last line is a check. Copies of a world of 2^20 particles, too far from each other to be seen,
+make one of 1e8: after two steps of all particles each copy must be what the first one is, up to
+rounding.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import torch
 
-from npa_envs.measure.speed.throughput import rollout_call
-from npa_envs.measure.speed.workloads import Workload
+from npa_envs.measure.speed.workloads import Workload, rollout_call
+from npa_envs.world.rollout import rollout
 
 INFERENCE = (2**22, 2**24, 40_000_000, 100_000_000, 120_000_000)
 TRAINING = (2**22, 2**24)
@@ -27,7 +34,6 @@ def measured(
 ) -> dict[str, object]:
     """Return what a rollout of a world takes."""
     workload = Workload(2, 1, particle_count, steps)
-    torch.cuda.empty_cache()
     torch.cuda.reset_peak_memory_stats(device)
     x, s = workload.worlds(device)
     options = {"cuda_graph": False}
@@ -50,7 +56,47 @@ def measured(
         "ms_a_step": round(best * 1e3, 3),
         "particle_steps_a_second": round(particle_count / best),
         "peak_gib": round(torch.cuda.max_memory_allocated(device) / 2**30, 2),
+        "reserved_gib": round(torch.cuda.max_memory_reserved(device) / 2**30, 2),
         "worlds_gib": round((x.nbytes + s.nbytes) / 2**30, 2),
+    }
+
+
+@torch.no_grad()
+def checked(copies: int, particle_count: int, device: torch.device) -> dict[str, object]:
+    """Return how far copies within one world are from the first of them, after two steps."""
+    workload = Workload(2, 1, particle_count, 2)
+    x, s = workload.worlds(device)
+    # On a grid of 2^-14, places of copies are numbers of float32.
+    x = (x * 2.0**14).round() / 2.0**14
+    rule = workload.rule(device)
+    draws = torch.Generator(device).manual_seed(3)
+    for weight in rule.parameters():
+        noise = torch.randn(weight.shape, generator=draws, device=device)
+        weight.copy_(0.1 * noise)
+    given = {"eps": workload.eps, "update_prob": 1.0, "cuda_graph": False}
+    side = math.ceil(math.sqrt(copies))
+    pitch = math.ceil(2.0 * workload.half_width + 10.0 * workload.eps)
+    number = torch.arange(copies, device=device)
+    places = torch.stack((number % side, number // side), -1).float()
+    places = ((places - side // 2) * pitch)[:, None]
+    all_x = (x + places).reshape(1, -1, 2)
+    all_x, all_s = rollout(rule, all_x, s.repeat(1, copies, 1), workload.steps, **given)
+    parts_x, parts_s = all_x.view(copies, -1, 2), all_s.view(copies, particle_count, -1)
+    first_x, first_s = parts_x[0] - places[0], parts_s[0]
+    far_x, far_s = [], []
+    for place, part_x, part_s in zip(places, parts_x, parts_s, strict=True):
+        far_x.append(float((part_x - place - first_x).abs().max()))
+        far_s.append(float((part_s - first_s).abs().max()))
+    return {
+        "copies": copies,
+        "particles": copies * particle_count,
+        "worst_x": max(far_x),
+        "worst_s": max(far_s),
+        "median_copy_x": sorted(far_x)[copies // 2],
+        "median_copy_s": sorted(far_s)[copies // 2],
+        "moved_x": float((first_x - x).abs().mean()),
+        "moved_s": float((first_s - s).abs().mean()),
+        "float32_step_at_the_edge": float(torch.finfo().eps * places.abs().max() / 2),
     }
 
 
@@ -62,17 +108,26 @@ def main() -> None:
     parser.add_argument("--training", type=int, nargs="*", default=TRAINING)
     parser.add_argument("--steps", type=int, default=4)
     parser.add_argument("--training-steps", type=int, default=16)
+    parser.add_argument("--copies", type=int, default=95, help="of the check; 0: none")
     told = parser.parse_args()
     device = torch.device("cuda", torch.cuda.current_device())
-    lines = [{"device": torch.cuda.get_device_name(device)}]
+    lines: list[dict[str, object]] = [{"device": torch.cuda.get_device_name(device)}]
     asked = [(n, told.steps, False) for n in told.inference]
     asked += [(n, told.training_steps, True) for n in told.training]
-    for particle_count, steps, train in asked:
+    measurements: list[tuple[dict[str, object], Callable[[], dict[str, object]]]] = [
+        ({"particles": n, "train": train}, partial(measured, n, steps, device, train=train))
+        for n, steps, train in asked
+    ]
+    if told.copies:
+        measurements.append(({"copies": told.copies}, partial(checked, told.copies, 2**20, device)))
+    for what, measure in measurements:
+        torch.cuda.empty_cache()
+        begun = time.perf_counter()
         try:
-            line = measured(particle_count, steps, device, train=train)
+            line = measure()
         except Exception as error:
-            line = {"particles": particle_count, "train": train, "error": str(error)[:500]}
-        print(json.dumps(line), flush=True)
+            line = what | {"error": str(error)[:500]}
+        print(json.dumps(line | {"seconds": round(time.perf_counter() - begun, 1)}), flush=True)
         lines.append(line)
         if told.out is not None:
             told.out.write_text(json.dumps(lines, indent=1) + "\n")
