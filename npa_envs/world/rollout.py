@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import functools
 import math
-import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from types import NoneType
-from typing import Literal, NamedTuple, Protocol, overload
+from typing import Literal, NamedTuple, overload
 
 import torch
 from torch import Tensor
@@ -24,28 +23,18 @@ from npa_envs.ops.checks import (
     checked_flag,
     checked_number,
 )
-from npa_envs.ops.perceive import (
-    PerceptionOptions,
-    Terms,
-    perceive_rows,
-    update_some_at_a_time,
-)
-from npa_envs.ops.static import StaticRows, StaticWorlds, prepare_static, static_rows
-from npa_envs.ops.update import update_particles
+from npa_envs.ops.static import StaticWorlds, prepare_static
 from npa_envs.rule.network import Network
-from npa_envs.rule.rule import LIFE, NPARule, check_rule
-from npa_envs.world.cuda_graph import Beside
+from npa_envs.rule.rule import NPARule, check_rule
 from npa_envs.world.divergence import DivergenceWatch, OnDivergence, make_watch
-from npa_envs.world.division import Births, divided, living, parked
+from npa_envs.world.division import living
 from npa_envs.world.prepared import PreparedSteps, may_prepare, run_prepared
 from npa_envs.world.randomness import (
     Randomness,
-    WorldRandom,
     check_generator,
-    normal_draws,
-    uniform_draws,
 )
 from npa_envs.world.recorded import CudaGraph, Worlds, check_cuda_graph, rule_form, run_call
+from npa_envs.world.steps import DivisionStep, RuleStep, Step, StepOptions, rule_terms
 
 Memory = Literal["store", "recompute", "minimal"]
 
@@ -54,55 +43,6 @@ STORED_INTERVAL: dict[Memory, float] = {"store": 1, "recompute": 3, "minimal": m
 
 FEWEST_STATIC = 3
 """Steps from which on it pays to prepare worlds whose particles never move."""
-
-ROWS_TOGETHER = 2**24
-"""Rows of static worlds that are given together, at most, if they are of several steps."""
-
-ROWS_KEPT = 2**24
-"""Rows of perception that are kept for the network all together, at most."""
-
-MOST_AHEAD = 4
-"""Steps whose draws a recording makes beside the steps before them, at most: these take memory."""
-
-OVERFLOW_LOG_PROBABILITY = 34.5
-"""Row capacities hold with probability 1 - exp(-34.5), about 1 - 1e-15, for each step."""
-
-
-class StepOptions(NamedTuple):
-    """Everything about a step that stays the same over a rollout, checked."""
-
-    eps: float
-    box: tuple[float, ...] | None
-    update_prob: float
-    dt: float
-    position_noise: float
-    detach_positions: bool
-
-
-def row_capacity(particle_total: int, update_prob: float) -> int:
-    """Return how many rows hold the active particles of a step, without reading their number.
-
-    Bernstein's inequality bounds the number of active particles; a graph of kernels needs a shape
-    that does not depend on the draw. On the CPU the exact number is used instead.
-
-    Args:
-        particle_total: Particles of all worlds, B N.
-        update_prob: Probability p with which each is active.
-    """
-    mean = particle_total * update_prob
-    variance = mean * (1.0 - update_prob)
-    slack = OVERFLOW_LOG_PROBABILITY / 3.0
-    margin = slack + math.sqrt(slack * slack + 2.0 * OVERFLOW_LOG_PROBABILITY * variance)
-    return min(particle_total, math.ceil(mean + margin))
-
-
-def row_count(mask: Tensor | None, x: Tensor, options: StepOptions) -> int:
-    """Return how many rows hold the active particles of a step of worlds at x; no mask: all."""
-    total = x.shape[0] * x.shape[1]
-    if mask is None:
-        return total
-    # Counting is free on the CPU; on CUDA it would stall the stream.
-    return row_capacity(total, options.update_prob) if mask.is_cuda else max(int(mask.sum()), 1)
 
 
 def check_memory(memory: Memory) -> None:
@@ -171,235 +111,6 @@ def _checked_numbers(
 
 
 _known_numbers = functools.lru_cache(maxsize=256, typed=True)(_checked_numbers)
-
-
-def draw_step(x: Tensor, options: StepOptions, generator: Randomness | None) -> Draws:
-    """Draw a step's update mask and position noise, in this order."""
-    mask = noise = None
-    if isinstance(generator, WorldRandom):
-        generator.advance()
-        if options.update_prob < 1.0:
-            mask = generator.bernoulli(options.update_prob, x.shape[1])
-        if options.position_noise > 0.0:
-            noise = generator.normal(*x.shape[1:], dtype=x.dtype)
-            noise *= options.position_noise
-        return Draws(mask, noise)
-    if options.update_prob < 1.0:
-        mask = torch.empty(x.shape[:2], dtype=torch.uint8, device=x.device)
-        mask.bernoulli_(options.update_prob, generator=generator)
-    if options.position_noise > 0.0:
-        noise = torch.randn(x.shape, dtype=x.dtype, device=x.device, generator=generator)
-        noise *= options.position_noise
-    return Draws(mask, noise)
-
-
-def drawn_steps(draw: Callable[[], Draws], like: Tensor, steps: int) -> Iterator[Draws]:
-    """Yield what each of some steps draws, in the same order everywhere.
-
-    In a CUDA graph some steps' draws are made while the steps before them run.
-
-    Args:
-        draw: Returns what the next step draws.
-        like: A tensor on the worlds' device.
-        steps: Number of steps.
-    """
-    # Asked in this order: a compiler cannot trace what a stream does.
-    recording = not torch.compiler.is_compiling() and like.is_cuda
-    if not (recording and torch.cuda.is_current_stream_capturing()):
-        for _ in range(steps):
-            yield draw()
-        return
-    beside = Beside.of_thread(like.device, threading.get_ident())
-    ready, rest = [draw()], steps - 1
-    while rest > 0:
-        # Their memory comes from steps that are over by then: these streams take turns in it.
-        count = min(3 * len(ready), MOST_AHEAD, rest)
-        with beside.aside():
-            coming = [draw() for _ in range(count)]
-        yield from ready
-        beside.join()
-        ready, rest = coming, rest - count
-    yield from ready
-
-
-def rule_terms(rule: NPARule) -> Terms:
-    """Return the groups of the perception vector that a rule reads."""
-    inverse = rule.moment_inverse if rule.moment_correction else None
-    return Terms(rule.state_gradient, inverse, rule.density_gradient)
-
-
-class Draws(NamedTuple):
-    """What a step draws."""
-
-    mask: Tensor | None
-    """Update mask, uint8, shape [B, N]; None: all particles are updated."""
-    noise: Tensor | None
-    """Position noise [length units], shape [B, N, D], or None."""
-    rows: StaticRows | None = None
-    """Rows of the active particles, where particles never move."""
-    births: Births | None = None
-    """What fates and children hang on, where particles divide."""
-
-
-class Step(Protocol):
-    """What a rollout repeats: draws, and an advance that follows from them alone."""
-
-    def draws(self, x: Tensor, steps: int, generator: Randomness | None) -> Iterator[Draws]:
-        """Draw what each of some steps of worlds at x draws."""
-
-    def advance(
-        self,
-        x: Tensor,
-        s: Tensor,
-        path_length: Tensor,
-        mask: Tensor | None,
-        noise: Tensor | None,
-        rows: StaticRows | None,
-        births: Births | None,
-    ) -> Worlds:
-        """Return the worlds after one step with these draws."""
-
-    def ordered(self, worlds: Worlds) -> Worlds:
-        """Return worlds of the rollout in the caller's order of particles."""
-
-
-class RuleStep(NamedTuple):
-    """The step of one rule: perceive the active particles, run the network, update."""
-
-    rule: NPARule
-    network: Network | None
-    """The rule's weights as they are run; None: it runs as the module that it is."""
-    options: StepOptions
-    static: StaticWorlds | None = None
-    """Where particles never move: worlds in sorted order, prepared once."""
-
-    def draws(self, x: Tensor, steps: int, generator: Randomness | None) -> Iterator[Draws]:
-        """Draw each step's update mask and position noise."""
-        if self.static is None:
-            yield from drawn_steps(lambda: draw_step(x, self.options, generator), x, steps)
-            return
-        # The rows of static worlds are given some steps at a time, in few launches.
-        total = x.shape[0] * x.shape[1]
-        together = max(min(16, ROWS_TOGETHER // total), 1)
-        for first in range(0, steps, together):
-            count = min(together, steps - first)
-            drawn = [draw_step(x, self.options, generator) for _ in range(count)]
-            masks = [draws.mask for draws in drawn if draws.mask is not None]
-            if masks:
-                capacity = row_capacity(total, self.options.update_prob)
-                rows = static_rows(self.static, x.detach(), masks, capacity)
-                drawn = [Draws(None, None, own) for own in rows]
-            yield from drawn
-
-    def advance(
-        self,
-        x: Tensor,
-        s: Tensor,
-        path_length: Tensor,
-        mask: Tensor | None,
-        noise: Tensor | None,
-        rows: StaticRows | None,
-        births: Births | None,
-    ) -> Worlds:
-        """Return the worlds after one step with these draws."""
-        rule, options = self.rule, self.options
-        network = rule if self.network is None else self.network
-        width = rule.perception_dim if self.network is None else self.network.row_width
-        count = len(rows.row_source) if rows is not None else row_count(mask, x, options)
-        huge = count > ROWS_KEPT and not torch.is_grad_enabled() and self.static is None
-        if huge and not torch.compiler.is_compiling():
-            sides = None if options.box is None else list(options.box)
-            asked = PerceptionOptions(
-                count, width, options.eps, options.eps / rule.eps0, sides, rule_terms(rule)
-            )
-            update, active = update_some_at_a_time(x, s, mask, network, asked)
-        else:
-            perception, active = perceive_rows(
-                x.detach() if options.detach_positions else x,
-                s,
-                mask=mask,
-                row_capacity=count,
-                row_width=width,
-                eps=options.eps,
-                eps0=rule.eps0,
-                box=options.box,
-                terms=rule_terms(rule),
-                static=self.static,
-                static_rows=rows,
-            )
-            update = network(perception)
-        return Worlds(
-            *update_particles(
-                update,
-                x if noise is None else x + noise,
-                s,
-                path_length,
-                rows=active,
-                reach=rule.alpha * options.eps,
-                dt=options.dt,
-                moving=not rule.static,
-                box=options.box,
-            )
-        )
-
-    def ordered(self, worlds: Worlds) -> Worlds:
-        """Return worlds of the rollout in the caller's order of particles."""
-        return worlds if self.static is None else Worlds(*map(self.static.unsort, worlds))
-
-
-class DivisionStep(NamedTuple):
-    """The step of a rule whose particles divide: that of the living, and then their fates."""
-
-    step: RuleStep
-    """The step of the living."""
-
-    def draws(self, x: Tensor, steps: int, generator: Randomness | None) -> Iterator[Draws]:
-        """Draw each step's update mask, position noise, fates and directions of children."""
-        yield from drawn_steps(lambda: self._draw(x, generator), x, steps)
-
-    def _draw(self, x: Tensor, generator: Randomness | None) -> Draws:
-        drawn = draw_step(x, self.step.options, generator)
-        chance = uniform_draws(generator, x.shape[:2], x)
-        return drawn._replace(births=Births(chance, normal_draws(generator, x.shape, x)))
-
-    def advance(
-        self,
-        x: Tensor,
-        s: Tensor,
-        path_length: Tensor,
-        mask: Tensor | None,
-        noise: Tensor | None,
-        rows: StaticRows | None,
-        births: Births | None,
-    ) -> Worlds:
-        """Return the worlds after one step with these draws."""
-        assert births is not None, "drawn above"
-        eps = self.step.options.eps
-        alive = living(s)
-        updated = alive if mask is None else alive & mask.bool()
-        life, rest = s[..., : LIFE + 1], s[..., LIFE + 1 :]
-        # Life is no weight of what is perceived, so perception gives it no gradient.
-        perceived = torch.cat((life.detach(), rest), dim=-1)
-        after = self.step.advance(
-            parked(x, alive, eps), perceived, path_length, updated.byte(), noise, rows, None
-        )
-        # A rule does not change life.
-        new_s = torch.cat((life, after.s[..., LIFE + 1 :]), dim=-1)
-        return Worlds(
-            *divided(
-                after.x,
-                new_s,
-                after.path_length,
-                fates=self.step.rule.fates(new_s),
-                updated=updated,
-                births=births,
-                eps=eps,
-            )
-        )
-
-    def ordered(self, worlds: Worlds) -> Worlds:
-        """Return worlds of the rollout in the caller's order of particles."""
-        return worlds
 
 
 def run_steps(

@@ -22,18 +22,14 @@ from npa_envs.world.division import Births
 from npa_envs.world.randomness import Randomness, WorldRandom, check_generator
 from npa_envs.world.recorded import CudaGraph, Worlds, check_cuda_graph, run_call
 from npa_envs.world.rollout import (
-    Draws,
     Memory,
-    StepOptions,
     check_memory,
     checked_keep_every,
     checked_options,
-    draw_step,
     rollout,
-    row_capacity,
-    rule_terms,
     run_steps,
 )
+from npa_envs.world.steps import Draws, StepOptions, draw_step, row_capacity, rule_terms
 
 SpeciesPerception = Literal["shared", "per_species"]
 

@@ -11,7 +11,7 @@ from npa_envs.ops import splat
 from npa_envs.ops.perceive import Rows
 from npa_envs.ops.update import update_particles
 from npa_envs.tasks.seeds import uniform_ball
-from npa_envs.world.rollout import row_capacity
+from npa_envs.world.steps import row_capacity
 
 
 def plain_rollout(rule, x, s, steps, *, eps, box, dt, masks, detach_positions):
@@ -125,13 +125,13 @@ def test_rollout_and_its_gradients_equal_plain_torch(
 
 def test_recomputing_gives_the_gradients_of_storing(device, monkeypatch):
     advanced = []
-    advance = npa_envs.world.rollout.RuleStep.advance
+    advance = npa_envs.world.steps.RuleStep.advance
 
     def counted(*args):
         advanced[-1] += 1
         return advance(*args)
 
-    monkeypatch.setattr(npa_envs.world.rollout.RuleStep, "advance", counted)
+    monkeypatch.setattr(npa_envs.world.steps.RuleStep, "advance", counted)
     rule = lively_rule(device, dtype=torch.float32)
     x, s = random_world(2, 200, 2, 5, dtype=torch.float32, device=device)
     results = []

@@ -16,7 +16,8 @@ from npa_envs.ops.backend import Request, describe
 from npa_envs.ops.launch import Launch, noted_launches
 from npa_envs.ops.sort import Plan, make_plan
 from npa_envs.rule.rule import NPARule
-from npa_envs.world.rollout import row_capacity, step
+from npa_envs.world.rollout import step
+from npa_envs.world.steps import row_capacity
 
 LEAST_SHARE = 0.005
 """Kernels that take less of a step are left out."""
