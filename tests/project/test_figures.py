@@ -286,3 +286,20 @@ def test_ppo_is_above_what_learns_nothing_in_small_worlds_by_three_standard_erro
         assert ppo is not None
         for floor in floors:
             assert ppo[0] - floor[0] > 3.0 * math.hypot(ppo[1], floor[1])
+
+
+def test_the_table_of_the_test_of_best_has_the_numbers_of_its_file() -> None:
+    page = (ROOT / "docs" / "recipes.md").read_text(encoding="utf-8")
+    section = page.split("## The test of `best`")[1].split("![")[0]
+    told = dict(re.findall(r"^\| ([a-z -]+) \| (.*) \|$", section, re.MULTILINE))
+    record = content(RESULTS / "recipes_best_test_h200.json")
+    aged = {row["picture"]: row for row in record["long"]}
+    steps = (64, 128, 512, 1024, 4096, 20_000)
+    assert len(record["runs"]) == len(aged) == 12
+    for run in record["runs"]:
+        losses = {row["step"]: row["loss"] for row in run["growth"]}
+        late = aged[run["picture"]]
+        cells = [f"{losses[step]:.3f}" for step in steps] + [f"{late['loss']['100000']:.3f}"]
+        cells += [f"{row['worlds_healed']} of {row['world_count']}" for row in run["healing"]]
+        cells.append(f"{late['worlds_within']} of 8")
+        assert told[run["picture"].replace("-", " ")].split(" | ") == cells
