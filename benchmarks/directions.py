@@ -15,7 +15,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import shutil
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -59,6 +58,8 @@ def train(arguments: argparse.Namespace) -> None:
     configs, names = [], []
     for target in arguments.targets:
         for kind in arguments.kinds:
+            if arguments.runs and f"{target}-{kind}" not in arguments.runs:
+                continue
             fields = {**SECOND, **SIZES[arguments.size], **KINDS[kind], "target": target}
             if arguments.size != "tiny":
                 # Few numbers of steps: few graphs.
@@ -72,10 +73,7 @@ def train(arguments: argparse.Namespace) -> None:
             out = arguments.out / "runs" / f"{target}-{kind}"
             configs.append(preset("paper", **fields, out=out))
             names.append(f"{target}-{kind}")
-    trainers, seconds = train_side_by_side(configs, arguments.longest)
-    for name, trainer in zip(names, trainers, strict=True):
-        trainer.save()
-        shutil.copy(trainer.folder.rule, arguments.out / f"{name}.safetensors")
+    trainers, seconds = train_side_by_side(configs, arguments.longest, arguments.out)
     print(f"{len(names)} runs, {trainers[0].iteration} iterations, {seconds:.1f} s together")
 
 
@@ -215,6 +213,7 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--targets", nargs="+", default=TARGETS)
     parser.add_argument("--kinds", nargs="+", default=tuple(KINDS))
+    parser.add_argument("--runs", nargs="*", default=(), help="such as gecko-plain; default: all")
     parser.add_argument("--size", default="small")
     parser.add_argument("--iterations", type=int, default=0)
     parser.add_argument("--learning-rate", type=float, default=0.0)

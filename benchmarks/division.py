@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import shutil
 import statistics
 from collections.abc import Mapping
 from pathlib import Path
@@ -70,10 +69,7 @@ def train(arguments: argparse.Namespace) -> None:
         )
         for name, fields in wanted.items()
     ]
-    trainers, seconds = train_side_by_side(configs, arguments.longest)
-    for name, trainer in zip(wanted, trainers, strict=True):
-        trainer.save()
-        shutil.copy(trainer.folder.rule, arguments.out / f"{name}.safetensors")
+    trainers, seconds = train_side_by_side(configs, arguments.longest, arguments.out)
     print(f"{[*wanted]}, {trainers[0].iteration} iterations, {seconds:.1f} s together")
 
 

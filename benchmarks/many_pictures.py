@@ -18,7 +18,6 @@ import argparse
 import json
 import math
 import random
-import shutil
 import statistics
 import time
 from collections.abc import Mapping, Sequence
@@ -260,10 +259,7 @@ def train(arguments: argparse.Namespace) -> None:
             preset(base_of(arguments), **fields, out=arguments.out / "runs" / name)
             for name, fields in wanted.items()
         ]
-        trainers, seconds = train_side_by_side(configs, arguments.longest)
-        for name, trainer in zip(wanted, trainers, strict=True):
-            trainer.save()
-            shutil.copy(trainer.folder.rule, arguments.out / f"{name}.safetensors")
+        trainers, seconds = train_side_by_side(configs, arguments.longest, arguments.out)
         told_iterations = [t.iteration for t in trainers]
         print(f"{[*wanted]}: {told_iterations} iterations, {seconds:.1f} s together", flush=True)
 

@@ -23,6 +23,7 @@ import contextlib
 import json
 import math
 import random
+import shutil
 import statistics
 import sys
 import tarfile
@@ -369,13 +370,17 @@ def on(stream: Any) -> Any:
 
 
 def train_side_by_side(
-    configs: Sequence[Morphogenesis2DTrainConfig], longest: float = math.inf
+    configs: Sequence[Morphogenesis2DTrainConfig],
+    longest: float = math.inf,
+    kept: Path | None = None,
 ) -> tuple[list[Trainer], float]:
     """Train several rules, an iteration of each in turn; return the trainers and the seconds.
 
     Args:
         configs: What they are told.
         longest: Stop after this time [s], finished or not.
+        kept: Folder that the rules are copied to every 512 iterations and at the end, by the names
+            of the runs' folders.
     """
     device = torch.device(configs[0].device)
     streams, trainers = [], []
@@ -391,13 +396,25 @@ def train_side_by_side(
             torch.cuda.synchronize()
         if time.perf_counter() - begun >= longest:
             break
+        if kept is not None and number and number % 512 == 0:
+            keep(trainers, kept)
         for trainer, stream in zip(trainers, streams, strict=True):
             if trainer.iteration < trainer.config.total_iterations:
                 with on(stream):
                     trainer.iterate()
     if device.type == "cuda":
         torch.cuda.synchronize()
-    return trainers, time.perf_counter() - begun
+    seconds = time.perf_counter() - begun
+    if kept is not None:
+        keep(trainers, kept)
+    return trainers, seconds
+
+
+def keep(trainers: Sequence[Trainer], folder: Path) -> None:
+    """Copy the rules of runs to a folder."""
+    for trainer in trainers:
+        trainer.save()
+        shutil.copy(trainer.folder.rule, folder / f"{trainer.config.out.name}.safetensors")
 
 
 def measured(trainer: Trainer, size: str, last_step: int = LAST) -> dict[str, Any]:
