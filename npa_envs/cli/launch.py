@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import logging
 import os
@@ -101,6 +102,35 @@ def launch(count: int, words: Sequence[str], out: Path, device: str) -> int:
             f"{RunFolder(out).checkpoint}; go on from it with --resume"
         ) from error
     return 0
+
+
+def with_device_of_gpus(words: Sequence[str]) -> list[str]:
+    """Return options with CUDA as their device, where they say `--gpus` and no device."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--gpus")
+    parser.add_argument("--device")
+    first, _ = parser.parse_known_args(words)
+    cuda = first.gpus is not None and first.device is None
+    return [*words, "--device", "cuda"] if cuda else list(words)
+
+
+def asked_count(gpus: int | None, processes: int | None, device: str) -> int | None:
+    """Return how many processes `--gpus` or `--processes` asks for; None for neither.
+
+    Raises:
+        NPAError: Both do, or there are to be fewer than one, or GPUs that are not to be used.
+    """
+    if gpus is not None and processes is not None:
+        raise NPAError(
+            f"gpus says how many processes there are, got gpus {gpus} and processes {processes}: "
+            "give one of them"
+        )
+    if gpus is not None and device == "cpu":
+        raise NPAError("gpus goes with device 'cuda', got 'cpu': take --processes instead")
+    for name, count in (("gpus", gpus), ("processes", processes)):
+        if count is not None and count < 1:
+            raise NPAError(f"{name} must be at least 1, got {count}")
+    return gpus if processes is None else processes
 
 
 @contextlib.contextmanager

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from npa_envs.cli.launch import launch, told_once
+from npa_envs.cli.launch import asked_count, launch, told_once, with_device_of_gpus
 from npa_envs.cli.output import (
     OutFolder,
     RunOptions,
@@ -92,12 +92,12 @@ def main(arguments: Sequence[str]) -> int:
     with joined_ranks() as ranks:
         asked = None
         if ranks.first:
-            words = settled_resume(arguments, lambda words: parse(words).out)
+            words = settled_resume(with_device_of_gpus(arguments), lambda words: parse(words).out)
             asked = words, parse(words)
         asked = ranks.told(asked)
         assert asked is not None, "said by the first process"
         words, options = asked
-        count = options.processes or 1
+        count = asked_count(options.gpus, options.processes, options.device) or 1
         if count > 1 and not ranks.together:
             return launch(count, ("learn", *words), options.out, options.device)
         with told_once(ranks):
@@ -108,15 +108,11 @@ def parse(words: Sequence[str]) -> LearnOptions:
     """Return what the words after `npa-envs learn` say.
 
     Raises:
-        NPAError: A number is too small, or GPUs are given beside what they stand for.
+        NPAError: A number is too small.
     """
     options = parse_options(LearnOptions, "learn", words)
-    check_numbers(options, worlds=1, episodes=1, entries=1, processes=1, gpus=1)
-    if options.gpus is None:
-        return options
-    if options.processes is not None or "--device" in words:
-        raise NPAError("gpus stands for --device cuda and --processes: give one or the other")
-    return replace(options, device="cuda", processes=options.gpus)
+    check_numbers(options, worlds=1, episodes=1, entries=1)
+    return options
 
 
 def run(options: LearnOptions, ranks: Ranks) -> int:

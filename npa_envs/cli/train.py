@@ -12,7 +12,7 @@ import torch
 import torch.distributed as dist
 
 from npa_envs.cli import INTERRUPTED
-from npa_envs.cli.launch import launch, told_once
+from npa_envs.cli.launch import asked_count, launch, told_once
 from npa_envs.cli.output import duration, torch_threads
 from npa_envs.cli.report import Training, write_report
 from npa_envs.cli.train_options import (
@@ -179,18 +179,9 @@ def process_count(task_name: str, options: TrainOptions, config: TrainConfig[Any
         NPAError: There are to be fewer than one, or GPUs that are not to be used; or as for
             `load_checkpoint`, where a run is resumed.
     """
-    if options.gpus is not None and options.processes is not None:
-        raise NPAError(
-            f"gpus says how many processes there are, got gpus {options.gpus} and processes "
-            f"{options.processes}: give one of them"
-        )
-    if options.gpus is not None and config.device == "cpu":
-        raise NPAError("gpus goes with device 'cuda', got 'cpu': take --processes instead")
-    for name, count in (("gpus", options.gpus), ("processes", options.processes)):
-        if count is not None:
-            if count < 1:
-                raise NPAError(f"{name} must be at least 1, got {count}")
-            return count
+    asked = asked_count(options.gpus, options.processes, config.device)
+    if asked is not None:
+        return asked
     seconds = task_entry(task_name).expected_seconds(config)
     idle = thread_count(config) < torch.get_num_threads() and dist.is_available()
     if not idle or config.varied or seconds is None or seconds < PAIRED_SECONDS:

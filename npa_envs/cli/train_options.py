@@ -10,6 +10,7 @@ from typing import Any, get_type_hints
 
 import tyro
 
+from npa_envs.cli.launch import with_device_of_gpus
 from npa_envs.cli.output import OutFolder, parse_options, settled_resume
 from npa_envs.errors import NPAError
 from npa_envs.tasks.co_morphogenesis2d import CoMorphogenesis2DConfig
@@ -84,18 +85,11 @@ def settled(task_name: str, words: Sequence[str]) -> list[str]:
     Raises:
         NPAError: As for `starting_configuration`.
     """
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--gpus")
-    parser.add_argument("--device")
-    first, _ = parser.parse_known_args(words)
-    chosen = list(words)
-    if first.gpus is not None and first.device is None:
-        chosen += ["--device", "cuda"]
 
     def out_of(words: Sequence[str]) -> Path:
         return parse(task_name, starting_configuration(task_name, words), words)[1].out
 
-    return settled_resume(chosen, out_of)
+    return settled_resume(with_device_of_gpus(words), out_of)
 
 
 def starting_configuration(task_name: str, arguments: Sequence[str]) -> TrainConfig[Any]:

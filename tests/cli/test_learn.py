@@ -89,7 +89,9 @@ def test_a_killed_process_ends_a_run_and_a_signal_stops_it(tmp_path):
     [
         (["--options", "tempo=3"], "has no option 'tempo'"),
         (["--keywords", "heart"], "keywords must be NAME=VALUE, got 'heart'"),
-        (["--gpus", "2", "--processes", "2"], "gpus stands for --device cuda and --processes"),
+        (["--gpus", "2", "--processes", "2"], "gpus says how many processes there are"),
+        (["--gpus=2", "--device=cpu"], "gpus goes with device 'cuda', got 'cpu'"),
+        (["--gpus", "0"], "gpus must be at least 1, got 0"),
         (["--resume", "now"], "invalid choice: 'now'"),
     ],
 )
