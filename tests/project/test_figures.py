@@ -236,6 +236,29 @@ def test_the_table_of_searches_has_the_numbers_of_its_file() -> None:
         assert differences(row, rf"({NUMBER}) \(", [mean(column) for column in columns]) == []
 
 
+def earned(rows: list[dict[str, Any] | None]) -> str:
+    """Return what seeds of a learner earn in gardens, as a table's cell has it."""
+    told = [row for row in rows if row is not None]
+    if len(told) < len(rows):
+        return ""
+    values = [row["reward"] for row in told]
+    error = stdev(values) / len(values) ** 0.5
+    share = f" ({100 * mean(r['success'] for r in told):.0f} %)" if "success" in told[0] else ""
+    return f"{mean(values):.3f} ± {error:.3f}{share}".replace("-", "−")
+
+
+def test_the_table_of_learners_in_gardens_has_the_numbers_of_its_file() -> None:
+    page = (ROOT / "docs" / "gardening.md").read_text(encoding="utf-8")
+    for run in content(RESULTS / "garden_learning_cpu.json")["runs"]:
+        seeds = run["seeds"].values()
+        at = [[next((r for r in s if r["steps"] == k), None) for s in seeds] for k in TENS]
+        cells = [*map(earned, at), earned([rows[-1] for rows in seeds])]
+        line = f"| `{run['id']}`, {run['method'].upper()} | {' | '.join(cells)} |"
+        assert (line in page) == (run["method"] != "her"), line
+
+
+TENS = (10_000, 20_000, 30_000)
+
 SMALL_WORLDS = content(RESULTS / "small_sizes_cpu.json")["rows"]
 
 
