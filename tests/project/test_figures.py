@@ -18,11 +18,11 @@ RESULTS = ROOT / "benchmarks" / "results"
 
 # Where a measurement is repeated, name its new file here.
 ROLLOUTS = RESULTS / "paper_h200.json"
-ENVIRONMENTS = RESULTS / "environments_h200.json"
+ENVIRONMENTS = RESULTS / "environments_1024_h200.json"
 TRAINING = RESULTS / "training_h200.txt"
 ROLLOUTS_CPU = RESULTS / "throughput_cpu.json"
 PERCEPTIONS = (RESULTS / "accuracy_cpu.json", RESULTS / "accuracy_h200.json")
-HARD_SCENES = RESULTS / "stress_h200.json"
+HARD_SCENES = RESULTS / "stress_d519fdd_h200.json"
 
 
 def content(path: Path) -> Any:
