@@ -135,6 +135,24 @@ def interface_of(env: Any) -> Interface:
     )
 
 
+def acting_interface(env: Any) -> Interface:
+    """Return what `interface_of` does of an environment whose actions are rows of its particles.
+
+    Raises:
+        NPAError: Actions are something else there, such as codes or brushes.
+    """
+    interface = interface_of(env)
+    space = getattr(env, "single_action_space", None) or getattr(env, "action_space", None)
+    # Parallel environments of PettingZoo have a method there: their agents are particles' species.
+    shape = getattr(space, "shape", None)
+    if space is not None and not callable(space) and (shape is None or len(shape) != 2):
+        raise NPAError(
+            f"this policy acts by rows of particles, but the environment takes {space}: draw from "
+            "env.action_space.sample(), or give another environment"
+        )
+    return interface
+
+
 class Policy:
     """A function from observations to actions; subclasses say what `act` does.
 
@@ -285,10 +303,13 @@ class ZeroPolicy(Policy):
 
     Args:
         env: The environment that it is to act in.
+
+    Raises:
+        NPAError: Actions there are no rows of particles.
     """
 
     def __init__(self, env: Any) -> None:
-        super().__init__(interface_of(env))
+        super().__init__(acting_interface(env))
 
     def act(self, observation: Tensor) -> Tensor:
         """Return zeros."""
@@ -305,11 +326,11 @@ class RandomPolicy(Policy):
         seed: Of the sequence of actions, at least 0.
 
     Raises:
-        NPAError: The seed is no such integer.
+        NPAError: The seed is no such integer, or actions there are no rows of particles.
     """
 
     def __init__(self, env: Any, seed: int = 0) -> None:
-        super().__init__(interface_of(env))
+        super().__init__(acting_interface(env))
         given: Any = seed
         if not (is_whole(given) or isinstance(given, np.integer)) or given < 0:
             raise NPAError(f"a seed must be an integer of at least 0, got {shown(given)}")

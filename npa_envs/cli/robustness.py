@@ -42,8 +42,8 @@ class RobustnessOptions(MeasureOptions):
     """
 
     rules: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RULES")] = ()
-    """Shipped rules (`npa-envs list`), files of rules, or folders of training runs; default: all
-    shipped ones, or one of each task when quick."""
+    """Shipped rules (`npa-envs list`), rules that runs begin with (`seven-pictures`), files of
+    rules, or folders of runs; default: all shipped ones, or one of each task when quick."""
 
     seed_count: int | None = None
     """Seeds for each figure; default: 8, or 2 when quick."""
@@ -74,13 +74,18 @@ def main(arguments: Sequence[str]) -> int:
     from npa_envs.measure.accuracy.habitats import rule_names, task_name
     from npa_envs.measure.record import measured_facts, time_limit
     from npa_envs.measure.robustness.study import MOST_PARTICLES, RuleRecord, measure_rule, tables
+    from npa_envs.rule.files import first_rules
     from npa_envs.web.rule_world import name_of
 
     check_numbers(options, seed_count=1, first_seed=0, most_particles=1, threads=1)
     enough = time_limit(options.max_seconds)
     files = {name_of(rule_of(name)): rule_of(name) for name in options.rules if _is_file(name)}
-    shipped = [name for name in options.rules if not _is_file(name)]
-    names = chosen_names("rule", shipped, rule_names()) if shipped or not files else []
+    told = [name for name in options.rules if not _is_file(name)]
+    # Rules that runs begin with are measured where they are named.
+    first = [name for name in first_rules() if name in told and name not in rule_names()]
+    shipped = [name for name in told if name not in first]
+    names = chosen_names("rule", shipped, rule_names()) if shipped or not (files or first) else []
+    names += first
     names += [name for name in files if name not in names]
     if options.quick and not options.rules:
         # One of each task.

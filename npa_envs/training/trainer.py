@@ -409,6 +409,15 @@ def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
     if untrained.divides and not rule.divides:
         rule = dividing(rule)
     wrong = differing_fields(rule, untrained)
+    if rule.codes is not None and untrained.codes is not None:
+        had, wanted = rule.codes.names, untrained.codes.names
+        if had != wanted:
+            raise NPAError(
+                f"initial_rule must have codes of the run's targets, in their order, but "
+                f"{shown(source)} has those of {shown(', '.join(had))}, not of "
+                f"{shown(', '.join(wanted))}: give these targets, or start from a rule without "
+                "codes, or from random weights (initial_rule='')"
+            )
     if wrong:
         raise NPAError(
             f"initial_rule must be a rule of the task's shape, but {shown(source)} differs in "

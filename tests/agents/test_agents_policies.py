@@ -437,3 +437,11 @@ def test_the_shipped_rule_does_far_better_than_anything_scripted(
         assert rule.mean_return > factor * other.mean_return
         assert rule.final_losses.mean() < share * other.final_losses.mean()
     assert rule.final_losses.mean() < left * rule.start_losses.mean()
+
+
+@pytest.mark.parametrize("maker", [ZeroPolicy, RandomPolicy])
+@pytest.mark.parametrize("actions", ["code", "choice"])
+def test_policies_of_particles_refuse_an_environment_of_codes(maker, actions):
+    env = gymnasium.make("npa/Shapeshifter2D-v0", actions=actions)
+    with pytest.raises(NPAError, match="acts by rows of particles"):
+        maker(env)

@@ -393,3 +393,7 @@ def test_the_command_measures_writes_and_goes_on(tmp_path, capsys, monkeypatch):
     (path,) = whole.glob("*.json")
     whole = json.loads(path.read_text())
     assert (whole["courses"], whole["responses"]) == (held["courses"], held["responses"])
+
+
+def test_rules_that_runs_begin_with_are_known_by_name():
+    assert task_name("seven-pictures") == "morphogenesis2d"

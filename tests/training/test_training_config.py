@@ -274,3 +274,10 @@ def test_mappings_are_laid_over_the_species_that_are_there_and_more_over_the_las
 def test_what_several_rules_start_from_is_checked(fields, message):
     with pytest.raises(NPAError, match=message):
         preset("tiny", "co_morphogenesis2d", **fields)
+
+
+def test_a_rule_with_codes_of_other_targets_is_refused_by_their_names():
+    config = preset("fast", targets=("gecko", "heart"), initial_rule="seven-pictures")
+    untrained = NPARule(state_dim=24, hidden_dim=128, code_dim=8, code_names=("gecko", "heart"))
+    with pytest.raises(NPAError, match=r"codes of the run's targets.*not of 'gecko, heart'"):
+        initial_rule(config, untrained)

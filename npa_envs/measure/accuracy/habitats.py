@@ -13,7 +13,7 @@ from torch import Tensor
 
 from npa_envs.errors import NPAError
 from npa_envs.measure.accuracy.checks import Check, Finding, Session
-from npa_envs.rule.files import load_rule, rule_metadata, shipped_rules
+from npa_envs.rule.files import first_rules, load_rule, rule_metadata, shipped_rules
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task, seed_worlds, task_toward
 from npa_envs.training.trained_tasks import task_of_rule, trained_config
@@ -85,12 +85,12 @@ def rule_names() -> list[str]:
 
 
 def task_name(rule: str) -> str:
-    """Return the name of the task that a shipped rule, or one of a file of ours, was trained on.
+    """Return the name of the task that a rule of the package, or of a file of ours, was trained on.
 
     Raises:
         NPAError: The file is none of ours, or says nothing of a task.
     """
-    metadata = rule_metadata(shipped_rules().get(rule, Path(rule)))
+    metadata = rule_metadata((first_rules() | shipped_rules()).get(rule, Path(rule)))
     if metadata.get("task") not in HORIZONS:
         raise NPAError(
             f"the rule's file must say on which task it was trained, {rule!r} says "
