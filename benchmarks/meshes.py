@@ -335,8 +335,8 @@ def fall_by_clock(begun: float, seconds: float) -> Callable[[TrainConfig[Any], i
     """Return a cosine that falls with the time, where nobody knows how many iterations fit."""
 
     def fall(config: TrainConfig[Any], within: int) -> float:
-        share = min(1.0, (time.perf_counter() - begun) / seconds)
-        return LOWEST + (1.0 - LOWEST) * (0.5 + 0.5 * math.cos(math.pi * share))
+        share = max((time.perf_counter() - begun) / seconds, within / config.iterations)
+        return LOWEST + (1.0 - LOWEST) * (0.5 + 0.5 * math.cos(math.pi * min(1.0, share)))
 
     return fall
 
@@ -416,6 +416,7 @@ def particles(arguments: argparse.Namespace) -> None:
     for target in arguments.targets:
         for sigma, opacity in zip(arguments.sigmas, arguments.opacities, strict=True):
             fields = {"target": target, "sigma": sigma, "opacity": opacity, "blur_sigma": 0.0}
+            fields |= json.loads(arguments.fields)
             config = preset("paper", "morphogenesis3d", **fields).task
             task = Morphogenesis3D(config, device=arguments.device)
             places, shades = surface(load_mesh(target), config.particle_count)
