@@ -6,7 +6,8 @@ GPU several runs share the device, each on a stream of its own. Every finished r
 JSON, so that a stopped call goes on where it was. `pictures` draws the emoji; `warm-up` compiles
 all kernels and tests that runs side by side learn bit for bit what they learn alone; `merge` makes
 one record, one sheet of pictures and one archive of rules of what several processes left; `report`
-prints the tables and draws the figure; `follow` says what the decay of a rule's world is.
+prints the tables and draws the figure; `follow` says what the decay of a rule's world is; `long`
+runs finished rules for 100 000 steps within the bounds of `npa-envs stress`.
 
     python benchmarks/recipes.py pictures --out PICTURES
     python benchmarks/recipes.py warm-up --device cuda --out OUT
@@ -14,6 +15,7 @@ prints the tables and draws the figure; `follow` says what the decay of a rule's
     python benchmarks/recipes.py merge --out OUT
     python benchmarks/recipes.py report OUT/recipes.json --figure recipes.png
     python benchmarks/recipes.py follow RULE --target PICTURE.png
+    python benchmarks/recipes.py long --pictures PICTURES/test --device cuda --out OUT
 """
 
 from __future__ import annotations
@@ -43,6 +45,7 @@ from torch import Tensor
 
 from npa_envs.errors import NPAError
 from npa_envs.files import write_bytes
+from npa_envs.measure.accuracy import habitats
 from npa_envs.measure.plots import new_figure, number_plainly, png
 from npa_envs.measure.quality import Runner, evaluate, healing
 from npa_envs.measure.record import machine, write_record
@@ -717,6 +720,75 @@ def follow(arguments: argparse.Namespace) -> None:
         )
 
 
+def endurance(
+    home: habitats.Habitat, steps: int, generators: Sequence[torch.Generator]
+) -> dict[str, Any]:
+    """Return losses and figures of all worlds of a habitat, each against itself when settled.
+
+    Args:
+        home: The worlds.
+        steps: How long they are run.
+        generators: Of the run, and of the steps that tell the energy.
+    """
+    settled = min(habitats.SETTLED, steps // 2)
+    marks = [
+        round(settled * (steps / settled) ** (k / habitats.MARKS))
+        for k in range(habitats.MARKS + 1)
+    ]
+    run = habitats.LongRun(home, generators[0], home.options())
+    count = len(home.x)
+    first: list[dict[str, float]] = [{} for _ in range(count)]
+    largest: list[dict[str, float]] = [{} for _ in range(count)]
+    over: dict[int, str] = {}
+    losses = {}
+    centroids = home.x.mean(1)
+    for step, x, s in run.marks(marks):
+        losses[step] = home.task.metric(x, s).tolist()
+        if step == settled:
+            centroids = x.mean(1)
+        for k in range(count):
+            found = habitats.measured(home, x[k : k + 1], s[k : k + 1], generators[1])
+            if not found["not_finite"]:
+                first[k] = first[k] or dict(found)
+                found["drift"] = float((x[k].mean(0) - centroids[k]).norm())
+                for key, unit in (("extent", "extent"), ("energy", "energy"), ("drift", "extent")):
+                    found[key] /= max(first[k][unit], 1e-12)
+            beyond = [n for n, bound in habitats.BOUNDS.items() if not found.get(n, 0.0) <= bound]
+            if beyond:
+                over.setdefault(k, f"{', '.join(beyond)} at step {step}")
+            for key, value in found.items():
+                largest[k][key] = max(value, largest[k].get(key, 0.0))
+    return {
+        "steps": steps,
+        "worlds_within": count - len(over),
+        "over": over,
+        "worlds": largest,
+        "loss": {step: statistics.fmean(values) for step, values in losses.items()},
+        "worst_loss": {step: max(values) for step, values in losses.items()},
+    }
+
+
+def run_long(arguments: argparse.Namespace) -> None:
+    """Run the rules that `run` has left for very long, a line of JSON each."""
+    device = torch.device(arguments.device)
+    for path in sorted(arguments.out.glob("rule-*.safetensors")):
+        picture = next(p for p in arguments.pictures.glob("*.png") if f"-{p.stem}-" in path.name)
+        config = preset(arguments.preset, target=str(picture)).task
+        task = task_entry("morphogenesis2d").make(config, device)
+        rule = load_rule(path, device=device).float().requires_grad_(False)
+        seeds = [
+            task.seed(1, generator=torch.Generator(device).manual_seed(seed), device=device)
+            for seed in SEEDS
+        ]
+        x, s = (torch.cat(parts) for parts in zip(*seeds, strict=True))
+        home = habitats.Habitat(rule, task, x.float(), s.float(), habitats.SETTLED)
+        generators = [torch.Generator(device).manual_seed(seed) for seed in (1, 2)]
+        line = {"picture": picture.stem} | endurance(home, arguments.steps, generators)
+        with (arguments.out / "long.jsonl").open("a") as file:
+            file.write(json.dumps(line) + "\n")
+        print(f"{picture.stem}: {line['worlds_within']} of {len(SEEDS)} {line['over']}", flush=True)
+
+
 REPORTED = (64, 128, 512, 1024, 4096, LAST)
 """Steps of the tables."""
 
@@ -819,6 +891,13 @@ def main() -> None:
     own.add_argument("--target", required=True)
     own.add_argument("--preset", default="paper", help="what the world is like")
     own.add_argument("--steps", type=int, nargs="+", default=[512, 4096, 20_000])
+    own = commands.add_parser("long")
+    own.set_defaults(main=run_long)
+    own.add_argument("--out", type=Path, required=True, help="folder of `run`")
+    own.add_argument("--pictures", type=Path, required=True, help="folder of PNG files")
+    own.add_argument("--device", default="cpu")
+    own.add_argument("--preset", default="paper", help="what the world is like")
+    own.add_argument("--steps", type=int, default=habitats.STEPS)
     own = commands.add_parser("report")
     own.set_defaults(main=report)
     own.add_argument("record", type=Path)
