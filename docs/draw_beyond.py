@@ -1,11 +1,12 @@
 """Draw what rules do that go beyond the paper, `docs/images/beyond_*.png`.
 
     python docs/draw_beyond.py directions PLAIN EQUIVARIANT    # files of rules
+    python docs/draw_beyond.py directions_full PLAIN EQUIVARIANT [PLAIN EQUIVARIANT ...]
     python docs/draw_beyond.py sizes TRAINED VARIED
     python docs/draw_beyond.py division RULE
     python docs/draw_beyond.py pictures MANY
 
-It takes a minute on a CPU.
+It takes a minute or two on a CPU.
 """
 
 from __future__ import annotations
@@ -99,6 +100,28 @@ def directions(paths: list[str]) -> Shots:
     return shots
 
 
+def directions_full(paths: list[str]) -> Shots:
+    """Return targets, and what rules in pairs of a plain and an equivariant one grow of them.
+
+    Beside each the same world, turned by 90 degrees and some steps later; moved as the loss does,
+    half as large as it is compared.
+    """
+    shots: Shots = []
+    quarter = turns(torch.tensor([0.5 * math.pi]), torch.ones(1))
+    for place, path in enumerate(paths):
+        rule = npa_envs.load_rule(path)
+        task = task_of(path, rule)
+        if place % 2 == 0:
+            shots.append(("target", enlarged(task.target_picture)[::2, ::2]))
+        kind = "equivariant" if rule.equivariant else "plain"
+        generator = torch.Generator().manual_seed(SEEDS[0])
+        x, s = run(rule, task, *task.seed(1, generator=generator), GROWN, seed=SEEDS[0])
+        shots.append((f"{kind}, step {GROWN}", as_it_lies(task, x, s)[::2, ::2]))
+        x, s = run(rule, task, turned(x, quarter), s, AFTER, seed=SEEDS[1])
+        shots.append((f"turned, {AFTER} later", as_it_lies(task, x, s)[::2, ::2]))
+    return shots
+
+
 def sizes(paths: list[str]) -> Shots:
     """Return worlds of other numbers of particles and of other radii, of two rules."""
     shots: Shots = []
@@ -170,7 +193,13 @@ def pictures(paths: list[str]) -> Shots:
 def main() -> None:
     """Draw what the command line asks for."""
     what, *rest = sys.argv[1:]
-    kinds = {"directions": directions, "sizes": sizes, "division": division, "pictures": pictures}
+    kinds = {
+        "directions": directions,
+        "directions_full": directions_full,
+        "sizes": sizes,
+        "division": division,
+        "pictures": pictures,
+    }
     draw = kinds[what]
     captions, frames = zip(*draw(rest), strict=True)
     write_filmstrip(IMAGES / f"beyond_{what}.png", frames, captions, columns=COLUMNS)
