@@ -53,6 +53,9 @@ class BenchOptions(MeasureOptions):
     out: OptionalOutFolder = None
     """Folder for SUITE_DEVICE.json and plots; default: nothing is written."""
 
+    max_seconds: float | None = None
+    """Leave out what has not begun after this time [s]; the rest is written. Default: never."""
+
     plots: bool = False
     """Also draw plots into the output folder; needs the extra `bench`."""
 
@@ -129,7 +132,7 @@ def measured_report(options: BenchOptions, device: torch.device, command: str) -
     Raises:
         NPAError: There is no such strategy or precision.
     """
-    from npa_envs.measure.record import current_commit
+    from npa_envs.measure.record import current_commit, time_limit
     from npa_envs.measure.speed.strategies import PRECISIONS, STRATEGIES
     from npa_envs.measure.speed.suites import SUITES, Report, ratios
     from npa_envs.measure.speed.timing import Session
@@ -145,6 +148,7 @@ def measured_report(options: BenchOptions, device: torch.device, command: str) -
             strategies=[STRATEGIES[name] for name in strategies],
             precisions=[PRECISIONS[name] for name in precisions],
             progress=bar.advance,
+            enough=time_limit(options.max_seconds),
         )
         tables = SUITES[name](session)
         held = ratios(session) if name == QUICK else {}

@@ -251,6 +251,13 @@ def test_what_does_not_fit_into_memory_is_left_out():
     assert done == [1, 1]
 
 
+def test_what_has_not_begun_when_time_is_over_is_left_out():
+    here = session(enough=iter([False, True]).__next__)
+    assert here.attempt("first", lambda: 3) == [3]
+    assert here.attempt("second", lambda: 4) == []
+    assert here.left_out == [LeftOut("second", "no time was left")]
+
+
 def test_peers_that_are_there_are_right_and_others_are_left_out_with_a_reason(monkeypatch):
     def missing(*_):
         raise ModuleNotFoundError("No module named 'absent'")

@@ -23,7 +23,7 @@ from npa_envs import reference
 from npa_envs.measure.quality import psnr
 from npa_envs.measure.speed.hash_grid import grid_fields
 from npa_envs.measure.speed.strategies import PRECISIONS, STRATEGIES, Precision, Strategy
-from npa_envs.measure.speed.timing import Cost, Session, Timing, relative_error
+from npa_envs.measure.speed.timing import NO_TIME, Cost, Session, Timing, relative_error
 from npa_envs.measure.speed.workloads import Gecko, Workload, gecko
 from npa_envs.ops import perception_fields
 from npa_envs.rule.rule import NPARule
@@ -490,6 +490,9 @@ def peer_rows(session: Session, workload: Workload) -> list[PeerRow]:
     exact = _reference_fields(x.double(), s.double(), workload.eps)
     rows: list[PeerRow] = []
     for name, make in PEERS.items():
+        if session.enough():
+            session.leave_out(name, NO_TIME)
+            continue
         try:
             with quiet_warp():
                 calls = make(x, s, workload.eps)

@@ -187,11 +187,12 @@ class Point(NamedTuple):
 
 
 def pictures(tables: Tables) -> dict[str, bytes]:
-    """Return PNG files by their names, as many as there are tables for. Needs matplotlib."""
+    """Return PNG files by their names, of tables that are there and whole. Needs matplotlib."""
     drawn = {}
-    if "perception" in tables:
+    if tables.get("perception") and tables.get("rollouts"):
         drawn["pareto"] = png(_draw_fronts(tables["perception"], tables["rollouts"]))
-    if rows := tables.get("scaling"):
+    rows = tables.get("scaling", [])
+    if {row.axis for row in rows} == set(AXES):
         drawn["scaling"] = png(_draw_scaling(rows, "time"))
         if any(row.infer_mib is not None for row in rows):
             drawn["memory"] = png(_draw_scaling(rows, "memory"))

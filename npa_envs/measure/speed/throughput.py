@@ -292,7 +292,8 @@ def _scaling_row(session: Session, axis: str, value: int) -> ScalingRow:
 
 def slope_rows(rows: Sequence[ScalingRow]) -> list[SlopeRow]:
     """Return how the times of each axis grow."""
-    return [_slope_row(axis, [row for row in rows if row.axis == axis]) for axis in AXES]
+    of_axis = {axis: [row for row in rows if row.axis == axis] for axis in AXES}
+    return [_slope_row(axis, found) for axis, found in of_axis.items() if len(found) > 1]
 
 
 def _slope_row(axis: str, rows: Sequence[ScalingRow]) -> SlopeRow:

@@ -143,6 +143,10 @@ class LeftOut:
     why: str
 
 
+NO_TIME = "no time was left"
+"""Why something is left out that had not begun at the end of the time."""
+
+
 @dataclass
 class Session:
     """One run of the benchmark."""
@@ -161,6 +165,8 @@ class Session:
     """Called with 1 after each row."""
     left_out: list[LeftOut] = field(default_factory=list)
     """What could not be measured, each once."""
+    enough: Callable[[], bool] = lambda: False
+    """Says whether the time for it is over: rows that have not begun by then are left out."""
 
     @property
     def cuda(self) -> bool:
@@ -193,7 +199,10 @@ class Session:
         return Cost(timing, (torch.cuda.max_memory_allocated(device) - before) / 2**20)
 
     def attempt(self, what: str, make: Callable[[], Row]) -> list[Row]:
-        """Return the row that a call makes, none where the device's memory does not suffice."""
+        """Return the row that a call makes; none without the memory or the time for it."""
+        if self.enough():
+            self.leave_out(what, NO_TIME)
+            return []
         try:
             return [make()]
         except torch.OutOfMemoryError:
