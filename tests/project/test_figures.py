@@ -236,6 +236,32 @@ def test_the_table_of_searches_has_the_numbers_of_its_file() -> None:
         assert differences(row, rf"({NUMBER}) \(", [mean(column) for column in columns]) == []
 
 
+def bench_returns(path: Path, task: str) -> list[float]:
+    """Mean returns of the runs of a row of NPA-Bench, by the name of an id without its end."""
+    runs = [run for run in content(path)["runs"] if run["id"] == f"npa/{task}Small-v0"]
+    return [mean(run["returns"]) for run in runs]
+
+
+def test_what_shac_brought_in_npa_bench_and_the_gradient_in_gardens_is_told() -> None:
+    page = (ROOT / "docs" / "npa_bench.md").read_text(encoding="utf-8")
+    rows = RESULTS / "npa_bench_v0"
+    tasks = ("Morphogenesis2D", "Regeneration2D", "Texture", "PointClassification", "Mixing")
+    shac = [bench_returns(RESULTS / "npa_bench_v0_shac_unfinished.json", task) for task in tasks]
+    best = [mean(bench_returns(rows / "gradient.json", task)) for task in tasks]
+    parts = [f"{mean(values) / top:.2f}" for values, top in zip(shac, best, strict=True)]
+    assert f"| SHAC | {' | '.join(parts)} |" in page
+    assert f"| seeds | {' | '.join(str(len(values)) for values in shac)} |" in page
+    gardens = " ".join((ROOT / "docs" / "gardening.md").read_text(encoding="utf-8").split())
+    a, b, c, d = (
+        f"{mean(bench_returns(rows / f'{method}.json', task)) / 32:.2f}".replace("-", "−")
+        for task in ("Gardener2D", "Shepherd2D")
+        for method in ("gradient", "scripted")
+    )
+    assert f"gradient earns {a} a step" in gardens
+    assert f"script earns {b}, and {c} in" in gardens
+    assert f"it earns {d}, in the 32" in gardens
+
+
 def earned(rows: list[dict[str, Any] | None]) -> str:
     """Return what seeds of a learner earn in gardens, as a table's cell has it."""
     told = [row for row in rows if row is not None]
