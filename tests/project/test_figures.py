@@ -262,6 +262,20 @@ def test_what_shac_brought_in_npa_bench_and_the_gradient_in_gardens_is_told() ->
     assert f"it earns {d}, in the 32" in gardens
 
 
+def test_rows_of_npa_bench_on_two_machines_are_told_and_agree() -> None:
+    page = (ROOT / "docs" / "npa_bench.md").read_text(encoding="utf-8")
+    rows = content(RESULTS / "npa_bench_small_two_machines.json")
+    for first, second in (rows[:2], rows[2:]):
+        both = [list(row["returns"].values()) for row in (first, second)]
+        errors = [stdev(values) / len(values) ** 0.5 for values in both]
+        cells = [
+            f"{mean(values):.4f} ± {error:.4f}, {len(values)} seeds"
+            for values, error in zip(both, errors, strict=True)
+        ]
+        assert f"| `{first['method']}`, `{first['id']}` | {' | '.join(cells)} |" in page
+        assert abs(mean(both[0]) - mean(both[1])) < 2.0 * math.hypot(*errors)
+
+
 def earned(rows: list[dict[str, Any] | None]) -> str:
     """Return what seeds of a learner earn in gardens, as a table's cell has it."""
     told = [row for row in rows if row is not None]
