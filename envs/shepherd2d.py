@@ -113,18 +113,19 @@ class ShepherdTask(GardenTask[Shepherd2DEnvConfig]):
         """Return what worlds are to come to, and the share that may be lost, shape [B, 3]."""
         return torch.cat((marks[:, 2:4], torch.full_like(marks[:, :1], self.config.lost_limit)), 1)
 
-    def paid(self, achieved: Any, desired: Any) -> Any:
-        """Return rewards, shape [...], of what was achieved and desired, [..., 3]: arrays alike."""
-        away = ((achieved[..., :2] - desired[..., :2]) ** 2).sum(-1) ** 0.5
+    def paid(self, achieved: Tensor, desired: Tensor) -> Tensor:
+        """Return rewards, shape [...], of what was achieved and desired, [..., 3]."""
+        away = (achieved[..., :2] - desired[..., :2]).square().sum(dim=-1).sqrt()
         excess = achieved[..., 2] - desired[..., 2]
         if self.config.reward == "sparse":
             return ((away <= self.config.tolerance) & (excess <= 0.0)) * 1.0 - 1.0
-        return -away / self.config.goal_reach - self.config.reward_weight * excess.clip(min=0.0)
+        # No division: CUDA multiplies by the inverse instead, which is rounded otherwise.
+        nearness = -away * (1.0 / self.config.goal_reach)
+        return nearness - self.config.reward_weight * excess.clamp(min=0.0)
 
     def earned(self, x: Tensor, s: Tensor, loss: Tensor, marks: Tensor) -> Tensor:
         """Return what worlds are worth, shape [B]."""
-        worth: Tensor = self.paid(self.achieved(x, s, marks), self.desired(marks))
-        return worth.to(torch.float32)
+        return self.paid(self.achieved(x, s, marks), self.desired(marks)).to(torch.float32)
 
     def told_of(self, x: Tensor, s: Tensor, marks: Tensor) -> dict[str, Tensor]:
         """Return whether worlds are at their goals and whole, and what share is lost."""
@@ -227,7 +228,11 @@ class _GoalReward:
             desired_goal: What was desired, in the same shape.
             info: Not read.
         """
-        return self.task.paid(np.asarray(achieved_goal), np.asarray(desired_goal))
+        # By torch, as episodes are paid: NumPy's roots are rounded otherwise on some processors.
+        achieved = torch.tensor(np.asarray(achieved_goal))
+        desired = torch.tensor(np.asarray(desired_goal))
+        paid: NDArray[Any] = self.task.paid(achieved, desired).numpy()
+        return paid
 
 
 class Shepherd2DEnv(_GoalReward, GardenEnv):

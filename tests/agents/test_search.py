@@ -61,8 +61,13 @@ def test_a_candidate_comes_to_the_same_alone_and_beside_others(kind, device):
     together = tried.try_all(given)
     for number, one in enumerate(given):
         alone = tried.try_all(one[None])
-        assert torch.equal(alone.x[0], together.x[number])
-        assert alone.found == together.found[number : number + 1]
+        # But for rounding: some processors add up products of other sizes in another order.
+        torch.testing.assert_close(alone.x[0], together.x[number], atol=1e-6, rtol=0.0)
+        (one_found,), other = alone.found, together.found[number]
+        assert one_found is not None
+        assert other is not None
+        assert one_found.quality == pytest.approx(other.quality, abs=1e-6)
+        assert one_found.measures == pytest.approx(other.measures, abs=1e-6)
 
 
 def test_a_candidate_lives_as_its_rule_does_in_a_rollout(device):
