@@ -18,7 +18,6 @@ import json
 import math
 import time
 from collections.abc import Callable, Mapping
-from contextlib import nullcontext
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -27,6 +26,7 @@ from unittest.mock import patch
 import numpy as np
 import torch
 from PIL import Image
+from side_by_side import iterate_together, on, stream_of
 from torch import Tensor
 
 from npa_envs.files import write_text
@@ -297,38 +297,23 @@ def train_side_by_side(
     arguments: argparse.Namespace, group: list[tuple[str, str]]
 ) -> tuple[list[Trainer], float]:
     """Train several rules, an iteration of each in turn; return the trainers and the seconds."""
-    cuda = arguments.device.startswith("cuda")
     trainers, streams = [], []
     for arm, target in group:
         config = configuration(arguments, arm, target)
-        streams.append(torch.cuda.Stream(arguments.device) if cuda else nullcontext())
+        streams.append(stream_of(arguments.device))
         with on(streams[-1]):
             task = make_task(config, target, arguments.device)
             trainers.append(Trainer(task, config, task_name="morphogenesis3d", overwrite=True))
     begun = time.perf_counter()
+
+    def at(number: int) -> None:
+        if number % 200 == 0:
+            print(f"iteration {number}: {time.perf_counter() - begun:.1f} s", flush=True)
+
     longest = arguments.clock or arguments.longest or math.inf
     fall = fall_by_clock(begun, arguments.clock) if arguments.clock else TrainConfig._fall
     with patch.object(TrainConfig, "_fall", fall):
-        for number in range(max(trainer.config.total_iterations for trainer in trainers)):
-            if number % 16 == 0 and cuda:
-                # The host would run ahead of the time that the device needs.
-                torch.cuda.synchronize()
-            if number % 200 == 0:
-                print(f"iteration {number}: {time.perf_counter() - begun:.1f} s", flush=True)
-            if time.perf_counter() - begun >= longest:
-                break
-            for trainer, stream in zip(trainers, streams, strict=True):
-                if trainer.iteration < trainer.config.total_iterations:
-                    with on(stream):
-                        trainer.iterate()
-    if cuda:
-        torch.cuda.synchronize()
-    return trainers, time.perf_counter() - begun
-
-
-def on(stream: Any) -> Any:
-    """Return a context in which work goes to a stream."""
-    return torch.cuda.stream(stream) if isinstance(stream, torch.cuda.Stream) else stream
+        return trainers, iterate_together(trainers, streams, longest, at=at)
 
 
 def fall_by_clock(begun: float, seconds: float) -> Callable[[TrainConfig[Any], int], float]:

@@ -41,6 +41,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from PIL import Image
+from side_by_side import iterate_together, on, stream_of
 from torch import Tensor
 
 from npa_envs.errors import NPAError
@@ -361,17 +362,6 @@ def configuration(
     return preset("fast" if run.size == "fast" else "paper", **fields)
 
 
-@contextlib.contextmanager
-def stream_of(device: torch.device) -> Iterator[Any]:
-    """Yield a stream of one's own, and nothing on a CPU."""
-    yield torch.cuda.Stream(device) if device.type == "cuda" else contextlib.nullcontext()
-
-
-def on(stream: Any) -> Any:
-    """Return a context in which work goes to a stream."""
-    return torch.cuda.stream(stream) if isinstance(stream, torch.cuda.Stream) else stream
-
-
 def train_side_by_side(
     configs: Sequence[Morphogenesis2DTrainConfig],
     longest: float = math.inf,
@@ -388,26 +378,16 @@ def train_side_by_side(
     device = torch.device(configs[0].device)
     streams, trainers = [], []
     for config in configs:
-        with stream_of(device) as stream, on(stream):
+        streams.append(stream_of(device))
+        with on(streams[-1]):
             task = task_entry("morphogenesis2d").make(config.task, device)
             trainers.append(Trainer(task, config, task_name="morphogenesis2d"))
-            streams.append(stream)
-    begun = time.perf_counter()
-    for number in range(max(config.total_iterations for config in configs)):
-        if number % 64 == 0 and device.type == "cuda":
-            # The host would run ahead of the time that the device needs.
-            torch.cuda.synchronize()
-        if time.perf_counter() - begun >= longest:
-            break
+
+    def at(number: int) -> None:
         if kept is not None and number and number % 512 == 0:
             keep(trainers, kept)
-        for trainer, stream in zip(trainers, streams, strict=True):
-            if trainer.iteration < trainer.config.total_iterations:
-                with on(stream):
-                    trainer.iterate()
-    if device.type == "cuda":
-        torch.cuda.synchronize()
-    seconds = time.perf_counter() - begun
+
+    seconds = iterate_together(trainers, streams, longest, ahead=64, at=at)
     if kept is not None:
         keep(trainers, kept)
     return trainers, seconds

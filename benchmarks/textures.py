@@ -14,7 +14,6 @@ rule: positions and colours of grey particles follow its slope. `report` prints 
 from __future__ import annotations
 
 import argparse
-import contextlib
 import json
 import time
 from collections.abc import Sequence
@@ -26,6 +25,7 @@ import numpy as np
 import texture_candidates  # noqa: F401  names more losses
 import torch
 from PIL import Image
+from side_by_side import iterate_together, on, stream_of
 
 from npa_envs.measure.judge import Judge, JudgeRow
 from npa_envs.measure.quality import evaluate
@@ -40,38 +40,6 @@ from npa_envs.world.recorded import release_recordings
 
 SEEDS = tuple(range(1_000_000, 1_000_008))
 """Seeds of the worlds that rules are judged on."""
-
-
-def on(stream: Any) -> Any:
-    """Return a context in which work goes to a stream; None: on a CPU."""
-    return contextlib.nullcontext() if stream is None else torch.cuda.stream(stream)
-
-
-def train_side_by_side(
-    trainers: Sequence[Trainer], streams: Sequence[Any], longest: float
-) -> float:
-    """Train several rules, an iteration of each in turn; return the seconds.
-
-    Args:
-        trainers: What is trained.
-        streams: The stream that each was made on.
-        longest: Stop after this time [s], finished or not.
-    """
-    cuda = trainers[0].config.device.startswith("cuda")
-    begun = time.perf_counter()
-    for number in range(max(trainer.config.total_iterations for trainer in trainers)):
-        if number % 16 == 0 and cuda:
-            # The host would run ahead of the time that the device needs.
-            torch.cuda.synchronize()
-        if time.perf_counter() - begun >= longest:
-            break
-        for trainer, stream in zip(trainers, streams, strict=True):
-            if trainer.iteration < trainer.config.total_iterations:
-                with on(stream):
-                    trainer.iterate()
-    if cuda:
-        torch.cuda.synchronize()
-    return time.perf_counter() - begun
 
 
 def measured(
@@ -116,14 +84,14 @@ def run(arguments: argparse.Namespace) -> None:
             fields |= {"checkpoint_interval": 10**9, "log_interval": 100, "target": target}
             fields |= {"loss": loss, "device": arguments.device, "out": arguments.runs / name}
             config = preset(arguments.preset, "texture", **(fields | changes))
-            streams.append(torch.cuda.Stream() if arguments.device.startswith("cuda") else None)
+            streams.append(stream_of(arguments.device))
             with on(streams[-1]):
                 task = Texture(config.task, device=arguments.device)
                 config = replace(config, task=task.config)
                 trainers.append(Trainer(task, config, task_name="texture", overwrite=True))
             names.append(name)
     print(f"made in {time.perf_counter() - started:.0f} s", flush=True)
-    seconds = train_side_by_side(trainers, streams, arguments.longest)
+    seconds = iterate_together(trainers, streams, arguments.longest)
     print(f"{[t.iteration for t in trainers]} in {seconds:.0f} s", flush=True)
     for name, trainer in zip(names, trainers, strict=True):
         trainer.save()

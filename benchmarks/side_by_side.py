@@ -1,0 +1,60 @@
+"""Runs that share a device, each on a stream of its own: what other scripts train by."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+
+from npa_envs.training import Trainer
+
+
+def stream_of(device: str | torch.device) -> Any:
+    """Return a stream of one's own on a device; on a CPU what stands for one."""
+    device = torch.device(device)
+    return torch.cuda.Stream(device) if device.type == "cuda" else contextlib.nullcontext()
+
+
+def on(stream: Any) -> Any:
+    """Return a context in which work goes to a stream."""
+    return torch.cuda.stream(stream) if isinstance(stream, torch.cuda.Stream) else stream
+
+
+def iterate_together(
+    trainers: Sequence[Trainer],
+    streams: Sequence[Any],
+    longest: float = math.inf,
+    *,
+    ahead: int = 16,
+    at: Callable[[int], None] | None = None,
+) -> float:
+    """Train several rules, an iteration of each in turn; return the seconds.
+
+    Args:
+        trainers: What is trained.
+        streams: The stream that each was made on.
+        longest: Stop after this time [s], finished or not.
+        ahead: Iterations after which the host waits for the device.
+        at: Called with the number of each iteration before it begins.
+    """
+    cuda = trainers[0].config.device.startswith("cuda")
+    begun = time.perf_counter()
+    for number in range(max(trainer.config.total_iterations for trainer in trainers)):
+        if number % ahead == 0 and cuda:
+            # The host would run ahead of the time that the device needs.
+            torch.cuda.synchronize()
+        if time.perf_counter() - begun >= longest:
+            break
+        if at is not None:
+            at(number)
+        for trainer, stream in zip(trainers, streams, strict=True):
+            if trainer.iteration < trainer.config.total_iterations:
+                with on(stream):
+                    trainer.iterate()
+    if cuda:
+        torch.cuda.synchronize()
+    return time.perf_counter() - begun
