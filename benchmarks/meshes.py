@@ -21,7 +21,6 @@ from collections.abc import Callable, Mapping
 from datetime import date
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -46,7 +45,7 @@ from npa_envs.tasks.targets.meshes import (
     turned,
 )
 from npa_envs.tasks.targets.views import Views, over, some_views, views_of_mesh
-from npa_envs.tasks.train_config import LOWEST, TrainConfig
+from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training import Trainer, override, preset
 from npa_envs.training.overrides import config_to_dict
 from npa_envs.world.recorded import release_recordings
@@ -310,20 +309,8 @@ def train_side_by_side(
         if number % 200 == 0:
             print(f"iteration {number}: {time.perf_counter() - begun:.1f} s", flush=True)
 
-    longest = arguments.clock or arguments.longest or math.inf
-    fall = fall_by_clock(begun, arguments.clock) if arguments.clock else TrainConfig._fall
-    with patch.object(TrainConfig, "_fall", fall):
-        return trainers, iterate_together(trainers, streams, longest, at=at)
-
-
-def fall_by_clock(begun: float, seconds: float) -> Callable[[TrainConfig[Any], int], float]:
-    """Return a cosine that falls with the time, where nobody knows how many iterations fit."""
-
-    def fall(config: TrainConfig[Any], within: int) -> float:
-        share = max((time.perf_counter() - begun) / seconds, within / config.iterations)
-        return LOWEST + (1.0 - LOWEST) * (0.5 + 0.5 * math.cos(math.pi * min(1.0, share)))
-
-    return fall
+    longest, clock = arguments.longest or math.inf, arguments.clock or math.inf
+    return trainers, iterate_together(trainers, streams, longest, clock=clock, at=at)
 
 
 def make_task(config: TrainConfig[Any], target: str, device: str) -> Morphogenesis3D:
@@ -346,7 +333,7 @@ def measure(
 ) -> None:
     """Measure what was trained, and write what became of it."""
     out, config = arguments.out, trainer.config
-    rule = trainer._cycle.average.rule(trainer.rule)
+    rule = trainer.kept_rule
     save_rule(rule, out / f"{config.out.name}.safetensors", metadata=told_of(trainer))
     task = trainer.task.for_rule(rule)
     worlds = []

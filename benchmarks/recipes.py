@@ -366,6 +366,7 @@ def train_side_by_side(
     configs: Sequence[Morphogenesis2DTrainConfig],
     longest: float = math.inf,
     kept: Path | None = None,
+    clock: float = math.inf,
 ) -> tuple[list[Trainer], float]:
     """Train several rules, an iteration of each in turn; return the trainers and the seconds.
 
@@ -374,6 +375,7 @@ def train_side_by_side(
         longest: Stop after this time [s], finished or not.
         kept: Folder that the rules are copied to every 512 iterations and at the end, by the names
             of the runs' folders.
+        clock: Time in which their cosines fall [s], and training ends.
     """
     device = torch.device(configs[0].device)
     streams, trainers = [], []
@@ -387,7 +389,7 @@ def train_side_by_side(
         if kept is not None and number and number % 512 == 0:
             keep(trainers, kept)
 
-    seconds = iterate_together(trainers, streams, longest, ahead=64, at=at)
+    seconds = iterate_together(trainers, streams, longest, clock=clock, ahead=64, at=at)
     if kept is not None:
         keep(trainers, kept)
     return trainers, seconds
@@ -403,7 +405,7 @@ def keep(trainers: Sequence[Trainer], folder: Path) -> None:
 def measured(trainer: Trainer, size: str, last_step: int = LAST) -> dict[str, Any]:
     """Return growth and, where `last_step` is `LAST`, healing of a rule, by all worlds' means."""
     task: Any = trainer.task
-    rule = trainer._cycle.average.rule(trainer.rule)
+    rule = trainer.kept_rule
     device = trainer.config.device
     steps = (4, 8) if size == "tiny" else (*STEPS, LAST)
     steps = tuple(step for step in steps if step <= last_step)
@@ -436,7 +438,7 @@ def measured(trainer: Trainer, size: str, last_step: int = LAST) -> dict[str, An
 def strip(trainer: Trainer, steps: Sequence[int]) -> np.ndarray[Any, Any]:
     """Return pictures of the target and of one world as it grows, side by side."""
     task: Any = trainer.task
-    rule = trainer._cycle.average.rule(trainer.rule)
+    rule = trainer.kept_rule
     device = torch.device(trainer.config.device)
     runner = Runner(rule, task, device, SEEDS[0], None)
     x, s = task.seed(1, generator=torch.Generator(device).manual_seed(SEEDS[0]), device=device)
@@ -513,12 +515,16 @@ def run_all(arguments: argparse.Namespace) -> None:
                 )
                 for run in group
             ]
-            trainers, seconds = train_side_by_side(configs, arguments.longest)
+            trainers, seconds = train_side_by_side(
+                configs, arguments.longest, clock=arguments.clock
+            )
             for run, trainer in zip(group, trainers, strict=True):
                 line = asdict(run) | {"iterations": trainer.iteration, "seconds": seconds}
                 line |= {"together": len(group), "fields": changes}
+                if arguments.clock < math.inf:
+                    line["clock"] = arguments.clock
                 line |= measured(trainer, run.size, arguments.last_step)
-                rule = trainer._cycle.average.rule(trainer.rule)
+                rule = trainer.kept_rule
                 save_rule(rule, out / f"rule-{run.name}.safetensors")
                 if arguments.strips:
                     steps = (4, 8) if run.size == "tiny" else (32, 64, 128, 512, 4096)
@@ -857,6 +863,9 @@ def main() -> None:
     own.add_argument("--together", type=int, default=1, help="runs that share the device")
     own.add_argument("--seconds", type=float, default=1e9, help="begin no run that would end later")
     own.add_argument("--longest", type=float, default=math.inf, help="seconds of a run, at most")
+    own.add_argument(
+        "--clock", type=float, default=math.inf, help="seconds of a cosine that follows the time"
+    )
     own.add_argument("--process", default="0", help="part of the name of the file of results")
     own.add_argument("--fields", default="{}", help="JSON object of fields for all arms")
     own.add_argument("--last-step", type=int, default=LAST, help="measure no later one")

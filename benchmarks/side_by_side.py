@@ -29,6 +29,7 @@ def iterate_together(
     streams: Sequence[Any],
     longest: float = math.inf,
     *,
+    clock: float = math.inf,
     ahead: int = 16,
     at: Callable[[int], None] | None = None,
 ) -> float:
@@ -38,6 +39,8 @@ def iterate_together(
         trainers: What is trained.
         streams: The stream that each was made on.
         longest: Stop after this time [s], finished or not.
+        clock: Time in which a cosine falls [s], where nobody knows how many iterations fit; then
+            training stops.
         ahead: Iterations after which the host waits for the device.
         at: Called with the number of each iteration before it begins.
     """
@@ -47,14 +50,15 @@ def iterate_together(
         if number % ahead == 0 and cuda:
             # The host would run ahead of the time that the device needs.
             torch.cuda.synchronize()
-        if time.perf_counter() - begun >= longest:
+        elapsed = time.perf_counter() - begun
+        if elapsed >= min(longest, clock):
             break
         if at is not None:
             at(number)
         for trainer, stream in zip(trainers, streams, strict=True):
             if trainer.iteration < trainer.config.total_iterations:
                 with on(stream):
-                    trainer.iterate()
+                    trainer.iterate(elapsed / clock)
     if cuda:
         torch.cuda.synchronize()
     return time.perf_counter() - begun

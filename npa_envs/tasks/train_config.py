@@ -320,7 +320,7 @@ class TrainConfig(Generic[TaskConfigT]):
         """`dtype` as torch's own."""
         return torch.float64 if self.dtype == "float64" else torch.float32
 
-    def learning_rate_at(self, iteration: int) -> float:
+    def learning_rate_at(self, iteration: int, share: float = 0.0) -> float:
         """Return the learning rate of an iteration, counted from 0 over all repeats.
 
         It is a function of the iteration alone, restarted with each repeat, so that a resumed run
@@ -329,28 +329,32 @@ class TrainConfig(Generic[TaskConfigT]):
 
         Args:
             iteration: Iterations done so far in the run.
+            share: How much of a cosine is over, in [0, 1], where the iterations say less: a caller
+                who counts seconds makes it fall with them.
         """
         within = iteration % self.iterations
-        rate = self.learning_rate * self._fall(within)
+        rate = self.learning_rate * self._fall(within, share)
         if self.schedule == "cosine":
             rate *= min(1.0, (within + 1) / (RISE * self.iterations))
         return rate
 
-    def ageing_at(self, iteration: int) -> int:
+    def ageing_at(self, iteration: int, share: float = 0.0) -> int:
         """Return the steps without gradients before an iteration, counted from 0 over all repeats.
 
         Args:
             iteration: Iterations done so far in the run.
+            share: As for `learning_rate_at`.
         """
         if self.ageing_steps == 0 or iteration % self.ageing_interval:
             return 0
-        share = 1.0 - self._fall(iteration % self.iterations)
-        return round(share * self.ageing_steps / AGEING_BLOCK) * AGEING_BLOCK
+        fallen = 1.0 - self._fall(iteration % self.iterations, share)
+        return round(fallen * self.ageing_steps / AGEING_BLOCK) * AGEING_BLOCK
 
-    def _fall(self, within: int) -> float:
+    def _fall(self, within: int, share: float) -> float:
         """Return what is left of the learning rate after some iterations of a repeat."""
         if self.schedule == "cosine":
-            fall = 0.5 + 0.5 * math.cos(math.pi * within / self.iterations)
+            over = min(1.0, max(share, within / self.iterations))
+            fall = 0.5 + 0.5 * math.cos(math.pi * over)
             return LOWEST + (1.0 - LOWEST) * fall
         return float(self.decay ** sum(milestone <= within for milestone in self.milestones))
 

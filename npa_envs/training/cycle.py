@@ -136,14 +136,19 @@ class TrainingCycle:
         self._keep = Replayed(self._keep_worlds, device) if graphed else self._keep_worlds
         self._note = Replayed(self._note_iteration, device) if graphed else self._note_iteration
 
-    def run(self, iteration: int) -> int:
-        """Train for one iteration, and return the steps of its rollout, T."""
+    def run(self, iteration: int, share: float = 0.0) -> int:
+        """Train for one iteration, and return the steps of its rollout, T.
+
+        Args:
+            iteration: Iterations done so far in the run.
+            share: As for `TrainConfig.learning_rate_at`.
+        """
         config, batch = self._config, self.batch
         lo, hi = config.steps
         steps = int(torch.randint(lo, hi, (), generator=self.random.schedule))
         if isinstance(self.task, ScheduledTask):
             self.task.begin(iteration)
-        for _ in range(config.ageing_at(iteration) // AGEING_BLOCK):
+        for _ in range(config.ageing_at(iteration, share) // AGEING_BLOCK):
             if len(self._old) > 0:
                 self._grow_old()
         self._draw()
@@ -156,7 +161,7 @@ class TrainingCycle:
         # Between two graphs: what NCCL does is then watched for processes that do not answer.
         self._ranks.reduce([*batch.gradients, batch.terms], self._lost)
         self._note()
-        self.optimiser.step(iteration)
+        self.optimiser.step(iteration, share)
         self.average.update(iteration)
         return steps
 

@@ -55,12 +55,17 @@ class RuleOptimiser:
         for gradient in gradients:
             clear_non_finite(gradient)
 
-    def step(self, iteration: int) -> None:
-        """Take a step along the prepared gradients; at a repeat's start, with fresh moments."""
+    def step(self, iteration: int, share: float = 0.0) -> None:
+        """Take a step along the prepared gradients; at a repeat's start, with fresh moments.
+
+        Args:
+            iteration: Iterations done so far in the run.
+            share: As for `TrainConfig.learning_rate_at`.
+        """
         if iteration > 0 and iteration % self._config.iterations == 0:
             self._adamw = self._fresh()
         for group in self._adamw.param_groups:
-            group["lr"] = self._config.learning_rate_at(iteration)
+            group["lr"] = self._config.learning_rate_at(iteration, share)
         self._adamw.step()
 
     def state_dict(self) -> dict[str, Any]:

@@ -103,6 +103,7 @@ class Trainer:
         self.task_name = task_name
         self.iteration = 0
         """Iterations done."""
+        self._share = 0.0
         self.folder = RunFolder(config.out)
         self._log = JsonlLog(self.folder.log)
         self._record: dict[str, Any] = {}
@@ -212,7 +213,7 @@ class Trainer:
                 self._board.close()
                 self._board = None
         return TrainResult(
-            rule=self._cycle.average.rule(self.rule),
+            rule=self.kept_rule,
             iteration=self.iteration,
             finished=self.iteration >= total,
             interrupted=interrupted,
@@ -220,10 +221,29 @@ class Trainer:
             folder=self.folder.path,
         )
 
-    def iterate(self) -> None:
-        """Train for one iteration, and neither wait for the device nor write anything."""
-        self._cycle.run(self.iteration)
+    def iterate(self, share: float = 0.0) -> None:
+        """Train for one iteration, and neither wait for the device nor write anything.
+
+        Args:
+            share: How much of the schedule "cosine" is over, in [0, 1], where the iterations say
+                less. `elapsed / seconds` makes it fall with the time, where nobody knows how many
+                iterations fit; such a run is not repeatable.
+
+        Raises:
+            NPAError: The share is none.
+        """
+        if not 0.0 <= share <= 1.0:
+            raise NPAError(
+                f"share must lie in [0, 1], got {shown(share)}: min(1, elapsed / seconds)"
+            )
+        self._cycle.run(self.iteration, share)
+        self._share = share
         self.iteration += 1
+
+    @property
+    def kept_rule(self) -> NPARule:
+        """The rule as a run keeps it: the mean of its weights, where there is one."""
+        return self._cycle.average.rule(self.rule)
 
     def save(self) -> None:
         """Write the checkpoint and the rule.
@@ -245,7 +265,7 @@ class Trainer:
         # A rule is passed on: where and on what it was trained is nobody's business.
         told = config_to_dict(self.config)
         told = {name: told[name] for name in told if name not in ("out", "device", "initial_rule")}
-        self._save_rule(self._cycle.average.rule(self.rule), told)
+        self._save_rule(self.kept_rule, told)
 
     def _save_rule(self, rule: NPARule, told: dict[str, Any]) -> None:
         metadata = {"task": self.task_name, "config": json.dumps(told)}
@@ -279,7 +299,7 @@ class Trainer:
         self._cycle.meter.send()
         self._record_begun = {
             "iteration": self.iteration,
-            "learning_rate": self.config.learning_rate_at(self.iteration - 1),
+            "learning_rate": self.config.learning_rate_at(self.iteration - 1, self._share),
         }
         if not self._log_late:
             self._finish_record()

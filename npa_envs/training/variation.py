@@ -122,11 +122,18 @@ class VariedCycle(TrainingCycle):
             self._others.append(other)
         self.meter = _Meters(self.batch, [other.meter for other in self._others])
 
-    def run(self, iteration: int) -> int:
-        """Train for one iteration, and return the steps of its rollout, T."""
+    def run(self, iteration: int, share: float = 0.0) -> int:
+        """Train for one iteration, and return the steps of its rollout, T.
+
+        Args:
+            iteration: Iterations done so far in the run.
+            share: As for `TrainConfig.learning_rate_at`.
+        """
         count = len(self._others)
         kind = int(torch.randint(2 * count, (), generator=self.random.schedule))
-        return self._others[kind].run(iteration) if kind < count else super().run(iteration)
+        if kind < count:
+            return self._others[kind].run(iteration, share)
+        return super().run(iteration, share)
 
     def state_dict(self) -> dict[str, Any]:
         """Return all that changes but the rule, for a checkpoint."""

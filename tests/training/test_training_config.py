@@ -61,6 +61,17 @@ def test_learning_rate_rises_shortly_and_falls_along_a_cosine_whatever_the_lengt
     assert all(a > b for a, b in itertools.pairwise(rates[top:iterations]))
 
 
+def test_a_cosine_falls_with_a_share_that_says_more_than_the_iterations():
+    config = override(PAPER, iterations=100, learning_rate=1.0, schedule="cosine")
+    assert config.learning_rate_at(40, 0.2) == config.learning_rate_at(40)
+    assert config.learning_rate_at(10, 0.4) == config.learning_rate_at(40)
+    assert config.learning_rate_at(10, 1.0) == pytest.approx(0.01)
+    ageing = override(config, lifetimes=(64, 640), ageing_steps=640, ageing_interval=5)
+    assert ageing.ageing_at(5, 0.5) == ageing.ageing_at(50) == 320
+    stepwise = override(PAPER, iterations=100, learning_rate=1.0, milestones=(40,), decay=0.5)
+    assert stepwise.learning_rate_at(10, 1.0) == 1.0
+
+
 def test_override_reaches_fields_of_the_run_and_of_the_task():
     config = override(PAPER, iterations=7, target="heart", eps=1, out="elsewhere")
     assert (config.iterations, config.task.target, config.out) == (7, "heart", Path("elsewhere"))

@@ -239,6 +239,23 @@ def test_worlds_in_the_first_places_are_damaged_and_the_others_never(tmp_path):
     assert [share for share in shares if share <= 0.7] == [0.0] * 6
 
 
+def test_an_iteration_follows_a_share_of_the_schedule_and_the_mean_is_what_is_kept(tmp_path):
+    config = circle_config(tmp_path, schedule="cosine", average=0.9, log_interval=1)
+    trainer = trainer_of(config)
+    first = next(trainer.rule.parameters()).detach().clone()
+    trainer.iterate(share=1.0)
+    (group,) = trainer._cycle.optimiser._adamw.param_groups
+    assert group["lr"] == pytest.approx(0.01 * config.learning_rate)
+    trainer._begin_record()
+    assert log_of(tmp_path)[-1]["learning_rate"] == group["lr"]
+    # Of untrained weights a tenth is left after the first iteration.
+    mean = 0.1 * first + 0.9 * next(trainer.rule.parameters())
+    kept = next(trainer.kept_rule.parameters())
+    assert torch.allclose(kept, mean, rtol=0.0, atol=1e-7)
+    with pytest.raises(NPAError, match=r"share must lie in \[0, 1\], got 1.5"):
+        trainer.iterate(share=1.5)
+
+
 def test_run_leaves_rule_configuration_and_pictures(tmp_path):
     config = circle_config(tmp_path, picture_interval=3)
     result = train(config)
