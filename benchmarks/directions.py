@@ -1,9 +1,9 @@
 """Rules that know no direction, beside plain rules of the same recipe.
 
-`train` trains on each target a plain rule, an equivariant one that tells left from right and one
-that does not, side by side on one device; `measure` runs the rules on seeds that training never
-saw: losses at the best angle over the steps, and what becomes of grown creatures that are turned by
-90 degrees; `time` takes the time of a step. Each writes what it found to OUT as it goes.
+`train` trains on each target a plain rule and equivariant ones (KINDS), side by side on one device;
+`measure` runs the rules on seeds that training never saw: losses at the best angle over the steps,
+and what becomes of grown creatures that are turned by 90 degrees; `time` takes the time of a step.
+Each writes what it found to OUT as it goes.
 
     python benchmarks/directions.py train --device cuda --out OUT
     python benchmarks/directions.py measure --device cuda --out OUT
@@ -40,8 +40,10 @@ KINDS: Mapping[str, Mapping[str, Any]] = {
     "plain": {},
     "chiral": {"equivariant": True},
     "mirrored": {"equivariant": True, "chiral": False},
+    "framed": {"equivariant": True, "seed_across": 0.5},
 }
-"""Rules: plain, equivariant, and equivariant without telling left from right."""
+"""Rules: plain, equivariant, equivariant without telling left from right, and equivariant with
+seeds that have a left and a right besides a head and a tail."""
 
 SEEDS = tuple(range(1000, 1008))
 """Seeds of the worlds that rules are measured on."""

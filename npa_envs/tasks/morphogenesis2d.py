@@ -95,6 +95,10 @@ class Morphogenesis2DConfig(GrowthConfig):
     """Seeds of an equivariant rule have a head and a tail: across the disk, the first state goes
     from minus this to this (dimensionless), along a direction drawn for each world. 0: no such."""
 
+    seed_across: float = 0.0
+    """And a left and a right: the second state goes from minus this to this (dimensionless), across
+    that direction. 0: no such."""
+
     division: bool = False
     """A world starts with one particle. Particles divide and die; at most `particle_count` live."""
 
@@ -117,9 +121,8 @@ class Morphogenesis2DConfig(GrowthConfig):
                 f"got {self.blur_levels} for a resolution of {self.resolution}: lower it"
             )
         check_positive(self, float, "sigma")
-        check_non_negative(
-            self, "splat_weight", "colour_weight", "drift_weight", "seed_axis", "division_weight"
-        )
+        check_non_negative(self, "splat_weight", "colour_weight", "drift_weight", "division_weight")
+        check_non_negative(self, "seed_axis", "seed_across")
         check_flag(self, "equivariant", "chiral", "encoder", "division")
         self._check_targets()
         check_positive(self, int, "angles", at_least=4)
@@ -252,15 +255,19 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
         if config.division:
             s[:, 0, LIFE] = 1.0
             return torch.zeros_like(x), s
-        if config.equivariant and config.seed_axis > 0.0:
+        if config.equivariant and max(config.seed_axis, config.seed_across) > 0.0:
             share = (
                 generator.uniform(1, dtype=x.dtype)
                 if isinstance(generator, WorldRandom)
                 else torch.rand(world_count, 1, generator=generator, device=x.device, dtype=x.dtype)
             )
             angle = 2.0 * math.pi * share
-            along = x[..., 0] * angle.cos() + x[..., 1] * angle.sin()
+            cos, sin = angle.cos(), angle.sin()
+            along = x[..., 0] * cos + x[..., 1] * sin
+            across = x[..., 1] * cos - x[..., 0] * sin
             s[..., 0] = config.seed_axis * along / config.seed_radius
+            if config.seed_across > 0.0:
+                s[..., 1] = config.seed_across * across / config.seed_radius
         if self._code is not None:
             s = self.coded(torch.cat((s.new_zeros(*s.shape[:2], len(self._code)), s), dim=-1))
         return x, s

@@ -103,6 +103,24 @@ def test_seeds_have_a_head_and_a_tail_in_a_direction_of_their_own():
         assert blank.seed(2, generator=generator)[1].abs().max() == 0.0
 
 
+def test_seeds_have_a_left_and_a_right_across_their_axis():
+    x, s = task_of(seed_axis=0.25, seed_across=0.5).seed(
+        3, generator=npa_envs.WorldRandom([1, 2, 3])
+    )
+    plain_x, plain_s = task_of(seed_axis=0.25).seed(3, generator=npa_envs.WorldRandom([1, 2, 3]))
+    assert torch.equal(x, plain_x)
+    assert torch.equal(s[..., 0], plain_s[..., 0])
+    along, across = torch.linalg.lstsq(x, s[..., :2]).solution.unbind(dim=-1)
+    quarter = turn_of(0.5 * math.pi).to(x)
+    assert torch.allclose(across, 2.0 * along @ quarter.mT, atol=1e-5)
+    assert s[..., 2:].abs().max() == 0.0
+    alone = task_of(seed_axis=0.0, seed_across=0.5).seed(
+        3, generator=npa_envs.WorldRandom([1, 2, 3])
+    )
+    assert torch.equal(alone[1][..., 1], s[..., 1])
+    assert alone[1][..., 0].abs().max() == 0.0
+
+
 def test_penalties_know_no_direction_either():
     task = task_of(stray_weight=1.0, bound_weight=1.0)
     generator = torch.Generator().manual_seed(0)
@@ -124,6 +142,7 @@ def test_penalties_know_no_direction_either():
         ({"equivariant": "yes"}, "equivariant must be True or False, got 'yes'"),
         ({"chiral": 1}, "chiral must be True or False, got 1"),
         ({"seed_axis": -1.0}, "seed_axis must be a finite number of at least 0"),
+        ({"seed_across": -1.0}, "seed_across must be a finite number of at least 0"),
         ({"angles": 3}, "angles must be a whole number of at least 4, got 3"),
     ],
 )
