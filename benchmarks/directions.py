@@ -23,7 +23,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from recipes import SECOND, SIZES, train_side_by_side
+from recipe_arms import SECOND, SIZES
+from recipes import train_side_by_side
 from torch import Tensor
 
 import npa_envs

@@ -26,7 +26,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from recipes import DRAWN, SECOND, SIZES, single_emoji, train_side_by_side
+from emoji_sets import DRAWN, single_emoji
+from recipe_arms import SECOND, SIZES
+from recipes import train_side_by_side
 from torch import Tensor, nn
 
 import npa_envs

@@ -24,25 +24,24 @@ import argparse
 import contextlib
 import json
 import math
-import random
 import shutil
 import statistics
 import sys
 import tarfile
 import tempfile
 import time
-import unicodedata
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-import torch.nn.functional as F
+from emoji_sets import draw_pictures
+from old_worlds import follow, run_long
 from PIL import Image
+from recipe_arms import ARMS, FAST_ARMS, SEEDS, SIZES, Run, configuration
 from side_by_side import iterate_together, on, stream_of
-from torch import Tensor
 
 from npa_envs.errors import NPAError
 from npa_envs.files import write_bytes
@@ -51,315 +50,22 @@ from npa_envs.measure.plots import new_figure, number_plainly, png
 from npa_envs.measure.quality import Runner, evaluate, healing
 from npa_envs.measure.record import machine, write_record
 from npa_envs.render.colours import to_uint8
-from npa_envs.rule.files import load_rule, save_rule
-from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DTrainConfig
-from npa_envs.tasks.targets.emoji import render_emoji
-from npa_envs.training import Trainer, preset, task_entry
+from npa_envs.rule.files import save_rule
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2DTrainConfig
+from npa_envs.training import Trainer, task_entry
 from npa_envs.world.recorded import release_recordings
-from npa_envs.world.rollout import rollout
-
-SEEDS = tuple(range(1000, 1008))
-"""Seeds of the worlds that rules are measured on."""
 
 STEPS = (64, 128, 256, 512, 1024, 2048, 4096)
-"""Steps at which they are measured, before `LAST`."""
+"""Steps at which worlds are measured, before `LAST`."""
 
 LAST = 20_000
 """The last step at which worlds are measured; of full size alone in the first three rounds."""
-
-QUARTERS = (0.2, 0.4, 0.6, 0.8)
-"""Milestones of the paper's schedule, as shares of its length."""
 
 SIDE_BY_SIDE = 6
 """Runs of which the first is compared with one that has the device for itself."""
 
 PACES: Mapping[str, Sequence[int]] = {"small": (1, 6), "full": (1, 3)}
 """How many runs side by side are timed."""
-
-Fields = Mapping[str, Any]
-
-SIZES: Mapping[str, Fields] = {
-    "full": {"particle_count": 4096, "target_point_count": 4096, "iterations": 10_000},
-    "small": {
-        "particle_count": 1024,
-        "target_point_count": 1024,
-        "resolution": 128,
-        "eps": 0.14,
-        "seed_radius": 0.28,
-        "iterations": 3000,
-    },
-    "fast": {},
-    "tiny": {
-        "particle_count": 128,
-        "target_point_count": 128,
-        "resolution": 32,
-        "hidden_dim": 16,
-        "eps": 0.3,
-        "iterations": 6,
-        "steps": (4, 6),
-        "lifetimes": (4, 64),
-        "pool_size": 16,
-    },
-}
-"""Worlds: as in the preset `paper`; a quarter of its particles, which see as many others and
-begin in a disk as large, as they see; as in `fast`; and a test of the script."""
-
-STRAYS: Fields = {
-    "stray_share": 2e-4,
-    "stray_weight": 10.0,
-    "bound_weight": 10.0,
-    "drift_weight": 1.0,
-    "clump_radius": 0.2,
-    "cut_gap": 0.1,
-}
-"""What keeps worlds together for 100 000 steps, and heals clumps and cuts."""
-
-NO_STRAYS: Fields = dict.fromkeys(STRAYS, 0.0) | {"bound_weight": 100.0}
-
-FIRST: Fields = {
-    **STRAYS,
-    "lifetimes": (64, 16_384),
-    "pool_size": 64,
-    "schedule": "cosine",
-    "learning_rate": 1e-3,
-    "average": 0.999,
-    "blur_levels": 3,
-    "steps": (48, 80),
-}
-"""The first candidate: worlds of all ages, all of them damaged."""
-
-SECOND: Fields = {
-    **FIRST,
-    "average": 0.0,
-    "blur_levels": 0,
-    "damage_share": 0.5,
-    "stray_share": 5e-5,
-}
-"""The second candidate: half of the worlds are left to themselves; what did not help is gone.
-
-Its damaged worlds were those of every other place of the pool, the longest-lived ones too."""
-
-THIRD: Fields = SECOND | {
-    "lifetimes": (256, 32_768),
-    "damage_share": 0.25,
-    "stray_share": 2e-4,
-}
-"""The third candidate: fewer seeds, older worlds, and only worlds of short lives are damaged."""
-
-FIFTH: Fields = THIRD | {
-    "lifetimes": (128, 32_768),
-    "pool_size": 32,
-    "ageing_steps": 512,
-    "damage_radius": 0.2,
-    "initial_rule": "heart",
-}
-"""The fifth candidate: a rule that has learned to grow and to last learns another picture."""
-
-SEVENTH: Fields = {
-    **STRAYS,
-    "seed_interval": 1,
-    "fresh_share": 0.5,
-    "pool_size": 64,
-    "steps": (32, 64),
-    "schedule": "cosine",
-    "learning_rate": 2e-3,
-    "initial_rule": "heart",
-}
-"""What serves `fast`, in large: half of the worlds are seeds, none is old. Not at full size."""
-
-EIGHTH: Fields = {
-    **STRAYS,
-    "lifetimes": (64, 16_384),
-    "pool_size": 64,
-    "steps": (48, 80),
-    "schedule": "cosine",
-    "learning_rate": 2e-3,
-    "damage_share": 0.25,
-    "damage_radius": 0.2,
-    "rest_weight": 2.0,
-    "initial_rule": "heart",
-}
-"""The eighth candidate: grown worlds are to rest."""
-
-FAST_BEFORE: Fields = {
-    **NO_STRAYS,
-    "learning_rate": 2e-3,
-    "schedule": "milestones",
-    "milestones": (1500, 2100),
-    "seed_interval": 2,
-    "initial_rule": "",
-}
-"""The preset `fast` as it was when its arms were compared, laid over what it is."""
-
-FAST_FIRST: Fields = {
-    "lifetimes": (24, 2048),
-    "pool_size": 16,
-    "schedule": "cosine",
-    "average": 0.99,
-    "blur_levels": 2,
-}
-"""The first candidate in small."""
-
-FAST_SECOND: Fields = FAST_FIRST | {"average": 0.0, "blur_levels": 0, "damage_share": 0.5}
-"""The second candidate in small."""
-
-FAST_STRAYS: Fields = STRAYS | {"stray_share": 1e-3}
-"""As `STRAYS`, of fewer particles."""
-
-FAST_FIFTH: Fields = {
-    **FAST_STRAYS,
-    "learning_rate": 4e-3,
-    "schedule": "cosine",
-    "initial_rule": "gecko-512",
-}
-"""The preset `fast` after the third round, which begins with a rule that has learned a gecko."""
-
-FAST_SIXTH: Fields = FAST_FIFTH | {"seed_interval": 1}
-"""Half of the worlds are seeds: the preset `fast`."""
-
-FAST_EIGHTH: Fields = {
-    **FAST_FIFTH,
-    "learning_rate": 2e-3,
-    "lifetimes": (24, 256),
-    "damage_share": 0.5,
-    "rest_age": 64,
-    "rest_weight": 0.5,
-}
-"""The eighth candidate in small: of two worlds one is young and damaged, one grown and at rest."""
-
-ARMS: Mapping[str, Fields] = {
-    "paper": {},
-    "paper, seeds every 3rd": {"seed_interval": 3},
-    "first": FIRST,
-    "first, no ages, seeds every 3rd": {
-        **FIRST,
-        "lifetimes": (0, 0),
-        "pool_size": 512,
-        "seed_interval": 3,
-    },
-    "first, no average": FIRST | {"average": 0.0},
-    "first, no blur": FIRST | {"blur_levels": 0},
-    "first, no strays": FIRST | NO_STRAYS,
-    "first, milestones": FIRST | {"schedule": "milestones"},
-    "first, rate 2e-3": FIRST | {"learning_rate": 2e-3},
-    "second": SECOND,
-    "second, no strays": SECOND | NO_STRAYS,
-    "second, share 0.25": SECOND | {"damage_share": 0.25},
-    "second, share 1": SECOND | {"damage_share": 1.0},
-    "second, rate 2e-3": SECOND | {"learning_rate": 2e-3},
-    "second, steps 96 to 128": SECOND | {"steps": (96, 128), "iterations": 1700},
-    "second, lifetimes to 65536": SECOND | {"lifetimes": (64, 65_536)},
-    "second, hidden 256": SECOND | {"hidden_dim": 256},
-    "second, 4 worlds": SECOND | {"world_count": 4, "iterations": 6000},
-    "third": THIRD,
-    "third, no strays": THIRD | NO_STRAYS,
-    "third, lifetimes from 64": THIRD | {"lifetimes": (64, 32_768)},
-    "fifth": FIFTH,
-    "fifth, untrained": FIFTH | {"initial_rule": ""},
-    "fifth, no ageing": FIFTH | {"ageing_steps": 0},
-    "fifth, rate 5e-4": FIFTH | {"learning_rate": 5e-4},
-    "seventh": SEVENTH,
-    "eighth": EIGHTH,
-    "eighth, rest 1": EIGHTH | {"rest_weight": 1.0},
-    "eighth, no rest": EIGHTH | {"rest_weight": 0.0},
-    "eighth, rest 0.5": EIGHTH | {"rest_weight": 0.5},
-    "eighth, rate 1e-3": EIGHTH | {"learning_rate": 1e-3},
-    "eighth, rate 4e-3": EIGHTH | {"learning_rate": 4e-3},
-    "eighth, share 0.5": EIGHTH | {"damage_share": 0.5},
-    "eighth, steps 32 to 64": EIGHTH | {"steps": (32, 64), "lifetimes": (32, 16_384)},
-    "eighth, damage 0.1": EIGHTH | {"damage_radius": 0.1},
-    "seventh, untrained, rate 3e-3": SEVENTH
-    | {"initial_rule": "", "learning_rate": 3e-3, "steps": (48, 50), "iterations": 1500},
-}
-"""Arms of `full` and `small`: what each changes of the preset `paper`."""
-
-FAST_ARMS: Mapping[str, Fields] = {
-    "fast": {},
-    "fast, share 0.5": {"damage_share": 0.5},
-    "fast, rate 4e-3": {"learning_rate": 4e-3},
-    "first": FAST_FIRST,
-    "first, no ages": FAST_FIRST | {"lifetimes": (0, 0), "pool_size": 32},
-    "first, no average": FAST_FIRST | {"average": 0.0},
-    "first, no blur": FAST_FIRST | {"blur_levels": 0},
-    "first, milestones": FAST_FIRST | {"schedule": "milestones"},
-    "first, strays": FAST_FIRST | STRAYS,
-    "first, rate 1e-3": FAST_FIRST | {"learning_rate": 1e-3},
-    "second": FAST_SECOND,
-    "second, rate 4e-3": FAST_SECOND | {"learning_rate": 4e-3},
-    "second, no damage": FAST_SECOND | {"damage": False},
-    "second, strays": FAST_SECOND | FAST_STRAYS,
-    "second, steps 32 to 48": FAST_SECOND | {"steps": (32, 48), "iterations": 1440},
-    "second, 4 worlds": FAST_SECOND | {"world_count": 4, "iterations": 1200},
-    "second, lifetimes from 96": FAST_SECOND | {"lifetimes": (96, 2048)},
-    "second, hidden 128": FAST_SECOND | {"hidden_dim": 128},
-    "fast, rate 8e-3": {"learning_rate": 8e-3},
-    "fast, rate 4e-3, strays": FAST_STRAYS | {"learning_rate": 4e-3},
-    "fast, rate 4e-3, strays, cosine": {
-        **FAST_STRAYS,
-        "learning_rate": 4e-3,
-        "schedule": "cosine",
-    },
-    "third": {
-        **FAST_SECOND,
-        **FAST_STRAYS,
-        "learning_rate": 4e-3,
-        "lifetimes": (96, 4096),
-        "steps": (24, 40),
-        "iterations": 1800,
-    },
-    "fifth": FAST_FIFTH,
-    "fifth, rate 2e-3": FAST_FIFTH | {"learning_rate": 2e-3},
-    "sixth": FAST_SIXTH,
-    "sixth, rate 2e-3": FAST_SIXTH | {"learning_rate": 2e-3},
-    "sixth, share 0.5": FAST_SIXTH | {"damage_share": 0.5},
-    "eighth": FAST_EIGHTH,
-    "eighth, rate 4e-3": FAST_EIGHTH | {"learning_rate": 4e-3},
-    "eighth, no rest": FAST_EIGHTH | {"rest_weight": 0.0},
-    "eighth, rest 2": FAST_EIGHTH | {"rest_weight": 2.0},
-    "eighth, to 4096": FAST_EIGHTH | {"lifetimes": (24, 4096), "rest_age": 512},
-    "sixth, untrained": FAST_SIXTH | {"initial_rule": ""},
-}
-"""Arms of `fast`: what each changes of it as it was; the preset is the sixth now."""
-
-
-@dataclass(frozen=True)
-class Run:
-    """One training run."""
-
-    size: str
-    """A name of `SIZES`."""
-    arm: str
-    """A name of `ARMS`, or of `FAST_ARMS`."""
-    picture: str
-    """Stem of the picture's file."""
-    seed: int
-    """Seed of the run."""
-
-    @property
-    def name(self) -> str:
-        """What its files are called."""
-        return (
-            f"{self.size}-{self.arm.replace(' ', '_').replace(',', '')}-{self.picture}-{self.seed}"
-        )
-
-
-def configuration(
-    run: Run, picture: Path, out: Path, device: str, changes: Fields
-) -> Morphogenesis2DTrainConfig:
-    """Return what a run is told."""
-    fields: dict[str, Any] = {"repeats": 1, "tensorboard": False, "picture_interval": 0}
-    if run.size == "fast":
-        fields |= FAST_BEFORE | FAST_ARMS[run.arm]
-    else:
-        arm = ARMS[run.arm]
-        # An arm's own number of iterations is meant for small worlds.
-        fields |= SIZES[run.size] | arm if run.size == "small" else arm | SIZES[run.size]
-    fields |= changes
-    if run.size != "fast" and fields.get("schedule") != "cosine":
-        fields["milestones"] = tuple(round(share * fields["iterations"]) for share in QUARTERS)
-    fields |= {"out": out, "device": device, "seed": run.seed, "target": str(picture)}
-    fields["checkpoint_interval"] = 10**9
-    return preset("fast" if run.size == "fast" else "paper", **fields)
 
 
 def train_side_by_side(
@@ -581,43 +287,6 @@ def warm_up(arguments: argparse.Namespace) -> None:
     print((arguments.out / "check.json").read_text(), flush=True)
 
 
-BLOCKS = (
-    (0x1F300, 0x1F5FF),
-    (0x1F600, 0x1F64F),
-    (0x1F680, 0x1F6FF),
-    (0x1F900, 0x1F9FF),
-    (0x1FA70, 0x1FAFF),
-)
-"""Code points of pictures in Unicode, first and last."""
-
-SKIN_TONES = (0x1F3FB, 0x1F3FF)
-"""Those of them that change others."""
-
-DRAWN = 12
-"""Pictures to develop on, and as many to test."""
-
-
-def single_emoji() -> dict[str, Image.Image]:
-    """Return the picture of every emoji of one character that the installed font draws, by name."""
-    emoji = {}
-    for code in (code for first, last in BLOCKS for code in range(first, last + 1)):
-        name = unicodedata.name(chr(code), "")
-        if name and not SKIN_TONES[0] <= code <= SKIN_TONES[1]:
-            with contextlib.suppress(NPAError):
-                emoji[name.lower().replace(" ", "-")] = render_emoji(chr(code))
-    return emoji
-
-
-def draw_pictures(arguments: argparse.Namespace) -> None:
-    """Write emoji, drawn at random but always the same of the same font, as PNG files."""
-    emoji = single_emoji()
-    drawn = random.Random(0).sample(list(emoji), 2 * DRAWN)
-    for number, name in enumerate(drawn):
-        folder = arguments.out / ("development" if number < DRAWN else "test")
-        folder.mkdir(parents=True, exist_ok=True)
-        emoji[name].save(folder / f"{name}.png", optimize=True)
-
-
 def merge(arguments: argparse.Namespace) -> None:
     """Make one record, one sheet and one archive of what several processes left in a folder."""
     out: Path = arguments.out
@@ -638,141 +307,6 @@ def merge(arguments: argparse.Namespace) -> None:
         (out / "strips.txt").write_text("\n".join(path.stem for path in strips) + "\n")
     for path in strips:
         path.unlink()
-
-
-MOTIONS = ("place", "angle", "affine", "deformation")
-"""What a grown picture is moved by to be more like its target."""
-
-GRID = 8
-"""Displacements along each side of the field that a picture is deformed by."""
-
-
-def moved(x: Tensor, motion: str, place: Tensor, affine: Tensor, field: Tensor) -> Tensor:
-    """Return the positions of one world [1, N, 2] moved as far as a motion allows."""
-    away = x - x.mean(dim=1, keepdim=True)
-    if motion == "angle":
-        cosine, sine = affine[0, 0].cos(), affine[0, 0].sin()
-        away = away @ torch.stack([cosine, sine, -sine, cosine]).view(2, 2)
-    elif motion == "affine":
-        away = away + away @ affine
-    elif motion == "deformation":
-        wide = F.interpolate(field, scale_factor=4, mode="bicubic", align_corners=True)
-        at = x.detach().clamp(-1.0, 1.0)[:, None]
-        away = away + F.grid_sample(wide, at, align_corners=True)[:, :, 0].transpose(1, 2)
-    return away + place
-
-
-def least_loss(task: Morphogenesis2D, x: Tensor, s: Tensor, motion: str) -> float:
-    """Return the splat loss of one world moved so that it is least, by 60 steps of Adam."""
-    place = task.target.points.mean(dim=0).clone().requires_grad_()
-    affine = torch.zeros(2, 2, requires_grad=True)
-    field = torch.zeros(1, 2, GRID, GRID, requires_grad=True)
-    optimiser = torch.optim.Adam([place, affine, field], lr=0.01)
-    least = math.inf
-    for _ in range(60):
-        picture = task.picture(moved(x, motion, place, affine, field), s, centred=False)
-        # |d| + d^2 as in `Morphogenesis2D.splat_errors`, which centres pictures itself.
-        size = (picture - task.target_picture).abs()
-        errors = size + size * size
-        density = errors[..., 3]
-        colour = errors[..., :3].mean(dim=-1) * torch.exp(-density.detach())
-        loss = (density + task.config.colour_weight * colour).mean()
-        least = min(least, loss.item())
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-    return least
-
-
-def follow(arguments: argparse.Namespace) -> None:
-    """Print what of one world's loss, as it grows old, lies in motions of the whole."""
-    rule = load_rule(arguments.rule)
-    task = Morphogenesis2D(preset(arguments.preset, target=arguments.target).task)
-    generator = torch.Generator().manual_seed(SEEDS[0])
-    x, s = task.seed(1, generator=generator)
-    before = 0
-    options = {"eps": task.eps, "update_prob": task.update_prob, "generator": generator}
-    print(f"step  loss  {'  '.join(MOTIONS)}  motion in 64 steps, of it the whole's")
-    for step in arguments.steps:
-        with torch.no_grad():
-            x, s = rollout(rule, x, s, step - before, **options)
-            later, _ = rollout(rule, x, s, 64, **options)
-        before = step
-        least = "  ".join(f"{least_loss(task, x, s, motion):.3f}" for motion in MOTIONS)
-        way = (later - x)[0]
-        lengths = way.norm(dim=-1).mean(), way.mean(dim=0).norm()
-        print(
-            f"{step}  {float(task.metric(x, s)):.3f}  {least}  {lengths[0]:.1e}  {lengths[1]:.1e}"
-        )
-
-
-def endurance(
-    home: habitats.Habitat, steps: int, generators: Sequence[torch.Generator]
-) -> dict[str, Any]:
-    """Return losses and figures of all worlds of a habitat, each against itself when settled.
-
-    Args:
-        home: The worlds.
-        steps: How long they are run.
-        generators: Of the run, and of the steps that tell the energy.
-    """
-    settled = min(habitats.SETTLED, steps // 2)
-    marks = [
-        round(settled * (steps / settled) ** (k / habitats.MARKS))
-        for k in range(habitats.MARKS + 1)
-    ]
-    run = habitats.LongRun(home, generators[0], home.options())
-    count = len(home.x)
-    first: list[dict[str, float]] = [{} for _ in range(count)]
-    largest: list[dict[str, float]] = [{} for _ in range(count)]
-    over: dict[int, str] = {}
-    losses = {}
-    centroids = home.x.mean(1)
-    for step, x, s in run.marks(marks):
-        losses[step] = home.task.metric(x, s).tolist()
-        if step == settled:
-            centroids = x.mean(1)
-        for k in range(count):
-            found = habitats.measured(home, x[k : k + 1], s[k : k + 1], generators[1])
-            if not found["not_finite"]:
-                first[k] = first[k] or dict(found)
-                found["drift"] = float((x[k].mean(0) - centroids[k]).norm())
-                for key, unit in (("extent", "extent"), ("energy", "energy"), ("drift", "extent")):
-                    found[key] /= max(first[k][unit], 1e-12)
-            beyond = [n for n, bound in habitats.BOUNDS.items() if not found.get(n, 0.0) <= bound]
-            if beyond:
-                over.setdefault(k, f"{', '.join(beyond)} at step {step}")
-            for key, value in found.items():
-                largest[k][key] = max(value, largest[k].get(key, 0.0))
-    return {
-        "steps": steps,
-        "worlds_within": count - len(over),
-        "over": over,
-        "worlds": largest,
-        "loss": {step: statistics.fmean(values) for step, values in losses.items()},
-        "worst_loss": {step: max(values) for step, values in losses.items()},
-    }
-
-
-def run_long(arguments: argparse.Namespace) -> None:
-    """Run the rules that `run` has left for very long, a line of JSON each."""
-    device = torch.device(arguments.device)
-    for path in sorted(arguments.out.glob("rule-*.safetensors")):
-        picture = next(p for p in arguments.pictures.glob("*.png") if f"-{p.stem}-" in path.name)
-        config = preset(arguments.preset, target=str(picture)).task
-        task = task_entry("morphogenesis2d").make(config, device)
-        rule = load_rule(path, device=device).float().requires_grad_(False)
-        seeds = [
-            task.seed(1, generator=torch.Generator(device).manual_seed(seed), device=device)
-            for seed in SEEDS
-        ]
-        x, s = (torch.cat(parts) for parts in zip(*seeds, strict=True))
-        home = habitats.Habitat(rule, task, x.float(), s.float(), habitats.SETTLED)
-        generators = [torch.Generator(device).manual_seed(seed) for seed in (1, 2)]
-        line = {"picture": picture.stem} | endurance(home, arguments.steps, generators)
-        with (arguments.out / "long.jsonl").open("a") as file:
-            file.write(json.dumps(line) + "\n")
-        print(f"{picture.stem}: {line['worlds_within']} of {len(SEEDS)} {line['over']}", flush=True)
 
 
 REPORTED = (64, 128, 512, 1024, 4096, LAST)

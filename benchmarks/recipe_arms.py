@@ -1,0 +1,302 @@
+"""What is told to the runs that recipes.py compares: sizes of worlds, arms, seeds, one run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from npa_envs.tasks.morphogenesis2d import Morphogenesis2DTrainConfig
+from npa_envs.training import preset
+
+SEEDS = tuple(range(1000, 1008))
+"""Seeds of the worlds that rules are measured on."""
+
+QUARTERS = (0.2, 0.4, 0.6, 0.8)
+"""Milestones of the paper's schedule, as shares of its length."""
+
+Fields = Mapping[str, Any]
+
+SIZES: Mapping[str, Fields] = {
+    "full": {"particle_count": 4096, "target_point_count": 4096, "iterations": 10_000},
+    "small": {
+        "particle_count": 1024,
+        "target_point_count": 1024,
+        "resolution": 128,
+        "eps": 0.14,
+        "seed_radius": 0.28,
+        "iterations": 3000,
+    },
+    "fast": {},
+    "tiny": {
+        "particle_count": 128,
+        "target_point_count": 128,
+        "resolution": 32,
+        "hidden_dim": 16,
+        "eps": 0.3,
+        "iterations": 6,
+        "steps": (4, 6),
+        "lifetimes": (4, 64),
+        "pool_size": 16,
+    },
+}
+"""Worlds: as in the preset `paper`; a quarter of its particles, which see as many others and
+begin in a disk as large, as they see; as in `fast`; and a test of the script."""
+
+STRAYS: Fields = {
+    "stray_share": 2e-4,
+    "stray_weight": 10.0,
+    "bound_weight": 10.0,
+    "drift_weight": 1.0,
+    "clump_radius": 0.2,
+    "cut_gap": 0.1,
+}
+"""What keeps worlds together for 100 000 steps, and heals clumps and cuts."""
+
+NO_STRAYS: Fields = dict.fromkeys(STRAYS, 0.0) | {"bound_weight": 100.0}
+
+FIRST: Fields = {
+    **STRAYS,
+    "lifetimes": (64, 16_384),
+    "pool_size": 64,
+    "schedule": "cosine",
+    "learning_rate": 1e-3,
+    "average": 0.999,
+    "blur_levels": 3,
+    "steps": (48, 80),
+}
+"""The first candidate: worlds of all ages, all of them damaged."""
+
+SECOND: Fields = {
+    **FIRST,
+    "average": 0.0,
+    "blur_levels": 0,
+    "damage_share": 0.5,
+    "stray_share": 5e-5,
+}
+"""The second candidate: half of the worlds are left to themselves; what did not help is gone.
+
+Its damaged worlds were those of every other place of the pool, the longest-lived ones too."""
+
+THIRD: Fields = SECOND | {
+    "lifetimes": (256, 32_768),
+    "damage_share": 0.25,
+    "stray_share": 2e-4,
+}
+"""The third candidate: fewer seeds, older worlds, and only worlds of short lives are damaged."""
+
+FIFTH: Fields = THIRD | {
+    "lifetimes": (128, 32_768),
+    "pool_size": 32,
+    "ageing_steps": 512,
+    "damage_radius": 0.2,
+    "initial_rule": "heart",
+}
+"""The fifth candidate: a rule that has learned to grow and to last learns another picture."""
+
+SEVENTH: Fields = {
+    **STRAYS,
+    "seed_interval": 1,
+    "fresh_share": 0.5,
+    "pool_size": 64,
+    "steps": (32, 64),
+    "schedule": "cosine",
+    "learning_rate": 2e-3,
+    "initial_rule": "heart",
+}
+"""What serves `fast`, in large: half of the worlds are seeds, none is old. Not at full size."""
+
+EIGHTH: Fields = {
+    **STRAYS,
+    "lifetimes": (64, 16_384),
+    "pool_size": 64,
+    "steps": (48, 80),
+    "schedule": "cosine",
+    "learning_rate": 2e-3,
+    "damage_share": 0.25,
+    "damage_radius": 0.2,
+    "rest_weight": 2.0,
+    "initial_rule": "heart",
+}
+"""The eighth candidate: grown worlds are to rest."""
+
+FAST_BEFORE: Fields = {
+    **NO_STRAYS,
+    "learning_rate": 2e-3,
+    "schedule": "milestones",
+    "milestones": (1500, 2100),
+    "seed_interval": 2,
+    "initial_rule": "",
+}
+"""The preset `fast` as it was when its arms were compared, laid over what it is."""
+
+FAST_FIRST: Fields = {
+    "lifetimes": (24, 2048),
+    "pool_size": 16,
+    "schedule": "cosine",
+    "average": 0.99,
+    "blur_levels": 2,
+}
+"""The first candidate in small."""
+
+FAST_SECOND: Fields = FAST_FIRST | {"average": 0.0, "blur_levels": 0, "damage_share": 0.5}
+"""The second candidate in small."""
+
+FAST_STRAYS: Fields = STRAYS | {"stray_share": 1e-3}
+"""As `STRAYS`, of fewer particles."""
+
+FAST_FIFTH: Fields = {
+    **FAST_STRAYS,
+    "learning_rate": 4e-3,
+    "schedule": "cosine",
+    "initial_rule": "gecko-512",
+}
+"""The preset `fast` after the third round, which begins with a rule that has learned a gecko."""
+
+FAST_SIXTH: Fields = FAST_FIFTH | {"seed_interval": 1}
+"""Half of the worlds are seeds: the preset `fast`."""
+
+FAST_EIGHTH: Fields = {
+    **FAST_FIFTH,
+    "learning_rate": 2e-3,
+    "lifetimes": (24, 256),
+    "damage_share": 0.5,
+    "rest_age": 64,
+    "rest_weight": 0.5,
+}
+"""The eighth candidate in small: of two worlds one is young and damaged, one grown and at rest."""
+
+ARMS: Mapping[str, Fields] = {
+    "paper": {},
+    "paper, seeds every 3rd": {"seed_interval": 3},
+    "first": FIRST,
+    "first, no ages, seeds every 3rd": {
+        **FIRST,
+        "lifetimes": (0, 0),
+        "pool_size": 512,
+        "seed_interval": 3,
+    },
+    "first, no average": FIRST | {"average": 0.0},
+    "first, no blur": FIRST | {"blur_levels": 0},
+    "first, no strays": FIRST | NO_STRAYS,
+    "first, milestones": FIRST | {"schedule": "milestones"},
+    "first, rate 2e-3": FIRST | {"learning_rate": 2e-3},
+    "second": SECOND,
+    "second, no strays": SECOND | NO_STRAYS,
+    "second, share 0.25": SECOND | {"damage_share": 0.25},
+    "second, share 1": SECOND | {"damage_share": 1.0},
+    "second, rate 2e-3": SECOND | {"learning_rate": 2e-3},
+    "second, steps 96 to 128": SECOND | {"steps": (96, 128), "iterations": 1700},
+    "second, lifetimes to 65536": SECOND | {"lifetimes": (64, 65_536)},
+    "second, hidden 256": SECOND | {"hidden_dim": 256},
+    "second, 4 worlds": SECOND | {"world_count": 4, "iterations": 6000},
+    "third": THIRD,
+    "third, no strays": THIRD | NO_STRAYS,
+    "third, lifetimes from 64": THIRD | {"lifetimes": (64, 32_768)},
+    "fifth": FIFTH,
+    "fifth, untrained": FIFTH | {"initial_rule": ""},
+    "fifth, no ageing": FIFTH | {"ageing_steps": 0},
+    "fifth, rate 5e-4": FIFTH | {"learning_rate": 5e-4},
+    "seventh": SEVENTH,
+    "eighth": EIGHTH,
+    "eighth, rest 1": EIGHTH | {"rest_weight": 1.0},
+    "eighth, no rest": EIGHTH | {"rest_weight": 0.0},
+    "eighth, rest 0.5": EIGHTH | {"rest_weight": 0.5},
+    "eighth, rate 1e-3": EIGHTH | {"learning_rate": 1e-3},
+    "eighth, rate 4e-3": EIGHTH | {"learning_rate": 4e-3},
+    "eighth, share 0.5": EIGHTH | {"damage_share": 0.5},
+    "eighth, steps 32 to 64": EIGHTH | {"steps": (32, 64), "lifetimes": (32, 16_384)},
+    "eighth, damage 0.1": EIGHTH | {"damage_radius": 0.1},
+    "seventh, untrained, rate 3e-3": SEVENTH
+    | {"initial_rule": "", "learning_rate": 3e-3, "steps": (48, 50), "iterations": 1500},
+}
+"""Arms of `full` and `small`: what each changes of the preset `paper`."""
+
+FAST_ARMS: Mapping[str, Fields] = {
+    "fast": {},
+    "fast, share 0.5": {"damage_share": 0.5},
+    "fast, rate 4e-3": {"learning_rate": 4e-3},
+    "first": FAST_FIRST,
+    "first, no ages": FAST_FIRST | {"lifetimes": (0, 0), "pool_size": 32},
+    "first, no average": FAST_FIRST | {"average": 0.0},
+    "first, no blur": FAST_FIRST | {"blur_levels": 0},
+    "first, milestones": FAST_FIRST | {"schedule": "milestones"},
+    "first, strays": FAST_FIRST | STRAYS,
+    "first, rate 1e-3": FAST_FIRST | {"learning_rate": 1e-3},
+    "second": FAST_SECOND,
+    "second, rate 4e-3": FAST_SECOND | {"learning_rate": 4e-3},
+    "second, no damage": FAST_SECOND | {"damage": False},
+    "second, strays": FAST_SECOND | FAST_STRAYS,
+    "second, steps 32 to 48": FAST_SECOND | {"steps": (32, 48), "iterations": 1440},
+    "second, 4 worlds": FAST_SECOND | {"world_count": 4, "iterations": 1200},
+    "second, lifetimes from 96": FAST_SECOND | {"lifetimes": (96, 2048)},
+    "second, hidden 128": FAST_SECOND | {"hidden_dim": 128},
+    "fast, rate 8e-3": {"learning_rate": 8e-3},
+    "fast, rate 4e-3, strays": FAST_STRAYS | {"learning_rate": 4e-3},
+    "fast, rate 4e-3, strays, cosine": {
+        **FAST_STRAYS,
+        "learning_rate": 4e-3,
+        "schedule": "cosine",
+    },
+    "third": {
+        **FAST_SECOND,
+        **FAST_STRAYS,
+        "learning_rate": 4e-3,
+        "lifetimes": (96, 4096),
+        "steps": (24, 40),
+        "iterations": 1800,
+    },
+    "fifth": FAST_FIFTH,
+    "fifth, rate 2e-3": FAST_FIFTH | {"learning_rate": 2e-3},
+    "sixth": FAST_SIXTH,
+    "sixth, rate 2e-3": FAST_SIXTH | {"learning_rate": 2e-3},
+    "sixth, share 0.5": FAST_SIXTH | {"damage_share": 0.5},
+    "eighth": FAST_EIGHTH,
+    "eighth, rate 4e-3": FAST_EIGHTH | {"learning_rate": 4e-3},
+    "eighth, no rest": FAST_EIGHTH | {"rest_weight": 0.0},
+    "eighth, rest 2": FAST_EIGHTH | {"rest_weight": 2.0},
+    "eighth, to 4096": FAST_EIGHTH | {"lifetimes": (24, 4096), "rest_age": 512},
+    "sixth, untrained": FAST_SIXTH | {"initial_rule": ""},
+}
+"""Arms of `fast`: what each changes of it as it was; the preset is the sixth now."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training run."""
+
+    size: str
+    """A name of `SIZES`."""
+    arm: str
+    """A name of `ARMS`, or of `FAST_ARMS`."""
+    picture: str
+    """Stem of the picture's file."""
+    seed: int
+    """Seed of the run."""
+
+    @property
+    def name(self) -> str:
+        """What its files are called."""
+        return (
+            f"{self.size}-{self.arm.replace(' ', '_').replace(',', '')}-{self.picture}-{self.seed}"
+        )
+
+
+def configuration(
+    run: Run, picture: Path, out: Path, device: str, changes: Fields
+) -> Morphogenesis2DTrainConfig:
+    """Return what a run is told."""
+    fields: dict[str, Any] = {"repeats": 1, "tensorboard": False, "picture_interval": 0}
+    if run.size == "fast":
+        fields |= FAST_BEFORE | FAST_ARMS[run.arm]
+    else:
+        arm = ARMS[run.arm]
+        # An arm's own number of iterations is meant for small worlds.
+        fields |= SIZES[run.size] | arm if run.size == "small" else arm | SIZES[run.size]
+    fields |= changes
+    if run.size != "fast" and fields.get("schedule") != "cosine":
+        fields["milestones"] = tuple(round(share * fields["iterations"]) for share in QUARTERS)
+    fields |= {"out": out, "device": device, "seed": run.seed, "target": str(picture)}
+    fields["checkpoint_interval"] = 10**9
+    return preset("fast" if run.size == "fast" else "paper", **fields)
