@@ -44,9 +44,10 @@ KINDS: Mapping[str, Mapping[str, Any]] = {
     "codes": {},
     "wide": {"code_dim": 16, "hidden_dim": 256},
     "encoder": {"encoder": True, "code_dim": 16, "hidden_dim": 256},
+    "encoder-32": {"encoder": True, "code_dim": 32, "hidden_dim": 256},
 }
 """Rules of many pictures: 8 learned numbers a picture and as many hidden units as the controls; 16
-and twice the units; and 16 that are read from the picture."""
+and more units; 16 that are read from the picture, and 32."""
 
 LOCAL: Mapping[str, Any] = {"particle_count": 256, "target_point_count": 256}
 """Worlds of the preset `fast` with half of its particles: for one core."""
@@ -61,9 +62,6 @@ MANY_FIELDS = (
     "switch_share",
 )
 """What rules of many pictures may be told besides."""
-
-TRIAL = 40
-"""Iterations of a run that tells how many fit into a time."""
 
 SEEDS = tuple(range(1000, 1004))
 """Seeds of the worlds that rules are measured on."""
@@ -242,52 +240,29 @@ def median_losses(rows: Sequence[Mapping[str, Any]]) -> dict[int, str]:
 def train(arguments: argparse.Namespace) -> None:
     """Train rules of many pictures, and then the controls side by side.
 
-    With `--many-seconds` a short run tells how many iterations fit into so many seconds. `--share K
-    N` trains every Nth control from the Kth on.
+    With `--many-seconds` the rules of many pictures train for so long, and their cosines fall with
+    the time. `--share K N` trains every Nth control from the Kth on.
     """
     told, many = fields_of(arguments), many_fields(arguments)
     sources = named_targets(arguments.targets)
     chosen = random.Random(2).sample(list(sources), min(arguments.controls, len(sources)))
     kinds = {kind: told | many | KINDS[kind] for kind in arguments.kinds or KINDS if kind != "none"}
+    clock = arguments.many_seconds or math.inf
     if arguments.many_seconds:
-        for name, fields in kinds.items():
-            fields["iterations"] = fitting(arguments, name, fields)
+        for fields in kinds.values():
+            fields["iterations"] = 10**6
     first, step = arguments.share
     controls = {f"control-{name}": told | {"target": sources[name]} for name in chosen[first::step]}
-    for wanted in (kinds, controls):
+    for wanted, own_clock in ((kinds, clock), (controls, math.inf)):
         if not wanted:
             continue
         configs = [
             preset(base_of(arguments), **fields, out=arguments.out / "runs" / name)
             for name, fields in wanted.items()
         ]
-        trainers, seconds = train_side_by_side(configs, arguments.longest, arguments.out)
+        trainers, seconds = train_side_by_side(configs, arguments.longest, arguments.out, own_clock)
         told_iterations = [t.iteration for t in trainers]
         print(f"{[*wanted]}: {told_iterations} iterations, {seconds:.1f} s together", flush=True)
-
-
-def fitting(arguments: argparse.Namespace, name: str, fields: Mapping[str, Any]) -> int:
-    """Return how many iterations of a run fit into `--many-seconds`."""
-    out = arguments.out / "trials" / name
-    told = {**fields, "iterations": 10**6}
-    config = preset(base_of(arguments), **told, out=out)
-    task = ManyPictures(config.task, device=arguments.device)
-    trainer = Trainer(task, config, task_name="morphogenesis2d", overwrite=True)
-    begun = 0.0
-    for number in range(2 * TRIAL):
-        if number == TRIAL:
-            begun = now(arguments.device)
-        trainer.iterate()
-    pace = (now(arguments.device) - begun) / TRIAL
-    print(f"{name}: {1000 * pace:.2f} ms an iteration", flush=True)
-    return max(1, int(arguments.many_seconds / pace))
-
-
-def now(device: str) -> float:
-    """Return the time when the device has done its work [s]."""
-    if device.startswith("cuda"):
-        torch.cuda.synchronize()
-    return time.perf_counter()
 
 
 @torch.no_grad()
