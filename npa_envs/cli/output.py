@@ -189,6 +189,29 @@ def rule_of(source: str) -> str:
     raise NPAError(f"a folder must hold the {rule.name} of a run, {source!r} does not: {cure}")
 
 
+def told_rules(words: Iterable[str]) -> dict[str, str]:
+    """Return the rules that words name: name -> what `load_rule` takes, the package's own first.
+
+    Args:
+        words: Names of shipped rules or of rules that runs begin with, files of rules, and folders
+            of runs.
+
+    Raises:
+        NPAError: A name is not known, or as for `rule_of`.
+    """
+    from npa_envs.rule.files import first_rules, shipped_rules
+    from npa_envs.web.rule_world import name_of
+
+    words = list(words)
+    own = [*shipped_rules(), *(name for name in first_rules() if name not in shipped_rules())]
+    files = [w for w in words if w not in own and (w.endswith(".safetensors") or Path(w).is_dir())]
+    named = [word for word in words if word not in files]
+    found = {name: name for name in (chosen_names("rule", named, own) if named else ())}
+    for source in map(rule_of, files):
+        found.setdefault(name_of(source), source)
+    return found
+
+
 def duration(seconds: float) -> str:
     """Return a time [s] in words, in seconds, minutes or hours."""
     for unit, size in (("hours", 3600.0), ("minutes", 60.0)):

@@ -15,9 +15,8 @@ from npa_envs.cli.output import (
     OptionalOutFolder,
     StepBar,
     check_numbers,
-    chosen_names,
     parse_options,
-    rule_of,
+    told_rules,
     torch_threads,
     writable_folder,
 )
@@ -74,23 +73,15 @@ def main(arguments: Sequence[str]) -> int:
     from npa_envs.measure.accuracy.habitats import rule_names, task_name
     from npa_envs.measure.record import measured_facts, time_limit
     from npa_envs.measure.robustness.study import MOST_PARTICLES, RuleRecord, measure_rule, tables
-    from npa_envs.rule.files import first_rules
-    from npa_envs.web.rule_world import name_of
 
     check_numbers(options, seed_count=1, first_seed=0, most_particles=1, threads=1)
     enough = time_limit(options.max_seconds)
-    files = {name_of(rule_of(name)): rule_of(name) for name in options.rules if _is_file(name)}
-    told = [name for name in options.rules if not _is_file(name)]
     # Rules that runs begin with are measured where they are named.
-    first = [name for name in first_rules() if name in told and name not in rule_names()]
-    shipped = [name for name in told if name not in first]
-    names = chosen_names("rule", shipped, rule_names()) if shipped or not (files or first) else []
-    names += first
-    names += [name for name in files if name not in names]
+    sources = told_rules(options.rules or rule_names())
+    names = list(sources)
     if options.quick and not options.rules:
         # One of each task.
         names = list({task_name(name): name for name in reversed(names)}.values())[::-1]
-    sources = {name: files.get(name, name) for name in names}
     device = check_device(options.device)
     most = options.most_particles or MOST_PARTICLES[device.type]
     seeds = _seeds(options)
@@ -134,10 +125,6 @@ def main(arguments: Sequence[str]) -> int:
         lines.append(f"{left} rules are left: call again with the same options")
     print("\n".join(lines))
     return 0
-
-
-def _is_file(name: str) -> bool:
-    return name.endswith(".safetensors") or Path(name).is_dir()
 
 
 def _seeds(options: RobustnessOptions) -> range:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
 
 from npa_envs.cli.output import (
     MeasureOptions,
@@ -12,6 +14,7 @@ from npa_envs.cli.output import (
     StepBar,
     check_numbers,
     parse_options,
+    told_rules,
     torch_threads,
     writable_folder,
 )
@@ -30,6 +33,10 @@ class StressOptions(MeasureOptions):
     holds), or skipped. With --out a JSON file is written after each check, and a run that was
     stopped goes on where it was: what passed is not repeated.
     """
+
+    rules: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RULES")] = ()
+    """Check these rules alone, in all checks that are of a rule: shipped ones (`npa-envs list`),
+    files of rules, or folders of runs; default: the library and the shipped rules."""
 
     quick: bool = False
     """Small worlds, few steps, some rules: about a minute on two CPU cores."""
@@ -61,7 +68,8 @@ def main(arguments: Sequence[str]) -> int:
     from npa_envs.measure.record import measured_facts
 
     check_numbers(options, seed=0, threads=1)
-    checks = suite.all_checks(quick=options.quick, seed=options.seed)
+    rules = told_rules(options.rules)
+    checks = suite.all_checks(quick=options.quick, seed=options.seed, rules=rules)
     names = [check.name for check in checks]
     chosen = suite.chosen_checks(checks, options.only)
     if options.list:

@@ -10,6 +10,7 @@ import torch
 
 from npa_envs import reference
 from npa_envs.cli import main
+from npa_envs.cli.output import told_rules
 from npa_envs.errors import NPAError
 from npa_envs.measure.accuracy import habitats, hard_cases, numerics, suite
 from npa_envs.measure.accuracy import scenes as accuracy
@@ -25,6 +26,7 @@ from npa_envs.measure.accuracy.suite import (
     run_checks,
 )
 from npa_envs.rule.rule import NPARule
+from npa_envs.training import preset, train
 
 CHECKS = {check.name: check for check in suite.all_checks(quick=True)}
 FACTS = {"device": "cpu", "commit": "0"}
@@ -273,6 +275,36 @@ def test_what_grew_at_another_radius_is_measured_at_its_trained_size(device):
     assert held.at_trained_size(held.x, 2.0 * held.task.eps) is held.x
 
 
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"equivariant": True},
+        {"targets": ("ring", "heart"), "code_dim": 3},
+        {"targets": ("ring", "heart"), "code_dim": 3, "encoder": True},
+        {"division": True},
+    ],
+    ids=["equivariant", "coded", "encoded", "dividing"],
+)
+def test_rules_of_every_kind_in_files_are_checked_by_themselves(fields, tmp_path, device):
+    config = preset("tiny", **fields, iterations=2, device=str(device), out=tmp_path / "mine")
+    train(config, progress=False)
+    sources = told_rules([str(tmp_path / "mine")])
+    assert sources == {"mine": str(tmp_path / "mine" / "rule.safetensors")}
+    checks = suite.all_checks(quick=True, rules=sources)
+    assert [check.name for check in checks] == [
+        "time/mine",
+        "gradients/norm/mine",
+        "gradients/float32/mine",
+        *(f"precision/{name}/mine" for name in numerics.SHORT),
+    ]
+    entries = {check.name: run_check(check, session(device)) for check in checks}
+    assert all(entry.figures or entry.verdict == "skipped" for entry in entries.values())
+    assert entries["gradients/norm/mine"].verdict == "pass"
+    alike = entries["gradients/float32/mine"]
+    assert alike.verdict == ("skipped" if "division" in fields else "range"), alike.worst()
+    assert 0.9 < entries["precision/mixed/mine"].figures["ratio"] < 1.1
+
+
 # The command
 
 
@@ -297,6 +329,15 @@ def test_the_command_lists_its_checks(capsys):
     text = capsys.readouterr().out
     assert "values/nan_state: NaN in one state spreads in its own world only" in text
     assert "geometry" not in text
+    assert main(["stress", "heart", "seven-pictures", "--list", "--only", "time"]) == 0
+    text = capsys.readouterr().out
+    assert [name in text for name in ("time/heart:", "time/seven-pictures:", "time/dots:")] == [
+        True,
+        True,
+        False,
+    ]
+    assert main(["stress", "hart"]) == 2
+    assert "unknown rule 'hart': did you mean 'heart'" in capsys.readouterr().err
 
 
 def test_heat_maps_are_drawn_of_what_has_limits():

@@ -1,8 +1,8 @@
-"""Shipped rules in the worlds that they were trained for, and for 100 000 steps in them."""
+"""Rules in the worlds that they were trained for, and for 100 000 steps in them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -84,13 +84,18 @@ def rule_names() -> list[str]:
     return list(shipped_rules())
 
 
+def _file_of(rule: str) -> Path:
+    """Return the file of a rule of the package, or of a path."""
+    return (first_rules() | shipped_rules()).get(rule, Path(rule))
+
+
 def task_name(rule: str) -> str:
     """Return the name of the task that a rule of the package, or of a file of ours, was trained on.
 
     Raises:
         NPAError: The file is none of ours, or says nothing of a task.
     """
-    metadata = rule_metadata((first_rules() | shipped_rules()).get(rule, Path(rule)))
+    metadata = rule_metadata(_file_of(rule))
     if metadata.get("task") not in HORIZONS:
         raise NPAError(
             f"the rule's file must say on which task it was trained, {rule!r} says "
@@ -107,7 +112,7 @@ def habitat(
     particles: float = 1.0,
     looks: bool = True,
 ) -> Habitat:
-    """Return a shipped rule with seeds of its task.
+    """Return a rule of the package, or of a file, with seeds of its task.
 
     `particles` is over those it was trained with or, in a quick run, over the most there. Where the
     world `looks` at nothing, neither loss nor metric is asked for: a 3D target takes long to make.
@@ -140,7 +145,7 @@ def _task(session: Session, name: str, particles: float, looks: bool) -> tuple[N
 
 def trained_particles(session: Session, name: str) -> int:
     """Return how many particles a world of a rule has where their number is not what is varied."""
-    path = shipped_rules()[name]
+    path = _file_of(name)
     count = int(trained_config(path, rule_metadata(path)).task.particle_count)
     # Clouds are sampled farthest point by farthest point, all of them.
     most = QUICK_CLOUD if task_name(name) == "point_classification" else QUICK_PARTICLES
@@ -222,8 +227,8 @@ BOUNDS = {
 """Bounds of the figures that `endurance_checks` describes."""
 
 
-def endurance_checks() -> list[Check]:
-    """Return the checks of the group `time`.
+def endurance_checks(rules: Mapping[str, str] | None = None) -> list[Check]:
+    """Return the checks of the group `time`, of all shipped rules or of others: name -> source.
 
     Figures are the largest after the world has settled. `extent`: longest side of the bounding box,
     over that of the settled world. `overflow`: mean |s − clip(s, −1, 1)|. `largest_state`: the
@@ -236,7 +241,10 @@ def endurance_checks() -> list[Check]:
         "times the energy of the settled world's, states stay within 8 and on average within 1.1, "
         "the centroid moves by an extent at most"
     )
-    return [Check(f"time/{name}", expected, partial(_run, name)) for name in rule_names()]
+    sources = rules or {name: name for name in rule_names()}
+    return [
+        Check(f"time/{name}", expected, partial(_run, source)) for name, source in sources.items()
+    ]
 
 
 def measured(home: Habitat, x: Tensor, s: Tensor, generator: torch.Generator) -> dict[str, float]:

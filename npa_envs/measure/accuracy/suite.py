@@ -35,17 +35,19 @@ FAR = 1e3
 """Colours of heat maps end at this many times a limit, and at its inverse."""
 
 
-def all_checks(*, quick: bool = False, seed: int = 0) -> list[Check]:
+def all_checks(
+    *, quick: bool = False, seed: int = 0, rules: Mapping[str, str] | None = None
+) -> list[Check]:
     """Return every check in the order that they are run in; when quick, only of some of the rules.
 
-    Random places are drawn from the seed.
+    Random places are drawn from the seed. Of `rules`, name -> what `load_rule` takes, it is every
+    check of a rule, and nothing else.
     """
     return [
-        *geometry_checks(seed),
-        *values_checks(),
-        *endurance_checks(),
-        *gradients_checks(quick=quick),
-        *precision_checks(quick=quick),
+        *(() if rules else (*geometry_checks(seed), *values_checks())),
+        *endurance_checks(rules),
+        *gradients_checks(quick=quick, rules=rules),
+        *precision_checks(quick=quick, rules=rules),
     ]
 
 

@@ -14,6 +14,7 @@ from torch.nn import functional
 from npa_envs import reference
 from npa_envs.measure.speed.hash_grid import grid_fields
 from npa_envs.ops import perceive, perception_fields
+from npa_envs.ops.equivariance import invariants, steered
 from npa_envs.rule.rule import NPARule
 
 NEIGHBOUR_CAP = 32
@@ -173,10 +174,17 @@ class MixedRule(NPARule):
 
     def forward(self, perception: Tensor) -> Tensor:
         """Map perception vectors, shape [..., P], to raw updates, shape [..., A]."""
+        if not self.equivariant:
+            return self._outputs(perception, self.update_weight)
+        mixed, inputs = invariants(perception, self.mixing, self.vector_form)
+        output = self._outputs(inputs, self.output.weight)
+        return output if self.static else steered(output, mixed, self.steering, self.vector_form)
+
+    def _outputs(self, inputs: Tensor, weight: Tensor) -> Tensor:
         short = torch.bfloat16
-        weight, bias = self.hidden.weight.to(short), self.hidden.bias.to(short)
-        hidden = torch.relu(functional.linear(perception.to(short), weight, bias))
-        return functional.linear(hidden, self.output.weight.to(short)).to(perception.dtype)
+        hidden_weight, bias = self.hidden.weight.to(short), self.hidden.bias.to(short)
+        hidden = torch.relu(functional.linear(inputs.to(short), hidden_weight, bias))
+        return functional.linear(hidden, weight.to(short)).to(inputs.dtype)
 
 
 @dataclass(frozen=True)
