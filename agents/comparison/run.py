@@ -1,14 +1,15 @@
 """Runs of a comparison: each learns, is tested on held-out episodes, leaves a record and a picture.
 
-They are spread over cores or GPUs, and each may fail by itself: a run is a process,
+They are spread over cores or GPUs, and each may fail by itself: a run has a process,
 `python -m npa_envs.agents.comparison.run FOLDER`, which gets ready, waits for a line on its input
-that names a device, and does there what `request.json` in the folder asks for; it ends when its
-input does.
+that names a device, and does there what `request.json` in the folder asks for. Then it may be told
+another folder and another device; it ends when its input does.
 """
 
 from __future__ import annotations
 
 import contextlib
+import gc
 import json
 import math
 import os
@@ -145,6 +146,8 @@ class Request:
     command: str = ""
     teacher: str = ""
     """Folder of the run whose rules are cloned, if any."""
+    lasts: bool = False
+    """Whether the process waits for another run afterwards."""
 
     @classmethod
     def read(cls, folder: Path) -> Request:
@@ -286,7 +289,7 @@ def _rendered(envs: Any) -> NDArray[np.uint8]:
 
 
 def main(folder: Path) -> None:
-    """Do what a folder asks for once a device is named, unless the comparison ends before."""
+    """Do what a folder asks for once a device is named, then so for others, while there are any."""
     lines: SimpleQueue[str] = SimpleQueue()
 
     def listen() -> None:
@@ -299,14 +302,34 @@ def main(folder: Path) -> None:
     # Loads what the method needs. Whatever breaks here breaks in `run` as well, which records it.
     with contextlib.suppress(Exception):
         method_options(Request.read(folder).method)
+    lasts = Request.read(folder).lasts
     run(folder, lines.get())
+    while lasts:
+        folder = Path(json.loads(lines.get()))
+        _redirect_output(folder)
+        run(folder, lines.get())
+        # Nothing of a run is to be in the way of the next.
+        gc.collect()
+        if torch.cuda.is_initialized():
+            torch.cuda.empty_cache()
 
 
-# All runs over cores or GPUs: one process a run, each of which may fail by itself.
+def _redirect_output(folder: Path) -> None:
+    """Send what this process says from now on into a folder's file."""
+    for stream in (sys.stdout, sys.stderr):
+        stream.flush()
+    with (folder / OUTPUT).open("wb") as output:
+        for number in (1, 2):
+            os.dup2(output.fileno(), number)
+
+
+# All runs over cores or GPUs, each of which may fail by itself. What starts with a process, such as
+# libraries, a GPU's context and kernels, takes longer than many runs learn.
 
 PROGRAM = (sys.executable, "-m", "npa_envs.agents.comparison.run")
 """What a run's process is, before the folder of the run: it gets ready, begins when a line of its
-input names a device, and ends when its input does."""
+input names a device, and ends when its input does. Another folder, as JSON on a line, and another
+device are one more run."""
 
 MEASURED = ("done", "diverged")
 """Runs that a resumed comparison does not repeat."""
@@ -320,27 +343,45 @@ class _Process(Child):
     job: Job
     folder: Path
     process: subprocess.Popen[bytes]
+    lasts: bool
+    """Whether the process does another run afterwards."""
     begin: float = 0.0
 
     @property
     def over(self) -> bool:
-        """Whether it has ended."""
-        return self.process.poll() is not None
+        """Whether the run has ended."""
+        return self.process.poll() is not None or (self.lasts and (self.folder / RECORD).exists())
 
     def go(self, device: str) -> None:
         """Let it begin on a device."""
-        assert self.process.stdin is not None, "asked for at its start"
         self.begin = time.perf_counter()
-        # One that has died is found dead, and recorded, by whoever looks next.
-        with contextlib.suppress(BrokenPipeError):
-            self.process.stdin.write(f"{device}\n".encode())
-            self.process.stdin.flush()
+        _tell(self.process, device)
 
     def end(self) -> None:
         """End it, and leave nothing of it."""
         self.process.terminate()
         self.process.communicate()
         shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def _tell(process: subprocess.Popen[bytes], line: str) -> None:
+    """Write a line to the input of a process."""
+    assert process.stdin is not None, "asked for at its start"
+    # One that has died is found dead, and recorded, by whoever looks next.
+    with contextlib.suppress(BrokenPipeError):
+        process.stdin.write(f"{line}\n".encode())
+        process.stdin.flush()
+
+
+def lasts(plan: Plan, job: Job) -> bool:
+    """Return whether the process of a run does others before and afterwards.
+
+    One that is measured by time has a process of its own, so that all start alike, and so has a
+    function from outside this library, as it may keep what it likes.
+    """
+    own = ":" in plan.own.get(job.method, job.method)
+    # Elsewhere no folder can be moved while a process writes into it.
+    return os.name == "posix" and job.axis == "particle-steps" and not own
 
 
 def held_records(plan: Plan, folder: Path) -> dict[Job, RunRecord]:
@@ -367,11 +408,12 @@ def run_jobs(
     max_seconds: float = math.inf,
     written: Callable[[RunRecord], None] = lambda record: None,
 ) -> None:
-    """Run jobs, each in a process of its own; one that fails is recorded, and the others go on.
+    """Run jobs in processes; one that fails is recorded, and the others go on.
 
-    On GPUs the process of the next run is started early, and waits until its turn comes. A run's
-    results appear in its folder all at once, when it is over. If this is interrupted, its processes
-    are ended and leave nothing.
+    Runs that are measured by particle-steps follow each other in processes, as long as none fails;
+    all others have a process each, and on GPUs that of the next one is started early, and waits
+    until its turn comes. A run's results appear in its folder all at once, when it is over. If this
+    is interrupted, its processes are ended and leave nothing.
 
     Args:
         plan: What they belong to.
@@ -386,37 +428,65 @@ def run_jobs(
         NPAError: The folder cannot be written to.
     """
     waiting = list(jobs)
+    idle: list[subprocess.Popen[bytes]] = []
 
     def start(unfinished: Sequence[_Process]) -> _Process | None:
         ahead = {*waiting, *(one.job for one in unfinished)}
         for job in waiting:
             if plan.teacher(job) not in ahead:
                 waiting.remove(job)
-                return _start(plan, job, folder, places, command)
+                return _start(plan, job, folder, places, command, idle)
         return None
+
+    def finished(one: _Process) -> None:
+        record = _finish(plan, one, folder, command)
+        if one.lasts and record.status in MEASURED and one.process.poll() is None:
+            idle.append(one.process)
+        else:
+            one.process.communicate()
+        written(record)
 
     # What a killed comparison left of runs half-way.
     for job in jobs:
         target = folder / job.folder
         for left in target.parent.glob(f".{target.name}.*"):
             shutil.rmtree(left, ignore_errors=True)
-    run_children(
-        start,
-        lambda one: written(_finish(plan, one, folder, command)),
-        places,
-        ahead=places.ahead,
-        max_seconds=max_seconds,
-    )
+    try:
+        run_children(
+            start,
+            finished,
+            places,
+            ahead=places.ahead and not all(lasts(plan, job) for job in jobs),
+            max_seconds=max_seconds,
+        )
+    finally:
+        for process in idle:
+            process.communicate()
 
 
-def _start(plan: Plan, job: Job, folder: Path, places: Places, command: str) -> _Process:
+def _start(
+    plan: Plan,
+    job: Job,
+    folder: Path,
+    places: Places,
+    command: str,
+    idle: list[subprocess.Popen[bytes]],
+) -> _Process:
+    """Return the process of a run, which waits for its device: an idle one, or a new one."""
     target = folder / job.folder
     part = target.parent / f".{target.name}.{secrets.token_hex(4)}"
     part.mkdir(parents=True)
     teacher = plan.teacher(job)
     taught = "" if teacher is None else str(folder / teacher.folder)
-    request = Request(job, plan.facts(job), places.threads, command, taught)
+    lasting = lasts(plan, job)
+    request = Request(job, plan.facts(job), places.threads, command, taught, lasting)
     write_record(part / REQUEST, asdict(request))
+    if lasting and idle:
+        # The process turns to this file itself, unless it dies before.
+        (part / OUTPUT).touch()
+        process = idle.pop()
+        _tell(process, json.dumps(str(part)))
+        return _Process(job, part, process, lasts=True)
     environment = os.environ | {"OMP_NUM_THREADS": str(places.threads)}
     with (part / OUTPUT).open("wb") as output:
         process = subprocess.Popen(
@@ -426,12 +496,13 @@ def _start(plan: Plan, job: Job, folder: Path, places: Places, command: str) -> 
             stderr=output,
             env=environment,
         )
-    return _Process(job, part, process)
+    return _Process(job, part, process, lasts=lasting)
 
 
 def _finish(plan: Plan, one: _Process, folder: Path, command: str) -> RunRecord:
-    """Put the results of a process that is over into their place, and return its record."""
-    one.process.communicate()
+    """Put the results of a run that is over into their place, and return its record."""
+    if not one.lasts:
+        one.process.communicate()
     request = Request(one.job, plan.facts(one.job), command=command)
     record = RunRecord.read(one.folder, request.facts)
     if record is None:

@@ -50,9 +50,9 @@ QUICK: dict[str, Any] = {
 class CompareOptions(MeasureOptions):
     """Compare methods on tasks over seeds, for equal wall time, equal particle-steps, or both.
 
-    Every run is a process of its own. One that fails is recorded with its error, and the others go
-    on; a comparison that was stopped goes on where it was, and repeats runs that failed. Ends with
-    code 1 where a run failed.
+    Runs learn in processes. One that fails is recorded with its error, and the others go on; a
+    comparison that was stopped goes on where it was, and repeats runs that failed. Ends with code 1
+    where a run failed.
     """
 
     out: OutFolder = Path("comparison")

@@ -261,6 +261,75 @@ def test_no_place_stays_free_while_a_process_waits(tmp_path, child):
     assert [one.job.seed for one in seen] == [1, 2, 3, 0]
 
 
+LASTING = """
+import json, os, sys
+from pathlib import Path
+folder = Path(sys.argv[1])
+while True:
+    device = sys.stdin.readline().strip()
+    request = json.loads((folder / "request.json").read_text())
+    seed = request["job"]["seed"]
+    if seed == 2: os._exit(3)
+    (folder / "pid").write_text(str(os.getpid()))
+    record = {
+        "job": request["job"], "facts": request["facts"], "error": "", "curve": [], "returns": [],
+        "final_losses": [], "endings": {}, "seconds": 0.0, "command": "", "date": "",
+        "status": "failed" if seed == 4 else "done",
+    }
+    (folder / "part").write_text(json.dumps(record))
+    os.replace(folder / "part", folder / "run.json")
+    line = sys.stdin.readline()
+    if not line: break
+    folder = Path(json.loads(line))
+"""
+"""A process that does one run after the other, dies in that of seed 2, and fails that of seed 4."""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="elsewhere each run has a process")
+def test_runs_follow_each_other_in_a_process_until_one_fails(tmp_path, monkeypatch):
+    monkeypatch.setattr(one_run, "PROGRAM", (sys.executable, "-c", LASTING))
+    steps = {"particle-steps": {"growth": 1.0}}
+    made = plan(methods=["one"], seeds=(0, 1, 2, 3, 4, 5, 6), budgets=steps)
+    seen = []
+    run_jobs(made, made.jobs(), tmp_path, Places(("cuda",)), written=seen.append)
+    assert [one.job.seed for one in seen] == [0, 1, 2, 3, 4, 5, 6]
+    told = {one.job.seed: one.status for one in seen}
+    assert told == dict.fromkeys((0, 1, 3, 5, 6), "done") | {2: "failed", 4: "failed"}
+    assert seen[2].error.startswith("its process ended with code 3")
+    ran = {
+        one.job.seed: int((tmp_path / one.job.folder / "pid").read_text())
+        for one in seen
+        if one.job.seed != 2
+    }
+    assert ran[0] == ran[1] != ran[3] == ran[4] != ran[5] == ran[6]
+    assert not any(map(is_alive, ran.values()))
+    # Functions from outside, and what is measured by time, have processes of their own.
+    job = made.jobs()[0]
+    assert one_run.lasts(made, job)
+    assert not one_run.lasts(plan(methods=["one"], own={"one": "mine:train"}, budgets=steps), job)
+    assert not one_run.lasts(made, dataclasses.replace(job, axis="seconds"))
+
+
+@pytest.mark.slow
+def test_a_run_is_the_same_whatever_its_process_did_before(tmp_path, monkeypatch):
+    methods = ("random", "gradient", "shac", "ppo", "ppo_world", "evolution", "clone")
+    made = make_plan(
+        CompareOptions(quick=True, particle_steps=3e4, tasks=("mixing",), methods=methods)
+    )
+    jobs = [*reversed(made.jobs()[2:]), *made.jobs()[:2]]
+    run_jobs(made, jobs, tmp_path / "one", Places(("cpu",)))
+    monkeypatch.setattr(one_run, "lasts", lambda plan, job: False)
+    run_jobs(made, made.jobs(), tmp_path / "each", Places(("cpu",)))
+    found, alone = (held_records(made, tmp_path / name) for name in ("one", "each"))
+    assert list(found) == list(alone) == made.jobs()
+    for job, record in found.items():
+        other = alone[job]
+        assert record.returns == other.returns, job
+        assert [point.mean_return for point in record.curve] == [
+            point.mean_return for point in other.curve
+        ]
+
+
 @pytest.mark.parametrize("device", ["cpu", "cuda"])
 def test_a_run_that_clones_begins_when_its_teacher_is_over(tmp_path, child, device):
     child(
