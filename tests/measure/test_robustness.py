@@ -45,7 +45,7 @@ from npa_envs.measure.robustness.study import (
 )
 from npa_envs.rule.files import rule_metadata, shipped_rules
 from npa_envs.tasks.damage import random_particle
-from npa_envs.training.trained_tasks import trained_config
+from npa_envs.training.trained_tasks import task_of_rule, trained_config
 from npa_envs.world.randomness import WorldRandom
 
 SIDE = 2.0
@@ -298,6 +298,30 @@ def test_seeds_are_worlds_of_their_own_whatever_their_number(device):
     half = place.home(share=0.5)
     assert half.x.shape == (2, 64, 2)
     assert (half.task.config.target_point_count, two.task.config.target_point_count) == (64, 128)
+
+
+def test_seeds_of_a_rule_of_many_pictures_grow_them_in_turn(device):
+    place = Ground("seven-pictures", device, TINY, range(5, 9), 128)
+    names = place.rule.codes.names
+    home = place.home()
+    for world, seed in enumerate(range(5, 9)):
+        code = place.rule.codes[names[seed % 7]]
+        assert torch.equal(home.s[world, :, :8], code.expand(128, 8))
+    losses = home.losses(home.x, home.s)
+    for world, seed in enumerate(range(5, 9)):
+        own = task_of_rule(
+            "seven-pictures", place.rule, device, particle_count=128, target=names[seed % 7]
+        ).task
+        alone = own.metric(home.x[world : world + 1], home.s[world : world + 1])
+        assert torch.equal(losses[world], alone[0])
+    # Copies grow what their worlds grow, and a seed alone what it grows among others.
+    twice = home.with_worlds(home.x.repeat(2, 1, 1), home.s.repeat(2, 1, 1))
+    assert torch.equal(twice.losses(twice.x, twice.s), losses.repeat(2))
+    one = Ground("seven-pictures", device, TINY, range(8, 9), 128).home(share=0.5)
+    assert torch.equal(one.s, place.home(share=0.5).s[3:])
+    # What takes codes away gives them back.
+    courses = healing(place, grow(place)[0])
+    assert all(len(course.losses) == 4 for course in courses)
 
 
 def test_a_world_that_is_lost_stays_lost_and_leaves_the_others_as_they_are(device):

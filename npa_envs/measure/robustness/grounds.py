@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,7 +19,7 @@ from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
 from npa_envs.tasks.morphogenesis3d import Morphogenesis3D
 from npa_envs.tasks.point_classification import PointClassification, particle_classes
 from npa_envs.tasks.texture import Texture
-from npa_envs.training.trained_tasks import task_of_rule
+from npa_envs.training.trained_tasks import task_of_rule, tasks_of_codes
 from npa_envs.world.randomness import Purpose, WorldRandom
 
 SEEN_AT_ONCE = 1 << 17
@@ -58,13 +59,78 @@ class Home(Habitat):
             assert self.goal is not None, "clouds are made with their classes"
             says = particle_classes(self.task.outputs(s))
             return (says != self.goal[worlds, None]).to(s.dtype).mean(1)
-        return self.task.metric(x, s)
+        return task_toward(self.task, None if self.goal is None else self.goal[worlds]).metric(x, s)
+
+
+class PicturesInTurn:
+    """Worlds of several pictures of one rule, each compared as in a world of its own.
+
+    Satisfies `GoalTask` and `CodedTask`: a world's goal is the place of its picture.
+
+    Args:
+        tasks: The task of each picture, for the rule.
+        goal: Which of them the worlds grow, int64, shape [B].
+    """
+
+    def __init__(self, tasks: Sequence[Morphogenesis2D], goal: Tensor) -> None:
+        first = tasks[0]
+        self._tasks, self._goal = tuple(tasks), goal
+        self.config, self.metric_name = first.config, first.metric_name
+        self.eps, self.box, self.update_prob = first.eps, first.box, first.update_prob
+
+    def resized(self, particle_count: int, rule: NPARule, device: torch.device) -> PicturesInTurn:
+        """Return the same pictures for another number of particles."""
+        return PicturesInTurn(
+            [
+                Morphogenesis2D(
+                    task.config.with_particle_count(particle_count), device=device
+                ).for_rule(rule)
+                for task in self._tasks
+            ],
+            self._goal,
+        )
+
+    def seed_with_goals(
+        self, world_count: int, *, generator: WorldRandom, device: torch.device
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return fresh worlds with the codes of their pictures, and which ones these are."""
+        x, s = self._tasks[0].seed(world_count, generator=generator, device=device)
+        return x, self.coded(s), self._goal
+
+    def damage_with_goals(
+        self, x: Tensor, s: Tensor, goal: Tensor, generator: WorldRandom
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the worlds damaged as each picture's task does it."""
+        return *self._tasks[0].damage(x, s, generator), goal
+
+    def toward(self, goal: Tensor) -> PicturesInTurn:
+        """Return the task for worlds of other pictures, int64, shape [B]."""
+        return PicturesInTurn(self._tasks, goal)
+
+    def coded(self, s: Tensor) -> Tensor:
+        """Return states with the codes of their worlds' pictures."""
+        s = s.clone()
+        for task, worlds in self._worlds():
+            s[worlds] = task.coded(s[worlds])
+        return s
+
+    def metric(self, x: Tensor, s: Tensor) -> Tensor:
+        """Return how far each world is from its picture, shape [B]."""
+        losses = x.new_empty(len(x))
+        for task, worlds in self._worlds():
+            losses[worlds] = task.metric(x[worlds], s[worlds])
+        return losses
+
+    def _worlds(self) -> Iterator[tuple[Morphogenesis2D, Tensor]]:
+        for number in sorted(set(self._goal.tolist())):
+            yield self._tasks[number], (self._goal == number).nonzero()[:, 0]
 
 
 class Ground:
-    """A shipped rule and the tasks that it is tried in, one for each number of particles.
+    """A rule and the tasks that it is tried in, one for each number of particles.
 
-    The seeds are none that a rule was trained with.
+    The seeds are none that a rule was trained with. Of a rule of many pictures, world k of all
+    numbers grows picture k, modulo their number.
     """
 
     def __init__(
@@ -95,7 +161,11 @@ class Ground:
         """What losses are."""
         if isinstance(found.task, PointClassification):
             self.metric_name = "share of particles that are wrong"
-        self._tasks: dict[int, Task] = {self.particle_count: self.task}
+        if self.rule.codes is not None:
+            pictures = tasks_of_codes(name, self.rule, device, particle_count=particle_count)
+            numbers = torch.tensor(self._numbers, device=device)
+            self.task = PicturesInTurn(pictures, numbers % len(pictures))
+        self._tasks: dict[int, Any] = {self.particle_count: self.task}
 
     @property
     def particle_count(self) -> int:
@@ -109,9 +179,13 @@ class Ground:
 
     def random(self, purpose: int) -> WorldRandom:
         """Return streams of all worlds for a purpose, at their beginning."""
+        return WorldRandom(self._numbers, device=self._device).beside(purpose)
+
+    @property
+    def _numbers(self) -> list[int]:
+        """Number of each world."""
         each = self.plan.worlds_per_seed
-        numbers = [seed * each + k for seed in self.seeds for k in range(each)]
-        return WorldRandom(numbers, device=self._device).beside(purpose)
+        return [seed * each + k for seed in self.seeds for k in range(each)]
 
     def particles(self, share: float) -> int:
         """Return how many particles a share of the trained number is."""
@@ -121,7 +195,11 @@ class Ground:
         """Return fresh worlds: a share of the trained number of particles, a shape of `SHAPES`."""
         count = self.particles(share)
         if count not in self._tasks:
-            self._tasks[count] = task_for_rule(_resized(self.task, count, self._device), self.rule)
+            self._tasks[count] = (
+                self.task.resized(count, self.rule, self._device)
+                if isinstance(self.task, PicturesInTurn)
+                else task_for_rule(_resized(self.task, count, self._device), self.rule)
+            )
         task = self._tasks[count]
         random = self.random(Purpose.GROWTH)
         x, s, goal = seed_worlds(task, self.world_count, generator=random, device=self._device)
