@@ -310,8 +310,7 @@ def main(folder: Path) -> None:
         run(folder, lines.get())
         # Nothing of a run is to be in the way of the next.
         gc.collect()
-        if torch.cuda.is_initialized():
-            torch.cuda.empty_cache()
+        torch.cuda.empty_cache()
 
 
 def _redirect_output(folder: Path) -> None:

@@ -124,8 +124,8 @@ class _Schedule(TrainConfig[Any]):
     last_rate: float
     """Learning rate at the end, as a share of the first (dimensionless)."""
 
-    def learning_rate_at(self, iteration: int) -> float:
-        """Return the learning rate now: half a cosine over the budget, whatever the iteration."""
+    def learning_rate_at(self, iteration: int, share: float = 0.0) -> float:
+        """Return the learning rate now: half a cosine over the budget, whatever the arguments."""
         return annealed(self.learning_rate, self.last_rate, self.progress.share)
 
 
