@@ -23,7 +23,7 @@ from npa_envs.training.checkpoint import (
     save_checkpoint,
     unusable_checkpoint,
 )
-from npa_envs.training.run_folder import RunFolder
+from npa_envs.training.run_folder import RunFolder, check_choice
 from npa_envs.training.stopping import stop_flag
 from npa_envs.world.randomness import WorldRandom
 
@@ -106,6 +106,7 @@ class KeptProgress(Progress):
 
     def _opened(self, resume: bool) -> dict[str, Any] | None:
         """Return the checkpoint to go on from, or None, once the folder is fit to be written to."""
+        check_choice(resume=resume, overwrite=self._overwrite)
         folder, content = self.folder, None
         folder.note_checkpoint()
         if resume:

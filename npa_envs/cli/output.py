@@ -292,23 +292,27 @@ def settled_resume(words: Sequence[str], out_of: Callable[[Sequence[str]], Path]
         out_of: Returns the folder that words without it name.
 
     Raises:
-        NPAError: Another word stands behind `--resume`.
+        NPAError: Another word stands behind `--resume`, or `--overwrite` beside it.
     """
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-    parser.add_argument("--resume", nargs="?", choices=("auto",))
+    parser.add_argument("--resume", nargs="?", const=True, choices=("auto",))
+    parser.add_argument("--overwrite", action="store_true")
     try:
         first, _ = parser.parse_known_args(words)
     except argparse.ArgumentError as error:
         raise NPAError(f"{error.argument_name}: {error.message}") from error
     chosen = list(words)
+    if first.resume is None:
+        return chosen
+    from npa_envs.training.run_folder import RunFolder, check_choice
+
+    check_choice(resume=True, overwrite=first.overwrite)
     if first.resume == "auto":
         if "--resume=auto" in chosen:
             chosen.remove("--resume=auto")
         else:
             place = chosen.index("--resume")
             del chosen[place : place + 2]
-        from npa_envs.training.run_folder import RunFolder
-
         if RunFolder(out_of(chosen)).checkpoint.exists():
             chosen.append("--resume")
     return chosen

@@ -27,6 +27,19 @@ except ImportError:  # Windows
 _LARGEST_LOG = 2**29
 
 
+def check_choice(*, resume: bool, overwrite: bool) -> None:
+    """Check that a run does not both go on and start anew.
+
+    Raises:
+        NPAError: It does.
+    """
+    if resume and overwrite:
+        raise NPAError(
+            "resume and overwrite exclude each other: resume goes on with the run in the folder, "
+            "overwrite removes it: leave one of them out"
+        )
+
+
 class RunFolder:
     """Paths of a run's files.
 

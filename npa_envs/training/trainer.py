@@ -34,7 +34,7 @@ from npa_envs.training.diagnosis import divergence_error
 from npa_envs.training.iteration import Rollout
 from npa_envs.training.overrides import config_to_dict
 from npa_envs.training.ranks import Ranks
-from npa_envs.training.run_folder import JsonlLog, RunFolder, open_tensorboard
+from npa_envs.training.run_folder import JsonlLog, RunFolder, check_choice, open_tensorboard
 from npa_envs.training.stopping import stop_flag
 from npa_envs.training.variation import VariedCycle
 
@@ -361,6 +361,7 @@ class Trainer:
         raise error
 
     def _open_folder(self, *, resume: bool, overwrite: bool) -> dict[str, Any] | None:
+        check_choice(resume=resume, overwrite=overwrite)
         path = self.folder.checkpoint
         self.folder.note_checkpoint()
         if path.exists():

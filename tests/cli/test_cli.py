@@ -321,6 +321,7 @@ def test_train_refuses_before_it_says_where_it_writes(trained, tmp_path, capsys)
     words = ["train", *TINY, "--milestones", "--out"]
     for given, message in (
         ([str(trained)], r"holds one: resume it \(--resume\), .*overwrite it \(--overwrite\)"),
+        ([str(trained), "--resume", "--overwrite"], "resume and overwrite exclude each other"),
         ([str(tmp_path / "out"), "--target", "/nowhere.png"], r"nowhere\.png"),
     ):
         assert main([*words, *given]) == 2

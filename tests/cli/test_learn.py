@@ -93,6 +93,7 @@ def test_a_killed_process_ends_a_run_and_a_signal_stops_it(tmp_path):
         (["--gpus=2", "--device=cpu"], "gpus goes with device 'cuda', got 'cpu'"),
         (["--gpus", "0"], "gpus must be at least 1, got 0"),
         (["--resume", "now"], "invalid choice: 'now'"),
+        (["--resume", "auto", "--overwrite"], "resume and overwrite exclude each other"),
     ],
 )
 def test_mistakes_are_told(words, message, tmp_path, capsys):

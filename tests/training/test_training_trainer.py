@@ -407,6 +407,9 @@ def test_second_run_in_a_folder_is_refused_unless_it_overwrites(tmp_path):
         NPAError, match=r"holds one: resume it .*, choose another folder .*, or overwrite"
     ):
         trainer_of(config)
+    with pytest.raises(NPAError, match="resume and overwrite exclude each other"):
+        train(config, resume=True, overwrite=True)
+    assert [record["iteration"] for record in log_of(tmp_path)][-1] == config.iterations
     result = train(override(config, iterations=2), overwrite=True)
     assert result.iteration == 2
     assert [record["iteration"] for record in log_of(tmp_path)] == [1, 2]
