@@ -128,7 +128,13 @@ class ManyPictures(Morphogenesis2D):
         )
 
     def for_rule(self, rule: NPARule) -> Self:
-        """Return the task whose worlds carry the codes of a rule."""
+        """Return the task whose worlds carry the codes of a rule.
+
+        Those of an encoder are read from the pictures here, and each time that states are `coded`.
+        """
+        if rule.codes is not None:
+            with torch.no_grad():
+                self._read_codes(rule.codes)
         return self._with(_codes=rule.codes)
 
     def toward(self, goal: Tensor) -> Self:
@@ -154,7 +160,10 @@ class ManyPictures(Morphogenesis2D):
         x, s = super().seed(world_count, generator=generator, device=device)
         goal = drawn_indices(len(self.names), world_count, generator, torch.device(device))
         blank = s.new_zeros(*s.shape[:2], self.config.code_dim)
-        return x, self.toward(goal).coded(torch.cat((blank, s), dim=-1)).detach(), goal
+        s = torch.cat((blank, s), dim=-1)
+        if self._codes is not None:
+            s = self._carrying(s, self._codes.table.detach(), goal)
+        return x, s, goal
 
     def damage_with_goals(
         self, x: Tensor, s: Tensor, goal: Tensor, generator: Randomness
@@ -172,14 +181,21 @@ class ManyPictures(Morphogenesis2D):
         """Return states with the codes of their worlds' goals, differentiable in the codes."""
         if self._codes is None or self._goal is None:
             return s
-        table = self._codes.table
-        if self._codes.encoder is not None:
-            codes = self._codes.encode(self._target_pictures)
-            # What files and users read.
-            with torch.no_grad():
-                table.copy_(codes)
-            table = codes
-        code = table.index_select(0, self._goal).to(s)[:, None].expand(-1, s.shape[1], -1)
+        return self._carrying(s, self._read_codes(self._codes), self._goal)
+
+    def _read_codes(self, codes: Codes) -> Tensor:
+        """Return the targets' codes, those of an encoder as it is now, shape [T, K]."""
+        if codes.encoder is None:
+            return codes.table
+        read = codes.encode(self._target_pictures)
+        # What files and users read.
+        with torch.no_grad():
+            codes.table.copy_(read)
+        return read
+
+    def _carrying(self, s: Tensor, table: Tensor, goal: Tensor) -> Tensor:
+        """Return states with the codes of goals."""
+        code = table.index_select(0, goal).to(s)[:, None].expand(-1, s.shape[1], -1)
         return torch.cat((code, s[..., self.config.code_dim :]), dim=-1)
 
     @property

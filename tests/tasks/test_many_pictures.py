@@ -12,6 +12,7 @@ import npa_envs
 from npa_envs.cli import main
 from npa_envs.errors import NPAError
 from npa_envs.measure.codes import picture_rows
+from npa_envs.rule.codes import Codes
 from npa_envs.tasks.many_pictures import ManyPictures, named_targets
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.training import Trainer, preset
@@ -124,6 +125,24 @@ def test_training_changes_codes_and_keeps_them_with_their_worlds(encoder):
     assert torch.equal(x0[..., :3], s0[..., :3])
     assert x0[..., :3].unique(dim=1).shape[1] == 1
     assert goal.shape == (2,)
+
+
+def test_an_encoder_reads_the_pictures_once_in_an_iteration(monkeypatch):
+    read = []
+    encode = Codes.encode
+    monkeypatch.setattr(Codes, "encode", lambda *given: read.append(1) or encode(*given))
+    task = task_of(encoder=True)
+    rule = task.make_rule(generator())
+    bound = task.for_rule(rule)
+    # Fresh worlds carry what the encoder says, also of a rule that nobody has trained.
+    assert torch.equal(rule.codes.table, encode(rule.codes, task._target_pictures))
+    _, s, goal = bound.seed_with_goals(2, generator=generator(1))
+    assert torch.equal(s[:, 0, :3], rule.codes.table[goal])
+    config = preset("tiny", **SMALL, targets=TARGETS, encoder=True, steps=(2, 4), pool_size=6)
+    cycle, _ = make_cycle(config, task)
+    read.clear()
+    cycle.run(0)
+    assert len(read) == 1
 
 
 def test_a_resumed_run_is_the_same_run(tmp_path):
