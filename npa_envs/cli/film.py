@@ -216,10 +216,11 @@ def write_film(film: Film, folder: Path, name: str, *, fps: float = 25.0) -> lis
     strip, captions = film.strip()
     paths = [folder / f"{name}.gif", folder / f"{name}.mp4", folder / f"{name}-filmstrip.png"]
     write_gif(paths[0], film.frames, fps)
-    write_mp4(paths[1], film.frames, fps)
     rows = math.ceil(len(strip) / 8)
     columns = math.ceil(len(strip) / rows)
     write_filmstrip(paths[2], strip, captions, columns=columns, background=film.background)
+    # Last: the others need no ffmpeg.
+    write_mp4(paths[1], film.frames, fps)
     return paths
 
 

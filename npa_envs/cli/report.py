@@ -14,6 +14,7 @@ import torch
 
 from npa_envs.cli.film import film_world, frame_steps, large_task, write_film, write_solid
 from npa_envs.cli.output import StepBar, writable_folder
+from npa_envs.errors import MissingDependencyError
 from npa_envs.files import write_text
 from npa_envs.measure.codes import picture_rows
 from npa_envs.measure.judge import Judge, JudgeRow
@@ -82,7 +83,7 @@ def write_report(
         progress: Show a progress bar.
 
     Returns:
-        The card, and the rule's scores in a line.
+        The card, and the rule's scores in a line, which says what is not installed for its films.
 
     Raises:
         NPAError: A file cannot be written, or the rule's target cannot be loaded any more.
@@ -96,6 +97,7 @@ def write_report(
     count = 8 if thorough else 2
     judge = Judge(task) if thorough and isinstance(task, Texture) else None
     judged: list[JudgeRow] = []
+    not_filmed = ""
     with StepBar(None, show=progress) as bar:
         tables = tables_of(
             rule,
@@ -107,7 +109,10 @@ def write_report(
             progress=bar.advance,
             watch=None if judge is None else lambda *world: judged.append(judge.row(*world)),
         )
-        _film(path, rule, task, folder, device, bar)
+        try:
+            _film(path, rule, task, folder, device, bar)
+        except MissingDependencyError as error:
+            not_filmed = f"; not all films: {error}"
     if judged:
         tables["judge"] = judged
     if len(tasks := tasks_of_codes(str(path), rule, device)) > 1:
@@ -124,7 +129,7 @@ def write_report(
     write_text(folder / f"{path.stem}.json", text)
     card = folder / f"{path.stem}.md"
     write_text(card, _card(rule, task, training, facts, tables))
-    return card, score_line(json.loads(text))
+    return card, score_line(json.loads(text)) + not_filmed
 
 
 def _film(
@@ -149,9 +154,9 @@ def _film(
         every=frame_steps(FILM_STEPS),
         progress=bar.advance,
     )
-    write_film(film, folder, path.stem)
     if isinstance(task, ViewTask):
         write_solid(task, x, s, folder)
+    write_film(film, folder, path.stem)
 
 
 def _card(

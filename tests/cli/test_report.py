@@ -7,7 +7,8 @@ import pytest
 from PIL import Image
 from small_digits import write_idx
 
-from npa_envs.cli import main, report
+from npa_envs.cli import film, main, report
+from npa_envs.errors import MissingDependencyError
 from npa_envs.measure.quality import evaluate
 from npa_envs.rule.files import load_rule
 from npa_envs.training import TASKS
@@ -97,6 +98,19 @@ def test_a_run_writes_no_report_where_none_is_wanted_or_no_iteration_was_done(tm
     assert main([*words, "--overwrite", "--no-report"]) == 0
     assert not list((tmp_path / "run" / "report").iterdir())
     assert "  report  " not in capsys.readouterr().out.rpartition("finished")[2]
+
+
+def test_a_report_without_ffmpeg_has_all_but_the_film_that_needs_it(tmp_path, capsys, monkeypatch):
+    def refuse(*_arguments):
+        raise MissingDependencyError("an MP4 file needs imageio with ffmpeg")
+
+    monkeypatch.setattr(film, "write_mp4", refuse)
+    assert main(words_of("morphogenesis2d", tmp_path)) == 0
+    assert re.search(
+        r"report .*rule\.md: .*; not all films: an MP4 file needs", capsys.readouterr().out
+    )
+    files = {path.name for path in (tmp_path / "run" / "report").iterdir()}
+    assert files == {"rule.md", "rule.json", "rule.gif", "rule-filmstrip.png"}
 
 
 def test_a_rule_that_cannot_be_measured_is_kept_and_said_to_have_no_report(
