@@ -40,8 +40,14 @@ STEPS = (16, 32, 64, 128, 256, 512)
 AFTER = (32, 64, 128, 256)
 """Steps after half of the particles are gone."""
 
-KINDS: Mapping[str, Mapping[str, Any]] = {"disk": {}, "division": {"division": True}}
-"""What `train` trains of each target: the control, and a rule whose particles divide."""
+KINDS: Mapping[str, Mapping[str, Any]] = {
+    "disk": {},
+    "division": {"division": True},
+    "fixed": {"division": True, "division_weight": 0.0},
+    "fixed-96": {"division": True, "division_weight": 0.0, "steps": (95, 97)},
+}
+"""What `train` trains of each target: the control, a rule whose particles divide, and rules that do
+not learn when to, so that worlds are full after some 24 steps; the last one in longer rollouts."""
 
 
 def train(arguments: argparse.Namespace) -> None:
@@ -53,14 +59,14 @@ def train(arguments: argparse.Namespace) -> None:
         f"{target}-{kind}": {**small, **fields, "target": target, "initial_rule": target}
         for target in arguments.targets
         for kind, fields in KINDS.items()
+        if kind in arguments.kinds
     }
     configs = [
         preset(
             "best",
-            **fields,
-            iterations=arguments.iterations,
             # Few numbers of steps: few graphs.
-            steps=(62, 64),
+            **({"steps": (62, 64)} | fields),
+            iterations=arguments.iterations,
             tensorboard=False,
             picture_interval=0,
             checkpoint_interval=10**9,
@@ -69,7 +75,9 @@ def train(arguments: argparse.Namespace) -> None:
         )
         for name, fields in wanted.items()
     ]
-    trainers, seconds = train_side_by_side(configs, arguments.longest, arguments.out)
+    trainers, seconds = train_side_by_side(
+        configs, arguments.longest, arguments.out, arguments.seconds
+    )
     print(f"{[*wanted]}, {trainers[0].iteration} iterations, {seconds:.1f} s together")
 
 
@@ -142,7 +150,9 @@ def main() -> None:
     training.set_defaults(run=train)
     training.add_argument("--out", type=Path, required=True)
     training.add_argument("--targets", nargs="+", default=("heart", "gecko"))
+    training.add_argument("--kinds", nargs="+", choices=[*KINDS], default=("disk", "division"))
     training.add_argument("--iterations", type=int, default=2500)
+    training.add_argument("--seconds", type=float, default=math.inf, help="of a cosine by the time")
     training.add_argument("--longest", type=float, default=math.inf)
     training.add_argument("--particle-count", type=int, default=0)
     measuring = commands.add_parser("measure")
