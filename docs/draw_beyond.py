@@ -2,9 +2,10 @@
 
     python docs/draw_beyond.py directions PLAIN EQUIVARIANT    # files of rules
     python docs/draw_beyond.py directions_full PLAIN EQUIVARIANT [PLAIN EQUIVARIANT ...]
-    python docs/draw_beyond.py sizes TRAINED VARIED
-    python docs/draw_beyond.py division RULE
+    python docs/draw_beyond.py sizes TRAINED VARIED             # or sizes_full
+    python docs/draw_beyond.py division RULE                    # or division_full
     python docs/draw_beyond.py pictures MANY
+    python docs/draw_beyond.py sixty MANY                       # whose pictures lie where they lay
 
 It takes a minute or two on a CPU.
 """
@@ -19,12 +20,13 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from PIL import Image
 from torch import Tensor
 
 import npa_envs
 from npa_envs.render import to_uint8, write_filmstrip
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, turned, turns
-from npa_envs.training.trained_tasks import task_of_rule
+from npa_envs.training.trained_tasks import task_of_rule, tasks_of_codes
 from npa_envs.world.division import living
 
 IMAGES = Path(__file__).resolve().parent / "images"
@@ -44,6 +46,9 @@ HEALING = 64
 
 COLUMNS = 5
 """Pictures in a row."""
+
+ABREAST, LATER = 20, (64, 256)
+"""Targets abreast of a rule of many, and steps at which their worlds are drawn below them."""
 
 BECOMES, AFTER_SWITCH, BLENDS = "butterfly", (0, 16, 32, 64, 128), (0.0, 0.25, 0.5, 0.75, 1.0)
 
@@ -190,14 +195,35 @@ def pictures(paths: list[str]) -> Shots:
     return shots
 
 
+@torch.no_grad()
+def sixty(path: str) -> Image.Image:
+    """Return targets of a rule's codes, and below each what it grows after 64 and 256 steps."""
+    rule = npa_envs.load_rule(path)
+    tiles = []
+    for task in tasks_of_codes(path, rule, CPU):
+        x, s = task.seed(1, generator=torch.Generator().manual_seed(SEEDS[0]))
+        tile = [to_uint8(task.target_picture)]
+        for before, after in pairwise((0, *LATER)):
+            x, s = run(rule, task, x, s, after - before, seed=SEEDS[0] + after)
+            tile.append(to_uint8(task.picture(x, s)[0]))
+        tiles.append(np.concatenate(tile))
+    rows = [np.concatenate(tiles[k : k + ABREAST], axis=1) for k in range(0, len(tiles), ABREAST)]
+    return Image.fromarray(np.concatenate(rows))
+
+
 def main() -> None:
     """Draw what the command line asks for."""
     what, *rest = sys.argv[1:]
+    if what == "sixty":
+        sixty(rest[0]).quantize(128).save(IMAGES / "beyond_sixty.png", optimize=True)
+        return
     kinds = {
         "directions": directions,
         "directions_full": directions_full,
         "sizes": sizes,
+        "sizes_full": sizes,
         "division": division,
+        "division_full": division,
         "pictures": pictures,
     }
     draw = kinds[what]
