@@ -148,6 +148,7 @@ def curves(suite: Suite, rows: dict[str, Row]) -> bytes:
             draw_method(panel, rows[method], env_id, f"C{number}")
         panel.set_title(task_name(env_id), fontsize=9, loc="left")
         panel.set(xlabel="particle-steps", ylabel="return")
+        panel.ticklabel_format(axis="x", scilimits=(0, 0))
         panel.grid(alpha=0.3)
     for panel in list(grid.flat)[len(ids) :]:
         panel.set_axis_off()

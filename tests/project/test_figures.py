@@ -265,7 +265,7 @@ def test_what_shac_brought_in_npa_bench_and_the_gradient_in_gardens_is_told() ->
 def test_rows_of_npa_bench_on_two_machines_are_told_and_agree() -> None:
     page = (ROOT / "docs" / "npa_bench.md").read_text(encoding="utf-8")
     rows = content(RESULTS / "npa_bench_small_two_machines.json")
-    for first, second in (rows[:2], rows[2:]):
+    for first, second in (rows[:2], rows[2:4]):
         both = [list(row["returns"].values()) for row in (first, second)]
         errors = [stdev(values) / len(values) ** 0.5 for values in both]
         cells = [
@@ -274,6 +274,34 @@ def test_rows_of_npa_bench_on_two_machines_are_told_and_agree() -> None:
         ]
         assert f"| `{first['method']}`, `{first['id']}` | {' | '.join(cells)} |" in page
         assert abs(mean(both[0]) - mean(both[1])) < 2.0 * math.hypot(*errors)
+    apart = {}
+    for first, second in zip(rows[4::2], rows[5::2], strict=True):
+        assert (first["id"], first["method"]) == (second["id"], second["method"])
+        both = [list(row["returns"].values()) for row in (first, second)]
+        error = math.hypot(*(stdev(values) / len(values) ** 0.5 for values in both))
+        distance = abs(mean(both[0]) - mean(both[1]))
+        apart[distance / error if error else 0.0] = [f"{mean(values):.4f}" for values in both]
+    count = len(rows[4::2])
+    most, next_most = sorted(apart, reverse=True)[:2]
+    told = " ".join(page.split())
+    assert f"these {count} the means of {count - 1} differ by at most {next_most:.1f} " in told
+    assert f"Growth by the script differs by {most:.1f}: its seeds" in told
+    assert "returned {} on one machine and {} on the other".format(*apart[most]) in told
+
+
+def test_what_is_said_of_the_small_suite_is_in_its_table() -> None:
+    page = (ROOT / "docs" / "npa_bench.md").read_text(encoding="utf-8")
+    page = page[page.index("### On a laptop") : page.index("### On a GPU")]
+    told = " ".join(page.partition("<!-- made")[0].split())
+    scores = dict(re.findall(r"^\| `(\w+)` \|.* (\S+ \[\S+ \S+\]) \|$", page, re.MULTILINE))
+    assert f"SHAC brings {scores['shac']} of the gradient" in told
+    assert f"PPO brings {scores['ppo_world']} and the library's own {scores['ppo']}." in told
+    returned = page[page.index("Returns, mean") :]
+    digits = {
+        method: line.split(" | ")[3]
+        for method, line in re.findall(r"^\| `(\w+)` \| (.*) \|$", returned, re.MULTILINE)
+    }
+    assert f"the gradient returns {digits['gradient']}, SHAC {digits['shac']}, and" in told
 
 
 def earned(rows: list[dict[str, Any] | None]) -> str:
