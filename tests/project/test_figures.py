@@ -325,6 +325,21 @@ def test_the_table_of_learners_in_gardens_has_the_numbers_of_its_file() -> None:
         assert (line in page) == (run["method"] != "her"), line
 
 
+def test_what_hindsight_brought_is_told() -> None:
+    page = (ROOT / "docs" / "gardening.md").read_text(encoding="utf-8")
+    held = content(RESULTS / "garden_hindsight_cpu.json")
+    names = {"scripted": "scripted", "random": "random", "nobody": "zero"}
+    for seed, rows in held["seeds"].items():
+        steps = f"{rows[-1]['steps']:,}".replace(",", " ")
+        names[f"hindsight, seed {seed}, {steps} steps"] = f"seed {seed}"
+    for name, key in names.items():
+        row = held["last"][key]
+        earns = f"{row['reward']:.2f} ± {row['error']:.2f}".replace("-", "−")
+        assert f"| {name} | {100 * row['success']:.0f} % | {earns} |" in page
+    learned = [row for key, row in held["last"].items() if key.startswith("seed")]
+    assert all(row["more"] > 10.0 * row["more_error"] for row in learned)
+
+
 TENS = (10_000, 20_000, 30_000)
 
 SMALL_WORLDS = content(RESULTS / "small_sizes_cpu.json")["rows"]
