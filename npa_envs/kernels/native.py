@@ -19,6 +19,7 @@ BOTH_DEVICES = ("access.cuh", "mathematics.cuh")
 CUDA_ONLY = (
     "cuda/sort.cuh",
     "cuda/density.cuh",
+    "cuda/tiles.cuh",
     "cuda/perceive.cuh",
     "cuda/adjoint.cuh",
     "cuda/network.cuh",

@@ -15,6 +15,8 @@ from typing import Literal, NamedTuple
 
 import torch
 
+from npa_envs.kernels.cuda.tiles import SMALLEST_SIDE
+
 Operator = Literal["sort", "density", "perceive", "adjoint", "network", "update"]
 
 LARGEST_ROW, LARGEST_UPDATE, LARGEST_HIDDEN = 128, 32, 512
@@ -33,6 +35,10 @@ LARGEST_BLOCK_GRID = 4096
 """Cells of the largest grid that a block of threads has room for."""
 
 
+SHARED_WORLD = 4096
+"""Particles of worlds that are often rolled out few at a time: several threads share a particle."""
+
+
 class Request(NamedTuple):
     """What is known of a call before its data: all that the table asks for."""
 
@@ -42,6 +48,10 @@ class Request(NamedTuple):
     """Particles of a world N."""
     cell_count: int = 0
     """Cells of a world's grid."""
+    space_dim: int = 0
+    """Space dimension D."""
+    smallest_side: int = 0
+    """Cells along the shortest side of a world's grid."""
     aligned: bool = True
     """Whether tensors begin at multiples of 16 bytes in memory."""
     position_gradient: bool = False
@@ -94,6 +104,15 @@ def _block(request: Request) -> bool:
     )
 
 
+def _tiles(request: Request) -> bool:
+    return (
+        _cuda(request)
+        and request.space_dim == 2
+        and request.particle_count <= SHARED_WORLD
+        and request.smallest_side >= SMALLEST_SIDE
+    )
+
+
 def _world(request: Request) -> bool:
     return request.device.type == "cpu" and request.particle_count <= LARGEST_THREAD_WORLD
 
@@ -136,6 +155,14 @@ TABLE: tuple[Implementation, ...] = (
         _world,
     ),
     Implementation("sort", "portable", "kernels/portable/sort.py", "otherwise", _always),
+    Implementation(
+        "density",
+        "tiles",
+        "kernels/cuda/tiles.py",
+        f"{_MODERN}, 2D, worlds of at most {SHARED_WORLD} particles, boxes of at least "
+        f"{SMALLEST_SIDE} cells along each side: as below, a warp for eight particles",
+        _tiles,
+    ),
     Implementation(
         "density",
         "cuda",
@@ -199,9 +226,11 @@ class Listing(NamedTuple):
     """Threads of a particle in the density pass."""
     teams: int
     """Teams of lanes of a row in the perception pass."""
+    tiled: bool = False
+    """Whether the density pass is that of `kernels/cuda/tiles.py`."""
 
     def shape(self, row_count: int) -> tuple[int, int, int]:
-        """Return the shape of so many lists: 32 of them lie together."""
+        """Return the shape of so many lists; but those of tiles 32 of them lie together."""
         return -(-row_count // 32), self.capacity, 32
 
 
@@ -215,9 +244,6 @@ CROWD = range(80, 200)
 SMALL_WORLD = 2048
 """Particles of a small world."""
 
-SHARED_WORLD = 4096
-"""Particles of worlds that are often rolled out few at a time: several threads share a particle."""
-
 HUGE_WORLD = 2**22
 """Particles of the largest world whose lists of neighbours may take more memory than its rows."""
 
@@ -225,24 +251,27 @@ DENSITY_LANES = 4
 """Threads of a particle in the density pass of small worlds."""
 
 
-def rollout_listing(particle_count: int, mean_neighbours: float = 0.0) -> Listing:
+def rollout_listing(request: Request, mean_neighbours: float = 0.0) -> Listing:
     """Return how rollouts list neighbours: few worlds shall fill a GPU.
 
     Args:
-        particle_count: Particles of a world, N.
+        request: What is known of the call.
         mean_neighbours: Neighbours of particles that are spread evenly over a periodic box; 0 in
             open space.
     """
-    if particle_count <= SHARED_WORLD:
+    if request.particle_count <= SHARED_WORLD:
         crowded = int(mean_neighbours) in CROWD
         capacity = CROWDED_CAPACITY if crowded else LARGE_CAPACITY
-        return Listing(capacity, lanes=DENSITY_LANES, teams=2)
+        tiled = choose("density", request).name == "tiles"
+        return Listing(capacity, lanes=DENSITY_LANES, teams=2, tiled=tiled)
     # The lists of worlds that fill a device's memory would be the largest part of it.
-    huge = particle_count > HUGE_WORLD
+    huge = request.particle_count > HUGE_WORLD
     return Listing(HUGE_CAPACITY if huge else LARGE_CAPACITY, lanes=1, teams=1)
 
 
-def batch_listing(particle_count: int) -> Listing:
+def batch_listing(request: Request) -> Listing:
     """Return how environments list neighbours: whole batches fill a device with less."""
-    small = particle_count <= SMALL_WORLD
-    return Listing(CAPACITY if small else LARGE_CAPACITY, lanes=1, teams=1)
+    if request.particle_count <= SMALL_WORLD:
+        return Listing(CAPACITY, lanes=1, teams=1)
+    tiled = choose("density", request).name == "tiles"
+    return Listing(LARGE_CAPACITY, lanes=DENSITY_LANES if tiled else 1, teams=1, tiled=tiled)

@@ -10,6 +10,7 @@ from torch import Tensor
 from npa_envs.kernels.access import CUDA_LANES, WARP
 from npa_envs.kernels.cuda.density import LIST_BLOCK, listed_density
 from npa_envs.kernels.cuda.perceive import listed_perception
+from npa_envs.kernels.cuda.tiles import TILE, tiled_density
 from npa_envs.kernels.portable.density import density_kernels
 from npa_envs.kernels.portable.perceive import perception_kernels
 from npa_envs.ops.backend import Listing
@@ -44,7 +45,7 @@ class NeighbourLists(NamedTuple):
     listing: Listing
     """How they were listed."""
     steps: Tensor
-    """Steps to neighbours in the sorted order, int16; 32 particles together."""
+    """Steps to neighbours in the sorted order, int16; 32 particles together, or in tiles."""
     lengths: Tensor
     """Neighbours of each row's particle, int32, [K]."""
     records: Tensor
@@ -108,7 +109,7 @@ def compute_densities(
         state_place: Where the states of sorted particles are, int32, shape [B N]; None: in order.
         with_particles: Also leave `particles` where neighbours are listed: the adjoint reads them.
     """
-    if plan.runs("density") == "portable":
+    if not plan.lists_neighbours:
         return compute_density_gradients(plan, ordered, terms)
     return list_neighbours(plan, ordered, listing, state_place, with_particles)
 
@@ -121,17 +122,12 @@ def list_neighbours(
     with_particles: bool,
 ) -> Densities:
     """Compute densities, and list the neighbours of the rows: `compute_densities` on CUDA."""
-    capacity, lanes, _ = listing
     positions = ordered.positions
     records = positions.new_empty(plan.total, 4)
     particles = positions.new_empty(plan.total if with_particles else 0, plan.space_dim + 1)
     steps = positions.new_empty(listing.shape(plan.row_capacity), dtype=torch.int16)
     lengths = positions.new_empty(plan.row_capacity, dtype=torch.int32)
-    launch(
-        listed_density(plan.space_dim, lanes, plan.periodic, capacity, plan.masked),
-        -(-plan.total * lanes // WARP) * WARP,
-        positions.device,
-        plan.domain,
+    where = (
         ordered.starts,
         ordered.cell,
         positions,
@@ -142,8 +138,28 @@ def list_neighbours(
         records,
         steps,
         lengths,
-        block_dim=LIST_BLOCK,
     )
+    if listing.tiled:
+        launch(
+            tiled_density(plan.periodic, listing.capacity, plan.masked),
+            plan.world_count * -(-plan.particle_count // TILE) * WARP,
+            positions.device,
+            plan.domain,
+            plan.particle_count,
+            *where,
+            block_dim=WARP,
+        )
+    else:
+        launch(
+            listed_density(
+                plan.space_dim, listing.lanes, plan.periodic, listing.capacity, plan.masked
+            ),
+            -(-plan.total * listing.lanes // WARP) * WARP,
+            positions.device,
+            plan.domain,
+            *where,
+            block_dim=LIST_BLOCK,
+        )
     no_gradient = positions.new_empty(0, plan.space_dim, dtype=torch.float64)
     return Densities(particles, no_gradient, NeighbourLists(listing, steps, lengths, records))
 
@@ -216,7 +232,6 @@ def perception_launch(
         shifted = lists.steps[first_row // LISTS_TOGETHER :], lists.lengths[first_row:]
         lists = lists._replace(steps=shifted[0], lengths=shifted[1])
     if lists is not None:
-        capacity, _, teams = lists.listing
         kernel = listed_perception(
             plan.space_dim,
             plan.width,
@@ -225,12 +240,13 @@ def perception_launch(
             terms.correction,
             plan.periodic,
             plan.group_count > 1,
-            capacity,
+            lists.listing.capacity,
             row_kernel_sum is not None,
-            teams,
+            lists.listing.teams,
             lists.by_place,
+            lists.listing.tiled,
         )
-        threads = row_count * plan.group_count * CUDA_LANES * teams
+        threads = row_count * plan.group_count * CUDA_LANES * lists.listing.teams
         source = ordered.states if states is None else states
         return (
             kernel,

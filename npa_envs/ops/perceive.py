@@ -624,7 +624,7 @@ def survey(
     """
     x, s = x.contiguous(), s.contiguous()
     plan = make_plan(x, x.shape, s.shape[2], x.shape[0] * x.shape[1], False, eps, box)
-    listed = plan.runs("density") == "cuda"
+    listed = plan.lists_neighbours
     in_place = listed and plan.state_dim % plan.width == 0 and s.data_ptr() % 16 == 0
     ordered = sort_worlds(plan, x, None if in_place else s, None, with_rows=not listed)
     # World k of a batch perceives what it would alone, bit for bit: nothing here may follow from
@@ -633,7 +633,7 @@ def survey(
         plan,
         ordered,
         terms,
-        batch_listing(plan.particle_count),
+        batch_listing(plan.request),
         state_place=ordered.source if in_place else None,
         with_particles=False,
     )

@@ -70,6 +70,11 @@ class Plan(NamedTuple):
         return choose(operator, request).name
 
     @property
+    def lists_neighbours(self) -> bool:
+        """Whether the density pass leaves lists of neighbours, as it does on CUDA."""
+        return self.runs("density") != "portable"
+
+    @property
     def on_cpu(self) -> bool:
         """Whether kernels run on a CPU."""
         return self.request.device.type == "cpu"
@@ -153,6 +158,14 @@ def make_plan(
     # In 3D, more and smaller cells mean many short runs, which lanes share badly.
     reach = 1 if space_dim == 3 and like.device.type == "cuda" else 2
     domain = make_domain(space_dim, scalar, eps, sides, particle_count, reach)
+    request = Request(
+        like.device,
+        like.dtype,
+        particle_count,
+        int(domain.cell_count),
+        space_dim,
+        smallest_side=min(map(int, domain.cell_shape)),
+    )
     plan = Plan(
         scalar=scalar,
         width=channel_width(int(state_dim)),
@@ -163,8 +176,8 @@ def make_plan(
         row_capacity=row_capacity,
         masked=masked,
         domain=domain,
-        request=Request(like.device, like.dtype, particle_count, int(domain.cell_count)),
-        listing=rollout_listing(particle_count, mean_neighbours(particle_count, eps, sides)),
+        request=request,
+        listing=rollout_listing(request, mean_neighbours(particle_count, eps, sides)),
     )
     largest = max(2 * plan.cell_total, plan.total * (1 + plan.state_dim))
     if largest >= LARGEST_INDEX:

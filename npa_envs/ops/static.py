@@ -155,7 +155,7 @@ def _(
         return x.new_empty(count, dtype=torch.int32)
 
     lists: list[Tensor] = []
-    on_cuda = plan.runs("density") == "cuda"
+    on_cuda = plan.lists_neighbours
     if on_cuda:
         shape = plan.listing.shape(total)
         lists = [
@@ -309,7 +309,7 @@ def static_worlds(
         s: States in sorted order, dimensionless, shape [B, N, C].
     """
     lists = None
-    if plan.runs("density") == "cuda":
+    if plan.lists_neighbours:
         steps, lengths, records = tensors.lists
         lists = NeighbourLists(plan.listing, steps, lengths, records, by_place=True)
     ordered = SortedWorlds(

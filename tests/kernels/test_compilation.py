@@ -17,6 +17,7 @@ from npa_envs.kernels.cuda.network import (
 )
 from npa_envs.kernels.cuda.perceive import listed_perception
 from npa_envs.kernels.cuda.sort import BLOCKS, order_particles, sort_small_worlds
+from npa_envs.kernels.cuda.tiles import tiled_density
 from npa_envs.kernels.pictures.blending import block_kernels
 from npa_envs.kernels.portable.episodes import judge_worlds
 from npa_envs.ops import warmup
@@ -25,6 +26,7 @@ from npa_envs.ops.launch import launched
 VARIANTS: dict[str, Callable[[], Any]] = {
     "sort": lambda: sort_small_worlds(3, 1024),
     "density": lambda: listed_density(2, 4, True, 128, True),
+    "density in tiles": lambda: tiled_density(True, 256, True),
     "perceive": lambda: listed_perception(
         3, 16, 4, True, "smooth", False, True, 128, True, teams=2
     ),
@@ -72,6 +74,10 @@ def cuda_engine():
         yield listed_adjoint(space_dim, 16, True, False, False).unscale_cotangents
         yield order_particles(space_dim, 16)
         yield sort_small_worlds(space_dim, max(BLOCKS))
+    yield tiled_density(True, 256, False)
+    yield listed_perception(
+        2, 16, 4, True, "smooth", True, False, 256, False, teams=2, by_place=True, tiled=True
+    )
     yield arrangement_kernels().arrange_hidden
     for mode in ("rectify", "note", "mask"):
         yield two_layer_kernel(5, 3, mode)

@@ -41,7 +41,8 @@ template <int ROOM, int BLOCK> __device__ inline ListEnd cut_off(unsigned addres
     return end;
 }
 
-// Where a row's list begins: 32 rows lie together, their first two entries first.
+// Where a row's list begins: 32 rows lie together, their first two entries first. (Those that
+// `tiles.cuh` leaves lie one after the other.)
 template <int CAPACITY> __device__ inline size_t place_of_list(int row)
 {
     return (size_t)(row / 32) * (32 * CAPACITY) + row % 32 * 2;
@@ -85,12 +86,13 @@ __device__ inline int leave_list(
 }
 
 // Two steps of a row's list, of the entries 2 pair and 2 pair + 1, as one word; of a pair that lists
-// have no room for, those of another one.
-template <int CAPACITY>
+// have no room for, those of another one. TILED: lists lie one after the other.
+template <int CAPACITY, bool TILED>
 __device__ inline int steps_at(const wp::array_t<wp::int16>& lists, int row, int pair)
 {
-    const short* from = lists.data + place_of_list<CAPACITY>(row);
-    from += 64 * min(pair, CAPACITY / 2 - 1);
+    const int known = min(pair, CAPACITY / 2 - 1);
+    const short* from = TILED ? lists.data + (size_t)row * CAPACITY + 2 * known
+                              : lists.data + place_of_list<CAPACITY>(row) + 64 * known;
     return *reinterpret_cast<const int*>(from);
 }
 

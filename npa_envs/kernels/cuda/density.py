@@ -254,10 +254,15 @@ def listed_density(
 
 
 @functools.cache
-def make_steps_at(capacity: int) -> wp.Function:
-    """Return a Warp function that reads two steps of a row's list, as the density pass left it."""
+def make_steps_at(capacity: int, tiled: bool) -> wp.Function:
+    """Return a Warp function that reads two steps of a row's list, as the density pass left it.
 
-    @native.func_native(capacity)
+    Args:
+        capacity: Neighbours that a list has room for.
+        tiled: Whether `tiled_density` left it.
+    """
+
+    @native.func_native(capacity, tiled)
     def steps_at(
         lists: wp.array(dtype=wp.int16, ndim=3), row: wp.int32, pair: wp.int32
     ) -> wp.int32: ...

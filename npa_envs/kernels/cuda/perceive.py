@@ -68,6 +68,7 @@ def listed_perception(
     for_adjoint: bool,
     teams: int,
     by_place: bool = False,
+    tiled: bool = False,
 ) -> wp.Kernel:
     """Return the perception kernel of one variant.
 
@@ -84,6 +85,7 @@ def listed_perception(
         teams: Teams that share a particle where few particles fill the device: each runs through
             its own part of the list, all channels of it.
         by_place: Whether there is a list for each sorted particle, not for each row.
+        tiled: Whether the density pass was that of tiles, which lays lists out otherwise.
     """
     scalar = wp.float32
     moment_correction = moment_inverse is not None
@@ -113,6 +115,7 @@ def listed_perception(
         topic = "listed_smoothly_corrected_perception" if smooth else topic
     topic += "_in_box" * periodic + "_grouped" * grouped
     topic += f"_{capacity}" + "_for_adjoint" * for_adjoint + "_by_place" * by_place
+    topic += "_tiled" * tiled
     module = kernel_module(topic, space_dim, scalar, width, lanes)
     registers = CUDA_REGISTERS[space_dim] if teams == 1 else TEAM_REGISTERS
     load_vector = make_wide_load(vector, scalar)
@@ -121,7 +124,7 @@ def listed_perception(
     add_wide = make_lane_sum(wide, wp.float64, lanes, whole_warps=True)
     add_share = make_lane_sum(share, scalar, lanes, whole_warps=True, stride=team)
     add_gradient = make_lane_sum(share_gradient, scalar, lanes, whole_warps=True, stride=team)
-    steps_at = make_steps_at(capacity)
+    steps_at = make_steps_at(capacity, tiled)
     entries_together = wp.types.matrix((TOGETHER, space_dim + 2), scalar)
     states_together = wp.types.matrix((TOGETHER, share_width), scalar)
     places_of_pair = wp.types.vector(PAIR, wp.int32)

@@ -186,7 +186,7 @@ def _request(plan: Plan, rule: NPARule) -> Request:
 
 
 def _neighbours(plan: Plan) -> str:
-    if plan.runs("density") == "portable":
+    if not plan.lists_neighbours:
         return "searched for in each pass"
     listing = plan.listing
     return (

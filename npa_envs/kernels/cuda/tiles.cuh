@@ -1,0 +1,239 @@
+// Density of particles that lie side by side, a warp for a tile of them: they share candidates.
+
+namespace npa {
+
+// Particles of a tile, the lanes that share one, and cells on each side in which neighbours lie.
+constexpr int TILE = 8, TILE_LANES = 4, TILE_REACH = 2;
+constexpr int TILE_LINES = 2 * TILE_REACH + 1;
+// A lane notes in one word whom of so many candidates it has found near.
+constexpr int TILE_TESTS = 32;
+// Tests that follow each other without a look at how many are left.
+constexpr int TILE_UNROLLED = 4;
+// Cells that the particles of a line may lie apart: those further on have their turn later.
+constexpr int TILE_SPAN = 12;
+// Cells along each side of the smallest periodic box whose density is computed in tiles.
+constexpr int SMALLEST_TILED_BOX = 7;
+// Steps of a list's entry have 16 bits.
+constexpr int LONGEST_STEP = 0x7fff;
+
+template <int CAPACITY> struct TileMemory {
+    // Candidates that are there at once: with long lists fewer, so that a processor has room for 32.
+    static constexpr int WINDOW = CAPACITY > 128 ? 192 : 256;
+    float2 positions[WINDOW];
+    // Steps to them from the tile's first particle.
+    short steps[WINDOW];
+    // The odd 16 bytes spread the lists over the memory's banks.
+    alignas(16) short lists[TILE][CAPACITY + 8];
+};
+
+// Ask for 8 bytes of global memory to come into fast memory.
+__device__ inline void fetch(float2* to, const float2* from)
+{
+    const unsigned address = (unsigned)__cvta_generic_to_shared(to);
+    asm volatile("cp.async.ca.shared.global [%0], [%1], 8;" : : "r"(address), "l"(from));
+}
+
+__device__ inline void await_fetched() { asm volatile("cp.async.wait_all;" : : : "memory"); }
+
+// A run of cells around some of the tile's particles, as one lane copies it: 6 lanes share a run, or
+// 3 where lines wrap around the grid and are two runs each.
+struct TileRun {
+    int begin, count;
+    // Where its first candidate goes, and how many candidates all runs have.
+    int place, total;
+    // This lane of the run's, and how many share it.
+    int lane, lanes;
+};
+
+// The image of a position in a periodic box that is nearest to another position.
+template <typename Domain>
+__device__ inline float2 image_near(const Domain& domain, float2 position, float2 other)
+{
+    position.x -= domain.box[0] * rintf((position.x - other.x) * domain.inverse_box[0]);
+    position.y -= domain.box[1] * rintf((position.y - other.y) * domain.inverse_box[1]);
+    return position;
+}
+
+// The run that this lane copies for the particles from cell `left` to cell `right` of a line.
+template <typename Domain>
+__device__ inline TileRun run_around(
+    const Domain& domain, const int* starts, int left, int right, int line)
+{
+    const int lane = threadIdx.x & 31;
+    const int nx = domain.cell_shape[0], ny = domain.cell_shape[1];
+    const int width = right - left + 2 * TILE_REACH + 1;
+    const int first = left - TILE_REACH < 0 ? left - TILE_REACH + nx : left - TILE_REACH;
+    const bool wraps = first + width > nx;
+    TileRun run;
+    run.lanes = wraps ? 3 : 6;
+    const int number = wraps ? lane / 3 : lane / 6;
+    run.lane = lane - number * run.lanes;
+    const bool second = wraps && number & 1;
+    const int apart = line - TILE_REACH + (wraps ? number / 2 : number);
+    const int y = apart < 0 ? apart + ny : apart >= ny ? apart - ny : apart;
+    run.begin = run.count = 0;
+    if (number < (wraps ? 2 * TILE_LINES : TILE_LINES)) {
+        const int* row = starts + y * nx;
+        run.begin = row[second ? 0 : first];
+        run.count = row[second ? first + width - nx : wraps ? nx : first + width] - run.begin;
+    }
+    // Sums over the first lanes of the runs.
+    int end = run.lane == 0 ? run.count : 0;
+    #pragma unroll
+    for (int offset = 1; offset < 32; offset *= 2) {
+        const int before = __shfl_up_sync(~0u, end, offset);
+        if (lane >= offset) end += before;
+    }
+    run.place = end - run.count;
+    run.total = __shfl_sync(~0u, end, 31);
+    return run;
+}
+
+// Bring candidates from `window` on into fast memory, in a periodic box those images that are nearest
+// to an origin, and what is not a number behind the last one; return how many there are.
+template <bool PERIODIC, int CAPACITY, typename Domain>
+__device__ inline int fetch_window(
+    const Domain& domain, TileMemory<CAPACITY>& memory, const TileRun& run,
+    const float2* positions, float2 origin, int first, int window)
+{
+    constexpr int TOGETHER = TILE_LANES * TILE_UNROLLED;
+    const int count = min(memory.WINDOW, run.total - window);
+    const int place = run.place - window;
+    const int end = min(run.count, count - place);
+    const int begin = max(-place, 0) + run.lane;
+    for (int i = begin; i < end; i += run.lanes) {
+        fetch(memory.positions + place + i, positions + run.begin + i);
+        memory.steps[place + i] = run.begin + i - first;
+    }
+    const int padded = (count + TOGETHER - 1) / TOGETHER * TOGETHER;
+    const int i = count + (threadIdx.x & 31);
+    if (i < padded) memory.positions[i] = make_float2(nanf(""), nanf(""));
+    await_fetched();
+    if (PERIODIC) {
+        for (int i = begin; i < end; i += run.lanes) {
+            float2& candidate = memory.positions[place + i];
+            candidate = image_near(domain, candidate, origin);
+        }
+    }
+    __syncwarp();
+    return padded;
+}
+
+// Sum of the smoothing kernel over candidates in fast memory, without its norm; `near` has a bit for
+// each, the first in the highest bit: it is near if 1 - r^2 / eps^2 is positive.
+__device__ inline float smoothing_of_candidates(
+    const float2* candidates, int tests, float2 centre, float inverse_squared_eps, unsigned& near)
+{
+    float total = 0.0f;
+    for (int test = 0; test < tests; test += TILE_UNROLLED) {
+        #pragma unroll
+        for (int u = 0; u < TILE_UNROLLED; ++u) {
+            const float2 candidate = candidates[(test + u) * TILE_LANES];
+            const float x = candidate.x - centre.x, y = candidate.y - centre.y;
+            // The sign of what is not a number is positive here, and fmaxf makes it 0.
+            const float beyond = fmaf(fmaf(x, x, y * y), inverse_squared_eps, -1.0f);
+            near = __funnelshift_l(__float_as_uint(beyond), near, 1);
+            const float falloff = fmaxf(-beyond, 0.0f);
+            total += falloff * falloff * falloff;
+        }
+    }
+    near <<= TILE_TESTS - tests;
+    return total;
+}
+
+// Append the near candidates of a particle's lanes to its list; return its new length, one more than
+// CAPACITY where they do not all fit in. The particle is the `number`-th of its tile.
+template <int CAPACITY>
+__device__ inline int append_near(
+    short* list, int length, const short* steps, int number, unsigned near)
+{
+    const int lane = threadIdx.x & (TILE_LANES - 1);
+    const int own = __popc(near);
+    int end = own;
+    #pragma unroll
+    for (int offset = 1; offset < TILE_LANES; offset *= 2) {
+        const int before = __shfl_up_sync(~0u, end, offset, TILE_LANES);
+        if (lane >= offset) end += before;
+    }
+    const int total = length + __shfl_sync(~0u, end, TILE_LANES - 1, TILE_LANES);
+    if (total > CAPACITY) return CAPACITY + 1;
+    short* to = list + length + end - own;
+    while (near) {
+        const int test = __clz(near);
+        near &= 0x7fffffffu >> test;
+        *to++ = steps[test * TILE_LANES] - number;
+    }
+    return total;
+}
+
+// Sum of the smoothing kernel over all neighbours of particle k, without its norm; its four lanes
+// call it together, those of a tile's other particles too, and leave the list of its row, -1 if it
+// has none. `first` is the tile's first particle, `base` the first cell of their world.
+template <int CAPACITY, bool PERIODIC, typename Domain>
+__device__ inline float density_of_tile(
+    const Domain& domain, const wp::array_t<int>& starts, const wp::array_t<int>& sorted_cell,
+    const wp::array_t<wp::vec_t<2, float>>& sorted_positions, int base, int first, int k,
+    bool inside, int row, const wp::array_t<wp::int16>& lists, const wp::array_t<int>& list_lengths)
+{
+    __shared__ TileMemory<CAPACITY> memory;
+    const int lane = threadIdx.x & 31, part = lane & (TILE_LANES - 1);
+    const float2* positions = reinterpret_cast<const float2*>(sorted_positions.data);
+    const float2 position = positions[k];
+    const int cell = sorted_cell.data[k] - base, nx = domain.cell_shape[0];
+    const int y = (unsigned)cell / (unsigned)nx, x = cell - y * nx;
+    // Images are those of all particles of a turn: with their neighbours they take up less than half
+    // of a periodic box.
+    const int span = min(PERIODIC ? (nx - SMALLEST_TILED_BOX) / 2 : nx - TILE_LINES, TILE_SPAN);
+    short* list = memory.lists[lane / TILE_LANES];
+    float total = 0.0f;
+    int length = 0;
+    bool far = false;
+    // Particles of one line have their turn together: those of a tile lie in the order of cells.
+    for (unsigned waiting = __ballot_sync(~0u, inside); waiting;) {
+        const int leader = __ffs(waiting) - 1;
+        const int line = __shfl_sync(~0u, y, leader), left = __shfl_sync(~0u, x, leader);
+        const unsigned members = __ballot_sync(~0u, y == line && x - left <= span) & waiting;
+        waiting &= ~members;
+        const int right = __shfl_sync(~0u, x, 31 - __clz(members));
+        float2 origin, centre = make_float2(nanf(""), nanf(""));
+        if (PERIODIC) {
+            origin.x = __shfl_sync(~0u, position.x, leader);
+            origin.y = __shfl_sync(~0u, position.y, leader);
+        }
+        if (members >> lane & 1) {
+            centre = PERIODIC ? image_near(domain, position, origin) : position;
+        }
+        const TileRun run = run_around(domain, starts.data + base, left, right, line);
+        const int furthest = max(first + TILE - 1 - run.begin, run.begin + run.count - first);
+        far = far || (run.count > 0 && furthest > LONGEST_STEP);
+        for (int window = 0; window < run.total; window += memory.WINDOW) {
+            const int count = fetch_window<PERIODIC>(
+                domain, memory, run, positions, origin, first, window);
+            for (int begin = part; begin < count; begin += TILE_TESTS * TILE_LANES) {
+                const int tests = min(TILE_TESTS, (count - begin + part) / TILE_LANES);
+                unsigned near = 0u;
+                total += smoothing_of_candidates(
+                    memory.positions + begin, tests, centre, domain.inverse_squared_eps, near);
+                if (row < 0) near = 0u;
+                length = append_near<CAPACITY>(
+                    list, length, memory.steps + begin, lane / TILE_LANES, near);
+            }
+            __syncwarp();
+        }
+    }
+    #pragma unroll
+    for (int offset = 1; offset < TILE_LANES; offset *= 2) {
+        total += __shfl_xor_sync(~0u, total, offset);
+    }
+    if (__any_sync(~0u, far)) length = CAPACITY + 1;
+    if (row >= 0 && length <= CAPACITY) {
+        uint4* to = reinterpret_cast<uint4*>(lists.data + (size_t)row * CAPACITY);
+        for (int entries = part; 8 * entries < length; entries += TILE_LANES) {
+            to[entries] = reinterpret_cast<const uint4*>(list)[entries];
+        }
+    }
+    if (row >= 0 && part == 0) list_lengths.data[row] = length;
+    return total;
+}
+
+}  // namespace npa
