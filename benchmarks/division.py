@@ -43,8 +43,8 @@ AFTER = (32, 64, 128, 256)
 KINDS: Mapping[str, Mapping[str, Any]] = {
     "disk": {},
     "division": {"division": True},
-    "fixed": {"division": True, "division_weight": 0.0},
-    "fixed-96": {"division": True, "division_weight": 0.0, "steps": (95, 97)},
+    "fixed": {"division": True, "fate_rate": 0.0},
+    "fixed-96": {"division": True, "fate_rate": 0.0, "steps": (95, 97)},
 }
 """What `train` trains of each target: the control, a rule whose particles divide, and rules that do
 not learn when to, so that worlds are full after some 24 steps; the last one in longer rollouts."""

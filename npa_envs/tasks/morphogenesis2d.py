@@ -102,9 +102,6 @@ class Morphogenesis2DConfig(GrowthConfig):
     division: bool = False
     """A world starts with one particle. Particles divide and die; at most `particle_count` live."""
 
-    division_weight: float = 0.02
-    """Weight of the gradient by which particles learn to divide and to die (dimensionless)."""
-
     angles: int = 16
     """Angles that are tried first for an equivariant rule's world, evenly spread. Sixteen more near
     the best of them are tried next: 1/39 of the step between the first ones remains."""
@@ -121,7 +118,7 @@ class Morphogenesis2DConfig(GrowthConfig):
                 f"got {self.blur_levels} for a resolution of {self.resolution}: lower it"
             )
         check_positive(self, float, "sigma")
-        check_non_negative(self, "splat_weight", "colour_weight", "drift_weight", "division_weight")
+        check_non_negative(self, "splat_weight", "colour_weight", "drift_weight")
         check_non_negative(self, "seed_axis", "seed_across")
         check_flag(self, "equivariant", "chiral", "encoder", "division")
         self._check_targets()
@@ -304,7 +301,6 @@ class Morphogenesis2D(GrowthTask[Morphogenesis2DConfig]):
     def _living_picture(self, x: Tensor, s: Tensor, colour: Tensor) -> Tensor:
         """Return pictures of the living, differentiable in their life."""
         x, life = torch.where(living(s)[..., None], x, UNSEEN), s[..., LIFE : LIFE + 1]
-        life = life.detach() + self.config.division_weight * (life - life.detach())
         picture = self._splat(x, colour * life)
         if not life.requires_grad:
             return picture

@@ -107,6 +107,10 @@ class TrainConfig(Generic[TaskConfigT]):
     weight_decay: float = 0.0
     """AdamW's weight decay."""
 
+    fate_rate: float = 0.02
+    """Share of the learning rate with which rules whose particles divide learn when to divide and
+    to die; 0: not at all, and such weights do not decay either."""
+
     average: float = 0.0
     """Share in [0, 1) that the kept rule, a running mean of the weights, keeps of itself in an
     iteration (less in the first ones). 0: the weights themselves are kept."""
@@ -193,6 +197,7 @@ class TrainConfig(Generic[TaskConfigT]):
         check_positive(self, float, "learning_rate", "runaway_limit")
         check_fraction(self, "decay", "damage_share")
         check_non_negative(self, "weight_decay", "fresh_share", "average", "rest_weight")
+        check_non_negative(self, "fate_rate")
         if self.average >= 1.0:
             raise NPAError(f"average must be below 1, got {self.average}: try 0.999")
         if self.fresh_share > 1.0:

@@ -115,7 +115,9 @@ class TrainingCycle:
         """Worlds before and after the last rollout, the loss and its gradients."""
         parameters = self.batch.parameters
         self.optimiser: RuleOptimiser = (
-            RuleOptimiser(parameters, config) if beside is None else beside.optimiser
+            RuleOptimiser(parameters, config, list(rule.fate.parameters()) if rule.divides else ())
+            if beside is None
+            else beside.optimiser
         )
         """Changes the rule."""
         self.average: WeightAverage = (

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 import npa_envs.world.rollout
-from npa_envs.rule.rule import NPARule
+from npa_envs.rule.rule import LIFE, NPARule
 from npa_envs.tasks.base import Task, coded_states, task_toward
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.randomness import registered
@@ -81,6 +81,8 @@ class EagerIteration:
         self.grown = torch.zeros_like(x[:, 0, 0], dtype=torch.bool)
         """Which worlds are grown and whole, and are to rest, shape [B]."""
         self._rest_weight = config.rest_weight
+        # What lives is the business of the task's loss; that somebody was born is no unrest.
+        self._first_state = LIFE + 1 if rule.divides else 0
         self._task = task
         with torch.no_grad():
             total, parts = self._loss(x, s, torch.zeros_like(x[..., 0]))
@@ -141,7 +143,8 @@ class EagerIteration:
         """Return the task's loss and its parts, and how far grown worlds are from rest."""
         total, parts = self._task.loss(x, s, path_length)
         if self._rest_weight > 0.0:
-            unrest = path_length.mean(dim=1) / self._task.eps + (s - self.s0).abs().mean(dim=(1, 2))
+            change = (s - self.s0)[..., self._first_state :].abs().mean(dim=(1, 2))
+            unrest = path_length.mean(dim=1) / self._task.eps + change
             parts["rest"] = (self.grown.to(x.dtype) * unrest).mean()
             total = total + self._rest_weight * parts["rest"]
         return total, parts

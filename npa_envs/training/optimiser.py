@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -39,11 +40,19 @@ class RuleOptimiser:
     Args:
         parameters: The rule's parameters; their `.grad` is set before `prepare_gradients`.
         config: Learning rates, weight decay, gradient normalisation.
+        fates: Which parameters learn at the share `fate_rate` of the learning rate.
     """
 
-    def __init__(self, parameters: Sequence[nn.Parameter], config: TrainConfig[Any]) -> None:
+    def __init__(
+        self,
+        parameters: Sequence[nn.Parameter],
+        config: TrainConfig[Any],
+        fates: Sequence[nn.Parameter] = (),
+    ) -> None:
         self._parameters = list(parameters)
         self._config = config
+        slow = set(map(id, fates))
+        self._shares = [config.fate_rate if id(p) in slow else 1.0 for p in self._parameters]
         self._adamw = self._fresh()
 
     def prepare_gradients(self) -> None:
@@ -64,8 +73,9 @@ class RuleOptimiser:
         """
         if iteration > 0 and iteration % self._config.iterations == 0:
             self._adamw = self._fresh()
+        rate = self._config.learning_rate_at(iteration, share)
         for group in self._adamw.param_groups:
-            group["lr"] = self._config.learning_rate_at(iteration, share)
+            group["lr"] = rate * group["share"]
         self._adamw.step()
 
     def state_dict(self) -> dict[str, Any]:
@@ -88,8 +98,10 @@ class RuleOptimiser:
         self._adamw.load_state_dict({"state": state["state"], "param_groups": groups})
 
     def _fresh(self) -> torch.optim.AdamW:
+        runs = itertools.groupby(zip(self._shares, self._parameters, strict=True), lambda p: p[0])
+        groups = [{"share": share, "params": [p for _, p in run]} for share, run in runs]
         return torch.optim.AdamW(
-            self._parameters,
+            groups,
             lr=self._config.learning_rate,
             weight_decay=self._config.weight_decay,
             # One kernel for all parameters; the CPU's own loop is as fast there.

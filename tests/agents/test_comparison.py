@@ -102,7 +102,8 @@ def child(monkeypatch):
 
 def pids(folder) -> list[int]:
     """Numbers of processes that wrote them below a folder."""
-    return [int(path.read_text()) for path in folder.glob("pid-*")]
+    # A file that has just appeared may be empty still.
+    return [int(text) for path in folder.glob("pid-*") if (text := path.read_text())]
 
 
 def is_alive(pid: int) -> bool:

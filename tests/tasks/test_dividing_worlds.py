@@ -5,7 +5,7 @@ import torch
 
 import npa_envs
 from npa_envs.errors import NPAError
-from npa_envs.rule.rule import LIFE
+from npa_envs.rule.rule import FIRST_FATES, LIFE
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.training import Trainer, preset
 from npa_envs.world.division import living
@@ -46,7 +46,7 @@ def test_pictures_and_losses_are_those_of_the_living():
 
 
 def test_pictures_change_with_life_as_if_particles_were_taken_away():
-    task = make_task(division_weight=0.5)
+    task = make_task()
     x, s = half_alive(task)
     s.requires_grad_()
     picture = task.picture(x, s, centred=False)
@@ -55,8 +55,8 @@ def test_pictures_change_with_life_as_if_particles_were_taken_away():
     without = s.detach().clone()
     without[0, 5] = 0.0
     change = (weights * (picture - task.picture(x, without, centred=False))).sum().item()
-    # Pictures are linear in life, whose gradient is weighted.
-    assert abs(gradient[0, 5, LIFE].item() - 0.5 * change) < 1e-4
+    # Pictures are linear in life.
+    assert abs(gradient[0, 5, LIFE].item() - change) < 1e-4
 
 
 def test_damage_never_takes_the_last_particle():
@@ -72,8 +72,6 @@ def test_division_refuses_what_it_does_not_go_with():
     for field in ({"equivariant": True}, {"targets": ("ring", "heart")}):
         with pytest.raises(NPAError, match="division goes neither with equivariant"):
             make_task(**field)
-    with pytest.raises(NPAError, match="division_weight must be"):
-        make_task(division_weight=-1.0)
 
 
 def test_a_run_trains_resumes_and_leaves_a_rule_that_divides(tmp_path):
@@ -100,3 +98,41 @@ def test_a_run_trains_resumes_and_leaves_a_rule_that_divides(tmp_path):
     assert first.hyper_parameters() == second.hyper_parameters()
     assert all(map(torch.equal, first.state_dict().values(), second.state_dict().values()))
     assert first.fate.weight.abs().max() > 0.0
+
+
+def trained(tmp_path, iterations=4, **fields):
+    """The rule after a few iterations."""
+    options = {
+        "particle_count": 32, "target_point_count": 32, "steps": (12, 13), "pool_size": 4,
+        "world_count": 2, "learning_rate": 1e-3, "schedule": "milestones", "iterations": 1000,
+        "weight_decay": 0.0, "picture_interval": 0, "tensorboard": False,
+    } | fields  # fmt: skip
+    config = preset("tiny", "morphogenesis2d", division=True, out=tmp_path, **options)
+    trainer = Trainer(Morphogenesis2D(config.task), config, task_name="morphogenesis2d")
+    for _ in range(iterations):
+        trainer.iterate()
+    return trainer.rule
+
+
+def test_fates_that_are_not_learned_stay_as_they_are(tmp_path):
+    rule = trained(tmp_path, fate_rate=0.0, weight_decay=0.1)
+    assert rule.fate.bias.tolist() == list(FIRST_FATES)
+    assert not rule.fate.weight.any()
+
+
+def test_rest_says_nothing_of_fates(tmp_path):
+    # Old worlds are to rest, but what is born in them is no unrest; pictures do not count.
+    rest = {"rest_weight": 1.0, "lifetimes": (12, 48), "rest_age": 12, "damage": False}
+    rule = trained(tmp_path, 8, fate_rate=1.0, splat_weight=0.0, drift_weight=0.0, **rest)
+    assert rule.fate.bias.tolist() == list(FIRST_FATES)
+    assert rule.output.weight.any()
+
+
+def test_fates_learn_at_their_share_of_the_learning_rate(tmp_path):
+    changes = []
+    for rate in (1.0, 0.01):
+        rule = trained(tmp_path / str(rate), 1, fate_rate=rate)
+        changes.append((rule.fate.bias - torch.tensor(FIRST_FATES)).abs().max().item())
+    # AdamW's first step is the learning rate.
+    assert changes[0] == pytest.approx(1e-3, rel=0.01)
+    assert changes[1] == pytest.approx(1e-5, rel=0.05)

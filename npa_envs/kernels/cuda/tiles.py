@@ -3,7 +3,7 @@
 A tile's particles lie in one line of cells or two, so most of their candidates are the same. The
 warp brings these into fast memory once. Four lanes of a particle then test every fourth of them: a
 test takes ten instructions, no address is computed, and no end of a run of cells looked at. Whom a
-lane has found near stands in the bits of a word, of which lists are made afterwards. That takes half
+lane has found near stands in the bits of a word, of which lists are made afterwards. It takes half
 the time where neighbours are many and particles few. In sparse worlds tiles share few candidates,
 and in worlds that fill a device a thread for each particle does as well.
 """
