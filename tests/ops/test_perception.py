@@ -187,18 +187,20 @@ def test_fields_equal_the_oracle(dtype, space_dim, moment_inverse, device):
         assert relative_error(value, answer) < FORWARD[dtype]
 
 
-threads = pytest.mark.parametrize("shared", [0, 4096], ids=("one thread", "several threads"))
+@pytest.fixture(params=[0, 4096], ids=("one thread", "several threads"))
+def shared(request, monkeypatch):
+    """Particles of the largest world in which several threads of a GPU share a particle."""
+    monkeypatch.setattr(passes, "SHARED_WORLD", request.param)
+    passes.choose.cache_clear()
+    yield request.param
+    passes.choose.cache_clear()
 
 
-@threads
 @pytest.mark.parametrize(
     ("space_dim", "state_dim", "box"),
     [(2, 20, (1.5, 1.7)), (2, 5, None), (3, 16, None), (3, 33, (1.5, 1.7, 1.6))],
 )
-def test_rows_are_right_however_many_threads_share_them(
-    space_dim, state_dim, box, shared, device, monkeypatch
-):
-    monkeypatch.setattr(passes, "SHARED_WORLD", shared)
+def test_rows_are_right_however_many_threads_share_them(space_dim, state_dim, box, shared, device):
     x, s = random_world(3, 211, space_dim, state_dim, dtype=torch.float32, device=device)
     z = npa_envs.perceive(x, s, 0.3, 0.3, box=box)
     expected = oracle.perceive(*exact(x, s), 0.3, 0.3, box)
@@ -254,12 +256,10 @@ def assert_rows_equal_the_oracle(x, s, masked, box=None):
     assert relative_error(found, expected[active]) < FORWARD[torch.float32]
 
 
-@threads
 @all_or_some
 @pytest.mark.parametrize("count", [40, 130, 300, 900])
-def test_rows_of_crowded_worlds_are_right(count, masked, shared, device, monkeypatch):
+def test_rows_of_crowded_worlds_are_right(count, masked, shared, device):
     """Everybody sees everybody: on CUDA, lists overflow, and before that a lane's share of one."""
-    monkeypatch.setattr(passes, "SHARED_WORLD", shared)
     x, s = random_world(2, count, 2, 16, dtype=torch.float32, device=device)
     assert_rows_equal_the_oracle(0.05 * x, s, masked)
 
@@ -287,6 +287,27 @@ def test_rows_of_crowded_boxes_are_right(masked, device):
     assert neighbours.min() < 64
     assert neighbours.max() > 256
     assert_rows_equal_the_oracle(x, s, masked, (1.0, 1.0))
+
+
+@all_or_some
+@pytest.mark.parametrize("sides", [(6.1, 9.0), (7.1, 7.9), (8.1, 30.0), (40.0, 7.1)])
+def test_rows_of_small_boxes_are_right(sides, masked, device):
+    """In cells of eps / 2; particles are left several boxes away. Fewer than 7 are searched alone."""
+    box = tuple(0.1 * side for side in sides)
+    x, s = random_world(2, 203, 2, 16, dtype=torch.float32, device=device)
+    x = x / 2.8 * torch.tensor(box, device=device)
+    turns = torch.randint(-3, 4, x.shape, generator=torch.Generator().manual_seed(0))
+    away = x + turns.to(x) * torch.tensor(box, device=device)
+    expected = oracle.perceive(*exact(away, s), 0.2, 0.2, box=box)
+    assert relative_error(npa_envs.perceive(away, s, 0.2, box=box), expected) < 3e-5
+    assert_rows_equal_the_oracle(x, s, masked, box)
+
+
+def test_rows_of_lines_of_particles_are_right(device):
+    """On CUDA eight neighbours in the order of cells are one tile, however far apart they lie."""
+    x, s = random_world(2, 203, 2, 16, dtype=torch.float32, device=device)
+    for scale in ((20.0, 1e-3), (1e-3, 20.0), (30.0, 30.0)):
+        assert_rows_equal_the_oracle(x * torch.tensor(scale, device=device), s, masked=True)
 
 
 def test_detached_positions_get_no_gradient(device):
