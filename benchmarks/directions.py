@@ -13,7 +13,6 @@ Each writes what it found to OUT as it goes.
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import statistics
 import time
@@ -30,8 +29,14 @@ from torch import Tensor
 import npa_envs
 from npa_envs.measure.record import machine, write_record
 from npa_envs.rule.files import rule_metadata
-from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, turned, turns
+from npa_envs.tasks.morphogenesis2d import (
+    Morphogenesis2D,
+    Morphogenesis2DConfig,
+    turned,
+    turns,
+)
 from npa_envs.training import preset
+from npa_envs.training.trained_tasks import trained_config
 from npa_envs.world.randomness import WorldRandom
 
 TARGETS = ("gecko", "heart", "octopus")
@@ -80,16 +85,15 @@ def train(arguments: argparse.Namespace) -> None:
     print(f"{len(names)} runs, {trainers[0].iteration} iterations, {seconds:.1f} s together")
 
 
-def tasks_of(config: Mapping[str, Any], device: str) -> tuple[Morphogenesis2D, Morphogenesis2D]:
+def tasks_of(config: Morphogenesis2DConfig, device: str) -> tuple[Morphogenesis2D, Morphogenesis2D]:
     """Return the task of a run, and the same with worlds compared at the best angle."""
-    run = preset("paper", **config)
-    task = Morphogenesis2D(run.task, device=device)
-    blind = replace(run.task, equivariant=True, chiral=run.task.chiral or not run.task.equivariant)
+    task = Morphogenesis2D(config, device=device)
+    blind = replace(config, equivariant=True, chiral=config.chiral or not config.equivariant)
     return task, Morphogenesis2D(blind, device=device)
 
 
 @torch.no_grad()
-def measured(rule: npa_envs.NPARule, config: Mapping[str, Any], device: str) -> dict[str, Any]:
+def measured(rule: npa_envs.NPARule, config: Morphogenesis2DConfig, device: str) -> dict[str, Any]:
     """Return losses over the steps, and those of creatures turned by 90 degrees."""
     task, blind = tasks_of(config, device)
     random = WorldRandom(SEEDS, device=device)
@@ -136,7 +140,7 @@ def measure(arguments: argparse.Namespace) -> None:
     for path in sorted(arguments.out.glob("*.safetensors")):
         metadata = rule_metadata(path)
         rule = npa_envs.load_rule(path, device=arguments.device)
-        config = json.loads(metadata["config"])
+        config = trained_config(path, metadata).task
         row = {
             "iterations": int(metadata["iteration"]),
             **measured(rule, config, arguments.device),

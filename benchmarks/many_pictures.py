@@ -15,7 +15,6 @@ what an encoder grows from pictures that it never saw. Each writes what it found
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import random
 import statistics
@@ -39,6 +38,7 @@ from npa_envs.rule.files import rule_metadata
 from npa_envs.tasks.many_pictures import ManyPictures, named_targets
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D
 from npa_envs.training import Trainer, preset
+from npa_envs.training.trained_tasks import trained_config
 
 KINDS: Mapping[str, Mapping[str, Any]] = {
     "codes": {},
@@ -275,7 +275,7 @@ def measure(arguments: argparse.Namespace) -> None:
     for path in sorted(arguments.out.glob("*.safetensors")):
         metadata = rule_metadata(path)
         rule = npa_envs.load_rule(path, device=device)
-        config = preset(base_of(arguments), **json.loads(metadata["config"])).task
+        config = trained_config(path, metadata).task
         row: dict[str, Any] = {"iterations": int(metadata["iteration"])}
         if rule.codes is None:
             row["rows"] = control_rows(rule, config, device)

@@ -2,6 +2,7 @@
 
     python docs/draw_beyond.py directions PLAIN EQUIVARIANT    # files of rules
     python docs/draw_beyond.py directions_full PLAIN EQUIVARIANT [PLAIN EQUIVARIANT ...]
+    python docs/draw_beyond.py directions_framed RULE ...       # equivariant: --seed-across 0.5
     python docs/draw_beyond.py sizes TRAINED VARIED             # or sizes_full
     python docs/draw_beyond.py division RULE                    # or division_full
     python docs/draw_beyond.py pictures MANY
@@ -32,7 +33,7 @@ from npa_envs.world.division import living
 IMAGES = Path(__file__).resolve().parent / "images"
 SEEDS = (1_000_000, 1_000_001, 1_000_002)
 CPU = torch.device("cpu")
-GROWN, AFTER = 128, 128
+GROWN, AFTER, AGES = 128, 128, (512, 2048)
 SIDE = 128
 """Pixels on each side of a picture, at least."""
 
@@ -124,6 +125,29 @@ def directions_full(paths: list[str]) -> Shots:
         shots.append((f"{kind}, step {GROWN}", as_it_lies(task, x, s)[::2, ::2]))
         x, s = run(rule, task, turned(x, quarter), s, AFTER, seed=SEEDS[1])
         shots.append((f"turned, {AFTER} later", as_it_lies(task, x, s)[::2, ::2]))
+    return shots
+
+
+def directions_framed(paths: list[str]) -> Shots:
+    """Return targets, and what equivariant rules grow of them.
+
+    Beside each the same world, turned by 90 degrees and some steps later, and left alone; as in
+    `directions_full`.
+    """
+    shots: Shots = []
+    quarter = turns(torch.tensor([0.5 * math.pi]), torch.ones(1))
+    for path in paths:
+        rule = npa_envs.load_rule(path)
+        task = task_of(path, rule)
+        shots.append(("target", enlarged(task.target_picture)[::2, ::2]))
+        generator = torch.Generator().manual_seed(SEEDS[0])
+        x, s = run(rule, task, *task.seed(1, generator=generator), GROWN, seed=SEEDS[0])
+        shots.append((f"step {GROWN}", as_it_lies(task, x, s)[::2, ::2]))
+        y, u = run(rule, task, turned(x, quarter), s, AFTER, seed=SEEDS[1])
+        shots.append((f"turned, {AFTER} later", as_it_lies(task, y, u)[::2, ::2]))
+        for before, after in pairwise((GROWN, *AGES)):
+            x, s = run(rule, task, x, s, after - before, seed=SEEDS[0] + after)
+            shots.append((f"step {after}", as_it_lies(task, x, s)[::2, ::2]))
     return shots
 
 
@@ -220,6 +244,7 @@ def main() -> None:
     kinds = {
         "directions": directions,
         "directions_full": directions_full,
+        "directions_framed": directions_framed,
         "sizes": sizes,
         "sizes_full": sizes,
         "division": division,

@@ -35,8 +35,12 @@ LARGEST_BLOCK_GRID = 4096
 """Cells of the largest grid that a block of threads has room for."""
 
 
+SMALL_WORLD = 2048
+"""Particles of a small world."""
+
 SHARED_WORLD = 4096
-"""Particles of worlds that are often rolled out few at a time: several threads share a particle."""
+"""Particles of the largest worlds that are often rolled out few at a time: several threads share a
+particle."""
 
 
 class Request(NamedTuple):
@@ -160,7 +164,8 @@ TABLE: tuple[Implementation, ...] = (
         "tiles",
         "kernels/cuda/tiles.py",
         f"{_MODERN}, 2D, worlds of at most {SHARED_WORLD} particles, boxes of at least "
-        f"{SMALLEST_SIDE} cells along each side: as below, a warp for eight particles",
+        f"{SMALLEST_SIDE} cells along each side; environments only above {SMALL_WORLD}: neighbours "
+        "are listed on the way, by a warp for eight particles",
         _tiles,
     ),
     Implementation(
@@ -216,8 +221,8 @@ def describe(request: Request) -> list[str]:
 class Listing(NamedTuple):
     """How the CUDA engine lists neighbours, and how threads share particles.
 
-    It follows from the size of a world alone: the sums of a world, taken in the order that this
-    gives, are the same in every batch.
+    It follows from a world alone, its size and its box, and from the device: the sums of a world,
+    taken in the order that this gives, are the same in every batch.
     """
 
     capacity: int
@@ -230,7 +235,7 @@ class Listing(NamedTuple):
     """Whether the density pass is that of `kernels/cuda/tiles.py`."""
 
     def shape(self, row_count: int) -> tuple[int, int, int]:
-        """Return the shape of so many lists; but those of tiles 32 of them lie together."""
+        """Return the shape of so many lists: 32 of them together, or, of tiles, list after list."""
         return -(-row_count // 32), self.capacity, 32
 
 
@@ -240,9 +245,6 @@ crowded boxes."""
 
 CROWD = range(80, 200)
 """Mean neighbours in a box of which many are more than `LARGE_CAPACITY`, few `CROWDED_CAPACITY`."""
-
-SMALL_WORLD = 2048
-"""Particles of a small world."""
 
 HUGE_WORLD = 2**22
 """Particles of the largest world whose lists of neighbours may take more memory than its rows."""

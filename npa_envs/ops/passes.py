@@ -45,7 +45,8 @@ class NeighbourLists(NamedTuple):
     listing: Listing
     """How they were listed."""
     steps: Tensor
-    """Steps to neighbours in the sorted order, int16; 32 particles together, or in tiles."""
+    """Steps to neighbours in the sorted order, int16: 32 particles together, or, of tiles, list
+    after list."""
     lengths: Tensor
     """Neighbours of each row's particle, int32, [K]."""
     records: Tensor

@@ -564,6 +564,12 @@ def dividing(rule: NPARule) -> NPARule:
     return made
 
 
+def fate_parameters(rules: nn.Module) -> list[nn.Parameter]:
+    """Return the weights by which particles divide and die, of a rule or of several in a module."""
+    found = (module for module in rules.modules() if isinstance(module, NPARule))
+    return [parameter for rule in found if rule.divides for parameter in rule.fate.parameters()]
+
+
 def check_rule(rule: Any) -> None:
     """Check that something is a rule; one that `torch.compile` has wrapped is one too.
 

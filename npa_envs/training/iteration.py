@@ -8,11 +8,12 @@ import torch
 from torch import Tensor
 
 import npa_envs.world.rollout
-from npa_envs.rule.rule import LIFE, NPARule
+from npa_envs.rule.rule import LIFE, NPARule, fate_parameters
 from npa_envs.tasks.base import Task, coded_states, task_toward
 from npa_envs.tasks.train_config import TrainConfig
 from npa_envs.training.randomness import registered
 from npa_envs.world.cuda_graph import capture
+from npa_envs.world.division import living
 from npa_envs.world.randomness import Randomness, WorldRandom
 from npa_envs.world.rollout import Memory
 
@@ -81,8 +82,7 @@ class EagerIteration:
         self.grown = torch.zeros_like(x[:, 0, 0], dtype=torch.bool)
         """Which worlds are grown and whole, and are to rest, shape [B]."""
         self._rest_weight = config.rest_weight
-        # What lives is the business of the task's loss; that somebody was born is no unrest.
-        self._first_state = LIFE + 1 if rule.divides else 0
+        self._divides = bool(fate_parameters(rule))
         self._task = task
         with torch.no_grad():
             total, parts = self._loss(x, s, torch.zeros_like(x[..., 0]))
@@ -143,8 +143,12 @@ class EagerIteration:
         """Return the task's loss and its parts, and how far grown worlds are from rest."""
         total, parts = self._task.loss(x, s, path_length)
         if self._rest_weight > 0.0:
-            change = (s - self.s0)[..., self._first_state :].abs().mean(dim=(1, 2))
-            unrest = path_length.mean(dim=1) / self._task.eps + change
+            change = s - self.s0
+            if self._divides:
+                # Births and deaths are no unrest; who lives is the business of the task's loss.
+                stayed = (living(s) & living(self.s0))[..., None]
+                change = torch.where(stayed, change, 0.0)[..., LIFE + 1 :]
+            unrest = path_length.mean(dim=1) / self._task.eps + change.abs().mean(dim=(1, 2))
             parts["rest"] = (self.grown.to(x.dtype) * unrest).mean()
             total = total + self._rest_weight * parts["rest"]
         return total, parts

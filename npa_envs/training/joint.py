@@ -32,9 +32,6 @@ class JointRules(nn.Module):
         rules: The rules, species by species.
     """
 
-    divides = False
-    """Whether particles divide and die, as those of `NPARule` may."""
-
     def __init__(self, rules: Sequence[NPARule]) -> None:
         super().__init__()
         self.rules = nn.ModuleList(rules)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import itertools
 import math
+import operator
 from collections.abc import Sequence
 from typing import Any
 
@@ -40,7 +41,7 @@ class RuleOptimiser:
     Args:
         parameters: The rule's parameters; their `.grad` is set before `prepare_gradients`.
         config: Learning rates, weight decay, gradient normalisation.
-        fates: Which parameters learn at the share `fate_rate` of the learning rate.
+        fates: Which of `parameters` learn at the share `fate_rate` of the learning rate.
     """
 
     def __init__(
@@ -75,7 +76,7 @@ class RuleOptimiser:
             self._adamw = self._fresh()
         rate = self._config.learning_rate_at(iteration, share)
         for group in self._adamw.param_groups:
-            group["lr"] = rate * group["share"]
+            group["lr"] = rate * group["rate_share"]
         self._adamw.step()
 
     def state_dict(self) -> dict[str, Any]:
@@ -98,8 +99,10 @@ class RuleOptimiser:
         self._adamw.load_state_dict({"state": state["state"], "param_groups": groups})
 
     def _fresh(self) -> torch.optim.AdamW:
-        runs = itertools.groupby(zip(self._shares, self._parameters, strict=True), lambda p: p[0])
-        groups = [{"share": share, "params": [p for _, p in run]} for share, run in runs]
+        runs = itertools.groupby(
+            zip(self._shares, self._parameters, strict=True), operator.itemgetter(0)
+        )
+        groups = [{"rate_share": share, "params": [p for _, p in run]} for share, run in runs]
         return torch.optim.AdamW(
             groups,
             lr=self._config.learning_rate,

@@ -102,7 +102,7 @@ def load_config(
             if not isinstance(name, str) or name not in presets:
                 raise NPAError(f"unknown preset {name!r}: {suggest(name, presets)}")
             base = presets[name]
-        return override(base, **(completed(own, base) if whole else own))
+        return override(base, **(completed(own, base) if whole else _without_retired(own)))
     except NPAError as error:
         raise NPAError(f"in the configuration file {shown(str(path))}: {error}") from error
 
@@ -118,8 +118,14 @@ def config_to_dict(config: TrainConfig[Any]) -> dict[str, Any]:
     return result
 
 
+RETIRED = frozenset({"division_weight"})
+"""Fields that configurations had once: those that were kept are read without them."""
+
+
 def completed(held: Any, config: Any) -> Any:
-    """Return a configuration that was kept, with the defaults of fields that are younger than it.
+    """Return a configuration that was kept, as it is written now.
+
+    Fields that are younger than it have their defaults, and those that are no more are left out.
 
     Args:
         held: What `config_to_dict` once returned.
@@ -132,11 +138,21 @@ def completed(held: Any, config: Any) -> Any:
             if field.name not in held and field.default is not dataclasses.MISSING
         }
         now = {name: getattr(config, name, None) for name in held}
-        return younger | {name: completed(value, now[name]) for name, value in held.items()}
+        kept = _without_retired(held)
+        return younger | {name: completed(value, now[name]) for name, value in kept.items()}
     if isinstance(config, tuple) and config and isinstance(held, list):
         last = len(config) - 1
         return [completed(one, config[min(k, last)]) for k, one in enumerate(held)]
     return held
+
+
+def _without_retired(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Return fields of a configuration and of its task but those that are no more."""
+    return {
+        name: _without_retired(value) if isinstance(value, Mapping) else value
+        for name, value in fields.items()
+        if name not in RETIRED
+    }
 
 
 def _plain(value: Any) -> Any:

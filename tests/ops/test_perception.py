@@ -18,7 +18,7 @@ from worlds import (
 
 import npa_envs
 from npa_envs import reference as oracle
-from npa_envs.ops import backend as passes
+from npa_envs.ops import backend
 from npa_envs.ops.perceive import Terms, survey
 
 # Worst error measured on CPU and CUDA, then the bound of the test: a few times larger.
@@ -190,10 +190,10 @@ def test_fields_equal_the_oracle(dtype, space_dim, moment_inverse, device):
 @pytest.fixture(params=[0, 4096], ids=("one thread", "several threads"))
 def shared(request, monkeypatch):
     """Particles of the largest world in which several threads of a GPU share a particle."""
-    monkeypatch.setattr(passes, "SHARED_WORLD", request.param)
-    passes.choose.cache_clear()
+    monkeypatch.setattr(backend, "SHARED_WORLD", request.param)
+    backend.choose.cache_clear()
     yield request.param
-    passes.choose.cache_clear()
+    backend.choose.cache_clear()
 
 
 @pytest.mark.parametrize(
@@ -292,7 +292,7 @@ def test_rows_of_crowded_boxes_are_right(masked, device):
 @all_or_some
 @pytest.mark.parametrize("sides", [(6.1, 9.0), (7.1, 7.9), (8.1, 30.0), (40.0, 7.1)])
 def test_rows_of_small_boxes_are_right(sides, masked, device):
-    """In cells of eps / 2; particles are left several boxes away. Fewer than 7 are searched alone."""
+    """In cells of eps / 2; particles are left several boxes away. Boxes of 7 cells have tiles."""
     box = tuple(0.1 * side for side in sides)
     x, s = random_world(2, 203, 2, 16, dtype=torch.float32, device=device)
     x = x / 2.8 * torch.tensor(box, device=device)

@@ -8,6 +8,7 @@ from npa_envs.errors import NPAError
 from npa_envs.rule.rule import FIRST_FATES, LIFE
 from npa_envs.tasks.morphogenesis2d import Morphogenesis2D, Morphogenesis2DConfig
 from npa_envs.training import Trainer, preset
+from npa_envs.training.iteration import EagerIteration
 from npa_envs.world.division import living
 
 SMALL = {"target": "ring", "target_point_count": 64, "particle_count": 64, "resolution": 32}
@@ -126,6 +127,26 @@ def test_rest_says_nothing_of_fates(tmp_path):
     rule = trained(tmp_path, 8, fate_rate=1.0, splat_weight=0.0, drift_weight=0.0, **rest)
     assert rule.fate.bias.tolist() == list(FIRST_FATES)
     assert rule.output.weight.any()
+
+
+def test_births_are_no_unrest(tmp_path):
+    config = preset(
+        "tiny", "morphogenesis2d", division=True, particle_count=64, target_point_count=64,
+        world_count=1, lifetimes=(12, 48), rest_weight=1.0, out=tmp_path,
+    )  # fmt: skip
+    task = Morphogenesis2D(config.task)
+    rule = task.make_rule(torch.Generator().manual_seed(0))
+    torch.nn.init.zeros_(rule.output.weight)
+    x, s = task.seed(1, generator=torch.Generator().manual_seed(0))
+    s[:, 0, LIFE + 1 :] = 0.5
+    batch = EagerIteration(task, rule, config, x, s, torch.Generator().manual_seed(0))
+    batch.grown.fill_(True)
+    batch.run(12)
+    assert int(living(batch.s).sum()) > 8
+    rest = dict(zip(batch.term_names, batch.terms.tolist(), strict=True))["rest"]
+    # Nobody moves, and children have their parents' states.
+    assert (batch.s[living(batch.s)][:, LIFE + 1 :] == 0.5).all()
+    assert rest < 1e-6
 
 
 def test_fates_learn_at_their_share_of_the_learning_rate(tmp_path):

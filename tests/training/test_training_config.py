@@ -92,6 +92,18 @@ def test_configurations_that_were_kept_get_the_defaults_of_younger_fields(tmp_pa
     assert load_config(tmp_path / "config.json", config, whole=True).average == 0.0
 
 
+def test_configurations_that_were_kept_are_read_without_fields_that_are_no_more(tmp_path):
+    config = preset("fast", "morphogenesis2d")
+    held = json.loads(json.dumps(config_to_dict(config)))
+    held["task"]["division_weight"] = 0.02
+    assert completed(held, config) == json.loads(json.dumps(config_to_dict(config)))
+    (tmp_path / "config.json").write_text(json.dumps(held))
+    for whole in (False, True):
+        assert load_config(tmp_path / "config.json", config, whole=whole) == config
+    with pytest.raises(NPAError, match="division_weight"):
+        preset("fast", "morphogenesis2d", division_weight=0.02)
+
+
 def test_no_field_of_the_run_hides_one_of_the_task():
     own, of_task = (dataclasses.fields(kind) for kind in (TrainConfig, Morphogenesis2DConfig))
     assert not {field.name for field in own} & {field.name for field in of_task}

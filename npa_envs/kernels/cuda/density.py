@@ -4,6 +4,8 @@ One thread of a particle finds its neighbours with far fewer instructions than s
 agree on where they are in a list. A list holds the steps to neighbours in the sorted order, in 16
 bits. It is gathered in fast memory and left in an array: 32 particles together, their first two
 entries first. It has room for so many; of a longer one, only the length is known.
+
+Small worlds in 2D take `tiles.py`, whose lists lie one behind the other.
 """
 
 import functools

@@ -5,19 +5,21 @@ namespace npa {
 // Particles of a tile, the lanes that share one, and cells on each side in which neighbours lie.
 constexpr int TILE = 8, TILE_LANES = 4, TILE_REACH = 2;
 constexpr int TILE_LINES = 2 * TILE_REACH + 1;
-// A lane notes in one word whom of so many candidates it has found near.
+// A bit for each candidate that a lane tests; one word holds so many.
 constexpr int TILE_TESTS = 32;
 // Tests that follow each other without a look at how many are left.
 constexpr int TILE_UNROLLED = 4;
-// Cells that the particles of a line may lie apart: those further on have their turn later.
+// Cells that the particles of a line may lie apart: those further on have their turn later, so that
+// few particles far from each other do not share all candidates between them.
 constexpr int TILE_SPAN = 12;
 // Cells along each side of the smallest periodic box whose density is computed in tiles.
 constexpr int SMALLEST_TILED_BOX = 7;
-// Steps of a list's entry have 16 bits.
-constexpr int LONGEST_STEP = 0x7fff;
+// Where nobody is: differences from there overflow when they are squared.
+constexpr float NOWHERE = 1e30f;
 
 template <int CAPACITY> struct TileMemory {
-    // Candidates that are there at once: with long lists fewer, so that a processor has room for 32.
+    // Candidates that are there at once: with long lists fewer, so that a processor has room for 32
+    // blocks.
     static constexpr int WINDOW = CAPACITY > 128 ? 192 : 256;
     float2 positions[WINDOW];
     // Steps to them from the tile's first particle.
@@ -30,7 +32,8 @@ template <int CAPACITY> struct TileMemory {
 __device__ inline void fetch(float2* to, const float2* from)
 {
     const unsigned address = (unsigned)__cvta_generic_to_shared(to);
-    asm volatile("cp.async.ca.shared.global [%0], [%1], 8;" : : "r"(address), "l"(from));
+    asm volatile("cp.async.ca.shared.global [%0], [%1], 8;" : : "r"(address), "l"(from)
+        : "memory");
 }
 
 __device__ inline void await_fetched() { asm volatile("cp.async.wait_all;" : : : "memory"); }
@@ -41,8 +44,8 @@ struct TileRun {
     int begin, count;
     // Where its first candidate goes, and how many candidates all runs have.
     int place, total;
-    // This lane of the run's, and how many share it.
-    int lane, lanes;
+    // Which of the lanes that copy it this one is, and how many they are.
+    int copier, copiers;
 };
 
 // The image of a position in a periodic box that is nearest to another position.
@@ -65,20 +68,21 @@ __device__ inline TileRun run_around(
     const int first = left - TILE_REACH < 0 ? left - TILE_REACH + nx : left - TILE_REACH;
     const bool wraps = first + width > nx;
     TileRun run;
-    run.lanes = wraps ? 3 : 6;
+    run.copiers = wraps ? 3 : 6;
     const int number = wraps ? lane / 3 : lane / 6;
-    run.lane = lane - number * run.lanes;
+    run.copier = lane - number * run.copiers;
     const bool second = wraps && number & 1;
-    const int apart = line - TILE_REACH + (wraps ? number / 2 : number);
-    const int y = apart < 0 ? apart + ny : apart >= ny ? apart - ny : apart;
+    const int unwrapped = line - TILE_REACH + (wraps ? number / 2 : number);
+    const int y = unwrapped < 0 ? unwrapped + ny : unwrapped >= ny ? unwrapped - ny : unwrapped;
     run.begin = run.count = 0;
     if (number < (wraps ? 2 * TILE_LINES : TILE_LINES)) {
-        const int* row = starts + y * nx;
-        run.begin = row[second ? 0 : first];
-        run.count = row[second ? first + width - nx : wraps ? nx : first + width] - run.begin;
+        const int* line_starts = starts + y * nx;
+        const int end = second ? first + width - nx : wraps ? nx : first + width;
+        run.begin = line_starts[second ? 0 : first];
+        run.count = line_starts[end] - run.begin;
     }
     // Sums over the first lanes of the runs.
-    int end = run.lane == 0 ? run.count : 0;
+    int end = run.copier == 0 ? run.count : 0;
     #pragma unroll
     for (int offset = 1; offset < 32; offset *= 2) {
         const int before = __shfl_up_sync(~0u, end, offset);
@@ -90,7 +94,7 @@ __device__ inline TileRun run_around(
 }
 
 // Bring candidates from `window` on into fast memory, in a periodic box those images that are nearest
-// to an origin, and what is not a number behind the last one; return how many there are.
+// to an origin, and nobody behind the last one; return how many there are.
 template <bool PERIODIC, int CAPACITY, typename Domain>
 __device__ inline int fetch_window(
     const Domain& domain, TileMemory<CAPACITY>& memory, const TileRun& run,
@@ -100,17 +104,17 @@ __device__ inline int fetch_window(
     const int count = min(memory.WINDOW, run.total - window);
     const int place = run.place - window;
     const int end = min(run.count, count - place);
-    const int begin = max(-place, 0) + run.lane;
-    for (int i = begin; i < end; i += run.lanes) {
+    const int begin = max(-place, 0) + run.copier;
+    for (int i = begin; i < end; i += run.copiers) {
         fetch(memory.positions + place + i, positions + run.begin + i);
         memory.steps[place + i] = run.begin + i - first;
     }
     const int padded = (count + TOGETHER - 1) / TOGETHER * TOGETHER;
     const int i = count + (threadIdx.x & 31);
-    if (i < padded) memory.positions[i] = make_float2(nanf(""), nanf(""));
+    if (i < padded) memory.positions[i] = make_float2(NOWHERE, NOWHERE);
     await_fetched();
     if (PERIODIC) {
-        for (int i = begin; i < end; i += run.lanes) {
+        for (int i = begin; i < end; i += run.copiers) {
             float2& candidate = memory.positions[place + i];
             candidate = image_near(domain, candidate, origin);
         }
@@ -130,11 +134,11 @@ __device__ inline float smoothing_of_candidates(
         for (int u = 0; u < TILE_UNROLLED; ++u) {
             const float2 candidate = candidates[(test + u) * TILE_LANES];
             const float x = candidate.x - centre.x, y = candidate.y - centre.y;
-            // The sign of what is not a number is positive here, and fmaxf makes it 0.
-            const float beyond = fmaf(fmaf(x, x, y * y), inverse_squared_eps, -1.0f);
+            const float squared = fmaf(x, x, y * y);
+            total += smoothing(squared, inverse_squared_eps);
+            // The sign of r^2 / eps^2 - 1; what is not a number has none.
+            const float beyond = fmaf(squared, inverse_squared_eps, -1.0f);
             near = __funnelshift_l(__float_as_uint(beyond), near, 1);
-            const float falloff = fmaxf(-beyond, 0.0f);
-            total += falloff * falloff * falloff;
         }
     }
     near <<= TILE_TESTS - tests;
@@ -169,25 +173,26 @@ __device__ inline int append_near(
 // Sum of the smoothing kernel over all neighbours of particle k, without its norm; its four lanes
 // call it together, those of a tile's other particles too, and leave the list of its row, -1 if it
 // has none. `first` is the tile's first particle, `base` the first cell of their world.
-template <int CAPACITY, bool PERIODIC, typename Domain>
+template <int CAPACITY, bool PERIODIC, int SIZE, int SMALLEST_SIDE, typename Domain>
 __device__ inline float density_of_tile(
     const Domain& domain, const wp::array_t<int>& starts, const wp::array_t<int>& sorted_cell,
     const wp::array_t<wp::vec_t<2, float>>& sorted_positions, int base, int first, int k,
     bool inside, int row, const wp::array_t<wp::int16>& lists, const wp::array_t<int>& list_lengths)
 {
+    static_assert(SIZE == TILE && SMALLEST_SIDE == SMALLEST_TILED_BOX, "as in tiles.py");
     __shared__ TileMemory<CAPACITY> memory;
     const int lane = threadIdx.x & 31, part = lane & (TILE_LANES - 1);
     const float2* positions = reinterpret_cast<const float2*>(sorted_positions.data);
     const float2 position = positions[k];
-    const int cell = sorted_cell.data[k] - base, nx = domain.cell_shape[0];
+    const int cell = sorted_cell.data[k] - base;
+    const int nx = domain.cell_shape[0], ny = domain.cell_shape[1];
     const int y = (unsigned)cell / (unsigned)nx, x = cell - y * nx;
-    // Images are those of all particles of a turn: with their neighbours they take up less than half
-    // of a periodic box.
+    // One image of each candidate serves all particles of a turn: they and their neighbours lie less
+    // than half a periodic box from the first one's cell.
     const int span = min(PERIODIC ? (nx - SMALLEST_TILED_BOX) / 2 : nx - TILE_LINES, TILE_SPAN);
     short* list = memory.lists[lane / TILE_LANES];
     float total = 0.0f;
     int length = 0;
-    bool far = false;
     // Particles of one line have their turn together: those of a tile lie in the order of cells.
     for (unsigned waiting = __ballot_sync(~0u, inside); waiting;) {
         const int leader = __ffs(waiting) - 1;
@@ -195,17 +200,14 @@ __device__ inline float density_of_tile(
         const unsigned members = __ballot_sync(~0u, y == line && x - left <= span) & waiting;
         waiting &= ~members;
         const int right = __shfl_sync(~0u, x, 31 - __clz(members));
-        float2 origin, centre = make_float2(nanf(""), nanf(""));
-        if (PERIODIC) {
-            origin.x = __shfl_sync(~0u, position.x, leader);
-            origin.y = __shfl_sync(~0u, position.y, leader);
-        }
+        // Not the first particle's position, which may be no number.
+        const float2 origin = make_float2(
+            (left + 0.5f) * domain.box[0] / nx, (line + 0.5f) * domain.box[1] / ny);
+        float2 centre = make_float2(-NOWHERE, -NOWHERE);
         if (members >> lane & 1) {
             centre = PERIODIC ? image_near(domain, position, origin) : position;
         }
         const TileRun run = run_around(domain, starts.data + base, left, right, line);
-        const int furthest = max(first + TILE - 1 - run.begin, run.begin + run.count - first);
-        far = far || (run.count > 0 && furthest > LONGEST_STEP);
         for (int window = 0; window < run.total; window += memory.WINDOW) {
             const int count = fetch_window<PERIODIC>(
                 domain, memory, run, positions, origin, first, window);
@@ -225,7 +227,6 @@ __device__ inline float density_of_tile(
     for (int offset = 1; offset < TILE_LANES; offset *= 2) {
         total += __shfl_xor_sync(~0u, total, offset);
     }
-    if (__any_sync(~0u, far)) length = CAPACITY + 1;
     if (row >= 0 && length <= CAPACITY) {
         uint4* to = reinterpret_cast<uint4*>(lists.data + (size_t)row * CAPACITY);
         for (int entries = part; 8 * entries < length; entries += TILE_LANES) {

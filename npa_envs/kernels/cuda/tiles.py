@@ -5,7 +5,8 @@ warp brings these into fast memory once. Four lanes of a particle then test ever
 test takes ten instructions, no address is computed, and no end of a run of cells looked at. Whom a
 lane has found near stands in the bits of a word, of which lists are made afterwards. It takes half
 the time where neighbours are many and particles few. In sparse worlds tiles share few candidates,
-and in worlds that fill a device a thread for each particle does as well.
+and in worlds that fill a device a thread for each particle does as well. Worlds have at most 2^15
+particles: steps of lists have 16 bits.
 """
 
 import functools
@@ -51,7 +52,7 @@ def tiled_density(periodic: bool, capacity: int, masked: bool) -> wp.Kernel:
     vector, particle, Domain = types.vector, types.particle, types.Domain
     load_vector = make_wide_load(vector, wp.float32)
 
-    @native.func_native(capacity, periodic)
+    @native.func_native(capacity, periodic, TILE, SMALLEST_SIDE)
     def density_of_tile(
         domain: Domain,
         starts: wp.array(dtype=wp.int32),
