@@ -237,12 +237,13 @@ __device__ inline int largest_in_warp(int value)
 #endif
 }
 
-__device__ inline int sum_up_to(int value)
+// The sum of a value of this thread and of those before it, of a warp or of so many lanes.
+template <unsigned LANES = 32> __device__ inline int sum_up_to(int value)
 {
-    const unsigned lane = threadIdx.x & 31u;
+    const unsigned lane = threadIdx.x & (LANES - 1u);
     #pragma unroll
-    for (unsigned offset = 1; offset < 32; offset <<= 1) {
-        const int before = __shfl_up_sync(~0u, value, offset);
+    for (unsigned offset = 1; offset < LANES; offset <<= 1) {
+        const int before = __shfl_up_sync(~0u, value, offset, LANES);
         if (lane >= offset) value += before;
     }
     return value;

@@ -58,12 +58,7 @@ __device__ inline int leave_list(
     const unsigned bytes = list_end.c[0] - address;
     int length = bytes / (4 * BLOCK) * 2 + bytes / 2 % 2;
     if (length > ROOM) length = CAPACITY + 1;
-    int end = length;
-    #pragma unroll
-    for (int offset = 1; offset < LANES; offset *= 2) {
-        const int before = __shfl_up_sync(~0u, end, offset, LANES);
-        if (threadIdx.x % LANES >= offset) end += before;
-    }
+    const int end = sum_up_to<LANES>(length);
     const int total = LANES > 1 ? __shfl_sync(~0u, end, LANES - 1, LANES) : length;
     if (row < 0 || total > CAPACITY) return total;
     short* to = lists.data + place_of_list<CAPACITY>(row);

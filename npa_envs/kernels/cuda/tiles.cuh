@@ -81,13 +81,8 @@ __device__ inline TileRun run_around(
         run.begin = line_starts[second ? 0 : first];
         run.count = line_starts[end] - run.begin;
     }
-    // Sums over the first lanes of the runs.
-    int end = run.copier == 0 ? run.count : 0;
-    #pragma unroll
-    for (int offset = 1; offset < 32; offset *= 2) {
-        const int before = __shfl_up_sync(~0u, end, offset);
-        if (lane >= offset) end += before;
-    }
+    // The first lane of each run counts for it.
+    const int end = sum_up_to(run.copier == 0 ? run.count : 0);
     run.place = end - run.count;
     run.total = __shfl_sync(~0u, end, 31);
     return run;
@@ -151,14 +146,7 @@ template <int CAPACITY>
 __device__ inline int append_near(
     short* list, int length, const short* steps, int number, unsigned near)
 {
-    const int lane = threadIdx.x & (TILE_LANES - 1);
-    const int own = __popc(near);
-    int end = own;
-    #pragma unroll
-    for (int offset = 1; offset < TILE_LANES; offset *= 2) {
-        const int before = __shfl_up_sync(~0u, end, offset, TILE_LANES);
-        if (lane >= offset) end += before;
-    }
+    const int own = __popc(near), end = sum_up_to<TILE_LANES>(own);
     const int total = length + __shfl_sync(~0u, end, TILE_LANES - 1, TILE_LANES);
     if (total > CAPACITY) return CAPACITY + 1;
     short* to = list + length + end - own;
