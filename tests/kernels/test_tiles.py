@@ -1,0 +1,41 @@
+"""The CUDA C++ of tiles, run on a CPU by the 32 threads of a warp in turn."""
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from npa_envs.kernels import native
+
+HERE = Path(__file__).parent
+KERNELS = Path(native.__file__).parent
+
+
+def function_of(text, name):
+    """The definition of a function, with the template before it."""
+    head = rf"(?:template <[^>]*> )?__device__ inline \w+ {name}\([^{{]*?\)\s*"
+    return re.search(head + r"(?:\{[^\n]*\}\n|\{\n.*?\n\}\n)", text, re.S)[0]
+
+
+def test_tiles_find_all_neighbours_of_all_particles(tmp_path):
+    compiler = shutil.which("g++")
+    if compiler is None:
+        pytest.skip("needs g++")
+    tiles, mathematics, access = (
+        (KERNELS / name).read_text() for name in ("cuda/tiles.cuh", "mathematics.cuh", "access.cuh")
+    )
+    fetch, wait = function_of(tiles, "fetch"), function_of(tiles, "await_fetched")
+    tiles = tiles.replace(fetch, fetch.split("{")[0] + "{ *to = *from; }\n")
+    tiles = tiles.replace(wait, wait.split("{")[0] + "{}\n")
+    needed = [function_of(mathematics, name) for name in ("falloff_within", "smoothing")]
+    needed.append(function_of(access, "sum_up_to"))
+    head = "namespace npa {\n" + "\n".join(needed) + "}\nusing std::fmaf;\n"
+    (tmp_path / "native.h").write_text(head + tiles)
+    program = tmp_path / "tiles"
+    command = [compiler, "-std=c++20", "-O2", "-w", f"-I{HERE}", f"-I{tmp_path}", "-o", str(program)]
+    subprocess.run([*command, str(HERE / "tiles_on_cpu.cpp")], check=True)
+    told = subprocess.run([str(program)], capture_output=True, text=True, timeout=120)
+    assert told.returncode == 0, told.stdout
+    assert told.stdout == "704 worlds, 0 particles wrong\n"
