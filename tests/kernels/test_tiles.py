@@ -34,8 +34,8 @@ def test_tiles_find_all_neighbours_of_all_particles(tmp_path):
     head = "namespace npa {\n" + "\n".join(needed) + "}\nusing std::fmaf;\n"
     (tmp_path / "native.h").write_text(head + tiles)
     program = tmp_path / "tiles"
-    command = [compiler, "-std=c++20", "-O2", "-w", f"-I{HERE}", f"-I{tmp_path}", "-o", str(program)]
-    subprocess.run([*command, str(HERE / "tiles_on_cpu.cpp")], check=True)
+    options = ["-std=c++20", "-O2", "-w", f"-I{HERE}", f"-I{tmp_path}", "-o", str(program)]
+    subprocess.run([compiler, *options, str(HERE / "tiles_on_cpu.cpp")], check=True)
     told = subprocess.run([str(program)], capture_output=True, text=True, timeout=120)
     assert told.returncode == 0, told.stdout
     assert told.stdout == "704 worlds, 0 particles wrong\n"
