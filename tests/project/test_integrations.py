@@ -87,8 +87,8 @@ def test_callbacks_logs_and_films_of_stable_baselines3(tmp_path):
     (film,) = runs.glob("*.mp4")
     frames = imageio.imread(film)
     assert len(frames) in (17, 18)
-    # What is filmed moves: compression changes a picture by less.
-    assert abs(frames[16].astype(float) - frames[0]).mean() > 0.5
+    # The last picture is that of the next episode's start.
+    assert abs(frames[15].astype(float) - frames[0]).mean() > 1.0
 
 
 def test_films_of_gymnasium(tmp_path):
