@@ -193,6 +193,7 @@ def domain_types(space_dim: int, scalar: type) -> SimpleNamespace:
     )
 
 
+@functools.lru_cache(maxsize=256)
 def cell_grid(
     space_dim: int, particle_count: int, eps: float, box: tuple[float, ...] | None, reach: int
 ) -> tuple[int, ...]:

@@ -34,7 +34,6 @@ LARGEST_BLOCK_WORLD = 4096
 LARGEST_BLOCK_GRID = 4096
 """Cells of the largest grid that a block of threads has room for."""
 
-
 SMALL_WORLD = 2048
 """Particles of a small world."""
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from npa_envs.errors import NPAError
 from npa_envs.kernels.access import CUDA_LANES, WARP
 from npa_envs.kernels.cuda.sort import BLOCKS, STATE_SHARE, order_particles, sort_small_worlds
-from npa_envs.kernels.domain import make_domain
+from npa_envs.kernels.domain import cell_grid, make_domain
 from npa_envs.kernels.portable.sort import sort_kernels
 from npa_envs.ops.backend import (
     Listing,
@@ -164,7 +164,7 @@ def make_plan(
         particle_count,
         int(domain.cell_count),
         space_dim,
-        smallest_side=min(map(int, domain.cell_shape)),
+        smallest_side=min(cell_grid(space_dim, particle_count, eps, sides, reach)),
     )
     plan = Plan(
         scalar=scalar,
