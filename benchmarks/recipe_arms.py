@@ -208,6 +208,9 @@ ARMS: Mapping[str, Fields] = {
     "eighth, share 0.5": EIGHTH | {"damage_share": 0.5},
     "eighth, steps 32 to 64": EIGHTH | {"steps": (32, 64), "lifetimes": (32, 16_384)},
     "eighth, damage 0.1": EIGHTH | {"damage_radius": 0.1},
+    "eighth, second lives": EIGHTH | {"second_lives": 0.5},
+    "eighth, second lives, from 32": EIGHTH
+    | {"second_lives": 0.5, "lifetimes": (32, 16_384), "damage_share": 0.125},
     "seventh, untrained, rate 3e-3": SEVENTH
     | {"initial_rule": "", "learning_rate": 3e-3, "steps": (48, 50), "iterations": 1500},
 }

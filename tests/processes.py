@@ -4,6 +4,7 @@ import multiprocessing
 import os
 import traceback
 
+import torch
 import torch.distributed as dist
 
 from npa_envs.errors import NPAError
@@ -38,6 +39,8 @@ def on_ranks(count, function, folder):
 
 
 def _run(rank, count, function, store, pipe):
+    # A fork has none of its parent's threads of OpenMP, and would wait for them.
+    torch.set_num_threads(1)
     os.environ["GLOO_SOCKET_IFNAME"] = "lo"
     try:
         dist.init_process_group(

@@ -130,6 +130,11 @@ class TrainConfig(Generic[TaskConfigT]):
     one world from each of B equal sections of the pool, so it holds young and old worlds. (0, 0):
     fresh seeds come by `seed_interval` instead."""
 
+    second_lives: float = 0.0
+    """Share of the worlds whose time is over that are damaged, once, and live as long again, instead
+    of a fresh seed (dimensionless). So a rule learns what comes of a damage long after it. Needs
+    `lifetimes` and `damage`."""
+
     ageing_steps: int = 0
     """Steps that worlds of the longer-lived half of the pool's places are run without gradients,
     every `ageing_interval` iterations, so that they grow old under the rule as it is. So many once
@@ -146,14 +151,15 @@ class TrainConfig(Generic[TaskConfigT]):
     `lifetimes`."""
 
     rest_age: int = 512
-    """Steps from the seed after which a world is grown."""
+    """Steps from the seed, or from the damage before a second life, after which a world is grown."""
 
     damage: bool = True
     """Worlds from the pool are damaged before the rollout, so that the rule learns to heal."""
 
     damage_share: float = 1.0
-    """Share of the pool's places whose worlds are damaged: the first places, which with `lifetimes`
-    are those of the shortest lives. All other worlds are never damaged."""
+    """Share of the pool's places whose worlds are damaged in every batch: the first places, which
+    with `lifetimes` are those of the shortest lives. All others are damaged by `second_lives`
+    alone."""
 
     runaway_limit: float = 10.0
     """A world with |x| or |s| above this, or not finite, is replaced by a seed in the pool."""
@@ -200,10 +206,12 @@ class TrainConfig(Generic[TaskConfigT]):
         check_non_negative(
             self, "weight_decay", "fresh_share", "average", "rest_weight", "fate_rate"
         )
+        check_non_negative(self, "second_lives")
         if self.average >= 1.0:
             raise NPAError(f"average must be below 1, got {self.average}: try 0.999")
-        if self.fresh_share > 1.0:
-            raise NPAError(f"fresh_share must be at most 1, got {self.fresh_share}: try 0.5")
+        for name in ("fresh_share", "second_lives"):
+            if getattr(self, name) > 1.0:
+                raise NPAError(f"{name} must be at most 1, got {getattr(self, name)}: try 0.5")
         interval = self.picture_interval
         if not is_whole(interval) or interval < 0:
             raise NPAError(
@@ -273,12 +281,17 @@ class TrainConfig(Generic[TaskConfigT]):
                 f"{self.pool_size} and {self.world_count}: set "
                 f"pool_size={self.pool_size // self.world_count * self.world_count}"
             )
-        for name in ("ageing_steps", "rest_weight"):
+        for name in ("ageing_steps", "rest_weight", "second_lives"):
             if getattr(self, name) > 0 and not self.ages:
                 raise NPAError(
                     f"{name} needs worlds that have lifetimes, got {getattr(self, name)} without: "
                     "set lifetimes, for example to (256, 32768)"
                 )
+        if self.second_lives > 0.0 and not self.damage:
+            raise NPAError(
+                f"second_lives needs damage, got {self.second_lives} with damage=False: a world that "
+                "lives again is damaged first"
+            )
 
     def _check_variants(self) -> None:
         check_positive(self, int, "variants")

@@ -31,7 +31,7 @@ from npa_envs.training.pool import WorldPool
 from npa_envs.training.randomness import RunRandomness, registered, restart
 from npa_envs.training.ranks import Ranks
 from npa_envs.world.cuda_graph import Replayed
-from npa_envs.world.randomness import Randomness, WorldRandom
+from npa_envs.world.randomness import Randomness, WorldRandom, uniform_draws
 
 
 class TrainingCycle:
@@ -240,8 +240,16 @@ class TrainingCycle:
         restart(worlds, self.random.masks)
         self._index.copy_(self.pool.sample(len(self._index), worlds))
         x0, s0, goal = self.pool.read(self._index)
+        hit = self._places_hurt()
+        if config.ages:
+            age, over = self.pool.ages_of(self._index)
+            self._age.copy_(age.masked_fill(over, 0))
+            self.batch.grown.copy_((self._age >= config.rest_age) & ~hit)
+        if config.second_lives > 0.0:
+            again = over & (uniform_draws(worlds, (len(over), 1), x0)[:, 0] < config.second_lives)
+            over, hit = over & ~again, hit | again
         if config.damage:
-            x0, s0, goal = self._damaged(x0, s0, goal)
+            x0, s0, goal = self._damaged(x0, s0, goal, hit)
         # Drawn in every iteration, needed or not: nobody on the host knows which worlds run away.
         fresh_x, fresh_s, fresh_goal = self._seeds(len(self._index), worlds)
         self._fresh_x.copy_(fresh_x)
@@ -249,32 +257,27 @@ class TrainingCycle:
         if self._fresh_goal is not None and fresh_goal is not None:
             self._fresh_goal.copy_(fresh_goal)
         if config.ages:
-            age, over = self.pool.ages_of(self._index)
             x0, s0 = (
                 torch.where(over[:, None, None], fresh, old)
                 for fresh, old in ((fresh_x, x0), (fresh_s, s0))
             )
             if goal is not None and fresh_goal is not None:
                 goal = torch.where(over, fresh_goal, goal)
-            self._age.copy_(age.masked_fill(over, 0))
-            grown = (self._age >= config.rest_age) & ~self._places_hurt()
-            self.batch.grown.copy_(grown)
         self.batch.x0.copy_(x0)
         self.batch.s0.copy_(s0)
         if goal is not None:
             self.batch.aim(goal)
 
     def _damaged(
-        self, x: Tensor, s: Tensor, goal: Tensor | None
+        self, x: Tensor, s: Tensor, goal: Tensor | None, hit: Tensor
     ) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Return worlds of the pool damaged, where they are in places of damaged ones."""
+        """Return worlds of the pool damaged, those that are hit, bool, shape [B]."""
         worlds, whole = self.random.worlds, (x, s, goal)
         if isinstance(self.task, GoalTask) and goal is not None:
             x, s, goal = self.task.damage_with_goals(x, s, goal, worlds)
         else:
             x, s = self.task.damage(x, s, worlds)
         if self._config.damage_share < 1.0:
-            hit = self._places_hurt()
             x, s = (
                 torch.where(hit[:, None, None], hurt, old)
                 for hurt, old in ((x, whole[0]), (s, whole[1]))
@@ -284,7 +287,7 @@ class TrainingCycle:
         return x, s, goal
 
     def _places_hurt(self) -> Tensor:
-        """Return whether the batch's worlds come from places where all are damaged, shape [B]."""
+        """Return whether the batch's worlds come from places damaged each time, shape [B]."""
         share = self._config.damage_share if self._config.damage else 0.0
         return self._places[self._index] < share * self._config.pool_size
 

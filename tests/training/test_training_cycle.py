@@ -71,6 +71,7 @@ def runaway():
             clouds_cycle,
             {"steps": (2, 4), "pool_size": 16, "lifetimes": (2, 6), "damage_share": 0.5},
         ),
+        (tiny_cycle, {"lifetimes": (4, 40), "damage_share": 0.5, "second_lives": 0.5}),
         (circle_cycle, AGEING | {"pool_size": 6}),
         (world_cycle, {"damage_share": 0.5}),
         (world_cycle, AGEING | {"average": 0.9}),

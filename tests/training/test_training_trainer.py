@@ -239,6 +239,38 @@ def test_worlds_in_the_first_places_are_damaged_and_the_others_never(tmp_path):
     assert [share for share in shares if share <= 0.7] == [0.0] * 6
 
 
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_worlds_whose_time_is_over_are_damaged_once_and_live_again(tmp_path, share):
+    drawn = []
+
+    def rollout(rule, x, s, steps, **options):
+        cycle = trainer._cycle
+        places, ages = cycle._index.tolist(), cycle._age.tolist()
+        same = zip(x, cycle.pool.x[places], s, cycle.pool.s[places], strict=True)
+        changed = [(torch.equal(a, b), not torch.equal(c, d)) for a, b, c, d in same]
+        kept, hurt = zip(*changed, strict=True)
+        drawn.extend(zip(places, ages, kept, hurt, strict=True))
+        return plain_rollout(rule, x, s, steps, **options)
+
+    fields = {"iterations": 150, "pool_size": 16, "world_count": 4, "lifetimes": (8, 32)}
+    fields |= {"damage_share": 1e-6, "milestones": [], "steps": (4, 5), "second_lives": share}
+    config = circle_config(tmp_path, **fields)
+    trainer = trainer_of(config, WatchedTask(), rollout=rollout)
+    trainer.run(progress=False)
+    seen, begun = set(), []
+    for place, age, kept, hurt in drawn:
+        if age == 0 and place in seen:
+            begun.append((kept, hurt))
+        elif place > 0:  # the first place is damaged each time
+            assert not hurt
+        seen.add(place)
+    again = [hurt for kept, hurt in begun if kept]
+    assert len(begun) > 80
+    assert len(again) == pytest.approx(share * len(begun), abs=0.15 * len(begun) * (share % 1 > 0))
+    # 12 particles, each blanked with probability 0.2: 7 % of the damaged worlds have none.
+    assert sum(again) >= 0.8 * len(again)
+
+
 def test_an_iteration_follows_a_share_of_the_schedule_and_the_mean_is_what_is_kept(tmp_path):
     config = circle_config(tmp_path, schedule="cosine", average=0.9, log_interval=1)
     trainer = trainer_of(config)
