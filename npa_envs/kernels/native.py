@@ -18,6 +18,7 @@ BOTH_DEVICES = ("access.cuh", "mathematics.cuh")
 
 CUDA_ONLY = (
     "cuda/sort.cuh",
+    "cuda/splat.cuh",
     "cuda/density.cuh",
     "cuda/tiles.cuh",
     "cuda/perceive.cuh",

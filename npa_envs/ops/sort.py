@@ -204,7 +204,7 @@ def sort_worlds(
 
     What is left out is empty: states without `s`, everything about rows without `with_rows`.
     """
-    capacity = _block_capacity(plan, x, s, mask)
+    capacity = 0 if _earlier(plan) > LARGEST_MASK else block_capacity(plan.request, x, s, mask)
     if capacity:
         return _sort_by_blocks(plan, capacity, x, s, mask, with_rows)
     if plan.runs("sort") == "world" and _earlier(plan) <= LARGEST_THREAD_MASK:
@@ -281,12 +281,18 @@ def _empty_worlds(plan: Plan, x: Tensor, s: Tensor | None, with_rows: bool) -> l
     return [*integers, sorted_positions, row_positions, sorted_states]
 
 
-def _block_capacity(plan: Plan, *tensors: Tensor | None) -> int:
-    """Return how many particles a block that sorts these worlds has room for, 0 if none does."""
+def block_capacity(request: Request, *tensors: Tensor | None) -> int:
+    """Return how many particles a block that sorts such worlds has room for, 0 if none does."""
     aligned = not any(tensor is not None and tensor.data_ptr() % 16 for tensor in tensors)
-    if plan.runs("sort", aligned=aligned) != "block" or _earlier(plan) > LARGEST_MASK:
+    if choose("sort", request._replace(aligned=aligned)).name != "block":
         return 0
-    return next(size for size in sorted(BLOCKS) if size >= plan.particle_count)
+    return next(size for size in sorted(BLOCKS) if size >= request.particle_count)
+
+
+def slice_count(device: torch.device, world_count: int, particle_count: int) -> int:
+    """Return into how many slices worlds are cut that would leave processors idle."""
+    idle = processor_count(device) // world_count
+    return max(min(idle, particle_count // SMALLEST_SLICE), 1)
 
 
 def _earlier(plan: Plan) -> int:
@@ -330,9 +336,7 @@ def _sort_by_blocks(
     """Sort small worlds in one launch."""
     ordered = _empty_worlds(plan, x, s, with_rows)
     starts = torch.empty(plan.start_count, dtype=torch.int32, device=x.device)
-    # Worlds that leave processors idle are cut into slices.
-    idle = processor_count(x.device) // plan.world_count
-    slices = max(min(idle, plan.particle_count // SMALLEST_SLICE), 1)
+    slices = slice_count(x.device, plan.world_count, plan.particle_count)
     block = BLOCKS[capacity]
     launch(
         sort_small_worlds(plan.space_dim, capacity),

@@ -156,8 +156,12 @@ def _warm_pictures(x: torch.Tensor) -> None:
     colours = x.new_zeros(1, x.shape[1], 3)
     picture = splat(x, colours, resolution=8, pixel_size=0.1)
     _pull_back(picture)
-    middle = x.new_zeros(2)
-    picture_losses(x.detach(), colours, picture.detach()[0], goal=middle, shift=0.0, pixel_size=0.1)
+    target, middle = picture.detach()[0], x.new_zeros(2)
+    # Small, middling and large worlds have kernels of their own.
+    for particle_count in (x.shape[1], 4096, 4097):
+        places = x.detach()[:, :1].expand(-1, particle_count, -1)
+        states = colours[:, :1].expand(-1, particle_count, -1)
+        picture_losses(places, states, target, goal=middle, shift=0.0, pixel_size=0.1)
 
 
 def _warm_observation(x: torch.Tensor, s: torch.Tensor) -> None:

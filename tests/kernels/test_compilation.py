@@ -17,6 +17,7 @@ from npa_envs.kernels.cuda.network import (
 )
 from npa_envs.kernels.cuda.perceive import listed_perception
 from npa_envs.kernels.cuda.sort import BLOCKS, order_particles, sort_small_worlds
+from npa_envs.kernels.cuda.splat import sort_small_splats
 from npa_envs.kernels.cuda.tiles import tiled_density
 from npa_envs.kernels.pictures.blending import block_kernels
 from npa_envs.kernels.portable.episodes import judge_worlds
@@ -74,6 +75,7 @@ def cuda_engine():
         yield listed_adjoint(space_dim, 16, True, False, False).unscale_cotangents
         yield order_particles(space_dim, 16)
         yield sort_small_worlds(space_dim, max(BLOCKS))
+    yield sort_small_splats(max(BLOCKS))
     yield tiled_density(True, 256, False)
     yield listed_perception(
         2, 16, 4, True, "smooth", True, False, 256, False, teams=2, by_place=True, tiled=True

@@ -18,7 +18,7 @@ def sorted_twice(monkeypatch):
         plan = make_plan(x, x.shape, s.shape[2], row_capacity, mask is not None, 0.1, box)
         given = (plan, x, s if with_states else None, mask)
         found = sort_worlds(*given, with_rows=with_rows)
-        monkeypatch.setattr(cells, "_block_capacity", lambda *worlds: 0)
+        monkeypatch.setattr(cells, "block_capacity", lambda *worlds: 0)
         return found, sort_worlds(*given, with_rows=with_rows)
 
     return sort

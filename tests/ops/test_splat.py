@@ -9,6 +9,7 @@ from npa_envs import reference as oracle
 from npa_envs.kernels.pictures.splat import make_lens
 from npa_envs.ops import periodic_splat, splat
 from npa_envs.ops.launch import launch, scalar_type
+from npa_envs.ops.pictures import splat as pictures
 from npa_envs.ops.pictures.splat import (
     Splats,
     device_kernels,
@@ -108,6 +109,35 @@ def test_gathered_and_scattered_pictures_are_the_same(resolution, pixel_size, de
         picture.view(-1, 4),
     )
     torch.testing.assert_close(picture, expected, rtol=1e-12, atol=1e-13)
+
+
+@pytest.mark.parametrize("goal", [None, (0.1, -0.2)], ids=["as they lie", "moved"])
+@pytest.mark.parametrize(
+    ("world_count", "particle_count"),
+    [(1, 1), (3, 300), (150, 129), (2, 1024), (2, 1500), (5, 4096)],
+)
+def test_splats_of_small_worlds_are_sorted_as_others_are(
+    world_count, particle_count, goal, device, monkeypatch
+):
+    """On CUDA a block sorts a small world by itself; elsewhere the two are the same kernels."""
+    x, states = scattered(world_count, particle_count, torch.float32, device)
+    x[0, : particle_count // 4] = 0.25
+    x[-1, 0, 1] = 1e30
+    if goal is None:
+        x[-1, 0, 0] = torch.nan
+    lens = make_lens(scalar_type(x.dtype), 24, 0.11, 1.0, -1.0, 1.0)
+    splats = Splats(x, states, 0.5, None if goal is None else torch.tensor(goal, device=device))
+    found = sort_splats(splats, lens)
+    monkeypatch.setattr(pictures, "block_capacity", lambda *worlds: 0)
+    starts, footprints, source = sort_splats(splats, lens)
+    assert torch.equal(found[0], starts)
+    # What nobody sees lies in any order at each world's end.
+    hidden = starts[lens.cell_count - 1 :: lens.cell_count]
+    for world, begin in enumerate(hidden.tolist()):
+        seen = slice(world * particle_count, begin)
+        assert torch.equal(found[1][seen], footprints[seen])
+        assert torch.equal(found[2][seen], source[seen])
+    assert torch.equal(found[2].sort()[0].cpu(), torch.arange(x.shape[0] * x.shape[1]).int())
 
 
 def test_hidden_particles_have_no_gradient(device):

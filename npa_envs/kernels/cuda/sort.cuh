@@ -115,12 +115,14 @@ __device__ inline wp::vec_t<2, int> span_of_slice(unsigned long long address, in
     );
 }
 
+// In the cell `unordered` provisional places are final.
 template <int CAPACITY, int BLOCK, int GRID>
-__device__ inline wp::vec_t<3, int> ranked_at(unsigned long long address, int place)
+__device__ inline wp::vec_t<3, int> ranked_at(unsigned long long address, int place, int unordered)
 {
     auto& memory = memory_at<CAPACITY, BLOCK, GRID>(address);
     const int entry = memory.members[place];
     const int cell = memory.cells[entry >> 1];
+    if (cell == unordered) return wp::vec_t<3, int>(place, cell, -1);
     const int start = memory.starts[cell];
     const int end = memory.starts[cell + 1] & 0xffff;
     int ranked = start & 0xffff;

@@ -7,6 +7,7 @@ slice.
 """
 
 import functools
+from types import SimpleNamespace
 
 import warp as wp
 
@@ -49,22 +50,9 @@ def count_active(mask: wp.array(dtype=wp.uint8), count: wp.int32) -> wp.int32:
 
 
 @functools.cache
-def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
-    """Return the kernel that sorts worlds of float32 and of up to `capacity` particles."""
-    scalar = wp.float32
-    block = BLOCKS[capacity]
-    turns = capacity // block
-    types = domain_types(space_dim, scalar)
-    vector, Domain = types.vector, types.Domain
-    cell_of, cell_index = types.cell_of, types.cell_index
-    share = wp.types.vector(STATE_SHARE, scalar)
-    positions_ahead = wp.types.matrix((turns, space_dim), scalar)
-    flags_ahead = wp.types.vector(turns, wp.int32)
-    load_vector = make_wide_load(vector, scalar)
-    read_channels = make_read_channels(share, scalar)
-    store_vector = make_wide_store(vector, scalar)
-    store_share = make_wide_store(share, scalar)
-    sizes = capacity, block, LARGEST_GRID
+def block_functions(capacity: int) -> SimpleNamespace:
+    """Return what kernels do whose blocks each sort a world of up to `capacity` particles."""
+    sizes = capacity, BLOCKS[capacity], LARGEST_GRID
 
     @native.func_native(*sizes)
     def block_memory() -> wp.uint64:
@@ -95,12 +83,54 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
         """Provisional places, from and up to, of all that may belong into a slice of places."""
 
     @native.func_native(*sizes)
-    def ranked_at(address: wp.uint64, place: wp.int32) -> wp.vec3i:
-        """Final place, cell and row (-1: none) of the particle at a provisional place."""
+    def ranked_at(address: wp.uint64, place: wp.int32, unordered: wp.int32) -> wp.vec3i:
+        """Final place, cell and row (-1: none) of the particle at a provisional place.
+
+        In the cell `unordered` (-1: none) provisional places are final.
+        """
 
     @native.func_native(*sizes)
     def member_at(address: wp.uint64, place: wp.int32) -> wp.int32:
         """Number of the particle at a provisional place."""
+
+    return SimpleNamespace(
+        block_memory=block_memory,
+        clear_counts=clear_counts,
+        arrive=arrive,
+        add_up_counts=add_up_counts,
+        start_of=start_of,
+        place_arrived=place_arrived,
+        span_of_slice=span_of_slice,
+        ranked_at=ranked_at,
+        member_at=member_at,
+    )
+
+
+@functools.cache
+def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
+    """Return the kernel that sorts worlds of float32 and of up to `capacity` particles."""
+    scalar = wp.float32
+    block = BLOCKS[capacity]
+    turns = capacity // block
+    types = domain_types(space_dim, scalar)
+    vector, Domain = types.vector, types.Domain
+    cell_of, cell_index = types.cell_of, types.cell_index
+    share = wp.types.vector(STATE_SHARE, scalar)
+    positions_ahead = wp.types.matrix((turns, space_dim), scalar)
+    flags_ahead = wp.types.vector(turns, wp.int32)
+    load_vector = make_wide_load(vector, scalar)
+    read_channels = make_read_channels(share, scalar)
+    store_vector = make_wide_store(vector, scalar)
+    store_share = make_wide_store(share, scalar)
+    memory_of = block_functions(capacity)
+    block_memory, clear_counts, arrive = (
+        memory_of.block_memory,
+        memory_of.clear_counts,
+        memory_of.arrive,
+    )
+    add_up_counts, start_of = memory_of.add_up_counts, memory_of.start_of
+    place_arrived, span_of_slice = memory_of.place_arrived, memory_of.span_of_slice
+    ranked_at, member_at = memory_of.ranked_at, memory_of.member_at
 
     @wp.func
     def write_starts(
@@ -227,7 +257,7 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
                 if sorted_states.shape[0] > 0:
                     first = part * wp.static(STATE_SHARE)
                     state = read_channels(states, state_dim, aligned, i, first)
-                ranked = ranked_at(memory, k)
+                ranked = ranked_at(memory, k, wp.int32(-1))
                 inside = ranked[0] >= begin and ranked[0] < end
                 place = first_particle + ranked[0]
                 if inside and sorted_states.shape[0] > 0:

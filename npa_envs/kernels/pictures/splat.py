@@ -6,8 +6,9 @@ or not. They are products of a row's weight and a column's.
 
 On CUDA a few threads gather a tile of pixels. Particles are sorted by the tile that their patch's
 centre lies in, counted from r pixels before the picture: all that cover the tiles of a row of cells
-are then one contiguous run. On the CPU a thread draws a whole world, particle by particle. Either
-way a pixel's sum has an order that depends on its own world alone.
+are then one contiguous run. Small worlds are sorted by `kernels/cuda/splat.py`. On the CPU a thread
+draws a whole world, particle by particle. Either way a pixel's sum has an order that depends on its
+own world alone.
 """
 
 import functools
@@ -124,23 +125,11 @@ def group_count(resolution: int) -> int:
 
 
 @functools.cache
-def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
-    """Return the kernels of one scalar type; `lanes` threads share a tile, or a particle."""
+def splat_functions(scalar: type) -> SimpleNamespace:
+    """Return what several kernels share: where particles are drawn, and their footprints."""
     types = splat_types(scalar)
     Lens, vector, colour_type = types.Lens, types.vector, types.colour
-    footprint_type, pulls_type = types.footprint, types.pulls
-    columns_type, rows_type = types.columns, types.rows
-    weights_type, tile_type = types.weights, types.tile
-    group_tiles = GROUP_WIDTH * GROUP_HEIGHT
-    share = TILE_WIDTH * TILE_HEIGHT // lanes
-    module = native.module(f"npa_envs.kernels.splat_{scalar_name(scalar)}_l{lanes}")
-    load_footprint = make_wide_load(footprint_type, scalar)
-    store_footprint = make_wide_store(footprint_type, scalar)
-    load_colour = make_wide_load(colour_type, scalar)
-    store_colour = make_wide_store(colour_type, scalar)
-    group_sum = make_warp_sum(wp.vec2d)
-    share_out = make_lane_scatter(tile_type, scalar, lanes)
-    lane_sum = make_lane_sum(pulls_type, scalar, lanes)
+    footprint_type = types.footprint
     fast_exp2 = make_fast_exp2(scalar)
 
     @wp.func
@@ -157,14 +146,13 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         lens: Lens,
         position: vector,
         centred: wp.int32,
-        means: wp.array(dtype=vector),
+        mean: vector,
         goal: wp.array(dtype=vector),
-        world: wp.int32,
     ):
         """Place of a particle in pixels, its world's mean moved to the goal where asked for."""
         moved = position
         if centred != 0:
-            moved = (position - means[world]) + goal[0]
+            moved = (position - mean) + goal[0]
         return vector(
             (moved[0] - lens.low) * lens.pixels_per_length,
             (moved[1] - lens.low) * lens.pixels_per_length,
@@ -221,6 +209,55 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
     def footprint_colours(footprint: footprint_type):
         return colour_type(footprint[4], footprint[5], footprint[6], footprint[7])
 
+    return SimpleNamespace(
+        patch_weight=patch_weight,
+        pixel_place=pixel_place,
+        patch_centre=patch_centre,
+        visible=visible,
+        cell_of_centre=cell_of_centre,
+        footprint_of=footprint_of,
+        footprint_colours=footprint_colours,
+    )
+
+
+@functools.cache
+def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
+    """Return the kernels of one scalar type; `lanes` threads share a tile, or a particle."""
+    types = splat_types(scalar)
+    Lens, vector, colour_type = types.Lens, types.vector, types.colour
+    footprint_type, pulls_type = types.footprint, types.pulls
+    columns_type, rows_type = types.columns, types.rows
+    weights_type, tile_type = types.weights, types.tile
+    group_tiles = GROUP_WIDTH * GROUP_HEIGHT
+    share = TILE_WIDTH * TILE_HEIGHT // lanes
+    module = native.module(f"npa_envs.kernels.splat_{scalar_name(scalar)}_l{lanes}")
+    load_footprint = make_wide_load(footprint_type, scalar)
+    store_footprint = make_wide_store(footprint_type, scalar)
+    load_colour = make_wide_load(colour_type, scalar)
+    store_colour = make_wide_store(colour_type, scalar)
+    group_sum = make_warp_sum(wp.vec2d)
+    share_out = make_lane_scatter(tile_type, scalar, lanes)
+    lane_sum = make_lane_sum(pulls_type, scalar, lanes)
+    functions = splat_functions(scalar)
+    patch_weight, footprint_colours = functions.patch_weight, functions.footprint_colours
+    patch_centre, visible = functions.patch_centre, functions.visible
+    cell_of_centre, footprint_of = functions.cell_of_centre, functions.footprint_of
+    pixel_place = functions.pixel_place
+
+    @wp.func
+    def place_in_world(
+        lens: Lens,
+        position: vector,
+        centred: wp.int32,
+        means: wp.array(dtype=vector),
+        goal: wp.array(dtype=vector),
+        world: wp.int32,
+    ):
+        mean = vector()
+        if centred != 0:
+            mean = means[world]
+        return pixel_place(lens, position, centred, mean, goal)
+
     @wp.func
     def growth(difference: scalar):
         size = wp.abs(difference)
@@ -251,7 +288,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         await_earlier()
         i = wp.tid()
         world = i / particle_count
-        place = pixel_place(lens, positions[i], centred, means, goal, world)
+        place = place_in_world(lens, positions[i], centred, means, goal, world)
         index = world * lens.cell_count + cell_of_centre(lens, patch_centre(place))
         cell[i] = index
         arrival[i] = wp.atomic_add(counts, index + 1, 1)
@@ -292,7 +329,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         i = arrived[k]
         c = cell[i]
         world = i / particle_count
-        place = pixel_place(lens, positions[i], centred, means, goal, world)
+        place = place_in_world(lens, positions[i], centred, means, goal, world)
         footprint = footprint_of(lens, place, i, states, shift)
         begin = starts[c]
         target = k
@@ -436,7 +473,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         """Draw a whole world, particle after particle; for devices of few threads."""
         world = range_start + wp.tid()
         for i in range(world * particle_count, (world + 1) * particle_count):
-            place = pixel_place(lens, positions[i], centred, means, goal, world)
+            place = place_in_world(lens, positions[i], centred, means, goal, world)
             footprint = footprint_of(lens, place, i, states, shift)
             footprints[i] = footprint
             source[i] = i

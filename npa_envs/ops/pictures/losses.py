@@ -10,7 +10,7 @@ from torch import Tensor
 from npa_envs.errors import NPAError
 from npa_envs.kernels.pictures.splat import CHANNELS, group_count, make_lens
 from npa_envs.ops.launch import launch, scalar_type
-from npa_envs.ops.mean import average_sums, world_mean
+from npa_envs.ops.mean import average_sums
 from npa_envs.ops.opaque import opaque
 from npa_envs.ops.pictures.splat import (
     Splats,
@@ -28,7 +28,6 @@ from npa_envs.ops.pictures.splat import (
 def _picture_losses(
     x: Tensor,
     states: Tensor,
-    means: Tensor,
     goal: Tensor,
     target: Tensor,
     shift: float,
@@ -39,7 +38,7 @@ def _picture_losses(
 ) -> Tensor:
     world_count, device, scalar = x.shape[0], x.device, scalar_type(x.dtype)
     lens = make_lens(scalar, target.shape[0], pixel_size, sigma, low, high)
-    splats = Splats(x, states, shift, means, goal)
+    splats = Splats(x, states, shift, goal)
     group_total = group_count(lens.resolution) if device.type == "cuda" else lens.resolution
     partial_sums = x.new_empty(world_count, group_total, 2, dtype=torch.float64)
     if device.type == "cuda":
@@ -111,7 +110,6 @@ def picture_losses(
     losses = _picture_losses(
         x.contiguous(),
         states.contiguous(),
-        world_mean(x),
         goal.contiguous(),
         target,
         shift,

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError, shown
+from npa_envs.kernels.cuda.sort import BLOCKS
+from npa_envs.kernels.cuda.splat import sort_small_splats
 from npa_envs.kernels.pictures.splat import (
     CHANNELS,
     FOOTPRINT,
@@ -20,6 +22,7 @@ from npa_envs.kernels.pictures.splat import (
     make_lens,
     splat_kernels,
 )
+from npa_envs.ops.backend import Request
 from npa_envs.ops.checks import (
     LARGEST_SIDE,
     check_world,
@@ -29,8 +32,9 @@ from npa_envs.ops.checks import (
     checked_side,
 )
 from npa_envs.ops.launch import launch, scalar_type
+from npa_envs.ops.mean import world_mean
 from npa_envs.ops.opaque import once_differentiable, opaque
-from npa_envs.ops.sort import LARGEST_INDEX
+from npa_envs.ops.sort import LARGEST_INDEX, block_capacity, slice_count
 
 LARGEST_SPOT = 1e6
 """Pixels of a spot's standard deviation at most, and of one over it."""
@@ -45,25 +49,23 @@ class Splats(NamedTuple):
     """States, dimensionless, shape [B, N, C]."""
     shift: float = 0.0
     """What is added to the states to give colours, dimensionless."""
-    means: Tensor | None = None
-    """Where there are, each world's mean [length units], shape [B, 2], is moved to `goal`."""
     goal: Tensor | None = None
-    """A position [length units], shape [2]."""
+    """Where each world's mean is moved to, if anywhere [length units], shape [2]."""
 
     @property
     def total(self) -> int:
         """Particles of all worlds, B N."""
         return self.x.shape[0] * self.x.shape[1]
 
-    def places(self) -> tuple[Any, ...]:
-        """Arguments of the kernels that say where particles lie."""
-        goal = None if self.goal is None else self.goal.view(1, 2)
-        return int(self.means is not None), self.means, goal
-
     def contents(self) -> tuple[Any, ...]:
-        """Arguments of the kernels that write footprints."""
-        states = self.states.view(self.total, -1)
-        return self.x.shape[1], self.x.view(-1, 2), states, self.shift, *self.places()
+        """Arguments of kernels: particles of a world, positions, states, shift."""
+        return self.x.shape[1], self.x.view(-1, 2), self.states.view(self.total, -1), self.shift
+
+    def places(self) -> tuple[Any, ...]:
+        """Arguments of kernels that say where particles are drawn: whether moved, means, goal."""
+        if self.goal is None:
+            return 0, None, None
+        return 1, world_mean(self.x), self.goal.view(1, 2)
 
 
 def splat_lanes(device: torch.device) -> int:
@@ -99,20 +101,42 @@ def _check_size(largest: int, world_count: int, lens: Any) -> None:
 def sort_splats(splats: Splats, lens: Any) -> tuple[Tensor, Tensor, Tensor]:
     """Return starts of the cells [B cells + 1], sorted footprints [B N, 8], their sources [B N]."""
     x, total = splats.x, splats.total
-    kernels = device_kernels(x)
-    cell_total = x.shape[0] * lens.cell_count
-    _check_size(max(cell_total, x.numel()), x.shape[0], lens)
-    cell, arrival, arrived, source = torch.empty(
-        4, total, dtype=torch.int32, device=x.device
-    ).unbind()
+    world_count, particle_count, _ = x.shape
+    cell_total = world_count * lens.cell_count
+    _check_size(max(cell_total, x.numel()), world_count, lens)
+    footprints = x.new_empty(total, FOOTPRINT)
+    source = torch.empty(total, dtype=torch.int32, device=x.device)
+    request = Request(x.device, x.dtype, particle_count, lens.cell_count, 2)
+    capacity = block_capacity(request, x)
+    if capacity:
+        starts = source.new_empty(cell_total + 1)
+        slices = slice_count(x.device, world_count, particle_count)
+        goal = None if splats.goal is None else splats.goal.view(1, 2)
+        block = BLOCKS[capacity]
+        launch(
+            sort_small_splats(capacity),
+            world_count * slices * block,
+            x.device,
+            lens,
+            slices,
+            *splats.contents(),
+            int(goal is not None),
+            goal,
+            starts,
+            footprints,
+            source,
+            block_dim=block,
+        )
+        return starts, footprints, source
+    kernels, contents, places = device_kernels(x), splats.contents(), splats.places()
+    cell, arrival, arrived = torch.empty(3, total, dtype=torch.int32, device=x.device).unbind()
     counts = torch.zeros(cell_total + 1, dtype=torch.int32, device=x.device)
-    places = (x.shape[1], x.view(-1, 2), *splats.places())
-    launch(kernels.count_splats, total, x.device, lens, *places, cell, arrival, counts)
+    counted = (cell, arrival, counts)
+    launch(kernels.count_splats, total, x.device, lens, *contents[:2], *places, *counted)
     starts = torch.cumsum(counts, 0, dtype=torch.int32)
     launch(kernels.place_splats, total, x.device, cell, arrival, starts, arrived)
-    footprints = x.new_empty(total, FOOTPRINT)
     sorted_splats = (cell, arrived, starts, footprints, source)
-    launch(kernels.order_splats, total, x.device, lens, *splats.contents(), *sorted_splats)
+    launch(kernels.order_splats, total, x.device, lens, *contents, *places, *sorted_splats)
     return starts, footprints, source
 
 
@@ -123,7 +147,7 @@ def scatter_splats(splats: Splats, lens: Any) -> tuple[Tensor, Tensor, Tensor]:
     footprints = x.new_empty(total, FOOTPRINT)
     source = torch.empty(total, dtype=torch.int32, device=x.device)
     scratch = x.new_empty(x.shape[0], min(2 * lens.radius + 1, lens.resolution))
-    drawn = (*splats.contents(), scratch, picture, footprints, source)
+    drawn = (*splats.contents(), *splats.places(), scratch, picture, footprints, source)
     launch(device_kernels(x).scatter_splats, x.shape[0], x.device, lens, *drawn)
     return picture, footprints, source
 

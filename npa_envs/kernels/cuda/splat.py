@@ -1,0 +1,112 @@
+"""Splats of small worlds on CUDA: a block sorts a world's, in one launch in place of seven.
+
+The same footprints in the same order as those of `pictures/splat.py`. The block finds its world's
+mean, too. Where worlds are few, several blocks sort the same world, and each writes a slice.
+"""
+
+import functools
+
+import warp as wp
+
+from npa_envs.kernels import native
+from npa_envs.kernels.access import (
+    await_earlier,
+    block_number,
+    make_wide_load,
+    make_wide_store,
+    meet_block,
+    thread_of_block,
+)
+from npa_envs.kernels.cuda.sort import BLOCKS, RESIDENT_THREADS, block_functions, store_integer
+from npa_envs.kernels.pictures.splat import splat_functions, splat_types
+from npa_envs.kernels.portable.mean import CHUNK
+
+
+@functools.cache
+def sort_small_splats(capacity: int) -> wp.Kernel:
+    """Return the kernel that sorts splats of float32, of worlds of up to `capacity` particles."""
+    scalar = wp.float32
+    block = BLOCKS[capacity]
+    types, functions = splat_types(scalar), splat_functions(scalar)
+    Lens, vector, footprint_type = types.Lens, types.vector, types.footprint
+    pixel_place, patch_centre = functions.pixel_place, functions.patch_centre
+    cell_of_centre, footprint_of = functions.cell_of_centre, functions.footprint_of
+    load_vector = make_wide_load(vector, scalar)
+    store_footprint = make_wide_store(footprint_type, scalar)
+    memory_of = block_functions(capacity)
+    block_memory, clear_counts, arrive = (
+        memory_of.block_memory,
+        memory_of.clear_counts,
+        memory_of.arrive,
+    )
+    add_up_counts, start_of = memory_of.add_up_counts, memory_of.start_of
+    place_arrived, span_of_slice = memory_of.place_arrived, memory_of.span_of_slice
+    ranked_at, member_at = memory_of.ranked_at, memory_of.member_at
+
+    @native.func_native(capacity, CHUNK)
+    def mean_of_world(
+        positions: wp.array(dtype=vector), first: wp.int32, count: wp.int32
+    ) -> vector:
+        """Mean of a world's positions, which the whole block asks for."""
+
+    @wp.kernel(
+        enable_backward=False,
+        launch_bounds=(block, RESIDENT_THREADS // block),
+        module=native.module(f"npa_envs.kernels.small_splats_{capacity}"),
+    )
+    def sort_splats(
+        lens: Lens,
+        slice_count: wp.int32,
+        particle_count: wp.int32,
+        positions: wp.array(dtype=vector),
+        states: wp.array(dtype=scalar, ndim=2),
+        shift: scalar,
+        centred: wp.int32,
+        goal: wp.array(dtype=vector),
+        # outputs
+        starts: wp.array(dtype=wp.int32),
+        footprints: wp.array(dtype=footprint_type),
+        source: wp.array(dtype=wp.int32),
+    ):
+        """Sort every world's splats by cell, then index; write one slice of them."""
+        await_earlier()
+        world = block_number() / slice_count
+        slice_number = block_number() - world * slice_count
+        lane = thread_of_block()
+        first_particle = world * particle_count
+        mean = vector()
+        if centred != 0:
+            mean = mean_of_world(positions, first_particle, particle_count)
+        memory = block_memory()
+        clear_counts(memory, lens.cell_count, wp.int32(0))
+        for i in range(lane, particle_count, wp.static(block)):
+            position = load_vector(positions, first_particle + i)
+            place = pixel_place(lens, position, centred, mean, goal)
+            arrive(memory, i, cell_of_centre(lens, patch_centre(place)), False)
+        add_up_counts(memory, lens.cell_count)
+        first_cell = world * lens.cell_count
+        stride = slice_count * wp.static(block)
+        for cell in range(slice_number * wp.static(block) + lane, lens.cell_count, stride):
+            store_integer(starts, first_cell + cell, first_particle + start_of(memory, cell)[0])
+        if lane == 0 and first_particle + particle_count == positions.shape[0]:
+            starts[starts.shape[0] - 1] = positions.shape[0]
+        for i in range(lane, particle_count, wp.static(block)):
+            place_arrived(memory, i)
+        meet_block()
+
+        share = (particle_count + slice_count - 1) / slice_count
+        begin = slice_number * share
+        end = wp.min(begin + share, particle_count)
+        if begin < end:
+            span = span_of_slice(memory, begin, end)
+            for k in range(span[0] + lane, span[1], wp.static(block)):
+                # What nobody sees may lie in any order: there can be many of them.
+                target = ranked_at(memory, k, lens.cell_count - 1)[0]
+                if target >= begin and target < end:
+                    i = first_particle + member_at(memory, k)
+                    place = pixel_place(lens, load_vector(positions, i), centred, mean, goal)
+                    target += first_particle
+                    store_footprint(footprints, target, footprint_of(lens, place, i, states, shift))
+                    store_integer(source, target, i)
+
+    return sort_splats
