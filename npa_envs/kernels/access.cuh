@@ -167,6 +167,41 @@ CUDA_CALLABLE inline Share lane_scatter(Value value)
     return result;
 }
 
+// Share: a lane's share of the columns of a matrix of ROWS rows. Of the lanes' shares in a lane's
+// matrix the k-th is that of the lane whose number differs in the bits of k: so no lane has to look
+// for what it gives.
+template <typename Share, typename Part, int ROWS, int WIDTH, int LANES, typename Value>
+CUDA_CALLABLE inline Share lane_collect(Value value)
+{
+    constexpr int SHARE = WIDTH / LANES;
+    Share result;
+    Part* own = reinterpret_cast<Part*>(&result);
+    const Part* sums = reinterpret_cast<const Part*>(&value);
+    #pragma unroll
+    for (int i = 0; i < ROWS * SHARE; ++i) {
+        const Part* shares = sums + i / SHARE * WIDTH + i % SHARE;
+        own[i] = shares[0];
+#if defined(__CUDA_ARCH__)
+        #pragma unroll
+        for (int k = 1; k < LANES; ++k) {
+            own[i] += __shfl_xor_sync(lane_mask<LANES>(), shares[k * SHARE], k);
+        }
+#endif
+    }
+    return result;
+}
+
+// A number that is kept in a register: the compiler would compute it anew in every turn of a loop.
+CUDA_CALLABLE inline float kept(float value)
+{
+#if defined(__CUDA_ARCH__)
+    asm volatile("" : "+f"(value));
+#endif
+    return value;
+}
+
+CUDA_CALLABLE inline double kept(double value) { return value; }
+
 template <typename Value> CUDA_CALLABLE inline Value warp_sum(Value value)
 {
     return lane_sum<double, 32, true, 1>(value);

@@ -25,6 +25,7 @@ CUDA_ONLY = (
     "cuda/adjoint.cuh",
     "cuda/network.cuh",
     "pictures/blending.cuh",
+    "pictures/errors.cuh",
 )
 """The other files; what a file uses of another one stands before it."""
 

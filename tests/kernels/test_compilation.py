@@ -20,6 +20,7 @@ from npa_envs.kernels.cuda.sort import BLOCKS, order_particles, sort_small_world
 from npa_envs.kernels.cuda.splat import sort_small_splats
 from npa_envs.kernels.cuda.tiles import tiled_density
 from npa_envs.kernels.pictures.blending import block_kernels
+from npa_envs.kernels.pictures.errors import gather_errors
 from npa_envs.kernels.portable.episodes import judge_worlds
 from npa_envs.ops import warmup
 from npa_envs.ops.launch import launched
@@ -35,6 +36,7 @@ VARIANTS: dict[str, Callable[[], Any]] = {
     "network": lambda: two_layer_kernel(4, 2, "note"),
     "network's gradients": lambda: weight_gradient_kernels(4, 8, 2, 4, 1, 4).add_shares,
     "pictures": lambda: block_kernels(wp.float32).pull_back_blocks,
+    "errors of pictures": lambda: gather_errors(wp.float64),
 }
 
 
@@ -76,6 +78,7 @@ def cuda_engine():
         yield order_particles(space_dim, 16)
         yield sort_small_worlds(space_dim, max(BLOCKS))
     yield sort_small_splats(max(BLOCKS))
+    yield gather_errors(wp.float32)
     yield tiled_density(True, 256, False)
     yield listed_perception(
         2, 16, 4, True, "smooth", True, False, 256, False, teams=2, by_place=True, tiled=True

@@ -19,10 +19,24 @@ def function_of(text, name):
     return re.search(head + r"(?:\{[^\n]*\}\n|\{\n.*?\n\}\n)", text, re.S)[0]
 
 
-def test_tiles_find_all_neighbours_of_all_particles(tmp_path):
+def told_by(source, *folders):
+    """What a program of this folder says, which must end well."""
     compiler = shutil.which("g++")
     if compiler is None:
         pytest.skip("needs g++")
+    program = folders[0] / "program"
+    options = ["-std=c++20", "-O2", "-w", *(f"-I{folder}" for folder in (HERE, *folders))]
+    subprocess.run([compiler, *options, "-o", str(program), str(HERE / source)], check=True)
+    told = subprocess.run([str(program)], capture_output=True, text=True, timeout=120)
+    assert told.returncode == 0, told.stdout
+    return told.stdout
+
+
+def test_tiles_of_pictures_are_ranked_by_their_candidates(tmp_path):
+    assert told_by("ranks_on_cpu.cpp", tmp_path, KERNELS / "pictures") == "0 wrong\n"
+
+
+def test_tiles_find_all_neighbours_of_all_particles(tmp_path):
     tiles, mathematics, access = (
         (KERNELS / name).read_text() for name in ("cuda/tiles.cuh", "mathematics.cuh", "access.cuh")
     )
@@ -33,9 +47,4 @@ def test_tiles_find_all_neighbours_of_all_particles(tmp_path):
     needed.append(function_of(access, "sum_up_to"))
     head = "namespace npa {\n" + "\n".join(needed) + "}\nusing std::fmaf;\n"
     (tmp_path / "native.h").write_text(head + tiles)
-    program = tmp_path / "tiles"
-    options = ["-std=c++20", "-O2", "-w", f"-I{HERE}", f"-I{tmp_path}", "-o", str(program)]
-    subprocess.run([compiler, *options, str(HERE / "tiles_on_cpu.cpp")], check=True)
-    told = subprocess.run([str(program)], capture_output=True, text=True, timeout=120)
-    assert told.returncode == 0, told.stdout
-    assert told.stdout == "704 worlds, 0 particles wrong\n"
+    assert told_by("tiles_on_cpu.cpp", tmp_path) == "704 worlds, 0 particles wrong\n"

@@ -18,6 +18,7 @@
 #define __shared__ static
 
 struct float2 { float x, y; };
+struct int4 { int x, y, z, w; };
 struct uint4 { unsigned x, y, z, w; };
 struct Thread { unsigned x; };
 
@@ -99,6 +100,7 @@ template <typename T> T of_lane(T value, unsigned lane)
 }  // namespace warp
 
 inline void __syncwarp() { warp::meet(); }
+inline void __syncthreads() { warp::meet(); }  // of a block of one warp
 template <typename T> T __shfl_sync(unsigned, T value, int lane, int width = 32)
 {
     return warp::of_lane(value, threadIdx.x / width * width + lane % width);

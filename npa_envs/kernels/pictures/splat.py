@@ -1,14 +1,15 @@
-"""Pictures of 2D worlds, every particle a small Gaussian, and their errors against a target.
+"""Pictures of 2D worlds, every particle a small Gaussian.
 
 A particle at pixel p covers the patch of pixels q with |q - round(p)| <= r in both directions; its
 weights exp(-|q - p|^2 / 2 sigma^2) are normalised to sum 1 over the patch, be it inside the picture
 or not. They are products of a row's weight and a column's.
 
-On CUDA a few threads gather a tile of pixels. Particles are sorted by the tile that their patch's
-centre lies in, counted from r pixels before the picture: all that cover the tiles of a row of cells
-are then one contiguous run. Small worlds are sorted by `kernels/cuda/splat.py`. On the CPU a thread
-draws a whole world, particle by particle. Either way a pixel's sum has an order that depends on its
-own world alone.
+On CUDA a few threads gather a tile of pixels: each sums every so-manyth particle around all of it,
+and gets a row of the sums. Particles are sorted by the tile that their patch's centre lies in,
+counted from r pixels before the picture: all that cover the tiles of a row of cells are then one
+contiguous run. Small worlds are sorted by `kernels/cuda/splat.py`. On the CPU a thread draws a
+whole world, particle by particle. Either way a pixel's sum has an order that depends on its own
+world alone.
 """
 
 import functools
@@ -21,9 +22,10 @@ import warp as wp
 from npa_envs.kernels import native
 from npa_envs.kernels.access import (
     await_earlier,
-    make_lane_scatter,
+    load_integer,
+    make_kept,
+    make_lane_collect,
     make_lane_sum,
-    make_warp_sum,
     make_wide_load,
     make_wide_store,
 )
@@ -34,14 +36,20 @@ from npa_envs.kernels.mathematics import make_fast_exp2
 CHANNELS = 4
 """Red, green, blue and density."""
 
-TILE_WIDTH, TILE_HEIGHT = 4, 2
+TILE_WIDTH, TILE_HEIGHT = 4, 4
 """Pixels of a tile, which a few CUDA threads gather; also of a cell, which particles lie in."""
 
 TILE_LANES = 4
 """CUDA threads that share a tile's candidates, and a particle's cotangents; one on the CPU."""
 
+RUNS = 3
+"""Runs of particles, of a row of cells each, that are gathered as one."""
+
+CUDA_REGISTERS = 128
+"""Registers of a thread that gathers float32: all sums of a tile stay in them."""
+
 GROUP_WIDTH, GROUP_HEIGHT = 4, 2
-"""Tiles of a group: with their lanes they make up a warp, which adds up its errors."""
+"""Tiles of a group of a picture: with their lanes they make up a warp."""
 
 FOOTPRINT = 8
 """Entries of a footprint: the way from its place to the patch's centre and that centre, in pixels
@@ -116,6 +124,11 @@ def make_lens(
     # One more, for the particles that no pixel sees.
     lens.cell_count = lens.cell_columns * (lens.tile_rows - 1 + lens.cells_down) + 1
     return lens
+
+
+def gather_registers(scalar: type) -> int | None:
+    """Return how many registers of CUDA a thread that gathers has, None: as many as it likes."""
+    return CUDA_REGISTERS if scalar == wp.float32 else None
 
 
 def group_count(resolution: int) -> int:
@@ -221,13 +234,104 @@ def splat_functions(scalar: type) -> SimpleNamespace:
 
 
 @functools.cache
+def gather_functions(scalar: type, lanes: int) -> SimpleNamespace:
+    """Return what gathers pixels; one thread has a tile, or as many `lanes` as rows share it."""
+    assert lanes in (1, TILE_HEIGHT)
+    types, functions = splat_types(scalar), splat_functions(scalar)
+    Lens, footprint_type, tile_type = types.Lens, types.footprint, types.tile
+    columns_type, rows_type, weights_type = types.columns, types.rows, types.weights
+    patch_weight, footprint_colours = functions.patch_weight, functions.footprint_colours
+    runs_type = wp.types.vector(RUNS, wp.int32)
+    load_footprint = make_wide_load(footprint_type, scalar)
+    kept = make_kept(scalar)
+    collect = make_lane_collect(tile_type, scalar, lanes)
+
+    @wp.func
+    def candidate_count(
+        lens: Lens,
+        world: wp.int32,
+        tile_row: wp.int32,
+        tile_column: wp.int32,
+        starts: wp.array(dtype=wp.int32),
+    ):
+        """Particles in the cells around a tile."""
+        first = world * lens.cell_count + tile_row * lens.cell_columns + tile_column
+        total = wp.int32(0)
+        for _row in range(lens.cells_down):
+            total += load_integer(starts, first + lens.cells_across) - load_integer(starts, first)
+            first += lens.cell_columns
+        return total
+
+    @wp.func
+    def gather_tile(
+        lens: Lens,
+        world: wp.int32,
+        tile_row: wp.int32,
+        tile_column: wp.int32,
+        lane: wp.int32,
+        starts: wp.array(dtype=wp.int32),
+        footprints: wp.array(dtype=footprint_type),
+    ):
+        """Return a lane's share of a tile's pixels, each the weighted sum over its particles."""
+        across = columns_type()
+        for c in range(wp.static(TILE_WIDTH)):
+            across[c] = kept(scalar(tile_column * wp.static(TILE_WIDTH) + c))
+        # Each lane begins with its own row.
+        down = rows_type()
+        for r in range(wp.static(TILE_HEIGHT)):
+            down[r] = kept(scalar(tile_row * wp.static(TILE_HEIGHT) + (r ^ lane)))
+        reach = scalar(lens.radius) + scalar(0.5)
+        totals = tile_type()
+        base = world * lens.cell_count + tile_row * lens.cell_columns + tile_column
+        for first_row in range(0, lens.cells_down, wp.static(RUNS)):
+            # Lanes take turns along several runs as if they were one: few wait for the others.
+            shifts = runs_type()
+            ends = runs_type()
+            total = wp.int32(0)
+            for k in range(wp.static(RUNS)):
+                begin = wp.int32(0)
+                end = wp.int32(0)
+                if first_row + k < lens.cells_down:
+                    first = base + (first_row + k) * lens.cell_columns
+                    begin = load_integer(starts, first)
+                    end = load_integer(starts, first + lens.cells_across)
+                shifts[k] = begin - total
+                total += end - begin
+                ends[k] = total
+            for i in range(lane, total, wp.static(lanes)):
+                shift = shifts[0]
+                for k in range(wp.static(RUNS - 1)):
+                    shift = wp.where(i < ends[k], shift, shifts[k + 1])
+                footprint = load_footprint(footprints, i + shift)
+                slope_x = scalar(-2.0) * lens.falloff * footprint[0]
+                slope_y = scalar(-2.0) * lens.falloff * footprint[1]
+                columns = columns_type()
+                for c in range(wp.static(TILE_WIDTH)):
+                    offset = across[c] - footprint[2]
+                    weight = patch_weight(lens.falloff, slope_x, offset)
+                    columns[c] = wp.where(wp.abs(offset) < reach, weight, scalar(0.0))
+                rows = rows_type()
+                for r in range(wp.static(TILE_HEIGHT)):
+                    offset = down[r] - footprint[3]
+                    weight = patch_weight(lens.falloff, slope_y, offset)
+                    rows[r] = wp.where(wp.abs(offset) < reach, weight, scalar(0.0))
+                weights = weights_type()
+                for k in range(wp.static(TILE_WIDTH * TILE_HEIGHT)):
+                    weights[k] = (
+                        rows[k / wp.static(TILE_WIDTH)] * columns[k % wp.static(TILE_WIDTH)]
+                    )
+                totals += wp.outer(footprint_colours(footprint), weights)
+        return collect(totals)
+
+    return SimpleNamespace(candidate_count=candidate_count, gather_tile=gather_tile)
+
+
+@functools.cache
 def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
     """Return the kernels of one scalar type; `lanes` threads share a tile, or a particle."""
     types = splat_types(scalar)
     Lens, vector, colour_type = types.Lens, types.vector, types.colour
     footprint_type, pulls_type = types.footprint, types.pulls
-    columns_type, rows_type = types.columns, types.rows
-    weights_type, tile_type = types.weights, types.tile
     group_tiles = GROUP_WIDTH * GROUP_HEIGHT
     share = TILE_WIDTH * TILE_HEIGHT // lanes
     module = native.module(f"npa_envs.kernels.splat_{scalar_name(scalar)}_l{lanes}")
@@ -235,14 +339,13 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
     store_footprint = make_wide_store(footprint_type, scalar)
     load_colour = make_wide_load(colour_type, scalar)
     store_colour = make_wide_store(colour_type, scalar)
-    group_sum = make_warp_sum(wp.vec2d)
-    share_out = make_lane_scatter(tile_type, scalar, lanes)
     lane_sum = make_lane_sum(pulls_type, scalar, lanes)
     functions = splat_functions(scalar)
     patch_weight, footprint_colours = functions.patch_weight, functions.footprint_colours
     patch_centre, visible = functions.patch_centre, functions.visible
     cell_of_centre, footprint_of = functions.cell_of_centre, functions.footprint_of
     pixel_place = functions.pixel_place
+    gather_tile = gather_functions(scalar, lanes).gather_tile
 
     @wp.func
     def place_in_world(
@@ -257,19 +360,6 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         if centred != 0:
             mean = means[world]
         return pixel_place(lens, position, centred, mean, goal)
-
-    @wp.func
-    def growth(difference: scalar):
-        size = wp.abs(difference)
-        return size + size * size
-
-    @wp.func
-    def pixel_errors(value: colour_type, target: colour_type):
-        """Density error and weighted colour error of a pixel."""
-        density = growth(value[3] - target[3])
-        colour = growth(value[0] - target[0]) + growth(value[1] - target[1])
-        colour = (colour + growth(value[2] - target[2])) / scalar(3.0) * wp.exp(-density)
-        return wp.vec2d(wp.float64(density), wp.float64(colour))
 
     @wp.kernel(enable_backward=False, module=module)
     def count_splats(
@@ -343,49 +433,8 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         source[target] = i
 
     @wp.func
-    def gather_tile(
-        lens: Lens,
-        world: wp.int32,
-        tile_row: wp.int32,
-        tile_column: wp.int32,
-        lane: wp.int32,
-        starts: wp.array(dtype=wp.int32),
-        footprints: wp.array(dtype=footprint_type),
-    ):
-        """Return a lane's share of a tile's pixels, each the weighted sum over its particles."""
-        x = scalar(tile_column * wp.static(TILE_WIDTH))
-        y = scalar(tile_row * wp.static(TILE_HEIGHT))
-        reach = scalar(lens.radius) + scalar(0.5)
-        totals = tile_type()
-        base = world * lens.cell_count + tile_row * lens.cell_columns + tile_column
-        for cell_row in range(lens.cells_down):
-            first = base + cell_row * lens.cell_columns
-            end = starts[first + lens.cells_across]
-            for j in range(starts[first] + lane, end, wp.static(lanes)):
-                footprint = load_footprint(footprints, j)
-                slope_x = scalar(-2.0) * lens.falloff * footprint[0]
-                slope_y = scalar(-2.0) * lens.falloff * footprint[1]
-                columns = columns_type()
-                for c in range(wp.static(TILE_WIDTH)):
-                    offset = (x - footprint[2]) + scalar(c)
-                    weight = patch_weight(lens.falloff, slope_x, offset)
-                    columns[c] = wp.where(wp.abs(offset) < reach, weight, scalar(0.0))
-                rows = rows_type()
-                for r in range(wp.static(TILE_HEIGHT)):
-                    offset = (y - footprint[3]) + scalar(r)
-                    weight = patch_weight(lens.falloff, slope_y, offset)
-                    rows[r] = wp.where(wp.abs(offset) < reach, weight, scalar(0.0))
-                weights = weights_type()
-                for k in range(wp.static(TILE_WIDTH * TILE_HEIGHT)):
-                    weights[k] = (
-                        rows[k / wp.static(TILE_WIDTH)] * columns[k % wp.static(TILE_WIDTH)]
-                    )
-                totals += wp.outer(footprint_colours(footprint), weights)
-        return share_out(totals)
-
-    @wp.func
     def tile_of(lens: Lens, t: wp.int32):
-        """World, group in the picture, row and column of tiles, and lane of a thread."""
+        """World, row and column of tiles, and lane of a thread."""
         across = (lens.tile_columns + wp.static(GROUP_WIDTH - 1)) / wp.static(GROUP_WIDTH)
         down = (lens.tile_rows + wp.static(GROUP_HEIGHT - 1)) / wp.static(GROUP_HEIGHT)
         tile = t / wp.static(lanes)
@@ -395,7 +444,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         group -= world * across * down
         row = group / across * wp.static(GROUP_HEIGHT) + tile / wp.static(GROUP_WIDTH)
         column = group % across * wp.static(GROUP_WIDTH) + tile % wp.static(GROUP_WIDTH)
-        return world, group, row, column, t % wp.static(lanes)
+        return world, row, column, t % wp.static(lanes)
 
     @wp.func
     def pixel_of(lens: Lens, tile_row: wp.int32, tile_column: wp.int32, k: wp.int32):
@@ -407,7 +456,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
             pixel = wp.int32(-1)
         return pixel
 
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(enable_backward=False, module=module, cuda_max_registers=gather_registers(scalar))
     def gather_splats(
         lens: Lens,
         starts: wp.array(dtype=wp.int32),
@@ -416,7 +465,7 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         picture: wp.array(dtype=colour_type),
     ):
         """Write each pixel of the pictures."""
-        world, _group, row, column, lane = tile_of(lens, wp.tid())
+        world, row, column, lane = tile_of(lens, wp.tid())
         if row < lens.tile_rows and column < lens.tile_columns:
             values = gather_tile(lens, world, row, column, lane, starts, footprints)
             begin = world * lens.resolution * lens.resolution
@@ -425,31 +474,6 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
                 if pixel >= 0:
                     value = colour_type(values[0, k], values[1, k], values[2, k], values[3, k])
                     store_colour(picture, begin + pixel, value)
-
-    @wp.kernel(enable_backward=False, module=module)
-    def gather_errors(
-        lens: Lens,
-        starts: wp.array(dtype=wp.int32),
-        footprints: wp.array(dtype=footprint_type),
-        target: wp.array(dtype=colour_type),
-        # outputs
-        partial_sums: wp.array(dtype=wp.vec2d, ndim=2),
-    ):
-        """Write the sums of both errors over each group of tiles; no picture is written."""
-        await_earlier()
-        t = wp.tid()
-        world, group, row, column, lane = tile_of(lens, t)
-        sums = wp.vec2d()
-        if row < lens.tile_rows and column < lens.tile_columns:
-            values = gather_tile(lens, world, row, column, lane, starts, footprints)
-            for k in range(wp.static(share)):
-                pixel = pixel_of(lens, row, column, lane * wp.static(share) + k)
-                if pixel >= 0:
-                    value = colour_type(values[0, k], values[1, k], values[2, k], values[3, k])
-                    sums += pixel_errors(value, load_colour(target, pixel))
-        sums = group_sum(sums)
-        if t % wp.static(group_tiles * lanes) == 0:
-            partial_sums[world, group] = sums
 
     @in_ranges(WORLDS)
     @wp.kernel(enable_backward=False, module=module)
@@ -494,20 +518,6 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
                     for q in range(left, right):
                         drawn = picture[world, p, q]
                         picture[world, p, q] = drawn + scratch[world, q - left] * along
-
-    @wp.kernel(enable_backward=False, module=module)
-    def sum_errors(
-        picture: wp.array(dtype=colour_type, ndim=3),
-        target: wp.array(dtype=colour_type, ndim=2),
-        # outputs
-        partial_sums: wp.array(dtype=wp.vec2d, ndim=2),
-    ):
-        """Write the sums of both errors over each row of the pictures."""
-        world, row = wp.tid()
-        sums = wp.vec2d()
-        for column in range(picture.shape[2]):
-            sums += pixel_errors(picture[world, row, column], target[row, column])
-        partial_sums[world, row] = sums
 
     @in_ranges(PAIRS)
     @wp.kernel(enable_backward=False, module=module)
@@ -585,8 +595,6 @@ def splat_kernels(scalar: type, lanes: int) -> SimpleNamespace:
         place_splats=place_splats,
         order_splats=order_splats,
         gather_splats=gather_splats,
-        gather_errors=gather_errors,
         scatter_splats=scatter_splats,
-        sum_errors=sum_errors,
         pull_back_splats=pull_back_splats,
     )

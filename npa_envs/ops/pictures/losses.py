@@ -8,7 +8,10 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.kernels.pictures.splat import CHANNELS, group_count, make_lens
+from npa_envs.kernels.access import CUDA_BLOCK
+from npa_envs.kernels.pictures.errors import BLOCK_TILES, TURN_TILES, gather_errors, sum_errors
+from npa_envs.kernels.pictures.splat import CHANNELS, make_lens
+from npa_envs.ops.backend import processor_count
 from npa_envs.ops.launch import launch, scalar_type
 from npa_envs.ops.mean import average_sums
 from npa_envs.ops.opaque import opaque
@@ -17,11 +20,12 @@ from npa_envs.ops.pictures.splat import (
     aligned,
     check_particles,
     checked_window,
-    device_kernels,
-    gather_threads,
     scatter_splats,
     sort_splats,
 )
+
+BLOCKS_OF_PROCESSOR = 4
+"""Blocks that gather errors side by side on a processor."""
 
 
 @opaque("npa::picture_losses")
@@ -39,21 +43,29 @@ def _picture_losses(
     world_count, device, scalar = x.shape[0], x.device, scalar_type(x.dtype)
     lens = make_lens(scalar, target.shape[0], pixel_size, sigma, low, high)
     splats = Splats(x, states, shift, goal)
-    group_total = group_count(lens.resolution) if device.type == "cuda" else lens.resolution
-    partial_sums = x.new_empty(world_count, group_total, 2, dtype=torch.float64)
     if device.type == "cuda":
         starts, footprints, _ = sort_splats(splats, lens)
+        tile_total = lens.tile_columns * lens.tile_rows
+        partial_sums = x.new_empty(world_count, tile_total, 2, dtype=torch.float64)
+        tile_count = block_tiles(world_count * tile_total, processor_count(device))
+        threads = world_count * -(-tile_total // tile_count) * CUDA_BLOCK
         pixels = aligned(target).view(-1, CHANNELS)
-        threads = gather_threads(world_count, lens.resolution, device)
-        gathered = (starts, footprints, pixels, partial_sums)
-        launch(device_kernels(x).gather_errors, threads, device, lens, *gathered)
+        gathered = (tile_count, starts, footprints, pixels, partial_sums)
+        launch(gather_errors(scalar), threads, device, lens, *gathered)
     else:
         picture, *_ = scatter_splats(splats, lens)
-        rows = (world_count, group_total)
-        launch(
-            device_kernels(x).sum_errors, rows, device, picture, target.contiguous(), partial_sums
-        )
+        rows = (world_count, lens.resolution)
+        partial_sums = x.new_empty(*rows, 2, dtype=torch.float64)
+        launch(sum_errors(scalar), rows, device, picture, target.contiguous(), partial_sums)
     return average_sums(partial_sums, lens.resolution**2, x)
+
+
+def block_tiles(tile_total: int, processors: int) -> int:
+    """Return how many tiles a block serves: few where many would leave processors idle."""
+    tile_count = BLOCK_TILES
+    while tile_count > TURN_TILES and tile_total < BLOCKS_OF_PROCESSOR * processors * tile_count:
+        tile_count //= 2
+    return tile_count
 
 
 @_picture_losses.register_fake

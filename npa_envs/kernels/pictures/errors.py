@@ -1,0 +1,171 @@
+"""Errors of pictures of 2D worlds against a target.
+
+On CUDA no picture is written: a few threads gather a tile of pixels, compare it and go on to their
+next one. The tiles of a warp are served together, as long as the one with most particles around it
+takes, and many tiles of a picture have none. So a block first ranks its tiles by their particles.
+Which threads serve a tile changes none of its sums. On the CPU a drawn picture is compared.
+"""
+
+import functools
+
+import warp as wp
+
+from npa_envs.kernels import native
+from npa_envs.kernels.access import (
+    CUDA_BLOCK,
+    WARP,
+    await_earlier,
+    block_number,
+    make_lane_sum,
+    make_wide_load,
+    thread_of_block,
+)
+from npa_envs.kernels.domain import scalar_name
+from npa_envs.kernels.pictures.splat import (
+    CHANNELS,
+    TILE_HEIGHT,
+    TILE_LANES,
+    TILE_WIDTH,
+    gather_functions,
+    gather_registers,
+    splat_types,
+)
+
+BLOCK_TILES = CUDA_BLOCK
+"""Tiles of a block, at most: each thread counts the particles around one."""
+
+BLOCK_WARPS = CUDA_BLOCK // WARP
+"""Warps of a block."""
+
+WARP_TILES = WARP // TILE_LANES
+"""Tiles that a warp serves together."""
+
+TURN_TILES = WARP_TILES * BLOCK_WARPS
+"""Tiles that a block serves in a turn; it has one turn or several."""
+
+
+@functools.cache
+def make_pixel_errors(scalar: type) -> wp.Function:
+    """Return a Warp function for a pixel's density error, and three times its colour error."""
+    colour_type = splat_types(scalar).colour
+
+    @wp.func
+    def growth(difference: scalar):
+        size = wp.abs(difference)
+        return size + size * size
+
+    @wp.func
+    def pixel_errors(value: colour_type, target: colour_type):
+        density = growth(value[3] - target[3])
+        colour = growth(value[0] - target[0]) + growth(value[1] - target[1])
+        colour = (colour + growth(value[2] - target[2])) * wp.exp(-density)
+        return wp.vec2d(wp.float64(density), wp.float64(colour))
+
+    return pixel_errors
+
+
+@functools.cache
+def gather_errors(scalar: type) -> wp.Kernel:
+    """Return the kernel of one scalar type that gathers and compares; for CUDA."""
+    types = splat_types(scalar)
+    Lens, colour_type, footprint_type = types.Lens, types.colour, types.footprint
+    row_type = wp.types.matrix((CHANNELS, TILE_WIDTH), scalar)
+    gathering = gather_functions(scalar, TILE_LANES)
+    candidate_count, gather_tile = gathering.candidate_count, gathering.gather_tile
+    pixel_errors = make_pixel_errors(scalar)
+    load_colour = make_wide_load(colour_type, scalar)
+    lane_sum = make_lane_sum(wp.vec2d, wp.float64, TILE_LANES)
+
+    @native.func_native(BLOCK_TILES)
+    def rank_tiles(tile_count: wp.int32, candidates: wp.int32):
+        """Rank the first tiles of a block, each thread's own, by their candidates."""
+
+    @native.func_native(BLOCK_TILES)
+    def ranked_tile(rank: wp.int32) -> wp.vec2i:
+        """The tile of a rank and its candidates; -1 candidates where it has none to be."""
+
+    @wp.kernel(
+        enable_backward=False,
+        module=native.module(f"npa_envs.kernels.errors_{scalar_name(scalar)}"),
+        cuda_max_registers=gather_registers(scalar),
+        grid_stride=False,
+    )
+    def gather_errors(
+        lens: Lens,
+        tile_count: wp.int32,
+        starts: wp.array(dtype=wp.int32),
+        footprints: wp.array(dtype=footprint_type),
+        target: wp.array(dtype=colour_type),
+        # outputs
+        partial_sums: wp.array(dtype=wp.vec2d, ndim=2),
+    ):
+        """Write the sums of both errors over each tile; a block serves so many tiles."""
+        await_earlier()
+        # Neighbouring tiles are of different blocks, so that all blocks of a world do as much.
+        tiles = lens.tile_columns * lens.tile_rows
+        stride = (tiles + tile_count - 1) / tile_count
+        world = block_number() / stride
+        first = block_number() - world * stride
+        own = first + thread_of_block() * stride
+        candidates = wp.int32(-1)
+        if own < tiles and thread_of_block() < tile_count:
+            row = own / lens.tile_columns
+            candidates = candidate_count(lens, world, row, own - row * lens.tile_columns, starts)
+        rank_tiles(tile_count, candidates)
+        lane = thread_of_block() % wp.static(TILE_LANES)
+        warp = thread_of_block() / wp.static(WARP)
+        place = thread_of_block() % wp.static(WARP) / wp.static(TILE_LANES)
+        for turn in range(tile_count / wp.static(TURN_TILES)):
+            # There and back, so that all warps do as much.
+            batch = turn * wp.static(BLOCK_WARPS) + warp
+            if turn % 2 == 1:
+                batch += wp.static(BLOCK_WARPS - 1) - 2 * warp
+            ranked = ranked_tile(batch * wp.static(WARP_TILES) + place)
+            tile = first + ranked[0] * stride
+            row = wp.int32(wp.uint32(tile) / wp.uint32(lens.tile_columns))
+            column = tile - row * lens.tile_columns
+            values = row_type()
+            if ranked[1] > 0:
+                values = gather_tile(lens, world, row, column, lane, starts, footprints)
+            # A lane has a row of the tile.
+            row = row * wp.static(TILE_HEIGHT) + lane
+            column *= wp.static(TILE_WIDTH)
+            inside = wp.where(row < lens.resolution, lens.resolution - column, wp.int32(0))
+            pixel = row * lens.resolution + column
+            sums = wp.vec2d()
+            for k in range(wp.static(TILE_WIDTH)):
+                if k < inside:
+                    value = colour_type(values[0, k], values[1, k], values[2, k], values[3, k])
+                    sums += pixel_errors(value, load_colour(target, pixel + k))
+            sums = lane_sum(sums)
+            if lane == 0 and ranked[1] >= 0:
+                third = wp.float64(1.0) / wp.float64(3.0)
+                partial_sums[world, tile] = wp.vec2d(sums[0], third * sums[1])
+
+    return gather_errors
+
+
+@functools.cache
+def sum_errors(scalar: type) -> wp.Kernel:
+    """Return the kernel of one scalar type that compares drawn pictures; for the CPU."""
+    colour_type = splat_types(scalar).colour
+    pixel_errors = make_pixel_errors(scalar)
+
+    @wp.kernel(
+        enable_backward=False,
+        module=native.module(f"npa_envs.kernels.drawn_errors_{scalar_name(scalar)}"),
+    )
+    def sum_errors(
+        picture: wp.array(dtype=colour_type, ndim=3),
+        target: wp.array(dtype=colour_type, ndim=2),
+        # outputs
+        partial_sums: wp.array(dtype=wp.vec2d, ndim=2),
+    ):
+        """Write the sums of both errors over each row of the pictures."""
+        world, row = wp.tid()
+        sums = wp.vec2d()
+        for column in range(picture.shape[2]):
+            sums += pixel_errors(picture[world, row, column], target[row, column])
+        partial_sums[world, row] = wp.vec2d(sums[0], sums[1] / wp.float64(3.0))
+
+    return sum_errors
