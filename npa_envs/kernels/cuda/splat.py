@@ -96,11 +96,16 @@ def sort_small_splats(capacity: int) -> wp.Kernel:
 
         share = (particle_count + slice_count - 1) / slice_count
         begin = slice_number * share
-        end = wp.min(begin + share, particle_count)
+        # What nobody sees may lie in any order, as there can be much of it, but that differs among
+        # the blocks of a world: the last one writes all of it.
+        hidden = start_of(memory, lens.cell_count - 1)[0]
+        end = wp.min(begin + share, hidden)
+        if slice_number == slice_count - 1:
+            begin = wp.min(begin, hidden)
+            end = particle_count
         if begin < end:
             span = span_of_slice(memory, begin, end)
             for k in range(span[0] + lane, span[1], wp.static(block)):
-                # What nobody sees may lie in any order: there can be many of them.
                 target = ranked_at(memory, k, lens.cell_count - 1)[0]
                 if target >= begin and target < end:
                     i = first_particle + member_at(memory, k)
