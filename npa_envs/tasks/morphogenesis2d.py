@@ -535,7 +535,7 @@ MORPHOGENESIS2D_PRESETS: Mapping[str, Morphogenesis2DTrainConfig] = {
             **_TOGETHER,
         ),
         repeats=1,
-        iterations=4000,
+        iterations=8000,
         pool_size=64,
         steps=(48, 80),
         learning_rate=2e-3,
