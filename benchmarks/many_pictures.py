@@ -70,7 +70,7 @@ STEP = PICTURE_CHECKPOINTS[1]
 """Steps after which rules are compared with each other."""
 
 TRAINED, HELD_OUT = 60, 20
-"""Pictures that `pictures` draws."""
+"""Pictures that `pictures` draws, where `--count` does not ask for more to train on."""
 
 
 def draw_pictures(arguments: argparse.Namespace) -> None:
@@ -79,7 +79,10 @@ def draw_pictures(arguments: argparse.Namespace) -> None:
     taken = random.Random(0).sample(list(emoji), 2 * DRAWN)
     left = [name for name in emoji if name not in taken]
     drawn = random.Random(1).sample(left, TRAINED + HELD_OUT)
-    folders = {"development": taken[:DRAWN], "train": drawn[:TRAINED], "held-out": drawn[TRAINED:]}
+    rest = [name for name in left if name not in drawn]
+    more = random.Random(3).sample(rest, max(0, arguments.count - TRAINED))
+    train, held_out = drawn[:TRAINED] + more, drawn[TRAINED:]
+    folders = {"development": taken[:DRAWN], "train": train, "held-out": held_out}
     for folder, names in folders.items():
         (arguments.out / folder).mkdir(parents=True, exist_ok=True)
         for name in names:
@@ -402,6 +405,7 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--targets", nargs="+", default=("gecko", "heart"))
     parser.add_argument("--held-out", nargs="+", default=())
+    parser.add_argument("--count", type=int, default=TRAINED, help="pictures that are drawn to train")
     parser.add_argument("--kinds", nargs="*", default=())
     parser.add_argument("--controls", type=int, default=12)
     parser.add_argument("--size", choices=("local", *SIZES), default="local")

@@ -339,7 +339,7 @@ def table(runs: Sequence[Mapping[str, Any]], size: str) -> str:
 def draw(runs: Sequence[Mapping[str, Any]]) -> bytes:
     """Return a PNG of the arms' mean losses against steps from the seed, a panel a size."""
     sizes = [size for size in SIZES if any(run["size"] == size for run in runs)]
-    figure, ((*panels,),) = new_figure(1, len(sizes), (5.6 * len(sizes), 7.3))
+    figure, ((*panels,),) = new_figure(1, len(sizes), (5.6 * len(sizes), 8.8))
     for size, panel in zip(sizes, panels, strict=True):
         own = [run for run in runs if run["size"] == size]
         for number, arm in enumerate(dict.fromkeys(run["arm"] for run in own)):
