@@ -188,6 +188,8 @@ class Run:
     """Mean return of the held-out episodes; NaN where it diverged."""
     curve: tuple[tuple[float, float], ...] = ()
     """Particle-steps, and the mean return of other held-out episodes after them."""
+    machine: str = ""
+    """Where it ran, in a row of several machines; empty: not told."""
 
 
 @dataclass(frozen=True)
@@ -199,6 +201,8 @@ class Row:
     runs: tuple[Run, ...]
     about: str = ""
     """What the method is, in a sentence."""
+    machine: str = ""
+    """Where it ran; several machines are set apart by semicolons."""
 
     def returns(self, env_id: str) -> NDArray[np.float64]:
         """Return the mean returns of its runs on a problem, in the order of their seeds."""
@@ -267,7 +271,8 @@ def read_row(path: Path) -> Row:
             f"{path.name} must follow {SCHEMA.name}, but at {error.json_path} {error.message}"
         ) from error
     runs = tuple(_read_run(run) for run in held["runs"])
-    row = Row(SUITES[held["benchmark"]], held["method"], runs, held.get("about", ""))
+    suite, told = SUITES[held["benchmark"]], held.get("about", "")
+    row = Row(suite, held["method"], runs, told, held["machine"])
     _check_row(row, path.name)
     return row
 
@@ -276,12 +281,20 @@ def _read_run(held: Mapping[str, Any]) -> Run:
     returns = [math.nan if value is None else float(value) for value in held["returns"]]
     mean = sum(returns) / len(returns) if returns else math.nan
     curve = tuple((at, value) for at, value in held["curve"] if value is not None)
-    return Run(held["id"], held["seed"], held["particle_steps"], mean, curve)
+    where = held.get("machine", "")
+    return Run(held["id"], held["seed"], held["particle_steps"], mean, curve, where)
 
 
 def _check_row(row: Row, name: str) -> None:
     """Check what a schema cannot say; raises NPAError."""
     entries = row.suite.entries
+    machines = row.machine.split("; ")
+    for run in row.runs:
+        if run.machine and run.machine not in machines:
+            raise NPAError(
+                f"{name} has a run on {shown(run.machine)} that its machine does not name, got "
+                f"{shown(row.machine)}: name it there, behind a semicolon"
+            )
     for env_id in dict.fromkeys(run.env_id for run in row.runs):
         if env_id not in entries:
             raise NPAError(

@@ -168,6 +168,8 @@ def test_a_run_that_failed_is_in_no_row_and_one_that_diverged_has_no_returns(tmp
         (lambda held: held["runs"].pop(), "from at least 5 seeds"),
         (lambda held: held["runs"][0].update(seed=1), "each once"),
         (lambda held: held["runs"][0].update(particle_steps=1e12), "at most"),
+        (lambda held: held["runs"][0].update(machine="abacus"), "its machine does not name"),
+        (lambda held: held["runs"][0].update(machine=""), r"\$.runs\[0\].machine"),
     ],
 )
 def test_a_row_that_breaks_a_rule_is_refused(tmp_path, change, words):
@@ -178,6 +180,16 @@ def test_a_row_that_breaks_a_rule_is_refused(tmp_path, change, words):
     path.write_text(json.dumps(held))
     with pytest.raises(NPAError, match=words):
         read_row(path)
+
+
+def test_runs_of_a_row_from_several_machines_say_where_they_ran(tmp_path):
+    made = plan_of(methods=("zero",))
+    (path,) = write_rows(SUITE, made, records(made), tmp_path, "it")
+    held = json.loads(path.read_text())
+    held["machine"] = "abacus; slide rule"
+    held["runs"][0]["machine"] = "slide rule"
+    path.write_text(json.dumps(held))
+    assert [run.machine for run in read_row(path).runs[:2]] == ["slide rule", ""]
 
 
 def test_a_row_of_another_suite_is_refused(tmp_path):
