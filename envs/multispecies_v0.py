@@ -94,6 +94,9 @@ class MultiSpeciesEnv(CrowdEnv):
     The splat loss is that of [`npa/Morphogenesis2D-v0`](Morphogenesis2D.md#reward). It moves a
     picture's middle onto the target's, so it does not count where the picture lies.
 
+    There is one reward for each species. Rewards of single particles (`reward="particle"` and
+    `"marginal"`), and `tell_updated`, are for environments of one species, and are refused here.
+
     With `reward="team"` every live agent gets the mean of all rewards; the parts in `info` stay its
     own. In an invasion rewards sum to zero: species 0 gains as much as the live invaders lose, in
     equal parts. There "team" is refused.

@@ -228,7 +228,10 @@ class Pictures2DEnv(NPAEnv):
 
     The T columns behind these tell of the target, the same in all rows: means over squares of
     pixels, G × G of red, then of green, of blue, and of density, rows from the bottom up
-    (dimensionless). Policies of `npa_envs.agents` leave them out.
+    (dimensionless). Policies of `npa_envs.agents` leave them out, and
+    `npa_envs.agents.learning.Problem` refuses `observe_target`, as rules read no target: so none of
+    its methods takes these columns. Learners that read whole observations do, such as
+    Stable-Baselines3's through [`ParticleVecEnv`](../integrations.md).
 
     ## Starting state
 
