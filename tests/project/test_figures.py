@@ -260,6 +260,24 @@ def test_what_shac_brought_in_npa_bench_and_the_gradient_in_gardens_is_told() ->
     assert f"gradient earns {a} a step" in gardens
     assert f"script earns {b}, and {c} in" in gardens
     assert f"it earns {d}, in the 32" in gardens
+    learned = [
+        f"{mean(bench_returns(rows / f'{method}.json', task)) / 32:.2f}".replace("-", "−")
+        for method in ("ppo_world", "sac")
+        for task in ("Gardener2D", "Shepherd2D")
+    ]
+    assert f"PPO earns {learned[0]} a step in the garden (script {b})" in gardens
+    assert f"and {learned[1]} with shepherds (script {d}), SAC {learned[2]} and" in gardens
+    assert f"SAC {learned[2]} and {learned[3]}. SAC's" in gardens
+
+
+def test_the_speeds_of_gardens_are_the_fastest_of_their_file() -> None:
+    page = (ROOT / "docs" / "gardening.md").read_text(encoding="utf-8")
+    best: dict[str, dict[int, float]] = {}
+    for row in (row for run in content(RESULTS / "gardens_speed_cpu.json")["runs"] for row in run):
+        speeds = best.setdefault(row["id"], {})
+        speeds[row["worlds"]] = max(speeds.get(row["worlds"], 0.0), row["steps_a_second"])
+    for env_id, speeds in best.items():
+        assert f"| `{env_id}` | {' | '.join(f'{n:.0f}' for n in speeds.values())} |" in page
 
 
 def test_rows_of_npa_bench_on_two_machines_are_told_and_agree() -> None:
