@@ -405,7 +405,9 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--targets", nargs="+", default=("gecko", "heart"))
     parser.add_argument("--held-out", nargs="+", default=())
-    parser.add_argument("--count", type=int, default=TRAINED, help="pictures that are drawn to train")
+    parser.add_argument(
+        "--count", type=int, default=TRAINED, help="pictures that are drawn to train"
+    )
     parser.add_argument("--kinds", nargs="*", default=())
     parser.add_argument("--controls", type=int, default=12)
     parser.add_argument("--size", choices=("local", *SIZES), default="local")

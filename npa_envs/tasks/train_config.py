@@ -131,9 +131,9 @@ class TrainConfig(Generic[TaskConfigT]):
     fresh seeds come by `seed_interval` instead."""
 
     second_lives: float = 0.0
-    """Share of the worlds whose time is over that are damaged, once, and live as long again; a fresh
-    seed takes the place of the others (dimensionless). So a rule learns what comes of a damage long
-    after it. Needs `lifetimes` and `damage`."""
+    """Share of the worlds whose time is over that are damaged, once, and live as long again; a
+    fresh seed takes the place of the others (dimensionless). So a rule learns what comes of a
+    damage long after it. Needs `lifetimes` and `damage`."""
 
     ageing_steps: int = 0
     """Steps that worlds of the longer-lived half of the pool's places are run without gradients,
@@ -289,8 +289,8 @@ class TrainConfig(Generic[TaskConfigT]):
                 )
         if self.second_lives > 0.0 and not self.damage:
             raise NPAError(
-                f"second_lives needs damage, got {self.second_lives} with damage=False: worlds that "
-                "live again are damaged first"
+                f"second_lives needs damage, got {self.second_lives} with damage=False: worlds "
+                "that live again are damaged first"
             )
 
     def _check_variants(self) -> None:
