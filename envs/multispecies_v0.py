@@ -37,7 +37,8 @@ class MultiSpeciesEnv(CrowdEnv):
 
     `npa/MixingSmall-v0`, `npa/SegregationSmall-v0`, `npa/CoMorphogenesisSmall-v0` and
     `npa/SymbiosisSmall-v0` are the same tasks in worlds of 64 particles and episodes of 32 steps;
-    `npa/InvasionSmall-v0` has 64 particles of species 0 and 32 invaders that the environment plays;
+    `npa/InvasionSmall-v0` has 64 particles of species 0 and 32 invaders that the environment plays.
+    `npa/MixingLarge-v0` and the like have 4096 particles and episodes of 256 steps, for a GPU.
     `npa_envs.registration.SPECIES_SIZES` holds their keywords. `parallel_env`, `env`, `raw_env` and
     `batched` take ids instead of tasks as well.
 

@@ -134,6 +134,18 @@ _SMALL_PICTURE_OF_SPECIES: Mapping[str, Any] = {
 }
 
 
+_LARGE_SPECIES: Mapping[str, Any] = {"particle_count": 4096, "max_cycles": 256}
+
+_LARGE_PICTURE_OF_SPECIES: Mapping[str, Any] = {**_LARGE_SPECIES, "resolution": 128}
+
+_LARGE_INVASION: Mapping[str, Any] = {
+    "particle_counts": (3072, 1024),
+    "max_cycles": 256,
+    "resolution": 128,
+    "opponent": "random",
+}
+
+
 def _form(name: str, size: str, steps: int, version: int = 0, **keywords: Any) -> Registration:
     """Return a form of one of `ENVIRONMENTS` with other keywords."""
     usual = next(row for row in ENVIRONMENTS if row.name == name)
@@ -234,6 +246,17 @@ SPECIES_SIZES = (
         MappingProxyType({**_SMALL_PICTURE_OF_SPECIES, "target": "flower"}),
     ),
     SpeciesRegistration("npa/InvasionSmall-v0", "invasion", MappingProxyType(_SMALL_INVASION)),
+    SpeciesRegistration("npa/MixingLarge-v0", "mixing", MappingProxyType(_LARGE_SPECIES)),
+    SpeciesRegistration("npa/SegregationLarge-v0", "segregation", MappingProxyType(_LARGE_SPECIES)),
+    SpeciesRegistration(
+        "npa/CoMorphogenesisLarge-v0",
+        "co_morphogenesis",
+        MappingProxyType(_LARGE_PICTURE_OF_SPECIES),
+    ),
+    SpeciesRegistration(
+        "npa/SymbiosisLarge-v0", "symbiosis", MappingProxyType(_LARGE_PICTURE_OF_SPECIES)
+    ),
+    SpeciesRegistration("npa/InvasionLarge-v0", "invasion", MappingProxyType(_LARGE_INVASION)),
 )
 """The same for tasks of several species. The opponent of an invasion is fixed."""
 

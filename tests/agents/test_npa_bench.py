@@ -202,7 +202,7 @@ def test_a_row_of_another_suite_is_refused(tmp_path):
 
 
 def test_the_small_suite_is_all_small_worlds_that_rules_act_in():
-    small = {row.id for row in SIZES if "Small" in row.id} | {row.id for row in SPECIES_SIZES}
+    small = {row.id for row in (*SIZES, *SPECIES_SIZES) if "Small" in row.id}
     # The yardstick is a gradient, and where one side pays for the other there is none.
     small.remove("npa/InvasionSmall-v0")
     assert set(SUITES["npa-bench-small-v0"].entries) == small

@@ -42,6 +42,14 @@ def quick(row):
     return {} if "Small" in row.id else {key: n for key, n in FEW.items() if hasattr(config, key)}
 
 
+def quick_species(row):
+    """The same for species."""
+    if "Small" in row.id:
+        return {}
+    shared = "particle_counts" in row.keywords
+    return {"particle_counts": (48, 16)} if shared else {"particle_count": FEW["particle_count"]}
+
+
 @every_form
 def test_an_id_is_the_environment_of_its_name_with_other_keywords(row):
     usual = row.id.replace("Small", "").replace("Large", "").replace("-v1", "-v0")
@@ -118,10 +126,13 @@ def test_ppo_is_above_random_zero_and_scripted_policies_in_a_small_world(method)
 
 @of_species
 def test_species_of_an_id_pass_the_checker_and_a_batch_equals_them(row):
-    parallel_api_test(multispecies_v0.parallel_env(row.id, max_cycles=4), num_cycles=6)
-    env = multispecies_v0.parallel_env(row.id)
-    envs = multispecies_v0.batched(row.id, world_count=2)
-    problem = Problem(env_id=row.id, episode_steps=row.keywords["max_cycles"])
+    few = quick_species(row)
+    parallel_api_test(multispecies_v0.parallel_env(row.id, max_cycles=4, **few), num_cycles=6)
+    env = multispecies_v0.parallel_env(row.id, **few)
+    envs = multispecies_v0.batched(row.id, world_count=2, **few)
+    steps = row.keywords["max_cycles"]
+    assert Problem(env_id=row.id, episode_steps=steps).config.max_cycles == steps
+    problem = Problem(env_id=row.id, keywords=few, episode_steps=steps)
     assert env.worlds.task.config == envs.config == problem.config
     (seen, _), (alone, _) = envs.reset(seed=3), env.reset(seed=4)
     random = np.random.default_rng(0)
