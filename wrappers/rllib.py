@@ -19,7 +19,7 @@ from npa_envs.registration import (
     SPECIES_SIZES,
     register_environments,
 )
-from npa_envs.wrappers.base import AnyVectorEnv
+from npa_envs.wrappers.base import AnyVectorEnv, vector_env
 from npa_envs.wrappers.particle_rows import ParticleRows
 
 try:
@@ -165,7 +165,7 @@ def rllib_rows_config(
     rows = checked_count("world_count", world_count)
     world = _worlds(name, 1, fields)
     if name not in WHOLE_IDS:
-        fields["particle_count"] = world.unwrapped.config.particle_count
+        fields["particle_count"] = vector_env(world, "rllib_rows_config").config.particle_count
         rows *= fields["particle_count"]
     world.close()
     register_env(name, _RowMaker(name))

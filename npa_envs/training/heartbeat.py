@@ -5,8 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import threading
-
-import torch.distributed as dist
+from typing import Protocol
 
 BEAT_SECONDS = 5.0
 """Pause between two signs of life [s]."""
@@ -18,6 +17,14 @@ LOST_CODE = 2
 """Exit code of a process that has lost another one: the command line's for errors."""
 
 _LEFT = -(2**62)
+
+
+class Counters(Protocol):
+    """What Heartbeat needs of a store of torch.distributed's."""
+
+    def add(self, key: str, amount: int, /) -> int:
+        """Add to a counter, which begins at 0, and return it."""
+        ...
 
 
 class Heartbeat:
@@ -33,7 +40,7 @@ class Heartbeat:
         count: Number of processes, R.
     """
 
-    def __init__(self, store: dist.Store, rank: int, count: int) -> None:
+    def __init__(self, store: Counters, rank: int, count: int) -> None:
         self._store, self._rank = store, rank
         self._signs = [0] * count
         self._ended = threading.Event()

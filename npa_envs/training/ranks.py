@@ -238,13 +238,13 @@ def joined_ranks() -> Iterator[Ranks]:
     backend = "cpu:gloo,cuda:nccl" if dist.is_nccl_available() else "gloo"
     try:
         dist.init_process_group(backend)
+        ranks = Ranks.current()
+        heartbeat = _heartbeat(ranks) if ranks.count > 1 else None
     except RuntimeError as error:
         raise NPAError(
             f"the processes that torchrun starts must reach each other, but this one cannot "
             f"({shown(error)}): see its options --rdzv-endpoint and --master-addr"
         ) from error
-    ranks = Ranks.current()
-    heartbeat = _heartbeat(ranks) if ranks.count > 1 else None
     left = False
     try:
         yield ranks
@@ -260,12 +260,12 @@ def joined_ranks() -> Iterator[Ranks]:
 def _heartbeat(ranks: Ranks) -> Heartbeat:
     """Let processes notice within a minute where another one is lost, on any machine."""
     # A connection of its own: that of the group waits where the group does.
-    store = dist.TCPStore(
-        os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"]), wait_for_workers=False
-    )
+    address, port = os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"])
+    store = dist.TCPStore(address, port, wait_for_workers=False)  # type: ignore[attr-defined]
     # Torchrun may keep the store where it starts processes again.
     prefix = ranks.told(uuid.uuid4().hex)
-    return Heartbeat(dist.PrefixStore(prefix, store), ranks.rank, ranks.count)
+    own = dist.PrefixStore(prefix, store)  # type: ignore[attr-defined]
+    return Heartbeat(own, ranks.rank, ranks.count)
 
 
 def _choose_device(number: int) -> None:
