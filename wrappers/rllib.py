@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Any
 
 import gymnasium
+from gymnasium.spaces import flatten_space
+from gymnasium.wrappers.vector import FlattenObservation, TransformAction
 
 from npa_envs.envs import multispecies_v0, particles_v0
 from npa_envs.envs.core.vector import checked_count
 from npa_envs.errors import MissingDependencyError, NPAError, shown, suggest
-from npa_envs.registration import ENVIRONMENTS, register_environments
+from npa_envs.registration import (
+    ALL,
+    CODED,
+    GARDEN_IDS,
+    SPECIES_SIZES,
+    register_environments,
+)
+from npa_envs.wrappers.base import AnyVectorEnv, vector_env
 from npa_envs.wrappers.particle_rows import ParticleRows
 
 try:
@@ -28,8 +38,14 @@ MAKERS = {
     name: (module.parallel_env, task)
     for module in (multispecies_v0, particles_v0)
     for name, task in module.ENVIRONMENTS.items()
-}
+} | {size.id: (multispecies_v0.parallel_env, size.id) for size in SPECIES_SIZES}
 """Functions that make environments, and their tasks, by the ids of PettingZoo's registry."""
+
+ROW_IDS = tuple(row.id for row in ALL)
+"""Ids of Gymnasium's registry."""
+
+WHOLE_IDS = frozenset((*GARDEN_IDS, *(row.id for row in CODED)))
+"""Those where an action is of a whole world."""
 
 
 class _Maker:
@@ -54,32 +70,47 @@ class _Mapping:
 
 
 class _RowMaker:
-    """Makes worlds of an id whose particles are so many rows, as RLlib asks for it."""
+    """Makes worlds of an id, as many as give so many rows, as RLlib asks for it."""
 
     def __init__(self, name: str) -> None:
         self.name = name
 
-    def __call__(self, keywords: dict[str, Any]) -> ParticleRows:
+    def __call__(self, keywords: dict[str, Any]) -> AnyVectorEnv:
         # In a process of RLlib's this module may be all that was imported.
         register_environments()
-        fields = {"autoreset_mode": "next-step", **keywords}
-        row_count = fields.pop("num_envs")
-        particle_count = fields["particle_count"]
-        worlds = gymnasium.make_vec(
-            self.name,
-            num_envs=row_count // particle_count,
-            vectorization_mode="vector_entry_point",
-            **fields,
-        )
-        return ParticleRows(worlds)
+        fields = dict(keywords)
+        count = fields.pop("num_envs")
+        if self.name in WHOLE_IDS:
+            return _flat(_worlds(self.name, count, fields))
+        return ParticleRows(_worlds(self.name, count // fields["particle_count"], fields))
+
+
+def _worlds(name: str, count: int, fields: dict[str, Any]) -> AnyVectorEnv:
+    return gymnasium.make_vec(
+        name,
+        num_envs=count,
+        vectorization_mode="vector_entry_point",
+        **{"autoreset_mode": "next-step", **fields},
+    )
+
+
+def _flat(worlds: AnyVectorEnv) -> AnyVectorEnv:
+    """Return worlds whose observations and actions have one dimension, as RLlib's networks do."""
+    space = worlds.single_action_space
+    return TransformAction(
+        FlattenObservation(worlds),
+        lambda actions: actions.reshape(-1, *(space.shape or ())),
+        single_action_space=flatten_space(space),
+    )
 
 
 def rllib_config(name: str, *, shared: bool = False, **keywords: Any) -> PPOConfig:
     """Register an environment with RLlib, and return a configuration of PPO for it.
 
     Every species has a policy of its own, `species_0` and so on, which all of its particles share
-    where these are the agents, as in `npa/MixingParticles-v0`. Everything else is RLlib's default,
-    to be changed as always: `rllib_config(...).training(...)`.
+    where these are the agents, as in `npa/MixingParticles-v0`. Where species are, observations have
+    two dimensions, for which RLlib has no network: bring one along. Everything else is RLlib's
+    default, to be changed as always: `rllib_config(...).training(...)`.
 
     Args:
         name: An id of PettingZoo's registry.
@@ -89,8 +120,7 @@ def rllib_config(name: str, *, shared: bool = False, **keywords: Any) -> PPOConf
     Raises:
         NPAError: There is no such id, or a keyword is wrong.
     """
-    if name not in MAKERS:
-        raise NPAError(f"name must be a known id, got {shown(name)}: {suggest(name, MAKERS)}")
+    _check_id(name, MAKERS, ROW_IDS, "rllib_rows_config")
     make, task = MAKERS[name]
     env = make(task, **keywords)
     _, infos = env.reset(seed=0)
@@ -108,34 +138,37 @@ def rllib_config(name: str, *, shared: bool = False, **keywords: Any) -> PPOConf
 
 
 def rllib_rows_config(
-    name: str, *, particle_count: int, world_count: int = 4, **keywords: Any
+    name: str, *, particle_count: int | None = None, world_count: int = 4, **keywords: Any
 ) -> PPOConfig:
-    """Register an environment of one species with RLlib, and return a configuration of PPO for it.
+    """Register an environment of Gymnasium's with RLlib, and return a configuration of PPO for it.
 
-    Particles are the rows of a vector environment, and one policy is shared by all of them. Each
-    environment runner steps `world_count` worlds as one batch. Everything else is RLlib's default,
-    to be changed as always: `rllib_rows_config(...).training(...)`. RLlib keeps an object of its
-    own for each row, so hundreds of rows suit it better than many thousands.
+    Particles are the rows of a vector environment, and one policy is shared by all of them. In
+    gardens, and where an action is a code, the rows are worlds instead, observations and actions
+    flattened. Each environment runner steps `world_count` worlds as one batch. Everything else is
+    RLlib's default, to be changed as always: `rllib_rows_config(...).training(...)`. RLlib keeps an
+    object of its own for each row, so hundreds of rows suit it better than many thousands.
 
     Args:
-        name: An id of Gymnasium's registry.
-        particle_count: Particles N of a world.
+        name: An id of Gymnasium's registry, of any size.
+        particle_count: Particles N of a world; None: those of the id.
         world_count: Worlds B of an environment runner.
         keywords: Of `gymnasium.make_vec`, for example `max_episode_steps`.
 
     Raises:
         NPAError: There is no such id, or a keyword is wrong.
     """
-    ids = [environment.id for environment in ENVIRONMENTS]
-    if name not in ids:
-        raise NPAError(f"name must be a known id, got {shown(name)}: {suggest(name, ids)}")
-    rows = checked_count("world_count", world_count) * checked_count(
-        "particle_count", particle_count
-    )
-    fields = {"particle_count": particle_count, **keywords}
-    make = _RowMaker(name)
-    make({"num_envs": particle_count, **fields}).close()
-    register_env(name, make)
+    _check_id(name, ROW_IDS, MAKERS, "rllib_config")
+    register_environments()
+    fields = dict(keywords)
+    if particle_count is not None:
+        fields["particle_count"] = checked_count("particle_count", particle_count)
+    rows = checked_count("world_count", world_count)
+    world = _worlds(name, 1, fields)
+    if name not in WHOLE_IDS:
+        fields["particle_count"] = vector_env(world, "rllib_rows_config").config.particle_count
+        rows *= fields["particle_count"]
+    world.close()
+    register_env(name, _RowMaker(name))
     config: PPOConfig = (
         PPOConfig()
         .environment(name, env_config=fields)
@@ -145,3 +178,14 @@ def rllib_rows_config(
         )
     )
     return config
+
+
+def _check_id(name: str, known: Collection[str], others: Collection[str], cure: str) -> None:
+    """Check that an id is known to one of the two functions here.
+
+    Raises:
+        NPAError: It is the other one's, or nobody's.
+    """
+    if name not in known:
+        told = f"take {cure} for it; " if name in others else ""
+        raise NPAError(f"name must be a known id, got {shown(name)}: {told}{suggest(name, known)}")

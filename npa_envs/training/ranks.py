@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import os
+import uuid
 from collections.abc import Iterator, Sequence
 from typing import Any, TypeVar
 
@@ -14,6 +15,7 @@ from torch import Tensor
 
 from npa_envs.errors import LostProcessError, NPAError, shown
 from npa_envs.tasks.train_config import TrainConfig
+from npa_envs.training.heartbeat import Heartbeat
 
 ValueT = TypeVar("ValueT")
 
@@ -223,7 +225,8 @@ def joined_ranks() -> Iterator[Ranks]:
     """Join the processes that torchrun has started beside this one, within the block.
 
     Each of them sees one CUDA device, that of its number on its machine. To be called before
-    anything uses CUDA. Outside of torchrun, this process is alone.
+    anything uses CUDA. Within the block, a process that gives no sign of life ends the others (see
+    `Heartbeat`). Outside of torchrun, this process is alone.
 
     Raises:
         NPAError: The others cannot be reached.
@@ -235,15 +238,34 @@ def joined_ranks() -> Iterator[Ranks]:
     backend = "cpu:gloo,cuda:nccl" if dist.is_nccl_available() else "gloo"
     try:
         dist.init_process_group(backend)
+        ranks = Ranks.current()
+        heartbeat = _heartbeat(ranks) if ranks.count > 1 else None
     except RuntimeError as error:
         raise NPAError(
             f"the processes that torchrun starts must reach each other, but this one cannot "
             f"({shown(error)}): see its options --rdzv-endpoint and --master-addr"
         ) from error
-    yield Ranks.current()
+    left = False
+    try:
+        yield ranks
+        left = True
+    finally:
+        if heartbeat is not None:
+            heartbeat.end(left=left)
     # Not after an error: others may be gone. Recorded graphs hold on to the group.
     gc.collect()
     dist.destroy_process_group()
+
+
+def _heartbeat(ranks: Ranks) -> Heartbeat:
+    """Let processes notice within a minute where another one is lost, on any machine."""
+    # A connection of its own: that of the group waits where the group does.
+    address, port = os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"])
+    store = dist.TCPStore(address, port, wait_for_workers=False)  # type: ignore[attr-defined]
+    # Torchrun may keep the store where it starts processes again.
+    prefix = ranks.told(uuid.uuid4().hex)
+    own = dist.PrefixStore(prefix, store)  # type: ignore[attr-defined]
+    return Heartbeat(own, ranks.rank, ranks.count)
 
 
 def _choose_device(number: int) -> None:

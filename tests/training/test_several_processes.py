@@ -4,6 +4,7 @@ import json
 import os
 import random
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -29,6 +30,30 @@ def started(out, *options):
     command += ["--iterations", "1000000", "--checkpoint-interval", str(INTERVAL), "--no-progress"]
     return subprocess.Popen(
         [*command, *options], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+
+
+def started_node(number, port, out):
+    """A machine of two that share such a run, each with one process."""
+    command = [sys.executable, "-m", "torch.distributed.run", "--nnodes=2", "--nproc-per-node=1"]
+    command += [f"--node-rank={number}", "--master-addr=127.0.0.1", f"--master-port={port}"]
+    command += [
+        "-m",
+        "npa_envs",
+        "train",
+        "morphogenesis2d",
+        "--preset",
+        "tiny",
+        "--resume",
+        "auto",
+    ]
+    command += ["--out", str(out), "--iterations", "1000000", "--no-progress"]
+    return subprocess.Popen(
+        [*command, "--checkpoint-interval", str(INTERVAL)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=os.environ | {"GLOO_SOCKET_IFNAME": "lo", "OMP_NUM_THREADS": "1"},
     )
 
 
@@ -85,6 +110,32 @@ def test_a_killed_process_ends_the_run_which_goes_on_from_its_checkpoint(tmp_pat
         assert "of 2 was ended by SIGKILL" in said
         assert "go on from it with --resume" in said
         saved = check_left(out, workers, saved)
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_machine_notices_within_a_minute_that_another_one_is_lost(tmp_path, number):
+    out = tmp_path / "run"
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    here, there = (started_node(node, port, out) for node in (0, 1))
+    try:
+        mine = grown(here, out, 0)
+        (lost,) = others = children(there.pid)
+        os.kill(lost, number)
+        begun = time.monotonic()
+        said, _ = here.communicate(timeout=60)
+        assert time.monotonic() - begun < 60
+        assert here.returncode == 1
+        if number == signal.SIGSTOP:
+            assert "process 0 of 2 has heard nothing from process 1 for 40 s" in said
+            # It is there until it may go on, and then ends by itself.
+            os.kill(lost, signal.SIGCONT)
+        assert "the last checkpoint is intact" in said
+        there.communicate(timeout=60)
+        check_left(out, [*mine, *others], 0)
+    finally:
+        here.kill()
+        there.kill()
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])

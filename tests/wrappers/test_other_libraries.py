@@ -6,6 +6,7 @@ from crowds import small, still
 
 from npa_envs.envs import multispecies_v0, particles_v0
 from npa_envs.errors import NPAError
+from npa_envs.registration import ALL, SPECIES_SIZES
 from npa_envs.wrappers import NumericInfos
 
 pytestmark = [
@@ -70,8 +71,8 @@ def test_torchrl_finds_the_specs_right_and_rolls_out(module, keywords):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("shared", [False, True])
-def test_rllib_trains_a_policy_for_each_species_or_one_for_all(shared):
+@pytest.mark.parametrize(("shared", "runner_count"), [(False, 0), (True, 0), (False, 2)])
+def test_rllib_trains_a_policy_for_each_species_or_one_for_all(shared, runner_count):
     ray = pytest.importorskip("ray")
     from npa_envs.wrappers.rllib import rllib_config
 
@@ -79,17 +80,18 @@ def test_rllib_trains_a_policy_for_each_species_or_one_for_all(shared):
     del keywords["task"]
     config = (
         rllib_config("npa/MixingParticles-v0", shared=shared, **keywords)
-        .env_runners(num_env_runners=0, rollout_fragment_length=24)
+        .env_runners(num_env_runners=runner_count, rollout_fragment_length=24)
         .learners(num_learners=0)
         .training(train_batch_size_per_learner=48, minibatch_size=48, num_epochs=1)
     )
-    ray.init(num_cpus=1, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
+    ray.init(num_cpus=3, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
     try:
         algorithm = config.build_algo()
         results = algorithm.train()
         names = {"everyone"} if shared else {"species_0", "species_1"}
         assert set(results["learners"]) == names | {"__all_modules__"}
         assert results["env_runners"]["episode_len_mean"] == 6
+        assert algorithm.env_runner_group.num_remote_env_runners() == runner_count
         for name in names:
             steps = results["learners"][name]["num_module_steps_trained"]
             assert steps > 0
@@ -98,6 +100,8 @@ def test_rllib_trains_a_policy_for_each_species_or_one_for_all(shared):
         ray.shutdown()
     with pytest.raises(NPAError, match="name must be a known id, got 'npa/Mixin-v0'"):
         rllib_config("npa/Mixin-v0")
+    with pytest.raises(NPAError, match="'npa/TextureSmall-v0': take rllib_rows_config for it"):
+        rllib_config("npa/TextureSmall-v0")
 
 
 @pytest.mark.slow
@@ -129,6 +133,50 @@ def test_rllib_trains_one_policy_on_the_particles_of_worlds_of_one_species(runne
         ray.shutdown()
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "observed", "acted", "rows"),
+    [
+        ("npa/TextureSmall-v0", 18, 6, 192),
+        ("npa/Gardener2DSmall-v0", 96, 32, 2),
+        ("npa/Shepherd2DSmall-v0", 30, 8, 2),
+    ],
+)
+def test_rllib_trains_on_small_worlds_and_in_gardens(name, observed, acted, rows):
+    ray = pytest.importorskip("ray")
+    from npa_envs.wrappers.rllib import rllib_rows_config
+
+    config = (
+        rllib_rows_config(name, world_count=2, max_episode_steps=6)
+        .env_runners(num_env_runners=0, rollout_fragment_length=14)
+        .training(train_batch_size_per_learner=14 * rows, minibatch_size=12, num_epochs=1)
+    )
+    assert config.num_envs_per_env_runner == rows
+    ray.init(num_cpus=1, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
+    try:
+        algorithm = config.build_algo()
+        results = algorithm.train()
+        assert results["env_runners"]["episode_len_mean"] == 6
+        module = algorithm.get_module()
+        spaces = module.observation_space, module.action_space
+        assert [space.shape for space in spaces] == [(observed,), (acted,)]
+        algorithm.stop()
+    finally:
+        ray.shutdown()
+
+
+def test_rllib_knows_every_id():
+    pytest.importorskip("ray.rllib")
+    pytest.importorskip("sklearn")
+    from npa_envs.wrappers.rllib import rllib_config, rllib_rows_config
+
+    for row in ALL:
+        rows = rllib_rows_config(row.id, world_count=3, particle_count=64)
+        assert rows.num_envs_per_env_runner in (3, 3 * 64)
+    for size in SPECIES_SIZES:
+        assert "species_0" in rllib_config(size.id).policies
+
+
 def test_rllib_rows_need_a_known_id_and_right_keywords():
     pytest.importorskip("ray.rllib")
     from npa_envs.wrappers.rllib import rllib_rows_config
@@ -139,5 +187,7 @@ def test_rllib_rows_need_a_known_id_and_right_keywords():
         rllib_rows_config("npa/Texure-v0", particle_count=8)
     with pytest.raises(NPAError, match="world_count must be a whole number of at least 1, got 0"):
         rllib_rows_config("npa/Texture-v0", particle_count=8, world_count=0)
+    with pytest.raises(NPAError, match="'npa/MixingParticles-v0': take rllib_config for it"):
+        rllib_rows_config("npa/MixingParticles-v0")
     with pytest.raises(NPAError, match="did you mean 'target'"):
         rllib_rows_config("npa/Morphogenesis2D-v0", particle_count=8, targets="heart")
