@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from PIL import Image
 
 from npa_envs import reference
 from npa_envs.cli import main
@@ -306,6 +307,27 @@ def test_rules_of_every_kind_in_files_are_checked_by_themselves(fields, tmp_path
 
 
 # The command
+
+
+def test_where_a_picture_is_gone_what_looks_at_it_is_skipped(tmp_path):
+    picture = tmp_path / "picture.png"
+    image = Image.new("RGBA", (16, 16))
+    image.paste((200, 40, 40, 255), (4, 4, 12, 12))
+    image.save(picture)
+    config = preset("tiny", out=tmp_path / "run", target=str(picture), iterations=1, milestones=[])
+    train(config, progress=False)
+    sources = {"it": str(tmp_path / "run" / "rule.safetensors")}
+    device = torch.device("cpu")
+    assert habitat(session(device), sources["it"]).task.target.name == "picture"
+    picture.unlink()
+    habitat(session(device), sources["it"], looks=False)
+    (check,) = (
+        check
+        for check in suite.all_checks(quick=True, rules=sources)
+        if check.name.startswith("precision/mixed/")
+    )
+    with pytest.raises(Skipped, match="its target cannot be loaded: .*picture.png"):
+        check.run(session(device))
 
 
 def test_the_command_writes_a_record_draws_it_and_goes_on(tmp_path, capsys, monkeypatch):

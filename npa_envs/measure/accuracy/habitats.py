@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from npa_envs.errors import NPAError
-from npa_envs.measure.accuracy.checks import Check, Finding, Session
+from npa_envs.measure.accuracy.checks import Check, Finding, Session, Skipped
 from npa_envs.rule.files import first_rules, load_rule, rule_metadata, shipped_rules
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.base import Task, seed_worlds, task_toward
@@ -116,6 +116,9 @@ def habitat(
 
     `particles` is over those it was trained with or, in a quick run, over the most there. Where the
     world `looks` at nothing, neither loss nor metric is asked for: a 3D target takes long to make.
+
+    Raises:
+        Skipped: It looks at a target that cannot be loaded.
     """
     key = ("task", name, particles, looks)
     rule, task = session.once(key, lambda: _task(session, name, particles, looks))
@@ -137,10 +140,12 @@ def _task(session: Session, name: str, particles: float, looks: bool) -> tuple[N
     rule = load_rule(name, device=session.device).float().requires_grad_(False)
     fields = {} if looks or rule.space_dim == 2 else SMALLEST_VIEWS
     count = trained_particles(session, name)
-    task = task_of_rule(
+    found = task_of_rule(
         name, rule, session.device, particle_count=max(1, round(particles * count)), **fields
-    ).task
-    return rule, task
+    )
+    if looks and found.doubt is not None:
+        raise Skipped(found.doubt)
+    return rule, found.task
 
 
 def trained_particles(session: Session, name: str) -> int:
