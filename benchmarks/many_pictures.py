@@ -81,7 +81,7 @@ def draw_pictures(arguments: argparse.Namespace) -> None:
     drawn = random.Random(1).sample(left, TRAINED + HELD_OUT)
     rest = [name for name in left if name not in drawn]
     more = random.Random(3).sample(rest, max(0, arguments.count - TRAINED))
-    train, held_out = drawn[:TRAINED] + more, drawn[TRAINED:]
+    train, held_out = (drawn[:TRAINED] + more)[: arguments.count], drawn[TRAINED:]
     folders = {"development": taken[:DRAWN], "train": train, "held-out": held_out}
     for folder, names in folders.items():
         (arguments.out / folder).mkdir(parents=True, exist_ok=True)

@@ -6,7 +6,7 @@ from collections.abc import Collection
 from typing import Any
 
 import gymnasium
-from gymnasium.spaces import flatten_space
+from gymnasium.spaces import Box, flatten_space
 from gymnasium.wrappers.vector import FlattenObservation, TransformAction
 
 from npa_envs.envs import multispecies_v0, particles_v0
@@ -96,9 +96,11 @@ def _worlds(name: str, count: int, fields: dict[str, Any]) -> AnyVectorEnv:
 
 def _flat(worlds: AnyVectorEnv) -> AnyVectorEnv:
     """Return worlds whose observations and actions have one dimension, as RLlib's networks do."""
-    space = worlds.single_action_space
+    space, flat = worlds.single_action_space, FlattenObservation(worlds)
+    if not isinstance(space, Box):
+        return flat
     return TransformAction(
-        FlattenObservation(worlds),
+        flat,
         lambda actions: actions.reshape(-1, *(space.shape or ())),
         single_action_space=flatten_space(space),
     )

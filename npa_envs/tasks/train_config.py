@@ -125,15 +125,16 @@ class TrainConfig(Generic[TaskConfigT]):
     """Share of fresh seeds in a batch that has any; at least one world."""
 
     lifetimes: tuple[int, int] = (0, 0)
-    """Steps that a world of the pool lives until a fresh seed takes its place: the least, in the
+    """Steps that a world of the pool lives until a fresh seed takes its place, or until it is damaged
+    and lives again (`second_lives`): the least, in the
     pool's first place, and the most, in its last; evenly in the logarithm between them. A batch has
     one world from each of B equal sections of the pool, so it holds young and old worlds. (0, 0):
     fresh seeds come by `seed_interval` instead."""
 
     second_lives: float = 0.0
-    """Share of the worlds whose time is over that are damaged, once, and live as long again; a
-    fresh seed takes the place of the others (dimensionless). So a rule learns what comes of a
-    damage long after it. Needs `lifetimes` and `damage`."""
+    """Share in [0, 1) of the worlds whose time is over that are damaged at that moment and live as
+    long again; a fresh seed takes the place of the others (dimensionless). So a rule learns what
+    comes of a damage long after it. Needs `lifetimes` and `damage`."""
 
     ageing_steps: int = 0
     """Steps that worlds of the longer-lived half of the pool's places are run without gradients,
@@ -209,9 +210,12 @@ class TrainConfig(Generic[TaskConfigT]):
         check_non_negative(self, "second_lives")
         if self.average >= 1.0:
             raise NPAError(f"average must be below 1, got {self.average}: try 0.999")
-        for name in ("fresh_share", "second_lives"):
-            if getattr(self, name) > 1.0:
-                raise NPAError(f"{name} must be at most 1, got {getattr(self, name)}: try 0.5")
+        if self.fresh_share > 1.0:
+            raise NPAError(f"fresh_share must be at most 1, got {self.fresh_share}: try 0.5")
+        if self.second_lives >= 1.0:
+            raise NPAError(
+                f"second_lives must be below 1, got {self.second_lives}: with 1 there are no seeds"
+            )
         interval = self.picture_interval
         if not is_whole(interval) or interval < 0:
             raise NPAError(

@@ -44,7 +44,7 @@ class Heartbeat:
         self._store, self._rank = store, rank
         self._signs = [0] * count
         self._ended = threading.Event()
-        self._left = False
+        self._left = self._store_gone = False
         # Two, as a store that does not answer holds up whoever asks it.
         self._threads = [
             threading.Thread(target=task, daemon=True) for task in (self._beat, self._watch)
@@ -72,8 +72,8 @@ class Heartbeat:
             if self._left:
                 self._store.add(str(self._rank), _LEFT)
         except RuntimeError:
-            # The store is gone: from now on all seem silent that have not left.
-            return
+            # From now on all seem silent that have not left.
+            self._store_gone = True
 
     def _watch(self) -> None:
         count = len(self._signs)
@@ -86,11 +86,15 @@ class Heartbeat:
             seen = signs
             lost = [str(other) for other in range(count) if silent[other] >= SILENT_BEATS]
             if lost:
+                why = (
+                    "as the store that processes meet in is gone"
+                    if self._store_gone
+                    else "which was killed or stopped, or cannot be reached"
+                )
                 print(
                     f"npa-envs: error: process {self._rank} of {count} has heard nothing from "
-                    f"process {', '.join(lost)} for {SILENT_BEATS * BEAT_SECONDS:.0f} s, which was "
-                    "killed or stopped, or cannot be reached: the last checkpoint is intact; "
-                    "resume it",
+                    f"process {', '.join(lost)} for {SILENT_BEATS * BEAT_SECONDS:.0f} s, {why}: "
+                    "the last checkpoint is intact; resume it",
                     file=sys.stderr,
                     flush=True,
                 )

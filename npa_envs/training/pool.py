@@ -43,7 +43,7 @@ class WorldPool:
         self.goal = goal
         """Goals, int64, shape [W], or None."""
         self.age = None if lifetimes is None else torch.zeros_like(x[:, 0, 0], dtype=torch.int64)
-        """Steps since the seed, int64, shape [W], or None."""
+        """Steps since the seed, or since a life began by damage, int64, shape [W], or None."""
         self.lifetime: Tensor | None = None
         """Age at which the world of each place has lived, int64, shape [W], or None."""
         if lifetimes is not None:

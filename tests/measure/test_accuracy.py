@@ -326,7 +326,7 @@ def test_where_a_picture_is_gone_what_looks_at_it_is_skipped(tmp_path):
         for check in suite.all_checks(quick=True, rules=sources)
         if check.name.startswith("precision/mixed/")
     )
-    with pytest.raises(Skipped, match="its target cannot be loaded: .*picture.png"):
+    with pytest.raises(Skipped, match=r"its target cannot be loaded: .*picture\.png"):
         check.run(session(device))
 
 

@@ -63,6 +63,8 @@ def test_nothing_depends_on_the_run_the_batch_or_the_memory(worlds):
 
 def test_it_does_not_matter_how_many_tiles_a_block_serves(worlds, monkeypatch):
     task, x, s = worlds
+    if x.device.type != "cuda":
+        pytest.skip("blocks gather tiles on CUDA devices only")
     losses = task.splat_losses(x, s)
     for count in (32, 64, 128):
         monkeypatch.setattr(pictures, "block_tiles", lambda *sizes, count=count: count)

@@ -46,6 +46,17 @@ def test_a_process_that_falls_silent_is_missed(codes, capfd):
     assert "process 0 of 3 has heard nothing from process 2 for" in capfd.readouterr().err
 
 
+def test_a_store_that_is_gone_is_named(codes, capfd):
+    class Gone:
+        def add(self, _, __):
+            raise RuntimeError("connection reset")
+
+    watching = Heartbeat(Gone(), 0, 2)
+    assert set(waited(codes)) == {LOST_CODE}
+    watching.end(left=True)
+    assert "s, as the store that processes meet in is gone" in capfd.readouterr().err
+
+
 def test_a_store_that_does_not_answer_is_as_silent(codes, capfd):
     class Frozen:
         def __init__(self):

@@ -125,7 +125,7 @@ def test_no_field_of_the_run_hides_one_of_the_task():
         ("lifetimes", [0, 2], "lifetimes must be two whole numbers"),
         ("ageing_steps", -64, "ageing_steps must be a whole number of at least 0, got -64"),
         ("ageing_interval", 0, "ageing_interval must be a whole number of at least 1, got 0"),
-        ("second_lives", 1.5, "second_lives must be at most 1, got 1.5"),
+        ("second_lives", 1.0, "second_lives must be below 1, got 1.0"),
         ("second_lives", 0.5, "second_lives needs worlds that have lifetimes, got 0.5 without"),
         ("damage_share", 0.0, r"damage_share must lie in \(0, 1\], got 0.0"),
         ("average", 1.0, "average must be below 1, got 1.0"),

@@ -239,8 +239,8 @@ def test_worlds_in_the_first_places_are_damaged_and_the_others_never(tmp_path):
     assert [share for share in shares if share <= 0.7] == [0.0] * 6
 
 
-@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
-def test_worlds_whose_time_is_over_are_damaged_once_and_live_again(tmp_path, share):
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.9])
+def test_worlds_whose_time_is_over_are_damaged_then_and_live_again(tmp_path, share):
     drawn = []
 
     def rollout(rule, x, s, steps, **options):
@@ -266,7 +266,7 @@ def test_worlds_whose_time_is_over_are_damaged_once_and_live_again(tmp_path, sha
         seen.add(place)
     again = [hurt for kept, hurt in begun if kept]
     assert len(begun) > 80
-    assert len(again) == pytest.approx(share * len(begun), abs=0.15 * len(begun) * (share % 1 > 0))
+    assert len(again) == pytest.approx(share * len(begun), abs=0.15 * len(begun) * (share > 0))
     # 12 particles, each blanked with probability 0.2: 7 % of the damaged worlds have none.
     assert sum(again) >= 0.8 * len(again)
 

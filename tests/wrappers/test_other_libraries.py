@@ -135,19 +135,20 @@ def test_rllib_trains_one_policy_on_the_particles_of_worlds_of_one_species(runne
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "observed", "acted", "rows"),
+    ("name", "fields", "observed", "acted", "rows"),
     [
-        ("npa/TextureSmall-v0", 18, 6, 192),
-        ("npa/Gardener2DSmall-v0", 96, 32, 2),
-        ("npa/Shepherd2DSmall-v0", 30, 8, 2),
+        ("npa/TextureSmall-v0", {}, 18, 6, 192),
+        ("npa/Gardener2DSmall-v0", {}, 96, 32, 2),
+        ("npa/Gardener2DSmall-v0", {"actions": "discrete"}, 96, 4, 2),
+        ("npa/Shepherd2DSmall-v0", {}, 30, 8, 2),
     ],
 )
-def test_rllib_trains_on_small_worlds_and_in_gardens(name, observed, acted, rows):
+def test_rllib_trains_on_small_worlds_and_in_gardens(name, fields, observed, acted, rows):
     ray = pytest.importorskip("ray")
     from npa_envs.wrappers.rllib import rllib_rows_config
 
     config = (
-        rllib_rows_config(name, world_count=2, max_episode_steps=6)
+        rllib_rows_config(name, world_count=2, max_episode_steps=6, **fields)
         .env_runners(num_env_runners=0, rollout_fragment_length=14)
         .training(train_batch_size_per_learner=14 * rows, minibatch_size=12, num_epochs=1)
     )

@@ -122,15 +122,12 @@ def sort_small_worlds(space_dim: int, capacity: int) -> wp.Kernel:
     read_channels = make_read_channels(share, scalar)
     store_vector = make_wide_store(vector, scalar)
     store_share = make_wide_store(share, scalar)
-    memory_of = block_functions(capacity)
-    block_memory, clear_counts, arrive = (
-        memory_of.block_memory,
-        memory_of.clear_counts,
-        memory_of.arrive,
-    )
-    add_up_counts, start_of = memory_of.add_up_counts, memory_of.start_of
-    place_arrived, span_of_slice = memory_of.place_arrived, memory_of.span_of_slice
-    ranked_at, member_at = memory_of.ranked_at, memory_of.member_at
+    sorting = block_functions(capacity)
+    block_memory, clear_counts = sorting.block_memory, sorting.clear_counts
+    arrive, add_up_counts = sorting.arrive, sorting.add_up_counts
+    start_of, place_arrived = sorting.start_of, sorting.place_arrived
+    span_of_slice, ranked_at = sorting.span_of_slice, sorting.ranked_at
+    member_at = sorting.member_at
 
     @wp.func
     def write_starts(

@@ -33,15 +33,12 @@ def sort_small_splats(capacity: int) -> wp.Kernel:
     cell_of_centre, footprint_of = functions.cell_of_centre, functions.footprint_of
     load_vector = make_wide_load(vector, scalar)
     store_footprint = make_wide_store(footprint_type, scalar)
-    memory_of = block_functions(capacity)
-    block_memory, clear_counts, arrive = (
-        memory_of.block_memory,
-        memory_of.clear_counts,
-        memory_of.arrive,
-    )
-    add_up_counts, start_of = memory_of.add_up_counts, memory_of.start_of
-    place_arrived, span_of_slice = memory_of.place_arrived, memory_of.span_of_slice
-    ranked_at, member_at = memory_of.ranked_at, memory_of.member_at
+    sorting = block_functions(capacity)
+    block_memory, clear_counts = sorting.block_memory, sorting.clear_counts
+    arrive, add_up_counts = sorting.arrive, sorting.add_up_counts
+    start_of, place_arrived = sorting.start_of, sorting.place_arrived
+    span_of_slice, ranked_at = sorting.span_of_slice, sorting.ranked_at
+    member_at = sorting.member_at
 
     @native.func_native(capacity, CHUNK)
     def mean_of_world(
