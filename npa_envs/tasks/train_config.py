@@ -125,11 +125,10 @@ class TrainConfig(Generic[TaskConfigT]):
     """Share of fresh seeds in a batch that has any; at least one world."""
 
     lifetimes: tuple[int, int] = (0, 0)
-    """Steps that a world of the pool lives until a fresh seed takes its place, or until it is damaged
-    and lives again (`second_lives`): the least, in the
-    pool's first place, and the most, in its last; evenly in the logarithm between them. A batch has
-    one world from each of B equal sections of the pool, so it holds young and old worlds. (0, 0):
-    fresh seeds come by `seed_interval` instead."""
+    """Steps that a world of the pool lives until a fresh seed takes its place, or it is damaged and
+    lives again (`second_lives`): the least, in the pool's first place, and the most, in its last;
+    evenly in the logarithm between them. A batch has one world from each of B equal sections of the
+    pool, so it holds young and old worlds. (0, 0): fresh seeds come by `seed_interval` instead."""
 
     second_lives: float = 0.0
     """Share in [0, 1) of the worlds whose time is over that are damaged at that moment and live as

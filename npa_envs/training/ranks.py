@@ -226,7 +226,8 @@ def joined_ranks() -> Iterator[Ranks]:
 
     Each of them sees one CUDA device, that of its number on its machine. To be called before
     anything uses CUDA. Within the block, a process that gives no sign of life ends the others (see
-    `Heartbeat`), so whichever process keeps the store that they meet in is to leave it last. Outside of torchrun, this process is alone.
+    `Heartbeat`), so whichever process keeps the store that they meet in is to leave it last.
+    Outside of torchrun, this process is alone.
 
     Raises:
         NPAError: The others cannot be reached.
