@@ -129,44 +129,6 @@ CUDA_CALLABLE inline Value lane_sum(Value value)
     return value;
 }
 
-// Share: one lane's share of the channels. Part: the scalar type. WIDTH: channels of each row.
-template <typename Share, typename Part, int ROWS, int WIDTH, int LANES, typename Value>
-CUDA_CALLABLE inline Share lane_scatter(Value value)
-{
-    Share result;
-    Part* own = reinterpret_cast<Part*>(&result);
-    Part* sums = reinterpret_cast<Part*>(&value);
-#if defined(__CUDA_ARCH__)
-    const unsigned mask = lane_mask<LANES>();
-    #pragma unroll
-    for (unsigned row = 0; row < ROWS; ++row) {
-        unsigned count = WIDTH;
-        // At each step a lane keeps the half of the channels on its side and gives the other away.
-        #pragma unroll
-        for (unsigned offset = LANES / 2; offset > 0; offset >>= 1) {
-            const bool upper = threadIdx.x & offset;
-            count /= 2;
-            #pragma unroll
-            for (unsigned c = 0; c < WIDTH / 2; ++c) {
-                if (c < count) {
-                    const Part low = sums[row * WIDTH + c];
-                    const Part high = sums[row * WIDTH + count + c];
-                    const Part given = __shfl_xor_sync(mask, upper ? low : high, offset);
-                    sums[row * WIDTH + c] = (upper ? high : low) + given;
-                }
-            }
-        }
-        #pragma unroll
-        for (unsigned c = 0; c < WIDTH / LANES; ++c) {
-            own[row * (WIDTH / LANES) + c] = sums[row * WIDTH + c];
-        }
-    }
-#else
-    for (unsigned i = 0; i < sizeof(result) / sizeof(Part); ++i) own[i] = sums[i];
-#endif
-    return result;
-}
-
 // Share: a lane's share of the columns of a matrix of ROWS rows. Of the lanes' shares in a lane's
 // matrix the k-th is that of the lane whose number differs in the bits of k: so no lane has to look
 // for what it gives.

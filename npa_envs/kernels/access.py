@@ -2,8 +2,8 @@
 
 On CUDA a few neighbouring threads, its lanes, may share one particle and split its candidates: each
 lane sums every so-many-th candidate, and warp shuffles then add the lanes in a fixed order. Short
-sums go to every lane; the sums over channels are scattered, so that each lane finishes its own
-share of the channels. On the CPU a particle has one lane and the same source runs without either.
+sums go to every lane; of long ones each lane gets its own share. On the CPU a particle has one lane
+and the same source runs without either.
 
 What the factories make is for both devices, as is `of_warp`; the rest is for whole warps of CUDA:
 all of a warp's threads must take the same way to it.
@@ -175,29 +175,11 @@ def make_lane_sum(
 
 
 @functools.cache
-def make_lane_scatter(value_type: type, scalar: type, lanes: int) -> Any:
-    """Return a Warp function that adds a value over the lanes; each gets its share of channels.
-
-    Args:
-        value_type: A vector [W] or matrix [D, W] type; W is a multiple of `lanes`.
-        scalar: The scalar type that it is made of.
-        lanes: Lanes of a particle, 1 on the CPU.
-    """
-    *rows, width = value_type._shape_
-    share = share_type(value_type, scalar, lanes)
-
-    @native.func_native(share, scalar, rows[0] if rows else 1, width, lanes)
-    def lane_scatter(value: value_type) -> share: ...
-
-    return lane_scatter
-
-
-@functools.cache
 def make_lane_collect(value_type: type, scalar: type, lanes: int) -> Any:
     """Return a Warp function that adds over the lanes; each gets its share of the columns.
 
-    Of the shares in a lane's value the k-th is that of lane `lane ^ k`, its own one the first: this
-    takes half the instructions of `make_lane_scatter`.
+    Of the shares in a lane's value the k-th is that of lane `lane ^ k`, its own one the first: so
+    no lane has to look for what it gives.
 
     Args:
         value_type: A matrix [D, W] type; W is a multiple of `lanes`.

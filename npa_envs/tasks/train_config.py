@@ -147,8 +147,8 @@ class TrainConfig(Generic[TaskConfigT]):
     """Weight of what a rollout changes in grown worlds: the mean path length of their particles in
     perception radii, and the mean |Δs| from its start to its end; of all others it is 0
     (dimensionless). Births and deaths do not count. Grown are worlds of `rest_age` whose place in
-    the pool is never damaged. It ends the slow flow by which worlds lose their shape. Needs
-    `lifetimes`."""
+    the pool is not damaged in every batch. It ends the slow flow by which worlds lose their shape.
+    Needs `lifetimes`."""
 
     rest_age: int = 512
     """Steps from the seed, or from the damage before another life, after which a world is grown."""
@@ -203,10 +203,8 @@ class TrainConfig(Generic[TaskConfigT]):
         check_positive(self, int, "ageing_steps", at_least=0)
         check_positive(self, float, "learning_rate", "runaway_limit")
         check_fraction(self, "decay", "damage_share")
-        check_non_negative(
-            self, "weight_decay", "fresh_share", "average", "rest_weight", "fate_rate"
-        )
-        check_non_negative(self, "second_lives")
+        check_non_negative(self, "weight_decay", "fresh_share", "average", "rest_weight")
+        check_non_negative(self, "fate_rate", "second_lives")
         if self.average >= 1.0:
             raise NPAError(f"average must be below 1, got {self.average}: try 0.999")
         if self.fresh_share > 1.0:

@@ -61,11 +61,14 @@ class Splats(NamedTuple):
         """Arguments of kernels: particles of a world, positions, states, shift."""
         return self.x.shape[1], self.x.view(-1, 2), self.states.view(self.total, -1), self.shift
 
+    def aim(self) -> tuple[int, Tensor | None]:
+        """Arguments of kernels: whether worlds are moved, and where to."""
+        return (0, None) if self.goal is None else (1, self.goal.view(1, 2))
+
     def places(self) -> tuple[Any, ...]:
         """Arguments of kernels that say where particles are drawn: whether moved, means, goal."""
-        if self.goal is None:
-            return 0, None, None
-        return 1, world_mean(self.x), self.goal.view(1, 2)
+        moved, goal = self.aim()
+        return moved, world_mean(self.x) if moved else None, goal
 
 
 def splat_lanes(device: torch.device) -> int:
@@ -111,7 +114,6 @@ def sort_splats(splats: Splats, lens: Any) -> tuple[Tensor, Tensor, Tensor]:
     if capacity:
         starts = source.new_empty(cell_total + 1)
         slices = slice_count(x.device, world_count, particle_count)
-        goal = None if splats.goal is None else splats.goal.view(1, 2)
         block = BLOCKS[capacity]
         launch(
             sort_small_splats(capacity),
@@ -120,8 +122,7 @@ def sort_splats(splats: Splats, lens: Any) -> tuple[Tensor, Tensor, Tensor]:
             lens,
             slices,
             *splats.contents(),
-            int(goal is not None),
-            goal,
+            *splats.aim(),
             starts,
             footprints,
             source,
