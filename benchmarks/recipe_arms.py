@@ -91,7 +91,7 @@ FIFTH: Fields = THIRD | {
     "pool_size": 32,
     "ageing_steps": 512,
     "damage_radius": 0.2,
-    "initial_rule": "heart",
+    "initial_rule": "heart-v0",
 }
 """The fifth candidate: a rule that has learned to grow and to last learns another picture."""
 
@@ -103,7 +103,7 @@ SEVENTH: Fields = {
     "steps": (32, 64),
     "schedule": "cosine",
     "learning_rate": 2e-3,
-    "initial_rule": "heart",
+    "initial_rule": "heart-v0",
 }
 """What serves `fast`, in large: half of the worlds are seeds, none is old. Not at full size."""
 
@@ -117,7 +117,7 @@ EIGHTH: Fields = {
     "damage_share": 0.25,
     "damage_radius": 0.2,
     "rest_weight": 2.0,
-    "initial_rule": "heart",
+    "initial_rule": "heart-v0",
 }
 """The eighth candidate: grown worlds are to rest."""
 

@@ -13,7 +13,7 @@ from npa_envs.envs.core.config import EnvConfig
 from npa_envs.envs.core.task import Start
 from npa_envs.envs.morphogenesis2d import Morphogenesis2DEnvConfig, PictureTask
 from npa_envs.errors import NPAError, shown
-from npa_envs.rule.files import load_rule, shipped_rules
+from npa_envs.rule.files import frozen_rule, load_rule, shipped_rules
 from npa_envs.rule.rule import NPARule
 from npa_envs.tasks.checks import check_positive
 from npa_envs.tasks.targets.clouds import Split
@@ -36,8 +36,9 @@ class GrownConfig(Morphogenesis2DEnvConfig):
     which takes `grow_steps` steps of the rule."""
 
     rule: str | None = None
-    """What grows the worlds: a shipped rule or a rule's file; None: the shipped rule with the
-    target's name."""
+    """What grows the worlds: a shipped rule or a rule's file; None: the rule that was shipped with
+    the target's name when environments of version 0 were frozen
+    (`npa_envs.rule.files.frozen_rule`)."""
 
     split: Split = "train"
     """Which grown worlds the pool holds: "train", or "test" for others that evaluate what was
@@ -166,7 +167,7 @@ def _load_rule(config: GrownConfig, device: torch.device) -> NPARule:
             "rule must say what grows the worlds, as no shipped rule grows "
             f"{shown(config.target)} ({', '.join(known)}): give rule='PATH'{config.without_rule}"
         )
-    rule = load_rule(config.rule or config.target, device=device)
+    rule = load_rule(config.rule or frozen_rule(config.target), device=device)
     wanted = {
         "space_dim": 2,
         "state_dim": config.state_dim,

@@ -53,9 +53,9 @@ class Regeneration2DEnvConfig(GrownConfig):
     [length units]; None: 0.3, 0.1, 0.2 and 0.05."""
 
     rule: str | None = None
-    """What grows the worlds: a shipped rule, or a rule's file; None: the shipped rule with the
-    target's name. "picture" starts from the target's own points instead, with blank hidden
-    states."""
+    """What grows the worlds: a shipped rule, or a rule's file; None: the rule that was shipped with
+    the target's name when environments of version 0 were frozen. "picture" starts from the target's
+    own points instead, with blank hidden states."""
 
     split_damage: bool = False
     """Damage of split="test" is drawn apart from that of "train", also where `reset` is given the

@@ -78,12 +78,25 @@ def shipped_rules(task: str | None = None) -> dict[str, Path]:
 def first_rules() -> dict[str, Path]:
     """Return the rules that runs of presets and environments begin with: name -> file, by name.
 
-    The preset `best` of 2D morphogenesis begins with the shipped heart. Others have learned one
-    picture in small worlds, or several (`seven-pictures`), and are not shipped to be looked at.
+    Those named as a shipped rule and `-v0` are what was shipped under that name when environments
+    of version 0 were frozen (`frozen_rule`). Others have learned one picture in small worlds, or
+    several (`seven-pictures`), and are not shipped to be looked at.
     """
     folder = Path(__file__).resolve().parent / "first"
-    rules = {path.stem: path for path in sorted(folder.glob("*.safetensors"))}
-    return rules | {"heart": shipped_rules()["heart"]}
+    return {path.stem: path for path in sorted(folder.glob("*.safetensors"))}
+
+
+def frozen_rule(name: str) -> str:
+    """Return the name of the rule that grows a target in environments of version 0.
+
+    A shipped rule may be replaced by a better one; then the file that it was is kept as `NAME-v0`,
+    and environments still begin with the worlds that it grows.
+
+    Args:
+        name: A shipped rule's, for example "heart".
+    """
+    kept = f"{name}-v0"
+    return kept if kept in first_rules() else name
 
 
 def load_rule(source: str | Path, *, device: str | torch.device = "cpu") -> NPARule:

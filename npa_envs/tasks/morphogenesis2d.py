@@ -543,7 +543,7 @@ MORPHOGENESIS2D_PRESETS: Mapping[str, Morphogenesis2DTrainConfig] = {
         lifetimes=(64, 16_384),
         damage_share=0.25,
         rest_weight=2.0,
-        initial_rule="heart",
+        initial_rule="heart-v0",
         out=_OUT,
     ),
     # A few particles that see far; half of the worlds are seeds: docs/recipes.md.

@@ -55,7 +55,7 @@ class TrainConfig(Generic[TaskConfigT]):
     initial_rule: str = ""
     """Start from this rule, a name or a file, instead of random weights; '': from these. The preset
     `fast` of morphogenesis2d starts from `gecko-512`, which has grown a gecko in its worlds, and
-    `best` from the shipped heart; `best` of morphogenesis3d from `rocket-8192`."""
+    `best` from a heart (`heart-v0`); `best` of morphogenesis3d from `rocket-8192`."""
 
     vary_particles: tuple[float, float] = (1.0, 1.0)
     """Range of factors on the number of particles. Half of the batches are as the task says, the

@@ -3,6 +3,7 @@
 import pickle
 import re
 import warnings
+from hashlib import sha256
 from pathlib import Path
 
 import gymnasium
@@ -250,6 +251,13 @@ def test_settings_stay_what_they_are_as_long_as_the_version_does(name):
     config = gymnasium.make(name).unwrapped.config
     for key, value in (FOR_ALL | FROZEN[name]).items():
         assert getattr(config, key) == value, key
+
+
+def test_the_rule_that_runs_a_frozen_world_stays_what_it_is():
+    rule = gymnasium.make("npa/Gardener2DSmall-v0").unwrapped.task.rule
+    weights = b"".join(p.detach().cpu().numpy().tobytes() for p in rule.parameters())
+    assert sha256(weights).hexdigest()[-12:] == "bfc570262e4d"
+    assert not torch.equal(rule.hidden.weight, npa_envs.load_rule("heart").hidden.weight)
 
 
 @pytest.mark.parametrize(

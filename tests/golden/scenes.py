@@ -31,7 +31,10 @@ RULES: dict[str, dict[str, Any]] = {
 }
 """Shipped rules with the radius [length units] and the box of the task of each."""
 
-KEPT_RULES = {"dots": GOLDEN.with_name("dots.safetensors")}
+KEPT_RULES = {
+    "dots": GOLDEN.with_name("dots.safetensors"),
+    "heart": "heart-v0",
+}
 """Rules that are no longer shipped as they were when their worlds were stored."""
 
 
@@ -279,7 +282,7 @@ def shipped_together() -> Arrays:
     def scene(dtype: torch.dtype) -> Arrays:
         x, s = stored_world("gecko", dtype)
         counts = (x.shape[1] // 2, x.shape[1] - x.shape[1] // 2)
-        rules = [npa_envs.load_rule(name).to(dtype) for name in ("gecko", "heart")]
+        rules = [rule_named(name).to(dtype) for name in ("gecko", "heart")]
         after = npa_envs.rollout_species(
             rules,
             x,
