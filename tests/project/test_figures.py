@@ -307,6 +307,35 @@ def test_rows_of_npa_bench_on_two_machines_are_told_and_agree() -> None:
     assert "returned {} on one machine and {} on the other".format(*apart[most]) in told
 
 
+def test_two_rows_of_npa_bench_from_a_cpu_and_a_gpu_are_told() -> None:
+    page = (ROOT / "docs" / "npa_bench.md").read_text(encoding="utf-8")
+    rows = content(RESULTS / "npa_bench_two_machines.json")
+    apart = []
+    for first, second in zip(rows[:24:2], rows[1:24:2], strict=True):
+        assert (first["id"], first["method"]) == (second["id"], second["method"])
+        held = content(RESULTS / "npa_bench_v0" / f"{second['method']}.json")
+        assert (second["machine"], second["commit"]) == (held["machine"], held["commit"])
+        runs = {run["seed"]: run["returns"] for run in held["runs"] if run["id"] == first["id"]}
+        assert second["returns"] == {str(seed): round(mean(runs[seed]), 5) for seed in range(5)}
+        for row in (first, second):
+            values = list(row["returns"].values())
+            assert row["mean"] == pytest.approx(mean(values), abs=1e-5)
+            assert row["standard_error"] == pytest.approx(stdev(values) / 5**0.5, abs=1e-5)
+        if "Gardener" in first["id"] or "Shepherd" in first["id"]:
+            cells = [f"{row['mean']:.3f} ± {row['standard_error']:.3f}" for row in (first, second)]
+            assert f"| `{first['method']}`, `{first['id']}` | {' | '.join(cells)} |" in page
+            error = math.hypot(first["standard_error"], second["standard_error"])
+            apart.append(f"{abs(first['mean'] - second['mean']) / error:.1f}")
+        else:
+            assert second["returns"] == pytest.approx(first["returns"], abs=1.5e-5)
+    told = " ".join(page.split())
+    assert f"means differ by {' and '.join(apart)} standard errors of their difference" in told
+    for again in rows[24:]:
+        (first,) = (row for row in rows[:14:2] if row["id"] == again["id"])
+        assert all(again[key] == first[key] for key in ("method", "machine"))
+        assert again["returns"] == pytest.approx(first["returns"], abs=5e-5)
+
+
 def test_what_is_said_of_the_small_suite_is_in_its_table() -> None:
     page = (ROOT / "docs" / "npa_bench.md").read_text(encoding="utf-8")
     page = page[page.index("### On a laptop") : page.index("### On a GPU")]
