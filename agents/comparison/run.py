@@ -21,7 +21,7 @@ import threading
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from queue import SimpleQueue
@@ -36,7 +36,7 @@ from npa_envs.agents.evaluation import Episodes, evaluate_policy, policy_in
 from npa_envs.agents.learning import method_options, train
 from npa_envs.agents.learning.problem import Problem
 from npa_envs.agents.learning.progress import Budget, Entry
-from npa_envs.errors import DivergedError
+from npa_envs.errors import DivergedError, NPAError
 from npa_envs.measure.record import number, read_record, write_record
 from npa_envs.processes import Child, Places, run_children
 from npa_envs.render import write_png
@@ -424,8 +424,10 @@ def run_jobs(
         written: Called with each record once it is in its place.
 
     Raises:
-        NPAError: The folder cannot be written to.
+        NPAError: A run would clone one that is neither among the jobs nor in the folder, or the
+            folder cannot be written to.
     """
+    _check_teachers(plan, jobs, folder)
     waiting = list(jobs)
     idle: list[subprocess.Popen[bytes]] = []
 
@@ -461,6 +463,19 @@ def run_jobs(
     finally:
         for process in idle:
             process.communicate()
+
+
+def _check_teachers(plan: Plan, jobs: Collection[Job], folder: Path) -> None:
+    """Refuse runs whose teacher is not there and will not come, before anything is run."""
+    for job in jobs:
+        teacher = plan.teacher(job)
+        if teacher is None or teacher in jobs or (folder / teacher.folder).is_dir():
+            continue
+        raise NPAError(
+            f"{job.method!r} clones the rules of {teacher.method!r} from the same seed, but "
+            f"{teacher} is neither in {str(folder)!r} nor to be run: add --methods "
+            f"{teacher.method}, or name a rule by --options {job.method}.teacher=NAME"
+        )
 
 
 def _start(

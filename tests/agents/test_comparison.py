@@ -349,6 +349,18 @@ def test_a_run_that_clones_begins_when_its_teacher_is_over(tmp_path, child, devi
             assert order.index(teacher) < order.index(str(job.folder))
 
 
+def test_a_run_that_clones_is_refused_where_its_teacher_will_never_be(tmp_path, child):
+    child("pass")
+    made = plan(methods=["clone"], seeds=(0,))
+    with pytest.raises(NPAError, match=r"clones the rules of 'gradient'.*add --methods gradient"):
+        run_jobs(made, made.jobs(), tmp_path, Places(("cpu",), jobs=1))
+    assert list(tmp_path.iterdir()) == []
+    # What an earlier call has run serves as well.
+    (tmp_path / made.teacher(made.jobs()[0]).folder).mkdir(parents=True)
+    run_jobs(made, made.jobs(), tmp_path, Places(("cpu",), jobs=1))
+    assert (tmp_path / made.jobs()[0].folder / "run.json").exists()
+
+
 @pytest.mark.parametrize("waiting", [False, True])
 def test_a_process_that_dies_is_recorded_the_others_go_on_and_it_is_run_again(
     tmp_path, child, waiting
