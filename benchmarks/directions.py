@@ -74,6 +74,8 @@ def train(arguments: argparse.Namespace) -> None:
                 fields["steps"] = (62, 64)
             if arguments.iterations:
                 fields["iterations"] = arguments.iterations
+            if arguments.initial_rule:
+                fields["initial_rule"] = arguments.initial_rule
             if arguments.learning_rate:
                 fields["learning_rate"] = arguments.learning_rate
             fields |= {"repeats": 1, "tensorboard": False, "picture_interval": 0}
@@ -224,6 +226,7 @@ def main() -> None:
     parser.add_argument("--size", default="small")
     parser.add_argument("--iterations", type=int, default=0)
     parser.add_argument("--learning-rate", type=float, default=0.0)
+    parser.add_argument("--initial-rule", default="", help="file of a rule of the same kind")
     parser.add_argument("--longest", type=float, default=math.inf)
     parser.add_argument("--particles", nargs="+", type=int, default=(4096,))
     parser.add_argument("--steps", type=int, default=64)
