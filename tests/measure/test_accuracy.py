@@ -267,6 +267,15 @@ def test_a_rule_that_blows_up_is_found_out(factor, count, verdict, device, monke
         assert (entry.note == "") == (verdict == "pass")
 
 
+def test_the_energy_of_a_world_at_rest_is_no_chance(device):
+    home = habitat(session(device), "heart", looks=False)
+    run = habitats.LongRun(home, torch.Generator(device).manual_seed(0), home.options())
+    run.advance(512)
+    draws = [torch.Generator(device).manual_seed(seed) for seed in range(8)]
+    energies = [habitats.measured(home, run.x, run.s, draw)["energy"] for draw in draws]
+    assert max(energies) < 2.0 * min(energies)
+
+
 def test_what_grew_at_another_radius_is_measured_at_its_trained_size(device):
     free, held = (habitat(session(device), name) for name in ("heart", "dots"))
     eps = free.task.eps
