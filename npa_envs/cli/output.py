@@ -176,17 +176,11 @@ def rule_of(source: str) -> str:
     Raises:
         NPAError: The folder holds no rule, or those of several species.
     """
-    from npa_envs.rule.files import shipped_rules
+    from npa_envs.rule.files import rule_in, shipped_rules
 
-    folder = Path(source)
-    rule = folder / "rule.safetensors"
-    if not folder.is_dir() or source in shipped_rules():
+    if not Path(source).is_dir() or source in shipped_rules():
         return source
-    if rule.is_file():
-        return str(rule)
-    others = sorted(folder.glob("rule-*.safetensors"))
-    cure = f"name one of its rules, such as {str(others[0])!r}" if others else "name another one"
-    raise NPAError(f"a folder must hold the {rule.name} of a run, {source!r} does not: {cure}")
+    return str(rule_in(source))
 
 
 def told_rules(words: Iterable[str]) -> dict[str, str]:

@@ -106,7 +106,7 @@ def load_rule(source: str | Path, *, device: str | torch.device = "cpu") -> NPAR
         source: The name of a rule (`shipped_rules()`, `first_rules()`), or the path of a
             `.safetensors` file that `save_rule` wrote, of the authors' state dict (`.pth`, `.pt`;
             no code in it is run), or of their web demo's collection: `"models.json#name"`, or of a
-            stack of rules without names `"models_digits.json#0"`.
+            stack of rules without names `"models_digits.json#0"`; or a training run's folder.
         device: Where the weights go: "cpu", "cuda", "cuda:1", or torch's own device.
 
     Returns:
@@ -239,6 +239,8 @@ def _locate(source: str | Path) -> tuple[Path, str | None]:
     named = known | first_rules()
     if text in named:
         return named[text], None
+    if os.path.isdir(text):
+        return rule_in(text), None
     base, mark, name = text.rpartition("#")
     path, inner = (Path(base), name) if mark and base.endswith(".json") else (Path(text), None)
     if path.suffix in _SUFFIXES:
@@ -247,8 +249,25 @@ def _locate(source: str | Path) -> tuple[Path, str | None]:
         raise NPAError(f"a rule's file must end in {suffixes}, got {shown(text)}: rename it")
     raise NPAError(
         f"unknown rule {shown(text)}: {suggest(text, known)}; or give the path of a "
-        f"file that ends in {suffixes}"
+        f"file that ends in {suffixes}, or a run's folder"
     )
+
+
+def rule_in(folder: str | Path) -> Path:
+    """Return the file of the rule in a training run's folder.
+
+    Args:
+        folder: The folder, which exists.
+
+    Raises:
+        NPAError: It holds no rule, or those of several species.
+    """
+    rule = Path(folder) / "rule.safetensors"
+    if rule.is_file():
+        return rule
+    others = sorted(Path(folder).glob("rule-*.safetensors"))
+    cure = f"name one of its rules, such as {str(others[0])!r}" if others else "name another one"
+    raise NPAError(f"a folder must hold the {rule.name} of a run, {str(folder)!r} does not: {cure}")
 
 
 def _read_header(path: Path) -> dict[str, str]:

@@ -54,6 +54,16 @@ def test_a_saved_rule_comes_back_bit_by_bit(tmp_path: Path, kind: str, dtype: to
     assert torch.equal(loaded(z), rule(z))
 
 
+def test_a_runs_folder_stands_for_its_rule(tmp_path: Path) -> None:
+    with pytest.raises(NPAError, match=r"a folder must hold the rule\.safetensors of a run"):
+        load_rule(tmp_path)
+    save_rule(NPARule(), tmp_path / "rule-0.safetensors")
+    with pytest.raises(NPAError, match=r"name one of its rules, such as .*rule-0\.safetensors"):
+        load_rule(tmp_path)
+    save_rule(rule := NPARule(), tmp_path / "rule.safetensors")
+    assert_same_rule(load_rule(tmp_path), rule)
+
+
 def test_a_loaded_rule_does_not_hang_on_its_file(tmp_path: Path) -> None:
     path = tmp_path / "rule.safetensors"
     rule = NPARule()

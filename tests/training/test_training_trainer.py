@@ -27,9 +27,11 @@ def test_training_starts_from_an_initial_rule_of_its_shape(tmp_path):
     path = tmp_path / "first" / "rule.safetensors"
     config = circle_config(tmp_path / "second", iterations=3, initial_rule=str(path))
     assert_same(trainer_of(config).rule.state_dict(), first.rule.state_dict())
+    config = circle_config(tmp_path / "third", initial_rule=str(path.parent))  # the run's folder
+    assert_same(trainer_of(config).rule.state_dict(), first.rule.state_dict())
     save_rule(NPARule(2, 5, 7), tmp_path / "other.safetensors")
     config = circle_config(tmp_path / "run", initial_rule=str(tmp_path / "other.safetensors"))
-    with pytest.raises(NPAError, match=r"initial_rule must be .* differs in .*hidden_dim"):
+    with pytest.raises(NPAError, match=r"shape, but .* differs in .*hidden_dim \(7, here "):
         trainer_of(config)
 
 
