@@ -440,9 +440,15 @@ def initial_rule(config: TrainConfig[Any], untrained: NPARule) -> NPARule:
                 "codes, or from random weights (initial_rule='')"
             )
     if wrong:
+        told, asked = rule.hyper_parameters(), untrained.hyper_parameters()
+        differences = [
+            f"{'eps0, the eps it learned at' if name == 'eps0' else name} "
+            f"({shown(told.get(name))}, here {shown(asked.get(name))})"
+            for name in wrong
+        ]
         raise NPAError(
             f"initial_rule must be a rule of the task's shape, but {shown(source)} differs in "
-            f"{', '.join(wrong)}: change those fields, start from another rule, or from random "
-            "weights (initial_rule='')"
+            f"{', '.join(differences)}: change those fields, start from another rule, or from "
+            "random weights (initial_rule='')"
         )
     return rule
