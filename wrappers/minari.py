@@ -7,6 +7,7 @@ Minari keeps datasets below the folder that the variable `MINARI_DATASETS_PATH` 
 from __future__ import annotations
 
 import os
+import re
 import secrets
 import shutil
 import warnings
@@ -37,6 +38,9 @@ except ImportError as error:
 
 ROOT = "MINARI_DATASETS_PATH"
 """Variable that names the folder of all datasets."""
+
+_DATASET_ID = re.compile(r"([-\w][-\w/]*[-\w]/)?[-\w]+-v\d+")
+"""Minari's ids with a version, without which it writes none."""
 
 
 def record_episodes(
@@ -151,6 +155,11 @@ def write_dataset(
     Raises:
         NPAError: There is such a dataset, the id is none, or files cannot be written.
     """
+    if not _DATASET_ID.fullmatch(dataset_id):
+        raise NPAError(
+            f"dataset must be an id with a version, got {shown(dataset_id)}: for example "
+            "npa/heart/expert-v0"
+        )
     target: Path = get_dataset_path(dataset_id)
     if target.exists():
         raise NPAError(

@@ -205,6 +205,14 @@ class GardenPolicy:
             NPAError: The file is not called as `save` calls it, or is missing.
         """
         name = Path(path).stem
-        if name not in ALGORITHMS or not Path(path).is_file():
-            raise NPAError(f"path must be of a file sac.zip or ppo.zip, got {shown(str(path))}")
+        if name not in ALGORITHMS:
+            raise NPAError(
+                f"path must be of a file sac.zip or ppo.zip, got {shown(str(path))}: name the file "
+                "as the learner that wrote it, because its name says how to read it"
+            )
+        if not Path(path).is_file():
+            raise NPAError(
+                f"path must be of a file that exists, got {shown(str(path))}: name one that "
+                "`save` or `npa-envs learn` wrote"
+            )
         return cls(ALGORITHMS[name].load(path, device="cpu"))

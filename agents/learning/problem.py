@@ -33,7 +33,7 @@ from npa_envs.envs.multi.tasks import task_type as species_task_type
 from npa_envs.envs.multi.vector import MultiSpeciesVectorEnv
 from npa_envs.envs.shapeshifter2d import ShapeshifterTask
 from npa_envs.errors import NPAError, shown, suggest
-from npa_envs.registration import ENVIRONMENTS, SPECIES_SIZES
+from npa_envs.registration import ALL, SPECIES_SIZES
 from npa_envs.tasks.checks import check_positive
 from npa_envs.world.actions import Physics
 
@@ -153,7 +153,7 @@ class Problem:
         if isinstance(entry, str):
             entry = gymnasium.envs.registration.load_env_creator(entry)
         if not (isinstance(entry, type) and issubclass(entry, NPAVectorEnv)):
-            known = [environment.id for environment in ENVIRONMENTS]
+            known = [environment.id for environment in ALL]
             raise NPAError(
                 f"env_id must be of an environment of many worlds, got {shown(self.env_id)}: "
                 f"{suggest(self.env_id, [*known, *SPECIES])}"

@@ -76,7 +76,7 @@ def test_a_dataset_is_written_whole_or_not_at_all(root):
         recorded(problem, rules)
     with pytest.raises(NPAError, match="there is no dataset 'npa/other-v0'"):
         read_pairs("npa/other-v0")
-    with pytest.raises(NPAError, match="could not be written"):
+    with pytest.raises(NPAError, match="must be an id with a version, got 'no version'"):
         recorded(problem, rules, "no version")
     assert not list(root.glob(".*"))
 
@@ -126,11 +126,16 @@ def test_the_command_records_any_policy(root, capsys, env, policy, names):
         ("npa/Mixing-v0", "must be of one species"),
         ("npa/Morphogenesis2D-v0 --options target", "NAME=VALUE"),
         ("npa/Morphogenesis2D-v0 --episodes 0", "episodes must be at least 1"),
+        ("npa/Gardener2DSmal-v0", "did you mean 'npa/Gardener2DSmall-v0'"),
         ("npa/Gardener2DSmall-v0 --policy heart", "policy must be one of"),
+        ("npa/Gardener2DSmall-v0 --policy none/sac.zip", "must be of a file that exists"),
+        ("npa/Gardener2DSmall-v0 --policy best.zip", "must be of a file sac.zip or ppo.zip"),
+        ("npa/Gardener2DSmall-v0 --episodes 1 --dataset heart", "must be an id with a version"),
+        ("npa/Gardener2DSmall-v0 --episodes 1 --dataset ../heart-v0", "must be an id"),
     ],
 )
 def test_what_cannot_be_recorded_is_told(words, told, capsys):
-    assert main(["record", *words.split(), "--dataset", "npa/test-v0"]) == 2
+    assert main(["record", "--dataset", "npa/test-v0", *words.split()]) == 2
     assert told in capsys.readouterr().err
 
 
