@@ -16,8 +16,9 @@ class ListOptions:
 def main(arguments: Sequence[str]) -> int:
     """Print everything that has a name."""
     parse_options(ListOptions, "list", arguments)
+    from npa_envs.envs.multi.tasks import ENVIRONMENTS as OF_SPECIES
     from npa_envs.measure.quality import score_line, scores
-    from npa_envs.registration import ALL
+    from npa_envs.registration import ALL, SPECIES_SIZES
     from npa_envs.rule.files import load_rule, shipped_rules
     from npa_envs.tasks.losses.texture import TEXTURE_LOSSES
     from npa_envs.tasks.targets.clouds import BUILT_IN
@@ -36,6 +37,8 @@ def main(arguments: Sequence[str]) -> int:
     print("environments (import npa_envs; gymnasium.make(NAME) or make_vec(NAME, num_envs=64))")
     for environment in ALL:
         print(f"  {environment.id}: episodes of {environment.max_episode_steps} steps")
+    print("several species (npa_envs.envs.multispecies_v0.parallel_env(NAME); needs PettingZoo)")
+    print(f"  {', '.join((*OF_SPECIES, *(size.id for size in SPECIES_SIZES)))}")
     print("targets (--target NAME, or the path of a picture; for morphogenesis also one emoji)")
     for name, entry in TASKS.items():
         if entry.targets():

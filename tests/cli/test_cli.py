@@ -125,6 +125,9 @@ def test_list_names_tasks_presets_targets_and_losses(capsys):
         "vgg_ot",
         "filter_swd",
         "bubbles, cells, dots, droplets, grid, hearts, maze, stars",
+        "npa/Regeneration2D-v1",
+        "npa/Mixing-v0, npa/Segregation-v0",
+        "npa/InvasionLarge-v0",
     ):
         assert words in text
     assert "morphogenesis3d: doughnut, duck, mushroom, rocket" in text
