@@ -24,6 +24,7 @@ from npa_envs.training import (
     preset,
     task_entry,
 )
+from npa_envs.training.checkpoint import check_task, load_checkpoint
 
 COMMON = ("target", "iterations", "device", "out")
 """Fields of configurations that stand among the most common options, where a task has them."""
@@ -118,7 +119,12 @@ def starting_configuration(task_name: str, arguments: Sequence[str]) -> TrainCon
                 f"there is no checkpoint to resume from at {str(folder.checkpoint)!r}: give the "
                 "folder of an earlier run with --out, or leave --resume out to start a new run"
             )
-        base = load_config(folder.config, base, whole=True)
+        try:
+            base = load_config(folder.config, base, whole=True)
+        except NPAError:
+            # Fields of another task are unknown here; that it is another task says more.
+            check_task(load_checkpoint(folder.checkpoint), task_name, folder.checkpoint)
+            raise
     if first.config is not None:
         presets = task_entry(task_name).presets
         if first.preset or first.resume:

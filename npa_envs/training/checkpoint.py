@@ -138,6 +138,19 @@ def drawn_by_world(content: Mapping[str, Any]) -> bool:
     return isinstance(states, dict) and states.keys() == {"schedule"}
 
 
+def check_task(content: Mapping[str, Any], task_name: str, path: Path) -> None:
+    """Check that a checkpoint is of a task.
+
+    Raises:
+        NPAError: It is of another one.
+    """
+    if content.get("task_name") != task_name:
+        raise NPAError(
+            f"the checkpoint {str(path)!r} is of task {shown(content.get('task_name'))}, "
+            f"not of {task_name!r}: resume it with that task, or choose another folder"
+        )
+
+
 def check_same_run(
     content: dict[str, Any], task_name: str, config: TrainConfig[Any], path: Path
 ) -> None:
@@ -148,11 +161,7 @@ def check_same_run(
             than the run goes.
     """
     _check_complete(content, path)
-    if content["task_name"] != task_name:
-        raise NPAError(
-            f"the checkpoint {str(path)!r} is of task {shown(content['task_name'])}, "
-            f"not of {task_name!r}: resume it with that task, or choose another folder"
-        )
+    check_task(content, task_name, path)
     theirs = _flat(completed(content["config"], config))
     ours = _flat(config_to_dict(config))
     differences = [

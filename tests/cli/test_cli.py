@@ -334,6 +334,11 @@ def test_train_refuses_before_it_says_where_it_writes(trained, tmp_path, capsys)
     assert (trained / "rule.safetensors").read_bytes() == before
 
 
+def test_a_run_of_another_task_is_not_resumed_but_named(trained, capsys):
+    message = error_of(capsys, ["train", "texture", "--resume", "--out", str(trained)])
+    assert "is of task 'morphogenesis2d', not of 'texture'" in message
+
+
 @pytest.mark.parametrize("command", ["rollout", "evaluate"])
 def test_the_folder_of_a_run_stands_for_its_rule(command, trained, tmp_path, capsys):
     words = [command, str(trained), "--no-progress"]
