@@ -141,16 +141,19 @@ def run(
         meet += f" --particle-count {sum(config.task.counts[:2])}"
     _say_how_it_ended(result, rules, resume_command)
     if options.report and result.iteration > 0 and not result.interrupted:
-        training = Training(
-            task_name, ("train", *words), result.iteration, result.record.get("seconds", 0.0)
-        )
+        told = ("train", *words)
+        if options.resume:  # These words do not say what the run began with; its file does.
+            told = ("train", task_name, "--config", str(folder.config))
+            told += ("--processes", str(ranks.count)) if ranks.count > 1 else ()
+        seconds = result.record.get("seconds", 0.0)
+        training = Training(task_name, told, result.iteration, seconds)
         for rule in rules:
             device = check_device(config.device)
             try:
-                told = write_report(
+                card, scores = write_report(
                     rule, folder.report, training, device, progress=options.progress
                 )
-                print(f"  report      {told[0]}: {told[1]}")
+                print(f"  report      {card}: {scores}")
             except NPAError as error:
                 # The rule is there all the same; a bad one may not live as long as is measured.
                 print(f"  no report   {error}")
@@ -246,7 +249,7 @@ def announcement(
 def _say_how_it_ended(result: TrainResult, rules: Sequence[Path], resume_command: str) -> None:
     folder = RunFolder(result.folder)
     loss = result.record.get("loss")
-    figures = "" if loss is None else f", loss {loss:.4g}"
+    figures = "" if loss is None else f", training loss {loss:.4g}"
     if result.finished:
         print(f"finished: {result.iteration} iterations{figures}")
     else:

@@ -94,7 +94,8 @@ def test_a_run_writes_no_report_where_none_is_wanted_or_no_iteration_was_done(tm
     assert main([*words, "--overwrite", "--max-seconds", "1e-9"]) == 0
     assert not (tmp_path / "run" / "report").exists()
     assert main([*words, "--resume"]) == 0
-    assert (tmp_path / "run" / "report" / "rule.md").exists()
+    card = (tmp_path / "run" / "report" / "rule.md").read_text("utf-8")
+    assert f"npa-envs train morphogenesis2d --config {tmp_path / 'run' / 'config.json'}\n" in card
     assert main([*words, "--overwrite", "--no-report"]) == 0
     assert not list((tmp_path / "run" / "report").iterdir())
     assert "  report  " not in capsys.readouterr().out.rpartition("finished")[2]
