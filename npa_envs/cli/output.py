@@ -66,7 +66,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "sweep": (
         "sweep --over target=heart,ring seed=0,1,2 --devices cuda:0 cuda:1 -- morphogenesis2d",
     ),
-    "view": ("view gecko", "view runs/heart", "view npa/Texture-v0 --policy dots"),
+    "view": ("view gecko", "view runs/heart", "view npa/Morphogenesis2D-v0 --policy gecko"),
     "warmup": ("warmup", "warmup --device cuda --space-dims 2 3"),
     "train morphogenesis2d": (
         "train morphogenesis2d --target heart --out runs/heart",
