@@ -85,7 +85,8 @@ class AgentsEnv:
 
         The seed is what `reset` was given; the generator of later keys begins with the first one.
         """
-        if seed is None and self.np_random is not None:
+        # After a first reset that was refused there are no worlds to go on with.
+        if seed is None and self._started:
             return None
         self.np_random, _ = seeding.np_random(plain_seed(first))
         return world_keys(seed, self.worlds.world_count, self.np_random)

@@ -252,3 +252,15 @@ def test_what_is_refused_says_why():
     ):
         with pytest.raises(NPAError, match=message):
             envs.step(actions)
+
+
+def test_a_first_reset_that_is_refused_leaves_the_next_one_random():
+    states = []
+    for _ in range(2):
+        envs = batch()
+        with pytest.raises(NPAError, match="one for each of 3 worlds"):
+            envs.reset(seed=[1, 2])
+        envs.reset()
+        states += list(envs.state())
+    # Neither two worlds nor two environments are alike.
+    assert len({state.tobytes() for state in states}) == 6
