@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from npa_envs.envs.core.screen import Screen
-from npa_envs.envs.core.spaces import Rows, to_output
+from npa_envs.envs.core.spaces import Rows, number_tensor, to_output
 from npa_envs.envs.core.task import EnvTask
 from npa_envs.envs.core.worlds import FLAGS, Report, Worlds, reason
 from npa_envs.errors import NPAError, shown, suggest
@@ -244,21 +244,19 @@ class NPAVectorEnv(VectorEnv[Any, Any, Any]):
         Args:
             x: Positions [length units], shape [M, N, D].
             s: States, dimensionless, shape [M, N, C].
-            worlds: Which worlds, indices, shape [M]; None: all of them.
+            worlds: Which worlds, indices, each once, shape [M]; None: all of them.
 
         Raises:
-            NPAError: A shape is another one, a number is not finite or beyond its limit, or a world
-                does not exist.
+            NPAError: A shape is another one, a number is not finite or beyond its limit, or worlds
+                are no such indices.
         """
         if not self._started:
             raise NPAError("particles need worlds: call reset first")
-        device, everyone = self.task.device, range(self.num_envs)
-        chosen = torch.as_tensor(list(everyone) if worlds is None else worlds, device=device).long()
-        if chosen.ndim != 1 or not bool(((chosen >= 0) & (chosen < self.num_envs)).all()):
-            raise NPAError(
-                f"worlds must be indices below {self.num_envs}, got {chosen.tolist()}: "
-                "for example worlds=[0, 2]"
-            )
+        if worlds is None:
+            chosen = torch.arange(self.num_envs)
+        else:
+            chosen = world_numbers(worlds, self.num_envs)
+        chosen = chosen.to(self.task.device)
         count = self.config.particle_count
         start = self.worlds.checked_particles(x, s, len(chosen), count)
         with self.worlds.here():
@@ -415,6 +413,26 @@ def worlds_to_reset(options: dict[str, Any] | None, world_count: int) -> NDArray
     if not given.any():
         raise NPAError("reset_mask must choose at least one world, got none: skip the reset")
     return np.flatnonzero(given)
+
+
+def world_numbers(worlds: Any, world_count: int) -> Tensor:
+    """Return which of B worlds a caller means, by indices, each once; on the CPU, int64, shape [M].
+
+    Raises:
+        NPAError: They are no such indices.
+    """
+    given = number_tensor("worlds", worlds).cpu()
+    # A mask would else be taken for the indices 0 and 1.
+    whole = not given.is_floating_point() and given.dtype != torch.bool
+    if given.ndim == 1 and whole:
+        chosen = given.long()
+        there = bool(((chosen >= 0) & (chosen < world_count)).all())
+        if there and len(set(chosen.tolist())) == len(chosen):
+            return chosen
+    raise NPAError(
+        f"worlds must be indices below {world_count}, each once, got {shown(given.tolist())}: "
+        "for example worlds=[0, 2]"
+    )
 
 
 def world_keys(

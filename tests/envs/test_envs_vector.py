@@ -244,6 +244,28 @@ def test_wrong_use_is_a_clear_error(name):
     assert make_vec(name, np.int64(2), max_episode_steps=-1).num_envs == 2
 
 
+@pytest.mark.parametrize(
+    "worlds",
+    [[3], [-1], [1, 1], [True, False, True], np.array([True, True, True]), [0.5], [[0]], 1, []],
+)
+def test_particles_are_placed_in_worlds_that_exist_each_once(worlds):
+    envs = make_vec(IDS[0], 3).unwrapped
+    envs.reset(seed=0)
+    x, s = envs.particles()
+    # As many as a mask has entries, or as there are indices.
+    count = np.asarray(worlds).size
+    with pytest.raises(NPAError, match="worlds must be indices below 3, each once"):
+        envs.place_particles(x[:1].repeat(count, 1, 1), s[:1].repeat(count, 1, 1), worlds=worlds)
+    assert torch.equal(envs.particles()[0], x)
+
+
+def test_worlds_to_place_particles_in_are_numbers():
+    envs = make_vec(IDS[0], 3).unwrapped
+    envs.reset(seed=0)
+    with pytest.raises(NPAError, match="worlds must be an array of numbers"):
+        envs.place_particles(*envs.particles(), worlds="all")
+
+
 @every_id
 def test_each_world_has_its_picture(name):
     envs = make_vec(name, 3, render_mode="rgb_array")
