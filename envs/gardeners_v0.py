@@ -16,6 +16,7 @@ from gymnasium.wrappers import TimeLimit
 from numpy.typing import NDArray
 from torch import Tensor
 
+from npa_envs.envs.core.vector import checked_count
 from npa_envs.envs.garden.forms import Brushes
 from npa_envs.envs.gardener2d import Gardener2DEnv
 from npa_envs.envs.multi.parallel import Outcome, in_turns, register
@@ -110,9 +111,9 @@ class GardenersEnv(pettingzoo.ParallelEnv):  # type: ignore[misc]
         calm = {"gust_chance": 0.0, "blight_chance": 0.0}
         self.garden = _SharedGarden(**(calm | config))
         """The world as a Gymnasium environment, whose actions are those of both."""
-        self.max_cycles = max_cycles
+        self.max_cycles = checked_count("max_cycles", max_cycles)
         """Steps of an episode."""
-        self._episodes = TimeLimit(self.garden, max_cycles)
+        self._episodes = TimeLimit(self.garden, self.max_cycles)
         self.render_mode = self.garden.render_mode
         self.possible_agents = list(AGENTS)
         self.agents: list[str] = []

@@ -93,3 +93,13 @@ def test_bad_agents_and_actions_are_clear_errors():
         env.step({"keeper_0": env.action_space("keeper_0").sample()})
     with pytest.raises(NPAError, match=r"action must be real numbers of shape \[K, W\]"):
         env.step({agent: np.zeros((3, 2), np.float32) for agent in env.agents})
+
+
+@pytest.mark.parametrize("number", [0, -1, 1.5, None, True, "3"])
+def test_a_wrong_number_of_steps_is_a_clear_error(number):
+    with pytest.raises(NPAError, match="max_cycles must be a whole number of at least 1"):
+        gardeners_v0.parallel_env(max_cycles=number, **SMALL)
+
+
+def test_numpys_whole_numbers_of_steps_are_taken():
+    assert gardeners_v0.parallel_env(max_cycles=np.int64(4), **SMALL).max_cycles == 4
