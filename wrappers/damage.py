@@ -214,9 +214,11 @@ class VectorDamageEvents(_DamagesWorlds, EpisodeWrapper):
         x, s = self._particles(due)
         observations = base.place_particles(x[chosen], s[chosen], chosen)
         output = base.config.output
-        now = {"loss": worlds.loss.clone(), "loss_damage": worlds.loss - before}
-        for k, name in enumerate(worlds.part_names):
-            now[f"loss_{name}"] = worlds.report.numbers[2 + k].clone()
+        # Arrays are float64, as those of environments are, and differences as of single ones.
+        dtype = torch.float64 if output == "numpy" else torch.float32
+        loss, *parts = worlds.report.numbers[1 : 2 + len(worlds.part_names)].to(dtype, copy=True)
+        now = {"loss": loss, "loss_damage": loss - before.to(dtype)}
+        now |= {f"loss_{n}": part for n, part in zip(worlds.part_names, parts, strict=True)}
         mask = torch.from_numpy(hurt).to(base.task.device)
         now |= {"_loss_damage": mask}
         told = {name: to_output(value, output) for name, value in now.items()}

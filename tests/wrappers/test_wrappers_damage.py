@@ -201,7 +201,8 @@ def test_world_k_is_damaged_as_the_single_environment(events, every):
             hurt = info.get("_loss_damage", np.zeros(3, bool))[k]
             assert hurt == ("loss_damage" in expected_info)
             if hurt:
-                assert info["loss_damage"][k] == pytest.approx(expected_info["loss_damage"])
+                assert info["loss_damage"][k] == expected_info["loss_damage"]
+                assert info["loss"].dtype == np.float64
                 damaged += 1
     assert damaged >= 6
 
