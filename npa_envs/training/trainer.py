@@ -208,6 +208,8 @@ class Trainer:
                 self.save()
                 interrupted = ranks.any(stop.is_set())
         finally:
+            # What happens until the next `run` is no time of training.
+            self._seconds_before, self._started = self._seconds(), None
             bar.close()
             if self._board is not None:
                 self._board.close()
