@@ -21,7 +21,7 @@ from npa_envs.world.randomness import Purpose, WorldRandom
 from npa_envs.world.rollout import rollout
 
 FIRST_TEST_SEED = 1_000_000
-"""Pools have fewer worlds than this."""
+"""Pools have no more worlds than this."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,6 +53,11 @@ class GrownConfig(Morphogenesis2DEnvConfig):
         check_positive(self, int, "grow_steps")
         if self.split not in get_args(Split):
             raise NPAError(f"split must be 'train' or 'test', got {shown(self.split)}")
+        if self.seed_pool > FIRST_TEST_SEED:
+            raise NPAError(
+                f"seed_pool must be at most {FIRST_TEST_SEED}, got {self.seed_pool}: the worlds "
+                "after those are of the other split"
+            )
         if self.split == "test" and self.seed_pool == 0:
             raise NPAError(
                 "split must be 'train' where seed_pool=0 grows each episode's world anew: evaluate "

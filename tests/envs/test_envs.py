@@ -338,6 +338,9 @@ def test_a_test_split_grows_other_worlds_than_those_to_learn_from():
         gymnasium.make(name, **(given | {"seed_pool": 0}), split="test")
     with pytest.raises(NPAError, match="split must be 'train' or 'test', got 'eval'"):
         gymnasium.make(name, **given, split="eval")
+    # The millionth world is where those of the test split begin.
+    with pytest.raises(NPAError, match="seed_pool must be at most 1000000, got 1000001"):
+        gymnasium.make(name, **(given | {"seed_pool": 1_000_001}))
 
 
 def test_version_1_of_regeneration_begins_with_many_worlds_and_evaluates_with_other_damage():
