@@ -80,6 +80,8 @@ class KeptProgress(Progress):
         """
         assert learner is not None, "the methods whose runs are kept say what is to be kept"
         with self.folder.locked() if self.ranks.first else nullcontext():
+            if self.ranks.first:
+                self.folder.tidy()
             if self._content is not None:
                 self._go_on(learner, self._content)
             elif self.ranks.first and self._overwrite:

@@ -214,6 +214,15 @@ def test_a_checkpoint_that_was_changed_is_refused(finished):
             kept("ppo", finished, 2, resume=True)
 
 
+def test_what_a_killed_run_left_half_written_is_removed_by_the_next_start(finished):
+    half = finished / ".checkpoint.0123456789ab.tmp.pt"
+    mine = finished / ".film.0123456789ab.tmp.mp4"
+    for path in (half, mine):
+        path.write_bytes(b"half")
+    kept("ppo", finished, 2, resume=True)
+    assert (half.exists(), mine.exists()) == (False, True)
+
+
 def test_what_cannot_be_shared_is_refused(tmp_path):
     said = on_ranks(2, lambda: kept("ppo", None, 1), tmp_path)
     assert said[0] == said[1]
