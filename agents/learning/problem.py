@@ -36,6 +36,7 @@ from npa_envs.errors import NPAError, shown, suggest
 from npa_envs.registration import ALL, SPECIES_SIZES
 from npa_envs.tasks.checks import check_positive
 from npa_envs.world.actions import Physics
+from npa_envs.world.cuda_graph import sent
 
 WORLDS_PER_SEED = 10_000
 """Distance of the worlds' seeds of one run from those of the next."""
@@ -449,8 +450,11 @@ class ConcatenatedSpeciesEnv:
             Observations, shape [B, N, P], and infos with `loss`.
         """
         rows, infos = self.species_env.reset(seed, options)
-        self._reasons[worlds_to_reset(options, self.num_envs)] = None
-        self._loss = self._stacked(infos, "loss")
+        chosen = worlds_to_reset(options, self.num_envs)
+        self._reasons[chosen] = None
+        # Nothing is said any more of species that have ended in worlds that go on.
+        losses, index = self._stacked(infos, "loss"), sent(chosen, self._loss.device)
+        self._loss = self._loss.index_copy(0, index, losses[index])
         return self._concatenated(rows), {"loss": self._loss.mean(dim=1)}
 
     def step(self, actions: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:

@@ -282,6 +282,21 @@ def test_episodes_of_species_end_with_their_last_observations():
     assert observation[..., :4].abs().sum() == 0.0
 
 
+def test_species_that_ended_keep_their_loss_where_another_world_is_reset():
+    problem = species(particle_counts=[30, 18], deaths=[[1, 2]])
+    envs = problem.make_envs(2)
+    envs.reset(seed=0)
+    still = torch.zeros(2, 48, problem.interface.action_dim)
+    for _ in range(4):
+        *_, infos = envs.step(still)
+    mask = torch.tensor([True, False])
+    _, told = envs.reset(options={"reset_mask": mask})
+    assert told["loss"][1] == infos["loss"][1] > 0.0
+    assert told["loss"][0] != infos["loss"][0]
+    # Nothing has moved there.
+    assert envs.step(still)[-1]["loss"][1] == infos["loss"][1]
+
+
 def test_a_world_terminates_where_its_last_species_ends():
     problem = species(deaths=[[0, 2], [1, 4]], episode_steps=8)
     envs = problem.make_envs(2)
