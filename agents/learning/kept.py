@@ -166,7 +166,8 @@ class KeptProgress(Progress):
         if not self.log or not all(is_real(value) or value == math.inf for value in numbers):
             raise unusable_checkpoint(path, "curve must hold the numbers of its entries")
         self._iteration, self._part = content["iteration"], content["part"] + 1
-        self.particle_steps, self._seconds = content["particle_steps"], content["seconds"]
+        self.particle_steps = content["particle_steps"]
+        self._seconds = self._elapsed = content["seconds"]
         self._looks = int(self.share * self._entries)
         learner.go_on(self._iteration, self._part)
 

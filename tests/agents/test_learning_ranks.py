@@ -178,6 +178,22 @@ def test_a_run_that_is_asked_to_stop_can_be_resumed(tmp_path, monkeypatch):
     assert kept("ppo", tmp_path, 8, resume=True)[1] == [0, 3, 4, 8]
 
 
+def test_a_shared_run_that_goes_on_by_seconds_evaluates_at_their_shares(tmp_path):
+    def learn(seconds, **given):
+        budget = Budget(seconds=seconds)
+        told = {"evaluation_seeds": [500], "entries": 2, "out": tmp_path / "run"}
+        return len(train("ppo", HEART, budget, 0, **told, **METHODS["ppo"], **given).log)
+
+    def resumed():
+        spent = load_checkpoint(tmp_path / "run" / "checkpoint.pt")["seconds"]
+        return learn(1.6 * spent, resume=True)
+
+    # Of the first, of two shares, and at the end: that is where the second share ends.
+    (first,) = on_ranks(1, lambda: learn(0.5), tmp_path)
+    # Five eighths are spent: there is one more share, and no look before it.
+    assert on_ranks(1, resumed, tmp_path) == [first + 1]
+
+
 @pytest.fixture(scope="module")
 def one_round(tmp_path_factory):
     folder = tmp_path_factory.mktemp("kept") / "run"
