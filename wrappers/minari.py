@@ -186,6 +186,9 @@ def write_dataset(
         if namespace and namespace not in list_local_namespaces():
             create_namespace(namespace)
         os.replace(part / dataset_id, target)
+    except NPAError:
+        # That of an episode, which says itself what is wrong.
+        raise
     except (OSError, ValueError) as error:
         raise NPAError(
             f"dataset {shown(dataset_id)} could not be written ({shown(error)}): give an id such "

@@ -7,7 +7,7 @@ from learning_problems import heart, wild_rules
 from npa_envs.agents import evaluate_policy
 from npa_envs.agents.learning import Budget, Problem, RuleSet, train
 from npa_envs.cli import main
-from npa_envs.errors import NPAError
+from npa_envs.errors import DivergedError, NPAError
 
 minari = pytest.importorskip("minari")
 pytest.importorskip("h5py")
@@ -79,6 +79,15 @@ def test_a_dataset_is_written_whole_or_not_at_all(root):
     with pytest.raises(NPAError, match="must be an id with a version, got 'no version'"):
         recorded(problem, rules, "no version")
     assert not list(root.glob(".*"))
+
+
+def test_a_policy_that_diverges_while_it_is_recorded_is_told_as_that(root):
+    problem = heart(episode_steps=3)
+    spec = spec_of(problem.env_id, {}, 3)
+    episodes = record_episodes(problem.make_envs(), lambda seen: seen[..., :6] * np.nan, range(2))
+    with pytest.raises(DivergedError, match=r"^action must be finite"):
+        write_dataset("npa/test-v0", spec, episodes, algorithm="wild", description="a test")
+    assert list(root.iterdir()) == []
 
 
 def test_rules_learn_from_a_dataset_without_a_world(monkeypatch):
