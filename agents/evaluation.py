@@ -145,10 +145,18 @@ def _run_single(
     observation, info = env.reset(seed=seeds[0])
     start_loss, total, steps, over = info["loss"], 0.0, 0, False
     while not over:
-        observation, reward, terminated, truncated, info = env.step(policy(observation[None])[0])
+        action = policy(_as_batch(observation))[0]
+        observation, reward, terminated, truncated, info = env.step(action)
         total, steps, over = total + float(reward), steps + 1, terminated or truncated
     ending = np.array([_ending(info)], dtype=object)
     return *(np.array([n]) for n in (total, start_loss, info["loss"], steps)), ending
+
+
+def _as_batch(observation: Any) -> Any:
+    """Return what is seen of one world, an array or a dict of such, as what is seen of a batch."""
+    if isinstance(observation, Mapping):
+        return {name: part[None] for name, part in observation.items()}
+    return observation[None]
 
 
 def _ending(info: Mapping[str, Any]) -> str:

@@ -53,6 +53,19 @@ def test_scripts_do_better_than_nobody_and_nobody_than_chance(name, make, keywor
     assert still > chance
 
 
+@pytest.mark.parametrize("output", ["numpy", "torch"])
+@pytest.mark.parametrize(
+    ("name", "make"), [(GARDENER, ScriptedGardener), (SHEPHERD, ScriptedShepherd)]
+)
+def test_episodes_of_one_world_are_those_of_many(name, make, output):
+    quick = {"max_episode_steps": 3, "rule_steps": 1, "output": output}
+    many = make_vec(name, 2, **quick)
+    one = gymnasium.make(name, disable_env_checker=True, **QUICK, **quick)
+    left, right = (evaluate_policy(env, make(env), range(3)) for env in (many, one))
+    assert np.allclose(left.returns, right.returns, atol=1e-6)
+    assert np.array_equal(left.final_losses, right.final_losses)
+
+
 def test_what_a_scripted_gardener_does_is_linear_in_what_is_seen():
     envs = make_vec(GARDENER, 8, rule_steps=1)
     policy = ScriptedGardener(envs, gain=0.05, share=0.05)
